@@ -4,7 +4,7 @@ Maps are those of the even scans, measurements the odd scans, increments the raw
 ``carmen_logs/odometry``. Runs begin with a normal density of variances 0.25, 0.25 m^2 and 0.0685 rad^2 around the
 first logged pose. A run is lost if the median error of its last tenth is above 1 m.
 
-    python bench/accuracy/localization.py --seeds 3 --out bench/results/localization.json
+    python bench/accuracy/localization.py --seeds 3 --out localization.json
 """
 
 from __future__ import annotations

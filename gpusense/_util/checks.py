@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import numbers
 import os
 import reprlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from gpusense._util import masks
 
 _REPR = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = 120
@@ -119,17 +122,24 @@ def boolean(name: str, value: object) -> bool:
     return bool(value)
 
 
-def as_array(name: str, value: object) -> NDArray[Any]:
+def as_array(name: str, value: object, *, masked: bool = False) -> NDArray[Any]:
     """Return ``numpy.asarray(value)`` of any dtype.
+
+    Args:
+        name: Name of the argument.
+        value: Anything that ``numpy.asarray`` accepts.
+        masked: Whether values may be masked; these become NaN, and integers with them float64.
 
     Raises:
         TypeError: The value has no values, because JAX traces it.
-        ValueError: The value is a ragged sequence.
+        ValueError: The value is a ragged sequence, or a value is masked.
     """
     check_values(name, value)
     try:
-        return np.asarray(cast("ArrayLike", value))
-    except ValueError:
+        return np.asarray(cast("ArrayLike", masks.filled(value) if masked else masks.unmasked(name, value)))
+    except ValueError as error:
+        if str(error).startswith(f"{name}: "):
+            raise
         raise ValueError(f"{name}: must be an array of one shape, got {show(value)}") from None
 
 
@@ -147,7 +157,7 @@ def array(
         name: Name of the argument.
         value: Anything that ``numpy.asarray`` accepts; copied only if its dtype differs from ``dtype``.
         shape: Required shape; an integer is an exact length, a letter any length. None skips this check.
-        finite: Whether to refuse NaN and infinities.
+        finite: Whether to refuse NaN, infinities and masked values. Otherwise masked values are NaN.
         dtype: Dtype of the result. An integer dtype accepts integers only. None keeps a floating dtype (in the
             machine's byte order) and converts integers to float64.
 
@@ -156,7 +166,7 @@ def array(
             requires them.
         ValueError: The shape or a value breaks the rule.
     """
-    values = as_array(name, value)
+    values = as_array(name, value, masked=not finite)
     kinds, rule = "fiu", "must hold real numbers"
     if dtype is not None and np.dtype(dtype).kind in "iu":
         kinds, rule = "iu", "must hold integers"
@@ -197,6 +207,37 @@ def check_gradients(array: object, name: str, error: Exception) -> None:
             f"{name}: must not require gradients, which are not computed here, got a "
             f"{type(array).__module__}.{type(array).__name__} that does: pass {name}.detach()"
         ) from error
+
+
+def nested(name: str, value: object, *, deepest: int, most: int) -> int:
+    """Count the values in mappings, lists and tuples within each other, each time that they occur.
+
+    The keys of mappings count, too. A text counts once more for every 64 characters.
+
+    Args:
+        name: Name of the argument.
+        value: The caller's value.
+        deepest: Most levels.
+        most: Most values.
+
+    Raises:
+        ValueError: There are more levels, as in a list that contains itself, or more values.
+    """
+    count = 0
+    inner: list[Iterator[Any]] = [iter([value])]
+    while inner:
+        for one in inner[-1]:
+            count += 1 + (len(one) >> 6 if isinstance(one, str) else 0)
+            if count > most:
+                raise ValueError(f"{name}: must hold at most {most} values, got more")
+            if isinstance(one, (Mapping, list, tuple)):
+                if len(inner) > deepest:
+                    raise ValueError(f"{name}: must be nested at most {deepest} deep, got more")
+                inner.append(itertools.chain.from_iterable(one.items()) if isinstance(one, Mapping) else iter(one))
+                break
+        else:
+            inner.pop()
+    return count
 
 
 def path(name: str, value: object) -> Path:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from gpusense._util import masks
 from gpusense._util.checks import check_gradients, shape_text, show
 from gpusense.backends.base import Adopted, Backend, Buffer
 from gpusense.backends.registry import entry_of_array, selection_for
@@ -36,8 +37,11 @@ def to_host(array: object, name: str = "poses") -> object:
 
     Raises:
         TypeError: a tensor whose gradients are recorded.
+        ValueError: a masked value.
     """
-    if isinstance(array, (np.ndarray, list, tuple)) or not hasattr(array, "__dlpack__"):
+    if isinstance(array, (np.ndarray, list, tuple)):
+        return masks.unmasked(name, array)
+    if not hasattr(array, "__dlpack__"):
         return array
     try:
         return np.from_dlpack(array)
@@ -47,7 +51,8 @@ def to_host(array: object, name: str = "poses") -> object:
 
 
 def copied_to_host(array: object, backend: Backend, name: str) -> object:
-    """Return readings as a NumPy array; those on the device are copied, after its work has ended."""
+    """Return readings as a NumPy array, NaN where masked; those on the device are copied, after its work has ended."""
+    array = masks.filled(array)
     if not on_device(array):
         return to_host(array, name)
     return _adopt(array, backend, name).to_host()

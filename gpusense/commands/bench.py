@@ -116,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _reports(args: argparse.Namespace) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
     """Read the reports of ``--compare``: the old one and the new one, or None."""
-    from gpusense.evaluation.benchmark.compare import read_report
+    from gpusense.evaluation.benchmark.stored import read_report
 
     if not args.compare:
         return None, None

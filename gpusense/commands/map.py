@@ -34,7 +34,8 @@ _EPILOG = """\
 Each ray makes the cells that it crosses more likely free, and the cell where it ends more likely occupied. Cells
 without a ray stay unknown. The map is written as map_server's YAML file with an image beside it.
 
-Ctrl-C ends the run; the map of the scans so far is written.
+Ctrl-C ends the run; the map of the scans so far is written. A map of more than four million cells is built in bands
+of rows: then it is the map of the bands so far, and of the last one's scans.
 
 Exit codes: 0 success, 2 bad input, 130 interrupted.
 
@@ -76,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
         resolution=args.resolution, origin=None, shape=None, range_limit=args.range_limit, clear_max=args.clear_max,
         p_hit=args.p_hit, p_miss=args.p_miss, p_prior=0.5, occupied_threshold=65, backend=args.backend, each=_SCANS,
     )  # fmt: skip
-    done = _build(builder, len(scans))
+    done = _build(builder)
     grid = builder.grid()
     write_map(grid, args.out)
     counted = round(done * len(scans))
@@ -92,15 +93,18 @@ def run(args: argparse.Namespace) -> int:
         print(f"{args.out}: {rows} x {cols} cells of {grid.resolution} m, {occupied} occupied, {free} free; "
               f"{builder.rays} rays of {counted} scans")  # fmt: skip
     if done < 1:
-        sys.stderr.write(f"gpusense: interrupted: the map holds {counted} of {len(scans)} scans\n")
+        held = f"{counted} of {len(scans)} scans"
+        if builder.bands > 1:
+            held = f"its lower part, {100 * done:.0f}% of the work; the rest is unknown"
+        sys.stderr.write(f"gpusense: interrupted: the map holds {held}\n")
         return INTERRUPTED
     return 0
 
 
-def _build(builder: MapBuilder, count: int) -> float:
-    """Count all rays, and return the share of scans that are done: less than 1 after an interrupt."""
+def _build(builder: MapBuilder) -> float:
+    """Count all rays, and return the share of the work that is done: less than 1 after an interrupt."""
     done = 0.0
-    with progress(-(-count // _SCANS)) as step:
+    with progress(max(builder.parts, 1)) as step:
         try:
             for done in builder.steps():
                 step(f"{100 * done:.0f}%")

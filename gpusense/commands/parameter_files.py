@@ -50,7 +50,7 @@ def read_localization(path: Path) -> tuple[BeamParameters | None, dict[str, Any]
 
 def _content(path: Path) -> dict[Any, Any]:
     from gpusense._util import checks
-    from gpusense._util.files import read_mapping
+    from gpusense._util.documents import read_mapping
 
     return read_mapping(checks.existing_file(path))
 

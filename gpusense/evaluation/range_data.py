@@ -6,8 +6,6 @@ neighbouring scans are correlated, so data are grouped in blocks, and every othe
 
 from __future__ import annotations
 
-import gzip
-import io
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util import checks
+from gpusense._util.lines import numbered_lines
 from gpusense.backends import Selection
 from gpusense.logs import Scan
 from gpusense.models.scan.beam import BeamModel
@@ -175,33 +174,23 @@ def _chosen_rows(file: Any, every: int, offset: int, limit: int | None) -> Float
 
 def _number_rows(file: Any) -> Iterator[Floats]:
     """Yield (n, 2) or (n, 3) numbers of a file, one block of lines at a time."""
-    with open(file, "rb") as raw:
-        zipped = raw.read(2) == b"\x1f\x8b"
-        raw.seek(0)
-        stream = io.BufferedReader(gzip.GzipFile(fileobj=raw)) if zipped else raw
-        columns, number, header = 0, 0, True
-        lines: list[tuple[int, str]] = []
-        while True:
-            try:
-                line = stream.readline(_LONGEST_LINE + 1)
-            except (OSError, EOFError) as error:
-                raise ValueError(f"{file}: must be a whole gzip file, got {error}") from None
-            number += 1
-            if len(line) > _LONGEST_LINE:
-                raise ValueError(f"{file}: line {number}: must have at most {_LONGEST_LINE} bytes, got more")
-            text = line.decode("utf-8", "backslashreplace").strip().removeprefix("\ufeff")
-            if text and not text.startswith("#"):
-                if header and not any(_number(word) is not None for word in text.split(",")):
-                    header = False
-                else:
-                    header = False
-                    columns = columns or text.count(",") + 1
-                    lines.append((number, text))
-            if lines and (len(lines) == _LINES or not line):
-                yield _numbers(file, lines, columns)
-                lines = []
-            if not line:
-                return
+    columns, header = 0, True
+    lines: list[tuple[int, str]] = []
+    for number, line in numbered_lines(file):
+        if len(line) > _LONGEST_LINE:
+            raise ValueError(f"{file}: line {number}: must have at most {_LONGEST_LINE} bytes, got more")
+        text = line.decode("utf-8", "backslashreplace").strip().removeprefix("\ufeff")
+        if not text or text.startswith("#"):
+            continue
+        if not header or any(_number(word) is not None for word in text.split(",")):
+            columns = columns or text.count(",") + 1
+            lines.append((number, text))
+        header = False
+        if len(lines) == _LINES:
+            yield _numbers(file, lines, columns)
+            lines = []
+    if lines:
+        yield _numbers(file, lines, columns)
 
 
 def _numbers(file: Any, lines: list[tuple[int, str]], columns: int) -> Floats:

@@ -6,6 +6,7 @@ import re
 
 from gpusense.interface import casters, structs
 from gpusense.interface.flags import FLAGS
+from gpusense.interface.directives import resolve
 from gpusense.interface.kernel_files import has_opencl_source, opencl_source
 
 _PRELUDE = """\
@@ -17,7 +18,6 @@ typedef {real}4 real4;
 #define SPLITTER ((real){splitter})
 """
 _REQUIRES = re.compile(r"^// requires: (.*)$", re.MULTILINE)
-_CONDITION = re.compile(r"#if (!?)([A-Z0-9_]+)$")
 
 
 def prelude(*, float64: bool, doubles: bool = False) -> str:
@@ -61,36 +61,6 @@ def _with_requirements(name: str, flags: frozenset[str]) -> list[str]:
 def _requirements(name: str) -> list[str]:
     match = _REQUIRES.search(opencl_source(name))
     return match.group(1).split() if match else []
-
-
-def resolve(text: str, flags: frozenset[str], name: str = "source") -> str:
-    """Keep the taken branches of ``#if FLAG``, ``#if !FLAG``, ``#else``, ``#endif``; the rest becomes empty lines.
-
-    Lines keep their numbers, so that a compiler's message names the place in the file.
-
-    Raises:
-        ValueError: a condition that is not a single known flag, or unbalanced directives.
-    """
-    kept: list[str] = []
-    taken: list[bool] = []
-    for number, line in enumerate(text.splitlines(), 1):
-        directive = line.strip()
-        if directive.startswith("#if"):
-            match = _CONDITION.match(directive)
-            if match is None or match.group(2) not in FLAGS:
-                raise ValueError(f"{name}:{number}: condition must be one known flag, got {directive!r}")
-            taken.append((match.group(2) in flags) != (match.group(1) == "!"))
-        elif directive in ("#else", "#endif"):
-            if not taken:
-                raise ValueError(f"{name}:{number}: {directive} without #if")
-            last = taken.pop()
-            if directive == "#else":
-                taken.append(not last)
-        keep = all(taken) and not directive.startswith(("#if", "#else", "#endif"))
-        kept.append(line if keep else "")
-    if taken:
-        raise ValueError(f"{name}: #if without #endif")
-    return "\n".join(kept) + "\n"
 
 
 def uses_double(file: str, flags: frozenset[str] = frozenset()) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 from gpusense._util import checks
-from gpusense._util.files import read_mapping
+from gpusense._util.documents import read_mapping
 from gpusense.localization.motion import MotionModel, OdometryMotion, OmniMotion
 from gpusense.localization.nav2_nodes import parameters_of
 from gpusense.models.scan.beam import BeamModel

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from gpusense._util import masks
 from gpusense.localization.evidence import Evidence
 from gpusense.localization.sensors import Sensor
 from gpusense.models.landmark.model import LandmarkModel
@@ -62,7 +63,7 @@ class Verdict:
         """Add the features of a scan, before the filter is corrected by them."""
         for index, evidence in self._evidence.items():
             if index in readings and _count(readings[index]):
-                evidence.predicted(poses, weights, np.asarray(readings[index][0], np.float64))
+                evidence.predicted(poses, weights, np.asarray(masks.filled(readings[index][0]), np.float64))
 
     @property
     def gain(self) -> float:

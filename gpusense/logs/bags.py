@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from gpusense.logs.bag_bounds import check_metadata, install
+
 SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 # ROS 1's first version of transforms has the layout of the second.
@@ -92,8 +94,12 @@ def _open(path: Path) -> Iterator[tuple[Any, Any]]:
         from rosbags.rosbag1 import Reader as Reader1
         from rosbags.rosbag2 import Reader as Reader2
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        install()
     except ImportError as error:
         raise ImportError(f"{path}: {_INSTALL} ({error})") from None
+    if path.is_dir():
+        check_metadata(path)
     first = path.suffix.lower() == ".bag"
     store = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
     if TRANSFORMS not in store.types:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util import masks
 from gpusense.world.landmarks import LandmarkMap
 from gpusense.world.scanner import Scanner
 
@@ -29,7 +30,7 @@ class Scan:
     time: float
     """Time of measurement by the log's clock [s]."""
     ranges: NDArray[np.float64]
-    """(K,) readings [m]; read-only. :func:`gpusense.classify` classifies them."""
+    """(K,) readings [m], NaN where masked; read-only. :func:`gpusense.classify` classifies them."""
     scanner: Scanner
     """The geometry; one object for all scans of the same geometry."""
     odometry: Pose
@@ -37,6 +38,9 @@ class Scan:
     pose: Pose | None
     """The robot's corrected pose in the world [m, m, rad]; the laser's in a CARMEN log, which has no mount. None if the
     log has none."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "ranges", masks.filled(self.ranges))
 
     def __repr__(self) -> str:
         return f"Scan(time={self.time}, {len(self.ranges)} readings, odometry={self.odometry}, pose={self.pose})"

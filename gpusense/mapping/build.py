@@ -8,12 +8,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
+from gpusense._util.memory import check_room
 from gpusense.backends import Selection, get_backend
-from gpusense.mapping.counts import SCANS, RayCounts, RayEnds, batches, extent
-from gpusense.world.grid import OccupancyGrid
+from gpusense.mapping.counts import BandCounts, bands
+from gpusense.mapping.rays import SCANS, RayEnds, Survey, batches, check_lengths, extent
+from gpusense.world.grid import OccupancyGrid, check_origin, check_resolution, grid_of_checked
 from gpusense.world.scanner import Scanner
 from gpusense.world.sweep import check_motion
-from gpusense.world.windows import LONGEST_SIDE
+from gpusense.world.windows import LONGEST_SIDE, Window
+
+BAND_CELLS = 1 << 22
+"""Most cells of a band of rows, whose counts are on the device at once."""
+# Scans of at most so many readings keep their rays from the look for the map's extent.
+_KEPT_RAYS = 1 << 20
 
 
 def build_map(
@@ -38,13 +45,14 @@ def build_map(
     Each ray adds ``log(p_miss / (1 - p_miss))`` to the log-odds of the cells that it crosses, and ``log(p_hit / (1 -
     p_hit))`` to the cell where it ends at an obstacle (*Probabilistic Robotics* tables 9.1 and 9.2, with an obstacle of
     one cell's thickness). The device counts hits and misses in integers by an exact walk from cell to cell, so all
-    backends build the same map. Cells without a ray are unknown.
+    backends build the same map. Cells without a ray are unknown. Rays may start or end outside the map, at any distance.
+    A large map is built in bands of rows, so that it takes little more memory than its result, a byte a cell.
 
     Args:
-        scans: (S, K) readings [m]; missing readings say nothing.
+        scans: (S, K) readings [m]; missing readings say nothing. A ray may span 524 288 cells along an axis.
         poses: (S, 3) poses of the robot in the world [m, m, rad].
         scanner: The scanner's geometry.
-        resolution: Side of a cell [m], > 0.
+        resolution: Side of a cell [m], 1e-4 to 1e3.
         origin: Pose (x, y, yaw) of the map's first corner [m, m, rad]; requires ``shape``. None: the map holds all
             rays, and its origin is a multiple of the resolution.
         shape: Rows and columns; requires ``origin``. Cells of rays outside are left out.
@@ -65,7 +73,7 @@ def build_map(
 
     Raises:
         TypeError, ValueError: an argument is of the wrong kind or breaks its rule; the message names it.
-        MemoryError: the device cannot hold the map.
+        MemoryError: the map does not fit into memory.
 
     Example:
         >>> import gpusense as gs
@@ -85,7 +93,11 @@ def build_map(
 
 
 class MapBuilder:
-    """Builds a map in steps, after each of which the map so far can be read; see :func:`build_map`."""
+    """Builds a map in steps, after each of which the map so far can be read; see :func:`build_map`.
+
+    Counts take eight bytes a cell, the map itself one. So large maps are built in bands of rows, each from all scans
+    that meet it.
+    """
 
     def __init__(
         self,
@@ -105,39 +117,95 @@ class MapBuilder:
         backend: Selection,
         motion: ArrayLike | None = None,
         each: int = SCANS,
+        most: int = BAND_CELLS,
     ) -> None:
         if not isinstance(scanner, Scanner):
             raise TypeError(f"scanner: must be a Scanner, got {checks.show(scanner)}")
         placed = checks.array("poses", poses, ("S", 3))
         readings = checks.array("scans", scans, (len(placed), scanner.count), finite=False)
-        cell = checks.real("resolution", resolution, above=0)
+        cell = check_resolution(resolution)
         limit = scanner.range_max if range_limit is None else checks.real("range_limit", range_limit, above=0)
         checks.boolean("clear_max", clear_max)
         self._occupancy = _occupancy(p_hit, p_miss, p_prior)
         self._threshold = checks.integer("occupied_threshold", occupied_threshold, low=1, high=100)
         moved = check_motion("motion", motion, len(placed))
-        device = get_backend(backend)
-        self._parts = [
-            RayEnds(readings[part], placed[part], scanner, min(limit, scanner.range_max), clear_max=clear_max,
-                    motion=None if moved is None else moved[part])
-            for part in batches(len(placed), each)
-        ]  # fmt: skip
-        self._counts = RayCounts(device, cell, *_frame(self._parts, cell, origin, shape))
+        self._survey = Survey(readings, placed, scanner, min(limit, scanner.range_max), clear_max, moved)
+        self._each, self._backend = each, get_backend(backend)
+        self._place(cell, origin, shape)
+        self._bands = bands(self._shape, most)
+        self._counts: BandCounts | None = None
+        self._rays = self._finished = 0
+        check_room("shape", self._shape[0] * self._shape[1], f"{self._shape[0]} x {self._shape[1]} cells")
+        self._cells = np.full(self._shape, -1, np.int8)
+
+    def _place(self, resolution: float, origin: ArrayLike | None, shape: tuple[int, int] | None) -> None:
+        """Choose the map's frame and shape, and find the rows that the rays of each scan meet."""
+        placed = _frame(origin, shape)
+        # Without a frame, boxes are in metres until all are known.
+        frame = OccupancyGrid([[0]], 1.0 if placed is None else resolution, (0, 0, 0) if placed is None else placed[0])
+        boxes = np.empty((len(self._survey.poses), 4))
+        self._kept: dict[bytes, RayEnds] = {}
+        for part in batches(np.arange(len(boxes)), self._each):
+            ends = self._survey.rays(part)
+            check_lengths(ends, resolution, int(part[0]))
+            boxes[part] = ends.boxes(len(part), frame)
+            if len(boxes) * self._survey.scanner.count <= _KEPT_RAYS:
+                self._kept[part.tobytes()] = ends
+        if placed is None:
+            placed = extent(boxes, resolution)
+            boxes = (boxes - np.tile(placed[0][:2], 2)) / resolution
+        (self._origin, self._shape), self._rows = placed, boxes[:, [1, 3]]
+        self._frame = OccupancyGrid([[0]], resolution, self._origin)
 
     def steps(self) -> Iterator[float]:
-        """Count rays, some scans at a time, and yield the share of scans that are done."""
-        for i, part in enumerate(self._parts):
-            self._counts.add(part)
-            yield (i + 1) / len(self._parts)
+        """Count rays, some scans at a time, and yield the share of the work that is done."""
+        chosen = [batches(self._scans_of(band), self._each) for band in self._bands]
+        total, done = max(sum(len(part) for parts in chosen for part in parts), 1), 0
+        for band, parts in zip(self._bands, chosen, strict=True):
+            self._counts = BandCounts(self._backend, self._frame, self._shape, band)
+            for part in parts:
+                self._counts.add(self._kept.pop(part.tobytes(), None) or self._survey.rays(part))
+                done += len(part)
+                if done < total:
+                    yield done / total
+            self._write(self._counts, self._cells)
+            self._rays, self._counts, self._finished = self._rays + self._counts.rays, None, self._finished + 1
+        yield 1.0
+
+    def _scans_of(self, band: Window) -> np.ndarray:
+        """Return the indices of the scans with rays that meet a band."""
+        low, high = self._rows.T
+        return np.flatnonzero((high >= band.row - 1) & (low <= band.row + band.rows + 1))
+
+    def _write(self, counts: BandCounts, cells: np.ndarray) -> None:
+        """Write the occupancies of a band."""
+        counts.occupancies(cells, self._occupancy)
 
     @property
     def rays(self) -> int:
-        """Rays that have been counted."""
-        return self._counts.rays
+        """Rays that have been counted; those beside the map are not."""
+        return self._rays + (0 if self._counts is None else self._counts.rays)
+
+    @property
+    def parts(self) -> int:
+        """Number of launches, each of some scans and a band."""
+        return sum(-(-len(self._scans_of(band)) // self._each) for band in self._bands)
+
+    @property
+    def bands(self) -> int:
+        """Bands of rows that are counted one after the other; a map of one is whole after each step."""
+        return len(self._bands)
 
     def grid(self) -> OccupancyGrid:
-        """Return the map so far."""
-        return self._counts.grid(*self._occupancy, self._threshold)
+        """Return the map so far: of all bands that are done, and of the one that is being counted."""
+        cells = self._cells
+        if self._finished < len(self._bands):
+            cells = cells.copy()
+            if self._counts is not None:
+                self._write(self._counts, cells)
+        return grid_of_checked(
+            cells, self._frame.resolution, self._frame.origin, occupied_threshold=self._threshold
+        )
 
 
 def _occupancy(p_hit: float, p_miss: float, p_prior: float) -> tuple[float, float, float]:
@@ -147,16 +215,15 @@ def _occupancy(p_hit: float, p_miss: float, p_prior: float) -> tuple[float, floa
 
 
 def _frame(
-    parts: list[RayEnds], resolution: float, origin: ArrayLike | None, shape: tuple[int, int] | None
-) -> tuple[tuple[float, float, float], tuple[int, int]]:
-    """Return the map's origin and shape."""
+    origin: ArrayLike | None, shape: tuple[int, int] | None
+) -> tuple[tuple[float, float, float], tuple[int, int]] | None:
+    """Return the map's origin and shape; None if they follow from the rays."""
     if (origin is None) != (shape is None):
         missing, present = ("origin", "shape") if origin is None else ("shape", "origin")
         raise ValueError(f"{missing}: must be given with {present}, got None")
     if shape is None:
-        return extent(parts, resolution)
-    x, y, yaw = checks.array("origin", origin, (3,)).tolist()
+        return None
     rows, cols = checks.array("shape", shape, (2,), dtype=np.int64).tolist()
     for size in (rows, cols):
         checks.integer("shape", size, low=1, high=LONGEST_SIDE)
-    return (x, y, yaw), (rows, cols)
+    return check_origin(origin), (rows, cols)

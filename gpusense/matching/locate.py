@@ -11,7 +11,7 @@ from typing import Literal, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gpusense._util import checks
+from gpusense._util import checks, masks
 from gpusense._util.typing import Space
 from gpusense.backends import get_backend
 from gpusense.interface.terms import log_weight
@@ -92,6 +92,7 @@ def locate_scan(
         raise ValueError(
             f"model: must have compat=None, since weights of peers are no likelihood, got {model.compat!r}"
         )
+    ranges = masks.filled(ranges)
     cell = model.grid.resolution
     stride = max(round(checks.real("resolution", resolution, above=0) / cell), 1)
     turns = 4 * math.ceil(math.pi / 2 / checks.real("angle", angle, above=1e-4, high=math.pi / 2) - 1e-9)

@@ -149,6 +149,6 @@ def _still(ranges: np.ndarray, scanner: Scanner, motion: np.ndarray | None) -> n
 
 def readings(name: str, ranges: object, scanner: Scanner, backend: Backend) -> np.ndarray:
     """Return readings of one scan (K,) or of several (S, K), checked."""
-    values = checks.as_array(name, arrays.copied_to_host(ranges, backend, name))
+    values = checks.as_array(name, arrays.copied_to_host(ranges, backend, name), masked=True)
     shape = ("S", scanner.count) if values.ndim == 2 else (scanner.count,)
     return checks.array(name, values, shape, finite=False, dtype=None)

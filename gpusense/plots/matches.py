@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gpusense._util import masks
 from gpusense.plots.drawing import draw_map, new_figure
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
@@ -60,7 +61,7 @@ def match_figure(
 
 def _points(ranges: ArrayLike, scanner: Scanner) -> np.ndarray:
     """Return the end points of the hits of a scan in the robot's frame."""
-    z = np.asarray(ranges, np.float64)
+    z = np.asarray(masks.filled(ranges), np.float64)
     hit = classify(z, scanner) == Reading.HIT
     points: np.ndarray = z[hit, None] * ray_vectors(scanner.bearings, scanner.mount)[hit] + np.array(scanner.mount[:2])
     return points

@@ -14,6 +14,8 @@ from gpusense._util import checks
 
 Pairs = tuple[tuple[str, Any], ...]
 _SCALARS = (bool, int, float, str)
+# Values in the options of a job, and levels of mappings and lists in them.
+MOST_VALUES, DEEPEST = 100_000, 32
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,8 @@ class Job:
         labels: Names of the axes of the plan and of this job's place on them. They do not change the key.
 
     Raises:
-        TypeError, ValueError: a field of another type, or an option that is not plain.
+        TypeError, ValueError: a field of another type, an option that is not plain, or more than 100 000 values in
+            options.
 
     Example:
         >>> import gpusense as gs
@@ -56,6 +59,8 @@ class Job:
             if not isinstance(getattr(self, name), str):
                 raise TypeError(f"{name}: must be a text, got {checks.show(getattr(self, name))}")
         checks.integer("seed", self.seed, low=0)
+        for name in ("options", "labels"):
+            checks.nested(name, getattr(self, name), deepest=DEEPEST, most=MOST_VALUES)
         object.__setattr__(self, "options", tuple(sorted(_pairs("options", self.options))))
         object.__setattr__(self, "labels", _pairs("labels", self.labels))
         names = [name for name, _ in self.options]

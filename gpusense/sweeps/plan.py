@@ -9,12 +9,14 @@ from collections.abc import Mapping
 from typing import Any
 
 from gpusense._util import checks
-from gpusense._util.files import read_mapping
-from gpusense.sweeps.job import Job
+from gpusense._util.documents import read_mapping
+from gpusense.sweeps.job import DEEPEST, MOST_VALUES, Job
 from gpusense.sweeps.tasks import TASKS, check_options
 
 # Jobs of a plan.
 MOST_JOBS = 1_000_000
+# Values of options in all jobs of a plan.
+_MOST_VALUES = 50_000_000
 _FIELDS = ("map", "log", "model", "seed")
 _NAMES = ("task", "options", "axes")
 
@@ -62,6 +64,7 @@ def jobs_of(document: Mapping[Any, Any]) -> tuple[Job, ...]:
     count = math.prod(map(len, sides.values()))
     if not 0 < count <= MOST_JOBS:
         raise ValueError(f"axes: must make 1 to {MOST_JOBS} jobs, got {count}")
+    _check_size(common, sides, count)
     jobs = []
     for places in itertools.product(*sides.values()):
         settings = dict(common)
@@ -75,6 +78,20 @@ def jobs_of(document: Mapping[Any, Any]) -> tuple[Job, ...]:
     if len(keys) < len(jobs):
         raise ValueError(f"axes: must make different jobs, got {len(jobs) - len(keys)} twice")
     return tuple(jobs)
+
+
+def _check_size(common: Any, sides: Mapping[str, list[tuple[Any, dict[str, Any]]]], count: int) -> None:
+    """Bound the options of all jobs before one is made.
+
+    Raises:
+        ValueError: they are too many, or nested too deeply.
+    """
+    values = count * checks.nested("options", common, deepest=DEEPEST, most=MOST_VALUES)
+    for name, side in sides.items():
+        options = checks.nested(f"axes.{name}", [one for _, one in side], deepest=DEEPEST, most=_MOST_VALUES)
+        values += count // len(side) * options
+    if values > _MOST_VALUES:
+        raise ValueError(f"options: must have at most {_MOST_VALUES} values in all jobs, got {values}")
 
 
 def _axis(name: str, values: Any) -> list[tuple[Any, dict[str, Any]]]:

@@ -13,6 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense._util import checks
 from gpusense.world.messages import field, planar_pose, real_field
 
+SMALLEST_RESOLUTION, LARGEST_RESOLUTION = 1e-4, 1e3
+"""Bounds of the side of a cell [m]."""
+FARTHEST_ORIGIN = 1e9
+"""Largest coordinate of a map's origin [m]."""
+
 
 class OccupancyGrid:
     """Immutable occupancy grid, as in ``nav_msgs/OccupancyGrid``.
@@ -23,8 +28,9 @@ class OccupancyGrid:
 
     Args:
         cells: (H, W) integers, at least one: occupancy in per cent, 0 to 100, or -1 for unknown. Copied.
-        resolution: Side of a cell [m], > 0.
-        origin: Pose (x, y, yaw) of the outer corner of ``cells[0, 0]`` in the world [m, m, rad].
+        resolution: Side of a cell [m], 1e-4 to 1e3.
+        origin: Pose (x, y, yaw) of the outer corner of ``cells[0, 0]`` in the world [m, m, rad]; x and y are at most
+            1e9 m from 0, where float64 still resolves a thousandth of a millimetre.
         occupied_threshold: Least occupancy of an occupied cell [per cent], 1 to 100. The default equals map_server's
             ``occupied_thresh`` of 0.65.
 
@@ -51,12 +57,18 @@ class OccupancyGrid:
         *,
         occupied_threshold: int = 65,
     ) -> None:
-        self._cells = _checked_cells(cells)
-        self._resolution = checks.real("resolution", resolution, above=0)
-        x, y, yaw = checks.array("origin", origin, (3,)).tolist()
-        self._origin: tuple[float, float, float] = (x, y, yaw)
+        self._place(_checked_cells(cells), resolution, origin, occupied_threshold)
+
+    def _place(
+        self, cells: NDArray[np.int8], resolution: object, origin: object, occupied_threshold: object
+    ) -> OccupancyGrid:
+        """Take checked cells, and check everything else."""
+        self._cells = cells
+        self._resolution = check_resolution(resolution)
+        self._origin = check_origin(origin)
         self._occupied_threshold = checks.integer("occupied_threshold", occupied_threshold, low=1, high=100)
         self._occupied: NDArray[np.bool] | None = None
+        return self
 
     @classmethod
     def from_message(cls, message: Any, *, occupied_threshold: int = 65) -> OccupancyGrid:
@@ -185,12 +197,9 @@ class OccupancyGrid:
             raise ValueError(f"region: must put {size}, got ({row}, {col})")
         changed = self._cells.copy()
         changed[row : row + rows, col : col + cols] = patch
-        changed.setflags(write=False)
-        # The rest of the grid was checked when it was made.
-        grid = object.__new__(OccupancyGrid)
-        grid._cells, grid._resolution, grid._origin = changed, self._resolution, self._origin
-        grid._occupied_threshold, grid._occupied = self._occupied_threshold, None
-        return grid
+        return grid_of_checked(
+            changed, self._resolution, self._origin, occupied_threshold=self._occupied_threshold
+        )
 
     def bounds(self) -> tuple[float, float, float, float]:
         """Return the axis-aligned box around the grid in the world: (x_min, y_min, x_max, y_max) [m]."""
@@ -273,6 +282,42 @@ class OccupancyGrid:
         # Copies and pickles call the constructor, so that their cells are read-only too.
         make = functools.partial(OccupancyGrid, occupied_threshold=self._occupied_threshold)
         return make, (self._cells, self._resolution, self._origin)
+
+
+def check_resolution(value: object) -> float:
+    """Return the side of a cell after checking its bounds [m].
+
+    Raises:
+        TypeError: It is no real number.
+        ValueError: It is out of bounds.
+    """
+    return checks.real("resolution", value, low=SMALLEST_RESOLUTION, high=LARGEST_RESOLUTION)
+
+
+def check_origin(value: object) -> tuple[float, float, float]:
+    """Return the pose of a map after checking it [m, m, rad].
+
+    Raises:
+        TypeError: It holds no real numbers.
+        ValueError: It has another shape, a value is not finite, or a coordinate is out of bounds.
+    """
+    x, y, yaw = checks.array("origin", value, (3,)).tolist()
+    for index, coordinate in enumerate((x, y)):
+        checks.real(f"origin[{index}]", coordinate, low=-FARTHEST_ORIGIN, high=FARTHEST_ORIGIN)
+    return x, y, yaw
+
+
+def grid_of_checked(
+    cells: NDArray[np.int8], resolution: object, origin: object, *, occupied_threshold: int
+) -> OccupancyGrid:
+    """Make a map of (H, W) occupancies that are known to be valid; they are kept without a copy, and read-only.
+
+    Raises:
+        TypeError, ValueError: Another argument breaks a rule of :class:`OccupancyGrid`.
+    """
+    kept = np.ascontiguousarray(cells)
+    kept.setflags(write=False)
+    return object.__new__(OccupancyGrid)._place(kept, resolution, origin, occupied_threshold)
 
 
 def _checked_cells(cells: ArrayLike) -> NDArray[np.int8]:

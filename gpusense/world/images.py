@@ -1,4 +1,6 @@
-"""Read map images (PGM, PPM, PNG, BMP) as greys, strip by strip; memory is allocated only for data that the file holds.
+"""Read map images (PGM, PPM, PNG, BMP) as greys, strip by strip.
+
+Pixels, bytes and memory are checked before anything is decoded: memory is allocated only for data that the file holds.
 
 Greys are those of nav2_map_server 1.4 to 1.5, which reads images with the 16-bit build of GraphicsMagick 1.3.
 """
@@ -17,11 +19,18 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-_MAX_CELLS = 1 << 31
+from gpusense._util.memory import check_room
+
+_MAX_CELLS = 1 << 29
 _STRIP_CELLS = 1 << 20
+# Memory of the strips in work, of up to 16 bytes a pixel.
+_STRIPS_BYTES = 1 << 24
 _MAX_PILLOW_WIDTH = 1 << 26  # keeps a strip of one row below Pillow's limit on pixels
 _DIGITS = b"0123456789 "
 _BLANKS_TO_SPACES = bytes.maketrans(b"\t\n\v\f\r", b"     ")
+
+# Bytes of a pixel that Pillow decodes, by colour type and whether it has 16 bits: grey and palettes; the others take 4.
+_PNG_BYTES = {(0, False): 1, (3, False): 1, (0, True): 2}
 
 # Shares of red, green and blue in a grey, in thousandths (ITU-R BT.601).
 _LUMA = (299, 587, 114)
@@ -62,7 +71,11 @@ def open_raster(stream: BinaryIO, file: Path, size: int) -> Raster:
         return _open_pnm(stream, file, size)
     if magic == b"\x89PNG\r\n\x1a\n":
         with _decoding(file, "PNG"):
-            _check_png(stream)
+            header = struct.unpack(">IIBBBBB", stream.read(29)[16:])
+        _check_size(file, header[1], header[0])
+        _check_memory(file, header[1], header[0], _PNG_BYTES.get((header[3], header[2] == 16), 4))
+        with _decoding(file, "PNG"):
+            _check_png(stream, header)
         return _open_pillow(stream, file, size, "PNG")
     if magic[:2] == b"BM":
         return _open_pillow(stream, file, size, "BMP")
@@ -72,6 +85,15 @@ def open_raster(stream: BinaryIO, file: Path, size: int) -> Raster:
 def _check_size(file: Path, rows: int, cols: int) -> None:
     if rows < 1 or cols < 1 or rows * cols > _MAX_CELLS:
         raise ValueError(f"{file}: must have 1 to {_MAX_CELLS} pixels, got {rows} rows of {cols}")
+
+
+def _check_memory(file: Path, rows: int, cols: int, pixel: int = 0) -> None:
+    """Check that an image of ``pixel`` bytes a pixel, if it is decoded as a whole, and its cells fit into memory.
+
+    Raises:
+        MemoryError: They do not.
+    """
+    check_room(str(file), rows * cols * (1 + pixel) + _STRIPS_BYTES, f"{rows} x {cols} cells")
 
 
 def _strip_rows(rows: int, cols: int) -> Iterator[tuple[int, int]]:
@@ -95,17 +117,15 @@ def _open_pnm(stream: BinaryIO, file: Path, size: int) -> Raster:
     available = size - stream.tell()
     if available < needed:
         raise ValueError(f"{file}: must have a raster of at least {needed} bytes, got {available}")
+    _check_memory(file, rows, cols)
 
     steps = _steps(maxval)
 
     def strips() -> Iterator[_Strip]:
-        values = _plain_values(stream, file, count) if plain else None
+        values = _PlainValues(stream, file, count) if plain else None
         for top, end in _strip_rows(rows, cols):
-            first, last = top * cols * channels, end * cols * channels
-            if values is not None:
-                block = values[first:last]
-            else:
-                block = np.frombuffer(stream.read(width * (last - first)), f">u{width}")
+            number = (end - top) * cols * channels
+            block = values.take(number) if values else np.frombuffer(stream.read(width * number), f">u{width}")
             if block.max() > maxval:
                 raise ValueError(f"{file}: every value must be at most {maxval}, got {block.max()}")
             yield _greys(block.reshape(end - top, cols, channels), steps), None
@@ -135,25 +155,39 @@ def _pnm_header(stream: BinaryIO, file: Path) -> list[int]:
     raise ValueError(f"{file}: must have a header of width, height and maximum value, got {numbers}")
 
 
-def _plain_values(stream: BinaryIO, file: Path, count: int) -> NDArray[np.uint32]:
-    """Read the first ``count`` decimal numbers of the stream."""
-    values = np.empty(count, np.uint32)
-    filled = 0
-    rest = b""
-    while filled < count:
-        chunk = stream.read(1 << 20)
-        head, _, rest = (rest + chunk).translate(_BLANKS_TO_SPACES).rpartition(b" ")
+class _PlainValues:
+    """The decimal numbers of a stream, taken one strip after the other."""
+
+    def __init__(self, stream: BinaryIO, file: Path, count: int) -> None:
+        self._stream, self._file, self._count = stream, file, count
+        self._ready, self._taken, self._rest, self._ended = np.empty(0, np.uint32), 0, b"", False
+
+    def take(self, number: int) -> NDArray[np.uint32]:
+        """Return the next numbers.
+
+        Raises:
+            ValueError: The stream has something else, or too few of them.
+        """
+        blocks, have = [self._ready], len(self._ready)
+        while have < number:
+            if self._ended:
+                raise ValueError(f"{self._file}: must have {self._count} values, got {self._taken + have}")
+            blocks.append(self._read())
+            have += len(blocks[-1])
+        every = np.concatenate(blocks)
+        self._ready, self._taken = every[number:], self._taken + number
+        return every[:number]
+
+    def _read(self) -> NDArray[np.uint32]:
+        """Read some more numbers."""
+        chunk = self._stream.read(1 << 18)
+        head, _, self._rest = (self._rest + chunk).translate(_BLANKS_TO_SPACES).rpartition(b" ")
         if not chunk:
-            head, rest = rest, b""
+            head, self._rest, self._ended = self._rest, b"", True
         tokens = head.split()
-        if head.translate(None, _DIGITS) or len(rest) > 10 or any(len(token) > 9 for token in tokens):
-            raise ValueError(f"{file}: must have a raster of decimal numbers, got something else")
-        tokens = tokens[: count - filled]
-        if not tokens and not chunk:
-            raise ValueError(f"{file}: must have {count} values, got {filled}")
-        values[filled : filled + len(tokens)] = [int(token) for token in tokens]
-        filled += len(tokens)
-    return values
+        if head.translate(None, _DIGITS) or len(self._rest) > 10 or any(len(token) > 9 for token in tokens):
+            raise ValueError(f"{self._file}: must have a raster of decimal numbers, got something else")
+        return np.array([int(token) for token in tokens], np.uint32)
 
 
 @contextlib.contextmanager
@@ -165,12 +199,12 @@ def _decoding(file: Path, kind: str) -> Iterator[None]:
         raise ValueError(f"{file}: must be a whole {kind} image, got a broken one: {error}") from error
 
 
-def _check_png(stream: BinaryIO) -> None:
+def _check_png(stream: BinaryIO, header: tuple[int, ...]) -> None:
     """Check, in little memory, that the image data of a PNG inflates to the size in its header.
 
     Pillow allocates by the header, and leaves missing pixels black: they would become walls.
     """
-    cols, rows, depth, colour, _, _, interlace = struct.unpack(">IIBBBBB", stream.read(29)[16:])
+    cols, rows, depth, colour, _, _, interlace = header
     bits = depth * {2: 3, 4: 2, 6: 4}.get(colour, 1)
     # The passes of Adam7: first column, first row, step along the columns, step along the rows.
     adam7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
@@ -257,9 +291,21 @@ def _load_pillow(stream: BinaryIO, file: Path, size: int, kind: str) -> Any:
         needed = offset + rows * args[1]
         if size < needed:
             raise ValueError(f"{file}: must have at least {needed} bytes, got {size}")
+    _check_memory(file, rows, cols, 1 if image.mode in ("1", "L", "P") else 4)
     with _decoding(file, kind):
         image.load()
     return image
+
+
+def mapped(values: NDArray[Any], table: NDArray[Any]) -> NDArray[Any]:
+    """Return ``table[values]``; for single bytes as fast as memory allows."""
+    if values.dtype != np.uint8 or table.itemsize != 1:
+        return table[values]
+    full = np.zeros(256, table.dtype)
+    full[: len(table)] = table
+    if full.dtype == np.uint8 and (full == np.arange(256)).all():
+        return values
+    return np.frombuffer(values.tobytes().translate(full.tobytes()), table.dtype).reshape(values.shape)
 
 
 def _steps(maxval: int) -> NDArray[np.uint32]:
@@ -272,8 +318,7 @@ def _steps(maxval: int) -> NDArray[np.uint32]:
 def _greys(values: NDArray[Any], steps: NDArray[np.uint32]) -> NDArray[np.uint8]:
     """Return the (h, w) greys of (h, w, C) channels: the luma in 16 bits, rounded half up, of which 8 bits are kept."""
     if values.shape[2] == 1:
-        grey: NDArray[np.uint8] = (steps // 257).astype(np.uint8)[values[:, :, 0]]
-        return grey
+        return mapped(values[:, :, 0], (steps // 257).astype(np.uint8))
     luma = np.full(values.shape[:2], 500, np.uint32)
     for channel, share in enumerate(_LUMA):
         luma += (share * steps).astype(np.uint32)[values[:, :, channel]]

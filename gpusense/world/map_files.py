@@ -6,7 +6,7 @@ import os
 import re
 import secrets
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal
@@ -15,9 +15,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
-from gpusense._util.files import read_mapping
-from gpusense.world.grid import OccupancyGrid
-from gpusense.world.images import open_raster
+from gpusense._util.documents import read_mapping
+from gpusense.world.grid import (
+    FARTHEST_ORIGIN,
+    LARGEST_RESOLUTION,
+    SMALLEST_RESOLUTION,
+    OccupancyGrid,
+    grid_of_checked,
+)
+from gpusense.world.images import mapped, open_raster
 from gpusense.world.wean_map import read_probabilities
 
 # The grey that map_saver writes for unknown cells.
@@ -54,7 +60,8 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
     grey keeps the upper 8 bits of its fraction of white. Three images differ from nav2's: a 16-bit PNG with colours or
     alpha counts with its upper 8 bits only, the transparent colour of an 8-bit RGB PNG is unknown, and a PGM may have
     any maximum. Memory is allocated only after the file has been seen to hold the pixels that its header claims, at
-    most 2^31.
+    most 2^29, and their memory to be there: a byte for each cell, and for PNG and BMP one more for each grey pixel, two
+    for 16 bits, or four for a colour.
 
     A file ``.dat`` or ``.dat.gz`` has a line for each x with the probabilities that the cells are free, or -1 for
     unknown, and possibly a header with the resolution, else 0.1 m; its cells are ``round(100 (1 - p))``.
@@ -67,6 +74,7 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
         FileNotFoundError: The YAML file or its image is missing.
         TypeError: ``path`` or ``occupied_threshold`` has the wrong type.
         ValueError: A file breaks the format; the message names the file and the rule.
+        MemoryError: The map does not fit into the available memory.
 
     Warns:
         UserWarning: A map of mode trinary has the grey 205 of unknown cells, and its ``free_thresh`` makes them free.
@@ -83,6 +91,7 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
     if file.name.lower().endswith((".dat", ".dat.gz")):
         return read_probabilities(file, occupied_threshold=occupied_threshold)
     meta = _read_yaml(file)
+    checks.integer("occupied_threshold", occupied_threshold, low=1, high=100)
     size = meta.image.stat().st_size
     with meta.image.open("rb") as stream:
         raster = open_raster(stream, meta.image, size)
@@ -90,12 +99,12 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
         cells = np.empty((raster.rows, raster.cols), np.int8)
         end, freed = raster.rows, 0
         for greys, opaque in raster.strips:
-            block = table[greys]
+            block = cells[end - len(greys) : end][::-1]
+            block[:] = mapped(greys, table)
             if opaque is not None and meta.mode != "raw":
                 block[~opaque] = -1
             if _frees_unknown(meta, table):
                 freed += int(np.count_nonzero((greys == UNKNOWN_GREY) & (block == 0)))
-            cells[end - len(block) : end] = block[::-1]
             end -= len(block)
     if freed:
         warnings.warn(
@@ -103,7 +112,7 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
             f"unknown, got {meta.free_thresh}: {freed} such cells are free",
             stacklevel=2,
         )
-    return OccupancyGrid(cells, meta.resolution, meta.origin, occupied_threshold=occupied_threshold)
+    return grid_of_checked(cells, meta.resolution, meta.origin, occupied_threshold=occupied_threshold)
 
 
 def write_map(
@@ -150,11 +159,10 @@ def write_map(
             raise ValueError(f"path: must not name a folder, got {file}")
 
     cells = grid.cells
-    trinary = sum(np.count_nonzero(cells == value) for value in (0, 100, -1)) == cells.size
+    trinary = all(np.isin(strip, (0, 100, -1)).all() for strip in _strips(cells))
     greys = bytearray([*range(101), *[255] * 155])  # indexed by the cell's byte; unknown, -1, is byte 255
     if trinary:
         greys[0], greys[100], greys[255] = 254, 0, UNKNOWN_GREY
-    pixels = cells[::-1].tobytes().translate(greys)
     meta = {
         "image": image.name,
         "mode": "trinary" if trinary else "raw",
@@ -166,21 +174,30 @@ def write_map(
     }
     text = yaml.safe_dump(meta, sort_keys=False, default_flow_style=None, allow_unicode=True)
     writers: dict[Path, Callable[[BinaryIO], object]] = {
-        image: lambda stream: _write_image(stream, pixels, grid.shape, image_format),
+        image: lambda stream: _write_image(stream, cells, bytes(greys), image_format),
         target: lambda stream: stream.write(text.encode()),
     }
     _write_all(writers)
 
 
-def _write_image(stream: BinaryIO, pixels: bytes, shape: tuple[int, int], image_format: str) -> None:
-    size = shape[::-1]
+def _write_image(stream: BinaryIO, cells: NDArray[np.int8], greys: bytes, image_format: str) -> None:
+    """Write the greys of cells as an image, from the last row to the first."""
+    pixels = (strip.tobytes().translate(greys) for strip in _strips(cells))
+    size = cells.shape[1], cells.shape[0]
     if image_format == "png":
         from PIL import Image
 
-        Image.frombytes("L", size, pixels).save(stream, "PNG")
+        Image.frombytes("L", size, b"".join(pixels)).save(stream, "PNG")
     else:
         stream.write(b"P5\n%d %d\n255\n" % size)
-        stream.write(pixels)
+        for each in pixels:
+            stream.write(each)
+
+
+def _strips(cells: NDArray[np.int8]) -> Iterator[NDArray[np.int8]]:
+    """Yield the rows of cells from the last to the first, about a million cells at a time."""
+    height = max(1, (1 << 20) // cells.shape[1])
+    return (cells[max(end - height, 0) : end][::-1] for end in range(len(cells), 0, -height))
 
 
 def _write_all(writers: dict[Path, Callable[[BinaryIO], object]]) -> None:
@@ -233,8 +250,14 @@ def _read_yaml(file: Path) -> _MapYaml:
         raise ValueError(f"{file}: occupied_thresh: must be > free_thresh = {free}, got {occupied}")
     return _MapYaml(
         image=checks.existing_file(file.parent / image),
-        resolution=_number(file, "resolution", data["resolution"], above=0),
-        origin=[_number(file, f"origin[{i}]", value) for i, value in enumerate(origin)],
+        resolution=_number(file, "resolution", data["resolution"], low=SMALLEST_RESOLUTION, high=LARGEST_RESOLUTION),
+        origin=[
+            *(
+                _number(file, f"origin[{i}]", value, low=-FARTHEST_ORIGIN, high=FARTHEST_ORIGIN)
+                for i, value in enumerate(origin[:2])
+            ),
+            _number(file, "origin[2]", origin[2]),
+        ],
         negate=bool(negate),
         occupied_thresh=occupied,
         free_thresh=free,

@@ -104,7 +104,7 @@ def spread_readings(message: object, places: int, upside_down: bool = False) -> 
         places: Number of bearings, from -pi on; each reading takes the nearest one.
         upside_down: Whether the beams run clockwise.
     """
-    raw = np.array(field("message", message, "ranges"), np.float64)
+    raw = checks.array("message.ranges", field("message", message, "ranges"), ("K",), finite=False)
     first, step = (real_field("message", message, name) for name in ("angle_min", "angle_increment"))
     raw = raw[: distinct_beams(step, len(raw))]
     bearings = (first + step * np.arange(len(raw))) * (-1 if upside_down else 1)

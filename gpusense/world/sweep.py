@@ -108,7 +108,7 @@ def deskew_scan(ranges: ArrayLike, scanner: Scanner, motion: ArrayLike) -> Float
     """
     if not isinstance(scanner, Scanner):
         raise TypeError(f"scanner: must be a Scanner, got {checks.show(scanner)}")
-    read = checks.as_array("ranges", ranges)
+    read = checks.as_array("ranges", ranges, masked=True)
     shape = ("S", scanner.count) if read.ndim == 2 else (scanner.count,)
     values = np.atleast_2d(checks.array("ranges", read, shape, finite=False))
     moved = check_motion("motion", motion, len(values))

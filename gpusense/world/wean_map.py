@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from gpusense._util.lines import numbered_lines
-from gpusense.world.grid import OccupancyGrid
+from gpusense._util.memory import check_room
+from gpusense.world.grid import LARGEST_RESOLUTION, SMALLEST_RESOLUTION, OccupancyGrid, grid_of_checked
 
-_RESOLUTION, _MOST_CELLS = 0.1, 1 << 28
+_RESOLUTION, _MOST_CELLS, _LONGEST_FIELD = 0.1, 1 << 28, 64
 _SPECIFICATION, _SIZE = b"robot_specifications->", b"global_map[0]:"
 
 
@@ -26,9 +27,10 @@ def read_probabilities(file: Path, *, occupied_threshold: int) -> OccupancyGrid:
     """
     resolution, columns = _RESOLUTION, []
     for number, line in numbered_lines(file):
-        fields, where = line.split(), f"{file}:{number}"
-        if not fields or fields[0].startswith(_SIZE):
+        where = f"{file}:{number}"
+        if not line.strip() or line.lstrip().startswith(_SIZE):
             continue
+        fields = _fields(where, line)
         if fields[0].startswith(_SPECIFICATION):
             if fields[0] == _SPECIFICATION + b"resolution":
                 resolution = _resolution(where, fields)
@@ -40,7 +42,23 @@ def read_probabilities(file: Path, *, occupied_threshold: int) -> OccupancyGrid:
             raise ValueError(f"{where}: must have at most {_MOST_CELLS} cells in all, got more")
     if not columns:
         raise ValueError(f"{file}: must have a line of numbers for each x, got none")
-    return OccupancyGrid(np.stack(columns, axis=1), resolution, occupied_threshold=occupied_threshold)
+    check_room(str(file), len(columns) * len(columns[0]), f"{len(columns[0])} x {len(columns)} cells")
+    cells = np.stack(columns, axis=1)
+    return grid_of_checked(cells, resolution, (0.0, 0.0, 0.0), occupied_threshold=occupied_threshold)
+
+
+def _fields(where: str, line: bytes) -> list[bytes]:
+    """Return the fields of a line, which are short: as an array, all are as long as the longest.
+
+    Raises:
+        ValueError: A field is longer than any number.
+    """
+    fields = line.split()
+    longest = max(fields, key=len)
+    if len(longest) > _LONGEST_FIELD:
+        text = longest[:40].decode(errors="replace")
+        raise ValueError(f"{where}: must have fields of at most {_LONGEST_FIELD} bytes, got {text!r}...")
+    return fields
 
 
 def _cells(where: str, fields: list[bytes]) -> np.ndarray:
@@ -67,6 +85,7 @@ def _resolution(where: str, fields: list[bytes]) -> float:
         value = float(fields[1]) / 100 if len(fields) == 2 and b"_" not in fields[1] else 0.0
     except ValueError:
         value = 0.0
-    if not 0 < value < 1000:
-        raise ValueError(f"{where}: resolution: must be a number of centimetres > 0, got {fields[1:3]}")
+    if not SMALLEST_RESOLUTION <= value <= LARGEST_RESOLUTION:
+        rule = f"must be a number of centimetres, {100 * SMALLEST_RESOLUTION:g} to {100 * LARGEST_RESOLUTION:g}"
+        raise ValueError(f"{where}: resolution: {rule}, got {fields[1:3]}")
     return value

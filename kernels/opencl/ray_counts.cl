@@ -1,31 +1,57 @@
 // Counts of hits and misses of cells, of which the log-odds of an occupancy grid are sums (book section 9.2). Start and
-// end of a ray are integers in units of 1/4096 cell, and the walk from cell to cell compares products of integers, so
-// that all backends visit the same cells. A ray misses each cell that it leaves. Its last cell is hit where the ray ends
-// at an obstacle, and missed otherwise. A tie, the ray through a corner, steps in x first.
+// end of a ray are cells and places inside them in units of 1/4096 cell, and the walk from cell to cell compares products
+// of integers, so that all backends visit the same cells. A ray misses each cell that it leaves. Its last cell is hit
+// where the ray ends at an obstacle, and missed otherwise. A tie, the ray through a corner, steps in x first.
 
 // Fraction bits of a coordinate.
 #define BITS 12
 #define UNIT (1 << BITS)
 
 // Return the distance along an axis to the first boundary that a ray crosses.
-int to_boundary(const int position, const int step) {
-    const int inside = position & (UNIT - 1);
+int to_boundary(const int inside, const int step) {
     return step > 0 ? UNIT - inside : inside;
 }
 
+// Return whether a walk has left an axis of some cells, to which it does not return.
+bool has_left(const int cell, const int step, const int cells) {
+    return step > 0 ? cell >= cells : cell < 0;
+}
+
+// Return how many boundaries of an axis a ray crosses before it has come as far as another boundary on the other axis.
+// Products of lengths fit in 64 bits, since rays span at most 2^19 cells.
+long crossed_before(const int first, const long size, const long reached, const long other, const int ties) {
+    const long room = reached * size - first * other - (1 - ties);
+    return room < 0 ? 0 : room / (UNIT * other) + 1;
+}
+
 // Add the cells of rays to the counts; cells outside the grid are left out. One work-item takes a ray.
-kernel void count_rays(global const int2 *start, global const int2 *end, global const int *hit, global int *hits,
-                       global int *misses, const int rows, const int cols, const int rays) {
+kernel void count_rays(global const int2 *start_cell, global const int2 *start_inside, global const int2 *end_cell,
+                       global const int2 *end_inside, global const int *hit, global int *hits, global int *misses,
+                       const int rows, const int cols, const int rays) {
     const int n = get_global_id(0);
     if (n >= rays) return;
-    const int2 begin = start[n], last = end[n];
-    int col = begin.x >> BITS, row = begin.y >> BITS;
-    const int step_x = last.x >= begin.x ? 1 : -1, step_y = last.y >= begin.y ? 1 : -1;
-    const long size_x = (long)step_x * ((long)last.x - begin.x), size_y = (long)step_y * ((long)last.y - begin.y);
-    int left_x = step_x * ((last.x >> BITS) - col), left_y = step_y * ((last.y >> BITS) - row);
+    const int2 begin = start_inside[n], across = end_cell[n] - start_cell[n];
+    int col = start_cell[n].x, row = start_cell[n].y;
+    const long span_x = (long)across.x * UNIT + (end_inside[n].x - begin.x);
+    const long span_y = (long)across.y * UNIT + (end_inside[n].y - begin.y);
+    const int step_x = span_x >= 0 ? 1 : -1, step_y = span_y >= 0 ? 1 : -1;
+    const long size_x = step_x * span_x, size_y = step_y * span_y;
+    int left_x = step_x * across.x, left_y = step_y * across.y;
+    const int first_x = to_boundary(begin.x, step_x), first_y = to_boundary(begin.y, step_y);
+    // The steps that bring the walk to the grid's columns and rows are not taken one by one.
+    const int need_x = max(step_x > 0 ? -col : col - (cols - 1), 0), need_y = max(step_y > 0 ? -row : row - (rows - 1), 0);
+    if (need_x > left_x || need_y > left_y) return;
+    long done_x = need_x, done_y = 0;
+    if (need_x > 0) done_y = min(crossed_before(first_y, size_y, first_x + (done_x - 1) * UNIT, size_x, 0), (long)left_y);
+    if (done_y < need_y) {
+        done_y = need_y;
+        done_x = min(crossed_before(first_x, size_x, first_y + (done_y - 1) * UNIT, size_y, 1), (long)left_x);
+    }
+    col += step_x * (int)done_x, row += step_y * (int)done_y;
+    left_x -= (int)done_x, left_y -= (int)done_y;
     // Negative where the next boundary is one in x.
-    long lead = to_boundary(begin.x, step_x) * size_y - to_boundary(begin.y, step_y) * size_x;
-    while (true) {
+    long lead = (first_x + done_x * UNIT) * size_y - (first_y + done_y * UNIT) * size_x;
+    while (!has_left(col, step_x, cols) && !has_left(row, step_y, rows)) {
         const bool at_end = left_x + left_y == 0;
         if (col >= 0 && col < cols && row >= 0 && row < rows)
             atomic_add((at_end && hit[n] ? hits : misses) + (row * cols + col), 1);

@@ -1,8 +1,8 @@
 """Counts of hits and misses of cells, of which the log-odds of an occupancy grid are sums (book section 9.2).
 
-Start and end of a ray are integers in units of 1/4096 cell, and the walk from cell to cell compares products of
-integers, so that all backends visit the same cells. A ray misses each cell that it leaves. Its last cell is hit where
-the ray ends at an obstacle, and missed otherwise. A tie, the ray through a corner, steps in x first.
+Start and end of a ray are cells and places inside them in units of 1/4096 cell, and the walk from cell to cell compares
+products of integers, so that all backends visit the same cells. A ray misses each cell that it leaves. Its last cell is
+hit where the ray ends at an obstacle, and missed otherwise. A tie, the ray through a corner, steps in x first.
 """
 
 import warp as wp
@@ -16,16 +16,34 @@ UNIT = wp.constant(1 << 12)
 
 # Return the distance along an axis to the first boundary that a ray crosses.
 @wp.func
-def to_boundary(position: wp.int32, step: wp.int32):
-    inside = position & (UNIT - 1)
+def to_boundary(inside: wp.int32, step: wp.int32):
     return wp.where(step > 0, UNIT - inside, inside)
+
+
+# Return whether a walk has left an axis of some cells, to which it does not return.
+@wp.func
+def has_left(cell: wp.int32, step: wp.int32, cells: wp.int32):
+    return wp.where(step > 0, cell >= cells, cell < 0)
+
+
+# Return how many boundaries of an axis a ray crosses before it has come as far as another boundary on the other axis.
+# Products of lengths fit in 64 bits, since rays span at most 2^19 cells.
+@wp.func
+def crossed_before(first: wp.int32, size: wp.int64, reached: wp.int64, other: wp.int64, ties: wp.int32):
+    room = reached * size - wp.int64(first) * other - wp.int64(1 - ties)
+    crossed = wp.int64(0)
+    if room >= wp.int64(0):
+        crossed = room / (wp.int64(UNIT) * other) + wp.int64(1)
+    return crossed
 
 
 # Add the cells of rays to the counts; cells outside the grid are left out. One work-item takes a ray.
 @kernel
 def count_rays(
-    start: wp.array(dtype=wp.vec2i),
-    end: wp.array(dtype=wp.vec2i),
+    start_cell: wp.array(dtype=wp.vec2i),
+    start_inside: wp.array(dtype=wp.vec2i),
+    end_cell: wp.array(dtype=wp.vec2i),
+    end_inside: wp.array(dtype=wp.vec2i),
     hit: wp.array(dtype=wp.int32),
     hits: wp.array(dtype=wp.int32),
     misses: wp.array(dtype=wp.int32),
@@ -36,19 +54,43 @@ def count_rays(
     n = wp.tid()
     if n >= rays:
         return
-    begin = start[n]
-    last = end[n]
-    col = begin.x >> BITS
-    row = begin.y >> BITS
-    step_x = wp.where(last.x >= begin.x, 1, -1)
-    step_y = wp.where(last.y >= begin.y, 1, -1)
-    size_x = wp.int64(step_x) * (wp.int64(last.x) - wp.int64(begin.x))
-    size_y = wp.int64(step_y) * (wp.int64(last.y) - wp.int64(begin.y))
-    left_x = step_x * ((last.x >> BITS) - col)
-    left_y = step_y * ((last.y >> BITS) - row)
+    begin = start_inside[n]
+    across = end_cell[n] - start_cell[n]
+    last = end_inside[n] - begin
+    col = start_cell[n].x
+    row = start_cell[n].y
+    span_x = wp.int64(across.x) * wp.int64(UNIT) + wp.int64(last.x)
+    span_y = wp.int64(across.y) * wp.int64(UNIT) + wp.int64(last.y)
+    step_x = wp.where(span_x >= wp.int64(0), 1, -1)
+    step_y = wp.where(span_y >= wp.int64(0), 1, -1)
+    size_x = wp.int64(step_x) * span_x
+    size_y = wp.int64(step_y) * span_y
+    left_x = step_x * across.x
+    left_y = step_y * across.y
+    first_x = to_boundary(begin.x, step_x)
+    first_y = to_boundary(begin.y, step_y)
+    # The steps that bring the walk to the grid's columns and rows are not taken one by one.
+    need_x = wp.max(wp.where(step_x > 0, -col, col - (cols - 1)), 0)
+    need_y = wp.max(wp.where(step_y > 0, -row, row - (rows - 1)), 0)
+    if need_x > left_x or need_y > left_y:
+        return
+    done_x = wp.int64(need_x)
+    done_y = wp.int64(0)
+    if need_x > 0:
+        reached = wp.int64(first_x) + (done_x - wp.int64(1)) * wp.int64(UNIT)
+        done_y = wp.min(crossed_before(first_y, size_y, reached, size_x, 0), wp.int64(left_y))
+    if done_y < wp.int64(need_y):
+        done_y = wp.int64(need_y)
+        reached = wp.int64(first_y) + (done_y - wp.int64(1)) * wp.int64(UNIT)
+        done_x = wp.min(crossed_before(first_x, size_x, reached, size_y, 1), wp.int64(left_x))
+    col += step_x * wp.int32(done_x)
+    row += step_y * wp.int32(done_y)
+    left_x -= wp.int32(done_x)
+    left_y -= wp.int32(done_y)
     # Negative where the next boundary is one in x.
-    lead = wp.int64(to_boundary(begin.x, step_x)) * size_y - wp.int64(to_boundary(begin.y, step_y)) * size_x
-    while left_x + left_y > 0:
+    lead = (wp.int64(first_x) + done_x * wp.int64(UNIT)) * size_y
+    lead -= (wp.int64(first_y) + done_y * wp.int64(UNIT)) * size_x
+    while left_x + left_y > 0 and not has_left(col, step_x, cols) and not has_left(row, step_y, rows):
         if col >= 0 and col < cols and row >= 0 and row < rows:
             wp.atomic_add(misses, row * cols + col, 1)
         if left_x > 0 and (left_y == 0 or lead <= wp.int64(0)):
@@ -59,7 +101,7 @@ def count_rays(
             row += step_y
             left_y -= 1
             lead -= wp.int64(UNIT) * size_x
-    if col >= 0 and col < cols and row >= 0 and row < rows:
+    if left_x + left_y == 0 and col >= 0 and col < cols and row >= 0 and row < rows:
         if hit[n] != 0:
             wp.atomic_add(hits, row * cols + col, 1)
         else:

@@ -266,7 +266,7 @@ PAIRS = ["--pairs", "{file}", "--range-max", "5"]
     ("nan,1\nnan,1\n", PAIRS, "ranges: must hold a reading that is not missing, got 2 of which none is"),
     ("1,9\n", PAIRS,
      "expected: every value must be in [0, range_max] where the reading is not missing, got 9.0 at index 0"),
-    (b"\x1f\x8b\x08junk", PAIRS, "{file}: must be a whole gzip file, got "),
+    (b"\x1f\x8b\x08junk", PAIRS, "{file}:1: must be a whole gzip file, got "),
     (b"\xff\xfe\x00", PAIRS, "pairs: must hold a pair of number 0"),
     (None, ["--pairs", "{folder}/none.csv", "--range-max", "5"], "none.csv: must exist, got no such file"),
 ])  # fmt: skip

@@ -105,7 +105,7 @@ def test_ends(evaluate):
 
 
 def derived() -> ModuleType:
-    """Import bench/lane_constants.py."""
+    """Import bench/derive/lane_constants.py."""
     path = ROOT / "bench" / "derive" / "lane_constants.py"
     spec = importlib.util.spec_from_file_location("lane_constants", path)
     module = importlib.util.module_from_spec(spec)

@@ -89,7 +89,7 @@ def test_no_heading_leaves_the_circle():
 
 
 def derived() -> ModuleType:
-    """Import bench/heading_constants.py."""
+    """Import bench/derive/heading_constants.py."""
     path = ROOT / "bench" / "derive" / "heading_constants.py"
     spec = importlib.util.spec_from_file_location("heading_constants", path)
     module = importlib.util.module_from_spec(spec)

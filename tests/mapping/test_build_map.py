@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
+import tracemalloc
 from fractions import Fraction
 
 import numpy as np
@@ -10,8 +12,12 @@ import pytest
 from support.kernel_scenes import run
 
 import gpusense as gs
+from gpusense._util import memory
 from gpusense.backends import get_backend
 from gpusense.mapping.build import MapBuilder
+from gpusense.mapping.counts import BandCounts
+from gpusense.mapping.rays import RayEnds
+from gpusense.world.windows import Window
 
 UNIT = 4096
 
@@ -56,8 +62,10 @@ def test_counts_are_those_of_a_walk_in_fractions(backend):
         "count_rays",
         frozenset(),
         (150,),
-        start,
-        end,
+        start >> 12,
+        start & (UNIT - 1),
+        end >> 12,
+        end & (UNIT - 1),
         hit,
         hits.copy(),
         misses.copy(),
@@ -167,3 +175,124 @@ def test_odd_scans_agree_with_the_map_of_the_even_ones(tmp_path, data_dir):
         for model in (gs.LikelihoodFieldModel(each, scanner) for each in (grid, derived))
     ]
     assert log_p[0] > log_p[1]
+
+
+def integer_cells(start, end):
+    """Yield the cells of a ray between places in units of 1/4096 cell, from counts of crossings alone."""
+    (x, y), (to_x, to_y) = start, end
+    step = [1 if to_x >= x else -1, 1 if to_y >= y else -1]
+    first = [UNIT - v % UNIT if s > 0 else v % UNIT for v, s in zip(start, step, strict=True)]
+    size, total = (abs(to_x - x), abs(to_y - y)), [abs(b // UNIT - a // UNIT) for a, b in zip(start, end, strict=True)]
+    done = [0, 0]
+    while True:
+        yield y // UNIT + step[1] * done[1], x // UNIT + step[0] * done[0]
+        if done == total:
+            return
+        next_x, next_y = ((first[k] + done[k] * UNIT) * size[1 - k] for k in (0, 1))
+        in_x = done[0] < total[0] and (done[1] == total[1] or next_x <= next_y)
+        done[0 if in_x else 1] += 1
+
+
+FAR = [  # start and end in cells; all but the last cross a map of 40 x 50 cells, or end in it
+    ((-524_230.5, -524_240.25), (20.25, 30.75)),  # as long as a ray may be
+    ((270_000.125, 12.5), (20.375, 12.5)),
+    ((25.5, 265_000.75), (25.75, 3.5)),
+    ((-262_145.0, 30.0), (262_100.0, 21.0)),
+    ((30.0, 20.0), (-270_000.5, 100_000.5)),
+    ((-1000.25, 263_000.5), (41.0, 5.25)),
+    ((40_000_000.5, 7.5), (39_990_000.5, 8.5)),
+]
+
+
+@functools.cache
+def far_counts():
+    """Return the hits and misses of these rays in the map."""
+    hits, misses = np.zeros((40, 50), int), np.zeros((40, 50), int)
+    for ray in FAR:
+        last = None
+        for last in integer_cells(*[[round(v * UNIT) for v in place] for place in ray]):
+            if 0 <= last[0] < 40 and 0 <= last[1] < 50:
+                misses[last] += 1
+        if 0 <= last[0] < 40 and 0 <= last[1] < 50:
+            misses[last] -= 1
+            hits[last] += 1
+    return hits, misses
+
+
+def test_rays_from_far_do_not_bend(backend):
+    """Rays of more than 2^18 cells, which were clamped there, visit the cells of a walk in integers."""
+    shape, (hits, misses) = (40, 50), far_counts()
+    assert misses.sum() > 150 and hits.sum() == 4
+    starts, ends = (np.array([ray[k] for ray in FAR]) for k in (0, 1))
+    counts = BandCounts(get_backend(backend), gs.OccupancyGrid([[0]], 1.0), shape, Window(0, 0, *shape))
+    ends_of = object.__new__(RayEnds)
+    ends_of.start, ends_of.end, ends_of.hit, ends_of.scan = starts, ends, np.ones(len(FAR), bool), np.arange(len(FAR))
+    counts.add(ends_of)
+    ((_, found_hits, found_misses),) = counts._counts()
+    np.testing.assert_array_equal(found_misses.reshape(shape), misses)
+    np.testing.assert_array_equal(found_hits.reshape(shape), hits)
+    assert counts.rays == 6
+
+
+def test_a_robot_far_outside_sees_into_the_map_and_too_long_rays_are_refused(backend):
+    scanner = gs.Scanner([0.0, 0.5], range_max=20_000.0)
+    scans, poses = [[15_000.52, np.nan], [np.nan, 3.0]], [(-15_000.0, 1.25, 0.0), (1e300, -1e300, 0.0)]
+    options = dict(resolution=0.05, origin=(0, 0, 0), shape=(50, 40), backend=backend)
+    grid = gs.build_map(scans, poses, scanner, **options)
+    assert np.argwhere(~grid.unknown).tolist() == [[25, col] for col in range(11)]
+    assert grid.occupied[25, 10] and grid.occupied.sum() == 1
+    with pytest.raises(ValueError, match=r"^scans: a ray must span at most 524288 cells along an axis, got 1500052 in "
+                       r"scan 0"):  # fmt: skip
+        gs.build_map(scans, poses, scanner, **options | {"resolution": 0.01})
+
+
+def world_of_scans(count=30, beams=40, side=20.0):
+    rng = np.random.default_rng(5)
+    scanner = gs.Scanner.uniform(angle_min=-3.1, angle_increment=6.2 / beams, count=beams, range_max=8.0)
+    poses = np.column_stack([rng.uniform(-2, side + 2, (count, 2)), rng.uniform(-3, 3, count)])
+    return rng.uniform(0.5, 9, (count, beams)), poses, scanner
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7])
+def test_bands_of_rows_make_the_same_map(backend, yaw):
+    scans, poses, scanner = world_of_scans()
+    motion = np.column_stack([np.full(30, 0.1), np.zeros(30), np.full(30, 0.05)])
+    options = dict(
+        resolution=0.1, origin=(0.5, 0.3, yaw), shape=(170, 190), range_limit=None, clear_max=True, p_hit=0.85,
+        p_miss=0.45, p_prior=0.5, occupied_threshold=65, backend=backend, motion=motion,
+    )  # fmt: skip
+    maps, rays = [], []
+    for most in (1 << 22, 190 * 40, 190 * 7 if yaw else 1):
+        builder = MapBuilder(scans, poses, scanner, **options, each=8, most=most)
+        for share in builder.steps():
+            before = builder.grid()
+            assert 0 < share <= 1 and (before.unknown.sum() >= maps[0].unknown.sum() if maps else True)
+        maps.append(builder.grid())
+        rays.append(builder.rays)
+    assert builder.bands == (25 if yaw else 170) and maps[0].occupied.sum() > 100 and (~maps[0].unknown).mean() > 0.4
+    assert all(each == maps[0] for each in maps) and set(rays) == {rays[0]} and 0 < rays[0] <= 1200
+
+
+def test_the_counts_of_a_large_map_take_little_memory_beside_it():
+    """41 bytes a cell before; NumPy's counts are memory of this process, so that all of it is measured."""
+    scans, poses, scanner = world_of_scans(count=40, side=150.0)
+    options = dict(resolution=0.05, origin=(0, 0, 0), shape=(3000, 3000), backend="numpy")
+    gs.build_map(scans[:1], poses[:1], scanner, **options)
+    tracemalloc.start()
+    try:
+        grid = gs.build_map(scans, poses, scanner, **options)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert (~grid.unknown).any() and peak < 8 * grid.cells.size
+
+
+def test_a_map_beyond_the_memory_or_the_earth_is_refused(monkeypatch):
+    scanner = gs.Scanner([0.0], range_max=5.0)
+    with pytest.raises(ValueError, match=r"^poses: all rays must lie within 1e\+09 m of 0, got 1e\+10 m"):
+        gs.build_map([[1.0]], [(1e10, 0, 0)], scanner, backend="numpy")
+    with pytest.raises(ValueError, match=r"^origin\[1\]: must be finite and >= -1000000000.0"):
+        gs.build_map([[1.0]], [(0, 0, 0)], scanner, origin=(0, -1e17, 0), shape=(3, 3), backend="numpy")
+    monkeypatch.setattr(memory, "available", lambda: 1 << 20)
+    with pytest.raises(MemoryError, match="^shape: 20000 x 20000 cells must fit into the available memory"):
+        gs.build_map([[1.0]], [(0, 0, 0)], scanner, origin=(0, 0, 0), shape=(20000, 20000), backend="numpy")

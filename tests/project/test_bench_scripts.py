@@ -226,6 +226,14 @@ def test_trees_are_compared(needs: Callable[[str], str], tmp_path: Path) -> None
         assert row["quartiles"][0] <= row["ratio"] <= row["quartiles"][1] and row["old_s"] > 0 and row["new_s"] > 0
 
 
+def test_map_memory_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
+    arguments = ["--backend", needs("opencl"), "--backend", "numpy", "--side", "300", "--scans", "5"]
+    rows = run_script("speed/map_memory.py", *arguments, output=tmp_path / "memory")["rows"]
+    assert [row["what"] for row in rows] == ["opencl", "numpy", "PGM", "PNG, 8 bits", "PNG, 1 bit"]
+    assert rows[0]["result, SHA-256"] == rows[1]["result, SHA-256"] != rows[2]["result, SHA-256"]
+    assert rows[2]["result, SHA-256"] == rows[3]["result, SHA-256"] != rows[4]["result, SHA-256"]
+
+
 def test_preparation_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     arguments = ["--backend", needs("opencl"), "--cells", "220", "--repeats", "1"]
     report = run_script("speed/preparation.py", *arguments, output=tmp_path / "preparation")

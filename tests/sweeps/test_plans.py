@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import pickle
+import re
+import tracemalloc
 
 import pytest
 
@@ -121,3 +123,57 @@ def test_a_parquet_file_has_the_columns_of_the_csv_file(tmp_path):
             table.add(job, outcome(job.seed / 3, "no" if job.seed == 1 else ""), 1)
         table.finish([job.key for job in jobs])
     assert gs.sweep.read_table(tmp_path / "t.parquet") == gs.sweep.read_table(tmp_path / "t.csv")
+
+
+LAUGHS = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{chr(98 + k)}: &{chr(98 + k)} [{', '.join([f'*{chr(97 + k)}'] * 10)}]\n" for k in range(8)
+)
+MERGES = "a: &a {k: x}\n" + "".join(
+    f"{chr(98 + k)}: &{chr(98 + k)} {{<<: [{', '.join([f'*{chr(97 + k)}'] * 10)}]}}\n" for k in range(8)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (LAUGHS, "its aliases must repeat at most 100000 values"),
+        (MERGES, "its aliases must repeat at most 100000 values"),
+        ("options: {" + LAUGHS.replace("\n", ", ") + "}", "its aliases must repeat at most 100000 values"),
+        ("options: &o {inner: *o}", "no part may contain itself, got *o within &o"),
+        ("axes: &x [[*x]]", "no part may contain itself"),
+        ("options: " + "{a: " * 200 + "1" + "}" * 200, "its parts must be nested at most 100 deep"),
+        ("options: " + "{a: " * 50 + "1" + "}" * 50, "options: must be nested at most 32 deep"),
+        (f"options: {{a: [{'1,' * 20000}1]}}\naxes: {{seed: 10000}}", "options: must have at most 50000000 values"),
+        (f"options: {{task: {'x' * 900000}}}\naxes: {{seed: 10000}}", "options: must have at most 50000000 values"),
+        (f"axes: {{log: {{one: {{a: [{'1,' * 20000}1]}}}}, seed: 10000}}", "options: must have at most 50000000"),
+    ],
+    ids=["laughs", "merges", "laughs-in-options", "self", "self-in-list", "deep", "deep-options", "product", "text",
+         "product-of-axes"],
+)  # fmt: skip
+def test_a_plan_that_grows_without_bound_is_refused_at_once(tmp_path, text, message):
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match=re.escape(message)) as caught:
+            gs.sweep.read_plan(plan(tmp_path, text))
+        assert tracemalloc.get_traced_memory()[1] < 60e6
+    finally:
+        tracemalloc.stop()
+    assert len(str(caught.value)) < 500
+
+
+def test_aliases_that_stay_small_are_read(tmp_path):
+    text = "options: &all {every: 2}\naxes: {places: {one: {<<: *all, log: a}, two: {<<: *all, log: b, every: 3}}}"
+    assert [dict(job.options) for job in gs.sweep.read_plan(plan(tmp_path, text))] == [{"every": 2}, {"every": 3}]
+
+
+def test_options_that_contain_themselves_are_no_options():
+    for options in ({"a": []}, {"a": {}}):
+        inner = options["a"]
+        inner.append(inner) if isinstance(inner, list) else inner.update(b=inner)
+        with pytest.raises(ValueError, match="options: must be nested at most 32 deep"):
+            gs.sweep.Job(options=options)
+    wide = [0]
+    for _ in range(20):
+        wide = [wide, wide]
+    with pytest.raises(ValueError, match="options: must hold at most 100000 values"):
+        gs.sweep.Job(options={"a": wide})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 import zlib
 
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from support.map_files import CELLS, GREYS, chunk, pgm, png, yaml_text
 
+from gpusense._util import memory
 from gpusense.world import images
 from gpusense.world.map_files import read_map
 
@@ -242,3 +244,50 @@ def test_damaged_images_never_raise_anything_else(tmp_path_factory, data, kind):
         read_map(folder / "map.yaml")
     except ValueError as error:
         assert str(file) in str(error)
+
+
+BOUND = 3000
+"""Side of images whose memory is measured."""
+
+
+def big_images():
+    """Yield name, content and bytes a cell, beside fixed ones, that reading may take at its peak."""
+    side = BOUND
+    yield "map.png", png(side, side, bytes(side * (1 + (side + 7) // 8)), depth=1), 1.3
+    yield "map.png", png(side, side, bytes(side * (1 + side))), 1.3
+    yield "map.pgm", pgm(np.zeros((side, side), np.uint8)), 1.3
+    yield "map.pgm", b"P2 %d %d 255\n" % (side, side) + b"0 " * (side * side), 1.3
+
+
+@pytest.mark.parametrize(("name", "content", "most"), big_images(), ids=["png-1-bit", "png", "pgm", "pgm-plain"])
+def test_a_map_is_read_at_a_byte_a_cell(tmp_path, name, content, most):
+    """NumPy's and Python's own memory; Pillow holds one more byte a pixel of a grey PNG, which it does not report."""
+    (tmp_path / name).write_bytes(content)
+    (tmp_path / "map.yaml").write_text(yaml_text(name))
+    read_map(tmp_path / "map.yaml")
+    tracemalloc.start()
+    try:
+        grid = read_map(tmp_path / "map.yaml")
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert grid.shape == (BOUND, BOUND) and grid.occupied.all()
+    assert peak < most * BOUND * BOUND + 24e6
+
+
+@pytest.mark.parametrize("name", ["map.pgm", "map.png", "map.bmp"])
+def test_a_map_beyond_the_memory_is_refused_before_it_is_decoded(tmp_path, monkeypatch, name):
+    Image.fromarray(np.zeros((100, 100), np.uint8)).save(tmp_path / name, "PPM" if name.endswith("pgm") else None)
+    (tmp_path / "map.yaml").write_text(yaml_text(name))
+    assert read_map(tmp_path / "map.yaml").shape == (100, 100)
+    monkeypatch.setattr(memory, "available", lambda: 1 << 20)
+    with pytest.raises(MemoryError, match=f"{name}: 100 x 100 cells must fit into the available memory, 1.05 MB, got"):
+        read_map(tmp_path / "map.yaml")
+
+
+def test_the_available_memory_is_that_of_the_machine_its_container_and_the_process():
+    room = memory.available()
+    assert room is None or 1 << 20 < room < 1 << 60
+    memory.check_room("x", 1, "a cell")
+    with pytest.raises(MemoryError, match="^x: 3 cells must fit into the available memory"):
+        memory.check_room("x", 1 << 62, "3 cells")

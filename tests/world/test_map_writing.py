@@ -24,7 +24,7 @@ ANY = st.integers(-1, 100)
     cells=st.sampled_from([TRINARY, ANY]).flatmap(
         lambda values: hnp.arrays(np.int8, hnp.array_shapes(min_dims=2, max_dims=2), elements=values)
     ),
-    resolution=st.floats(1e-6, 1e6),
+    resolution=st.floats(1e-4, 1e3),
     origin=st.tuples(*[st.floats(-1e9, 1e9)] * 3),
     image_format=st.sampled_from(["pgm", "png"]),
 )

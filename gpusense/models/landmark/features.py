@@ -20,7 +20,7 @@ _WIDER = 1e-5
 
 def _read(features: object, p: LandmarkParameters) -> np.ndarray:
     """Return (F, 3) float64 features, NaN for parts not measured or left out; finite bearings are in [-pi, pi]."""
-    values = checks.as_array("features", features)
+    values = checks.as_array("features", features, masked=True)
     values = np.zeros((0, 2)) if values.shape == (0,) else checks.array("features", values, finite=False)
     if values.ndim != 2 or values.shape[1] not in (2, 3):
         raise ValueError(f"features: shape must be (F, 2) or (F, 3), got {checks.shape_text(values.shape)}")

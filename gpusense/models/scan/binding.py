@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from gpusense._util import checks
+from gpusense._util import checks, masks
 from gpusense.backends import Backend, arrays
 from gpusense.backends.results import Result
 from gpusense.backends.workspace import Workspace
@@ -213,7 +213,7 @@ class _StagedCall(BoundCall):
 
 def _shape_of(name: str, value: Any, shape: tuple[int | str, ...]) -> tuple[int, ...]:
     """Return the shape of an array in host memory; each call reads its numbers anew."""
-    actual = np.shape(cast(Any, arrays.to_host(value, name)))
+    actual = np.shape(cast(Any, arrays.to_host(masks.filled(value), name)))
     if len(actual) != len(shape) or any(isinstance(n, int) and n != m for n, m in zip(shape, actual, strict=True)):
         raise ValueError(f"{name}: shape must be {checks.shape_text(shape)}, got {checks.shape_text(actual)}")
     return actual

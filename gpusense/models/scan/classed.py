@@ -128,7 +128,7 @@ class ClassedScans(NamedTuple):
 
 def check_ranges(ranges: object, scanner: Scanner) -> np.ndarray:
     """Return readings of one scan (K,) or of several (S, K), checked, in their float dtype."""
-    readings = as_array("ranges", ranges)
+    readings = as_array("ranges", ranges, masked=True)
     shape = ("S", scanner.count) if readings.ndim == 2 else (scanner.count,)
     return array("ranges", readings, shape=shape, finite=False, dtype=None)
 

@@ -211,7 +211,7 @@ def test_turn_by_the_yaw_of_a_far_origin(on, seed, yaw):
 
 @pytest.mark.sampled(0.5)
 @LAWS
-@given(SEEDS, NAMES, st.sampled_from([-12, -1, 1, 12]))
+@given(SEEDS, NAMES, st.sampled_from([-11, -1, 1, 11]))
 def test_all_lengths_times_a_power_of_two(kind, on, seed, name, power):
     """Ranges scale to the bit; a hit's density is per metre and falls by the factor, a max reading's does not."""
     s, before, p = 2.0**power, scene(kind, seed, mount=MOUNT), PARAMETERS[kind][name]

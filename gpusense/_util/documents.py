@@ -1,0 +1,149 @@
+"""Read documents of settings and reports, YAML and JSON, within bounds; nothing in them is executed."""
+
+from __future__ import annotations
+
+import functools
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from gpusense._util import checks
+
+_LARGEST_YAML_BYTES, _LARGEST_JSON_BYTES = 1 << 20, 1 << 28
+DEEPEST = 100
+"""Levels of lists and mappings in each other."""
+MOST_REPEATED = 100_000
+"""Values that the aliases of a document may repeat, counted as if each were written out."""
+
+
+@functools.cache
+def _base() -> Any:
+    """Return PyYAML's safe loader, the compiled one where it was built."""
+    import yaml
+
+    return getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+@functools.cache
+def _loader() -> Any:
+    """Return the safe loader with decimal numbers.
+
+    YAML 1.1 reads 010 as octal and 1:30 as sexagesimal. ROS reads both with yaml-cpp, by YAML 1.2: ten, and no number.
+    """
+
+    class DecimalLoader(_base()):  # type: ignore[misc]
+        pass
+
+    def decimal(loader: Any, node: Any) -> Any:
+        text = loader.construct_scalar(node)
+        if ":" in text:
+            return text
+        if re.fullmatch("[-+]?0[0-9_]+", text):
+            return int(text.replace("_", ""))
+        construct = "construct_yaml_float" if node.tag.endswith("float") else "construct_yaml_int"
+        return getattr(loader, construct)(node)
+
+    # PyYAML takes 08 as text.
+    DecimalLoader.add_implicit_resolver("tag:yaml.org,2002:int", re.compile("[-+]?0[0-9_]+$"), list("-+0"))
+    for kind in ("int", "float"):
+        DecimalLoader.add_constructor(f"tag:yaml.org,2002:{kind}", decimal)
+    return DecimalLoader
+
+
+def check_yaml(text: str | bytes) -> None:
+    """Refuse YAML whose parts are nested too deeply, contain themselves, or grow without bound by aliases.
+
+    The events of the parser are read one by one, so that nothing is expanded.
+
+    Raises:
+        ValueError: The document breaks a bound, or is no YAML.
+    """
+    import yaml
+
+    nested: list[tuple[str | None, int]] = []
+    known: dict[str, int] = {}
+    size = repeated = 0
+    for event in yaml.parse(text, _base()):
+        if isinstance(event, yaml.CollectionEndEvent):
+            anchor, before = nested.pop()
+            if anchor is not None:
+                known[anchor] = size
+            size += before
+            continue
+        size += 1
+        if isinstance(event, yaml.AliasEvent):
+            if any(anchor == event.anchor for anchor, _ in nested):
+                raise ValueError(f"no part may contain itself, got *{event.anchor} within &{event.anchor}")
+            part = known.get(event.anchor, 0)
+            size, repeated = size + part, repeated + part
+            if repeated > MOST_REPEATED:
+                raise ValueError(f"its aliases must repeat at most {MOST_REPEATED} values, got more")
+        elif isinstance(event, yaml.CollectionStartEvent):
+            if len(nested) == DEEPEST:
+                raise ValueError(f"its parts must be nested at most {DEEPEST} deep, got more")
+            nested.append((event.anchor, size))
+            size = 0
+        elif isinstance(event, yaml.ScalarEvent) and event.anchor is not None:
+            known[event.anchor] = 1
+
+
+def read_mapping(file: Path) -> dict[Any, Any]:
+    """Read the mapping in a YAML file of plain values; numbers are decimal.
+
+    Raises:
+        ValueError: The file is too large, is not plain YAML, holds no mapping, or breaks a bound of :func:`check_yaml`.
+    """
+    import yaml
+
+    text = _bounded(file, _LARGEST_YAML_BYTES, "a YAML file")
+    try:
+        check_yaml(text)
+        data = yaml.load(text, _loader())
+    except (yaml.YAMLError, ValueError, RecursionError, AttributeError, KeyError) as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f" in line {mark.line + 1}" if mark else ""
+        raise ValueError(f"{file}: must be plain YAML, got an error{line}: {_problem(error)}") from error
+    if not isinstance(data, dict):
+        raise ValueError(f"{file}: must hold a YAML mapping, got {checks.show(data)}")
+    return data
+
+
+def _problem(error: Exception) -> str:
+    """Return what is wrong with a document, in words of the library that read it."""
+    for name in ("problem", "reason"):
+        if text := getattr(error, name, None):
+            return " ".join(str(text).split())
+    return str(error) if type(error) is ValueError and str(error) else type(error).__name__
+
+
+def read_json(file: Path, kind: str) -> Any:
+    """Read a JSON file.
+
+    Args:
+        file: The file.
+        kind: What it must be, with an article, such as ``"a report of gpusense bench"``.
+
+    Raises:
+        FileNotFoundError: The file is missing.
+        ValueError: The file is too large, or is no JSON.
+    """
+    text = _bounded(checks.existing_file(file), _LARGEST_JSON_BYTES, kind)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        problem = error if isinstance(error, json.JSONDecodeError) else type(error).__name__
+        raise ValueError(f"{file}: must be {kind}, got no JSON ({problem})") from None
+
+
+def _bounded(file: Path, most: int, kind: str) -> bytes:
+    """Return the content of a file.
+
+    Raises:
+        ValueError: It has more bytes than ``most``.
+    """
+    with file.open("rb") as stream:
+        text = stream.read(most + 1)
+    if len(text) > most:
+        raise ValueError(f"{file}: must be {kind} of at most {most} bytes, got a larger file")
+    return text

@@ -1,0 +1,42 @@
+"""Decompress data within bounds, so that a small file cannot fill memory, a disk or a day."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+FLOOR, RATIO = 1 << 28, 100
+"""A compressed stream may hold ``FLOOR`` bytes, and ``RATIO`` more for each of its compressed bytes."""
+_PIECE = 1 << 20
+
+
+def most_bytes(compressed: int) -> int:
+    """Return the most bytes that a stream of so many compressed bytes may hold."""
+    return FLOOR + RATIO * compressed
+
+
+def inflated(make: Callable[[], Any], data: bytes, most: int) -> bytes:
+    """Decompress one or several frames that follow each other.
+
+    Args:
+        make: Constructor of a decompressor with the interface of :class:`bz2.BZ2Decompressor`.
+        data: The compressed bytes.
+        most: Most bytes of the result.
+
+    Raises:
+        ValueError: The result is longer, or the data end within a frame.
+    """
+    parts: list[bytes] = []
+    total = 0
+    while data:
+        decompressor, rest = make(), data
+        while not decompressor.eof:
+            if not rest and decompressor.needs_input:
+                raise ValueError("compressed data: must be whole, got data that end within a frame")
+            part = decompressor.decompress(rest, _PIECE)
+            rest, total = b"", total + len(part)
+            if total > most:
+                raise ValueError(f"compressed data: must hold at most {most} bytes, got more")
+            parts.append(part)
+        data = decompressor.unused_data or b""
+    return b"".join(parts)

@@ -1,0 +1,68 @@
+"""Masked arrays of NumPy: a masked reading is missing, and a masked pose or cell is an error."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+
+
+def is_masked(value: object) -> bool:
+    """Return whether a value is a masked array, or a list or tuple with one in it, however deep."""
+    library = sys.modules.get("numpy.ma")
+    if library is None or type(value) is np.ndarray:
+        return False
+    if isinstance(value, (list, tuple)):
+        # Lists of numbers are long: only their types are looked at.
+        kinds = set(map(type, value))
+        return any(issubclass(kind, library.MaskedArray) for kind in kinds) or (
+            any(issubclass(kind, (list, tuple)) for kind in kinds) and any(map(is_masked, value))
+        )
+    return isinstance(value, library.MaskedArray)
+
+
+def filled(value: Any) -> Any:
+    """Return a masked array, or nested lists with one in them, as an array with NaN where it is masked.
+
+    Integers and booleans become float64 if any of them is masked. Other values are returned as they are.
+    """
+    if not is_masked(value):
+        return value
+    data, mask = _parts(value)
+    if not mask.any():
+        return data
+    if data.dtype.kind not in "fc":
+        data = data.astype(np.float64)
+    return np.where(mask, data.dtype.type(np.nan), data)
+
+
+def unmasked(name: str, value: Any) -> Any:
+    """Return a masked array without masked values as a plain one; other values as they are.
+
+    Raises:
+        ValueError: A value is masked.
+    """
+    if not is_masked(value):
+        return value
+    data, mask = _parts(value)
+    if mask.any():
+        index = tuple(int(i) for i in np.argwhere(mask)[0])
+        place = f" at index {index[0] if len(index) == 1 else index}" if index else ""
+        raise ValueError(f"{name}: no value may be masked, got {int(mask.sum())}, the first{place}")
+    return data
+
+
+def _parts(value: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the numbers and the mask of a masked array, or of nested lists with one in them.
+
+    Raises:
+        ValueError: The lists are ragged.
+    """
+    if isinstance(value, (list, tuple)):
+        datas, masks = zip(*map(_parts, value), strict=True)
+        return np.stack(datas), np.stack(masks)
+    if isinstance(value, np.ma.MaskedArray):
+        return np.asarray(value.data), np.ma.getmaskarray(value)
+    plain = np.asarray(value)
+    return plain, np.zeros(plain.shape, bool)

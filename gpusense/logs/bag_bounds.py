@@ -1,0 +1,124 @@
+"""Bounds for the library rosbags, which decompresses chunks and reads YAML without any.
+
+A bag of a few kilobytes could fill memory or the disk. The library has tables of its decompressors; their entries are
+replaced by ones with a bound, for the whole process and once. Sound bags are read as before.
+"""
+
+from __future__ import annotations
+
+import bz2
+import functools
+import io
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from gpusense._util.documents import check_yaml
+from gpusense._util.inflate import inflated, most_bytes
+
+LARGEST_CHUNK = 1 << 29
+"""Most bytes of a chunk or message of a bag, decompressed."""
+_LARGEST_METADATA = 1 << 24
+
+
+def check_metadata(folder: Path) -> None:
+    """Check the size and the aliases of a ROS 2 bag's ``metadata.yaml``.
+
+    Raises:
+        ValueError: it is too large, or grows without bound.
+    """
+    file = folder / "metadata.yaml"
+    with file.open("rb") as stream:
+        text = stream.read(_LARGEST_METADATA + 1)
+    if len(text) > _LARGEST_METADATA:
+        raise ValueError(f"{file}: must have at most {_LARGEST_METADATA} bytes, got more")
+    check_yaml(text)
+
+
+@functools.cache
+def install() -> None:
+    """Replace the library's decompressors and its parser of nested YAML by ones with bounds.
+
+    Raises:
+        ImportError: rosbags, or a table of it, is absent.
+    """
+    from lz4.frame import LZ4FrameDecompressor
+    from rosbags import rosbag1, rosbag2  # noqa: F401  # imports the modules below
+    from rosbags.rosbag1 import reader as reader1
+    from rosbags.rosbag2 import metadata, storage_mcap, storage_sqlite3
+    from rosbags.rosbag2 import reader as reader2
+
+    zstd = reader2.zstd
+    mcap, first = _table(storage_mcap, "DECOMPRESSORS"), _table(reader1, "decompressors")
+    for name, make in (("lz4", LZ4FrameDecompressor), ("zstd", zstd.ZstdDecompressor)):
+        mcap[name] = functools.partial(_chunk, make)
+    for name, make in (("lz4", LZ4FrameDecompressor), ("bz2", bz2.BZ2Decompressor)):
+        first[name] = functools.partial(_whole, make)
+    reader2.zstd = SimpleNamespace(
+        decompress=functools.partial(_whole, zstd.ZstdDecompressor), open=functools.partial(_Bounded, zstd.open)
+    )  # fmt: skip
+    parse = functools.partial(_qos, metadata.parse_qos)
+    for module in (reader2, storage_mcap, storage_sqlite3):
+        module.parse_qos = parse
+
+
+def _table(module: Any, name: str) -> Any:
+    """Return a table of the library.
+
+    Raises:
+        ImportError: this version has none, so that its decompression cannot be bounded.
+    """
+    table = getattr(module, name, None)
+    if not isinstance(table, dict):
+        raise ImportError(f"{module.__name__} has no {name}: this version of rosbags is unknown")
+    return table
+
+
+def _chunk(make: Callable[[], Any], data: bytes, size: int) -> bytes:
+    """Decompress a chunk of a stated size."""
+    if size > LARGEST_CHUNK:
+        raise ValueError(f"chunk: must hold at most {LARGEST_CHUNK} bytes, got {size}")
+    return inflated(make, data, size)
+
+
+def _whole(make: Callable[[], Any], data: bytes) -> bytes:
+    """Decompress a chunk or a message."""
+    return inflated(make, data, LARGEST_CHUNK)
+
+
+def _qos(parse: Callable[[Any], Any], profiles: Any) -> Any:
+    """Parse the quality of service of a topic, which may be text in YAML."""
+    if isinstance(profiles, str):
+        check_yaml(profiles)
+    return parse(profiles)
+
+
+class _Bounded(io.RawIOBase):
+    """A compressed file that is read up to a bound, and no further than the disk has room for."""
+
+    def __init__(self, opened: Callable[..., Any], file: Any, mode: str) -> None:
+        self._inner = opened(file, mode)
+        self._room = min(
+            most_bytes(os.fstat(file.fileno()).st_size), shutil.disk_usage(tempfile.gettempdir()).free * 9 // 10
+        )
+
+    def read(self, size: int = -1) -> bytes:
+        """Read some bytes.
+
+        Raises:
+            ValueError: the file holds more than its bound.
+        """
+        data: bytes = self._inner.read(min(size, 1 << 20) if size > 0 else 1 << 20)
+        self._room -= len(data)
+        if self._room < 0:
+            raise ValueError("compressed file: must hold no more than 100 times its size and the disk's room, got more")
+        return data
+
+    def close(self) -> None:
+        """Close the compressed stream; the file below belongs to the caller."""
+        self._inner.close()
+        super().close()

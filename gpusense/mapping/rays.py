@@ -1,0 +1,194 @@
+"""Rays of scans at known poses: where they start and end, and which part of a map they meet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpusense.interface.constants import RAY_BITS
+from gpusense.world.frames import ray_vectors
+from gpusense.world.grid import FARTHEST_ORIGIN, OccupancyGrid
+from gpusense.world.scanner import Reading, Scanner, classify
+from gpusense.world.sweep import beam_poses
+from gpusense.world.windows import LONGEST_SIDE, Window
+
+# Scans whose rays are counted in one launch.
+SCANS = 1024
+LONGEST_RAY = 1 << 19
+"""Most cells that a ray may span along an axis of the map: products of lengths in 1/4096 cell fit in 64 bits."""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Scans at known poses, and the rule by which readings become rays.
+
+    Attributes:
+        scans: (S, K) readings [m].
+        poses: (S, 3) poses of the robot [m, m, rad].
+        scanner: The scanner's geometry.
+        range_limit: Readings beyond it clear cells up to it and mark no obstacle [m].
+        clear_max: Whether max readings clear cells up to ``range_limit``; otherwise they are left out.
+        motion: (S, 3) motions of the robot during the scans, see ``gpusense.world.sweep``; None: it is at rest.
+    """
+
+    scans: np.ndarray
+    poses: np.ndarray
+    scanner: Scanner
+    range_limit: float
+    clear_max: bool
+    motion: np.ndarray | None = None
+
+    def rays(self, chosen: np.ndarray) -> RayEnds:
+        """Return the rays of some scans by their indices."""
+        motion = None if self.motion is None else self.motion[chosen]
+        return RayEnds(
+            self.scans[chosen], self.poses[chosen], self.scanner, self.range_limit, clear_max=self.clear_max,
+            motion=motion,
+        )  # fmt: skip
+
+
+class RayEnds:
+    """Start and end of each ray of scans in the world, as far as they say something about the map.
+
+    Args:
+        scans: (S, K) readings [m].
+        poses: (S, 3) poses of the robot [m, m, rad].
+        scanner: The scanner's geometry.
+        range_limit: See :class:`Survey`.
+        clear_max: See :class:`Survey`.
+        motion: See :class:`Survey`.
+
+    Attributes:
+        start: (R, 2) [m].
+        end: (R, 2) [m].
+        hit: (R,) whether an obstacle is at the end.
+        scan: (R,) index of the scan.
+    """
+
+    def __init__(
+        self, scans: np.ndarray, poses: np.ndarray, scanner: Scanner, range_limit: float, *, clear_max: bool,
+        motion: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
+        kinds = classify(scans, scanner)
+        hit = (kinds == Reading.HIT) & (scans <= range_limit)
+        used = (kinds == Reading.HIT) | (kinds == Reading.MAX) if clear_max else kinds == Reading.HIT
+        length = np.where(hit, scans, range_limit)[used]
+        scan, beam = np.nonzero(used)
+        poses = poses[scan] if motion is None else _poses_of_beams(poses, motion, scanner.count)[scan, beam]
+        cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+        x, y, _ = scanner.mount
+        along, across = ray_vectors(scanner.bearings, scanner.mount)[beam].T
+        turned = np.stack([cos * along - sin * across, sin * along + cos * across], axis=1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            self.start = poses[:, :2] + np.stack([cos * x - sin * y, sin * x + cos * y], axis=1)
+            self.end = self.start + length[:, None] * turned
+        self.hit, self.scan = hit[used], scan
+
+    def boxes(self, count: int, frame: OccupancyGrid) -> np.ndarray:
+        """Return the (S, 4) least column and row and largest column and row of the rays of each scan [cells].
+
+        Scans without a ray have infinite ones in reverse order.
+        """
+        both = np.stack([frame.world_to_cells(xy) for xy in (self.start, self.end)])
+        boxes = np.tile([np.inf, np.inf, -np.inf, -np.inf], (count, 1))
+        # Rays lie in the order of their scans.
+        first = np.flatnonzero(np.diff(self.scan, prepend=-1))
+        if len(first):
+            of = self.scan[first]
+            boxes[of, :2] = np.minimum.reduceat(both.min(axis=0), first, axis=0)
+            boxes[of, 2:] = np.maximum.reduceat(both.max(axis=0), first, axis=0)
+        return boxes
+
+
+def _poses_of_beams(poses: np.ndarray, motion: np.ndarray, beams: int) -> np.ndarray:
+    """Return the (S, K, 3) poses in the world of a robot that moves during S scans."""
+    place, heading = beam_poses(motion, beams)
+    cos, sin = np.cos(poses[:, 2])[:, None], np.sin(poses[:, 2])[:, None]
+    x = poses[:, 0, None] + cos * place[..., 0] - sin * place[..., 1]
+    y = poses[:, 1, None] + sin * place[..., 0] + cos * place[..., 1]
+    return np.stack([x, y, poses[:, 2, None] + heading], axis=-1)
+
+
+class CellRays:
+    """The rays that meet a window of a map, in its cells.
+
+    Attributes:
+        start_cell: (R, 2) int32 column and row of the start, relative to the window.
+        start_inside: (R, 2) int32 place of the start in its cell [1/4096 cell].
+        end_cell: (R, 2) int32 column and row of the end.
+        end_inside: (R, 2) int32 place of the end in its cell.
+        hit: (R,) int32, 1 where an obstacle is at the end.
+        ending: Number of rays whose end, or the map's cell nearest to it, lies in the rows of the window.
+    """
+
+    def __init__(self, ends: RayEnds, frame: OccupancyGrid, window: Window, shape: tuple[int, int]) -> None:
+        with np.errstate(over="ignore", invalid="ignore"):
+            start, end = frame.world_to_cells(ends.start), frame.world_to_cells(ends.end)
+            low, high = np.minimum(start, end), np.maximum(start, end)
+            first, last = (window.col, window.row), (window.col + window.cols, window.row + window.rows)
+            # A fraction of a cell more than the window, for the rounding of places.
+            meets = ((high >= np.subtract(first, 1)) & (low <= np.add(last, 1))).all(axis=1)
+            row = np.clip(end[:, 1], 0, shape[0] - 1)
+            self.ending = int(np.count_nonzero(meets & (row >= first[1]) & (row < last[1])))
+            places = [
+                np.rint(xy[meets] * (1 << RAY_BITS)).astype(np.int64) - (np.array(first) << RAY_BITS)
+                for xy in (start, end)
+            ]
+        (self.start_cell, self.start_inside), (self.end_cell, self.end_inside) = (
+            ((place >> RAY_BITS).astype(np.int32), (place & ((1 << RAY_BITS) - 1)).astype(np.int32))
+            for place in places
+        )
+        self.hit = ends.hit[meets].astype(np.int32)
+
+
+def check_lengths(ends: RayEnds, resolution: float, first: int) -> None:
+    """Refuse rays that span more cells than a walk can take.
+
+    Args:
+        ends: The rays.
+        resolution: Side of a cell [m].
+        first: Index of the first scan, for the message.
+
+    Raises:
+        ValueError: A ray is too long.
+    """
+    if len(ends.hit) == 0:
+        return
+    with np.errstate(over="ignore", invalid="ignore"):
+        cells = np.abs(ends.end - ends.start).max(axis=1) / resolution
+    longest = int(np.argmax(np.where(np.isnan(cells), np.inf, cells)))
+    if not cells[longest] <= LONGEST_RAY:
+        rule = f"a ray must span at most {LONGEST_RAY} cells along an axis"
+        raise ValueError(f"scans: {rule}, got {cells[longest]:.0f} in scan {first + int(ends.scan[longest])}")
+
+
+def extent(boxes: np.ndarray, resolution: float) -> tuple[tuple[float, float, float], tuple[int, int]]:
+    """Return origin and shape of the smallest map of whole cells that holds all rays, with a cell to spare around it.
+
+    Args:
+        boxes: (S, 4) least x and y and largest x and y of the rays of each scan [m].
+        resolution: Side of a cell [m].
+
+    Raises:
+        ValueError: no ray, or a map that is too large or too far from 0.
+    """
+    low, high = boxes[:, :2].min(axis=0, initial=np.inf), boxes[:, 2:].max(axis=0, initial=-np.inf)
+    if not (low <= high).all():
+        raise ValueError("scans: must have a range, got none")
+    if not max(-low.min(), high.max()) < FARTHEST_ORIGIN:
+        rule = f"all rays must lie within {FARTHEST_ORIGIN:g} m of 0"
+        raise ValueError(f"poses: {rule}, got {max(-low.min(), high.max()):g} m")
+    low = np.floor(low / resolution) - 1
+    size = np.floor(high / resolution) + 2 - low
+    if not (size <= LONGEST_SIDE).all():
+        raise ValueError(
+            f"resolution: the map must have at most {LONGEST_SIDE} rows and columns, got {size[1]:.0f} x {size[0]:.0f}"
+        )
+    x, y = (low * resolution).tolist()
+    return (x, y, 0.0), (int(size[1]), int(size[0]))
+
+
+def batches(scans: np.ndarray, each: int) -> list[np.ndarray]:
+    """Return the scans of each launch, of those with these indices."""
+    return [scans[first : first + each] for first in range(0, len(scans), each)]

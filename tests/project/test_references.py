@@ -1,0 +1,174 @@
+"""Files that comments, docstrings and pages name are there; links of pages and their anchors lead somewhere."""
+
+from __future__ import annotations
+
+import ast
+import io
+import itertools
+import re
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from support.paths import ROOT
+
+# Reports hold the commands of the day on which they were made; folders of tools are no part of the project.
+_LEFT_OUT = ("bench/results/", ".git/", ".venv/", "venv/", "build/", "dist/", "shared/", "site/", "htmlcov/")
+_SOURCES = (".py", ".pyi", ".cl", ".md", ".toml", ".cpp")
+# Scripts whose names of old a page explains.
+_FORMER = {"bench/RESULTS.md": {"speed.py", "several_scans.py", "work_items.py"}}
+# Folders in which a path may begin, beside that of the file that names it.
+_BASES = ("", "gpusense", "kernels", "kernels/opencl", "kernels/warp", "bench", "tests", "docs")
+_ENDINGS = "py|pyi|cl|md|toml|cpp|svg|png|json|yaml|yml|xml|cfg"
+_PATH = re.compile(
+    rf"(?<![\w/.:<>{{}}*$~-])((?:[\w.-]+/)*[\w.-]*\w\.(?:{_ENDINGS})|(?:[\w.-]+/)+)(?![\w/*<{{-])"
+)
+_LINK = re.compile(r"!?\[[^\]]*\]\(\s*<?([^)\s>]+)>?[^)]*\)|^\s*\[[^\]]+\]:\s*(\S+)|(?:src|href)=\"([^\"]+)\"", re.MULTILINE)
+
+
+def every_file() -> dict[str, Path]:
+    """Return the files of the checkout by their paths in it."""
+    hidden = re.compile(r"(^|/)(__pycache__|\.(?!ci/|gitignore)[^/]*|[^/]*\.egg-info)(/|$)")
+    found = {path.relative_to(ROOT).as_posix(): path for path in ROOT.rglob("*") if path.is_file()}
+    return {
+        name: path for name, path in found.items() if not name.startswith(_LEFT_OUT[1:]) and not hidden.search(name)
+    }
+
+
+FILES = every_file()
+FOLDERS = {parent.as_posix() for name in FILES for parent in Path(name).parents}
+NAMES = {Path(name).name for name in FILES}
+READ = [name for name in FILES if name.endswith(_SOURCES) and not name.startswith(_LEFT_OUT[:1])] + [".ci/run"]
+PAGES = [name for name in READ if name.endswith(".md")]
+
+
+def prose(name: str, text: str) -> Iterator[tuple[int, str]]:
+    """Yield the lines of a file that are written for readers: comments, docstrings, pages.
+
+    A command after "Command:" is as it was run.
+    """
+    if name.endswith((".py", ".pyi")):
+        for token in tokenize.generate_tokens(io.StringIO(text).readline):
+            if token.type == tokenize.COMMENT:
+                yield token.start[0], token.string
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+                yield from enumerate(node.value.value.splitlines(), node.lineno)
+        return
+    mark = {".cl": "//", ".cpp": "//", ".md": ""}.get(Path(name).suffix, "#")
+    for number, line in enumerate(text.splitlines(), 1):
+        if mark in line:
+            yield number, (line.split(mark, 1)[1] if mark else line).split("Command: ")[0]
+
+
+def missing_paths(name: str, text: str) -> list[str]:
+    """Return the paths that a file names and that the project lacks, with their places.
+
+    A path with folders is one of the project if its first folder is there, in the root, in one of the usual bases, or
+    beside the file. A bare name is one if it ends as a source does.
+    """
+    gone = []
+    for number, line in prose(name, text):
+        for match in _PATH.finditer(line):
+            path = match.group(1).rstrip("/")
+            here = Path(name).parent.as_posix()
+            first = path.split("/")[0]
+            bases = [Path(base) for base in (*_BASES, here)]
+            if any(normal(base / path) in FILES or normal(base / path) in FOLDERS for base in bases):
+                continue
+            if "/" not in match.group(1):
+                known = path in NAMES or not path.endswith((".py", ".pyi", ".cl")) or path in _FORMER.get(name, ())
+            else:
+                known = first in ("..", ".") or not any(normal(base / first) in FOLDERS for base in bases)
+            if not known:
+                gone.append(f"{name}:{number}: {path}")
+    return gone
+
+
+def normal(path: Path) -> str:
+    """Return a path in the checkout without ``..``."""
+    parts: list[str] = []
+    for part in path.parts:
+        if part == ".." and parts:
+            parts.pop()
+        elif part != ".":
+            parts.append(part)
+    return "/".join(parts)
+
+
+def anchors(text: str) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub makes them, and those that it names itself."""
+    found = set(re.findall(r"<a (?:id|name)=\"([^\"]+)\"", text))
+    for line in without_blocks(text).splitlines():
+        heading = re.match(r"#{1,6}\s+(.*?)\s*#*$", line)
+        if heading:
+            plain = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", heading.group(1))
+            slug = re.sub(r"[^\w\- ]", "", plain.lower()).replace(" ", "-")
+            free = (f"{slug}-{k}" if k else slug for k in itertools.count())
+            found.add(next(one for one in free if one not in found))
+    return found
+
+
+def without_blocks(text: str) -> str:
+    """Return a page without its blocks of code."""
+    return re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+
+
+def without_code(text: str) -> str:
+    """Return a page without its blocks and spans of code, which hold no links."""
+    return re.sub(r"`[^`\n]*`", "", without_blocks(text))
+
+
+def broken_links(name: str, text: str) -> list[str]:
+    """Return the relative links of a page that lead nowhere."""
+    broken = []
+    for groups in _LINK.findall(without_code(text)):
+        target = next(filter(None, groups))
+        if re.match(r"[a-z][a-z+.-]*:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        file = normal(Path(name).parent / path) if path else name
+        if file not in FILES and file not in FOLDERS:
+            broken.append(f"{name}: {target}")
+        elif anchor and (not file.endswith(".md") or anchor not in anchors(FILES[file].read_text(encoding="utf-8"))):
+            broken.append(f"{name}: {target}")
+    return broken
+
+
+def test_paths_in_comments_docstrings_and_pages_exist():
+    assert len(READ) > 700
+    assert [gone for name in READ for gone in missing_paths(name, FILES[name].read_text(encoding="utf-8"))] == []
+
+
+def test_links_and_anchors_of_pages_resolve():
+    assert len(PAGES) > 20
+    assert [link for name in PAGES for link in broken_links(name, FILES[name].read_text(encoding="utf-8"))] == []
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "gone"),
+    [
+        ("gpusense/x.py", "# see tests/test_lanes.py\n", ["gpusense/x.py:1: tests/test_lanes.py"]),
+        ("gpusense/x.py", '"""Run.\n\nSee bench/limits.py, or bench/speed/limits.py.\n"""\n', ["gpusense/x.py:3: bench/limits.py"]),
+        ("gpusense/x.py", "x = 'bench/limits.py'  # a string is no prose\n", []),
+        ("kernels/opencl/x.cl", "int x; // as in raycasting.cl and raycast.cl\n", ["kernels/opencl/x.cl:1: raycasting.cl"]),
+        ("docs/x.md", "`models/scan/modell.py`, `models/scan/`, `world/gone/`, your/own.py, map.yaml, <name>.py, a/*.md",
+         ["docs/x.md:1: models/scan/modell.py", "docs/x.md:1: world/gone"]),
+        ("docs/x.md", "https://example.org/bench/limits.py and /usr/lib/bench/limits.py and ~/docs/none.md", []),
+        (".ci/run", "cd bench/none.py # see docs/none.md\n", [".ci/run:1: docs/none.md"]),
+    ],
+)  # fmt: skip
+def test_the_check_finds_paths_that_are_gone(name, text, gone):
+    assert missing_paths(name, text) == gone
+
+
+def test_the_check_finds_links_that_lead_nowhere():
+    text = (
+        "[a](casters.md) [b](none.md) [c](../README.md#nowhere) [d](#here) ![e](img/none.png) [f](https://a.org/x.md)\n"
+        "[g](#code-and-more) `[h](none.md)` [i]: gone.md\n## Here\n## `Code` and more\n[j]: away.md\n```\n[k](none.md)\n```\n"
+    )
+    assert anchors(text) == {"here", "code-and-more"} and anchors("# A\n# A\n") == {"a", "a-1"}
+    assert broken_links("docs/casters.md", text.replace("(#here)", "()").replace("(#code-and-more)", "()")) == [
+        f"docs/casters.md: {target}" for target in ("none.md", "../README.md#nowhere", "img/none.png", "away.md")
+    ]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from gpusense._util.files import check_writable, write_whole
 from gpusense._util.progress import progress
-from gpusense.commands.arguments import add_backend, add_json, add_seed, positive_number, whole_number
+from gpusense.commands.arguments import add_backend, add_json, add_seed, check_writer, positive_number, whole_number
 from gpusense.commands.fit_so_far import SoFar
 from gpusense.commands.output import print_json, print_table
 from gpusense.commands.scans import add_poses, read_scans
@@ -312,6 +312,7 @@ def _write(folder: Path, result: Result) -> list[Path]:
 
 def _folder(text: str) -> Path:
     """Convert an argument to a folder that can be written to, created if absent."""
+    check_writer(".png")
     folder = Path(text)
     try:
         folder.mkdir(parents=True, exist_ok=True)

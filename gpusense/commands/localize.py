@@ -174,16 +174,13 @@ def _recording(args: argparse.Namespace, pf: ParticleFilter) -> Recording | None
     """Begin a recording; None where none is asked for.
 
     Raises:
-        ValueError: the library is not installed.
+        ImportError: the library is not installed.
     """
     if args.record is None:
         return None
     from gpusense.plots.viewer import Recording
 
-    try:
-        return Recording(pf.grid)
-    except ImportError as error:
-        raise ValueError(f"--record: {error}") from None
+    return Recording(pf.grid)
 
 
 def _filter(args: argparse.Namespace, steps: list[Step]) -> ParticleFilter:

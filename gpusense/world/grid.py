@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
 from gpusense.world.messages import field, planar_pose, real_field
+from gpusense.world.plausible import look_at_grid
 
 
 class OccupancyGrid:
@@ -55,6 +56,7 @@ class OccupancyGrid:
         self._resolution = checks.real("resolution", resolution, above=0)
         x, y, yaw = checks.array("origin", origin, (3,)).tolist()
         self._origin: tuple[float, float, float] = (x, y, yaw)
+        look_at_grid(self._resolution, self._origin)
         self._occupied_threshold = checks.integer("occupied_threshold", occupied_threshold, low=1, high=100)
         self._occupied: NDArray[np.bool] | None = None
 

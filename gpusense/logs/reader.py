@@ -90,8 +90,8 @@ def read_log(
     """Read a log, one record at a time and in the file's order.
 
     Formats are CARMEN and Wean Hall logs, plain or compressed by gzip, rosbags of ROS 1, and of ROS 2 with sqlite3 or
-    MCAP storage, as a folder or a single file. ROS is not needed. The module of each format describes how messages become records, such as
-    :mod:`gpusense.logs.carmen` and :mod:`gpusense.logs.ros`.
+    MCAP storage, as a folder or a single file. ROS is not needed. The module of each format describes how messages
+    become records, such as :mod:`gpusense.logs.carmen` and :mod:`gpusense.logs.ros`.
 
     Args:
         path: The file, or the folder of a ROS 2 bag.

@@ -15,7 +15,8 @@ All other messages are skipped without being decoded; the message definitions th
   headings along the shorter arc; before the first and after the last message it is the nearest one's. A log without
   odometry has (0, 0, 0). ``Scan.pose`` is None.
 * The robot's base is the child frame of odometry, else ``base_footprint`` or ``base_link``. Without a chain of
-  transforms the mount is (0, 0, 0), and a warning says so. A laser that is mounted upside down has bearings that run clockwise.
+  transforms the mount is (0, 0, 0), and a warning says so. A laser that is mounted upside down has bearings that run
+  clockwise.
 * A last beam that points where the first one does is dropped. A reading of exactly 0 becomes NaN, as it means "none" to
   all drivers. Other readings are those of the message: infinities are "no return", NaN is missing (REP-117).
 * Some lasers change the number and bearings of their beams from scan to scan. All scans then share one scanner with

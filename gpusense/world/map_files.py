@@ -18,10 +18,9 @@ from gpusense._util import checks
 from gpusense._util.files import read_mapping
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.images import open_raster
+from gpusense.world.map_greys import MODES, UNKNOWN_GREY, MapMode, paint, write_image
+from gpusense.world.map_hints import check_no_image
 from gpusense.world.wean_map import read_probabilities
-
-# The grey that map_saver writes for unknown cells.
-UNKNOWN_GREY = 205
 
 
 @dataclass(frozen=True)
@@ -82,6 +81,7 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
     file = checks.existing_file(checks.path("path", path))
     if file.name.lower().endswith((".dat", ".dat.gz")):
         return read_probabilities(file, occupied_threshold=occupied_threshold)
+    check_no_image(file)
     meta = _read_yaml(file)
     size = meta.image.stat().st_size
     with meta.image.open("rb") as stream:
@@ -107,24 +107,37 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
 
 
 def write_map(
-    grid: OccupancyGrid, path: str | os.PathLike[str], *, image_format: Literal["pgm", "png"] = "pgm"
+    grid: OccupancyGrid,
+    path: str | os.PathLike[str],
+    *,
+    image_format: Literal["pgm", "png"] = "pgm",
+    mode: MapMode | None = None,
 ) -> None:
     """Write a map for ROS map_server, atomically.
 
-    The image has the YAML file's name with the suffix of its format. A grid of 0, 100 and unknown is written in mode
-    ``trinary`` with map_saver's greys (254, 0 and 205, ``free_thresh`` 0.196), any other grid in mode ``raw`` with 255
-    for unknown. :func:`read_map` returns equal cells, resolution and origin. The format has no place for
-    ``occupied_threshold``.
+    The image has the YAML file's name with the suffix of its format. Modes:
+
+    - ``"trinary"``: map_saver's greys, 254 for free, 0 for occupied, 205 for unknown cells (``free_thresh`` 0.196). The
+      image can be looked at and edited. :func:`read_map` returns the same free, occupied and unknown cells, of 0, 100
+      and -1.
+    - ``"scale"``: from white, 0 per cent, to black; unknown cells are transparent, which takes a PNG. Cells come back
+      equal.
+    - ``"raw"``: the per cent as greys, so almost black, and 255 for unknown. Cells come back equal.
+    - None: trinary for a grid of 0, 100 and unknown, else raw, so that cells come back equal.
+
+    The format has no place for ``occupied_threshold``, which decides in mode trinary.
 
     Args:
         grid: The map.
         path: The YAML file, ending in .yaml or .yml. It and its image are replaced if they exist.
         image_format: ``"pgm"`` or ``"png"``.
+        mode: The mode.
 
     Raises:
         FileNotFoundError: The folder is missing.
         TypeError: An argument has the wrong type.
-        ValueError: ``path`` has another suffix or is a folder, or ``image_format`` is unknown.
+        ValueError: ``path`` has another suffix or is a folder, ``image_format`` or ``mode`` is unknown, or a PGM cannot
+            hold the mode's transparent cells.
         OSError: The files cannot be written; the old files are then unchanged.
 
     Example:
@@ -142,6 +155,8 @@ def write_map(
     if target.suffix.lower() not in (".yaml", ".yml"):
         raise ValueError(f"path: must end in .yaml or .yml, got {target}")
     checks.choice("image_format", image_format, ("pgm", "png"))
+    if mode is not None:
+        checks.choice("mode", mode, MODES)
     image = target.with_suffix(f".{image_format}")
     if not target.parent.is_dir():
         raise FileNotFoundError(f"path: must lie in a folder that exists, got {target}")
@@ -149,38 +164,25 @@ def write_map(
         if file.is_dir():
             raise ValueError(f"path: must not name a folder, got {file}")
 
-    cells = grid.cells
-    trinary = sum(np.count_nonzero(cells == value) for value in (0, 100, -1)) == cells.size
-    greys = bytearray([*range(101), *[255] * 155])  # indexed by the cell's byte; unknown, -1, is byte 255
-    if trinary:
-        greys[0], greys[100], greys[255] = 254, 0, UNKNOWN_GREY
-    pixels = cells[::-1].tobytes().translate(greys)
+    painting = paint(grid, mode)
+    if painting.alpha and image_format != "png":
+        rule = "must be 'png' for unknown cells in mode 'scale', which are transparent"
+        raise ValueError(f"image_format: {rule}, got {image_format!r}")
     meta = {
         "image": image.name,
-        "mode": "trinary" if trinary else "raw",
+        "mode": painting.mode,
         "resolution": grid.resolution,
         "origin": list(grid.origin),
         "negate": 0,
-        "occupied_thresh": 0.65,
-        "free_thresh": 0.196,
+        "occupied_thresh": painting.occupied_thresh,
+        "free_thresh": painting.free_thresh,
     }
     text = yaml.safe_dump(meta, sort_keys=False, default_flow_style=None, allow_unicode=True)
     writers: dict[Path, Callable[[BinaryIO], object]] = {
-        image: lambda stream: _write_image(stream, pixels, grid.shape, image_format),
+        image: lambda stream: write_image(stream, painting, grid.shape, image_format),
         target: lambda stream: stream.write(text.encode()),
     }
     _write_all(writers)
-
-
-def _write_image(stream: BinaryIO, pixels: bytes, shape: tuple[int, int], image_format: str) -> None:
-    size = shape[::-1]
-    if image_format == "png":
-        from PIL import Image
-
-        Image.frombytes("L", size, pixels).save(stream, "PNG")
-    else:
-        stream.write(b"P5\n%d %d\n255\n" % size)
-        stream.write(pixels)
 
 
 def _write_all(writers: dict[Path, Callable[[BinaryIO], object]]) -> None:
@@ -232,7 +234,7 @@ def _read_yaml(file: Path) -> _MapYaml:
     if free >= occupied:
         raise ValueError(f"{file}: occupied_thresh: must be > free_thresh = {free}, got {occupied}")
     return _MapYaml(
-        image=checks.existing_file(file.parent / image),
+        image=_image(file, image),
         resolution=_number(file, "resolution", data["resolution"], above=0),
         origin=[_number(file, f"origin[{i}]", value) for i, value in enumerate(origin)],
         negate=bool(negate),
@@ -240,6 +242,18 @@ def _read_yaml(file: Path) -> _MapYaml:
         free_thresh=free,
         mode=mode.lower(),
     )
+
+
+def _image(file: Path, name: str) -> Path:
+    """Return the image that a YAML file names.
+
+    Raises:
+        FileNotFoundError, ValueError: It is missing, or no regular file; the message names both files.
+    """
+    try:
+        return checks.existing_file(file.parent / name)
+    except (FileNotFoundError, ValueError) as error:
+        raise type(error)(f"{file}: image: {error}") from None
 
 
 def _number(file: Path, key: str, value: object, **limits: float) -> float:

@@ -46,9 +46,9 @@ def _notice(text: str) -> None:
     warn_user(text, PlausibilityWarning)
 
 
-def look_at_bearings(name: str, bearings: NDArray[np.float64]) -> None:
-    """Warn of bearings that span more than a turn, or lie more than a turn from 0 [rad]."""
-    if not bearings.size:
+def look_at_bearings(name: str, bearings: NDArray[np.float64] | None) -> None:
+    """Warn of bearings that span more than a turn, or lie more than two turns from 0 [rad]; None are none."""
+    if bearings is None or not bearings.size:
         return
     low, high = float(bearings.min()), float(bearings.max())
     if high - low > _TURN * (1 + 1 / bearings.size):
@@ -105,9 +105,7 @@ def look_at_scene(range_max: float, size: float) -> None:
         )
 
 
-def look_at_readings(
-    name: str, ranges: NDArray[np.floating], range_max: float, size: float | None = None
-) -> bool:
+def look_at_readings(name: str, ranges: NDArray[np.floating], range_max: float, size: float | None = None) -> bool:
     """Warn of negative readings, and of readings in other units than metres.
 
     Args:

@@ -90,7 +90,7 @@ def test_a_failure_while_writing_leaves_nothing(tmp_path, monkeypatch):
         stream.write(b"P5")
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(map_files, "_write_image", failing)
+    monkeypatch.setattr(map_files, "write_image", failing)
     with pytest.raises(OSError, match="no space left"):
         write_map(OccupancyGrid([[1, 2]]), tmp_path / "copy.yaml")
     assert list(tmp_path.iterdir()) == []

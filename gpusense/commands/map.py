@@ -98,7 +98,8 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json({
             "map": str(args.out), "image": str(image), "mode": args.mode, "scans": counted,
-            "scans_chosen": len(scans), "rays": builder.rays, "rows": rows, "cols": cols, "resolution": grid.resolution, "origin": grid.origin, "free": free, "occupied": occupied,
+            "scans_chosen": len(scans), "rays": builder.rays, "rows": rows, "cols": cols,
+            "resolution": grid.resolution, "origin": grid.origin, "free": free, "occupied": occupied,
             "machine": machine(),
         })  # fmt: skip
     else:

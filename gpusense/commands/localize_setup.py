@@ -32,7 +32,8 @@ def read_parameters(args: argparse.Namespace) -> Localization:
         if args.node is not None:
             raise ValueError(f"--node: must come with --parameters, got {args.node} alone")
         return Localization(None, {})
-    read = read_localization(args.parameters, args.node)
+    with options_named():
+        read = read_localization(args.parameters, args.node)
     if read.nav2 is not None and read.nav2.ignored:
         sys.stderr.write(f"gpusense: {args.parameters}: without effect here: {', '.join(read.nav2.ignored)}\n")
     return read

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 FORMATS = "CARMEN or Wean Hall, plain or .gz; a bag of ROS 1 (.bag) or of ROS 2 (folder, .db3, .mcap)"
 # Arguments of the library, and the options that set them.
-_OPTIONS = {"topic": "topic", "sensors": "topic", "mount": "mount"}
+_OPTIONS = {"topic": "topic", "sensors": "topic", "mount": "mount", "node": "node"}
 
 
 def add_log(parser: argparse.ArgumentParser, what: str, *, required: bool = True, several: bool = False) -> None:

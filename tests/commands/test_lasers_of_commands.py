@@ -38,8 +38,9 @@ def place(tmp_path_factory):
         for name, mount in MOUNTS.items():
             both.transform(0.0, BASE, name, mount[:2], mount[2])
         for time, pose in enumerate(poses):
-            both.odometry(time, *map(float, pose))
-            bare.odometry(time, *map(float, pose))
+            odometry = [float(value) for value in pose + (0.01 * time, 0.0, 0.0)]
+            both.odometry(time, *odometry)
+            bare.odometry(time, *odometry)
             for name, mount in MOUNTS.items():
                 ranges = caster.cast(gs.compose_poses(pose, mount)[None], BEARINGS)[0] + rng.normal(0, 0.01, 61)
                 both.scan(time, ranges, BEARINGS[0], step, f"/{name}", frame=name, range_max=20.0)

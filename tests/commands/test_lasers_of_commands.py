@@ -38,7 +38,7 @@ def place(tmp_path_factory):
         for name, mount in MOUNTS.items():
             both.transform(0.0, BASE, name, mount[:2], mount[2])
         for time, pose in enumerate(poses):
-            odometry = [float(value) for value in pose + (0.01 * time, 0.0, 0.0)]
+            odometry = [float(pose[0]) + 0.01 * time, float(pose[1]), float(pose[2])]
             both.odometry(time, *odometry)
             bare.odometry(time, *odometry)
             for name, mount in MOUNTS.items():

@@ -33,6 +33,9 @@ class OccupancyGrid:
         TypeError: An argument has the wrong type, such as cells of dtype float or bool.
         ValueError: A shape or a value breaks a rule above.
 
+    Warns:
+        PlausibilityWarning: Cells are larger than 1 m, or the origin's yaw is more than a turn.
+
     Example:
         >>> import gpusense as gs
         >>> grid = gs.OccupancyGrid([[0, 100, -1], [0, 0, 0]], resolution=0.5)

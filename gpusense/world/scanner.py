@@ -56,6 +56,9 @@ class Scanner:
         TypeError: An argument has the wrong type.
         ValueError: A shape or a value breaks a rule above.
 
+    Warns:
+        PlausibilityWarning: Bearings or lengths seem to be in degrees or millimetres.
+
     Example:
         >>> import gpusense as gs, numpy as np
         >>> gs.Scanner(np.linspace(-np.pi / 2, np.pi / 2, 181), range_max=8.0)

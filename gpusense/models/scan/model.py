@@ -173,6 +173,9 @@ class ScanModel(ABC):
             TypeError: an argument does not hold real numbers, or is on a device that the backend cannot read.
             ValueError: a wrong shape, or a pose that is not finite; the message names it.
             MemoryError: the device cannot hold the map's table, or even a few particles.
+
+        Warns:
+            PlausibilityWarning: in the first calls of a scanner: negative readings, or ones that seem to be millimetres.
         """
         if out is None and not per_beam and is_recorded(poses):
             calls = self._differentiable(ranges)

@@ -27,7 +27,7 @@ def add_log(parser: argparse.ArgumentParser, what: str, *, required: bool = True
 
     Args:
         parser: The parser of a command.
-        what: What the log must have, with an article.
+        what: The log and its contents in words, with an article.
         required: Whether it must be given.
         several: Whether the command takes several lasers.
     """

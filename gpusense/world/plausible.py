@@ -23,7 +23,7 @@ _FARTHEST, _FAR = 1e4, 1e3
 _LARGEST_MOUNT = 100.0
 # Calls with scans of a scanner that are looked at.
 _CALLS = 32
-# Readings beyond so many times range_max, or the map, are in other units; a code for "no return" is the same each time.
+# Readings beyond these multiples of range_max or of the map are in other units; a code for "no return" is one value.
 _TIMES_RANGE, _TIMES_MAP, _VALUES = 10.0, 100.0, 3
 
 

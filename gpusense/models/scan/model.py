@@ -175,7 +175,7 @@ class ScanModel(ABC):
             MemoryError: the device cannot hold the map's table, or even a few particles.
 
         Warns:
-            PlausibilityWarning: in the first calls of a scanner: negative readings, or ones that seem to be millimetres.
+            PlausibilityWarning: in the first calls of a scanner, negative readings, or ones in millimetres.
         """
         if out is None and not per_beam and is_recorded(poses):
             calls = self._differentiable(ranges)

@@ -63,6 +63,7 @@ _NAMES = {
     "world.landmarks": ("LandmarkMap",),
     "world.map_files": ("read_map", "write_map"),
     "world.parameters": ("BeamParameters", "IncidenceParameters", "LandmarkParameters", "LikelihoodFieldParameters"),
+    "world.plausible": ("PlausibilityWarning",),
     "world.scanner": ("Reading", "Scanner", "classify"),
     "world.sweep": ("deskew_scan",),
     "world.sensor_parameters": ("BeaconParameters", "BumperParameters", "HeadingParameters", "PositionParameters"),

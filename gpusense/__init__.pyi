@@ -79,6 +79,7 @@ from gpusense.world.parameters import BeamParameters as BeamParameters
 from gpusense.world.parameters import IncidenceParameters as IncidenceParameters
 from gpusense.world.parameters import LandmarkParameters as LandmarkParameters
 from gpusense.world.parameters import LikelihoodFieldParameters as LikelihoodFieldParameters
+from gpusense.world.plausible import PlausibilityWarning as PlausibilityWarning
 from gpusense.world.scanner import Reading as Reading
 from gpusense.world.scanner import Scanner as Scanner
 from gpusense.world.scanner import classify as classify

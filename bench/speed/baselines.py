@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
+from gpusense._util.extras import install_command
 from gpusense.evaluation.benchmark.candidates import Candidate
 from gpusense.evaluation.benchmark.scenes import Scene
 from gpusense.world.scanner import Reading, classify
@@ -40,7 +41,7 @@ BLOCK = 16
 try:
     import numba
 except ImportError as error:
-    numba, NUMBA_MISSING = None, f"not installed ({error}): pip install numba"
+    numba, NUMBA_MISSING = None, f"not installed ({error}): {install_command('numba')}"
 else:
     NUMBA_MISSING = ""
 

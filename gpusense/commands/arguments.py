@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gpusense._util.extras import check_library
 from gpusense._util.files import check_writable
 from gpusense.localization.defaults import DEFAULTS
 
@@ -18,6 +19,10 @@ BACKEND_HELP = (
     "device: auto (the fastest one present), numpy, opencl, opencl:<part of a device's or driver's name>, "
     "opencl:<platform>:<device>, warp:cpu or warp:cuda:<number>; 'gpusense devices' lists the devices"
 )
+
+# Library that writes files of an ending, and the subject of the message where it is absent.
+_PICTURE = ("matplotlib", "a picture")
+_WRITERS = {".png": _PICTURE, ".pdf": _PICTURE, ".svg": _PICTURE, ".rrd": ("rerun", "a recording for Rerun")}
 
 
 def add_backend(parser: argparse.ArgumentParser, *, default: str = "auto") -> None:
@@ -138,6 +143,8 @@ def _finite(text: str) -> float:
 def output_path(*suffixes: str) -> Callable[[str], Path]:
     """Make a type for ``add_argument``: a file that can be written, which is checked before any work is done.
 
+    The library that writes the file must be installed, too.
+
     Args:
         suffixes: Allowed endings, such as ``".png"``; none allows every ending.
     """
@@ -146,6 +153,7 @@ def output_path(*suffixes: str) -> Callable[[str], Path]:
         path = Path(text)
         if suffixes and path.suffix.lower() not in suffixes:
             raise argparse.ArgumentTypeError(f"must end in {' or '.join(suffixes)}, got {text!r}")
+        check_writer(path.suffix.lower())
         try:
             check_writable(path)
         except (OSError, ValueError) as error:
@@ -154,3 +162,17 @@ def output_path(*suffixes: str) -> Callable[[str], Path]:
         return path
 
     return convert
+
+
+def check_writer(suffix: str) -> None:
+    """Check that the library that writes files of an ending is installed.
+
+    Raises:
+        argparse.ArgumentTypeError: it is absent; the message has the command that installs it.
+    """
+    if suffix not in _WRITERS:
+        return
+    try:
+        check_library(*_WRITERS[suffix])
+    except ImportError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None

@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from typing import NoReturn
 
+from gpusense._util.extras import explained
 from gpusense._version import __version__
 
 # Modules of gpusense.commands, in the order of the help.
@@ -99,11 +100,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stderr.write("gpusense: interrupted\n")
         return INTERRUPTED
     except (ValueError, TypeError, OSError, MemoryError) as error:
-        if os.environ.get(TRACEBACK):
+        return _failed(error)
+    except ImportError as error:
+        absent = explained(error)
+        if absent is None:
             raise
-        _settle()
-        sys.stderr.write(_error_line(_message(error)))
-        return BAD_INPUT
+        return _failed(absent)
+
+
+def _failed(error: Exception) -> int:
+    """Print an error as one line; with its traceback where the environment asks for it."""
+    if os.environ.get(TRACEBACK):
+        raise error
+    _settle()
+    sys.stderr.write(_error_line(_message(error)))
+    return BAD_INPUT
 
 
 def _settle() -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gpusense import plots
+from gpusense._util.extras import check_library
 from gpusense._util.files import check_writable
 from gpusense._util.progress import progress
 from gpusense.backends import Backend
@@ -84,6 +85,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Make the scene, score it on every device, report and draw."""
     if not args.no_plot:
+        check_library("matplotlib", "the picture, which --no-plot leaves out,")
         check_writable(args.output)
     backends, failures = arguments.open_backends(args.backend)
     scene = make_scene(args.seed, args.particles, args.beams)

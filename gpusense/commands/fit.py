@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from gpusense._util.files import check_writable, write_whole
 from gpusense._util.progress import progress
-from gpusense.commands.arguments import add_backend, add_json, add_seed, positive_number, whole_number
+from gpusense.commands.arguments import add_backend, add_json, add_seed, check_writer, positive_number, whole_number
 from gpusense.commands.fit_so_far import SoFar
 from gpusense.commands.output import print_json, print_table
-from gpusense.commands.scans import add_poses, read_scans
+from gpusense.commands.scans import add_log, add_reference, options_named, read_scans
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
@@ -71,8 +71,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description, parser.epilog = _DESCRIPTION, _EPILOG
     add = parser.add_argument
     add("--map", type=Path, metavar="YAML", help="a map_server map; needs --log")
-    add("--log", type=Path, metavar="FILE", help="a log with corrected poses, or any with --reference; needs --map")
-    add_poses(parser)
+    add_log(parser, "a log with corrected poses, or any with --reference; needs --map", required=False)
+    add_reference(parser)
     add("--pairs", type=Path, metavar="CSV",
         help="a file of columns separated by commas instead: reading [m], expected range [m] and, optionally, angle of "
         "incidence [rad]; needs --range-max")  # fmt: skip
@@ -141,7 +141,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_sources(args: argparse.Namespace) -> None:
     if args.pairs is not None:
-        for name in ("map", "log", "reference", "topic"):
+        for name in ("map", "log", "reference", "topic", "mount"):
             if getattr(args, name) is not None:
                 raise ValueError(f"--{name}: must be left out with --pairs, got {getattr(args, name)}")
         if args.fit_motion:
@@ -216,7 +216,10 @@ def _motion(args: argparse.Namespace) -> MotionFit | None:
     if not args.fit_motion:
         return None
     sensors = () if args.topic is None else (args.topic,)
-    steps = read_steps(args.log, every=args.every, offset=args.offset, limit=args.limit, sensors=sensors)
+    with options_named():
+        steps = read_steps(
+            args.log, every=args.every, offset=args.offset, limit=args.limit, sensors=sensors, mount=args.mount
+        )
     if args.reference is not None:
         steps = with_references(steps, *read_tum(args.reference))
     return fit_odometry_motion(*references_to_learn_from(steps))
@@ -312,6 +315,7 @@ def _write(folder: Path, result: Result) -> list[Path]:
 
 def _folder(text: str) -> Path:
     """Convert an argument to a folder that can be written to, created if absent."""
+    check_writer(".png")
     folder = Path(text)
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -16,6 +16,7 @@ from gpusense.commands.arguments import (
     whole_number,
 )
 from gpusense.commands.output import print_json, print_table
+from gpusense.commands.scans import add_log, options_named
 from gpusense.evaluation.machine import machine
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     add = parser.add_argument
     add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
-    add("--log", required=True, type=Path, metavar="FILE", help="a log with scans, plain or .gz")
+    add_log(parser, "a log with scans")
     add("--scan", type=whole_number(low=0), default=0, metavar="I", help="index of the scan (default: 0)")
     add("--out", required=True, type=output_path(".png", ".pdf", ".svg"), metavar="FILE", help="the picture")
     add("--model", choices=("beam", "field"), default="field", help="measurement model (default: %(default)s)")
@@ -111,12 +112,12 @@ def _scan(args: argparse.Namespace) -> Scan:
     Raises:
         ValueError: the log has fewer scans.
     """
-    from gpusense.logs import Scan, read_log
+    from gpusense.logs.several import read_laser
 
     index = 0
-    for record in read_log(args.log, range_max=args.range_max):
-        if isinstance(record, Scan):
+    with options_named():
+        for scan in read_laser(args.log, args.topic, range_max=args.range_max, mount=args.mount):
             if index == args.scan:
-                return record
+                return scan
             index += 1
     raise ValueError(f"--scan: must be below the log's number of scans, {index}, got {args.scan}")

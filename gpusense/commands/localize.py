@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import (
@@ -20,13 +19,13 @@ from gpusense.commands.arguments import (
     positive_number,
     whole_number,
 )
+from gpusense.commands.scans import add_log
 from gpusense.localization.defaults import DEFAULTS
 
 if TYPE_CHECKING:
     from gpusense.evaluation.steps import Step
     from gpusense.evaluation.tracking import Track
     from gpusense.localization.filter import ParticleFilter
-    from gpusense.localization.motion import MotionModel
     from gpusense.plots.viewer import Recording
 
 NAME = "localize"
@@ -45,6 +44,9 @@ of a reference pose in deviations.
 The verdict at the end does not need reference poses: it is 'lost' if the estimates of the last tenth of the scans
 explain too few of their beams, as on a wrong map.
 
+A file of nav2 gives amcl's model, beams, particles, noise of the odometry, recovery and initial pose; options of this
+command come first. Its frames, topics and gates (update_min_d, update_min_a, resample_interval) have no effect.
+
 Ctrl-C ends the run with the results so far, and writes the files.
 
 Exit codes: 0 success, 1 lost at the end, or no reading there to judge by, 2 bad input, 130 interrupted.
@@ -52,7 +54,8 @@ Exit codes: 0 success, 1 lost at the end, or no reading there to judge by, 2 bad
 example:
   gpusense localize --map map.yaml --log run.log.gz
   gpusense localize --map map.yaml --log run.log.gz --global --particles 20000 --tum run.tum --plot run.png
-  gpusense localize --map map.yaml --log run.log.gz --start 1.5 -2 0.3
+  gpusense localize --map map.yaml --log run.bag --topic /front --start 1.5 -2 0.3
+  gpusense localize --map map.yaml --log run.mcap --parameters nav2_params.yaml
   gpusense localize --map map.yaml --log run.log.gz --every 2 --offset 1 --parameters fitted/parameters.yaml"""
 
 
@@ -61,13 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     add = parser.add_argument
     add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
-    add(
-        "--log",
-        required=True,
-        type=Path,
-        metavar="FILE",
-        help="a log with laser scans and odometry: CARMEN or Wean Hall, plain or .gz, rosbag 1 or 2, MCAP",
-    )
+    add_log(parser, "a log with laser scans and odometry", several=True)
     add("--particles", type=whole_number(low=1), metavar="N",
         help=f"particles (default: {DEFAULTS.particles}, with --global {DEFAULTS.particles_everywhere})")  # fmt: skip
     begin = parser.add_mutually_exclusive_group()
@@ -79,15 +76,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a TUM trajectory of true poses on the map to compare with, by the times of the scans (default: the "
         "logged poses)")  # fmt: skip
     add("--parameters", "--params", type=Path, metavar="YAML",
-        help="a file with beam_model or odometry_motion, such as 'gpusense fit --out' writes (default: a likelihood "
-        "field, and the noise below)")  # fmt: skip
-    add(
-        "--sensors",
-        nargs="+",
-        default=[],
-        metavar="NAME",
-        help="lasers that correct the filter: topics of a bag, front or rear of a CARMEN log (default: its main laser)",
-    )
+        help="a file with beam_model or odometry_motion, such as 'gpusense fit --out' writes, or nav2's parameters of "
+        "amcl (default: a likelihood field, and the noise below)")  # fmt: skip
+    add("--node", metavar="NAME", help="amcl's node in a file of nav2 with several, such as /robot1/amcl")
     add("--beams", type=whole_number(low=1), metavar="B", help="thin each scan evenly to B beams (default: all)")
     add_temperature(parser, "auto: learned from the scans")
     add("--motion-noise", type=not_negative_number, nargs=4, metavar=("A1", "A2", "A3", "A4"),
@@ -122,11 +113,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Localise, and print the results; after Ctrl-C those so far."""
     from gpusense.commands.localize_report import report
+    from gpusense.commands.localize_setup import make_filter, read_chosen, read_parameters, start_of
     from gpusense.evaluation.tracking import Track, follow, start
+    from gpusense.world.map_files import read_map
 
-    steps = _steps(args)
-    pf = _filter(args, steps)
-    start(pf, steps, everywhere=args.everywhere, pose=args.start)
+    read = read_parameters(args)
+    grid = read_map(args.map)
+    steps = read_chosen(args, read)
+    pf = make_filter(args, grid, steps, read)
+    pose, covariance = start_of(args, read.nav2) or (None, None)
+    start(pf, steps, everywhere=args.everywhere, pose=pose, covariance=covariance)
     track, recording = Track(), _recording(args, pf)
     try:
         with progress(len(steps)) as step:
@@ -143,105 +139,17 @@ def run(args: argparse.Namespace) -> int:
     return LOST if found["lost"] or found["explained_at_end"] is None else 0
 
 
-def _steps(args: argparse.Namespace) -> list[Step]:
-    """Read the chosen scans, with the poses of ``--reference`` where it is given.
-
-    Raises:
-        ValueError: a file breaks its format, or has no scan or pose of these.
-    """
-    from gpusense.evaluation.steps import read_steps, with_references
-    from gpusense.evaluation.trajectory_files import read_tum
-
-    try:
-        steps = read_steps(
-            args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit,
-            sensors=args.sensors,
-        )  # fmt: skip
-    except ValueError as error:
-        # The option has another name than the arguments.
-        rest = str(error).removeprefix("topic: ").removeprefix("sensors: ")
-        raise (error if rest == str(error) else ValueError(f"--sensors: {rest}")) from None
-    if args.reference is None:
-        return steps
-    steps = with_references(steps, *read_tum(args.reference))
-    if args.everywhere or args.start is not None:
-        return steps
-    # The run begins around the first reference pose.
-    return steps[next(i for i, step in enumerate(steps) if step.reference is not None) :]
-
-
 def _recording(args: argparse.Namespace, pf: ParticleFilter) -> Recording | None:
     """Begin a recording; None where none is asked for.
 
     Raises:
-        ValueError: the library is not installed.
+        ImportError: the library is not installed.
     """
     if args.record is None:
         return None
     from gpusense.plots.viewer import Recording
 
-    try:
-        return Recording(pf.grid)
-    except ImportError as error:
-        raise ValueError(f"--record: {error}") from None
-
-
-def _filter(args: argparse.Namespace, steps: list[Step]) -> ParticleFilter:
-    """Make the filter, with a model for each laser.
-
-    Raises:
-        ValueError: an option breaks its rule, a file its format, or the backend is absent.
-    """
-    from gpusense.commands.parameter_files import read_localization
-    from gpusense.localization.filter import ParticleFilter
-    from gpusense.models.scan.beam import BeamModel
-    from gpusense.models.scan.field import LikelihoodFieldModel
-    from gpusense.world.map_files import read_map
-    from gpusense.world.parameters import LikelihoodFieldParameters
-
-    grid = read_map(args.map)
-    scanners = {step.sensor: step.scan.scanner for step in steps}
-    for sensor, name in enumerate(args.sensors):
-        if sensor not in scanners:
-            raise ValueError(f"--sensors: must have scans that are chosen, got none of {name}")
-    beams = DEFAULTS.beams if args.beams is None else args.beams
-    beam, noise = (None, {}) if args.parameters is None else read_localization(args.parameters)
-    field = LikelihoodFieldParameters(**DEFAULTS.field)
-    models: list[Any] = [
-        LikelihoodFieldModel(grid, scanners[sensor], field, beams=beams, backend=args.backend)
-        if beam is None
-        else BeamModel(grid, scanners[sensor], beam, beams=beams, backend=args.backend)
-        for sensor in sorted(scanners)
-    ]
-    particles = DEFAULTS.particles_everywhere if args.everywhere else DEFAULTS.particles
-    return ParticleFilter(
-        models, motion=_motion(args, steps, noise), particles=particles if args.particles is None else args.particles,
-        seed=args.seed, temperature=args.temperature, recovery=args.recovery, beam_skip=args.beam_skip,
-    )  # fmt: skip
-
-
-def _motion(args: argparse.Namespace, steps: list[Step], noise: dict[str, Any]) -> MotionModel:
-    """Return the motion model of the options, and of the file of parameters where an option is not given.
-
-    Raises:
-        ValueError: there are no logged poses to learn from, or a number breaks its rule.
-    """
-    from gpusense.evaluation.steps import references_to_learn_from
-    from gpusense.localization.motion import OdometryMotion
-    from gpusense.localization.motion_fit import fit_odometry_motion
-
-    if args.fit_motion:
-        for name in ("motion_noise", "sideways", "reverse"):
-            if getattr(args, name) is not None:
-                option = "--" + name.replace("_", "-")
-                raise ValueError(f"--fit-motion: must be given without {option}, which it learns, got both")
-        fit = fit_odometry_motion(*references_to_learn_from(steps))
-        if fit.undetermined:
-            names = ", ".join(fit.undetermined)
-            print(f"gpusense: --fit-motion: the log does not determine {names}: at most the default", file=sys.stderr)
-        return fit.motion
-    given = dict(alpha=args.motion_noise, sideways=args.sideways, reverse=args.reverse)
-    return OdometryMotion(**noise | {name: value for name, value in given.items() if value is not None})
+    return Recording(pf.grid)
 
 
 def _text(track: Track, step: Step) -> str:

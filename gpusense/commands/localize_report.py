@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import itertools
 import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gpusense.commands.output import print_json
+from gpusense.commands.scans import scan_times
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def report(
 
     result = summary(track)
     if args.tum is not None:
-        times, indices = _times_of(track)
+        times, indices = scan_times([step.scan.time for step in track.steps])
         write_tum(args.tum, times, track.poses, indices=indices)
     if args.plot is not None:
         _draw(args.plot, pf, track)
@@ -59,16 +59,6 @@ def report(
         if path is not None:
             print(f"written: {path}")
     return result
-
-
-def _times_of(track: Track) -> tuple[list[float], bool]:
-    """Return the times of the scans [s]; where they do not increase, as readers of files demand, indices and True."""
-    times = [step.scan.time for step in track.steps]
-    if all(one < two for one, two in itertools.pairwise(times)):
-        return times, False
-    rule = "the times of the log do not increase: the trajectory has the indices of the scans in their place"
-    print(f"gpusense: --tum: {rule}", file=sys.stderr)
-    return [float(i) for i in range(len(times))], True
 
 
 def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track) -> None:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import (
@@ -17,8 +16,9 @@ from gpusense.commands.arguments import (
     whole_number,
 )
 from gpusense.commands.output import print_json
-from gpusense.commands.scans import add_poses, read_scans
+from gpusense.commands.scans import add_log, add_reference, read_scans
 from gpusense.evaluation.machine import machine
+from gpusense.world.map_greys import MODES
 
 if TYPE_CHECKING:
     from gpusense.mapping.build import MapBuilder
@@ -32,7 +32,12 @@ _SCANS = 64
 
 _EPILOG = """\
 Each ray makes the cells that it crosses more likely free, and the cell where it ends more likely occupied. Cells
-without a ray stay unknown. The map is written as map_server's YAML file with an image beside it.
+without a ray stay unknown. The map is written as map_server's YAML file with an image beside it, white where it is
+free, black where occupied, grey where unknown: an image editor removes people and closes gaps.
+
+Scans need the poses of the robot. Some CARMEN logs have them; for bags and raw logs --reference gives a TUM trajectory:
+that of a SLAM program; that of 'gpusense localize --tum' in an older map; or that of 'gpusense match --tum', which
+chains matches from scan to scan, and drifts over long drives.
 
 Ctrl-C ends the run; the map of the scans so far is written. A map of more than four million cells is built in bands
 of rows: then it is the map of the bands so far, and of the last one's scans.
@@ -41,16 +46,21 @@ Exit codes: 0 success, 2 bad input, 130 interrupted.
 
 example:
   gpusense map --log run.log.gz --out map.yaml
-  gpusense map --log run.log.gz --every 2 --range-limit 20 --resolution 0.1 --out even.yaml"""
+  gpusense map --log run.log.gz --every 2 --range-limit 20 --resolution 0.1 --out even.yaml
+  gpusense match --log run.bag --tum run.tum
+  gpusense map --log run.bag --reference run.tum --out map.yaml"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     parser.epilog = _EPILOG
     add = parser.add_argument
-    add("--log", required=True, type=Path, metavar="FILE", help="a log with corrected poses; any with --reference")
-    add_poses(parser)
+    add_log(parser, "a log with corrected poses, or any with --reference")
+    add_reference(parser)
     add("--out", required=True, type=output_path(".yaml"), metavar="YAML", help="the map; its image lies beside it")
+    add("--mode", choices=MODES, default="trinary",
+        help="trinary: white, black and grey; scale: shades, a PNG; raw: per cent as greys, almost black "
+        "(default: %(default)s)")  # fmt: skip
     add("--resolution", type=positive_number, default=0.05, metavar="M", help="side of a cell [m] (default: 0.05)")
     add("--range-limit", type=positive_number, metavar="M",
         help="longer ranges clear cells up to it and mark no obstacle [m] (default: none)")  # fmt: skip
@@ -79,19 +89,23 @@ def run(args: argparse.Namespace) -> int:
     )  # fmt: skip
     done = _build(builder)
     grid = builder.grid()
-    write_map(grid, args.out)
+    transparent = args.mode == "scale" and bool(grid.unknown.any())
+    form: Literal["pgm", "png"] = "png" if transparent else "pgm"
+    write_map(grid, args.out, mode=args.mode, image_format=form)
+    image = args.out.with_suffix(f".{form}")
     counted = round(done * len(scans))
     rows, cols = grid.shape
     free, occupied = int(grid.free.sum()), int(grid.occupied.sum())
     if args.json:
         print_json({
-            "map": str(args.out), "scans": counted, "scans_chosen": len(scans), "rays": builder.rays, "rows": rows,
-            "cols": cols, "resolution": grid.resolution, "origin": grid.origin, "free": free, "occupied": occupied,
+            "map": str(args.out), "image": str(image), "mode": args.mode, "scans": counted,
+            "scans_chosen": len(scans), "rays": builder.rays, "rows": rows, "cols": cols,
+            "resolution": grid.resolution, "origin": grid.origin, "free": free, "occupied": occupied,
             "machine": machine(),
         })  # fmt: skip
     else:
         print(f"{args.out}: {rows} x {cols} cells of {grid.resolution} m, {occupied} occupied, {free} free; "
-              f"{builder.rays} rays of {counted} scans")  # fmt: skip
+              f"{builder.rays} rays of {counted} scans\nimage: {image}")  # fmt: skip
     if done < 1:
         held = f"{counted} of {len(scans)} scans"
         if builder.bands > 1:

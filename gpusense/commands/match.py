@@ -21,6 +21,7 @@ from gpusense.commands.arguments import (
     whole_number,
 )
 from gpusense.commands.output import print_json
+from gpusense.commands.scans import add_log, add_reference, read_scans, scan_times
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
@@ -41,6 +42,7 @@ Exit codes: 0 success, 2 bad input, 130 interrupted.
 example:
   gpusense match --log run.log.gz --limit 300
   gpusense match --log run.log.gz --guess identity --plot worst.png
+  gpusense match --log run.bag --topic /scan --noise 0.03 --tum run.tum
   gpusense match --log run.log.gz --map map.yaml --shift 0.5 --turn 10 --out poses.csv"""
 
 
@@ -48,7 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     parser.epilog = _EPILOG
     add = parser.add_argument
-    add("--log", required=True, type=Path, metavar="FILE", help="a log (CARMEN), plain or .gz")
+    add_log(parser, "a log with scans")
+    add_reference(parser)
     add("--map", type=Path, metavar="YAML", help="a map_server map to which all scans are matched")
     add("--guess", choices=("odometry", "logged", "identity"),
         help="the guess of each match (default: odometry, with --map logged)")  # fmt: skip
@@ -58,6 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="change headings of guesses by up to this [degrees] (default: 0)")  # fmt: skip
     add("--method", choices=("auto", "icp", "gauss_newton", "correlative"), default="auto",
         help="method of match_scan (default: %(default)s)")  # fmt: skip
+    add("--noise", type=positive_number, metavar="M",
+        help="standard deviation of ranges [m] (default: that of match_scan)")  # fmt: skip
     add("--every", type=whole_number(low=1), default=1, metavar="E", help="every E-th scan (default: 1)")
     add("--offset", type=whole_number(low=0), default=0, metavar="O", help="index of the first scan (default: 0)")
     add("--limit", type=whole_number(low=1), metavar="S", help="largest number of scans (default: all)")
@@ -67,6 +72,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_seed(parser)
     add_json(parser)
     add("--out", type=output_path(".csv"), metavar="CSV", help="write poses, deviations and statuses")
+    add("--tum", type=output_path(".tum", ".txt"), metavar="FILE",
+        help="write the trajectory: matches chained from the first scan on, or poses in the map; a match that failed "
+        "is replaced by its guess")  # fmt: skip
     add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
         help="draw the match with the largest correction, before and after")  # fmt: skip
 
@@ -77,13 +85,13 @@ def run(args: argparse.Namespace) -> int:
     from gpusense.world.map_files import read_map
 
     grid = None if args.map is None else read_map(args.map)
-    scans = _scans(args)
+    scans = read_scans(args, posed=False)
     parts: list[LogMatches] = []
     begun = time.perf_counter()
     try:
         calls = match_log(
             scans, grid, guess=args.guess or ("odometry" if grid is None else "logged"), method=args.method,
-            backend=args.backend, spread=(args.shift, math.radians(args.turn)), seed=args.seed,
+            backend=args.backend, spread=(args.shift, math.radians(args.turn)), seed=args.seed, noise=args.noise,
         )  # fmt: skip
         with progress(len(scans)) as step:
             for part in calls:
@@ -96,27 +104,6 @@ def run(args: argparse.Namespace) -> int:
         raise
     _report(args, grid, scans, parts, time.perf_counter() - begun)
     return 0
-
-
-def _scans(args: argparse.Namespace) -> list[tuple[int, Scan]]:
-    """Read the chosen scans, all of one scanner.
-
-    Raises:
-        ValueError: none is chosen, or they are of several scanners.
-    """
-    import itertools
-
-    from gpusense.logs import Scan, read_log
-
-    last = None if args.limit is None else args.offset + args.every * args.limit
-    records = (record for record in read_log(args.log, range_max=args.range_max) if isinstance(record, Scan))
-    chosen = list(itertools.islice(enumerate(records), args.offset, last, args.every))
-    if not chosen:
-        raise ValueError(f"log: must have a scan of index {args.offset}, got fewer in {args.log}")
-    for index, scan in chosen:
-        if scan.scanner != chosen[0][1].scanner:
-            raise ValueError(f"log: every scan must come from the same scanner, got another at scan {index}")
-    return chosen
 
 
 def _report(
@@ -133,6 +120,8 @@ def _report(
     total = summary(matches) | {"milliseconds_each": 1e3 * seconds / len(matches.match)}
     if args.out is not None:
         _write(args.out, matches)
+    if args.tum is not None:
+        _write_tum(args.tum, scans, matches)
     if args.plot is not None:
         _draw(args.plot, grid, dict(scans), matches)
     if args.json:
@@ -142,7 +131,7 @@ def _report(
     expected = len(scans) - (grid is None)
     if len(matches.match) < expected:
         print(f"interrupted: results of {len(matches.match)} of {expected} matches")
-    for path, word in ((args.out, "written"), (args.plot, "drawn")):
+    for path, word in ((args.out, "written"), (args.tum, "written"), (args.plot, "drawn")):
         if path is not None:
             print(f"{word}: {path}")
     print(f"\n{machine_line()}")
@@ -188,6 +177,17 @@ def _write(path: Path, matches: LogMatches) -> None:
         lines.append(f"{first},{second},{numbers},{status}")
     text = "\n".join(lines) + "\n"
     write_whole(path, lambda file: file.write(text.encode()))
+
+
+def _write_tum(path: Path, scans: list[tuple[int, Scan]], matches: LogMatches) -> None:
+    """Write the trajectory of the matched scans, from the first one's logged pose or odometry on."""
+    from gpusense.evaluation.matching import trajectory
+    from gpusense.evaluation.trajectory_files import write_tum
+
+    first = scans[0][1]
+    poses = trajectory(matches, np.array(first.odometry if first.pose is None else first.pose))
+    times, indices = scan_times([scan.time for _, scan in scans[: len(poses)]])
+    write_tum(path, times, poses, indices=indices)
 
 
 def _draw(path: Path, grid: OccupancyGrid | None, scans: dict[int, Scan], matches: LogMatches) -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gpusense.commands.fit import Result
-    from gpusense.world.parameters import BeamParameters
+    from gpusense.localization.nav2 import Nav2Options
+    from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 
 
 def read_beam_parameters(path: Path) -> BeamParameters:
@@ -24,28 +25,56 @@ def read_beam_parameters(path: Path) -> BeamParameters:
     return _made(path, "beam_model", values, BeamParameters.from_dict)
 
 
-def read_localization(path: Path) -> tuple[BeamParameters | None, dict[str, Any]]:
-    """Read the mappings ``beam_model`` and ``odometry_motion`` of a YAML file.
+@dataclass(frozen=True)
+class Localization:
+    """Parameters of a file for a localisation.
 
-    Returns:
-        The parameters of the beam model, or None; arguments of :class:`OdometryMotion`, none without the mapping.
+    Attributes:
+        sensor: Parameters of the beam model or the likelihood field; None where the file has none.
+        noise: Arguments of :class:`OdometryMotion`; none where the file has none.
+        nav2: The options of nav2_amcl's node, where the file is one of nav2.
+    """
+
+    sensor: BeamParameters | LikelihoodFieldParameters | None
+    noise: dict[str, Any]
+    nav2: Nav2Options | None = None
+
+
+def read_localization(path: Path, node: str | None = None) -> Localization:
+    """Read the mappings ``beam_model`` and ``odometry_motion`` of a YAML file, or the parameters of nav2_amcl's node.
+
+    Args:
+        path: The file.
+        node: Name of the node in a file of nav2; None for the only amcl.
 
     Raises:
         FileNotFoundError: the file is missing.
-        ValueError: the file has neither, or a parameter breaks its rule.
+        ValueError: the file has none of these, or a parameter breaks its rule.
     """
     from gpusense._util import checks
     from gpusense.localization.motion import OdometryMotion
+    from gpusense.localization.nav2 import from_nav2, has_parameters
 
     content = _content(path)
-    if not content.keys() & {"beam_model", "odometry_motion"}:
-        raise ValueError(f"{path}: must hold a mapping beam_model or odometry_motion, got {checks.show(list(content))}")
+    own = content.keys() & {"beam_model", "odometry_motion"}
+    if has_parameters(content) and not own:
+        try:
+            options = from_nav2(path, node=node)
+        except (TypeError, ValueError) as error:
+            text = str(error)
+            raise ValueError(text if text.startswith((str(path), "node: ")) else f"{path}: {text}") from None
+        return Localization(options.parameters, {}, options)
+    if node is not None:
+        raise ValueError(f"--node: must come with a file of nav2's parameters, got {path}")
+    if not own:
+        rule = "must hold a mapping beam_model or odometry_motion, or amcl's ros__parameters"
+        raise ValueError(f"{path}: {rule}, got {checks.show(list(content))}")
     beam = read_beam_parameters(path) if "beam_model" in content else None
     if "odometry_motion" not in content:
-        return beam, {}
+        return Localization(beam, {})
     values = content["odometry_motion"]
     _made(path, "odometry_motion", values, OdometryMotion.from_dict)
-    return beam, values
+    return Localization(beam, values)
 
 
 def _content(path: Path) -> dict[Any, Any]:

@@ -1,41 +1,93 @@
-"""The scans of a log that a command takes, with their poses: its own, or those of a trajectory."""
+"""The scans of a log that a command takes: their laser, and their poses, its own or those of a trajectory."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import itertools
+import re
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gpusense.commands.arguments import finite_number
+
 if TYPE_CHECKING:
     from gpusense.logs import Scan
 
+FORMATS = "CARMEN or Wean Hall, plain or .gz; a bag of ROS 1 (.bag) or of ROS 2 (folder, .db3, .mcap)"
+# Arguments of the library, and the options that set them.
+_OPTIONS = {"topic": "topic", "sensors": "topic", "mount": "mount", "node": "node"}
 
-def add_poses(parser: argparse.ArgumentParser) -> None:
-    """Add ``--reference``, the poses of the scans, and ``--topic``, their laser."""
+
+def add_log(parser: argparse.ArgumentParser, what: str, *, required: bool = True, several: bool = False) -> None:
+    """Add ``--log``, and its laser: ``--topic`` and ``--mount``.
+
+    Args:
+        parser: The parser of a command.
+        what: The log and its contents in words, with an article.
+        required: Whether it must be given.
+        several: Whether the command takes several lasers.
+    """
+    add = parser.add_argument
+    add("--log", required=required, type=Path, metavar="FILE", help=f"{what}: {FORMATS}")
+    names = "topic of a bag (default: /scan, or the only one); front or rear of a CARMEN log (default: front)"
+    if several:
+        add("--topic", "--sensors", dest="topic", nargs="+", default=[], metavar="NAME",
+            help=f"lasers that correct the filter, one or more: {names}")  # fmt: skip
+    else:
+        add("--topic", metavar="NAME", help=f"laser: {names}")
+    add("--mount", type=finite_number, nargs=3, metavar=("X", "Y", "THETA"),
+        help="pose of a bag's laser on the robot [m, m, rad] (default: by the bag's fixed transforms)")  # fmt: skip
+
+
+def add_reference(parser: argparse.ArgumentParser) -> None:
+    """Add ``--reference``, the poses of the scans."""
     parser.add_argument(
         "--reference", type=Path, metavar="FILE",
         help="a TUM trajectory with the poses of the robot at the times of the scans; scans without one are left out "
         "(default: the logged poses)",
     )  # fmt: skip
-    parser.add_argument("--topic", metavar="NAME", help="topic of the scans in a bag (default: /scan, or the only one)")
 
 
-def read_scans(args: argparse.Namespace) -> list[tuple[int, Scan]]:
+@contextlib.contextmanager
+def options_named() -> Iterator[None]:
+    """Name the options of the command line in errors about arguments of the library.
+
+    Raises:
+        ValueError: what a call within raises, with the option's name.
+    """
+    try:
+        yield
+    except ValueError as error:
+        found = re.match(r"(\w+): ", str(error))
+        if found is None or found[1] not in _OPTIONS:
+            raise
+        raise ValueError(f"--{_OPTIONS[found[1]]}: {str(error)[found.end() :]}") from None
+
+
+def read_scans(args: argparse.Namespace, *, posed: bool = True) -> list[tuple[int, Scan]]:
     """Read the chosen scans of ``--log`` with their indices and poses.
+
+    Args:
+        args: Arguments of a command with the options of :func:`add_log` and :func:`add_reference`.
+        posed: Whether each scan must have a pose.
 
     Raises:
         ValueError: a file breaks its format, no scan is chosen, or a chosen scan has no pose or another scanner.
         FileNotFoundError: a file is missing.
     """
-    from gpusense.evaluation.scoring import chosen_scans, with_poses
+    from gpusense.evaluation.scoring import chosen_scans, with_one_scanner, with_poses
     from gpusense.evaluation.trajectory_files import poses_at, read_tum
 
     trajectory = None if args.reference is None else read_tum(args.reference)
-    scans = chosen_scans(
-        args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit, topic=args.topic
-    )
+    with options_named():
+        scans = chosen_scans(
+            args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit,
+            topic=args.topic, mount=args.mount,
+        )  # fmt: skip
     if trajectory is not None:
         chosen, poses = len(scans), poses_at([scan.time for _, scan in scans], *trajectory)
         scans = [
@@ -43,4 +95,13 @@ def read_scans(args: argparse.Namespace) -> list[tuple[int, Scan]]:
         ]
         if len(scans) < chosen:
             sys.stderr.write(f"gpusense: --reference: has poses of {len(scans)} of {chosen} chosen scans\n")
-    return with_poses(scans, args.log)
+    return (with_poses if posed else with_one_scanner)(scans, args.log)
+
+
+def scan_times(times: list[float]) -> tuple[list[float], bool]:
+    """Return the times of scans for a trajectory; where they do not increase, as readers demand, indices and True."""
+    if all(one < two for one, two in itertools.pairwise(times)):
+        return times, False
+    rule = "the times of the log do not increase: the trajectory has the indices of the scans in their place"
+    sys.stderr.write(f"gpusense: --tum: {rule}\n")
+    return [float(i) for i in range(len(times))], True

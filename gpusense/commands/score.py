@@ -21,7 +21,7 @@ from gpusense.commands.arguments import (
     whole_number,
 )
 from gpusense.commands.output import TableStream
-from gpusense.commands.scans import add_poses, read_scans
+from gpusense.commands.scans import add_log, add_reference, read_scans
 from gpusense.commands.score_report import number_text, pose_name, print_report
 
 if TYPE_CHECKING:
@@ -78,8 +78,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     add = parser.add_argument
     add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
-    add("--log", required=True, type=Path, metavar="FILE", help="a log with corrected poses; any with --reference")
-    add_poses(parser)
+    add_log(parser, "a log with corrected poses, or any with --reference")
+    add_reference(parser)
     add("--model", choices=("beam", "field"), default="beam", help="measurement model (default: %(default)s)")
     add("--backend", action="append", metavar="DEVICE",
         help=f"{BACKEND_HELP}; may be repeated to compare rankings (default: auto)")  # fmt: skip

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpusense.backends import Selection
+from gpusense.localization.pose_algebra import compose_poses
 from gpusense.logs import Scan
 from gpusense.matching.match import Method, match_scan
 from gpusense.matching.result import ScanMatch
@@ -73,6 +75,7 @@ def match_log(
     backend: Selection,
     spread: tuple[float, float],
     seed: int,
+    noise: float | None = None,
 ) -> Iterator[LogMatches]:
     """Match each scan of a log to the one before, or all scans to a map; yield the matches of each call.
 
@@ -84,6 +87,7 @@ def match_log(
         backend: The device.
         spread: Largest change of a guess in x and in y [m] and in heading [rad], uniformly at random.
         seed: Seed of these changes.
+        noise: Standard deviation of ranges [m]; None for the default of ``match_scan``.
 
     Raises:
         ValueError: the guesses need poses that the log lacks, or there is no pair.
@@ -109,14 +113,36 @@ def match_log(
         logged = start = poses
         indices, second = np.stack([np.full(len(numbers), -1), numbers], axis=1), ranges
     if np.isnan(start).any():
-        raise ValueError(f"guess: {guess!r} needs a pose of every scan, got a scan without one")
+        raise ValueError(
+            f"guess: {guess!r} needs a pose of every scan, of its own or by --reference, got a scan without one"
+        )
+    options: dict[str, Any] = {} if noise is None else {"noise": noise}
     rng = np.random.default_rng(seed)
     start = start + rng.uniform(-1, 1, start.shape) * (spread[0], spread[0], spread[1])
     for begin in range(0, len(second), _BATCH):
         part = slice(begin, begin + _BATCH)
         reference = ranges[:-1][part] if grid is None else grid
-        match = match_scan(reference, second[part], scanner, start[part], method, backend)
+        match = match_scan(reference, second[part], scanner, start[part], method, backend, **options)
         yield LogMatches(indices[part], start[part], match, logged[part])
+
+
+def trajectory(matches: LogMatches, first: Floats) -> Floats:
+    """Return (S + 1, 3) poses of scans that were matched one to the next, or (S, 3) of those matched to a map.
+
+    A match that did not converge is replaced by its guess.
+
+    Args:
+        matches: Matches of a log.
+        first: (3,) pose of the first scan, which matches to a map have themselves [m, m, rad].
+    """
+    usable = matches.match.converged[:, None]
+    steps = np.where(usable, matches.match.pose, matches.guess)
+    if matches.indices[0, 0] < 0:
+        return steps
+    poses = [np.asarray(first, np.float64)]
+    for step in steps:
+        poses.append(compose_poses(poses[-1], step))
+    return np.array(poses)
 
 
 def joined(parts: list[LogMatches]) -> LogMatches:

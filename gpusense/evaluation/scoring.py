@@ -16,14 +16,15 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
 from gpusense.backends import BackendInfo
 from gpusense.evaluation.agreement import Agreement, Comparison, Model
 from gpusense.evaluation.worlds import cloud_around, cloud_uniform
 from gpusense.localization.weights import normalize_weights
-from gpusense.logs import Pose, Scan, read_log
+from gpusense.logs import Pose, Scan
+from gpusense.logs.several import read_laser
 from gpusense.models.scan.rules import choose_beams
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Reading, classify
@@ -184,6 +185,7 @@ def chosen_scans(
     offset: int = 0,
     limit: int | None = None,
     topic: str | None = None,
+    mount: ArrayLike | None = None,
 ) -> list[tuple[int, Scan]]:
     """Read scans of a log with their indices: ``offset``, ``offset + every``, ..., ``limit`` of them at most.
 
@@ -193,14 +195,15 @@ def chosen_scans(
         every: Stride of the scans.
         offset: Index of the first scan.
         limit: Largest number of scans; None for all.
-        topic: Topic of the scans in a bag; None for its only laser.
+        topic: The laser, see :func:`gpusense.logs.several.read_laser`; None for the only or main one.
+        mount: Pose of a bag's laser on the robot [m, m, rad]; None for that of the bag's transforms.
 
     Raises:
         ValueError: the log breaks its format, or no scan is chosen.
         FileNotFoundError: the log is missing.
     """
     last = None if limit is None else offset + every * limit
-    scans = read_log(path, range_max=range_max, topic=topic)
+    scans = read_laser(path, topic, range_max=range_max, mount=mount)
     chosen = list(itertools.islice(enumerate(scans), offset, last, every))
     if not chosen:
         raise ValueError(f"log: must have a scan of index {offset}, which is the first one chosen, got fewer in {path}")
@@ -216,7 +219,20 @@ def with_poses(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> l
     for index, scan in scans:
         if scan.pose is None:
             rule = "every scan must have a pose, of its own or by --reference"
-            raise ValueError(f"log: {rule}, got none at scan {index} of {path}")
+            raise ValueError(
+                f"log: {rule}, got none at scan {index} of {path}; trajectories for --reference: of a SLAM program, of "
+                "'gpusense localize --tum' in a map, of 'gpusense match --tum' without one"
+            )
+    return with_one_scanner(scans, path)
+
+
+def with_one_scanner(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> list[tuple[int, Scan]]:
+    """Return numbered scans of a log, which must have one scanner.
+
+    Raises:
+        ValueError: a scan has another one.
+    """
+    for index, scan in scans:
         if scan.scanner != scans[0][1].scanner:
             raise ValueError(f"log: every scan must come from the same scanner, got another at scan {index} of {path}")
     return scans

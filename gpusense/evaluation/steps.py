@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gpusense.evaluation.trajectory_files import poses_at
 from gpusense.localization.pose_algebra import compose_poses, pose_difference, wrap_angle
@@ -48,6 +48,7 @@ def read_steps(
     offset: int = 0,
     limit: int | None = None,
     sensors: Sequence[str] = (),
+    mount: ArrayLike | None = None,
 ) -> list[Step]:
     """Read scans of a log with raw odometry.
 
@@ -61,6 +62,7 @@ def read_steps(
         offset: Index of the first scan of each laser.
         limit: Largest number of scans; None for all. Nothing is read after the last one.
         sensors: Its lasers: topics of a bag, front or rear of a CARMEN log; none for its only or main laser.
+        mount: Pose of a bag's only laser on the robot [m, m, rad]; None for those of the bag's transforms.
 
     Raises:
         ValueError: the log breaks its format, has no scan of these, or a laser changes its geometry.
@@ -70,7 +72,7 @@ def read_steps(
     steps: list[Step] = []
     counts = [0] * max(len(sensors), 1)
     scanners: dict[int, Scanner] = {}
-    for sensor, record in read_lasers(path, sensors, range_max=range_max):
+    for sensor, record in read_lasers(path, sensors, range_max=range_max, mount=mount):
         if isinstance(record, Odometry):
             between = record.pose
             continue

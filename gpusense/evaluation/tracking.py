@@ -73,8 +73,22 @@ class Track:
         return None if difference is None else (np.hypot(*difference[:, :2].T), np.abs(difference[:, 2]))
 
 
-def start(pf: ParticleFilter, steps: Sequence[Step], *, everywhere: bool, pose: Sequence[float] | None = None) -> None:
+def start(
+    pf: ParticleFilter,
+    steps: Sequence[Step],
+    *,
+    everywhere: bool,
+    pose: Sequence[float] | None = None,
+    covariance: Floats | None = None,
+) -> None:
     """Initialise a filter: everywhere, or around a pose, by default the first reference pose.
+
+    Args:
+        pf: The filter.
+        steps: Its scans.
+        everywhere: Whether it begins anywhere on the map.
+        pose: The pose; None for the first reference pose.
+        covariance: (3, 3) covariance of the start; None for the usual one.
 
     Raises:
         ValueError: the first scan has no reference pose, and the start is not everywhere.
@@ -86,7 +100,7 @@ def start(pf: ParticleFilter, steps: Sequence[Step], *, everywhere: bool, pose: 
         rule = "must have a pose at the first chosen scan, unless --start gives one or --global begins anywhere"
         raise ValueError(f"log: {rule}, got none at scan {steps[0].index}")
     else:
-        pf.initialize(mean=first, covariance=np.diag(np.square(START)))
+        pf.initialize(mean=first, covariance=np.diag(np.square(START)) if covariance is None else covariance)
 
 
 def follow(pf: ParticleFilter, steps: Iterable[Step], track: Track) -> Iterable[Step]:

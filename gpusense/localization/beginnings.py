@@ -16,6 +16,7 @@ from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.motion import STILL, SampledMotion
 from gpusense.localization.results import Results
 from gpusense.localization.trust import Trust
+from gpusense.world.plausible import look_at_heading, look_at_start
 
 
 class Beginnings(Results):
@@ -41,8 +42,12 @@ class Beginnings(Results):
 
         Raises:
             TypeError, ValueError: an argument breaks its rule.
+
+        Warns:
+            PlausibilityWarning: the mean lies off the map, or its heading is more than a turn.
         """
         self._place(starts.normal(mean, covariance, self._number(particles), self._key()))
+        self._look_at_start(np.asarray(mean, np.float64))
         self._together = is_together(np.asarray(covariance))
 
     def initialize_uniform(self, *, bounds: AnyArray | None = None, particles: int | None = None) -> None:
@@ -87,6 +92,15 @@ class Beginnings(Results):
         """
         pool, spread = starts.likely_pool(likelihood, self._number(particles), self._key())
         self._place(starts.spread(pool, spread, self._number(particles), self._key(), each=True))
+
+    def _look_at_start(self, pose: np.ndarray) -> None:
+        """Warn of a start that cannot be meant."""
+        grids = [sensor.model.grid for sensor in self._sensors if hasattr(sensor.model, "grid")]
+        if grids:
+            (place,), (rows, cols) = grids[0].world_to_cells(pose[None, :2]), grids[0].shape
+            look_at_start(pose, bool(0 <= place[0] <= cols and 0 <= place[1] <= rows), grids[0].bounds())
+        else:
+            look_at_heading("start", float(pose[2]))
 
     def _number(self, particles: int | None) -> int:
         most = self.options.most

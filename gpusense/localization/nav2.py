@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 from gpusense._util import checks
 from gpusense._util.documents import read_mapping
+from gpusense.localization import nav2_start
 from gpusense.localization.motion import MotionModel, OdometryMotion, OmniMotion
-from gpusense.localization.nav2_nodes import parameters_of
+from gpusense.localization.nav2_nodes import nodes_of, parameters_of
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.world.compat import Amcl
@@ -96,6 +97,8 @@ class Nav2Options:
     """Time by which the transform is dated ahead [s]."""
     initial_pose: tuple[float, float, float] | None
     """The robot's first pose (x, y, yaw) [m, m, rad]; None where the file sets none."""
+    initial_covariance: nav2_start.Matrix | None
+    """(3, 3) covariance of the first pose, of Beluga's ``initial_pose.covariance_x`` and others; None without one."""
     ignored: tuple[str, ...]
     """Names of other parameters in the file, which have no effect here."""
 
@@ -149,7 +152,8 @@ class Nav2Options:
 def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str | None = None) -> Nav2Options:
     """Read the parameters of nav2_amcl's node from a YAML file or a mapping, without ROS.
 
-    A missing parameter has the node's default. The file is read as plain data; nothing in it is executed. The book's
+    A missing parameter has the node's default. A dotted name (``initial_pose.x``) and a mapping (``initial_pose: {x:
+    ...}``) are the same. The file is read as plain data; nothing in it is executed. The book's
     parameters have the same weights in proportion. A file of ``gpusense fit`` has the fitted parameters, with offset
     and growth, in ``beam_model``: these are then ``parameters``; and its ``odometry_motion`` is ``odometry``.
 
@@ -176,7 +180,7 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str |
     else:
         file = checks.existing_file(checks.path("source", source))
         content, name = read_mapping(file), str(file)
-    found = parameters_of(content, name, node, _DEFAULTS)
+    found = parameters_of(content, name, node, (*_DEFAULTS, *nav2_start.NAMES))
     robot = _ROBOTS[
         checks.choice("robot_model_type", found.get("robot_model_type", _DEFAULTS["robot_model_type"]), tuple(_ROBOTS))
     ]
@@ -215,9 +219,15 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str |
         topics=(values["map_topic"], values["scan_topic"]),
         tf_broadcast=values["tf_broadcast"],
         transform_tolerance=values["transform_tolerance"],
-        initial_pose=_initial_pose(name, found) if values["set_initial_pose"] else None,
-        ignored=tuple(sorted(str(key) for key in found if key not in _DEFAULTS and key != "initial_pose")),
+        initial_pose=nav2_start.pose(name, found) if values["set_initial_pose"] else None,
+        initial_covariance=nav2_start.covariance(name, found) if values["set_initial_pose"] else None,
+        ignored=tuple(sorted(key for key in found if key not in _DEFAULTS and key not in nav2_start.NAMES)),
     )
+
+
+def has_parameters(content: Mapping[Any, Any]) -> bool:
+    """Return whether the content of a file has parameters of a node of ROS, or those of amcl themselves."""
+    return any(key in content for key in _DEFAULTS) or any(True for _ in nodes_of(content))
 
 
 def _value(name: str, key: str, value: object, default: object) -> Any:
@@ -284,11 +294,3 @@ def _normalized(weights: BeamWeights | FieldWeights) -> BeamParameters | Likelih
     return BeamParameters.from_dict(values) if isinstance(weights, BeamWeights) else (
         LikelihoodFieldParameters.from_dict(values)
     )  # fmt: skip
-
-
-def _initial_pose(name: str, found: Mapping[str, Any]) -> tuple[float, float, float]:
-    pose = found.get("initial_pose", {})
-    if not isinstance(pose, Mapping):
-        raise TypeError(f"{name}: initial_pose: must be a mapping, got {checks.show(pose)}")
-    x, y, yaw = (checks.real(f"{name}: initial_pose.{key}", pose.get(key, 0.0)) for key in ("x", "y", "yaw"))
-    return x, y, yaw

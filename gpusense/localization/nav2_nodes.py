@@ -13,7 +13,10 @@ FITTED = ("beam_model", "incidence_model", "odometry_motion")
 
 
 def parameters_of(content: Mapping[str, Any], name: str, node: str | None, known: Collection[str]) -> dict[str, Any]:
-    """Return the parameters of a node, with those of ``/**`` that it lacks, as in ROS.
+    """Return the parameters of a node by dotted names, with those of ``/**`` that it lacks, as in ROS.
+
+    A mapping within the parameters has the parameters of a dotted name: ``initial_pose: {x: 1}`` is
+    ``initial_pose.x: 1``.
 
     Args:
         content: The content of a file, or the mapping of the parameters themselves.
@@ -23,16 +26,16 @@ def parameters_of(content: Mapping[str, Any], name: str, node: str | None, known
 
     Raises:
         TypeError: ``node`` is no string.
-        ValueError: There is no such node, or more than one.
+        ValueError: There is no such node, or more than one; or a parameter has two values.
     """
     if node is not None and not isinstance(node, str):
         raise TypeError(f"node: must be a string or None, got {checks.show(node)}")
     if any(key in content for key in known):
         if node is not None:
             raise ValueError(f"node: must be None where source has the parameters themselves, got {checks.show(node)}")
-        return dict(content)
-    found = list(_nodes(content, ""))
-    anywhere = {key: value for path, own in found if path == "/**" for key, value in own.items()}
+        return _dotted(content, name)
+    found = list(nodes_of(content))
+    anywhere = {key: value for path, own in found if path == "/**" for key, value in _dotted(own, name).items()}
     own_nodes = [(path, own) for path, own in found if path != "/**"]
     wanted = "amcl" if node is None else node.strip("/")
     chosen = [(path, own) for path, own in own_nodes if f"/{path}".endswith(f"/{wanted}")]
@@ -42,7 +45,7 @@ def parameters_of(content: Mapping[str, Any], name: str, node: str | None, known
         paths = sorted(path for path, _ in chosen)
         raise ValueError(f"node: must name one of {checks.show(paths)} in {name}, got {checks.show(node)}")
     if chosen:
-        return {key: value for key, value in anywhere.items() if key in known} | dict(chosen[0][1])
+        return {key: value for key, value in anywhere.items() if key in known} | _dotted(chosen[0][1], name)
     if node is not None:
         paths = sorted(path for path, _ in own_nodes)
         raise ValueError(f"node: must be a node of {name}, one of {checks.show(paths)}, got {checks.show(node)}")
@@ -55,7 +58,24 @@ def parameters_of(content: Mapping[str, Any], name: str, node: str | None, known
     raise ValueError(f"{name}: must hold amcl's {_OWN}, got the keys {checks.show(sorted(map(str, content)))}")
 
 
-def _nodes(content: Mapping[str, Any], path: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
+def _dotted(values: Mapping[Any, Any], name: str) -> dict[str, Any]:
+    """Return parameters by dotted names.
+
+    Raises:
+        ValueError: A parameter has two values, one by its dotted name and one in a mapping.
+    """
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        inner = isinstance(value, Mapping) and str(key) not in FITTED
+        parts = {f"{key}.{each}": one for each, one in _dotted(value, name).items()} if inner else {str(key): value}
+        for each, one in parts.items():
+            if each in flat and flat[each] != one:
+                raise ValueError(f"{name}: {each}: must have one value, got {checks.show(flat[each])} and {one!r}")
+            flat[each] = one
+    return flat
+
+
+def nodes_of(content: Mapping[Any, Any], path: str = "") -> Iterator[tuple[str, Mapping[str, Any]]]:
     """Yield full name and parameters of each node."""
     for key, value in content.items():
         if key in (_OWN, *FITTED) or not isinstance(value, Mapping):
@@ -63,4 +83,4 @@ def _nodes(content: Mapping[str, Any], path: str) -> Iterator[tuple[str, Mapping
         here = f"{path}/{str(key).strip('/')}"
         if isinstance(value.get(_OWN), Mapping):
             yield here, value[_OWN]
-        yield from _nodes(value, here)
+        yield from nodes_of(value, here)

@@ -11,13 +11,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from gpusense._util.extras import library
 from gpusense.logs.bag_bounds import check_metadata, install
 
 SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 # ROS 1's first version of transforms has the layout of the second.
 _SAME_LAYOUT = {"tf/msg/tfMessage": TRANSFORMS}
-_INSTALL = "reading ROS bags needs the library rosbags: pip install 'gpusense[ros]'"
 
 
 class Message(NamedTuple):
@@ -90,20 +90,16 @@ def errors_at(where: str) -> Iterator[None]:
 @contextmanager
 def _open(path: Path) -> Iterator[tuple[Any, Any]]:
     """Open a bag: the reader of rosbags, and the function that decodes a message of a type."""
-    try:
-        from rosbags.rosbag1 import Reader as Reader1
-        from rosbags.rosbag2 import Reader as Reader2
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-        install()
-    except ImportError as error:
-        raise ImportError(f"{path}: {_INSTALL} ({error})") from None
+    first = path.suffix.lower() == ".bag"
+    purpose = f"{path}: a ROS bag"
+    readers = library("rosbags.rosbag1" if first else "rosbags.rosbag2", purpose)
+    types = library("rosbags.typesys", purpose)
+    install()
     if path.is_dir():
         check_metadata(path)
-    first = path.suffix.lower() == ".bag"
-    store = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
+    store = types.get_typestore(types.Stores.ROS1_NOETIC if first else types.Stores.ROS2_HUMBLE)
     if TRANSFORMS not in store.types:
-        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
-    reader: Any = Reader1(path) if first else Reader2(path)
+        store.register(types.get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
+    reader = readers.Reader(path)
     with reader:
         yield reader, store.deserialize_ros1 if first else store.deserialize_cdr

@@ -90,9 +90,8 @@ def read_log(
     """Read a log, one record at a time and in the file's order.
 
     Formats are CARMEN and Wean Hall logs, plain or compressed by gzip, rosbags of ROS 1, and of ROS 2 with sqlite3 or
-    MCAP storage, as a folder or a single file. ROS is not needed, but the library rosbags is: ``pip install
-    'gpusense[ros]'``. The module of each format describes how messages become records, such as
-    :mod:`gpusense.logs.carmen` and :mod:`gpusense.logs.ros`.
+    MCAP storage, as a folder or a single file. ROS is not needed. The module of each format describes how messages
+    become records, such as :mod:`gpusense.logs.carmen` and :mod:`gpusense.logs.ros`.
 
     Args:
         path: The file, or the folder of a ROS 2 bag.
@@ -104,7 +103,8 @@ def read_log(
         rear: Whether to yield the scans of the rear laser of a CARMEN log instead of those of the front laser.
         topic: Topic of the scans in a ROS bag; None takes ``/scan``, or the only one.
         mount: Pose (x, y, theta) of a ROS bag's laser on the robot [m, m, rad]; None takes it from the bag's fixed
-            transforms. A warning says where these contradict a given mount; see also :func:`check_mount`.
+            transforms. A warning says where these contradict a given mount, or where there are none and (0, 0, 0) is
+            assumed; see also :func:`check_mount`.
 
     Returns:
         An iterator of :class:`Scan`, and of :class:`Odometry` if ``odometry``.
@@ -113,7 +113,7 @@ def read_log(
         FileNotFoundError: The file is missing; raised by the call, as are the next two.
         TypeError: An argument has the wrong type.
         ValueError: ``range_max`` is not finite and > 0, or the file has another format.
-        ImportError: While reading a ROS bag, the library rosbags is absent.
+        ImportError: While reading a ROS bag, the library rosbags cannot be imported.
         ValueError: While reading, a message breaks the format; the error names the file and the line, or the topic and
             the message's number.
 

@@ -15,7 +15,8 @@ All other messages are skipped without being decoded; the message definitions th
   headings along the shorter arc; before the first and after the last message it is the nearest one's. A log without
   odometry has (0, 0, 0). ``Scan.pose`` is None.
 * The robot's base is the child frame of odometry, else ``base_footprint`` or ``base_link``. Without a chain of
-  transforms the mount is (0, 0, 0). A laser that is mounted upside down has bearings that run clockwise.
+  transforms the mount is (0, 0, 0), and a warning says so. A laser that is mounted upside down has bearings that run
+  clockwise.
 * A last beam that points where the first one does is dropped. A reading of exactly 0 becomes NaN, as it means "none" to
   all drivers. Other readings are those of the message: infinities are "no return", NaN is missing (REP-117).
 * Some lasers change the number and bearings of their beams from scan to scan. All scans then share one scanner with
@@ -26,7 +27,6 @@ All other messages are skipped without being decoded; the message definitions th
 from __future__ import annotations
 
 import math
-import warnings
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -34,6 +34,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gpusense._util.notices import warn_user
 from gpusense.logs.bags import ODOMETRY, SCAN, TRANSFORMS, errors_at, messages, topics_of
 from gpusense.logs.records import Floats, Odometry, Pose, Scan
 from gpusense.logs.transforms import Transforms, matrix_of, planar_mount
@@ -188,6 +189,11 @@ def _mount(path: Path, bag: _Bag, given: Pose | None) -> tuple[Pose, bool]:
     bases = [bag.base] if bag.base else list(_BASES)
     found = [matrix for base in bases if (matrix := bag.transforms.between(base, bag.frame)) is not None]
     if not found:
+        if given is None:
+            warn_user(
+                f"{path}: has no fixed transforms from {' or '.join(bases)} to {bag.frame or 'the laser'}: the laser "
+                "is taken to be at the robot's centre, with mount (0, 0, 0); give its place as mount= or --mount"
+            )
         return given or (0.0, 0.0, 0.0), False
     with errors_at(f"{path}: transform to {bag.frame}"):
         place, upside_down = planar_mount(found[0])
@@ -197,9 +203,7 @@ def _mount(path: Path, bag: _Bag, given: Pose | None) -> tuple[Pose, bool]:
     turn = abs((given[2] - place[2] + math.pi) % (2 * math.pi) - math.pi)
     if apart > _APART[0] or turn > _APART[1]:
         shown = ", ".join(f"{value:.4g}" for value in place)
-        warnings.warn(
-            f"{path}: mount {given} contradicts the transforms of the log, by which it is ({shown})", stacklevel=4
-        )
+        warn_user(f"{path}: mount {given} contradicts the transforms of the log, by which it is ({shown})")
     return given, upside_down
 
 

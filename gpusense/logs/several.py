@@ -6,15 +6,46 @@ import heapq
 import os
 from collections.abc import Iterator, Sequence
 
+from numpy.typing import ArrayLike
+
 from gpusense._util import checks
-from gpusense.logs.reader import format_of, read_log
+from gpusense.logs.reader import Format, format_of, read_log
 from gpusense.logs.records import Odometry, Scan
 
 FRONT, REAR = "front", "rear"
 
 
+def read_laser(
+    path: str | os.PathLike[str],
+    topic: str | None = None,
+    *,
+    range_max: float | None = None,
+    mount: ArrayLike | None = None,
+) -> Iterator[Scan]:
+    """Read the scans of one laser of a log.
+
+    Args:
+        path: The log, as for :func:`gpusense.read_log`.
+        topic: Topic of the laser in a ROS bag; ``"front"`` or ``"rear"`` for a CARMEN log. None is the laser that
+            ``read_log`` takes.
+        range_max: Readings of at least this are "no return" [m]; None for the log's.
+        mount: Pose of a bag's laser on the robot [m, m, rad]; None for that of the bag's transforms.
+
+    Raises:
+        FileNotFoundError: The log is missing.
+        ValueError: A laser that the log does not have, or a broken log.
+    """
+    form = format_of(checks.path("path", path))
+    records = _records(form, path, topic, range_max=range_max, mount=mount, odometry=False)
+    return (record for record in records if isinstance(record, Scan))
+
+
 def read_lasers(
-    path: str | os.PathLike[str], sensors: Sequence[str] = (), *, range_max: float | None = None
+    path: str | os.PathLike[str],
+    sensors: Sequence[str] = (),
+    *,
+    range_max: float | None = None,
+    mount: ArrayLike | None = None,
 ) -> Iterator[tuple[int, Scan | Odometry]]:
     """Read scans and odometry.
 
@@ -23,29 +54,56 @@ def read_lasers(
         sensors: Topics of the lasers of a ROS bag, whose transforms have their mounts; ``"front"`` or ``"rear"`` for a
             CARMEN log, which states no mounts. None of them is the laser that ``read_log`` takes.
         range_max: Readings of at least this are "no return" [m]; None for the log's.
+        mount: Pose of a bag's only laser on the robot [m, m, rad]; None for those of the bag's transforms.
 
     Yields:
         The index of a laser in ``sensors``, and its scan; 0 and a reading of the odometry.
 
     Raises:
         FileNotFoundError: The log is missing.
-        ValueError: A laser that the log does not have, or a broken log.
+        ValueError: A laser that the log does not have, a mount for several lasers, or a broken log.
     """
     for index, name in enumerate(sensors):
         if name in sensors[:index]:
             raise ValueError(f"sensors: must differ, got {checks.show(name)} twice")
     form = format_of(checks.path("path", path))
-    if sensors and not form.topics:
-        if len(sensors) > 1 or sensors[0] not in (FRONT, REAR):
-            rule = f"must be only one of 'front' and 'rear' for {form.name}, which states no mounts"
-            raise ValueError(f"sensors: {rule}, got {', '.join(sensors)}")
-        return _of(0, read_log(path, range_max=range_max, odometry=True, rear=sensors[0] == REAR))
+    if len(sensors) > 1:
+        if not form.topics:
+            raise _wrong_laser(form, sensors)
+        if mount is not None:
+            raise ValueError(f"mount: must be None for {len(sensors)} lasers, whose transforms have them, got one")
     topics: Sequence[str | None] = sensors or (None,)
     each = [
-        _of(index, read_log(path, range_max=range_max, odometry=index == 0, topic=topic))
+        _of(index, _records(form, path, topic, range_max=range_max, mount=mount, odometry=index == 0))
         for index, topic in enumerate(topics)
     ]
     return each[0] if len(each) == 1 else heapq.merge(*each, key=lambda one: one[1].time)
+
+
+def _records(
+    form: Format,
+    path: str | os.PathLike[str],
+    name: str | None,
+    *,
+    range_max: float | None,
+    mount: ArrayLike | None,
+    odometry: bool,
+) -> Iterator[Scan | Odometry]:
+    """Read the records of one laser, which None leaves to ``read_log``.
+
+    Raises:
+        ValueError: The log's format has no such laser.
+    """
+    if form.topics:
+        return read_log(path, range_max=range_max, odometry=odometry, topic=name, mount=mount)
+    if name not in (None, FRONT, REAR):
+        raise _wrong_laser(form, [name])
+    return read_log(path, range_max=range_max, odometry=odometry, rear=name == REAR, mount=mount)
+
+
+def _wrong_laser(form: Format, names: Sequence[object]) -> ValueError:
+    rule = f"must be only one of 'front' and 'rear' for {form.name}, which states no mounts"
+    return ValueError(f"sensors: {rule}, got {', '.join(map(str, names))}")
 
 
 def _of(index: int, records: Iterator[Scan | Odometry]) -> Iterator[tuple[int, Scan | Odometry]]:

@@ -123,6 +123,7 @@ class MapBuilder:
             raise TypeError(f"scanner: must be a Scanner, got {checks.show(scanner)}")
         placed = checks.array("poses", poses, ("S", 3))
         readings = checks.array("scans", scans, (len(placed), scanner.count), finite=False)
+        scanner._first_scans.look_at("scans", readings)
         cell = check_resolution(resolution)
         limit = scanner.range_max if range_limit is None else checks.real("range_limit", range_limit, above=0)
         checks.boolean("clear_max", clear_max)

@@ -178,6 +178,7 @@ def _end_points(model: LikelihoodFieldModel, ranges: ArrayLike) -> tuple[np.ndar
     """Return the indices of the hits that the model uses, and their (M, 2) end points on the robot [m]."""
     scanner = model.scanner
     z = checks.array("ranges", ranges, (scanner.count,), finite=False)
+    scanner._first_scans.look_at("ranges", z, math.hypot(model.grid.width, model.grid.height))
     hits = np.flatnonzero(BeamChoice.of(model.beams, scanner.count).used(classify(z, scanner) == Reading.HIT))
     vectors = ray_vectors(scanner.bearings, scanner.mount)
     return hits, z[hits, None] * vectors[hits] + np.array(scanner.mount[:2])

@@ -151,4 +151,6 @@ def readings(name: str, ranges: object, scanner: Scanner, backend: Backend) -> n
     """Return readings of one scan (K,) or of several (S, K), checked."""
     values = checks.as_array(name, arrays.copied_to_host(ranges, backend, name), masked=True)
     shape = ("S", scanner.count) if values.ndim == 2 else (scanner.count,)
-    return checks.array(name, values, shape, finite=False, dtype=None)
+    read = checks.array(name, values, shape, finite=False, dtype=None)
+    scanner._first_scans.look_at(name, read)
+    return read

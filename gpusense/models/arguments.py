@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from gpusense._util import checks
 from gpusense.backends import Backend
 from gpusense.world.grid import OccupancyGrid
+from gpusense.world.plausible import look_at_scene
 from gpusense.world.scanner import Scanner
 from gpusense.world.sensor_table import SensorTable
 
@@ -24,6 +27,7 @@ def check_scene(grid: object, range_max: float) -> OccupancyGrid:
     """
     if not isinstance(grid, OccupancyGrid):
         raise TypeError(f"grid: must be an OccupancyGrid, got {checks.show(grid)}")
+    look_at_scene(range_max, math.hypot(grid.width, grid.height))
     cells = range_max / grid.resolution
     if cells > _MOST_CELLS_PER_RANGE:
         raise ValueError(f"range_max: must be at most {_MOST_CELLS_PER_RANGE} cells of the grid, got {cells:.15g}")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.extras import library
 from gpusense._util.files import write_whole
 from gpusense.evaluation.steps import Step
 from gpusense.evaluation.tracking import Track
@@ -17,7 +18,6 @@ from gpusense.localization.pose_algebra import compose_poses
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Reading, Scanner, classify
 
-_INSTALL = "recording for Rerun needs the library rerun-sdk: pip install 'gpusense[rerun]'"
 # Most particles of a scan that are recorded; length of the robot's arrow [m].
 _PARTICLES, _ARROW = 2000, 0.7
 # Red, green, blue.
@@ -36,11 +36,7 @@ class Recording:
     """
 
     def __init__(self, grid: OccupancyGrid) -> None:
-        try:
-            import rerun
-        except ImportError as error:
-            raise ImportError(f"{_INSTALL} ({error})") from None
-        self._rr: Any = rerun
+        self._rr: Any = library("rerun", "a recording for Rerun")
         self._stream: Any = self._rr.RecordingStream("gpusense localize")
         self._content = self._stream.binary_stream()
         walls = grid.cell_centers(*np.nonzero(grid.occupied))

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense._util import checks
 from gpusense.positions.closed_forms import EPS, Complexes, wrap
 from gpusense.positions.fix import STATUSES, PositionFix
+from gpusense.world.plausible import look_at_bearings
 
 Floats = NDArray[np.float64]
 
@@ -256,6 +257,7 @@ def make_problem(
     count = len(positions)
     distances = None if ranges is None else checks.array("ranges", ranges, (count,))
     angles = None if bearings is None else checks.array("bearings", bearings, (count,))
+    look_at_bearings("bearings", angles)
     if distances is not None and distances.size and distances.min() < 0:
         index = int(np.argmin(distances))
         raise ValueError(f"ranges: must be >= 0, got {distances[index]} at index {index}")

@@ -15,6 +15,7 @@ from concurrent.futures import CancelledError, Executor, Future
 from typing import Any
 
 from gpusense._util import checks
+from gpusense._util.extras import library
 from gpusense.sweeps.executors import WorkerDied
 from gpusense.sweeps.worker import DEVICE, receive
 
@@ -28,7 +29,6 @@ _FRESH = 2.0
 # Seconds to wait for a finished job's result before asking whether it still exists, and how often.
 _FETCH = 2.0
 _FETCHES = 15
-_ABSENT = "dask: must be installed for this executor: pip install 'gpusense[sweep]'"
 
 
 class DaskExecutor(Executor):
@@ -64,10 +64,7 @@ class DaskExecutor(Executor):
         security: Any = None,
         timeout: float = 30.0,
     ) -> None:
-        try:
-            import distributed
-        except ImportError as error:
-            raise ImportError(_ABSENT) from error
+        distributed = library("distributed", "a sweep on Dask")
         wait = checks.real("timeout", timeout, above=0)
         self._cluster = None if address is not None else _local(devices, security)
         target = address if self._cluster is None else self._cluster

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from gpusense._util import checks
+from gpusense._util.extras import library
 from gpusense._util.files import write_whole
 from gpusense.sweeps.job import Job
 from gpusense.sweeps.worker import Outcome
@@ -275,8 +276,4 @@ def _pyarrow() -> Any:
     Raises:
         ImportError: it is not installed.
     """
-    try:
-        import pyarrow.parquet
-    except ImportError as error:
-        raise ImportError("table: Parquet must have pyarrow: pip install 'gpusense[sweep]', or use .csv") from error
-    return pyarrow.parquet
+    return library("pyarrow.parquet", "a Parquet table, in place of a .csv one,")

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
 from gpusense.world.messages import field, planar_pose, real_field
+from gpusense.world.plausible import look_at_grid
 
 SMALLEST_RESOLUTION, LARGEST_RESOLUTION = 1e-4, 1e3
 """Bounds of the side of a cell [m]."""
@@ -37,6 +38,9 @@ class OccupancyGrid:
     Raises:
         TypeError: An argument has the wrong type, such as cells of dtype float or bool.
         ValueError: A shape or a value breaks a rule above.
+
+    Warns:
+        PlausibilityWarning: Cells are larger than 1 m, or the origin's yaw is more than a turn.
 
     Example:
         >>> import gpusense as gs
@@ -66,6 +70,7 @@ class OccupancyGrid:
         self._cells = cells
         self._resolution = check_resolution(resolution)
         self._origin = check_origin(origin)
+        look_at_grid(self._resolution, self._origin)
         self._occupied_threshold = checks.integer("occupied_threshold", occupied_threshold, low=1, high=100)
         self._occupied: NDArray[np.bool] | None = None
         return self

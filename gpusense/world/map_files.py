@@ -6,7 +6,7 @@ import os
 import re
 import secrets
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal
@@ -24,10 +24,9 @@ from gpusense.world.grid import (
     grid_of_checked,
 )
 from gpusense.world.images import mapped, open_raster
+from gpusense.world.map_greys import MODES, UNKNOWN_GREY, MapMode, paint, write_image
+from gpusense.world.map_hints import check_no_image
 from gpusense.world.wean_map import read_probabilities
-
-# The grey that map_saver writes for unknown cells.
-UNKNOWN_GREY = 205
 
 
 @dataclass(frozen=True)
@@ -90,6 +89,7 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
     file = checks.existing_file(checks.path("path", path))
     if file.name.lower().endswith((".dat", ".dat.gz")):
         return read_probabilities(file, occupied_threshold=occupied_threshold)
+    check_no_image(file)
     meta = _read_yaml(file)
     checks.integer("occupied_threshold", occupied_threshold, low=1, high=100)
     size = meta.image.stat().st_size
@@ -116,24 +116,37 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
 
 
 def write_map(
-    grid: OccupancyGrid, path: str | os.PathLike[str], *, image_format: Literal["pgm", "png"] = "pgm"
+    grid: OccupancyGrid,
+    path: str | os.PathLike[str],
+    *,
+    image_format: Literal["pgm", "png"] = "pgm",
+    mode: MapMode | None = None,
 ) -> None:
     """Write a map for ROS map_server, atomically.
 
-    The image has the YAML file's name with the suffix of its format. A grid of 0, 100 and unknown is written in mode
-    ``trinary`` with map_saver's greys (254, 0 and 205, ``free_thresh`` 0.196), any other grid in mode ``raw`` with 255
-    for unknown. :func:`read_map` returns equal cells, resolution and origin. The format has no place for
-    ``occupied_threshold``.
+    The image has the YAML file's name with the suffix of its format. Modes:
+
+    - ``"trinary"``: map_saver's greys, 254 for free, 0 for occupied, 205 for unknown cells (``free_thresh`` 0.196). The
+      image can be looked at and edited. :func:`read_map` returns the same free, occupied and unknown cells, of 0, 100
+      and -1.
+    - ``"scale"``: from white, 0 per cent, to black; unknown cells are transparent, which takes a PNG. Cells come back
+      equal.
+    - ``"raw"``: the per cent as greys, so almost black, and 255 for unknown. Cells come back equal.
+    - None: trinary for a grid of 0, 100 and unknown, else raw, so that cells come back equal.
+
+    The format has no place for ``occupied_threshold``, which decides in mode trinary.
 
     Args:
         grid: The map.
         path: The YAML file, ending in .yaml or .yml. It and its image are replaced if they exist.
         image_format: ``"pgm"`` or ``"png"``.
+        mode: The mode.
 
     Raises:
         FileNotFoundError: The folder is missing.
         TypeError: An argument has the wrong type.
-        ValueError: ``path`` has another suffix or is a folder, or ``image_format`` is unknown.
+        ValueError: ``path`` has another suffix or is a folder, ``image_format`` or ``mode`` is unknown, or a PGM cannot
+            hold the mode's transparent cells.
         OSError: The files cannot be written; the old files are then unchanged.
 
     Example:
@@ -151,6 +164,8 @@ def write_map(
     if target.suffix.lower() not in (".yaml", ".yml"):
         raise ValueError(f"path: must end in .yaml or .yml, got {target}")
     checks.choice("image_format", image_format, ("pgm", "png"))
+    if mode is not None:
+        checks.choice("mode", mode, MODES)
     image = target.with_suffix(f".{image_format}")
     if not target.parent.is_dir():
         raise FileNotFoundError(f"path: must lie in a folder that exists, got {target}")
@@ -158,46 +173,25 @@ def write_map(
         if file.is_dir():
             raise ValueError(f"path: must not name a folder, got {file}")
 
-    cells = grid.cells
-    trinary = all(np.isin(strip, (0, 100, -1)).all() for strip in _strips(cells))
-    greys = bytearray([*range(101), *[255] * 155])  # indexed by the cell's byte; unknown, -1, is byte 255
-    if trinary:
-        greys[0], greys[100], greys[255] = 254, 0, UNKNOWN_GREY
+    painting = paint(grid, mode)
+    if painting.alpha and image_format != "png":
+        rule = "must be 'png' for unknown cells in mode 'scale', which are transparent"
+        raise ValueError(f"image_format: {rule}, got {image_format!r}")
     meta = {
         "image": image.name,
-        "mode": "trinary" if trinary else "raw",
+        "mode": painting.mode,
         "resolution": grid.resolution,
         "origin": list(grid.origin),
         "negate": 0,
-        "occupied_thresh": 0.65,
-        "free_thresh": 0.196,
+        "occupied_thresh": painting.occupied_thresh,
+        "free_thresh": painting.free_thresh,
     }
     text = yaml.safe_dump(meta, sort_keys=False, default_flow_style=None, allow_unicode=True)
     writers: dict[Path, Callable[[BinaryIO], object]] = {
-        image: lambda stream: _write_image(stream, cells, bytes(greys), image_format),
+        image: lambda stream: write_image(stream, painting, grid.shape, image_format),
         target: lambda stream: stream.write(text.encode()),
     }
     _write_all(writers)
-
-
-def _write_image(stream: BinaryIO, cells: NDArray[np.int8], greys: bytes, image_format: str) -> None:
-    """Write the greys of cells as an image, from the last row to the first."""
-    pixels = (strip.tobytes().translate(greys) for strip in _strips(cells))
-    size = cells.shape[1], cells.shape[0]
-    if image_format == "png":
-        from PIL import Image
-
-        Image.frombytes("L", size, b"".join(pixels)).save(stream, "PNG")
-    else:
-        stream.write(b"P5\n%d %d\n255\n" % size)
-        for each in pixels:
-            stream.write(each)
-
-
-def _strips(cells: NDArray[np.int8]) -> Iterator[NDArray[np.int8]]:
-    """Yield the rows of cells from the last to the first, about a million cells at a time."""
-    height = max(1, (1 << 20) // cells.shape[1])
-    return (cells[max(end - height, 0) : end][::-1] for end in range(len(cells), 0, -height))
 
 
 def _write_all(writers: dict[Path, Callable[[BinaryIO], object]]) -> None:
@@ -249,7 +243,7 @@ def _read_yaml(file: Path) -> _MapYaml:
     if free >= occupied:
         raise ValueError(f"{file}: occupied_thresh: must be > free_thresh = {free}, got {occupied}")
     return _MapYaml(
-        image=checks.existing_file(file.parent / image),
+        image=_image(file, image),
         resolution=_number(file, "resolution", data["resolution"], low=SMALLEST_RESOLUTION, high=LARGEST_RESOLUTION),
         origin=[
             *(
@@ -263,6 +257,18 @@ def _read_yaml(file: Path) -> _MapYaml:
         free_thresh=free,
         mode=mode.lower(),
     )
+
+
+def _image(file: Path, name: str) -> Path:
+    """Return the image that a YAML file names.
+
+    Raises:
+        FileNotFoundError, ValueError: It is missing, or no regular file; the message names both files.
+    """
+    try:
+        return checks.existing_file(file.parent / name)
+    except (FileNotFoundError, ValueError) as error:
+        raise type(error)(f"{file}: image: {error}") from None
 
 
 def _number(file: Path, key: str, value: object, **limits: float) -> float:

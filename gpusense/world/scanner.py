@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
+from gpusense.world import plausible
 from gpusense.world.messages import laser_geometry
 
 
@@ -55,6 +56,9 @@ class Scanner:
         TypeError: An argument has the wrong type.
         ValueError: A shape or a value breaks a rule above.
 
+    Warns:
+        PlausibilityWarning: Bearings or lengths seem to be in degrees or millimetres.
+
     Example:
         >>> import gpusense as gs, numpy as np
         >>> gs.Scanner(np.linspace(-np.pi / 2, np.pi / 2, 181), range_max=8.0)
@@ -64,7 +68,9 @@ class Scanner:
         (4, 9)
     """
 
-    __slots__ = ("_bearings", "_cone", "_cone_rays", "_critical", "_hash", "_mount", "_range_max", "_range_min")
+    __slots__ = (
+        "_bearings", "_cone", "_cone_rays", "_critical", "_first_scans", "_hash", "_mount", "_range_max", "_range_min",
+    )  # fmt: skip
 
     def __init__(
         self,
@@ -92,6 +98,9 @@ class Scanner:
         self._critical = critical_incidence
         if critical_incidence is not None:
             self._critical = checks.real("critical_incidence", critical_incidence, above=0, high=math.pi / 2)
+        self._first_scans = plausible.FirstScans(self._range_max)
+        plausible.look_at_bearings("bearings", directions)
+        plausible.look_at_scanner(self._range_max, self._mount)
         # Adding 0.0 makes -0.0 and 0.0, which are equal, hash alike.
         self._hash = hash(((directions + 0.0).tobytes(), *self._scalars()))
 

@@ -143,7 +143,6 @@ def test_odometry_that_copies_corrected_poses_is_chained_from_wheel_readings(tmp
 
 
 def test_two_lasers_of_a_bag_track_together(place, capsys, tmp_path):
-    pytest.importorskip("rosbags", reason="the library rosbags is not installed: pip install 'gpusense[ros]'")
     from support.bags import BASE, Writer
 
     grid, bearings = gs.read_map(place / "map.yaml"), np.radians(np.arange(-80, 81, 2.0))
@@ -162,7 +161,7 @@ def test_two_lasers_of_a_bag_track_together(place, capsys, tmp_path):
                          frame=name, range_max=20.0)  # fmt: skip
             truth.append(gs.compose_poses(truth[-1], (0.2, 0, 0.1)))
     tum = tmp_path / "run.tum"
-    both = call(place, "--sensors", "/front", "/rear", "--global", "--particles", "4000", "--tum", str(tum))
+    both = call(place, "--topic", "/front", "/rear", "--global", "--particles", "4000", "--tum", str(tum))
     both[both.index("--log") + 1] = str(bag.path)
     assert cli.main(both) == 0
     assert "LikelihoodFieldModel, LikelihoodFieldModel" in capsys.readouterr().out
@@ -172,7 +171,7 @@ def test_two_lasers_of_a_bag_track_together(place, capsys, tmp_path):
     assert "/top" in error_of(both, capsys)
     neither = call(place, "--global")
     neither[neither.index("--log") + 1] = str(bag.path)
-    assert "--sensors: must be given, one of /front, /rear" in error_of(neither, capsys)
+    assert "--topic: must be given, one of /front, /rear" in error_of(neither, capsys)
     one = call(place, "--sensors", "rear")
     assert "log" in error_of(one, capsys)
 
@@ -244,4 +243,5 @@ def test_a_run_is_recorded_for_the_viewer(place, capsys, monkeypatch, tmp_path):
     ends = kept["scan"][0][0][:, :2]
     assert np.median(np.hypot(*(ends[:, None] - walls[None, :, :2]).T).min(axis=0)) < 0.1
     monkeypatch.setitem(sys.modules, "rerun", None)
-    assert "pip install 'gpusense[rerun]'" in error_of(call(place, "--record", str(path)), capsys)
+    message = error_of(call(place, "--record", str(path)), capsys)
+    assert "needs the library rerun-sdk, which is not installed" in message and "pip install '.[rerun]'" in message

@@ -305,7 +305,6 @@ def test_a_trajectory_of_indices_is_not_taken_for_times(place, capsys, tmp_path)
 
 
 def test_a_laser_of_a_bag_is_chosen_by_its_topic(place, capsys, tmp_path):
-    pytest.importorskip("rosbags", reason="the library rosbags is not installed: pip install 'gpusense[ros]'")
     from support.bags import BASE, Writer
 
     caster, pose = gs.RayCaster(gs.read_map(place / "map.yaml"), range_max=20.0, backend="numpy"), (3.0, 1.5, 0.2)

@@ -41,7 +41,16 @@ def test_a_map_is_built_and_its_likelihoods_are_drawn(log, tmp_path, capsys):
     scans = list(gs.read_log(log, range_max=50.0))
     expected = gs.build_map([s.ranges for s in scans], [s.pose for s in scans], scans[0].scanner, resolution=0.1,
                             backend="numpy")  # fmt: skip
-    assert grid == expected
+    for name in ("occupied", "free", "unknown"):
+        np.testing.assert_array_equal(getattr(grid, name), getattr(expected, name))
+    assert (grid.resolution, grid.origin, report["mode"]) == (expected.resolution, expected.origin, "trinary")
+    greys = np.unique(np.frombuffer(out.with_suffix(".pgm").read_bytes()[-grid.cells.size :], np.uint8))
+    assert greys.tolist() == [0, 205, 254] and report["image"] == str(out.with_suffix(".pgm"))
+    for mode, image in (("raw", "pgm"), ("scale", "png")):
+        assert main(["map", "--log", str(log), "--out", str(tmp_path / f"{mode}.yaml"), "--resolution", "0.1",
+                     "--backend", "numpy", "--range-max", "50", "--mode", mode]) == 0  # fmt: skip
+        assert f"image: {tmp_path / mode}.{image}" in capsys.readouterr().out
+        assert gs.read_map(tmp_path / f"{mode}.yaml") == expected
 
     picture = tmp_path / "likelihood.png"
     command = ["likelihood-map", "--map", str(out), "--log", str(log), "--scan", "1", "--out", str(picture),

@@ -135,6 +135,42 @@ def test_a_filter_has_the_options_of_the_file() -> None:
     assert from_nav2({"beam_skip_threshold": 2.0}).beam_skip is None
 
 
+def test_dotted_names_and_mappings_are_the_same() -> None:
+    start = {"x": 1.5, "y": -2.0, "yaw": 0.5, "covariance_x": 0.25, "covariance_y": 0.5, "covariance_xy": 0.1}
+    nested = from_nav2({"set_initial_pose": True, "initial_pose": start})
+    dotted = from_nav2({"set_initial_pose": True} | {f"initial_pose.{name}": value for name, value in start.items()})
+    mixed = {"set_initial_pose": True, "initial_pose": {"x": 1.5}, "initial_pose.y": -2, "initial_pose.yaw": 0.5}
+    assert nested == dotted and nested.initial_pose == from_nav2(mixed).initial_pose == (1.5, -2.0, 0.5)
+    assert nested.initial_covariance == ((0.25, 0.1, 0.0), (0.1, 0.5, 0.0), (0.0, 0.0, 0.0))
+    assert from_nav2(mixed).initial_covariance is None and from_nav2({"initial_pose.x": 1, "z_hit": 1}).ignored == ()
+    everywhere = {"/**": {"ros__parameters": {"initial_pose.x": 3.0}}}
+    own = {"amcl": {"ros__parameters": {"set_initial_pose": True, "initial_pose": {"y": 4.0, "z": 1.0}}}}
+    options = from_nav2(everywhere | own)
+    assert options.initial_pose == (3.0, 4.0, 0.0) and options.ignored == ("initial_pose.z",)
+    assert from_nav2({"z_hit": 0.5, "laser": {"front": {"x": 1}}}).ignored == ("laser.front.x",)
+
+
+BELUGA = """
+amcl:
+  ros__parameters:
+    robot_model_type: differential_drive
+    set_initial_pose: true
+    initial_pose.x: 0.0
+    initial_pose.y: 2.0
+    initial_pose.yaw: 0.25
+    initial_pose.covariance_x: 0.25
+    initial_pose.covariance_y: 0.25
+    initial_pose.covariance_yaw: 0.0685
+"""
+
+
+def test_the_form_of_belugas_file(tmp_path: Path) -> None:
+    (tmp_path / "params.yaml").write_text(BELUGA)
+    options = from_nav2(tmp_path / "params.yaml")
+    assert options.initial_pose == (0.0, 2.0, 0.25) and options.ignored == ()
+    np.testing.assert_array_equal(options.initial_covariance, np.diag([0.25, 0.25, 0.0685]))
+
+
 V, T = ValueError, TypeError
 CASES: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({}, V, "source: must hold amcl's ros__parameters, got the keys []"),
@@ -151,6 +187,11 @@ CASES: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"z_hit": 0.0, "z_rand": 0.0}, V, "z_hit + z_max + z_rand: must be > 0, got 0.0"),
     ({"do_beamskip": True, "beam_skip_threshold": 1.0}, V,
      "beam_skip_threshold: must be finite and > 0 and < 1, got 1.0"),
+    ({"z_hit": 1, "initial_pose": {"x": 1}, "initial_pose.x": 2}, V,
+     "source: initial_pose.x: must have one value, got 1 and 2"),
+    ({"set_initial_pose": True, "initial_pose.covariance_x": -1.0}, V,
+     "source: initial_pose.covariance: must be positive semidefinite, got an eigenvalue of -1"),
+    ({"set_initial_pose": True, "initial_pose.x": "a"}, T, "source: initial_pose.x: must be a real number, got 'a'"),
     ({"set_initial_pose": True, "initial_pose": 3}, T, "source: initial_pose: must be a mapping, got 3"),
 ]  # fmt: skip
 

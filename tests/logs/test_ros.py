@@ -14,8 +14,6 @@ from support.bags import BASE, LASER, Writer
 
 import gpusense as gs
 
-pytest.importorskip("rosbags", reason="the library rosbags is not installed: pip install 'gpusense[ros]'")
-
 KINDS = ("ros1", "sqlite3", "mcap")
 each_kind = pytest.mark.parametrize("kind", KINDS)
 
@@ -80,6 +78,7 @@ def test_an_upside_down_laser_odometry_by_transforms_and_the_duplicated_beam(tmp
 
 def test_scans_whose_beams_vary_share_a_scanner(tmp_path: Path) -> None:
     with Writer(tmp_path, "sqlite3") as bag:
+        bag.transform(0.0, BASE, LASER, (0.0, 0.0), 0.0)
         for k, count in enumerate((258, 263, 260)):
             bag.scan(1.0 + k, 1.0 + np.arange(count) / 100, 0.01 * k, 2 * math.pi / count)
     scans = list(gs.read_log(bag.path))
@@ -95,6 +94,7 @@ def test_scans_whose_beams_vary_share_a_scanner(tmp_path: Path) -> None:
 
 def test_topics(tmp_path: Path) -> None:
     with Writer(tmp_path, "ros1") as bag:
+        bag.transform(0.0, BASE, LASER, (0.0, 0.0), 0.0)
         bag.scan(1.0, [1.0, 2.0], 0.0, 0.1, topic="/front")
         bag.scan(2.0, [3.0, 4.0], 0.0, 0.1, topic="/rear")
     assert [scan.ranges[0] for scan in gs.read_log(bag.path, topic="/rear")] == [3.0]
@@ -129,8 +129,22 @@ def test_broken_bags_are_errors_of_one_line(tmp_path: Path, kind: str) -> None:
 def test_a_bag_without_the_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = small_bag(tmp_path, "ros1")
     monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
-    with pytest.raises(ImportError, match=r"needs the library rosbags: pip install 'gpusense\[ros\]'"):
+    text = rf"^{path}: a ROS bag needs the library rosbags, which is not installed: .*pip install rosbags$"
+    with pytest.raises(ImportError, match=text):
         list(gs.read_log(path))
+
+
+def test_a_bag_without_transforms_names_the_mount_that_is_assumed(tmp_path: Path) -> None:
+    with Writer(tmp_path, "mcap") as bag:
+        bag.odometry(1.0, 0.0, 0.0, 0.0)
+        bag.scan(1.0, [1.0, 2.0], 0.0, 0.1)
+    text = r"run: has no fixed transforms from base_link to laser: .* with mount \(0, 0, 0\)"
+    with pytest.warns(UserWarning, match=text) as caught:
+        assert next(gs.read_log(bag.path)).scanner.mount == (0.0, 0.0, 0.0)
+    assert [str(one.filename) for one in caught] == [__file__]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert next(gs.read_log(bag.path, mount=(0.1, 0.0, 0.0))).scanner.mount == (0.1, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -140,7 +154,7 @@ def test_a_bag_without_the_library(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         ("neato_ros1_bag/middle.bag", {}, 185, 360, (-0.1016, 0, -3.14159)),
         ("jarvis_lab/jarvis_complex_path_fast.bag", {"topic": "/driver_laser_security/laser_scan"}, 619, 761,
          (0.895, 0, 0)),
-        ("lidar_wall/g2_0.5m.mcap", {}, 289, 1440, (0, 0, 0)),
+        ("lidar_wall/g2_0.5m.mcap", {"mount": (0, 0, 0)}, 289, 1440, (0, 0, 0)),
     ],
 )  # fmt: skip
 def test_recorded_bags(data_dir: Path, name: str, options: Any, count: int, beams: int, mount: Any) -> None:

@@ -260,7 +260,7 @@ def test_an_unknown_kernel_is_named() -> None:
 
 
 def test_importing_gpusense_loads_no_backend(layout: Layout, tmp_path: Path) -> None:
-    heavy = ("PIL", "matplotlib", "pyopencl", "rich", "scipy", "warp", "yaml")
+    heavy = ("PIL", "matplotlib", "pyopencl", "rich", "rosbags", "scipy", "warp", "yaml")
     script = f"import sys, gpusense; print([name for name in {heavy!r} if name in sys.modules])"
     assert layout.run(script, cwd=tmp_path) == "[]"
 
@@ -283,5 +283,7 @@ def test_dependencies_on_linux_x86_64(wheel: Path) -> None:
     needed = [
         item.name.lower() for item in map(Requirement, lines) if item.marker is None or item.marker.evaluate(machine)
     ]
-    expected = "matplotlib numpy pillow platformdirs pocl-binary-distribution pyopencl pyyaml rich scipy warp-lang"
+    expected = (
+        "matplotlib numpy pillow platformdirs pocl-binary-distribution pyopencl pyyaml rich rosbags scipy warp-lang"
+    )
     assert sorted(needed) == expected.split()

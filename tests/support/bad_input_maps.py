@@ -70,13 +70,13 @@ MAP_CASES = [
         "map-missing-image",
         map_with(image="absent.pgm"),
         FileNotFoundError,
-        "{tmp}/input/absent.pgm: must exist, got no such file",
+        f"{YAML}: image: {{tmp}}/input/absent.pgm: must exist, got no such file",
     ),
     (
         "map-impossible-image-name",
         map_with(image="a" * 300),
         FileNotFoundError,
-        "{tmp}/input/" + "a" * 300 + ": must exist, got no such file",
+        f"{YAML}: image: {{tmp}}/input/" + "a" * 300 + ": must exist, got no such file",
     ),
     ("map-image-number", map_with(image="3"), ValueError, f"{YAML}: image: must be a file name, got 3"),
     *[

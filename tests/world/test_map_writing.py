@@ -90,7 +90,41 @@ def test_a_failure_while_writing_leaves_nothing(tmp_path, monkeypatch):
         stream.write(b"P5")
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(map_files, "_write_image", failing)
+    monkeypatch.setattr(map_files, "write_image", failing)
     with pytest.raises(OSError, match="no space left"):
         write_map(OccupancyGrid([[1, 2]]), tmp_path / "copy.yaml")
     assert list(tmp_path.iterdir()) == []
+
+
+EVERY = [*range(101), -1]
+
+
+@pytest.mark.parametrize("threshold", [1, 50, 65, 100])
+def test_trinary_keeps_the_classes_of_cells(tmp_path, threshold):
+    grid = OccupancyGrid([EVERY], occupied_threshold=threshold)
+    write_map(grid, tmp_path / "copy.yaml", mode="trinary")
+    again = read_map(tmp_path / "copy.yaml")
+    assert set(np.unique(again.cells)) == {-1, 0, 100}
+    for name in ("occupied", "free", "unknown"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(grid, name))
+    greys = (tmp_path / "copy.pgm").read_bytes()[-102:]
+    assert (greys[0], greys[100] if threshold <= 100 else None, greys[101]) == (254, 0, 205)
+
+
+@pytest.mark.parametrize(("mode", "form"), [("scale", "png"), ("raw", "png"), ("raw", "pgm")])
+def test_other_modes_keep_every_cell(tmp_path, mode, form):
+    grid = OccupancyGrid([EVERY, EVERY[::-1]], 0.1)
+    write_map(grid, tmp_path / "copy.yaml", mode=mode, image_format=form)
+    assert read_map(tmp_path / "copy.yaml") == grid
+    assert yaml.safe_load((tmp_path / "copy.yaml").read_text())["mode"] == mode
+
+
+def test_shades_without_unknown_cells_fit_a_pgm(tmp_path):
+    grid = OccupancyGrid([EVERY[:-1]])
+    write_map(grid, tmp_path / "copy.yaml", mode="scale")
+    assert read_map(tmp_path / "copy.yaml") == grid
+    with pytest.raises(ValueError, match="image_format: must be 'png' for unknown cells in mode 'scale'"):
+        write_map(OccupancyGrid([EVERY]), tmp_path / "other.yaml", mode="scale")
+    with pytest.raises(ValueError, match="mode: must be one of 'trinary', 'scale', 'raw', got 'grey'"):
+        write_map(grid, tmp_path / "other.yaml", mode="grey")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["copy.pgm", "copy.yaml"]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
+from gpusense.world.plausible import look_at_readings
 from gpusense.world.scanner import Reading, classes
 
 # Most readings used to estimate the step that a sensor rounds to.
@@ -86,6 +87,7 @@ def make_pairs(ranges: ArrayLike, expected: ArrayLike, range_max: float, range_m
         )
     z, z_expected = z.ravel(), z_expected.ravel()
     kinds = classes(z, range_min, range_max)
+    look_at_readings("ranges", z, range_max)
     if not (kinds != Reading.MISSING).any():
         raise ValueError(f"ranges: must hold a reading that is not missing, got {z.size} of which none is")
     # A ray without an obstacle has the expected range range_max, possibly rounded to float32.

@@ -13,6 +13,7 @@ from gpusense.models.landmark.reach import reach_of
 from gpusense.models.landmark.sensor import Sensor, full_circle
 from gpusense.world.frames import Mount, split
 from gpusense.world.parameters import LandmarkParameters
+from gpusense.world.plausible import look_at_bearings
 
 # Discs are widened by this share, for rounding errors of distances.
 _WIDER = 1e-5
@@ -32,6 +33,14 @@ def _read(features: object, p: LandmarkParameters) -> np.ndarray:
     finite = np.isfinite(full[:, 1])
     full[finite, 1] = wrapped(full[finite, 1])
     return full
+
+
+def look_at_feature_bearings(features: object) -> bool:
+    """Warn of bearings of (F, 2) or (F, 3) features that cannot be meant; return whether there were any."""
+    values = np.asarray(features, np.float64)
+    bearings = values[:, 1][np.isfinite(values[:, 1])] if values.ndim == 2 else np.zeros(0)
+    look_at_bearings("features: bearings", bearings)
+    return bool(bearings.size)
 
 
 def _impossible(full: np.ndarray, p: LandmarkParameters, span: tuple[float, float]) -> np.ndarray:

@@ -23,6 +23,7 @@ from gpusense.models.landmark.call import Call, known_features
 from gpusense.models.landmark.features import (
     PreparedFeatures,
     check_correspondence,
+    look_at_feature_bearings,
     possible_features,
     prepare_features,
 )
@@ -109,7 +110,7 @@ class LandmarkModel(PointModel):
         x, y, yaw = (float(value) for value in checks.array("mount", mount, (3,)))
         self.mount = (x, y, yaw)
         super().__init__(backend, precision, temperature)
-        self._sensor = describe(p, landmarks)
+        self._sensor, self._seen = describe(p, landmarks), False
         tiny, most = np.finfo(self._real).tiny, np.finfo(self._real).max
         if any(scale and not tiny <= scale <= most for scale in self._sensor.scales):
             raise ValueError(f"parameters: deviations must fit {self._real.name}, got {p}")
@@ -199,6 +200,8 @@ class LandmarkModel(PointModel):
         """Return log p of each particle, and with ``each`` the (N, F) landmarks and terms of the features."""
         host = arrays.copied_to_host(features, self._backend, "features")
         full, impossible = possible_features(host, self.parameters, self._sensor.span)
+        if not self._seen:
+            self._seen = look_at_feature_bearings(host)
         call = self._prepare(full, correspondence, each)
         known = correspondence is not None
         left_out = feature_omissions(

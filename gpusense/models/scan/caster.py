@@ -19,6 +19,7 @@ from gpusense.tables import casters
 from gpusense.tables.casters import Caster
 from gpusense.world.frames import Mount, ray_vectors
 from gpusense.world.grid import OccupancyGrid
+from gpusense.world.plausible import look_at_bearings
 
 _NO_MOUNT: Mount = (0.0, 0.0, 0.0)
 
@@ -71,6 +72,7 @@ class RayCaster:
         self.caster = casters.choose(named[0], "exact" if named[1] is None else named[1])
         self.unknown = checks.choice("unknown", unknown, ("free", "occupied"))
         self.outside = checks.choice("outside", outside, ("free", "occupied"))
+        self._seen = False
         device = get_backend(backend)
         real = real_dtype(precision, device)
         self._caster = MapCaster(
@@ -171,8 +173,7 @@ class RayCaster:
         Raises:
             TypeError, ValueError: arguments that are not finite numbers of these shapes.
         """
-        vectors = ray_vectors(checks.array("bearings", bearings, ("K",)), _NO_MOUNT)
-        return self._caster.cast(poses, vectors, out)
+        return self._caster.cast(poses, self._vectors(bearings), out)
 
     def incidence(self, poses: AnyArray, bearings: AnyArray, *, out: Any = None) -> Any:
         """Return angles of incidence, between each ray and the normal of the surface that it hits.
@@ -191,6 +192,14 @@ class RayCaster:
         Raises:
             TypeError, ValueError: arguments that are not finite numbers of these shapes, or a method that is not exact.
         """
-        vectors = ray_vectors(checks.array("bearings", bearings, ("K",)), _NO_MOUNT)
+        vectors = self._vectors(bearings)
         require_exact("method", self.caster)
         return self._caster.cast(poses, vectors, out, Cones(incidence=True))
+
+    def _vectors(self, bearings: AnyArray) -> Any:
+        """Return (K, 2) cosines and sines of bearings; the first ones are looked at for degrees."""
+        checked = checks.array("bearings", bearings, ("K",))
+        if not self._seen:
+            self._seen = True
+            look_at_bearings("bearings", checked)
+        return ray_vectors(checked, _NO_MOUNT)

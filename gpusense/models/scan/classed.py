@@ -153,6 +153,7 @@ def hits_and_max(ranges: np.ndarray, scanner: Scanner) -> tuple[np.ndarray, np.n
 
 def class_scans(ranges: np.ndarray, rules: Rules) -> ClassedScans:
     """Class, choose and group the readings of (S, K) scans, S > 0."""
+    rules.scanner._first_scans.look_at("ranges", ranges, rules.map_size)
     hit, far = hits_and_max(ranges, rules.scanner)
     if rules.max_is_range:
         finite = np.isfinite(ranges)

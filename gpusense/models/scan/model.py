@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -67,6 +68,7 @@ class ScanModel(ABC):
         rules = Rules(
             scanner, ray_vectors(scanner.bearings, scanner.mount), 0.0 if weights.is_peer else z_max, self.beams,
             specialize, max_is_range=weights.is_peer, max_depends=max_depends,
+            map_size=math.hypot(grid.width, grid.height),
         )  # fmt: skip
         self._setting = Setting(
             device, real_dtype(precision, device), rules, weights, cubes, self.temperature, constant_term,
@@ -171,6 +173,9 @@ class ScanModel(ABC):
             TypeError: an argument does not hold real numbers, or is on a device that the backend cannot read.
             ValueError: a wrong shape, or a pose that is not finite; the message names it.
             MemoryError: the device cannot hold the map's table, or even a few particles.
+
+        Warns:
+            PlausibilityWarning: in the first calls of a scanner, negative readings, or ones in millimetres.
         """
         if out is None and not per_beam and is_recorded(poses):
             calls = self._differentiable(ranges)

@@ -66,6 +66,7 @@ class Rules:
         specialize: False keeps readings without information, and casts equal bearings one by one.
         max_is_range: Evaluate finite max readings like ranges.
         max_depends: The probability of a max reading depends on the pose, so such readings are evaluated.
+        map_size: Diagonal of the map [m]; None without a map.
     """
 
     scanner: Scanner
@@ -75,6 +76,7 @@ class Rules:
     specialize: bool
     max_is_range: bool = False
     max_depends: bool = False
+    map_size: float | None = None
 
     @functools.cached_property
     def choice(self) -> BeamChoice:

@@ -39,7 +39,8 @@ class Localizer:
         self._last: Pose | None = None
         self._start: tuple[np.ndarray, np.ndarray] | None = None
         if options.initial_pose is not None:
-            self.start_at(options.initial_pose, np.diag([0.25, 0.25, (math.pi / 12) ** 2]))
+            covariance = options.initial_covariance or np.diag([0.25, 0.25, (math.pi / 12) ** 2])
+            self.start_at(options.initial_pose, np.asarray(covariance))
 
     def set_map(self, message: Any) -> None:
         """Take a nav_msgs/OccupancyGrid; a filter goes on around its last estimate."""

@@ -1,0 +1,112 @@
+"""Import libraries that an installation may lack, with an error of one line that names the command to install them."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import shlex
+import shutil
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
+
+
+class Requirement(NamedTuple):
+    """A library that gpusense imports late.
+
+    Attributes:
+        package: Its package, as pip takes it.
+        extra: The extra of gpusense that has it; empty for a dependency.
+    """
+
+    package: str
+    extra: str = ""
+
+
+# By the module that is imported; a test compares them with pyproject.toml.
+REQUIREMENTS = {
+    "PIL": Requirement("Pillow"),
+    "dask": Requirement("dask[diagnostics,distributed]", "sweep"),
+    "distributed": Requirement("dask[diagnostics,distributed]", "sweep"),
+    "matplotlib": Requirement("matplotlib"),
+    "numba": Requirement("numba", "bench"),
+    "platformdirs": Requirement("platformdirs"),
+    "pyarrow": Requirement("pyarrow", "sweep"),
+    "pyopencl": Requirement("pyopencl"),
+    "rerun": Requirement("rerun-sdk", "rerun"),
+    "rich": Requirement("rich"),
+    "rosbags": Requirement("rosbags"),
+    "scipy": Requirement("scipy"),
+    "warp": Requirement("warp-lang"),
+    "yaml": Requirement("PyYAML"),
+}
+
+
+class MissingLibraryError(ImportError):
+    """A library is absent or cannot be imported; the message is one line with the command that installs it."""
+
+
+def library(module: str, purpose: str) -> ModuleType:
+    """Import a module of a library.
+
+    Args:
+        module: The module, such as ``"pyarrow.parquet"``, of a library in ``REQUIREMENTS``.
+        purpose: The subject of the message, such as ``"a Parquet table"``.
+
+    Raises:
+        MissingLibraryError: The library is absent, or cannot be imported.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise missing(module, purpose, error) from error
+
+
+def check_library(module: str, purpose: str) -> None:
+    """Check that a library is installed, without importing it.
+
+    Raises:
+        MissingLibraryError: It is absent.
+    """
+    name = module.partition(".")[0]
+    try:
+        absent = importlib.util.find_spec(name) is None
+    except ValueError:  # a module that is None, or has no specification
+        absent = sys.modules.get(name) is None
+    if absent:
+        raise missing(name, purpose, ModuleNotFoundError(f"No module named {name!r}", name=name))
+
+
+def missing(module: str, purpose: str, error: ImportError) -> MissingLibraryError:
+    """Return the error for a library that cannot be imported."""
+    name = module.partition(".")[0]
+    package = REQUIREMENTS[name].package.partition("[")[0]
+    absent = isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == name
+    reason = "is not installed" if absent else f"cannot be imported ({' '.join(str(error).split())})"
+    text = f"{purpose} needs the library {package}, which {reason}: {install_command(name)}"
+    return MissingLibraryError(text, name=name)
+
+
+def explained(error: ImportError) -> MissingLibraryError | None:
+    """Return the error of one line for a library that gpusense uses; None for a module of another library."""
+    if isinstance(error, MissingLibraryError):
+        return error
+    name = (error.name or "").partition(".")[0]
+    return missing(name, "gpusense", error) if name in REQUIREMENTS else None
+
+
+def install_command(module: str) -> str:
+    """Return the command that installs a library for the running Python, and the one for a checkout of gpusense."""
+    needed, pip = REQUIREMENTS[module.partition(".")[0]], _pip()
+    command = f"{pip} install {shlex.quote(needed.package)}"
+    return f"{command}, or in a checkout of gpusense {pip} install '.[{needed.extra}]'" if needed.extra else command
+
+
+def _pip() -> str:
+    """Return the command of the running Python's pip: ``pip`` where the shell finds that one."""
+    found = shutil.which("pip")
+    own = Path(sys.executable).parent if sys.executable else None
+    if own is None or (found is not None and Path(found).parent == own):
+        return "pip"
+    return f"{shlex.quote(sys.executable)} -m pip"

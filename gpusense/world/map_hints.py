@@ -1,0 +1,50 @@
+"""Find what a user meant who names the image of a map in place of its YAML file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from gpusense._util.files import read_mapping
+
+_ENDINGS = (".pgm", ".ppm", ".pnm", ".png", ".bmp", ".jpg", ".jpeg", ".tif", ".tiff")
+# YAML files of a folder that are read to find the one of an image.
+_MOST = 50
+
+
+def check_no_image(file: Path) -> None:
+    """Refuse an image where the YAML file of a map is wanted.
+
+    Raises:
+        ValueError: it is an image; the message names the YAML file that belongs to it, where there is one.
+    """
+    if file.suffix.lower() not in _ENDINGS:
+        return
+    found = next(_yaml_files(file), None)
+    if found is not None:
+        raise ValueError(f"{file}: must be the YAML file of a map, got its image: the YAML file is {found}")
+    keys = "image, resolution, origin, negate, occupied_thresh and free_thresh"
+    raise ValueError(
+        f"{file}: must be the YAML file of a map, got an image, and no YAML file beside it names it: write "
+        f"{file.with_suffix('.yaml').name} with {keys}"
+    )
+
+
+def _yaml_files(image: Path) -> Iterator[Path]:
+    """Yield the YAML files in the folder of an image that name it, first those of its own name."""
+    named = [image.with_suffix(suffix) for suffix in (".yaml", ".yml")]
+    others = sorted(path for path in image.parent.glob("*.y*ml") if path not in named)[:_MOST]
+    for path in (*named, *others):
+        try:
+            name = read_mapping(path).get("image") if path.is_file() else None
+        except (ValueError, OSError):
+            continue
+        if isinstance(name, str) and (path.parent / name).name == image.name and _same(path.parent / name, image):
+            yield path
+
+
+def _same(one: Path, other: Path) -> bool:
+    try:
+        return one.samefile(other)
+    except OSError:
+        return False

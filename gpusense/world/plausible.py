@@ -1,0 +1,177 @@
+"""Notice values that are legal but cannot be meant: degrees for radians, millimetres for metres, places off the map.
+
+Such values compute as semantics demand. A warning names the likely cause, once: geometry is looked at where it is made,
+readings in the first scans of a scanner.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense._util.notices import warn_user
+
+# A heading or bearing beyond a turn; rounding of float32 counts as none [rad].
+_TURN = 2 * math.pi * (1 + 1e-6)
+# Sides of cells beyond which a map is one in other units [m].
+_LARGEST_CELL = 1.0
+# A range beyond any scanner of a robot, and one that is doubtful in a map much smaller [m].
+_FARTHEST, _FAR = 1e4, 1e3
+# Largest distance of a scanner from the robot's centre [m].
+_LARGEST_MOUNT = 100.0
+# Calls with scans of a scanner that are looked at.
+_CALLS = 32
+# Readings beyond these multiples of range_max or of the map are in other units; a code for "no return" is one value.
+_TIMES_RANGE, _TIMES_MAP, _VALUES = 10.0, 100.0, 3
+
+
+class PlausibilityWarning(UserWarning):
+    """A value is legal, but likely in other units or another frame than it should be; results are those of the value.
+
+    ``warnings.simplefilter("error", gs.PlausibilityWarning)`` makes it an error, ``"ignore"`` silences it.
+
+    Example:
+        >>> import gpusense as gs, warnings
+        >>> with warnings.catch_warnings(record=True) as caught:
+        ...     warnings.simplefilter("always")
+        ...     scanner = gs.Scanner([-90.0, 0.0, 90.0], range_max=8.0)
+        >>> print(caught[0].message)
+        bearings: span 180 rad, more than a turn: are they in degrees? Radians are meant (numpy.radians converts)
+    """
+
+
+def _notice(text: str) -> None:
+    warn_user(text, PlausibilityWarning)
+
+
+def look_at_bearings(name: str, bearings: NDArray[np.float64] | None) -> None:
+    """Warn of bearings that span more than a turn, or lie more than two turns from 0 [rad]; None are none."""
+    if bearings is None or not bearings.size:
+        return
+    low, high = float(bearings.min()), float(bearings.max())
+    if high - low > _TURN * (1 + 1 / bearings.size):
+        _notice(
+            f"{name}: span {high - low:.4g} rad, more than a turn: are they in degrees? Radians are meant "
+            "(numpy.radians converts)"
+        )
+    elif max(-low, high) > 2 * _TURN:
+        _notice(
+            f"{name}: reach {max(-low, high):.4g} rad, more than two turns from 0: are they in degrees? Radians are "
+            "meant (numpy.radians converts)"
+        )
+
+
+def look_at_heading(name: str, heading: float) -> None:
+    """Warn of a heading of more than a turn [rad]."""
+    if abs(heading) > _TURN:
+        _notice(
+            f"{name}: has a heading of {heading:.6g} rad, more than a turn: is it in degrees? Radians are meant "
+            "(math.radians converts)"
+        )
+
+
+def look_at_scanner(range_max: float, mount: tuple[float, float, float]) -> None:
+    """Warn of a range or a mount that no scanner of a robot has."""
+    if range_max > _FARTHEST:
+        _notice(f"range_max: is {range_max:.6g} m, farther than a range scanner sees: is it in millimetres?")
+    if math.hypot(*mount[:2]) > _LARGEST_MOUNT:
+        _notice(f"mount: is {math.hypot(*mount[:2]):.6g} m from the robot's centre: is it in millimetres?")
+    look_at_heading("mount", mount[2])
+
+
+def look_at_grid(resolution: float, origin: tuple[float, float, float]) -> None:
+    """Warn of cells larger than those of maps for robots, and of an origin in degrees."""
+    if resolution > _LARGEST_CELL:
+        _notice(
+            f"resolution: is {resolution:.6g} m, the side of a cell: is it in centimetres or millimetres? Maps for "
+            "robots have cells of 0.01 to 0.25 m"
+        )
+    look_at_heading("origin", origin[2])
+
+
+def look_at_scene(range_max: float, size: float) -> None:
+    """Warn of a range that is far larger than a map.
+
+    Args:
+        range_max: Largest range [m].
+        size: Diagonal of the map [m].
+    """
+    if _FAR < range_max <= _FARTHEST and range_max > 10 * size:
+        _notice(
+            f"range_max: is {range_max:.6g} m in a map of {size:.4g} m from corner to corner: is it in millimetres, or "
+            "the map's resolution in other units than metres?"
+        )
+
+
+def look_at_readings(name: str, ranges: NDArray[np.floating], range_max: float, size: float | None = None) -> bool:
+    """Warn of negative readings, and of readings in other units than metres.
+
+    Args:
+        name: Name of the argument.
+        ranges: Readings of one scan or of several, of any value [m].
+        range_max: Of the scanner [m].
+        size: Diagonal of the map [m], where there is one.
+
+    Returns:
+        Whether there was a reason for a warning.
+    """
+    finite = ranges[np.isfinite(ranges)]
+    doubtful = False
+    if (finite < 0).any():
+        doubtful = True
+        _notice(
+            f"{name}: negative readings are missing readings, which say nothing (0 nats): a scanner's code for an "
+            "error, or another sign than meant? NaN is a missing reading without this warning"
+        )
+    positive = finite[finite > 0]
+    if len(positive):
+        limits = {f"range_max = {range_max:.6g} m": _TIMES_RANGE * range_max}
+        limits |= {} if size is None else {f"the map, {size:.4g} m from corner to corner": _TIMES_MAP * size}
+        for what, limit in limits.items():
+            beyond = positive[positive > limit]
+            if 2 * len(beyond) > len(positive) and len(np.unique(beyond)) >= _VALUES:
+                _notice(f"{name}: most readings are far beyond {what}: are they in millimetres? Metres are meant")
+                return True
+    return doubtful
+
+
+class FirstScans:
+    """The first scans of a scanner, which are looked at until one is doubtful; later ones cost nothing.
+
+    Args:
+        range_max: Of the scanner [m].
+    """
+
+    __slots__ = ("_left", "_range_max")
+
+    def __init__(self, range_max: float) -> None:
+        self._range_max, self._left = range_max, _CALLS
+
+    def look_at(self, name: str, ranges: NDArray[np.floating], size: float | None = None) -> None:
+        """Warn of readings that cannot be meant; arguments as for :func:`look_at_readings`."""
+        if not self._left:
+            return
+        self._left -= 1
+        least = np.fmin.reduce(ranges, axis=None, initial=np.inf)
+        if not 0 <= least < self._range_max and look_at_readings(name, ranges, self._range_max, size):
+            self._left = 0
+
+
+def look_at_start(pose: NDArray[np.float64], inside: bool, bounds: tuple[float, float, float, float]) -> None:
+    """Warn of a start off the map, or with a heading in degrees.
+
+    Args:
+        pose: (3,) the start [m, m, rad].
+        inside: Whether it lies on the map.
+        bounds: (x_min, y_min, x_max, y_max) of the map [m].
+    """
+    x, y, theta = pose.tolist()
+    if not inside:
+        low_x, low_y, high_x, high_y = bounds
+        _notice(
+            f"start: ({x:.6g}, {y:.6g}) m lies outside the map, which has x from {low_x:.6g} to {high_x:.6g} m and y "
+            f"from {low_y:.6g} to {high_y:.6g} m: is it in another frame, or in cells?"
+        )
+    look_at_heading("start", theta)

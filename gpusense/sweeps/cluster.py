@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent import futures
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -41,7 +42,7 @@ class DaskExecutor(Executor):
         address: Of a scheduler, such as ``"tcp://10.0.0.1:8786"``; None starts a cluster in this process, whose
             scheduler, workers and dashboard listen on 127.0.0.1 only.
         devices: Of a cluster that is started: selection strings, one for each worker, or the number of workers.
-        security: A ``distributed.Security`` with certificates for TLS.
+        security: A ``distributed.Security`` with certificates for TLS; None has those of Dask's configuration, if any.
         timeout: Longest time to connect, and to wait for a worker where there is none [s].
         job_timeout: As that of :class:`ProcessExecutor`.
         memory_limit: As that of :class:`ProcessExecutor`; the memory limit of a Dask worker holds for its jobs, too.
@@ -109,6 +110,10 @@ class DaskExecutor(Executor):
             self._client.register_plugin(_plugin(self._name, {}), name=f"gpusense-{self._name}")
         except ImportError as error:
             raise ImportError(f"dask: every worker must have gpusense and what it needs, got {error}") from error
+        except TypeError as error:
+            if "ssl_context" not in str(error):
+                raise
+            raise ValueError(f"security: must have certificates for TLS, got none for {address}") from error
         except (OSError, TimeoutError) as error:
             rule = f"dask: must have a scheduler with workers at {address}"
             raise OSError(f"{rule}, got none in {patience:g} s: {checks.show(str(error))}") from error
@@ -209,6 +214,26 @@ class DaskExecutor(Executor):
     def _say_goodbye(self) -> None:
         with contextlib.suppress(Exception):
             self._client.unregister_worker_plugin(f"gpusense-{self._name}")
+
+
+def security_of(authority: Path, certificate: Path, key: Path) -> Any:
+    """Return the TLS settings of a client, from files in PEM.
+
+    Args:
+        authority: Certificate of the authority that has signed those of the cluster.
+        certificate: Certificate of the client.
+        key: Its private key.
+
+    Raises:
+        ImportError: Dask is not installed.
+    """
+    try:
+        import distributed
+    except ImportError as error:
+        raise ImportError(_ABSENT) from error
+    return distributed.Security(
+        tls_ca_file=str(authority), tls_client_cert=str(certificate), tls_client_key=str(key), require_encryption=True
+    )
 
 
 async def _identity(client: Any) -> Any:

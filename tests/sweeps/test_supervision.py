@@ -201,7 +201,10 @@ def test_a_worker_that_ends_between_jobs_is_charged_to_none(tmp_path):
 
 def test_workers_that_cannot_start_end_the_sweep(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONHOME", str(tmp_path / "nowhere"))
-    with ProcessExecutor(1) as executor, pytest.raises(SweepLost, match="must start .* got 3 that ended with exit code"):
+    with (
+        ProcessExecutor(1) as executor,
+        pytest.raises(SweepLost, match="must start .* got 3 that ended with exit code"),
+    ):
         swept(endings(tmp_path, [], 2), tmp_path / "t.csv", executor)
 
 

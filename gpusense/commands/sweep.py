@@ -36,13 +36,13 @@ _TLS = {
 _EPILOG = """\
 A plan is a YAML file: each combination of its axes is a job. docs/sweeps.md describes it.
 
-A row is appended to the table as soon as its job ends. A failed job is a row with its error; one that ends its
-worker, hangs beyond --job-timeout or grows beyond --memory-limit fails alone. After a crash or Ctrl-C, --resume runs the
-jobs that have no row yet.
+A row is appended to the table as soon as its job ends. A failed job is a row with its error; one that ends its worker,
+hangs beyond --job-timeout or grows beyond --memory-limit fails alone. After a crash or Ctrl-C, --resume runs the jobs
+that have no row yet.
 
-Jobs run in a process of their own; with --processes or several --device in several, one for each device; with --dask on a
-Dask cluster. A cluster of 'local' listens on the loopback only. Whoever reaches the ports of a Dask cluster executes code
-there: use one at an address in a network that you trust, or with TLS. Maps and logs are sent to its workers, once.
+Jobs run in a process of their own; with --processes or several --device in several, one for each device; with --dask on
+a Dask cluster. A cluster of 'local' listens on the loopback only. Whoever reaches the ports of a Dask cluster executes
+code there: use one at an address in a network that you trust, or with TLS. Maps and logs are sent to its workers, once.
 
 Exit codes: 0 success, 1 some jobs failed, 2 bad input, or the cluster ended, 130 interrupted.
 

@@ -27,7 +27,7 @@ LOOPBACK = "127.0.0.1"
 # Resource of a Dask worker that stands for its device: a job takes one.
 RESOURCE = "gpusense"
 # Seconds for the scheduler to answer, and for workers to end what they run.
-_ANSWER, _GOODBYE = 10.0, 10.0
+_ANSWER, _GOODBYE = 5.0, 10.0
 _ABSENT = "dask: must be installed for this executor: pip install 'gpusense[sweep]'"
 
 
@@ -74,26 +74,26 @@ class DaskExecutor(Executor):
             raise ImportError(_ABSENT) from error
         patience = checks.real("timeout", timeout, above=0)
         limits = limits_of(job_timeout, memory_limit)
-        self._names = device_names(devices) if address is None else []
+        names = device_names(devices) if address is None else []
         self._name, self._contents = secrets.token_hex(8), dict[str, Any]()
         self._client: Any
         self._cluster: Any
         self._client = self._cluster = None
         self._watch: Watch | None = None
         try:
-            self._connect(address, security, patience)
+            self._connect(address, names, security, patience)
             self.address = str(self._client.scheduler.address)
             self._pinned = any(one.get("resources", {}).get(RESOURCE) for one in (self._workers() or {}).values())
             options = {"resources": {RESOURCE: 1}} if self._pinned else {}
             self._watch = Watch(
-                lambda watch: Link(self._client, self._name, limits, options, lambda: watch.lost),
-                self._usable, lambda: self.alive, patience,
+                lambda watch: Link(self._client, self._name, limits, options, lambda: watch.lost or self._ended),
+                self._usable, lambda: self._ended, patience,
             )  # fmt: skip
         except BaseException:
             self._leave()
             raise
 
-    def _connect(self, address: str | None, security: Any, patience: float) -> None:
+    def _connect(self, address: str | None, names: list[str], security: Any, patience: float) -> None:
         """Start a cluster or reach the one at the address, and wait for a worker.
 
         Raises:
@@ -103,7 +103,7 @@ class DaskExecutor(Executor):
         import distributed
 
         try:
-            self._cluster = None if address is not None else _local(len(self._names), security)
+            self._cluster = None if address is not None else _local(names, security)
             target = address if self._cluster is None else self._cluster
             self._client = distributed.Client(target, timeout=patience, security=security, set_as_default=False)
             self._client.wait_for_workers(1, timeout=patience)
@@ -137,13 +137,13 @@ class DaskExecutor(Executor):
         workers: Mapping[str, Any] = answer["workers"]
         return workers
 
-    def _usable(self) -> list[tuple[str, str, str]] | None:
-        """Return address, folder and device of the workers that take jobs."""
+    def _usable(self) -> list[tuple[str, str]] | None:
+        """Return address and folder of the workers that take jobs."""
         workers = self._workers()
         if workers is None:
             return None
         return [
-            (address, one["local_directory"], self._names[int(one["name"])] if self._names else "")
+            (address, one["local_directory"])
             for address, one in workers.items()
             if one.get("status", "running") == "running" and (one["resources"].get(RESOURCE) or not self._pinned)
         ]
@@ -169,6 +169,11 @@ class DaskExecutor(Executor):
         """Whether the scheduler is there."""
         return bool(self._client.status == "running" and not self._client.scheduler_comm.comm.closed())
 
+    @property
+    def _ended(self) -> str:
+        """Why there is no scheduler any more; empty as long as there is one."""
+        return "" if self.alive else "the scheduler has ended"
+
     def send(self, contents: Mapping[str, Any]) -> None:
         """Send maps and the bytes of logs once to each worker, also to those that join later."""
         self._client.register_plugin(_plugin(self._name, dict(contents)), name=f"gpusense-{self._name}")
@@ -190,6 +195,8 @@ class DaskExecutor(Executor):
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Leave the cluster after the jobs that run, and end it if it was started here."""
         if self._watch is not None and not self._watch.lost:
+            if self._ended:
+                self._watch.lose(self._ended)
             running = self._watch.open
             for future in running if cancel_futures else ():
                 future.cancel()
@@ -200,7 +207,7 @@ class DaskExecutor(Executor):
     def _leave(self) -> None:
         # A client without its scheduler would log that it no longer reconnects.
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
-        if self._client is not None and self._client.status == "running":
+        if self._client is not None and self.alive:
             # Workers end the processes of this executor; those that do not answer are not waited for.
             thread = threading.Thread(target=self._say_goodbye, daemon=True)
             thread.start()
@@ -283,7 +290,7 @@ def _plugin(name: str, contents: dict[str, Any]) -> Any:
     return Contents()
 
 
-def _local(workers: int, security: Any) -> Any:
+def _local(names: list[str], security: Any) -> Any:
     """Start a cluster in this process, all ports on the loopback; its workers supervise processes."""
     import dask
     import distributed
@@ -294,9 +301,11 @@ def _local(workers: int, security: Any) -> Any:
         "options": {**common, "port": 0, "dashboard": True, "dashboard_address": f"{LOOPBACK}:0"},
     }
     options = {**common, "nthreads": 1, "resources": {RESOURCE: 1}, "memory_limit": 0, "dashboard": False}
-    specification = {index: {"cls": distributed.Worker, "options": options} for index in range(workers)}
+    specification = {index: {"cls": distributed.Worker, "options": options} for index in range(len(names))}
     # Workers in this process are not lost, however long the machine sleeps.
     with dask.config.set({"distributed.scheduler.worker-ttl": None}):
-        return distributed.SpecCluster(
+        cluster = distributed.SpecCluster(
             scheduler=scheduler, workers=specification, silence_logs=50, asynchronous=False, security=security
         )
+    on_worker.DEVICES.update({worker.id: names[index] for index, worker in cluster.workers.items()})
+    return cluster

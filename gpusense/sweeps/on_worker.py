@@ -15,6 +15,8 @@ from gpusense.sweeps.worker import receive
 # Pools of this process by worker and executor: a cluster of one machine has several workers in a process.
 _POOLS: dict[tuple[str, str], Pool] = {}
 _LOCK = threading.Lock()
+# Devices of the Dask workers in this process; others have that of their environment.
+DEVICES: dict[str, str] = {}
 
 # An answer: its pickle, or how the worker failed.
 Answer = bytes | BrokenExecutor
@@ -65,13 +67,12 @@ class Pool:
             self._folder.cleanup()
 
 
-def answer(executor: str, place: str, device: str, payload: bytes, limits: Limits) -> Answer | None:
+def answer(executor: str, place: str, payload: bytes, limits: Limits) -> Answer | None:
     """Run a call in a process of the Dask worker that runs this.
 
     Args:
         executor: Name of the executor.
         place: Folder of the worker that was meant: Dask would repeat the call on one that has its address since.
-        device: Selection string of the worker's device; empty leaves that of the environment.
         payload: The call.
         limits: Limits of the job; the memory limit of the Dask worker holds as well.
 
@@ -86,7 +87,7 @@ def answer(executor: str, place: str, device: str, payload: bytes, limits: Limit
     known = [one for one in (limits.memory, worker.memory_manager.memory_limit) if one]
     try:
         limits = limits._replace(memory=min(known, default=None))
-        return pool_of(worker, executor).call(payload, limits, device)
+        return pool_of(worker, executor).call(payload, limits, DEVICES.get(worker.id, ""))
     except BrokenExecutor as error:
         return error
 

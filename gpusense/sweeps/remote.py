@@ -20,8 +20,8 @@ from gpusense.sweeps.supervised import Limits, WorkerDied, result_of
 from gpusense.sweeps.worker import error_text
 
 _LOG = logging.getLogger("gpusense")
-# Seconds between two looks at the scheduler's list of workers, and for its answer.
-LOOK, _ANSWER = 1.0, 10.0
+# Seconds between two looks at the scheduler's list of workers.
+LOOK = 1.0
 # Seconds to wait for a finished call's result before asking whether it still exists, and how often.
 _FETCH, _FETCHES = 2.0, 15
 
@@ -67,7 +67,6 @@ class RemoteWorker:
         link: To its cluster.
         address: Its address.
         place: Its folder, which no other worker has had.
-        device: Selection string of its device; empty leaves that of its environment.
 
     Attributes:
         address: It.
@@ -75,8 +74,8 @@ class RemoteWorker:
         gone: Set once the worker has left the cluster.
     """
 
-    def __init__(self, link: Link, address: str, place: str, device: str) -> None:
-        self._link, self._device = link, device
+    def __init__(self, link: Link, address: str, place: str) -> None:
+        self._link = link
         self.address, self.place, self.gone = address, place, threading.Event()
 
     def call(self, payload: bytes, name: str = "") -> Any:
@@ -92,7 +91,7 @@ class RemoteWorker:
         """
         link = self._link
         remote = link.client.submit(
-            on_worker.answer, name or link.name, self.place, self._device, payload, link.limits,
+            on_worker.answer, name or link.name, self.place, payload, link.limits,
             workers=[self.address], allow_other_workers=False, pure=False, retries=0, **link.options,
         )  # fmt: skip
         try:
@@ -152,8 +151,8 @@ class Watch:
 
     Args:
         link: To the cluster.
-        workers: Returns the usable workers now: address, folder and device; None where the scheduler does not answer.
-        alive: Tells whether there is a scheduler.
+        workers: Returns the usable workers now: address and folder; None where the scheduler does not answer.
+        ended: Returns why there is no scheduler any more, or an empty text.
         patience: Longest time without a worker, or without an answer of the scheduler [s].
 
     Attributes:
@@ -164,12 +163,12 @@ class Watch:
     def __init__(
         self,
         link: Callable[[Watch], Link],
-        workers: Callable[[], list[tuple[str, str, str]] | None],
-        alive: Callable[[], bool],
+        workers: Callable[[], list[tuple[str, str]] | None],
+        ended: Callable[[], str],
         patience: float,
     ) -> None:
         self.lost, self.workers = "", dict[str, RemoteWorker]()
-        self._found, self._alive, self._patience = workers, alive, patience
+        self._found, self._ended, self._patience = workers, ended, patience
         # Workers that cannot run calls, with the reasons.
         self._refused: dict[str, str] = {}
         self._calls: queue.SimpleQueue[Call] = queue.SimpleQueue()
@@ -190,9 +189,17 @@ class Watch:
             if self.lost:
                 raise RuntimeError(self.lost)
             self._open.add(future)
+            self._calls.put(Call(payload, future))
         future.add_done_callback(self._open.discard)
-        self._calls.put(Call(payload, future))
         return future
+
+    def _return(self, call: Call) -> None:
+        """Queue a call again, which its worker has not begun."""
+        with self._lock:
+            if not self.lost:
+                self._calls.put(call)
+                return
+        _refuse(call, self.lost)
 
     @property
     def open(self) -> list[Future[Any]]:
@@ -211,36 +218,42 @@ class Watch:
 
     def _look(self) -> None:
         """Follow the workers of the cluster, until it is lost."""
+        try:
+            self._follow()
+        except Exception as error:
+            # Nothing may wait for a watch that has ended.
+            _LOG.error("sweep: the workers could not be followed", exc_info=True)
+            self.lose(f"the workers could not be followed: {error_text(error)}")
+
+    def _follow(self) -> None:
         answered = present = time.monotonic()
         while not self._end.wait(LOOK):
-            found, now = self._found(), time.monotonic()
-            if not self._alive():
-                self.lose("the scheduler has ended")
-            elif found is None:
-                if now - answered > self._patience:
-                    self.lose(f"the scheduler has not answered for {self._patience:g} s")
+            found, now = None if self._ended() else self._found(), time.monotonic()
+            if found is None:
+                silent = f"the scheduler has not answered for {self._patience:g} s"
+                reason = self._ended() or (silent if now - answered > self._patience else "")
+                if reason:
+                    self.lose(reason)
                 continue
-            else:
-                had = bool(self.workers)
-                self._match(found)
-                answered = now
-                if self.workers:
-                    present = now
-                elif now - present > self._patience:
-                    reasons = "".join(f"; left out: {reason}" for reason in self._refused.values())
-                    self.lose(f"no worker has been there for {self._patience:g} s{reasons}")
-                elif had:
-                    _LOG.warning("sweep: no worker is left, waiting %g s for one", self._patience)
+            had, answered = bool(self.workers), now
+            self._match(found)
+            if self.workers:
+                present = now
+            elif now - present > self._patience:
+                reasons = "".join(f"; left out: {reason}" for reason in self._refused.values())
+                self.lose(f"no worker has been there for {self._patience:g} s{reasons}")
+            elif had:
+                _LOG.warning("sweep: no worker is left, waiting %g s for one", self._patience)
 
-    def _match(self, found: list[tuple[str, str, str]]) -> None:
+    def _match(self, found: list[tuple[str, str]]) -> None:
         """Take workers in that are new, and let those go that have left."""
         found = [one for one in found if one[1] not in self._refused]
-        places = {place for _, place, _ in found}
+        places = {place for _, place in found}
         for place in [place for place in self.workers if place not in places]:
             self.workers.pop(place).gone.set()
-        for address, place, device in found:
+        for address, place in found:
             if place not in self.workers:
-                worker = self.workers[place] = RemoteWorker(self.link, address, place, device)
+                worker = self.workers[place] = RemoteWorker(self.link, address, place)
                 threading.Thread(target=self._serve, args=(worker,), name="gpusense-sweep", daemon=True).start()
 
     def _serve(self, worker: RemoteWorker) -> None:
@@ -254,7 +267,7 @@ class Watch:
                 _LOG.warning("sweep: a worker is left out: %s", error)
                 self._refused[worker.place] = str(error)
                 worker.gone.set()
-                self._calls.put(call)
+                self._return(call)
             except BaseException as error:
                 call.future.set_exception(error)
 
@@ -265,7 +278,7 @@ class Watch:
                 if self.lost:
                     _refuse(call, self.lost)
                 elif worker.gone.is_set():
-                    self._calls.put(call)
+                    self._return(call)
                 else:
                     yield call
 

@@ -56,12 +56,13 @@ class Cluster:
             time.sleep(0.05)
 
     def close(self):
-        """End all processes: nannies end their workers where they are asked to."""
-        for process in (*self.workers, self.scheduler):
-            process.terminate()
-        for process in (*self.workers, self.scheduler):
+        """End all processes; a nanny ends its worker, which would look for the scheduler for a while."""
+        for process in (self.scheduler, *self.workers):
+            nanny = process is not self.scheduler and "--no-nanny" not in process.args
+            (process.terminate if nanny else process.kill)()
+        for process in (self.scheduler, *self.workers):
             with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(20)
+                process.wait(10)
             process.kill()
             process.wait()
 

@@ -235,3 +235,29 @@ def test_a_cluster_of_this_machine_may_use_tls(tmp_path):
         assert executor.address.startswith("tls://127.0.0.1:")
         assert all(address.startswith("tls://127.0.0.1:") for address in executor._workers())
         assert executor.submit(abs, -3).result(timeout=60) == 3
+
+
+def test_a_watch_that_fails_ends_the_calls(tmp_path):
+    with gs.sweep.DaskExecutor(timeout=60) as executor:
+        watch = executor._watched
+        running = executor.submit(time.sleep, 600)
+        queued = executor.submit(abs, 1)
+        watch._found = lambda: 1 / 0
+        for future in (running, queued):
+            with pytest.raises(OSError, match="the workers could not be followed: ZeroDivisionError"):
+                future.result(timeout=60)
+
+
+def test_a_worker_that_cannot_run_calls_is_left_out(caplog):
+    with gs.sweep.DaskExecutor(devices=2, timeout=2) as executor:
+        first, second = executor._watched.workers.values()
+        first.place = second.place = "/nowhere"
+        # Dask repeats a call on a worker that has taken over an address: it is not begun there.
+        with pytest.raises(WorkerDied, match="with its Dask worker at"):
+            executor.submit(abs, -1).result(timeout=60)
+        first._link = second._link = first._link._replace(limits=None)
+        with pytest.raises(OSError, match=r"no worker has been there .* left out: tcp://127.* AttributeError"):
+            first.place = next(place for place, one in executor._watched.workers.items() if one is first)
+            second.place = next(place for place, one in executor._watched.workers.items() if one is second)
+            executor.submit(abs, -1).result(timeout=60)
+        assert caplog.text.count("a worker is left out") == 2

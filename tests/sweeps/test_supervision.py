@@ -1,4 +1,4 @@
-"""Jobs that end their workers, hang or take too much memory: failed rows, exact numbers of starts, nothing that waits."""
+"""Jobs that end their workers, hang or take too much memory: failed rows, exact numbers of starts, no endless wait."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ def test_what_a_job_has_started_ends_with_its_worker(tmp_path):
     code = "import time; time.sleep(600)"
     with ProcessExecutor(1, job_timeout=1.5) as executor:
         started = executor.submit(start_and_hang, str(tmp_path), code)
-        with pytest.raises(JobTimeout, match="after the limit of 1.5 s"):
+        with pytest.raises(JobTimeout, match=r"after the limit of 1\.5 s"):
             started.result(timeout=60)
     await_end([int((tmp_path / "process").read_text())])
 
@@ -203,7 +203,7 @@ def test_workers_that_cannot_start_end_the_sweep(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONHOME", str(tmp_path / "nowhere"))
     with (
         ProcessExecutor(1) as executor,
-        pytest.raises(SweepLost, match="must start .* got 3 that ended with exit code"),
+        pytest.raises(SweepLost, match=r"must start .* got 3 that ended with exit code"),
     ):
         swept(endings(tmp_path, [], 2), tmp_path / "t.csv", executor)
 

@@ -1,6 +1,7 @@
 """Sweeps: jobs as plain data, run on processes or a Dask cluster, with a table that survives crashes."""
 
 from gpusense.sweeps.cluster import DaskExecutor
+from gpusense.sweeps.deaths import JobTimeout, WorkerDied
 from gpusense.sweeps.executors import ProcessExecutor, SerialExecutor
 from gpusense.sweeps.job import Job
 from gpusense.sweeps.plan import read_plan
@@ -8,7 +9,6 @@ from gpusense.sweeps.run import Sweep, run
 from gpusense.sweeps.split_filter import SplitParticleFilter
 from gpusense.sweeps.starts import SweepLost
 from gpusense.sweeps.store import Store
-from gpusense.sweeps.supervised import JobTimeout, WorkerDied
 from gpusense.sweeps.table import read_table
 
 __all__ = [

@@ -194,7 +194,8 @@ def _executor(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Iterator[Execu
 
 @contextlib.contextmanager
 def _dask(args: argparse.Namespace, names: list[str] | int, limits: dict[str, Any]) -> Iterator[DaskExecutor]:
-    from gpusense.sweeps.cluster import DaskExecutor, security_of
+    from gpusense.sweeps.cluster import DaskExecutor
+    from gpusense.sweeps.local_cluster import security_of
 
     local = args.dask == LOCAL
     try:

@@ -8,27 +8,24 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import pickle
 import secrets
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent import futures
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from gpusense._util import checks
 from gpusense.sweeps import on_worker
 from gpusense.sweeps.executors import device_names
+from gpusense.sweeps.local_cluster import ABSENT, RESOURCE, local_cluster
 from gpusense.sweeps.remote import Link, RemoteWorker, Watch
 from gpusense.sweeps.supervised import limits_of
 
-LOOPBACK = "127.0.0.1"
-# Resource of a Dask worker that stands for its device: a job takes one.
-RESOURCE = "gpusense"
 # Seconds for the scheduler to answer, and for workers to end what they run.
 _ANSWER, _GOODBYE = 5.0, 10.0
-_ABSENT = "dask: must be installed for this executor: pip install 'gpusense[sweep]'"
 
 
 class DaskExecutor(Executor):
@@ -71,11 +68,11 @@ class DaskExecutor(Executor):
         try:
             import distributed  # noqa: F401
         except ImportError as error:
-            raise ImportError(_ABSENT) from error
+            raise ImportError(ABSENT) from error
         patience = checks.real("timeout", timeout, above=0)
         limits = limits_of(job_timeout, memory_limit)
         names = device_names(devices) if address is None else []
-        self._name, self._contents = secrets.token_hex(8), dict[str, Any]()
+        self._name = secrets.token_hex(8)
         self._client: Any
         self._cluster: Any
         self._client = self._cluster = None
@@ -83,7 +80,10 @@ class DaskExecutor(Executor):
         try:
             self._connect(address, names, security, patience)
             self.address = str(self._client.scheduler.address)
-            self._pinned = any(one.get("resources", {}).get(RESOURCE) for one in (self._workers() or {}).values())
+            workers = self._workers()
+            if workers is None:
+                raise OSError(f"dask: must have a scheduler that answers, got none at {self.address}")
+            self._pinned = any(one.get("resources", {}).get(RESOURCE) for one in workers.values())
             options = {"resources": {RESOURCE: 1}} if self._pinned else {}
             self._watch = Watch(
                 lambda watch: Link(self._client, self._name, limits, options, lambda: watch.lost or self._ended),
@@ -103,19 +103,19 @@ class DaskExecutor(Executor):
         import distributed
 
         try:
-            self._cluster = None if address is not None else _local(names, security)
+            self._cluster = None if address is not None else local_cluster(names, security)
             target = address if self._cluster is None else self._cluster
             self._client = distributed.Client(target, timeout=patience, security=security, set_as_default=False)
             self._client.wait_for_workers(1, timeout=patience)
             self._client.register_plugin(_plugin(self._name, {}), name=f"gpusense-{self._name}")
-        except ImportError as error:
-            raise ImportError(f"dask: every worker must have gpusense and what it needs, got {error}") from error
+        except (ImportError, AttributeError, pickle.PickleError) as error:
+            raise ImportError(f"dask: every worker must have this version of gpusense, got {error}") from error
         except TypeError as error:
             if "ssl_context" not in str(error):
                 raise
             raise ValueError(f"security: must have certificates for TLS, got none for {address}") from error
         except (OSError, TimeoutError) as error:
-            rule = f"dask: must have a scheduler with workers at {address}"
+            rule = f"dask: must have a scheduler with workers at {address or 'the loopback'}"
             raise OSError(f"{rule}, got none in {patience:g} s: {checks.show(str(error))}") from error
 
     def __repr__(self) -> str:
@@ -223,26 +223,6 @@ class DaskExecutor(Executor):
             self._client.unregister_worker_plugin(f"gpusense-{self._name}")
 
 
-def security_of(authority: Path, certificate: Path, key: Path) -> Any:
-    """Return the TLS settings of a client, from files in PEM.
-
-    Args:
-        authority: Certificate of the authority that has signed those of the cluster.
-        certificate: Certificate of the client.
-        key: Its private key.
-
-    Raises:
-        ImportError: Dask is not installed.
-    """
-    try:
-        import distributed
-    except ImportError as error:
-        raise ImportError(_ABSENT) from error
-    return distributed.Security(
-        tls_ca_file=str(authority), tls_client_cert=str(certificate), tls_client_key=str(key), require_encryption=True
-    )
-
-
 async def _identity(client: Any) -> Any:
     """Return what a scheduler says about itself and its workers."""
     return await client.scheduler.identity(n_workers=-1)
@@ -288,24 +268,3 @@ def _plugin(name: str, contents: dict[str, Any]) -> Any:
             on_worker.close_pools(name, worker)
 
     return Contents()
-
-
-def _local(names: list[str], security: Any) -> Any:
-    """Start a cluster in this process, all ports on the loopback; its workers supervise processes."""
-    import dask
-    import distributed
-
-    common: dict[str, Any] = dict(host=LOOPBACK, security=security)
-    scheduler = {
-        "cls": distributed.Scheduler,
-        "options": {**common, "port": 0, "dashboard": True, "dashboard_address": f"{LOOPBACK}:0"},
-    }
-    options = {**common, "nthreads": 1, "resources": {RESOURCE: 1}, "memory_limit": 0, "dashboard": False}
-    specification = {index: {"cls": distributed.Worker, "options": options} for index in range(len(names))}
-    # Workers in this process are not lost, however long the machine sleeps.
-    with dask.config.set({"distributed.scheduler.worker-ttl": None}):
-        cluster = distributed.SpecCluster(
-            scheduler=scheduler, workers=specification, silence_logs=50, asynchronous=False, security=security
-        )
-    on_worker.DEVICES.update({worker.id: names[index] for index, worker in cluster.workers.items()})
-    return cluster

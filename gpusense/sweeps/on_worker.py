@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,7 @@ class Pool:
                 kept[path].write_bytes(content)
         self._first = [pickled(receive, (kept,), {})]
 
-    def call(self, payload: bytes, limits: Limits, device: str) -> bytes:
+    def call(self, payload: bytes, limits: Limits, device: str, wanted: Callable[[], bool]) -> bytes:
         """Run a call in a process, and return the pickle of its answer."""
         with self._lock:
             if not self._free:
@@ -52,7 +52,7 @@ class Pool:
                 self._all.append(self._free[-1])
             process = self._free.pop()
         try:
-            return process.call(payload, limits)
+            return process.call(payload, limits, wanted)
         finally:
             with self._lock:
                 self._free.append(process)
@@ -84,12 +84,23 @@ def answer(executor: str, place: str, payload: bytes, limits: Limits) -> Answer 
     worker = distributed.get_worker()
     if worker.local_directory != place:
         return None
+    task = worker.get_current_task()
     known = [one for one in (limits.memory, worker.memory_manager.memory_limit) if one]
     try:
         limits = limits._replace(memory=min(known, default=None))
-        return pool_of(worker, executor).call(payload, limits, DEVICES.get(worker.id, ""))
+        return pool_of(worker, executor).call(
+            payload, limits, DEVICES.get(worker.id, ""), lambda: _wanted(worker, task)
+        )
     except BrokenExecutor as error:
         return error
+
+
+def _wanted(worker: Any, task: str) -> bool:
+    """Tell whether a task of a Dask worker is still wanted: Dask forgets those of a client that has been killed."""
+    try:
+        return bool(worker.state.tasks[task].state == "executing")
+    except KeyError:
+        return False
 
 
 def pool_of(worker: Any, executor: str) -> Pool:

@@ -16,7 +16,8 @@ from concurrent.futures import BrokenExecutor, CancelledError, Future
 from typing import Any, NamedTuple
 
 from gpusense.sweeps import on_worker
-from gpusense.sweeps.supervised import Limits, WorkerDied, result_of
+from gpusense.sweeps.deaths import WorkerDied
+from gpusense.sweeps.supervised import Limits, result_of
 from gpusense.sweeps.worker import error_text
 
 _LOG = logging.getLogger("gpusense")

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
 from typing import Any, NamedTuple
 
+from gpusense.sweeps.deaths import JobTimeout, WorkerDied
 from gpusense.sweeps.job import Job
-from gpusense.sweeps.supervised import JobTimeout, WorkerDied
 from gpusense.sweeps.worker import Outcome, error_text
 
 

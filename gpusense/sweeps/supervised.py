@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 from gpusense._util import checks
 from gpusense.sweeps.child import BEGUN, READY, serve
+from gpusense.sweeps.deaths import JobTimeout, WorkerDied, death
 from gpusense.sweeps.memory import memory_of, shortages, size_text
 
 # Processes that may end before they take a call, one after another.
@@ -30,41 +31,6 @@ _STARTS = 3
 _LOOK, _LOOK_MEMORY = 0.25, 0.05
 # Seconds for a process to end by itself, and for one that has closed its link; seconds between two looks at it.
 _GRACE, _CLOSING, _SOON = 10.0, 2.0, 0.005
-
-
-class WorkerDied(BrokenExecutor):
-    """A worker ended while it ran a job.
-
-    Args:
-        how: How it ended, such as "by SIGSEGV" or "with exit code 3".
-        memory: The most memory that it was seen to use in the job [bytes]; 0 where unknown.
-        outside: Whether the cause may lie outside the job: a signal of another process, or a machine that was lost.
-
-    Example:
-        >>> import gpusense as gs
-        >>> print(gs.sweep.WorkerDied("by SIGSEGV"))
-        the worker ended by SIGSEGV
-    """
-
-    def __init__(self, how: str = "for an unknown reason", memory: int = 0, outside: bool = False) -> None:
-        super().__init__(how, memory, outside)
-        self.how, self.memory, self.outside = how, memory, outside
-
-    def __str__(self) -> str:
-        return f"the worker ended {self.how}"
-
-
-class JobTimeout(WorkerDied):
-    """A job ran for longer than its limit, and its worker was ended.
-
-    Example:
-        >>> import gpusense as gs
-        >>> print(gs.sweep.JobTimeout("after the limit of 60 s"))
-        the worker was ended after the limit of 60 s
-    """
-
-    def __str__(self) -> str:
-        return f"the worker was ended {self.how}"
 
 
 class Limits(NamedTuple):
@@ -113,8 +79,13 @@ class Supervised:
         process = self._process
         return () if process is None or process.pid is None or process.exitcode is not None else (process.pid,)
 
-    def call(self, payload: bytes, limits: Limits) -> bytes:
+    def call(self, payload: bytes, limits: Limits, wanted: Callable[[], bool] = lambda: True) -> bytes:
         """Run a call in the process, and return the pickle of its answer.
+
+        Args:
+            payload: The call.
+            limits: Its limits.
+            wanted: Tells whether anything still waits for the answer; otherwise the process is ended.
 
         Raises:
             BrokenExecutor: processes end before they take a call, or the executor was ended.
@@ -123,7 +94,7 @@ class Supervised:
         """
         for _ in range(_STARTS):
             if self._begun(payload):
-                return self._watched(limits)
+                return self._watched(limits, wanted)
             ended = self._buried()
         rule = "worker: must start (a script needs the guard if __name__ == '__main__')"
         raise BrokenExecutor(f"{rule}, got {_STARTS} that ended {ended.how}")
@@ -175,7 +146,7 @@ class Supervised:
             except (EOFError, OSError):
                 return None
 
-    def _watched(self, limits: Limits) -> bytes:
+    def _watched(self, limits: Limits, wanted: Callable[[], bool]) -> bytes:
         """Wait for the answer of a call, within its limits."""
         most, begin, short = 0, time.monotonic(), shortages()
         process, link = self._process, self._link
@@ -192,6 +163,9 @@ class Supervised:
             if limits.memory is not None and most > limits.memory:
                 self._buried(forced=True)
                 raise WorkerDied(f"beyond the memory limit of {size_text(limits.memory)}", most)
+            if not wanted():
+                self._buried(forced=True)
+                raise WorkerDied("as nothing waits for its job any more", most)
             if left <= 0:
                 self._buried(forced=True)
                 raise JobTimeout(f"after the limit of {limits.seconds:g} s", most)
@@ -211,7 +185,7 @@ class Supervised:
             self._link.close()
             self._process = self._link = None
         self._check_open()
-        return _death(code, memory, shortages() > short)
+        return death(code, memory, shortages() > short)
 
     def kill(self) -> None:
         """End the process at once, with all that it has started."""
@@ -286,18 +260,3 @@ def _parent_of_processes() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _death(code: int | None, memory: int, short: bool) -> WorkerDied:
-    """Return how a process with an exit code ended."""
-    if code is None:
-        return WorkerDied(memory=memory, outside=True)
-    if code >= 0:
-        return WorkerDied(f"with exit code {code if code < 1 << 16 else hex(code)}", memory)
-    try:
-        name = signal.Signals(-code).name
-    except ValueError:
-        name = f"signal {-code}"
-    if name != "SIGKILL":
-        return WorkerDied(f"by {name}", memory)
-    return WorkerDied(f"by {name}{', as the system ran out of memory' if short else ''}", memory, outside=True)

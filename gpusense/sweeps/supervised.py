@@ -125,7 +125,10 @@ class Supervised:
         process = context.Process(target=serve, args=(there, self._device), daemon=True, name="gpusense-sweep")
         with self._lock, _parent_of_processes():
             self._check_open()
-            process.start()
+            try:
+                process.start()
+            except OSError as error:
+                raise BrokenExecutor(f"worker: must start, got {error}") from error
             self._process, self._link = process, here
         there.close()
 
@@ -141,7 +144,7 @@ class Supervised:
         while True:
             try:
                 if wait([self._link, self._process.sentinel], _LOOK) or not self._alive():
-                    # What it sent before it ended is still in the link.
+                    # The link still holds messages from before its end.
                     return bytes(self._link.recv_bytes()) if self._link.poll() else None
             except (EOFError, OSError):
                 return None

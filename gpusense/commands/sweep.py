@@ -11,8 +11,9 @@ from concurrent.futures import Executor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gpusense._util import checks
 from gpusense._util.progress import progress
-from gpusense.commands.arguments import BACKEND_HELP, add_json, output_path, whole_number
+from gpusense.commands.arguments import BACKEND_HELP, add_json, output_path, positive_number, whole_number
 from gpusense.commands.output import print_json
 from gpusense.evaluation.machine import machine, machine_line
 
@@ -26,23 +27,31 @@ HELP = "Run many jobs from a plan, on processes or a Dask cluster, into a table 
 
 FAILED = 1
 LOCAL = "local"
+_TLS = {
+    "ca": "certificate of the authority that has signed those of the cluster",
+    "cert": "certificate of this client",
+    "key": "its private key",
+}
 
 _EPILOG = """\
 A plan is a YAML file: each combination of its axes is a job. docs/sweeps.md describes it.
 
-A row is appended to the table as soon as its job ends. A failed job is a row with its error. After a crash or Ctrl-C,
---resume runs the jobs that have no row yet.
+A row is appended to the table as soon as its job ends. A failed job is a row with its error; one that ends its worker,
+hangs beyond --job-timeout or grows beyond --memory-limit fails alone. After a crash or Ctrl-C, --resume runs the jobs
+that have no row yet.
 
-Jobs run in this process; with --processes or several --device in processes, one for each device; with --dask on a Dask
-cluster. A cluster of 'local' listens on the loopback only. Whoever reaches the ports of a Dask cluster executes code
-there: use one at an address in a network that you trust, or with TLS. Maps and logs are sent to its workers, once.
+Jobs run in a process of their own; with --processes or several --device in several, one for each device; with --dask on
+a Dask cluster. A cluster of 'local' listens on the loopback only. Whoever reaches the ports of a Dask cluster executes
+code there: use one at an address in a network that you trust, or with TLS. Maps and logs are sent to its workers, once.
 
 Exit codes: 0 success, 1 some jobs failed, 2 bad input, or the cluster ended, 130 interrupted.
 
 example:
   gpusense sweep examples/sweep_logs.yaml --root data --table sweep.csv --processes 2 --plot sweep.png
   gpusense sweep plan.yaml --device warp:cuda:0 --device warp:cuda:1
-  gpusense sweep plan.yaml --dask tcp://10.0.0.1:8786 --resume"""
+  gpusense sweep plan.yaml --processes 8 --job-timeout 600 --memory-limit 4GB
+  gpusense sweep plan.yaml --dask tcp://10.0.0.1:8786 --resume
+  gpusense sweep plan.yaml --dask tls://10.0.0.1:8786 --tls-ca ca.pem --tls-cert cert.pem --tls-key key.pem"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -59,13 +68,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--processes", type=whole_number(low=1), metavar="N",
         help="processes, or workers of the local cluster (default: one for each --device)")  # fmt: skip
     add("--device", action="append", metavar="DEVICE", help=f"{BACKEND_HELP}; repeatable: one worker each")
+    for name, what in _TLS.items():
+        add(f"--tls-{name}", type=Path, metavar="FILE", help=f"with --dask: {what}, PEM")
     add("--no-send", action="store_true", help="with --dask: workers read maps and logs from --root themselves")
     add("--attempts", type=whole_number(low=1), default=3, metavar="A",
         help="most starts of a job whose worker ends (default: %(default)s)")  # fmt: skip
+    add("--job-timeout", type=positive_number, metavar="SECONDS",
+        help="longest time of a job, which then fails, and its worker is replaced (default: none)")  # fmt: skip
+    add("--memory-limit", type=_memory, metavar="SIZE",
+        help="most memory of a worker, such as 4GB; it is ended beyond, and its job started again, "
+        "up to --attempts times (default: none)")  # fmt: skip
     add("--list", action="store_true", help="print the jobs with their keys, and run none")
     add_json(parser)
     add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
         help="draw error against run time, a point a job")  # fmt: skip
+
+
+def _memory(text: str) -> int:
+    from gpusense.sweeps.memory import size
+
+    try:
+        return size("size", text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error).removeprefix("size: ")) from None
 
 
 def run(args: argparse.Namespace) -> int:
@@ -143,40 +168,40 @@ def _executor(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Iterator[Execu
         OSError: no cluster at the address.
         ValueError: options that exclude each other.
     """
-    from gpusense.sweeps.executors import ProcessExecutor, SerialExecutor
+    from gpusense.sweeps.executors import ProcessExecutor
 
     devices: list[str] = args.device or []
     count = args.processes or max(len(devices), 1)
     if args.processes and len(devices) > 1 and len(devices) != count:
         raise ValueError(f"--processes: must be the number of --device, {len(devices)}, got {count}")
     names = devices if len(devices) == count else devices[:1] * count or count
+    given = [name for name in _TLS if getattr(args, f"tls_{name}") is not None]
+    if given and (args.dask in (None, LOCAL) or len(given) < len(_TLS)):
+        rule = "must be given together, and with --dask and an address"
+        raise ValueError(f"--tls-ca, --tls-cert, --tls-key: {rule}, got --tls-{given[0]}")
+    limits = {"job_timeout": args.job_timeout, "memory_limit": args.memory_limit}
     if args.dask is not None:
-        with _dask(args, names) as cluster:
+        with _dask(args, names, limits) as cluster:
             if args.dask != LOCAL and not args.no_send:
                 from gpusense.sweeps.sending import contents_of
 
                 cluster.send(contents_of(jobs, args.root))
             yield cluster
-    elif args.processes is None and len(devices) < 2:
-        yield SerialExecutor()
     else:
-        processes = ProcessExecutor(names)
-        try:
+        with ProcessExecutor(names, **limits) as processes:
             yield processes
-        except BaseException:
-            processes.terminate()
-            raise
-        finally:
-            processes.shutdown()
 
 
 @contextlib.contextmanager
-def _dask(args: argparse.Namespace, names: list[str] | int) -> Iterator[DaskExecutor]:
+def _dask(args: argparse.Namespace, names: list[str] | int, limits: dict[str, Any]) -> Iterator[DaskExecutor]:
     from gpusense.sweeps.cluster import DaskExecutor
+    from gpusense.sweeps.local_cluster import security_of
 
     local = args.dask == LOCAL
     try:
-        cluster = DaskExecutor(None if local else args.dask, devices=names)
+        files = [checks.existing_file(one) for one in (args.tls_ca, args.tls_cert, args.tls_key) if one is not None]
+        security = security_of(*files) if files else None
+        cluster = DaskExecutor(None if local else args.dask, devices=names, security=security, **limits)
     except ImportError as error:
         raise ValueError(str(error)) from None
     with cluster:

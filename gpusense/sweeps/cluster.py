@@ -8,50 +8,50 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
-import time
+import pickle
+import secrets
+import threading
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import CancelledError, Executor, Future
+from concurrent import futures
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from types import TracebackType
 from typing import Any
 
 from gpusense._util import checks
 from gpusense._util.extras import library
-from gpusense.sweeps.executors import WorkerDied
-from gpusense.sweeps.worker import DEVICE, receive
+from gpusense.sweeps import on_worker
+from gpusense.sweeps.executors import device_names
+from gpusense.sweeps.local_cluster import RESOURCE, local_cluster
+from gpusense.sweeps.remote import Link, RemoteWorker, Watch
+from gpusense.sweeps.supervised import limits_of
 
-LOOPBACK = "127.0.0.1"
-# Resource of a Dask worker that stands for its device: a job takes one.
-RESOURCE = "gpusense"
-# Workers would write their life to standard error.
-_QUIET = "DASK_LOGGING__DISTRIBUTED"
-# Seconds for which the number of workers is believed.
-_FRESH = 2.0
-# Seconds to wait for a finished job's result before asking whether it still exists, and how often.
-_FETCH = 2.0
-_FETCHES = 15
+# Seconds for the scheduler to answer, and for workers to end what they run.
+_ANSWER, _GOODBYE = 5.0, 10.0
 
 
 class DaskExecutor(Executor):
-    """Jobs on a Dask cluster, one at a time on each worker with a device.
+    """Jobs on a Dask cluster, one at a time on each worker, in a process that the worker supervises.
 
     Workers of a cluster at an address are started by ``GPUSENSE_SWEEP_DEVICE=warp:cuda:0 dask worker ADDRESS
-    --nthreads 1 --resources gpusense=1``, one for each device. Where no worker declares this resource, each thread
-    takes jobs.
+    --nthreads 1 --resources gpusense=1``, one for each device. Where a worker declares this resource, the others take
+    no jobs.
 
     Args:
-        address: Of a scheduler, such as ``"tcp://10.0.0.1:8786"``; None starts a cluster on this machine, whose
+        address: Of a scheduler, such as ``"tcp://10.0.0.1:8786"``; None starts a cluster in this process, whose
             scheduler, workers and dashboard listen on 127.0.0.1 only.
         devices: Of a cluster that is started: selection strings, one for each worker, or the number of workers.
-        security: A ``distributed.Security`` with certificates for TLS.
-        timeout: Longest time to connect, and to wait for the first worker [s].
+        security: A ``distributed.Security`` with certificates for TLS; None has those of Dask's configuration, if any.
+        timeout: Longest time to connect, and to wait for a worker where there is none [s].
+        job_timeout: As that of :class:`ProcessExecutor`.
+        memory_limit: As that of :class:`ProcessExecutor`; the memory limit of a Dask worker holds for its jobs, too.
 
     Attributes:
-        slots: Workers, or their threads.
+        slots: Workers.
         address: Of the scheduler.
         dashboard: Address of the dashboard; empty without one.
 
     Raises:
-        ImportError: Dask is not installed.
+        ImportError: Dask is not installed here, or gpusense is not on a worker.
         OSError: no scheduler answers at the address, or no worker joins it.
         TypeError, ValueError: an argument breaks its rule.
     """
@@ -63,36 +63,98 @@ class DaskExecutor(Executor):
         devices: int | Sequence[str] = 1,
         security: Any = None,
         timeout: float = 30.0,
+        job_timeout: float | None = None,
+        memory_limit: int | None = None,
     ) -> None:
-        distributed = library("distributed", "a sweep on Dask")
-        wait = checks.real("timeout", timeout, above=0)
-        self._cluster = None if address is not None else _local(devices, security)
-        target = address if self._cluster is None else self._cluster
+        library("distributed", "a sweep on Dask")
+        patience = checks.real("timeout", timeout, above=0)
+        limits = limits_of(job_timeout, memory_limit)
+        names = device_names(devices) if address is None else []
+        self._name = secrets.token_hex(8)
+        self._client: Any
+        self._cluster: Any
+        self._client = self._cluster = None
+        self._watch: Watch | None = None
         try:
-            self._client = distributed.Client(target, timeout=wait, security=security, set_as_default=False)
-            self._client.wait_for_workers(1, timeout=wait)
+            self._connect(address, names, security, patience)
+            self.address = str(self._client.scheduler.address)
+            workers = self._workers()
+            if workers is None:
+                raise OSError(f"dask: must have a scheduler that answers, got none at {self.address}")
+            self._pinned = any(one.get("resources", {}).get(RESOURCE) for one in workers.values())
+            options = {"resources": {RESOURCE: 1}} if self._pinned else {}
+            self._watch = Watch(
+                lambda watch: Link(self._client, self._name, limits, options, lambda: watch.lost or self._ended),
+                self._usable, lambda: self._ended, patience,
+            )  # fmt: skip
+        except BaseException:
+            self._leave()
+            raise
+
+    def _connect(self, address: str | None, names: list[str], security: Any, patience: float) -> None:
+        """Start a cluster or reach the one at the address, and wait for a worker.
+
+        Raises:
+            ImportError: a worker lacks gpusense.
+            OSError: none is there.
+        """
+        import distributed
+
+        try:
+            self._cluster = None if address is not None else local_cluster(names, security)
+            target = address if self._cluster is None else self._cluster
+            self._client = distributed.Client(target, timeout=patience, security=security, set_as_default=False)
+            self._client.wait_for_workers(1, timeout=patience)
+            self._client.register_plugin(_plugin(self._name, {}), name=f"gpusense-{self._name}")
+        except (ImportError, AttributeError, pickle.PickleError) as error:
+            raise ImportError(f"dask: every worker must have this version of gpusense, got {error}") from error
+        except TypeError as error:
+            if "ssl_context" not in str(error):
+                raise
+            raise ValueError(f"security: must have certificates for TLS, got none for {address}") from error
         except (OSError, TimeoutError) as error:
-            self._end()
-            raise OSError(f"dask: must have a scheduler with workers at {address}, got none in {wait:g} s") from error
-        self.address = str(self._client.scheduler.address)
-        self._slots, self._asked = 0, -math.inf
-        self._pinned = any(one.get("resources", {}).get(RESOURCE) for one in self._workers().values())
+            rule = f"dask: must have a scheduler with workers at {address or 'the loopback'}"
+            raise OSError(f"{rule}, got none in {patience:g} s: {checks.show(str(error))}") from error
 
     def __repr__(self) -> str:
         return f"DaskExecutor({self.address!r}, {self.slots} slots)"
 
-    def _workers(self) -> Mapping[str, Any]:
-        workers: Mapping[str, Any] = self._client.scheduler_info(n_workers=-1)["workers"]
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool | None:
+        if kind is not None:
+            self.terminate()
+        return super().__exit__(kind, error, trace)
+
+    def _workers(self) -> Mapping[str, Any] | None:
+        """Return the scheduler's list of workers; None where it does not answer."""
+        try:
+            answer = self._client.sync(_identity, self._client, callback_timeout=_ANSWER)
+        except Exception:
+            return None
+        workers: Mapping[str, Any] = answer["workers"]
         return workers
+
+    def _usable(self) -> list[tuple[str, str]] | None:
+        """Return address and folder of the workers that take jobs."""
+        workers = self._workers()
+        if workers is None:
+            return None
+        return [
+            (address, one["local_directory"])
+            for address, one in workers.items()
+            if one.get("status", "running") == "running" and (one["resources"].get(RESOURCE) or not self._pinned)
+        ]
 
     @property
     def slots(self) -> int:
-        """Jobs that run at once, as the scheduler said within the last two seconds."""
-        if time.monotonic() > self._asked + _FRESH:
-            workers = self._workers().values()
-            counts = [one.get("resources", {}).get(RESOURCE, 0) if self._pinned else one["nthreads"] for one in workers]
-            self._slots, self._asked = int(sum(counts)), time.monotonic()
-        return self._slots
+        """Jobs that run at once: the workers that were there a second ago."""
+        return len(self._watched.workers)
+
+    @property
+    def _watched(self) -> Watch:
+        assert self._watch is not None
+        return self._watch
 
     @property
     def dashboard(self) -> str:
@@ -102,127 +164,105 @@ class DaskExecutor(Executor):
 
     @property
     def alive(self) -> bool:
-        """Whether the scheduler answers."""
+        """Whether the scheduler is there."""
         return bool(self._client.status == "running" and not self._client.scheduler_comm.comm.closed())
+
+    @property
+    def _ended(self) -> str:
+        """Why there is no scheduler any more; empty as long as there is one."""
+        return "" if self.alive else "the scheduler has ended"
 
     def send(self, contents: Mapping[str, Any]) -> None:
         """Send maps and the bytes of logs once to each worker, also to those that join later."""
-        self._client.register_plugin(_plugin(dict(contents)), name="gpusense-sweep")
+        self._client.register_plugin(_plugin(self._name, dict(contents)), name=f"gpusense-{self._name}")
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Queue a function of a module; jobs of a worker that dies run on another one."""
-        options: dict[str, Any] = {"resources": {RESOURCE: 1}} if self._pinned else {}
-        future: Future[Any] = Future()
-        future.set_running_or_notify_cancel()
-        # pure=False: jobs of equal arguments are different jobs.
-        remote = self._client.submit(fn, *args, pure=False, **options, **kwargs)
-        remote.add_done_callback(lambda done: _settle(done, future))
-        return future
+        """Queue a function for the next free worker; where this ends, the future raises :class:`WorkerDied`."""
+        return self._watched.submit(_payload(fn, args, kwargs))
 
     def on_each(self) -> list[Executor]:
-        """Return an executor for each worker, which runs functions there and nowhere else."""
-        return [_OneWorker(self._client, address) for address in self._workers()]
+        """Return an executor for each worker, which runs functions there in one process and nowhere else."""
+        return [_OneWorker(one, f"{self._name}-each") for one in list(self._watched.workers.values())]
+
+    def terminate(self) -> None:
+        """End the jobs that run, and leave the cluster."""
+        if self._watch is not None:
+            self._watch.lose("the executor has been shut down")
+        self._leave()
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Leave the cluster, and end it if it was started here."""
-        self._end()
+        """Leave the cluster after the jobs that run, and end it if it was started here."""
+        if self._watch is not None and not self._watch.lost:
+            if self._ended:
+                self._watch.lose(self._ended)
+            running = self._watch.open
+            for future in running if cancel_futures else ():
+                future.cancel()
+            if wait:
+                futures.wait(running)
+        self.terminate()
 
-    def _end(self) -> None:
+    def _leave(self) -> None:
         # A client without its scheduler would log that it no longer reconnects.
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
-        for one in (getattr(self, "_client", None), self._cluster):
+        if self._client is not None and self.alive:
+            # Workers end the processes of this executor; those that do not answer are not waited for.
+            thread = threading.Thread(target=self._say_goodbye, daemon=True)
+            thread.start()
+            thread.join(_GOODBYE)
+        on_worker.close_pools(self._name)
+        for one in (self._client, self._cluster):
             if one is not None:
                 with contextlib.suppress(OSError, TimeoutError):
                     one.close()
 
+    def _say_goodbye(self) -> None:
+        with contextlib.suppress(Exception):
+            self._client.unregister_worker_plugin(f"gpusense-{self._name}")
+
+
+async def _identity(client: Any) -> Any:
+    """Return what a scheduler says about itself and its workers."""
+    return await client.scheduler.identity(n_workers=-1)
+
 
 class _OneWorker(Executor):
-    """Functions on one worker of a cluster."""
+    """Functions on one worker of a cluster, in a process that runs nothing else."""
 
-    def __init__(self, client: Any, address: str) -> None:
-        self._client, self._address, self.slots = client, address, 1
+    def __init__(self, worker: RemoteWorker, name: str) -> None:
+        self._worker, self._name, self.slots = worker, name, 1
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="gpusense-sweep")
 
     def __repr__(self) -> str:
-        return f"_OneWorker({self._address!r})"
+        return f"_OneWorker({self._worker.address!r})"
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        future.set_running_or_notify_cancel()
-        remote = self._client.submit(fn, *args, pure=False, workers=[self._address], **kwargs)
-        remote.add_done_callback(lambda done: _settle(done, future))
-        return future
+        return self._thread.submit(self._worker.call, _payload(fn, args, kwargs), self._name)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        self._thread.shutdown(wait=wait, cancel_futures=cancel_futures)
 
 
-def _settle(remote: Any, future: Future[Any]) -> None:
-    """Hand the result of a Dask future on."""
-    import distributed
+def _payload(fn: Callable[..., Any], args: Any, kwargs: Any) -> bytes:
+    """Return the pickle of a call, also of a function that another machine cannot import."""
+    import cloudpickle
 
-    try:
-        if remote.cancelled():
-            raise CancelledError("the scheduler has lost the job")
-        future.set_result(_fetched(remote))
-    except distributed.scheduler.KilledWorker as error:
-        future.set_exception(WorkerDied(f"workers of the job ended: {error.last_worker}"))
-    except BaseException as error:
-        future.set_exception(error)
+    return bytes(cloudpickle.dumps((fn, args, kwargs)))
 
 
-def _fetched(remote: Any) -> Any:
-    """Return the result of a finished Dask future.
-
-    The result waits in its worker's memory. Where the worker ends before it is fetched, Dask runs the job again, which
-    may wait behind others for hours, and every other result behind this one.
-
-    Raises:
-        WorkerDied: the result has gone with its worker.
-    """
-    for _ in range(_FETCHES):
-        try:
-            return remote.result(timeout=_FETCH)
-        except TimeoutError:
-            if remote.status == "error":
-                # The job's own.
-                raise
-            if remote.status != "finished":
-                break
-    remote.cancel()
-    raise WorkerDied("the worker ended before its result was fetched")
-
-
-def _plugin(contents: dict[str, Any]) -> Any:
-    """Return a plugin that hands contents to each worker."""
+def _plugin(name: str, contents: dict[str, Any]) -> Any:
+    """Return a plugin that hands contents to each worker, and ends the processes of an executor when it leaves."""
     import distributed
 
     class Contents(distributed.WorkerPlugin):  # type: ignore[misc]
         """Maps and logs of a sweep."""
 
         def setup(self, worker: Any) -> None:
-            """Keep them in the worker's process."""
-            receive(contents)
+            """Keep them for the processes of the worker."""
+            on_worker.open_pool(worker, name, contents)
+
+        def teardown(self, worker: Any) -> None:
+            """End the processes of the worker."""
+            on_worker.close_pools(name, worker)
 
     return Contents()
-
-
-def _local(devices: int | Sequence[str], security: Any) -> Any:
-    """Start a cluster of this machine: a process for each device, all ports on the loopback."""
-    import distributed
-
-    names = [""] * checks.integer("devices", devices, low=1) if isinstance(devices, int) else list(devices)
-    common: dict[str, Any] = dict(host=LOOPBACK, security=security)
-    scheduler = {
-        "cls": distributed.Scheduler,
-        "options": {**common, "port": 0, "dashboard": True, "dashboard_address": f"{LOOPBACK}:0"},
-    }
-    workers = {
-        index: {
-            "cls": distributed.Nanny,
-            "options": {
-                **common, "nthreads": 1, "resources": {RESOURCE: 1}, "memory_limit": 0, "dashboard": False,
-                "silence_logs": 40, "env": {_QUIET: "error"} | ({DEVICE: name} if name else {}),
-            },
-        }
-        for index, name in enumerate(names)
-    }  # fmt: skip
-    return distributed.SpecCluster(
-        scheduler=scheduler, workers=workers, silence_logs=50, asynchronous=False, security=security
-    )

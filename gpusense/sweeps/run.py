@@ -4,25 +4,22 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
+from concurrent.futures import CancelledError, Executor, Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from gpusense._util import checks
-from gpusense.sweeps.executors import SerialExecutor, WorkerDied
+from gpusense.sweeps.executors import SerialExecutor
 from gpusense.sweeps.job import Job
+from gpusense.sweeps.starts import Ended, Starts, SweepLost
 from gpusense.sweeps.table import DONE, FAILED, Row, Table
-from gpusense.sweeps.worker import Outcome, work
+from gpusense.sweeps.worker import work
 
 # Jobs that wait for each slot of an executor, so that it never idles.
 _QUEUED = 2
-
-
-class SweepLost(ConnectionError):
-    """The executor has ended before the sweep; its finished jobs are in the table."""
 
 
 @dataclass(frozen=True)
@@ -66,15 +63,19 @@ def run(
 ) -> Sweep:
     """Run jobs, and append a row to a table as soon as each ends.
 
-    A job that raises becomes a row with its error. A job whose worker ends is started again. If the executor itself
-    ends, finished jobs stay in the table, and ``resume=True`` runs the others.
+    A job that raises, also ``SystemExit``, becomes a row with its error. A job whose worker ends is started again, up
+    to ``attempts`` times; then its row says how the worker ended. One that has exceeded the executor's ``job_timeout``
+    is not started again. Where the cause of an end may lie outside the job (SIGKILL, a lost machine), its last start
+    comes after all other jobs and alone, so that no sound job fails by its neighbours. If the executor itself ends, or
+    after Ctrl-C, finished jobs stay in the table, and ``resume=True`` runs the others.
 
     Args:
         jobs: The jobs; equal ones run once.
         table: A ``.csv`` or ``.parquet`` file. Rows come in the order in which jobs end, and in the order of
             the jobs once all have ended.
         executor: Of the shape of ``concurrent.futures.Executor``, such as :class:`ProcessExecutor` or
-            :class:`DaskExecutor`; None runs the jobs here. It is not shut down.
+            :class:`DaskExecutor`; None runs the jobs here, where one that ends its process ends the sweep. It is not
+            shut down.
         root: Folder of maps and logs, on the machine of each worker unless they are sent.
         backend: Selection string of the device of workers that have none of their own.
         resume: Keep the rows of an existing table, and skip their jobs.
@@ -104,56 +105,30 @@ def run(
         size = checks.integer("window", size, low=1)
     with Table(table, resume=resume) as rows:
         kept = {key for key, row in rows.rows.items() if row["status"] == DONE or not retry_failed}
-        pending = deque(job for job in unique.values() if job.key not in kept)
-        left = len(pending)
+        pending = [job for job in unique.values() if job.key not in kept]
         counts: Counter[str] = Counter()
         setting = str(Path(root).resolve()), backend, secrets.token_hex(8)
+        starts = Starts(pending, lambda job: _submitted(chosen, job, setting), most)
+
+        def record(ended: Ended) -> None:
+            row = rows.add(ended.job, ended.outcome, ended.starts)
+            counts[row["status"]] += 1
+            counts["repeated"] += ended.starts - 1
+            on_row(row)
+
         try:
-            for job, outcome, tries in _outcomes(pending, chosen, size, most, setting):
-                row = rows.add(job, outcome, tries)
-                counts[row["status"]] += 1
-                counts["repeated"] += tries - 1
-                on_row(row)
+            for ended in starts.ended(lambda: size or _window(chosen)):
+                record(ended)
+        except (KeyboardInterrupt, SweepLost):
+            # Keep the results of jobs that have ended.
+            for ended in starts.left():
+                record(ended)
+            raise
         finally:
+            starts.cancel()
             rows.finish(list(unique))
-        return Sweep(str(rows.path), len(unique), counts[DONE], counts[FAILED], len(unique) - left, counts["repeated"])
-
-
-def _outcomes(
-    pending: deque[Job], executor: Executor, size: int | None, most: int, setting: tuple[str, ...]
-) -> Iterable[tuple[Job, Outcome, int]]:
-    """Yield each job with its outcome and the number of its starts, in the order in which they end.
-
-    Raises:
-        SweepLost: the executor has ended.
-    """
-    running: dict[Future[Any], tuple[Job, int]] = {}
-    again: deque[tuple[Job, int]] = deque()
-    error: SweepLost | None = None
-    try:
-        while pending or again or running:
-            limit = size or _window(executor)
-            while (pending or again) and len(running) < limit:
-                job, tries = again.popleft() if again else (pending.popleft(), 0)
-                running[_submitted(executor, job, setting)] = (job, tries + 1)
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                job, tries = running.pop(future)
-                try:
-                    outcome = _outcome(future)
-                except SweepLost as lost:
-                    # Others of this round may have finished.
-                    error = lost
-                    continue
-                if outcome is None and tries < most:
-                    again.append((job, tries))
-                    continue
-                died = Outcome({}, f"WorkerDied: the worker ended, {tries} times", "", 0.0, 0.0, "", "")
-                yield job, outcome or died, tries
-            if error is not None:
-                raise error
-    finally:
-        for future in running:
-            future.cancel()
+        skipped = len(unique) - len(pending)
+        return Sweep(str(rows.path), len(unique), counts[DONE], counts[FAILED], skipped, counts["repeated"])
 
 
 def _window(executor: Executor) -> int:
@@ -169,18 +144,3 @@ def _submitted(executor: Executor, job: Job, setting: tuple[str, ...]) -> Future
         return executor.submit(work, job, *setting)
     except (RuntimeError, OSError, CancelledError) as error:
         raise SweepLost(f"executor: must take jobs, got {type(error).__name__}: {error}") from error
-
-
-def _outcome(future: Future[Any]) -> Outcome | None:
-    """Return the outcome of a job; None where its worker has ended.
-
-    Raises:
-        SweepLost: the executor has ended.
-    """
-    try:
-        outcome: Outcome = future.result()
-        return outcome
-    except WorkerDied:
-        return None
-    except (BrokenExecutor, CancelledError, OSError) as error:
-        raise SweepLost(f"executor: has ended before the sweep: {type(error).__name__}: {error}") from error

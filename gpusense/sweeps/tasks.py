@@ -137,7 +137,7 @@ def check_options(job: Job) -> None:
             raise ValueError(f"{rule}, got {name!r}")
 
 
-_TIMINGS = ("seconds", "cpu_seconds", "worker", "device", "attempts", "particle_beams_per_second")
+_TIMINGS = ("seconds", "cpu_seconds", "worker", "device", "attempts", "memory_mb", "particle_beams_per_second")
 
 
 def is_timing(column: str) -> bool:

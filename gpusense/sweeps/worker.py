@@ -82,11 +82,23 @@ def work(job: Job, root: str, device: str, sweep: str = "") -> Outcome:
         error = trace = ""
         try:
             values = {name: _plain(value) for name, value in task_of(job)(job, _STORES[key]).items()}
-        except Exception as problem:
-            text = " ".join(f"{type(problem).__name__}: {problem}".split())
-            error, trace = text[:_LONGEST], traceback.format_exc()
+        except KeyboardInterrupt:
+            # In this process the user's, who ends the sweep.
+            raise
+        except BaseException as problem:
+            # SystemExit, too, is an error of the job and not the end of the worker.
+            error, trace = error_text(problem), traceback.format_exc()
         seconds, cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
     return Outcome(values, error, trace, seconds, cpu, f"{platform.node()}:{os.getpid()}", chosen)
+
+
+def error_text(error: BaseException) -> str:
+    """Return an error as the text of a row, on one line."""
+    try:
+        text = f"{type(error).__name__}: {error}"
+    except Exception:
+        text = f"{type(error).__name__} without a text"
+    return " ".join(text.split())[:_LONGEST]
 
 
 def _plain(value: Any) -> Any:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
+import sys
+import threading
 import time
 from pathlib import Path
 
@@ -39,11 +42,71 @@ def slow(job, store):
     return {"value": job.seed * 0.1}
 
 
-def held_again(folder):
-    """Write down the process; when repeated, wait for a file, at most 30 s, as a job behind long ones does."""
-    runs, end = Path(folder) / "runs", time.monotonic() + 30
-    repeated = runs.exists()
-    with open(runs, "a") as file:
+def written_down(folder):
+    """Write down the process."""
+    with open(Path(folder) / "runs", "a") as file:
         file.write(f"{os.getpid()}\n")
-    while repeated and not (Path(folder) / "released").exists() and time.monotonic() < end:
-        time.sleep(0.05)
+
+
+def ended_from_above(job, store):
+    """Kill the Dask worker of the process in the first start of seed 1."""
+    started(job)
+    if job.seed == 1 and starts(job.option("folder"), 2)[1] == 1:
+        os.kill(os.getppid(), signal.SIGKILL)
+        time.sleep(600)
+    return {"value": job.seed}
+
+
+def started(job):
+    """Note that a job has started."""
+    with open(Path(job.option("folder")) / "starts", "a") as file:
+        file.write(f"{job.seed}\n")
+
+
+def starts(folder, count):
+    """Return how often each of the first jobs has started."""
+    lines = (Path(folder) / "starts").read_text().split()
+    return [lines.count(str(seed)) for seed in range(count)]
+
+
+def _fill():
+    held = []
+    while True:
+        held.append(bytearray(1 << 23))
+        time.sleep(0.002)
+
+
+def _fork():
+    # The other process holds everything open that it has inherited.
+    if os.fork():
+        os._exit(9)
+    time.sleep(600)
+
+
+ENDS = {
+    "segmentation fault": lambda: ctypes.string_at(0),
+    "exit code 7": lambda: os._exit(7),
+    "exit code 0": lambda: os._exit(0),
+    "abort": os.abort,
+    "kill": lambda: os.kill(os.getpid(), signal.SIGKILL),
+    "terminate": lambda: os.kill(os.getpid(), signal.SIGTERM),
+    "memory": _fill,
+    "fork": _fork,
+    "SystemExit": lambda: sys.exit("enough"),
+    "KeyboardInterrupt": lambda: os.kill(os.getpid(), signal.SIGINT) or signal.raise_signal(signal.SIGINT) or raised(),
+    "hang": lambda: time.sleep(600),
+    "hang in C": lambda: pow(3, 1 << 31),
+    "unreadable": lambda: threading.Lock(),
+}
+
+
+def raised():
+    """Raise what Ctrl-C raises."""
+    raise KeyboardInterrupt
+
+
+def ending(job, store):
+    """End as the option of the seed says, if there is one."""
+    started(job)
+    end = job.option(f"end{job.seed}")
+    return {"value": ENDS[end]() if end else job.seed / 3}

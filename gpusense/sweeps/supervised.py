@@ -1,0 +1,265 @@
+"""A worker's process under supervision: it is started, watched while it runs a call, ended and replaced.
+
+All executors run their jobs in such processes, those on Dask in processes of the Dask workers. A process runs one call
+at a time, so that its end is charged to this call and to no other.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor
+from multiprocessing import resource_tracker
+from multiprocessing.connection import wait
+from typing import Any, NamedTuple
+
+from gpusense._util import checks
+from gpusense.sweeps.child import BEGUN, READY, serve
+from gpusense.sweeps.deaths import JobTimeout, WorkerDied, death
+from gpusense.sweeps.memory import memory_of, shortages, size_text
+
+# Processes that may end before they take a call, one after another.
+_STARTS = 3
+# Seconds between two looks at a process that runs a call; with a memory limit.
+_LOOK, _LOOK_MEMORY = 0.25, 0.05
+# Seconds for a process to end by itself, and for one that has closed its link; seconds between two looks at it.
+_GRACE, _CLOSING, _SOON = 10.0, 2.0, 0.005
+
+
+class Limits(NamedTuple):
+    """Limits of a job.
+
+    Attributes:
+        seconds: Longest time; None for any.
+        memory: Most resident memory of its process [bytes]; None for any.
+    """
+
+    seconds: float | None = None
+    memory: int | None = None
+
+
+def limits_of(job_timeout: float | None, memory_limit: int | None) -> Limits:
+    """Return the limits of an executor's arguments.
+
+    Raises:
+        TypeError, ValueError: an argument breaks its rule, or the memory of processes is unknown on this system.
+    """
+    seconds = None if job_timeout is None else checks.real("job_timeout", job_timeout, above=0)
+    memory = None if memory_limit is None else checks.integer("memory_limit", memory_limit, low=1)
+    if memory is not None and not memory_of(os.getpid()):
+        raise ValueError(f"memory_limit: must be None without psutil on this system, got {memory}")
+    return Limits(seconds, memory)
+
+
+class Supervised:
+    """One process, which is started on use and again after its end.
+
+    Args:
+        device: Selection string of its device; empty leaves that of the environment.
+        prepare: Payloads of calls that each new process runs first.
+    """
+
+    def __init__(self, device: str, prepare: Callable[[], list[bytes]] = list) -> None:
+        self._device, self._prepare = device, prepare
+        self._process: Any = None
+        self._link: Any = None
+        self._lock = threading.Lock()
+        self._closed = False
+
+    @property
+    def processes(self) -> tuple[int, ...]:
+        """Identifier of the process, if it runs."""
+        process = self._process
+        return () if process is None or process.pid is None or process.exitcode is not None else (process.pid,)
+
+    def call(self, payload: bytes, limits: Limits, wanted: Callable[[], bool] = lambda: True) -> bytes:
+        """Run a call in the process, and return the pickle of its answer.
+
+        Args:
+            payload: The call.
+            limits: Its limits.
+            wanted: Tells whether anything still waits for the answer; otherwise the process is ended.
+
+        Raises:
+            BrokenExecutor: processes end before they take a call, or the executor was ended.
+            JobTimeout: the call took too long; the process was ended.
+            WorkerDied: the process ended in the call.
+        """
+        for _ in range(_STARTS):
+            if self._begun(payload):
+                return self._watched(limits, wanted)
+            ended = self._buried()
+        rule = "worker: must start (a script needs the guard if __name__ == '__main__')"
+        raise BrokenExecutor(f"{rule}, got {_STARTS} that ended {ended.how}")
+
+    def _begun(self, payload: bytes) -> bool:
+        """Hand a call to the process, started if need be; tell whether the process has begun it."""
+        if self._process is not None and not self._alive():
+            self._buried()
+        try:
+            if self._process is None:
+                self._start()
+                if self._received() != READY:
+                    return False
+                for first in self._prepare():
+                    self._link.send_bytes(first)
+                    if self._received() != BEGUN or self._received() is None:
+                        return False
+            self._link.send_bytes(payload)
+        except OSError:
+            self._check_open()
+            return False
+        return self._received() == BEGUN
+
+    def _start(self) -> None:
+        # Drivers do not survive a fork.
+        context = multiprocessing.get_context("spawn")
+        here, there = context.Pipe()
+        process = context.Process(target=serve, args=(there, self._device), daemon=True, name="gpusense-sweep")
+        with self._lock, _parent_of_processes():
+            self._check_open()
+            try:
+                process.start()
+            except OSError as error:
+                raise BrokenExecutor(f"worker: must start, got {error}") from error
+            self._process, self._link = process, here
+        there.close()
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise BrokenExecutor("worker: must not be used after its executor has ended")
+
+    def _alive(self) -> bool:
+        return not wait([self._process.sentinel], 0) and self._process.exitcode is None
+
+    def _received(self) -> bytes | None:
+        """Return the next message of the process; None after its end."""
+        while True:
+            try:
+                if wait([self._link, self._process.sentinel], _LOOK) or not self._alive():
+                    # The link still holds messages from before its end.
+                    return bytes(self._link.recv_bytes()) if self._link.poll() else None
+            except (EOFError, OSError):
+                return None
+
+    def _watched(self, limits: Limits, wanted: Callable[[], bool]) -> bytes:
+        """Wait for the answer of a call, within its limits."""
+        most, begin, short = 0, time.monotonic(), shortages()
+        process, link = self._process, self._link
+        look = _LOOK if limits.memory is None else _LOOK_MEMORY
+        while True:
+            left = look if limits.seconds is None else limits.seconds - (time.monotonic() - begin)
+            most = max(most, memory_of(process.pid))
+            ready = wait([link, process.sentinel], max(min(look, left), 0))
+            if ready or not self._alive():
+                message = self._received()
+                if message is not None:
+                    return message
+                raise self._buried(most, short)
+            if limits.memory is not None and most > limits.memory:
+                self._buried(forced=True)
+                raise WorkerDied(f"beyond the memory limit of {size_text(limits.memory)}", most)
+            if not wanted():
+                self._buried(forced=True)
+                raise WorkerDied("as nothing waits for its job any more", most)
+            if left <= 0:
+                self._buried(forced=True)
+                raise JobTimeout(f"after the limit of {limits.seconds:g} s", most)
+
+    def _buried(self, memory: int = 0, short: int = 0, *, forced: bool = False) -> WorkerDied:
+        """End the process with all that it has started, and return how it ended."""
+        process = self._process
+        if process is None:
+            return WorkerDied("before it started")
+        if not forced:
+            # Its link closes a little before it has ended.
+            _await_end(process, _CLOSING)
+        self.kill()
+        _await_end(process, _GRACE)
+        code = process.exitcode
+        with self._lock:
+            self._link.close()
+            self._process = self._link = None
+        self._check_open()
+        return death(code, memory, shortages() > short)
+
+    def kill(self) -> None:
+        """End the process at once, with all that it has started."""
+        process = self._process
+        if process is None or process.pid is None:
+            return
+        if sys.platform != "win32":
+            # Its group, while the number of the process is not free for others.
+            with contextlib.suppress(OSError):
+                os.killpg(process.pid, signal.SIGKILL)
+        with contextlib.suppress(OSError):
+            process.kill()
+
+    def close(self, wait: bool = True) -> None:
+        """End the process, which runs no call; without waiting also one that does."""
+        with self._lock:
+            self._closed = True
+            process, link = self._process, self._link
+        if process is None:
+            return
+        if wait:
+            link.close()
+            process.join(_GRACE)
+        if process.exitcode is None:
+            self.kill()
+            process.join(_GRACE)
+
+
+def _await_end(process: Any, seconds: float) -> None:
+    """Wait until a process has ended, and leave it to be reaped where the system can."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if sys.platform == "linux":
+            try:
+                if os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None:
+                    return
+            except ChildProcessError:
+                # Reaped already, by whomever.
+                return
+        elif process.exitcode is not None:
+            return
+        time.sleep(_SOON)
+
+
+def pickled(function: Callable[..., Any], args: Any, kwargs: Any) -> bytes:
+    """Return the payload of a call of a function of a module."""
+    from multiprocessing.reduction import ForkingPickler
+
+    return bytes(ForkingPickler.dumps((function, args, kwargs)))
+
+
+def result_of(answer: bytes) -> Any:
+    """Return the result of a call, or raise its error."""
+    succeeded, value = pickle.loads(answer)
+    if succeeded:
+        return value
+    raise value
+
+
+@contextlib.contextmanager
+def _parent_of_processes() -> Iterator[None]:
+    """Let this process start others, to which Ctrl-C does not come while they start."""
+    # Workers of Dask are daemons, which may not start processes unless they say otherwise.
+    multiprocessing.current_process().daemon = False
+    if sys.platform == "win32":
+        yield
+        return
+    # Once it runs, it would admit Ctrl-C.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -1,0 +1,294 @@
+"""Sweeps on a Dask cluster that gpusense has not started: what it supervises, what it reports, and TLS."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from support.certificates import write_certificates
+from support.command_line import error_of
+from support.dask_cluster import Cluster
+from support.paths import ROOT
+from support.sweep_tasks import starts, written_down
+
+import gpusense as gs
+from gpusense.commands import cli
+from gpusense.sweep import Job, SweepLost, WorkerDied
+
+distributed = pytest.importorskip("distributed", reason="needs gpusense[sweep]")
+
+DEVICE = ("--resources", "gpusense=1")
+PLAIN = (*DEVICE, "--no-nanny", "--memory-limit", "0")
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
+    """Return a cluster of a worker that a nanny restarts."""
+    with Cluster(tmp_path_factory.mktemp("dask"), [(*DEVICE, "--memory-limit", "300MB")]) as cluster:
+        yield cluster
+
+
+@pytest.fixture(scope="module")
+def executor(cluster):
+    with gs.sweep.DaskExecutor(cluster.address, timeout=60) as executor:
+        yield executor
+
+
+def swept(jobs, path, executor=None, **options):
+    ended = gs.sweep.run(jobs, table=path, executor=executor, backend="numpy", **options)
+    return ended, gs.sweep.read_table(path)
+
+
+def made(name, count, folder, **options):
+    return [Job(task=f"support.sweep_tasks:{name}", seed=seed, options={"folder": str(folder)} | options)
+            for seed in range(count)]  # fmt: skip
+
+
+def awaited(what, seconds=60):
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end, "it has not come"
+        time.sleep(0.02)
+
+
+def alive(process):
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def parent(process):
+    return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
+
+
+def test_workers_of_others_supervise_their_jobs(tmp_path, executor):
+    ends = {"end0": "segmentation fault", "end1": "memory", "end2": "SystemExit"}
+    ended, table = swept(made("ending", 4, tmp_path, **ends), tmp_path / "t.csv", executor, attempts=2)
+    assert (ended.done, ended.failed, ended.repeated) == (1, 3, 2)
+    assert table["error"] == [
+        "WorkerDied: the worker ended by SIGSEGV, 2 times",
+        # The limit is that of the Dask worker.
+        "WorkerDied: the worker ended beyond the memory limit of 300 MB, 2 times",
+        "SystemExit: enough",
+        None,
+    ]
+    assert table["attempts"] == [2, 2, 1, 1] == starts(tmp_path, 4)
+
+
+def test_a_dask_worker_that_ends_costs_one_start(tmp_path, executor):
+    jobs = made("ended_from_above", 3, tmp_path)
+    ended, table = swept(jobs, tmp_path / "t.csv", executor)
+    assert (ended.done, ended.failed, ended.repeated) == (3, 0, 1), table["error"]
+    assert table["attempts"] == [1, 2, 1] == starts(tmp_path, 3)
+
+
+def test_a_result_that_ends_with_its_worker_is_not_waited_for(tmp_path, executor):
+    # Dask fetches results one after another: the first one holds the second in its worker until that has ended.
+    worker = next(iter(executor._watched.workers.values()))
+    ended, fetch = threading.Event(), worker._awaited
+
+    def held(remote):
+        awaited(lambda: remote.status == "finished")
+        ended.wait(60)
+        return fetch(remote)
+
+    worker._awaited = held
+    result = executor.submit(written_down, str(tmp_path))
+    awaited(lambda: (tmp_path / "runs").exists())
+    job = int((tmp_path / "runs").read_text().split()[0])
+    above = parent(job)
+    time.sleep(0.5)
+    os.kill(above, signal.SIGKILL)
+    awaited(lambda: not alive(job))
+    ended.set()
+    with pytest.raises(WorkerDied, match=r"before its result was fetched|with its Dask worker"):
+        result.result(timeout=60)
+    assert len((tmp_path / "runs").read_text().split()) == 1
+    # The nanny has started another worker.
+    assert executor.submit(abs, -2).result(timeout=60) == 2
+
+
+def test_an_executor_of_one_worker_does_not_wait_for_a_lost_one(executor):
+    awaited(lambda: executor.slots == 1)
+    (each,) = executor.on_each()
+    process = each.submit(os.getpid).result(timeout=60)
+    assert each.submit(os.getpid).result(timeout=60) == process != executor.submit(os.getpid).result(timeout=60)
+    running = each.submit(time.sleep, 600)
+    time.sleep(0.5)
+    os.kill(parent(process), signal.SIGKILL)
+    for future in (running, each.submit(abs, -1)):
+        with pytest.raises(WorkerDied, match="with its Dask worker"):
+            future.result(timeout=60)
+    each.shutdown()
+
+
+def test_executors_on_one_cluster_keep_apart_and_leave_nothing(tmp_path, cluster, executor):
+    executor.send({"a.txt": b"one"})
+    with gs.sweep.DaskExecutor(cluster.address, timeout=60) as other:
+        other.send({"a.txt": b"other"})
+        texts = [one.submit(sent_text, "a.txt").result(timeout=60) for one in (executor, other)]
+        assert texts == ["one", "other"]
+        process = other.submit(os.getpid).result(timeout=60)
+    awaited(lambda: not alive(process))
+    own = executor.submit(os.getpid).result(timeout=60)
+    with pytest.raises(KeyboardInterrupt), gs.sweep.DaskExecutor(cluster.address, timeout=60) as other:
+        process = other.submit(os.getpid).result(timeout=60)
+        other.submit(time.sleep, 600)
+        raise KeyboardInterrupt
+    awaited(lambda: not alive(process))
+    assert alive(own)
+
+
+def test_a_job_of_a_client_that_has_gone_does_not_hold_its_worker(cluster, executor):
+    other = gs.sweep.DaskExecutor(cluster.address, timeout=60)
+    process = other.submit(os.getpid).result(timeout=60)
+    other.submit(time.sleep, 600)
+    time.sleep(0.5)
+    # Of a client that is killed, only its connection tells.
+    other._client.close()
+    awaited(lambda: not alive(process))
+    assert executor.submit(abs, -4).result(timeout=60) == 4
+    other.terminate()
+
+
+def sent_text(name):
+    from gpusense.sweeps.worker import _SENT
+
+    return Path(_SENT[name]).read_text()
+
+
+def test_a_cluster_without_workers_ends_the_sweep(tmp_path, caplog):
+    jobs = made("ending", 4, tmp_path, end2="hang")
+    with Cluster(tmp_path, [PLAIN]) as cluster:
+
+        def kill():
+            awaited(lambda: (tmp_path / "starts").exists() and starts(tmp_path, 3)[2])
+            cluster.workers[0].kill()
+
+        with gs.sweep.DaskExecutor(cluster.address, timeout=60) as executor:
+            executor._watched._patience = 3
+            threading.Thread(target=kill).start()
+            with pytest.raises(SweepLost, match="no worker has been there for 3 s"):
+                swept(jobs, tmp_path / "t.csv", executor)
+            assert "no worker is left, waiting 3 s for one" in caplog.text and executor.alive
+            with pytest.raises(RuntimeError, match="no worker has been there"):
+                executor.submit(abs, 1)
+        assert gs.sweep.read_table(tmp_path / "t.csv")["seed"] == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("number", "reason"),
+    [
+        (signal.SIGKILL, "has ended before the sweep"),
+        pytest.param(signal.SIGSTOP, "the scheduler has not answered for 3 s", marks=pytest.mark.slow),
+    ],
+)
+def test_a_lost_scheduler_leaves_finished_jobs(tmp_path, number, reason):
+    jobs = made("slow", 8, tmp_path, seconds=0.02)
+    with Cluster(tmp_path, [PLAIN]) as cluster:
+
+        def kill(row):
+            if row["seed"] == "2":
+                cluster.scheduler.send_signal(number)
+
+        with gs.sweep.DaskExecutor(cluster.address, timeout=60) as executor:
+            assert executor.slots == 1 and executor.address == cluster.address
+            executor._watched._patience = 3
+            with pytest.raises(SweepLost, match=reason):
+                swept(jobs, tmp_path / "t.csv", executor, on_row=kill, window=2)
+        cluster.scheduler.kill()
+    finished = gs.sweep.read_table(tmp_path / "t.csv")["seed"]
+    assert {0, 1, 2} <= set(finished) and len(finished) < 8
+    (tmp_path / "runs").unlink()
+    ended, table = swept(jobs, tmp_path / "t.csv", resume=True)
+    again = [int(line) for line in (tmp_path / "runs").read_text().split()]
+    assert sorted([*again, *finished]) == list(range(8)) == table["seed"] and ended.skipped == len(finished)
+
+
+def security(ca, certificate, key):
+    names = {f"tls_{role}_{part}": path for role in ("client", "scheduler", "worker")
+             for part, path in (("cert", certificate), ("key", key))}  # fmt: skip
+    return distributed.Security(tls_ca_file=ca, require_encryption=True, **names)
+
+
+def test_tls_keeps_others_out(tmp_path, capsys):
+    own, foreign = (write_certificates(tmp_path / name) for name in ("own", "foreign"))
+    tls = ("--tls-ca-file", own[0], "--tls-cert", own[1], "--tls-key", own[2])
+    (tmp_path / "plan.yaml").write_text("options: {map: none.yaml, log: none.log}\naxes: {seed: 2}\n")
+    with Cluster(tmp_path, [(*PLAIN, *tls)], scheduler=(*tls, "--protocol", "tls")) as cluster:
+        assert cluster.address.startswith("tls://127.0.0.1:")
+        with gs.sweep.DaskExecutor(cluster.address, security=security(*own), timeout=60) as executor:
+            ended, _ = swept(made("plain", 2, tmp_path), tmp_path / "t.csv", executor)
+            assert ended.done == 2
+        for address, certificates in (
+            (cluster.address, foreign),
+            (cluster.address.replace("tls:", "tcp:"), None),
+        ):
+            with pytest.raises(OSError, match="must have a scheduler with workers"):
+                gs.sweep.DaskExecutor(address, security=certificates and security(*certificates), timeout=2)
+        call = ["sweep", str(tmp_path / "plan.yaml"), "--no-send", "--dask", cluster.address]
+        files = ["--tls-ca", own[0], "--tls-cert", own[1], "--tls-key", own[2]]
+        # The jobs fail for want of a map, but on the cluster.
+        assert cli.main([*call, *files, "--table", str(tmp_path / "c.csv")]) == 1
+        assert "2 failed" in capsys.readouterr().out and "none.log" in (tmp_path / "c.csv").read_text()
+        more = ["--table", str(tmp_path / "d.csv")]
+        assert "security: must have certificates for TLS, got none for tls://" in error_of([*call, *more], capsys)
+
+
+def strictly_verified(ca, certificate):
+    """Tell whether OpenSSL accepts a certificate as Python 3.13 does."""
+    call = ["openssl", "verify", "-x509_strict", "-CAfile", ca, certificate]
+    return subprocess.run(call, capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="needs the command openssl")
+def test_certificates_of_the_page_are_valid(tmp_path):
+    (commands,) = (
+        one for one in (ROOT / "docs" / "sweeps.md").read_text().split("```sh\n") if one.startswith("openssl")
+    )
+    subprocess.run(["sh", "-ec", commands.split("```")[0]], cwd=tmp_path, check=True, capture_output=True)
+    assert strictly_verified(tmp_path / "ca.pem", tmp_path / "cert.pem")
+    own = write_certificates(tmp_path / "own")
+    assert strictly_verified(*own[:2]) and not strictly_verified(own[0], tmp_path / "cert.pem")
+    security(*(str(tmp_path / name) for name in ("ca.pem", "cert.pem", "key.pem"))).get_connection_args("client")
+
+
+def test_a_cluster_of_this_machine_may_use_tls(tmp_path):
+    own = write_certificates(tmp_path)
+    with gs.sweep.DaskExecutor(security=security(*own)) as executor:
+        assert executor.address.startswith("tls://127.0.0.1:")
+        assert all(address.startswith("tls://127.0.0.1:") for address in executor._workers())
+        assert executor.submit(abs, -3).result(timeout=60) == 3
+
+
+def test_a_watch_that_fails_ends_the_calls(tmp_path):
+    with gs.sweep.DaskExecutor(timeout=60) as executor:
+        watch = executor._watched
+        running = executor.submit(time.sleep, 600)
+        queued = executor.submit(abs, 1)
+        watch._found = lambda: 1 / 0
+        for future in (running, queued):
+            with pytest.raises(OSError, match="the workers could not be followed: ZeroDivisionError"):
+                future.result(timeout=60)
+
+
+def test_a_worker_that_cannot_run_calls_is_left_out(caplog):
+    with gs.sweep.DaskExecutor(devices=2, timeout=2) as executor:
+        first, second = executor._watched.workers.values()
+        first.place = second.place = "/nowhere"
+        # Dask repeats a call on a worker that has taken over an address: it is not begun there.
+        with pytest.raises(WorkerDied, match="with its Dask worker at"):
+            executor.submit(abs, -1).result(timeout=60)
+        first._link = second._link = first._link._replace(limits=None)
+        with pytest.raises(OSError, match=r"no worker has been there .* left out: tcp://127.* AttributeError"):
+            first.place = next(place for place, one in executor._watched.workers.items() if one is first)
+            second.place = next(place for place, one in executor._watched.workers.items() if one is second)
+            executor.submit(abs, -1).result(timeout=60)
+        assert caplog.text.count("a worker is left out") == 2

@@ -16,7 +16,7 @@ from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.recording import Recording, Repeated
 from gpusense.interface.constants import ESTIMATE, LEFT, MOMENTS, SLOW_RATE, STAGE, STATE, WIDE_HEADINGS
 from gpusense.interface.launches import Program
-from gpusense.localization.filter_cloud import Contents, Summary, summary_of
+from gpusense.localization.filter_cloud import Contents, Summary, meaningful, summary_of
 from gpusense.localization.particles import Particles, Stage
 from gpusense.localization.sums import weight_block
 
@@ -47,7 +47,7 @@ class Cloud(Particles):
         """Replace all particles."""
         count = len(poses)
         w = np.ones(count) if weights is None else weights * (count / weights.sum())
-        places = self.places.placed()
+        places = self.places.placed(self.kept)
         self._fill((self.poses[places.shown], poses), (self.weights[places.weight], w),
                    (self.states[places.state], np.zeros(STATE)))  # fmt: skip
         self.set_particles(places, count, weight_block(self.backend, count))
@@ -62,7 +62,7 @@ class Cloud(Particles):
         """Upload the poses from which recovery injects particles."""
         self._recordings.clear()
         self._stages.clear()
-        self.pool = self.backend.upload(np.ascontiguousarray(poses, np.float64))
+        self.pool, self.pool_size = self.backend.upload(np.ascontiguousarray(poses, np.float64)), len(poses)
 
     def upload_settings(self, settings: np.ndarray) -> None:
         """Copy the numbers of a step to the device."""
@@ -80,7 +80,7 @@ class Cloud(Particles):
 
     def move(self, settings: np.ndarray, kind: int) -> None:
         """Move the particles now."""
-        places = self.places.moved()
+        places = self.places.moved(self.kept)
         self.upload_settings(settings)
         self.backend.run(self.motion(self.places.next, places.next, kind))
         self.places = places
@@ -125,13 +125,11 @@ class Cloud(Particles):
 
     def weigh(self, stage: Stage) -> None:
         """Run the launches of a stage after its scores."""
-        key = stage._replace(origin=0, kind=None)
-        self._stages.run((key, self.count, self._sensors), lambda: self.weighing(stage))
+        self._stages.run((stage.key, self.count, self._sensors), lambda: self.weighing(stage))
 
     def _draw(self, stage: Stage, drawn: int) -> None:
         """Draw into the other buffer."""
-        key = stage._replace(origin=0, kind=None)
-        self._stages.run((key, drawn, self.count, "draw"), lambda: self.draw(stage, drawn))
+        self._stages.run((stage.key, drawn, self.count, "draw"), lambda: self.draw(stage, drawn))
 
     def replay(self, stage: Stage, key: Hashable, scoring: Callable[[int], tuple[Program, object]]) -> None:
         """Run a stage as one recorded program.
@@ -220,12 +218,15 @@ class Cloud(Particles):
             self.host_poses(places.shown, count), self.host_weights(count),
             self.host_poses(places.next, self.count) if weighed else None,
             self._read(self.weights[places.before], self.count) if weighed else None,
-            self._read(self.states[places.state], STATE),
+            meaningful(self._read(self.states[places.state], STATE), self.pool_size > 0),
+            self._read(self.pool, 3 * self.pool_size).reshape(-1, 3) if self.pool_size else None,
         )  # fmt: skip
 
     def restore(self, contents: Contents) -> None:
         """Replace all particles by those of ``contents``."""
-        places, arrays = contents.places_and_arrays(self.places)
+        if contents.pool is not None:
+            self.set_pool(contents.pool)
+        places, arrays = contents.places_and_arrays(self.kept)
         self._fill(*((getattr(self, name)[index], array) for name, index, array in arrays),
                    (self.states[places.state], contents.state))  # fmt: skip
         self.set_particles(places, contents.next_count, weight_block(self.backend, contents.next_count))

@@ -26,7 +26,7 @@ class DeviceCloud(Cloud, FilterCloud):
     def correct(self, step: Step) -> None:
         """See FilterCloud.correct."""
         score = self._scoring.of(step.given)
-        stages = self.places.stages(step.stages, step.drawn, step.kind)
+        stages = self.places.stages(self.kept, step.stages, step.drawn, step.kind)
         self.run_stages(step.settings, stages, step.drawn, len(step.given), score)
 
     @property

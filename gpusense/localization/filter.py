@@ -15,10 +15,11 @@ from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.device_cloud import DeviceCloud
 from gpusense.localization.estimates import covariance_of
 from gpusense.localization.filter_cloud import FilterCloud, Step
-from gpusense.localization.journal import whole
+from gpusense.localization.journal import plain_state, set_state, settled, whole
 from gpusense.localization.motion import STILL, MotionModel, OdometryMotion, SampledMotion
 from gpusense.localization.scoring import given_of
 from gpusense.localization.sensors import sensors_of
+from gpusense.localization.state import FilterState, check_state, constructor_options, model_names, readings_on_host
 from gpusense.localization.verdict import Verdict
 
 
@@ -112,6 +113,9 @@ class ParticleFilter(Beginnings):
         """Return room for the particles."""
         return DeviceCloud(self._sensors, self.options.most, residual=self.options.resampling == "residual")
 
+    def _keep(self) -> None:
+        self._cloud.kept = self._cloud.places
+
     def __repr__(self) -> str:
         one = self.options
         count = f"{one.least}" if one.least == one.most else f"({one.least}, {one.most})"
@@ -121,7 +125,7 @@ class ParticleFilter(Beginnings):
             f"stages={one.stages}, backend={self.device.selection!r})"
         )
 
-    @whole
+    @settled
     def predict(self, *motion: Any) -> None:
         """Move the particles: by the odometry before and after the step, or what the motion model takes.
 
@@ -134,9 +138,11 @@ class ParticleFilter(Beginnings):
         """
         self._check_started()
         sampled = self.motion.sampled(*motion)
-        self.flush()
         # The next correction begins with the move: one program has both.
-        self._pending = sampled
+        if self._pending is None:
+            self._pending = sampled
+        else:
+            self._move(sampled)
 
     @whole
     def correct(self, readings: Any) -> None:
@@ -215,13 +221,50 @@ class ParticleFilter(Beginnings):
         )
         self._place(chosen, again=True)
 
-    @whole
+    @settled
     def flush(self) -> None:
         """Run the motion of the last ``predict`` now, as a step of its own; the next correction does it otherwise."""
-        if (motion := self._pending) is None:
-            return
+        if self._pending is not None:
+            self._move(None)
+
+    @whole
+    def _move(self, following: SampledMotion | None) -> None:
+        """Run the pending motion; another one follows it."""
+        motion = STILL if self._pending is None else self._pending
         self._cloud.move(self._settings(motion, []), motion.kind)
-        self._shown, self._pending = self._cloud.count, None
+        self._shown, self._pending = self._cloud.count, following
+
+    # ---- state
+
+    @settled
+    def state(self) -> FilterState:
+        """Return a copy of the filter's state, without models and device: see :class:`FilterState`."""
+        memory = plain_state(self, without=("_cloud", "_last"))
+        memory["_last"] = readings_on_host(self._last, self._backend)
+        options, models = constructor_options(self.options, self.motion), model_names(self._sensors)
+        return FilterState(options, models, self._cloud.contents(self._shown), memory)
+
+    @whole
+    def restore(self, state: FilterState) -> None:
+        """Take over the state of a filter with the same options and models, and continue with the same bits.
+
+        Args:
+            state: The result of :meth:`state`. It can be of a filter on another device, or of one that is split over
+                several.
+
+        Raises:
+            TypeError, ValueError: it is no state, or of a filter with other options or models.
+        """
+        given = check_state(state, constructor_options(self.options, self.motion), model_names(self._sensors))
+        self._cloud.restore(given.contents)
+        set_state(self, given.memory)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"models": self.models, "state": self.state()}
+
+    def __setstate__(self, values: dict[str, Any]) -> None:
+        ParticleFilter.__init__(self, values["models"], **values["state"].options)
+        self.restore(values["state"])
 
     def _settings(self, motion: SampledMotion, given: list[int]) -> np.ndarray:
         """Return the numbers of a step."""

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from gpusense.interface.constants import DEGENERATE, LEFT, RUNG, SAMPLE_SIZE, STAGE
+from gpusense.interface.constants import DEGENERATE, EVIDENCE, INJECTED, LEFT, RUNG, SAMPLE_SIZE, STAGE, STATE
 from gpusense.localization.particles import Places
 
 # Index of a sensor, and its readings.
@@ -41,6 +41,7 @@ class Contents(NamedTuple):
         next_poses: (M, 3) poses of the next step; None where they are those shown, as they were not weighed.
         next_weights: (M,) weights with which the next step begins; None together with ``next_poses``.
         state: State of the last correction, as the kernels hold it.
+        pool: Poses from which recovery injects particles; None without them.
     """
 
     poses: np.ndarray
@@ -48,6 +49,7 @@ class Contents(NamedTuple):
     next_poses: np.ndarray | None
     next_weights: np.ndarray | None
     state: np.ndarray
+    pool: np.ndarray | None
 
     @property
     def next_count(self) -> int:
@@ -58,12 +60,12 @@ class Contents(NamedTuple):
         """Return the buffers of these particles, which leave others as they are, and the array that each takes.
 
         Args:
-            now: The others.
+            now: The others; those at the beginning of the call.
 
         Returns:
             Names of buffers are "poses" and "weights".
         """
-        places = now.placed()
+        places = now.placed(now)
         if self.next_poses is None or self.next_weights is None:
             return places, [("poses", places.shown, self.poses), ("weights", places.weight, self.weights)]
         places = places._replace(next=places.shown + 1, weight=places.before - 1)
@@ -103,21 +105,37 @@ def summary_of(numbers: np.ndarray) -> Summary:
     return Summary(float(own[SAMPLE_SIZE]), min(used, 1.0), bool(numbers[DEGENERATE]), stage + 1, numbers)
 
 
+def meaningful(numbers: np.ndarray, averages: bool) -> np.ndarray:
+    """Return a state without the numbers that nothing reads: of stages that did not run, and of unused averages.
+
+    Args:
+        numbers: The state as the kernels hold it.
+        averages: Whether recovery follows the averages of the likelihood.
+    """
+    end, result = summary_of(numbers).stages * STAGE, np.zeros(STATE)
+    result[:end] = numbers[:end]
+    if averages:
+        result[EVIDENCE : INJECTED + 1] = numbers[EVIDENCE : INJECTED + 1]
+    return result
+
+
 class FilterCloud(ABC):
     """Particles of a filter.
 
-    A step reads the buffers in ``places`` and writes others. Its last assignments name the new ones, so a step that
-    was interrupted has changed nothing once the attributes in ``MEMORY`` have their old values again.
+    Steps write no buffer that ``kept`` names. Their last assignments name the new buffers in ``places``, so a call of
+    a filter that was interrupted has changed nothing once the attributes in ``MEMORY`` have their old values again.
 
     Attributes:
         MEMORY: Names of the attributes that a step changes.
         count: Particles of the next step.
         places: Buffers of the particles.
+        kept: Those at the beginning of the call of the filter that is running.
     """
 
     MEMORY: ClassVar[tuple[str, ...]]
     count: int
     places: Places
+    kept: Places
 
     # ---- steps
 

@@ -19,9 +19,9 @@ import importlib
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Collection, Hashable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from types import FrameType
-from typing import Any, ClassVar, Concatenate, NamedTuple, ParamSpec, TypeVar
+from typing import Any, Concatenate, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -38,21 +38,28 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-@functools.cache
-def _is_followed(kind: Hashable) -> bool:
-    """Return whether the attributes of a class's objects are state."""
-    if not isinstance(kind, type):
-        return False
-    if hasattr(kind, "MEMORY"):
-        return True
-    own = kind.__module__.startswith(_PACKAGE) and not issubclass(kind, (tuple, type))
-    return own and not getattr(kind, "__dataclass_params__", None)
+# Kinds of values, by their class.
+_OTHER, _OBJECT, _CONTAINER = range(3)
+
+
+class _Kinds(dict[type, int]):
+    """Whether values of a class hold state in their attributes or items, or are state as they are."""
+
+    def __missing__(self, kind: type) -> int:
+        own = kind.__module__.startswith(_PACKAGE) and not issubclass(kind, (tuple, type))
+        own = own and not hasattr(kind, "__dataclass_params__")
+        found = self[kind] = _CONTAINER if kind in _REPLACE else _OBJECT if own or hasattr(kind, "MEMORY") else _OTHER
+        return found
+
+
+_KINDS = _Kinds()
 
 
 def _attributes(owner: Any) -> dict[str, Any]:
     """Return the state of an object by name; attributes that are not set yet are left out."""
-    values, names = vars(owner), getattr(owner, "MEMORY", None)
-    return values.copy() if names is None else {name: values[name] for name in names if name in values}
+    values: dict[str, Any] = owner.__dict__
+    names: Collection[str] = getattr(owner, "MEMORY", ())
+    return {name: values[name] for name in names if name in values} if names else values.copy()
 
 
 class Journal:
@@ -67,23 +74,22 @@ class Journal:
         self._frame = frame
         self._objects: list[tuple[Any, dict[str, Any]]] = []
         self._containers: list[tuple[Any, Any]] = []
-        seen: set[int] = set()
-        open_ = [owner]
-        while open_:
-            one = open_.pop()
+        kinds, seen, open_ = _KINDS, set[int](), [owner]
+        for one in open_:
             if id(one) in seen:
                 continue
             seen.add(id(one))
             kind = type(one)
-            if _is_followed(kind):
-                values = _attributes(one)
-                self._objects.append((vars(one), values))
-                items = values.values()
+            kept: Any
+            if kinds[kind] == _OBJECT:
+                kept = _attributes(one)
+                self._objects.append((one.__dict__, kept))
             else:
                 kept = one.copy()
                 self._containers.append((one, kept))
-                items = kept.values() if kind is dict else kept
-            open_ += [item for item in items if type(item) in _REPLACE or _is_followed(type(item))]
+            for item in kept.values() if type(kept) is dict else kept:
+                if kinds[type(item)]:
+                    open_.append(item)
 
     def is_running(self) -> bool:
         """Return whether the call that may change the object has called the present one."""
@@ -93,6 +99,10 @@ class Journal:
                 return True
             frame = frame.f_back
         return False
+
+    def close(self) -> None:
+        """Forget the call, whose frame holds this object."""
+        self._frame = None
 
     def restore(self) -> None:
         """Put everything back; repeated if it was interrupted."""
@@ -114,6 +124,9 @@ class Whole:
         """Prepare the object for calls that are :func:`whole`."""
         self._calls = threading.RLock()
 
+    def _keep(self) -> None:
+        """Note what the call that begins must leave as it is."""
+
     def settle(self) -> None:
         """Put the state back that an interrupted call has left behind."""
         if self._journal is not None and not self._journal.is_running():
@@ -134,6 +147,7 @@ def whole(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W, P],
             if self._journal is not None:
                 # Part of a call that is whole.
                 return method(self, *args, **kwargs)
+            self._keep()
             journal = self._journal = Journal(self, sys._getframe())
             try:
                 result = method(self, *args, **kwargs)
@@ -143,6 +157,20 @@ def whole(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W, P],
                 journal.restore()
                 self._journal = None
                 raise
+            finally:
+                journal.close()
+
+    return call
+
+
+def settled(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W, P], R]:
+    """Make a method that changes no state, but by methods that are :func:`whole`, see none of an interrupted call."""
+
+    @functools.wraps(method)
+    def call(self: W, /, *args: P.args, **kwargs: P.kwargs) -> R:
+        with self._calls:
+            self.settle()
+            return method(self, *args, **kwargs)
 
     return call
 
@@ -201,7 +229,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, tuple):
         items = [_plain(item) for item in value]
         return tuple(items) if kind is tuple else kind(*items)
-    if _is_followed(kind):
+    if _KINDS[kind] == _OBJECT:
         return Held((kind.__module__, kind.__qualname__), plain_state(value))
     raise _NotPlainError
 

@@ -7,6 +7,7 @@ draws into the other one of its bank.
 
 from __future__ import annotations
 
+import functools
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -37,32 +38,34 @@ class Places(NamedTuple):
     before: int = 1
     state: int = 0
 
-    def placed(self) -> Places:
-        """Return the buffers of new particles, which leave these as they are."""
-        poses, weights = self._free()
-        return Places(poses, poses, weights + 1, weights + 1, 1 - self.state)
+    def placed(self, kept: Places) -> Places:
+        """Return the buffers of new particles, which leave those of ``kept`` as they are."""
+        poses, weights = kept.free()
+        return Places(poses, poses, weights + 1, weights + 1, 1 - kept.state)
 
-    def moved(self) -> Places:
+    def moved(self, kept: Places) -> Places:
         """Return the buffers after a move by itself: weights stay those that the next correction begins with."""
-        poses = self._free()[0]
+        poses = kept.free()[0]
         return self._replace(shown=poses, next=poses, weight=self.before)
 
-    def stages(self, most: int, drawn: int, kind: int) -> list[Stage]:
+    @functools.lru_cache(maxsize=64)  # noqa: B019 - plain values
+    def stages(self, kept: Places, most: int, drawn: int, kind: int) -> list[Stage]:
         """Return the stages of a correction.
 
         Args:
-            most: Their largest number.
+            kept: Buffers that it leaves as they are.
+            most: Largest number of stages.
             drawn: Particles of the next step.
             kind: Kind of the motion that begins the first one.
         """
-        poses, weights = self._free()
-        first = Stage(poses, 0, most, drawn if most == 1 else 0, self.before, weights, 1 - self.state, self.next, kind)
+        (poses, weights), state = kept.free(), 1 - kept.state
+        first = Stage(poses, 0, most, drawn if most == 1 else 0, self.before, weights, state, self.next, kind)
         return [first] + [
-            Stage(poses + number % 2, number, most, drawn if number + 1 == most else 0, weights + 1, weights, first.state)
+            Stage(poses + number % 2, number, most, drawn if number + 1 == most else 0, weights + 1, weights, state)
             for number in range(1, most)
         ]
 
-    def _free(self) -> tuple[int, int]:
+    def free(self) -> tuple[int, int]:
         """Return the first poses and the first weights of the banks that hold none of these."""
         return 2 - self.shown // 2 * 2, 2 - self.weight // 2 * 2
 
@@ -93,6 +96,11 @@ class Stage(NamedTuple):
     kind: int | None = None
 
     @property
+    def key(self) -> tuple[int, ...]:
+        """All on which its launches after the scores depend."""
+        return self[:7]
+
+    @property
     def target(self) -> int:
         """Index of the buffer into which it draws."""
         return self.source ^ 1
@@ -121,15 +129,17 @@ class Particles:
     Attributes:
         count: Particles of the next step.
         places: Buffers of the particles.
+        kept: Buffers that steps leave as they are: those at the beginning of a call of the filter.
+        pool_size: Poses from which recovery injects particles.
     """
 
-    MEMORY: ClassVar[tuple[str, ...]] = ("count", "block", "places", "pool")
+    MEMORY: ClassVar[tuple[str, ...]] = ("count", "block", "places", "pool", "pool_size")
 
     def __init__(
         self, backend: Backend, capacity: int, sensors: int, precision: np.dtype, *, residual: bool = False
     ) -> None:
         self.backend, self.capacity, self.precision, self._sensors = backend, capacity, precision, sensors
-        self.count, self.places = capacity, Places()
+        self.count, self.places, self.kept = capacity, Places(), Places()
         self.block = weight_block(backend, capacity)
         # Memory that a processor shares with the host is not lent.
         make = backend.blank if backend.info.kind == "gpu" else backend.empty
@@ -140,7 +150,7 @@ class Particles:
         self.sums, self.estimated = Sums(backend, capacity), backend.empty(ESTIMATE, _DOUBLE)
         self.settings = backend.empty(SETTINGS, _DOUBLE)
         self.states = [backend.upload(np.zeros(STATE)) for _ in range(2)]
-        self.pool = backend.upload(np.zeros(3))
+        self.pool, self.pool_size = backend.upload(np.zeros(3)), 0
         # Cumulative numbers of certain copies.
         self._copies = backend.empty(capacity, _DOUBLE) if residual else None
 

@@ -13,7 +13,7 @@ from gpusense.backends import BackendInfo
 from gpusense.backends.base import Backend
 from gpusense.localization.estimates import Estimate, clustered, covariance_of
 from gpusense.localization.filter_cloud import FilterCloud
-from gpusense.localization.journal import Whole, whole
+from gpusense.localization.journal import Whole, settled, whole
 from gpusense.localization.options import Options
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.verdict import Verdict
@@ -53,7 +53,7 @@ class Results(Whole, ABC):
         return self._backend.info
 
     @property
-    @whole
+    @settled
     def count(self) -> int:
         """Number of particles of the next step."""
         return self._cloud.count
@@ -92,7 +92,7 @@ class Results(Whole, ABC):
             summary.degenerate, self._shown,
         )  # fmt: skip
 
-    @whole
+    @settled
     def mean_and_covariance(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the weighted mean (3,) and the covariance (3, 3), without the verdict of :meth:`estimate`."""
         self._check_started()
@@ -106,13 +106,13 @@ class Results(Whole, ABC):
         return tuple(sensor.model for sensor in self._sensors)
 
     @property
-    @whole
+    @settled
     def temperatures(self) -> tuple[float, ...]:
         """Temperature of each model now."""
         return tuple(sensor.temperature(self.options.temperature) for sensor in self._sensors)
 
     @property
-    @whole
+    @settled
     def gain(self) -> float:
         """Mean gain of recent features over features anywhere or false ones [nats]; below 1 the filter is lost.
 
@@ -145,14 +145,14 @@ class Results(Whole, ABC):
                 return sensor.model.grid
         raise ValueError("models: must have a map, got none with one")
 
-    @whole
+    @settled
     def host_particles(self) -> np.ndarray:
         """Return a copy of the (N, 3) poses after the last step in host memory."""
         self._check_started()
         self.flush()
         return self._cloud.host_poses(self._cloud.places.shown, self._shown)
 
-    @whole
+    @settled
     def host_weights(self) -> np.ndarray:
         """Return a copy of the (N,) weights of the particles in host memory; their sum is 1."""
         self._check_started()
@@ -161,7 +161,7 @@ class Results(Whole, ABC):
         return weights / weights.sum()
 
     @property
-    @whole
+    @settled
     def particles(self) -> Any:
         """(N, 3) poses after the last step: on a GPU an array of the device, which other libraries use in place."""
         self._check_started()
@@ -169,7 +169,7 @@ class Results(Whole, ABC):
         return self._cloud.particles(self._shown)
 
     @property
-    @whole
+    @settled
     def weights(self) -> Any:
         """(N,) weights of the particles, whose sum is 1: on a GPU an array of the device."""
         self._check_started()
@@ -177,7 +177,7 @@ class Results(Whole, ABC):
         return self._cloud.shares(self._shown)
 
     @property
-    @whole
+    @settled
     def moments(self) -> Any:
         """(9,) mean x, y, theta and covariance xx, xy, xt, yy, yt, tt: on a GPU an array of the device."""
         self._check_started()

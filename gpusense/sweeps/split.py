@@ -19,7 +19,7 @@ from gpusense.interface.constants import (
     WEIGHT_SUMS,
     WIDE_HEADINGS,
 )
-from gpusense.localization.filter_cloud import Contents, FilterCloud, Step, Summary, summary_of
+from gpusense.localization.filter_cloud import Contents, FilterCloud, Step, Summary, meaningful, summary_of
 from gpusense.localization.particles import Places, Stage
 from gpusense.localization.sums import fans_of
 from gpusense.reference.draws import mark_of
@@ -51,12 +51,13 @@ class SplitCloud(FilterCloud):
         exchanged: Bytes of particles that were handed to shards.
     """
 
-    MEMORY: ClassVar[tuple[str, ...]] = ("count", "places", "exchanged", "_state")
+    MEMORY: ClassVar[tuple[str, ...]] = ("count", "places", "exchanged", "_state", "_pool")
 
     def __init__(self, team: Here | There, capacity: int, *, residual: bool = False) -> None:
         self._team, self._residual = team, residual
-        self.count, self.places, self.exchanged = capacity, Places(), 0
+        self.count, self.places, self.kept, self.exchanged = capacity, Places(), Places(), 0
         self._state = np.zeros(STATE)
+        self._pool: np.ndarray | None = None
 
     @property
     def _size(self) -> int:
@@ -76,7 +77,7 @@ class SplitCloud(FilterCloud):
 
     def place(self, poses: np.ndarray) -> None:
         """See FilterCloud.place."""
-        places, count = self.places.placed(), len(poses)
+        places, count = self.places.placed(self.kept), len(poses)
         self._fill([("poses", places.shown, poses), ("weights", places.weight, np.ones(count))])
         self._set(places, count, np.zeros(STATE))
 
@@ -92,10 +93,11 @@ class SplitCloud(FilterCloud):
     def set_pool(self, poses: np.ndarray) -> None:
         """See FilterCloud.set_pool."""
         self._all("set_pool", poses)
+        self._pool = poses
 
     def move(self, settings: np.ndarray, kind: int) -> None:
         """See FilterCloud.move."""
-        places = self.places.moved()
+        places = self.places.moved(self.kept)
         self._begin(settings, self.places.next, places.next, kind)
         self.places = places
 
@@ -104,7 +106,7 @@ class SplitCloud(FilterCloud):
 
     def correct(self, step: Step) -> None:
         """See FilterCloud.correct."""
-        stages, state = self.places.stages(step.stages, step.drawn, step.kind), self._state.copy()
+        stages, state = self.places.stages(self.kept, step.stages, step.drawn, step.kind), self._state.copy()
         self._begin(step.settings, stages[0].origin, stages[0].source, step.kind)
         for stage in stages:
             self._run(stage, step, state)
@@ -224,12 +226,16 @@ class SplitCloud(FilterCloud):
         return Contents(
             self.host_poses(places.shown, count), self.host_weights(count),
             self.host_poses(places.next, self.count) if weighed else None,
-            self._weights(places.before, self.count) if weighed else None, self._state.copy(),
+            self._weights(places.before, self.count) if weighed else None,
+            meaningful(self._state, self._pool is not None),
+            None if self._pool is None else self._pool.copy(),
         )  # fmt: skip
 
     def restore(self, contents: Contents) -> None:
         """See FilterCloud.restore."""
-        places, arrays = contents.places_and_arrays(self.places)
+        if contents.pool is not None:
+            self.set_pool(contents.pool)
+        places, arrays = contents.places_and_arrays(self.kept)
         self._fill(arrays)
         self._set(places, contents.next_count, contents.state.copy())
 

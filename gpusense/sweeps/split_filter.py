@@ -82,6 +82,19 @@ class SplitParticleFilter(ParticleFilter):
     def __repr__(self) -> str:
         return f"Split{super().__repr__()[:-1]}, {self._cloud.explain()})"
 
+    def __getstate__(self) -> dict[str, Any]:
+        if self._executors is not None:
+            raise TypeError(
+                "SplitParticleFilter: must have its shares in this process to be copied or pickled, got executors; "
+                "restore its state() in another filter"
+            )
+        return {"make": self._make, "devices": self._devices, "state": self.state()}
+
+    def __setstate__(self, values: dict[str, Any]) -> None:
+        state = values["state"]
+        SplitParticleFilter.__init__(self, values["make"], devices=values["devices"], **state.options)
+        self.restore(state)
+
     @property
     def exchanged(self) -> int:
         """Bytes of particles that devices have handed to one another."""

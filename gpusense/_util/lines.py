@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import gzip
+import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeVar
+
+T = TypeVar("T")
 
 MOST_BYTES = 1 << 24
 """Lines have fewer bytes; a longer one is an error before it is read as a whole."""
@@ -16,6 +20,8 @@ def numbered_lines(file: Path) -> Iterator[tuple[int, bytes]]:
 
     Yields:
         The line's number, from 1 on, and the line with its end.
+
+    A compressed file that is cut off is read up to there, with a warning.
 
     Raises:
         ValueError: A line is too long, or a compressed file is broken; the message begins with file and line.
@@ -32,5 +38,37 @@ def numbered_lines(file: Path) -> Iterator[tuple[int, bytes]]:
                         rule = f"must have lines of less than {MOST_BYTES} bytes"
                         raise ValueError(f"{file}:{number}: {rule}, got a longer one")
                     yield number, line
-    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+    except EOFError as error:
+        if not number:
+            raise ValueError(f"{file}:1: must be a whole gzip file, got one that is cut off: {error}") from error
+        warnings.warn(f"{file}: the compressed file is cut off; it is read up to line {number}", stacklevel=2)
+    except (gzip.BadGzipFile, zlib.error) as error:
         raise ValueError(f"{file}:{number + 1}: must be a whole gzip file, got a broken one: {error}") from error
+
+
+def until_cut(file: Path, read: Callable[[Iterator[tuple[int, bytes]]], Iterator[T]]) -> Iterator[T]:
+    """Yield the records that a function reads from the lines of a file.
+
+    A last line without an end that breaks the format is cut off: of a recorder that was killed, or a copy that was
+    interrupted. It is left out with a warning, unless it is the first record.
+
+    Args:
+        file: The file.
+        read: Function that yields the records of numbered lines, and raises ValueError at a line.
+    """
+    last, any_record = (0, b"\n"), False
+
+    def lines() -> Iterator[tuple[int, bytes]]:
+        nonlocal last
+        for each in numbered_lines(file):
+            last = each
+            yield each
+
+    try:
+        for record in read(lines()):
+            any_record = True
+            yield record
+    except ValueError:
+        if last[1].endswith(b"\n") or not any_record:
+            raise
+        warnings.warn(f"{file}:{last[0]}: the file ends in the middle of this line, which is left out", stacklevel=2)

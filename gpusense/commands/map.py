@@ -18,6 +18,7 @@ from gpusense.commands.arguments import (
 )
 from gpusense.commands.output import print_json
 from gpusense.commands.scans import add_poses, read_scans
+from gpusense.commands.signals import code_of, word_of
 from gpusense.evaluation.machine import machine
 
 if TYPE_CHECKING:
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 NAME = "map"
 HELP = "Build an occupancy grid from the scans of a log with corrected poses."
 
-INTERRUPTED = 130
 # Scans of a step of the progress bar.
 _SCANS = 64
 
@@ -36,7 +36,7 @@ without a ray stay unknown. The map is written as map_server's YAML file with an
 
 Ctrl-C ends the run; the map of the scans so far is written.
 
-Exit codes: 0 success, 2 bad input, 130 interrupted.
+Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
 example:
   gpusense map --log run.log.gz --out map.yaml
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
         resolution=args.resolution, origin=None, shape=None, range_limit=args.range_limit, clear_max=args.clear_max,
         p_hit=args.p_hit, p_miss=args.p_miss, p_prior=0.5, occupied_threshold=65, backend=args.backend, each=_SCANS,
     )  # fmt: skip
-    done = _build(builder, len(scans))
+    done, stop = _build(builder, len(scans))
     grid = builder.grid()
     write_map(grid, args.out)
     counted = round(done * len(scans))
@@ -91,19 +91,19 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(f"{args.out}: {rows} x {cols} cells of {grid.resolution} m, {occupied} occupied, {free} free; "
               f"{builder.rays} rays of {counted} scans")  # fmt: skip
-    if done < 1:
-        sys.stderr.write(f"gpusense: interrupted: the map holds {counted} of {len(scans)} scans\n")
-        return INTERRUPTED
+    if stop is not None:
+        sys.stderr.write(f"gpusense: {word_of(stop)}: the map holds {counted} of {len(scans)} scans\n")
+        return code_of(stop)
     return 0
 
 
-def _build(builder: MapBuilder, count: int) -> float:
-    """Count all rays, and return the share of scans that are done: less than 1 after an interrupt."""
+def _build(builder: MapBuilder, count: int) -> tuple[float, KeyboardInterrupt | None]:
+    """Count all rays, and return the share of scans that are done, and what has stopped it; None at the end."""
     done = 0.0
     with progress(-(-count // _SCANS)) as step:
         try:
             for done in builder.steps():
                 step(f"{100 * done:.0f}%")
-        except KeyboardInterrupt:
-            pass
-    return done
+        except KeyboardInterrupt as stop:
+            return done, stop
+    return done, None

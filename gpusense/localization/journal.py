@@ -27,12 +27,8 @@ import numpy as np
 
 _PACKAGE = "gpusense.localization."
 _PLAIN = (bool, int, float, str, np.generic)
-# Containers whose items are state, each with the function that replaces all of them.
-_REPLACE: dict[type, Callable[[Any, Any], None]] = {
-    dict: lambda target, items: (target.clear(), target.update(items)) and None,
-    list: lambda target, items: target.__setitem__(slice(None), items),
-    deque: lambda target, items: (target.clear(), target.extend(items)) and None,
-}
+# Containers whose items are state.
+_CONTAINERS = (dict, list, deque)
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -48,7 +44,9 @@ class _Kinds(dict[type, int]):
     def __missing__(self, kind: type) -> int:
         own = kind.__module__.startswith(_PACKAGE) and not issubclass(kind, (tuple, type))
         own = own and not hasattr(kind, "__dataclass_params__")
-        found = self[kind] = _CONTAINER if kind in _REPLACE else _OBJECT if own or hasattr(kind, "MEMORY") else _OTHER
+        found = self[kind] = (
+            _CONTAINER if kind in _CONTAINERS else _OBJECT if own or hasattr(kind, "MEMORY") else _OTHER
+        )
         return found
 
 
@@ -109,7 +107,8 @@ class Journal:
         for attributes, values in self._objects:
             attributes.update(values)
         for container, items in self._containers:
-            _REPLACE[type(container)](container, items)
+            container.clear()
+            (container.update if type(container) is dict else container.extend)(items)
 
 
 class Whole:

@@ -6,10 +6,14 @@ layouts that come with rosbags, and by one that is given here.
 
 from __future__ import annotations
 
+import contextlib
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from gpusense.logs.cut_bags import uncut
 
 SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -98,6 +102,16 @@ def _open(path: Path) -> Iterator[tuple[Any, Any]]:
     store = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
     if TRANSFORMS not in store.types:
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
-    reader: Any = Reader1(path) if first else Reader2(path)
-    with reader:
+    kind: Any = Reader1 if first else Reader2
+    with contextlib.closing(_opened(kind, path)) as reader:
         yield reader, store.deserialize_ros1 if first else store.deserialize_cdr
+
+
+def _opened(kind: Any, path: Path) -> Any:
+    """Return an open reader of a bag; of one that is cut off, with a warning, of its messages up to there."""
+    mended = uncut(path)
+    if mended is not None:
+        warnings.warn(f"{path}: the bag is cut off; it is read up to there", stacklevel=2)
+    reader = kind(mended or path)
+    reader.open()
+    return reader

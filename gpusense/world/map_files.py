@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import secrets
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
-from gpusense._util.files import read_mapping
+from gpusense._util.files import read_mapping, write_several
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.images import open_raster
 from gpusense.world.wean_map import read_probabilities
@@ -169,7 +168,7 @@ def write_map(
         image: lambda stream: _write_image(stream, pixels, grid.shape, image_format),
         target: lambda stream: stream.write(text.encode()),
     }
-    _write_all(writers)
+    write_several(writers)
 
 
 def _write_image(stream: BinaryIO, pixels: bytes, shape: tuple[int, int], image_format: str) -> None:
@@ -181,35 +180,6 @@ def _write_image(stream: BinaryIO, pixels: bytes, shape: tuple[int, int], image_
     else:
         stream.write(b"P5\n%d %d\n255\n" % size)
         stream.write(pixels)
-
-
-def _write_all(writers: dict[Path, Callable[[BinaryIO], object]]) -> None:
-    """Write several files atomically: either all are replaced or, after any failure, none is."""
-    tag = secrets.token_hex(4)
-    fresh = {target: target.with_name(f".{target.name}.{tag}.new") for target in writers}
-    backup = {target: target.with_name(f".{target.name}.{tag}.old") for target in writers}
-    existed = {target: target.exists() for target in writers}
-    try:
-        for target, write in writers.items():
-            with fresh[target].open("xb") as stream:
-                write(stream)
-        for target in writers:
-            if existed[target]:
-                os.replace(target, backup[target])
-            os.replace(fresh[target], target)
-    except BaseException:
-        for target in writers:
-            if backup[target].exists():
-                os.replace(backup[target], target)
-            elif not existed[target]:
-                target.unlink(missing_ok=True)
-        raise
-    else:
-        for file in backup.values():
-            file.unlink(missing_ok=True)
-    finally:
-        for file in fresh.values():
-            file.unlink(missing_ok=True)
 
 
 def _read_yaml(file: Path) -> _MapYaml:

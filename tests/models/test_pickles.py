@@ -58,7 +58,9 @@ CASES: dict[str, tuple[Any, Any]] = {
 for _name in absolute_models("numpy"):
     CASES[_name] = (
         lambda b, name=_name: absolute_models(b)[name][0],
-        lambda model, name=_name: model.log_likelihood(POSES + (5e6, 0, 0), *absolute_models("numpy")[name][1]),
+        lambda model, name=_name: model.log_likelihood(
+            POSES + np.array([5e6, 0, 0]), *absolute_models("numpy")[name][1]
+        ),
     )
 COPIES = {"copy": copy.copy, "deepcopy": copy.deepcopy, "pickle": lambda model: pickle.loads(pickle.dumps(model))}
 

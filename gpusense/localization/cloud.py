@@ -165,12 +165,16 @@ class Cloud(Particles):
         if self.backend.info.kind != "gpu":
             weights = self.host_weights(count)
             return weights / weights.sum()
+        return self.backend.lend(self.device_shares(count), (count,), _DOUBLE)
+
+    def device_shares(self, count: int) -> Buffer:
+        """Return a new buffer with the weights of the shown particles, whose sum is 1."""
         out, weight = self.backend.blank(count, _DOUBLE), self.weights[self.places.weight]
         program = self.sums.estimate(self.poses[self.places.shown], weight, self.estimated, count)
         program += self.sums.launch("normalize_weights", count, weight=weight, estimate=self.estimated, share=out,
                                     particles=count)  # fmt: skip
         self.backend.run(program)
-        return self.backend.lend(out, (count,), _DOUBLE)
+        return out
 
     def moments(self, count: int) -> Any:
         """Return mean and covariance of the shown particles: on a GPU an array of the device's library."""

@@ -155,7 +155,7 @@ def test_a_terminated_sweep_keeps_whole_rows_and_ends_its_processes(place, tmp_p
     workers = [int(word) for text in lists for word in text.split()]
     assert len(workers) >= 2
     process.send_signal(signal.SIGTERM)
-    out, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=60)
     assert process.returncode == 143, err
     assert err.splitlines()[-1] == "gpusense: terminated" and "has the finished jobs" in err
     with table.open(newline="") as stream:
@@ -176,7 +176,7 @@ def test_signals_that_the_caller_ignores_stay_ignored(place, tmp_path):
     for _ in range(20):
         time.sleep(0.05)
         process.send_signal(signal.SIGHUP)
-    out, err = process.communicate(timeout=100)
+    _, err = process.communicate(timeout=100)
     assert process.returncode in (0, 1) and (tmp_path / "made.tum").exists(), err
 
 

@@ -290,8 +290,10 @@ def test_headings_are_wrapped_after_any_move_with_the_same_bits(backend, deviati
     assert (np.abs(expected[2::3]) <= np.pi).all() and (np.abs(turned).max() > 3 * np.pi) == (deviation > 1)
     np.testing.assert_allclose(np.exp(1j * expected[2::3]), np.exp(1j * turned), atol=1e-15 * max(np.abs(turned)))
     device = get_backend(backend)
-    program = Sums(device, count).launch("move_particles", count, source=(on := device.upload(poses)),
-                                         settings=device.upload(settings), target=on, particles=count, kind=kind)  # fmt: skip
+    on, step = device.upload(poses), device.upload(settings)
+    program = Sums(device, count).launch(
+        "move_particles", count, source=on, settings=step, target=on, particles=count, kind=kind
+    )
     if not lanes:
         program = tuple(one._replace(flags=one.flags - {"WIDE"}) for one in program)
     device.run(program)

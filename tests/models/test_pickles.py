@@ -17,6 +17,7 @@ CELLS = np.pad(np.zeros((20, 30), int), 1, constant_values=100)
 GRID = gs.OccupancyGrid(CELLS, 0.1)
 SCANNER = gs.Scanner(np.linspace(-2, 2, 12), range_max=4.0, mount=(0.1, 0.0, 0.2))
 POSES = np.random.default_rng(0).uniform((0.3, 0.3, -3), (2.8, 1.8, 3), (40, 3))
+FAR = POSES + np.array([5e6, 0.0, 0.0])
 RANGES = np.linspace(0.3, 4.0, 12)
 BINS = gs.IncidenceParameters((0.0, 0.8, np.pi / 2), (gs.BeamParameters(), gs.BeamParameters(sigma_hit=0.3)))
 TABLE = gs.DiscreteBeamModel.learn(
@@ -58,9 +59,7 @@ CASES: dict[str, tuple[Any, Any]] = {
 for _name in absolute_models("numpy"):
     CASES[_name] = (
         lambda b, name=_name: absolute_models(b)[name][0],
-        lambda model, name=_name: model.log_likelihood(
-            POSES + np.array([5e6, 0, 0]), *absolute_models("numpy")[name][1]
-        ),
+        lambda model, name=_name: model.log_likelihood(FAR, *absolute_models("numpy")[name][1]),
     )
 COPIES = {"copy": copy.copy, "deepcopy": copy.deepcopy, "pickle": lambda model: pickle.loads(pickle.dumps(model))}
 

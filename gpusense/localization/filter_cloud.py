@@ -1,4 +1,4 @@
-"""What a particle filter asks of its particles, on one device or split over several."""
+"""The interface of a filter's particles, which are on one device or split over several."""
 
 from __future__ import annotations
 

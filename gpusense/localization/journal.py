@@ -2,8 +2,8 @@
 
 Python may raise KeyboardInterrupt between any two lines. A call that changes a filter first keeps all of the filter's
 attributes in a journal, and drops it at its end by one assignment. If the call does not come to its end, the journal
-puts the attributes back, at once or, if another interrupt prevents that, before the next call. What is on a device
-needs no copy: a step writes buffers that the attributes do not name yet.
+puts the attributes back, at once or, if another interrupt prevents that, before the next call. Buffers on a device
+need no copy: a step writes those that the attributes do not name yet.
 
 State are the attributes in ``MEMORY`` of a class; of classes of this package without it, all attributes. Dictionaries,
 lists and queues are kept by their items, objects of this package by their own attributes, and everything else, arrays

@@ -14,8 +14,8 @@ from gpusense.backends.base import Backend
 class Pickled(ABC):
     """Base of objects that copies and pickles make anew by their constructor.
 
-    A pickle names the device as the constructor was asked for it: "auto" may be another one on another machine. That of
-    a queue is named by its selection string. A copy is on the same device.
+    A pickle names the device as the constructor was asked for it: "auto" may be another one on another machine. A queue
+    is replaced by the selection string of its device. A copy is on the same device.
     """
 
     _selection: Selection

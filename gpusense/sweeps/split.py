@@ -39,8 +39,8 @@ class SplitCloud(FilterCloud):
 
     A stage of a correction has two exchanges, of the largest score and of the sums of integer weights, and a third one
     of particles where it draws: without jitter each shard gets the parents of its own particles; with jitter, and in
-    residual resampling, all. Shards are told which particles and buffers a step works on, and remember none: their
-    state is here.
+    residual resampling, all. Each call names the particles and buffers that it works on; shards remember none, and
+    their state is here.
 
     Args:
         team: The shards.

@@ -36,6 +36,7 @@ from gpusense.localization.pose_algebra import invert_poses as invert_poses
 from gpusense.localization.pose_algebra import mean_pose as mean_pose
 from gpusense.localization.pose_algebra import pose_difference as pose_difference
 from gpusense.localization.pose_algebra import wrap_angle as wrap_angle
+from gpusense.localization.state import FilterState as FilterState
 from gpusense.localization.temperature import calibrate_temperature as calibrate_temperature
 from gpusense.localization.weights import Weights as Weights
 from gpusense.localization.weights import normalize_weights as normalize_weights

@@ -60,7 +60,7 @@ def measure(backend: str, particles: int, beams: int, stages: int, steps: int) -
 def _in_a_row(pf: gs.ParticleFilter, steps: int, recordings: list[Any]) -> float:
     """Return the milliseconds of the device for recordings that are started one after the other."""
     cloud, times = pf._cloud, []
-    poses = cloud.host_poses(cloud.shown, cloud.count)
+    poses = cloud.host_poses(cloud.places.shown, cloud.count)
     for _ in range(5):
         # The recorded step moves the same particles each time: they must not drift apart.
         for buffer in cloud.poses:

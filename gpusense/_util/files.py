@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import secrets
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, BinaryIO
+
+# Unfinished files of this process; each is here before it is made and until it is gone.
+_UNFINISHED: set[Path] = set()
 
 
 def check_writable(path: Path) -> None:
@@ -20,8 +24,7 @@ def check_writable(path: Path) -> None:
     """
     if os.path.lexists(path) and not path.is_file():
         raise ValueError(f"{path}: must be a regular file, got another kind")
-    with _fresh(path) as stream:
-        stream.write(b"\0")
+    _write_fresh(path, lambda stream: stream.write(b"\0"), None)
 
 
 def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
@@ -38,23 +41,79 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
     target = Path(os.path.realpath(path))
     if os.path.lexists(target) and not target.is_file():
         raise ValueError(f"{path}: must be a regular file, got another kind")
-    with _fresh(target) as stream:
-        write(stream)
-        stream.close()
-        os.replace(stream.name, target)
+    _write_fresh(target, write, target)
 
 
-@contextlib.contextmanager
-def _fresh(path: Path) -> Iterator[BinaryIO]:
-    """Open a new file in the folder of ``path``; delete it afterwards unless it was renamed."""
-    fresh = path.parent / f".gpusense-{secrets.token_hex(6)}.new"
+def write_several(writers: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
+    """Write several files atomically: either all are replaced or, after any failure, none is.
+
+    Args:
+        writers: Functions that write the contents to a binary stream, by file.
+    """
+    tag = secrets.token_hex(4)
+    fresh = {target: target.with_name(f".{target.name}.{tag}.new") for target in writers}
+    backup = {target: target.with_name(f".{target.name}.{tag}.old") for target in writers}
+    existed = {target: target.exists() for target in writers}
+    replaced = False
+
+    def clean() -> None:
+        for target in writers:
+            if not replaced and backup[target].exists():
+                os.replace(backup[target], target)
+            elif not replaced and not existed[target]:
+                target.unlink(missing_ok=True)
+            backup[target].unlink(missing_ok=True)
+            _discard(fresh[target])
+
+    # Twice, as an interrupt may come before the first one or end it.
     try:
-        with fresh.open("xb") as stream:
-            yield stream
-    except FileNotFoundError as error:
-        raise FileNotFoundError(error.errno, error.strerror, str(path.parent)) from None
+        try:
+            for target, write in writers.items():
+                _UNFINISHED.add(fresh[target])
+                with fresh[target].open("xb") as stream:
+                    write(stream)
+            for target in writers:
+                if existed[target]:
+                    os.replace(target, backup[target])
+                os.replace(fresh[target], target)
+            replaced = True
+        finally:
+            clean()
     finally:
-        fresh.unlink(missing_ok=True)
+        clean()
+
+
+def _write_fresh(path: Path, write: Callable[[BinaryIO], object], target: Path | None) -> None:
+    """Write a new file in the folder of ``path``, and rename it to the target, or delete it."""
+    fresh = path.parent / f".gpusense-{secrets.token_hex(6)}.new"
+    # An interrupt may come before the first clean-up.
+    try:
+        try:
+            _UNFINISHED.add(fresh)
+            with fresh.open("xb") as stream:
+                write(stream)
+            if target is not None:
+                os.replace(fresh, target)
+        except FileNotFoundError as error:
+            raise FileNotFoundError(error.errno, error.strerror, str(path.parent)) from None
+        finally:
+            _discard(fresh)
+    finally:
+        _discard(fresh)
+
+
+def _discard(fresh: Path) -> None:
+    """Delete an unfinished file, if it is there."""
+    fresh.unlink(missing_ok=True)
+    _UNFINISHED.discard(fresh)
+
+
+@atexit.register
+def _remove_unfinished(process: int = os.getpid()) -> None:
+    """Delete the files that several interrupts in a row have left; a forked child leaves those of its parent."""
+    for fresh in tuple(_UNFINISHED) if os.getpid() == process else ():
+        with contextlib.suppress(OSError):
+            _discard(fresh)
 
 
 def unnamed_file() -> IO[bytes]:

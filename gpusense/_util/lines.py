@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import gzip
+import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 from gpusense._util.inflate import most_bytes
+
+T = TypeVar("T")
 
 MOST_BYTES = 1 << 24
 """Lines have fewer bytes; a longer one is an error before it is read as a whole."""
@@ -20,6 +24,8 @@ def numbered_lines(file: Path) -> Iterator[tuple[int, bytes]]:
 
     Yields:
         The line's number, from 1 on, and the line with its end.
+
+    A compressed file that is cut off is read up to there, with a warning.
 
     Raises:
         ValueError: A line is too long, or a compressed file is broken or grows without bound; the message begins with
@@ -42,7 +48,11 @@ def numbered_lines(file: Path) -> Iterator[tuple[int, bytes]]:
                         what = f"{most_bytes(file.stat().st_size)} bytes" if room < 0 else f"{lines} lines"
                         raise ValueError(f"{file}:{number}: must hold at most {what} in its compressed size, got more")
                     yield number, line
-    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+    except EOFError as error:
+        if not number:
+            raise ValueError(f"{file}:1: must be a whole gzip file, got one that is cut off: {error}") from error
+        warnings.warn(f"{file}: the compressed file is cut off; it is read up to line {number}", stacklevel=2)
+    except (gzip.BadGzipFile, zlib.error) as error:
         raise ValueError(f"{file}:{number + 1}: must be a whole gzip file, got a broken one: {error}") from error
 
 
@@ -52,3 +62,31 @@ def _bounds(file: Path, compressed: bool) -> tuple[float, float]:
         return float("inf"), float("inf")
     size = file.stat().st_size
     return _LINES + size, most_bytes(size)
+
+
+def until_cut(file: Path, read: Callable[[Iterator[tuple[int, bytes]]], Iterator[T]]) -> Iterator[T]:
+    """Yield the records that a function reads from the lines of a file.
+
+    A last line without an end that breaks the format is cut off: of a recorder that was killed, or a copy that was
+    interrupted. It is left out with a warning, unless it is the first record.
+
+    Args:
+        file: The file.
+        read: Function that yields the records of numbered lines, and raises ValueError at a line.
+    """
+    last, any_record = (0, b"\n"), False
+
+    def lines() -> Iterator[tuple[int, bytes]]:
+        nonlocal last
+        for each in numbered_lines(file):
+            last = each
+            yield each
+
+    try:
+        for record in read(lines()):
+            any_record = True
+            yield record
+    except ValueError:
+        if last[1].endswith(b"\n") or not any_record:
+            raise
+        warnings.warn(f"{file}:{last[0]}: the file ends in the middle of this line, which is left out", stacklevel=2)

@@ -86,24 +86,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, write the report and compare."""
+    """Measure, write the report and compare; after Ctrl-C write and print the points so far."""
     from gpusense.evaluation.benchmark import compare as comparing
     from gpusense.evaluation.benchmark.report import document, to_json
+    from gpusense.evaluation.benchmark.runner import Outcome, steps
     from gpusense.evaluation.benchmark.runner import run as run_plan
-    from gpusense.evaluation.benchmark.runner import steps
 
     old, new = _reports(args)
-    measured = new is None
+    measured, stopped = new is None, None
     if new is None:
         if args.output is not None:
             _check_folder(args.output)
         plan, absent = make_plan(args, old)
-        with progress(steps(plan)) as step:
-            outcome = run_plan(plan, step)
+        outcome = Outcome([], [])
+        try:
+            with progress(steps(plan)) as step:
+                run_plan(plan, step, outcome)
+        except KeyboardInterrupt as stop:
+            if not outcome.points:
+                raise
+            stopped = stop
         new = document(plan, outcome, _arguments(args, plan), machine(), absent)
         if args.output is not None:
             write_report(args.output, new, to_json(new), args.time)
-    comparison = None if old is None else comparing.compare(old, new, args.slower)
+    comparison = None if old is None or stopped is not None else comparing.compare(old, new, args.slower)
     if args.json:
         print_json(new if comparison is None else {"comparison": vars(comparison), "report": new if measured else None})
     else:
@@ -111,6 +117,8 @@ def run(args: argparse.Namespace) -> int:
             _print(new, args.output)
         if comparison is not None:
             print("\n".join(["", *comparing.lines_of(comparison, args.slower)]))
+    if stopped is not None:
+        raise stopped
     return LESS_EXACT if comparison is not None and comparison.less_exact else 0
 
 

@@ -14,6 +14,7 @@ from typing import NoReturn
 
 from gpusense._util.extras import explained
 from gpusense._version import __version__
+from gpusense.commands import signals
 
 # Modules of gpusense.commands, in the order of the help.
 COMMANDS = (
@@ -22,7 +23,6 @@ COMMANDS = (
 )  # fmt: skip
 
 BAD_INPUT = 2
-INTERRUPTED = 130
 BROKEN_PIPE = 141
 # Environment variable that lets exceptions through with their traceback, for developers.
 TRACEBACK = "GPUSENSE_TRACEBACK"
@@ -37,7 +37,8 @@ start here:
   gpusense devices            list the devices, and the remedy for each that is absent
   gpusense COMMAND --help     describe a command and its options, with an example
 
-Exit codes: 0 success, 2 bad input (described in one line on standard error), 130 interrupted."""
+Exit codes: 0 success, 2 bad input (described in one line on standard error), 130 interrupted (Ctrl-C),
+143 terminated. A command that is interrupted or terminated keeps and prints the results so far."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -81,24 +82,26 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments after the program's name; ``sys.argv[1:]`` by default.
 
     Returns:
-        The exit code: 0 success, 2 bad input, 130 interrupted, 141 when the reader of standard output is gone, or the
-        command's own.
+        The exit code: 0 success, 2 bad input, 130 interrupted, 143 terminated, 129 after the end of the terminal, 141
+        when the reader of standard output is gone, or the command's own.
     """
     for stream in (sys.stdout, sys.stderr):
         # A device's name may have characters outside the terminal's encoding.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     try:
-        with _short_warnings():
+        with signals.stopping(), _short_warnings():
             code = _dispatch(list(sys.argv[1:] if argv is None else argv))
-        print(end="", flush=True)
+            print(end="", flush=True)
         return code
     except BrokenPipeError:
         _settle()
         return BROKEN_PIPE
-    except KeyboardInterrupt:
-        sys.stderr.write("gpusense: interrupted\n")
-        return INTERRUPTED
+    except KeyboardInterrupt as stop:
+        with signals.ending(), contextlib.suppress(OSError):
+            _settle()
+            sys.stderr.write(f"gpusense: {signals.word_of(stop)}\n")
+        return signals.code_of(stop)
     except (ValueError, TypeError, OSError, MemoryError) as error:
         return _failed(error)
     except ImportError as error:

@@ -83,7 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make the scene, score it on every device, report and draw."""
+    """Make the scene, score it on every device, report and draw; after Ctrl-C report the scores so far."""
     if not args.no_plot:
         check_library("matplotlib", "the picture, which --no-plot leaves out,")
         check_writable(args.output)
@@ -91,26 +91,34 @@ def run(args: argparse.Namespace) -> int:
     scene = make_scene(args.seed, args.particles, args.beams)
     if not args.json:
         _introduce(scene, args.seed, backends)
-    with progress(2 * len(backends) + 3) as step:
-        scores, errors = _score_all(scene, backends, selected=args.backend is not None, step=step)
-        step("picture")
-        drawn = not args.no_plot and {score.name for score in scores} == {BEAM, FIELD}
-        if drawn:
-            draw(scene, scores, args.output)
-    failures += errors
+    scores: list[Score] = []
+    drawn, stopped = False, None
+    try:
+        with progress(2 * len(backends) + 3) as step:
+            _score_all(scene, backends, scores, failures, selected=args.backend is not None, step=step)
+            step("picture")
+            drawn = not args.no_plot and {score.name for score in scores} == {BEAM, FIELD}
+            if drawn:
+                draw(scene, scores, args.output)
+    except KeyboardInterrupt as stop:
+        if not scores:
+            raise
+        drawn, stopped = False, stop
     written = args.output if drawn else None
     if args.json:
         output.print_json(_document(scene, args.seed, scores, failures, written))
     else:
         _report(scene, scores, failures, written)
+    if stopped is not None:
+        raise stopped
     return 1 if failures else 0
 
 
 def _score_all(
-    scene: Scene, backends: list[Backend], *, selected: bool, step: Callable[[str], None]
-) -> tuple[list[Score], list[str]]:
-    """Score the scene with both models on all backends; return the scores and the errors of unselected backends."""
-    scores, failures = [], []
+    scene: Scene, backends: list[Backend], scores: list[Score], failures: list[str], *, selected: bool,
+    step: Callable[[str], None],
+) -> None:  # fmt: skip
+    """Score the scene with both models on all backends; add the scores, and the errors of unselected backends."""
     for name in (BEAM, FIELD):
         step(f"{name}, float64 reference")
         truth = make_model(scene, name, "numpy", "float64")
@@ -123,7 +131,6 @@ def _score_all(
                 if selected:
                     raise
                 failures.append(f"{backend.info.selection}: {name}: {type(error).__name__}: {error}")
-    return scores, failures
 
 
 def draw(scene: Scene, scores: list[Score], path: Path) -> None:

@@ -52,7 +52,7 @@ density.png, trace.png, surface.png, and incidence.png where angles of incidence
 
 Ctrl-C ends the fit and prints the best parameters so far.
 
-Exit codes: 0 success, 1 the fit did not converge, 2 bad input, 130 interrupted.
+Exit codes: 0 success, 1 the fit did not converge, 2 bad input, 130 interrupted, 143 terminated.
 
 example:
   gpusense fit --map map.yaml --log run.log.gz --every 2 --offset 1 --holdout --fit-motion --out fitted

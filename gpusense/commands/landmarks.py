@@ -117,10 +117,15 @@ def run(args: argparse.Namespace) -> int:
     alpha = None if args.motion_noise is None else tuple(args.motion_noise)
     drift = None if args.drift is None else tuple(args.drift)
     motion = run_motion(recorded_run, alpha=alpha, reverse=args.reverse, drift=drift, fit=args.fit_motion)
-    with progress((len(recorded_run.time) + 99) // 100) as step:
-        track = landmark_runs.localise(
-            recorded_run, model, known=args.known, particles=args.particles, seed=args.seed, motion=motion, step=step
-        )
+    try:
+        with progress((len(recorded_run.time) + 99) // 100) as step:
+            track = landmark_runs.localise(
+                recorded_run, model, known=args.known, particles=args.particles, seed=args.seed, motion=motion,
+                step=step,
+            )  # fmt: skip
+    except KeyboardInterrupt:
+        _print_fit(args, fit)
+        raise
     if args.json:
         print_json(_document(args, recorded_run, fit, suspicions, agreement, track, motion, model.device.selection))
     else:
@@ -130,6 +135,14 @@ def run(args: argparse.Namespace) -> int:
         if not args.json:
             print(f"drawn: {args.plot}")
     return LOST if track.lost else 0
+
+
+def _print_fit(args: argparse.Namespace, fit: LandmarkFit) -> None:
+    """Print the fit of a run whose localisation was interrupted."""
+    if args.json:
+        print_json({"interrupted": True, "fit": fit.to_dict(), "machine": machine()})
+    else:
+        print(f"interrupted while localising; the noise of the sensor:\n\n{fit}")
 
 
 def _draw(path: Path, recorded_run: LandmarkRun, track: Track, suspicions: Suspicions) -> None:

@@ -17,6 +17,7 @@ from gpusense.commands.arguments import (
 )
 from gpusense.commands.output import print_json, print_table
 from gpusense.commands.scans import add_log, options_named
+from gpusense.commands.signals import code_of, word_of
 from gpusense.evaluation.machine import machine
 
 if TYPE_CHECKING:
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 NAME = "likelihood-map"
 HELP = "Draw the likelihood of a scan over all positions and headings of a map."
 
-INTERRUPTED = 130
 # Modes that are printed.
 _MODES = 5
 
@@ -35,7 +35,7 @@ are no neighbours of a better one. The entropy is that of the pose for a uniform
 
 Ctrl-C ends the run; the picture then shows the positions so far.
 
-Exit codes: 0 success, 2 bad input, 130 interrupted.
+Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
 example:
   gpusense likelihood-map --map map.yaml --log run.log.gz --scan 101 --out likelihood.png
@@ -78,13 +78,13 @@ def run(args: argparse.Namespace) -> int:
     result, tiles = prepare_tiles(
         model, scan.ranges, resolution=args.resolution, headings=args.headings, positions=args.positions
     )
-    done = 0.0
+    done, stopped = 0.0, None
     with progress(100) as step:
         try:
             for done in tiles:
                 step(f"{100 * done:.0f}%")
-        except KeyboardInterrupt:
-            pass
+        except KeyboardInterrupt as stop:
+            stopped = stop
     result.plot(args.out)
     poses, log_p = result.modes(_MODES)
     if args.json:
@@ -100,9 +100,9 @@ def run(args: argparse.Namespace) -> int:
         rows = [[*(f"{v:.3f}" for v in pose), f"{value:.2f}"] for pose, value in zip(poses, log_p, strict=True)]
         print_table(columns, rows, right=columns)
         print(f"\n{args.out}: {result.log_p.size} poses, entropy {result.entropy:.2f} nats")
-    if done < 1:
-        sys.stderr.write(f"gpusense: interrupted: {100 * done:.0f}% of the positions are done\n")
-        return INTERRUPTED
+    if stopped is not None:
+        sys.stderr.write(f"gpusense: {word_of(stopped)}: {100 * done:.0f}% of the positions are done\n")
+        return code_of(stopped)
     return 0
 
 

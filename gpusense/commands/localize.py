@@ -49,7 +49,7 @@ command come first. Its frames, topics and gates (update_min_d, update_min_a, re
 
 Ctrl-C ends the run with the results so far, and writes the files.
 
-Exit codes: 0 success, 1 lost at the end, or no reading there to judge by, 2 bad input, 130 interrupted.
+Exit codes: 0 success, 1 lost at the end, or no reading there to judge by, 2 bad input, 130 interrupted, 143 terminated.
 
 example:
   gpusense localize --map map.yaml --log run.log.gz

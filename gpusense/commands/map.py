@@ -17,6 +17,7 @@ from gpusense.commands.arguments import (
 )
 from gpusense.commands.output import print_json
 from gpusense.commands.scans import add_log, add_reference, read_scans
+from gpusense.commands.signals import code_of, word_of
 from gpusense.evaluation.machine import machine
 from gpusense.world.map_greys import MODES
 
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 NAME = "map"
 HELP = "Build an occupancy grid from the scans of a log with corrected poses."
 
-INTERRUPTED = 130
 # Scans of a step of the progress bar.
 _SCANS = 64
 
@@ -42,7 +42,7 @@ chains matches from scan to scan, and drifts over long drives.
 Ctrl-C ends the run; the map of the scans so far is written. A map of more than four million cells is built in bands
 of rows: then it is the map of the bands so far, and of the last one's scans.
 
-Exit codes: 0 success, 2 bad input, 130 interrupted.
+Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
 example:
   gpusense map --log run.log.gz --out map.yaml
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
         resolution=args.resolution, origin=None, shape=None, range_limit=args.range_limit, clear_max=args.clear_max,
         p_hit=args.p_hit, p_miss=args.p_miss, p_prior=0.5, occupied_threshold=65, backend=args.backend, each=_SCANS,
     )  # fmt: skip
-    done = _build(builder)
+    done, stop = _build(builder)
     grid = builder.grid()
     transparent = args.mode == "scale" and bool(grid.unknown.any())
     form: Literal["pgm", "png"] = "png" if transparent else "pgm"
@@ -106,22 +106,22 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(f"{args.out}: {rows} x {cols} cells of {grid.resolution} m, {occupied} occupied, {free} free; "
               f"{builder.rays} rays of {counted} scans\nimage: {image}")  # fmt: skip
-    if done < 1:
+    if stop is not None:
         held = f"{counted} of {len(scans)} scans"
         if builder.bands > 1:
             held = f"its lower part, {100 * done:.0f}% of the work; the rest is unknown"
-        sys.stderr.write(f"gpusense: interrupted: the map holds {held}\n")
-        return INTERRUPTED
+        sys.stderr.write(f"gpusense: {word_of(stop)}: the map holds {held}\n")
+        return code_of(stop)
     return 0
 
 
-def _build(builder: MapBuilder) -> float:
-    """Count all rays, and return the share of the work that is done: less than 1 after an interrupt."""
+def _build(builder: MapBuilder) -> tuple[float, KeyboardInterrupt | None]:
+    """Count all rays, and return the share of the work that is done, and what has stopped it; None at the end."""
     done = 0.0
     with progress(max(builder.parts, 1)) as step:
         try:
             for done in builder.steps():
                 step(f"{100 * done:.0f}%")
-        except KeyboardInterrupt:
-            pass
-    return done
+        except KeyboardInterrupt as stop:
+            return done, stop
+    return done, None

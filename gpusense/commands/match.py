@@ -37,7 +37,7 @@ Each scan is matched to the one before, from the odometry's guess; with --map to
 are those against the logged poses, where the log has them. A match is wrong beyond 0.2 m or 5 degrees.
 Ctrl-C ends the run with the results so far.
 
-Exit codes: 0 success, 2 bad input, 130 interrupted.
+Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
 example:
   gpusense match --log run.log.gz --limit 300

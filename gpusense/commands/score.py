@@ -48,7 +48,7 @@ The verdict tells whether the logged poses explain the beams of their scans, whi
 A row is printed as soon as its scan is scored. Ctrl-C ends the run with the results so far.
 
 Exit codes: 0 success, 1 two backends rank the particles differently by more than rounding explains, or the logged poses
-do not fit the map, 2 bad input, 130 interrupted.
+do not fit the map, 2 bad input, 130 interrupted, 143 terminated.
 
 example:
   gpusense score --map map.yaml --log run.log.gz --model field --particles 20000

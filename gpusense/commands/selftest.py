@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compare the backends and print a table of the differences."""
+    """Compare the backends and print a table of the differences; after Ctrl-C of those so far."""
     return _run_stiff(args) if args.stiff else _run_pairs(args)
 
 
@@ -74,14 +74,18 @@ def _run_stiff(args: argparse.Namespace) -> int:
         if precision == "float32" or backend.info.float64
     ]
     rows: list[tuple[str, str, Row]] = []
-    with progress(len(jobs)) as step:
-        for backend, precision in jobs:
-            step(f"{backend.info.selection} {precision}")
-            rows += [(backend.info.selection, precision, row) for row in stiff.run(backend, precision)]
+    stopped = None
+    try:
+        with progress(len(jobs)) as step:
+            for backend, precision in jobs:
+                step(f"{backend.info.selection} {precision}")
+                rows += [(backend.info.selection, precision, row) for row in stiff.run(backend, precision)]
+    except KeyboardInterrupt as stop:
+        stopped = _kept(stop, rows)
     breaches = sum(not row.ok for _, _, row in rows)
     if args.json:
         listed = [{"backend": backend, "precision": precision} | asdict(row) for backend, precision, row in rows]
-        document = {"passed": not breaches, "rows": listed, "machine": machine()}
+        document = {"passed": not breaches and stopped is None, "rows": listed, "machine": machine()}
         print_json(document)
     else:
         _print_head(backends)
@@ -95,7 +99,20 @@ def _run_stiff(args: argparse.Namespace) -> int:
         print()
         print(machine_line())
         print(f"{len(rows)} rows, {f'{breaches} BREACHED' if breaches else 'none breached'}")
+    if stopped is not None:
+        raise stopped
     return BREACH if breaches else 0
+
+
+def _kept(stop: KeyboardInterrupt, results: Sequence[object]) -> KeyboardInterrupt:
+    """Return what has stopped the comparisons, to be raised after those so far are printed.
+
+    Raises:
+        KeyboardInterrupt: there is none.
+    """
+    if not results:
+        raise stop
+    return stop
 
 
 def _print_head(backends: Sequence[Backend]) -> None:
@@ -117,14 +134,19 @@ def _run_pairs(args: argparse.Namespace) -> int:
 
     begin = time.perf_counter()
     backends = selftest.chosen_backends(args.backend)
-    with progress(len(backends)) as step:
-        checks = selftest.run(backends, step=step)
+    checks: list[Check] = []
+    stopped = None
+    try:
+        with progress(len(backends)) as step:
+            selftest.run(backends, step=step, checks=checks)
+    except KeyboardInterrupt as stop:
+        stopped = _kept(stop, checks)
     seconds = time.perf_counter() - begin
     absent = [device for device in devices() if not device.available]
     breaches = sum(not check.passed for check in checks)
     if args.json:
         document = {
-            "passed": not breaches,
+            "passed": not breaches and stopped is None,
             "backends": [asdict(backend.info) for backend in backends],
             "absent": [asdict(device) for device in absent],
             "checks": [asdict(check) | {"passed": check.passed} for check in checks],
@@ -142,6 +164,8 @@ def _run_pairs(args: argparse.Namespace) -> int:
         print(machine_line())
         verdict = f"{breaches} BREACHED" if breaches else "none breached"
         print(f"{len(checks)} comparisons in {seconds:.1f} s, {verdict}")
+    if stopped is not None:
+        raise stopped
     return BREACH if breaches else 0
 
 

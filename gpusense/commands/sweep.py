@@ -44,7 +44,7 @@ Jobs run in a process of their own; with --processes or several --device in seve
 a Dask cluster. A cluster of 'local' listens on the loopback only. Whoever reaches the ports of a Dask cluster executes
 code there: use one at an address in a network that you trust, or with TLS. Maps and logs are sent to its workers, once.
 
-Exit codes: 0 success, 1 some jobs failed, 2 bad input, or the cluster ended, 130 interrupted.
+Exit codes: 0 success, 1 some jobs failed, 2 bad input, or the cluster ended, 130 interrupted, 143 terminated.
 
 example:
   gpusense sweep examples/sweep_logs.yaml --root data --table sweep.csv --processes 2 --plot sweep.png

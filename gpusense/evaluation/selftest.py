@@ -112,6 +112,7 @@ def run(
     step: Callable[[str], None] = lambda text: None,
     *,
     sonar: bool = True,
+    checks: list[Check] | None = None,
 ) -> list[Check]:
     """Compare backends with the truth and in pairs.
 
@@ -120,8 +121,9 @@ def run(
         scene: The scene; the built-in one by default.
         step: Called with a backend's selection string before its turn.
         sonar: Whether a ring of sonars is among the models; it needs the normals of the map.
+        checks: Receives the comparisons as they are made; a new list by default.
     """
-    scene, checks = scene or built_in_scene(), []
+    scene, checks = scene or built_in_scene(), [] if checks is None else checks
     results: dict[str, Results] = {}
     for backend in backends:
         step(backend.info.selection)

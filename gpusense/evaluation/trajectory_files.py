@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from gpusense._util import checks
 from gpusense._util.files import write_whole
+from gpusense._util.lines import until_cut
 from gpusense.localization.pose_algebra import wrap_angle
 from gpusense.logs import Pose
 
@@ -53,19 +54,24 @@ def _numbers(path: Path) -> Iterator[list[float]]:
     Raises:
         ValueError: a line has not eight finite numbers.
     """
-    with path.open(encoding="utf-8", errors="backslashreplace") as file:
-        for line, text in enumerate(file, 1):
-            if text.strip() == _INDICES:
-                raise ValueError(f"{path}: must have times of scans, got their indices")
-            words = text.split("#")[0].split()
-            try:
-                numbers = [float(word) for word in words]
-            except ValueError:
-                numbers = []
-            if words and not (len(numbers) == 8 and all(map(math.isfinite, numbers))):
-                raise ValueError(f"{path}: line {line} must have eight finite numbers, got {checks.show(text.strip())}")
-            if words:
-                yield numbers
+    yield from until_cut(path, lambda lines: _rows(path, lines))
+
+
+def _rows(path: Path, lines: Iterator[tuple[int, bytes]]) -> Iterator[list[float]]:
+    """Yield the numbers of numbered lines."""
+    for line, data in lines:
+        text = data.decode(errors="backslashreplace")
+        if text.strip() == _INDICES:
+            raise ValueError(f"{path}: must have times of scans, got their indices")
+        words = text.split("#")[0].split()
+        try:
+            numbers = [float(word) for word in words]
+        except ValueError:
+            numbers = []
+        if words and not (len(numbers) == 8 and all(map(math.isfinite, numbers))):
+            raise ValueError(f"{path}: line {line} must have eight finite numbers, got {checks.show(text.strip())}")
+        if words:
+            yield numbers
 
 
 def read_tum(path: Path) -> tuple[Floats, Floats]:

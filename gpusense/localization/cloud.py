@@ -8,47 +8,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.recording import Recording, Repeated
-from gpusense.interface.constants import (
-    DEGENERATE,
-    ESTIMATE,
-    LEFT,
-    MOMENTS,
-    RUNG,
-    SAMPLE_SIZE,
-    STAGE,
-    STATE,
-    WIDE_HEADINGS,
-)
+from gpusense.interface.constants import ESTIMATE, LEFT, MOMENTS, SLOW_RATE, STAGE, STATE, WIDE_HEADINGS
 from gpusense.interface.launches import Program
+from gpusense.localization.filter_cloud import Contents, Summary, meaningful, summary_of
 from gpusense.localization.particles import Particles, Stage
 from gpusense.localization.sums import weight_block
 
 _DOUBLE = np.dtype(np.float64)
 _MOST_RECORDED = 32
-
-
-class Summary(NamedTuple):
-    """The state of a filter after a correction.
-
-    Attributes:
-        effective_sample_size: Of the last stage.
-        temperature: Share of the temperature that all stages used.
-        degenerate: No particle was possible.
-        stages: Stages that ran.
-        numbers: The state as the kernels hold it.
-    """
-
-    effective_sample_size: float
-    temperature: float
-    degenerate: bool
-    stages: int
-    numbers: np.ndarray
 
 
 class Cloud(Particles):
@@ -60,12 +33,7 @@ class Cloud(Particles):
         sensors: Most sensors of a correction.
         precision: Of their log-likelihoods.
         residual: Whether draws are those of residual resampling.
-
-    Attributes:
-        moved: Whether the motion of the last correction was started.
     """
-
-    moved = False
 
     def __init__(
         self, backend: Backend, capacity: int, sensors: int, precision: np.dtype, *, residual: bool = False
@@ -75,11 +43,26 @@ class Cloud(Particles):
         self._estimates, self._stages = Repeated(backend, 8), Repeated(backend, 16)
         self._uploads: list[np.ndarray] = []
 
+    def place(self, poses: np.ndarray, weights: np.ndarray | None = None) -> None:
+        """Replace all particles."""
+        count = len(poses)
+        w = np.ones(count) if weights is None else weights * (count / weights.sum())
+        places = self.places.placed(self.kept)
+        self._fill((self.poses[places.shown], poses), (self.weights[places.weight], w),
+                   (self.states[places.state], np.zeros(STATE)))  # fmt: skip
+        self.set_particles(places, count, weight_block(self.backend, count))
+
+    def _fill(self, *arrays: tuple[Buffer, np.ndarray]) -> None:
+        """Copy arrays to buffers that work of earlier steps may use."""
+        self.backend.synchronize()
+        for buffer, array in arrays:
+            self.backend.upload(np.ascontiguousarray(array, np.float64), buffer)
+
     def set_pool(self, poses: np.ndarray) -> None:
         """Upload the poses from which recovery injects particles."""
-        self.pool = self.backend.upload(np.ascontiguousarray(poses, np.float64))
         self._recordings.clear()
         self._stages.clear()
+        self.pool, self.pool_size = self.backend.upload(np.ascontiguousarray(poses, np.float64)), len(poses)
 
     def upload_settings(self, settings: np.ndarray) -> None:
         """Copy the numbers of a step to the device."""
@@ -95,53 +78,58 @@ class Cloud(Particles):
 
     # ---- steps
 
-    def move(self, kind: int) -> None:
+    def move(self, settings: np.ndarray, kind: int) -> None:
         """Move the particles now."""
-        self.backend.run(self.motion(kind))
-        if self.shown == self.next:
-            return
-        # The weights of moved particles are those that the next correction begins with.
-        self.shown = self.next
-        self.backend.copy(self.before, self.weight, self.count * 8) if self.backend.info.kind == "gpu" else (
-            self.backend.upload(self._read(self.before, self.count), self.weight)
-        )
+        places = self.places.moved(self.kept)
+        self.upload_settings(settings)
+        self.backend.run(self.motion(self.places.next, places.next, kind))
+        self.places = places
 
-    def correct(self, kind: int, stages: int, drawn: int, sensors: int, score: Callable[[Stage], None]) -> None:
-        """Run a step: stages until nothing is left of the temperature.
+    def run_stages(
+        self, settings: np.ndarray, stages: list[Stage], drawn: int, sensors: int, score: Callable[[Stage], None]
+    ) -> None:
+        """Run a correction: stages until nothing is left of the temperature.
 
         Args:
-            kind: Kind of the motion that begins the step.
-            stages: Most stages.
+            settings: Numbers of the step.
+            stages: The stages.
             drawn: Particles of the next step.
             sensors: Sensors that are used, the first ones of ``log_p``.
             score: Runs the launches of a stage: the motion of the first one, the log-likelihoods, and the weighing.
         """
         self.use(sensors)
-        self.moved, source = False, self.next
-        for number in range(stages):
-            last = number + 1 == stages
-            stage = Stage(source, number, stages, drawn if last else 0, None if number else kind)
+        self.upload_settings(settings)
+        if settings[SLOW_RATE] > 0:
+            # Averages of the likelihood last.
+            self._copy_state(self.places.state, stages[0].state)
+        for stage in stages:
+            last = stage.number + 1 == stage.most
             score(stage)
             if not last:
-                last = self._read(self.state, STATE)[number * STAGE + LEFT] == 0.0
+                last = self._read(self.states[stage.state], STATE)[stage.number * STAGE + LEFT] == 0.0
                 self._draw(stage, drawn if last else self.count)
-            self.shown, self.next = source, 1 - source
             if last:
                 break
-            source = 1 - source
+        self.set_particles(stage.places, drawn, weight_block(self.backend, drawn))
 
-    def begin(self, kind: int) -> None:
+    def _copy_state(self, source: int, target: int) -> None:
+        if self.backend.info.kind == "gpu":
+            self.backend.copy(self.states[source], self.states[target], STATE * _DOUBLE.itemsize)
+        else:
+            self.backend.upload(self._read(self.states[source], STATE), self.states[target])
+
+    def begin(self, stage: Stage) -> None:
         """Start the motion of a correction."""
-        self.moved = True
-        self.backend.run(self.motion(kind))
+        if stage.kind is not None:
+            self.backend.run(self.motion(stage.origin, stage.source, stage.kind))
 
     def weigh(self, stage: Stage) -> None:
         """Run the launches of a stage after its scores."""
-        self._stages.run((stage[:4], self.count, self._sensors), lambda: self.weighing(stage))
+        self._stages.run((stage.key, self.count, self._sensors), lambda: self.weighing(stage))
 
     def _draw(self, stage: Stage, drawn: int) -> None:
         """Draw into the other buffer."""
-        self._stages.run((stage[:2], drawn, self.count, "draw"), lambda: self.draw(stage, drawn))
+        self._stages.run((stage.key, drawn, self.count, "draw"), lambda: self.draw(stage, drawn))
 
     def replay(self, stage: Stage, key: Hashable, scoring: Callable[[int], tuple[Program, object]]) -> None:
         """Run a stage as one recorded program.
@@ -155,10 +143,9 @@ class Cloud(Particles):
         if whole not in self._recordings:
             if len(self._recordings) > _MOST_RECORDED:
                 self._recordings.clear()
-            move = () if stage.kind is None else self.motion(stage.kind)
+            move = () if stage.kind is None else self.motion(stage.origin, stage.source, stage.kind)
             program, owners = scoring(stage.source)
             self._recordings[whole] = self.backend.record(move + program + self.weighing(stage)), owners
-        self.moved = True
         self._recordings[whole][0]()
 
     def explain(self) -> str:
@@ -167,42 +154,43 @@ class Cloud(Particles):
             return "launches one by one"
         return next(reversed(self._recordings.values()))[0].explain()
 
-    def resized(self, drawn: int) -> None:
-        """Set the number of particles, after a step that has drawn that number."""
-        self.count = drawn
-        self.block = weight_block(self.backend, drawn)
-
     # ---- what crosses to the host
 
     def summary(self) -> Summary:
         """Return the state after the last correction."""
-        numbers = self._read(self.state, STATE)
-        used, stage = 0.0, 0
-        while True:
-            used += float(numbers[stage * STAGE + RUNG])
-            if numbers[stage * STAGE + LEFT] == 0.0:
-                break
-            stage += 1
-        own = numbers[stage * STAGE : (stage + 1) * STAGE]
-        degenerate = bool(numbers[DEGENERATE])
-        return Summary(float(own[SAMPLE_SIZE]), min(used, 1.0), degenerate, stage + 1, numbers)
+        return summary_of(self._read(self.states[self.places.state], STATE))
 
     def shares(self, count: int) -> Any:
-        """Return the weights of the shown particles, whose sum is 1, as an array of the device's library."""
-        out = self.backend.blank(count, _DOUBLE)
-        program = self.sums.estimate(self.poses[self.shown], self.weight, self.estimated, count)
-        program += self.sums.launch("normalize_weights", count, weight=self.weight, estimate=self.estimated, share=out,
+        """Return the weights of the shown particles, whose sum is 1: on a GPU an array of the device's library."""
+        if self.backend.info.kind != "gpu":
+            weights = self.host_weights(count)
+            return weights / weights.sum()
+        return self.backend.lend(self.device_shares(count), (count,), _DOUBLE)
+
+    def device_shares(self, count: int) -> Buffer:
+        """Return a new buffer with the weights of the shown particles, whose sum is 1."""
+        out, weight = self.backend.blank(count, _DOUBLE), self.weights[self.places.weight]
+        program = self.sums.estimate(self.poses[self.places.shown], weight, self.estimated, count)
+        program += self.sums.launch("normalize_weights", count, weight=weight, estimate=self.estimated, share=out,
                                     particles=count)  # fmt: skip
         self.backend.run(program)
-        return self.backend.lend(out, (count,), _DOUBLE)
+        return out
 
     def moments(self, count: int) -> Any:
-        """Return mean and covariance of the shown particles as an array of the device's library."""
-        out = self.backend.blank(ESTIMATE, _DOUBLE)
+        """Return mean and covariance of the shown particles: on a GPU an array of the device's library."""
+        if self.backend.info.kind != "gpu":
+            return self.estimate(count)[:MOMENTS]
+        out, poses, weight = self.backend.blank(ESTIMATE, _DOUBLE), self.poses[self.places.shown], self.places.weight
         for again in (0, 1):
             # The second pass is right for any headings.
-            self.backend.run(self.sums.estimate(self.poses[self.shown], self.weight, out, count, again))
-        return self.lent(out, (MOMENTS,))
+            self.backend.run(self.sums.estimate(poses, self.weights[weight], out, count, again))
+        return self._lent(out, (MOMENTS,))
+
+    def particles(self, count: int) -> Any:
+        """Return the shown poses: on a GPU an array of the device's library."""
+        if self.backend.info.kind != "gpu":
+            return self.host_poses(self.places.shown, count)
+        return self._lent(self.poses[self.places.shown], (count, 3))
 
     def estimate(self, count: int) -> np.ndarray:
         """Return the kernels' estimate of the shown particles: mean, covariance, sum of weights."""
@@ -211,10 +199,11 @@ class Cloud(Particles):
 
     def _estimate(self, count: int, again: int) -> np.ndarray:
         """Return the numbers after a pass of the estimate."""
+        shown, weight = self.places.shown, self.places.weight
         # Clouds that change their size seldom ask twice for the same.
         self._estimates.run(
-            (self.shown, count, again),
-            lambda: self.sums.estimate(self.poses[self.shown], self.weight, self.estimated, count, again),
+            (shown, weight, count, again),
+            lambda: self.sums.estimate(self.poses[shown], self.weights[weight], self.estimated, count, again),
         )
         return self._read(self.estimated, ESTIMATE)
 
@@ -224,11 +213,31 @@ class Cloud(Particles):
 
     def host_weights(self, count: int) -> np.ndarray:
         """Return a copy of the weights of the shown particles, before they are normalised."""
-        return self._read(self.weight, count)
+        return self._read(self.weights[self.places.weight], count)
+
+    def contents(self, count: int) -> Contents:
+        """Return a copy of all particles, given the number of the shown ones."""
+        places, weighed = self.places, self.places.shown != self.places.next
+        return Contents(
+            self.host_poses(places.shown, count), self.host_weights(count),
+            self.host_poses(places.next, self.count) if weighed else None,
+            self._read(self.weights[places.before], self.count) if weighed else None,
+            meaningful(self._read(self.states[places.state], STATE), self.pool_size > 0),
+            self._read(self.pool, 3 * self.pool_size).reshape(-1, 3) if self.pool_size else None,
+        )  # fmt: skip
+
+    def restore(self, contents: Contents) -> None:
+        """Replace all particles by those of ``contents``."""
+        if contents.pool is not None:
+            self.set_pool(contents.pool)
+        places, arrays = contents.places_and_arrays(self.kept)
+        self._fill(*((getattr(self, name)[index], array) for name, index, array in arrays),
+                   (self.states[places.state], contents.state))  # fmt: skip
+        self.set_particles(places, contents.next_count, weight_block(self.backend, contents.next_count))
 
     def _read(self, buffer: Buffer, count: int) -> np.ndarray:
         return self.backend.download(buffer, np.empty(count))
 
-    def lent(self, buffer: Buffer, shape: tuple[int, ...]) -> Any:
+    def _lent(self, buffer: Buffer, shape: tuple[int, ...]) -> Any:
         """Return the head of a buffer as an array of the device's library."""
         return self.backend.lend(self.backend.part(buffer, 0, math.prod(shape), _DOUBLE), shape, _DOUBLE)

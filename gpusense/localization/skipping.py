@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from gpusense.backends import arrays
+from gpusense.localization.filter_cloud import Given
 from gpusense.localization.pose_algebra import mean_pose
-from gpusense.localization.scoring import Given
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.verdict import boundary
 

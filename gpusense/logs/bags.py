@@ -6,6 +6,8 @@ layouts that come with rosbags, and by one that is given here.
 
 from __future__ import annotations
 
+import contextlib
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +15,7 @@ from typing import Any, NamedTuple
 
 from gpusense._util.extras import library
 from gpusense.logs.bag_bounds import check_metadata, install
+from gpusense.logs.cut_bags import uncut
 
 SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -100,6 +103,15 @@ def _open(path: Path) -> Iterator[tuple[Any, Any]]:
     store = types.get_typestore(types.Stores.ROS1_NOETIC if first else types.Stores.ROS2_HUMBLE)
     if TRANSFORMS not in store.types:
         store.register(types.get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
-    reader = readers.Reader(path)
-    with reader:
+    with contextlib.closing(_opened(readers.Reader, path)) as reader:
         yield reader, store.deserialize_ros1 if first else store.deserialize_cdr
+
+
+def _opened(kind: Any, path: Path) -> Any:
+    """Return an open reader of a bag; of one that is cut off, with a warning, of its messages up to there."""
+    mended = uncut(path)
+    if mended is not None:
+        warnings.warn(f"{path}: the bag is cut off; it is read up to there", stacklevel=2)
+    reader = kind(mended or path)
+    reader.open()
+    return reader

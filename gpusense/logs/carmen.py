@@ -32,7 +32,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense._util.lines import numbered_lines
+from gpusense._util.lines import until_cut
 from gpusense.logs.records import Odometry, Pose, Scan
 from gpusense.world.scanner import Scanner
 
@@ -45,9 +45,17 @@ _TAIL = 3  # time of measurement, host, logger's time
 def read(path: Path, *, range_max: float | None, odometry: bool, rear: bool) -> Iterator[Scan | Odometry]:
     """Read the records of a CARMEN log; see :func:`gpusense.read_log` for arguments and errors."""
     names = _REAR if rear else _FRONT
+    return until_cut(path, lambda lines: _records(path, lines, names, range_max, odometry=odometry))
+
+
+def _records(
+    path: Path, lines: Iterator[tuple[int, bytes]], names: tuple[bytes, bytes], range_max: float | None, *,
+    odometry: bool,
+) -> Iterator[Scan | Odometry]:  # fmt: skip
+    """Read the records of numbered lines."""
     scanners: dict[tuple[float, ...], Scanner] = {}
     old_range_max = range_max
-    for where, fields in _messages(path):
+    for where, fields in _messages(path, lines):
         name = fields[0].decode()
         if fields[0] == b"ODOM":
             values = _message_numbers(where, fields, 6)
@@ -73,7 +81,7 @@ def read(path: Path, *, range_max: float | None, odometry: bool, rear: bool) -> 
         yield Scan(_time(where, fields), ranges, scanner, _pose(where, poses[3:]), _pose(where, poses[:3]))
 
 
-def _messages(path: Path) -> Iterator[tuple[str, list[bytes]]]:
+def _messages(path: Path, lines: Iterator[tuple[int, bytes]]) -> Iterator[tuple[str, list[bytes]]]:
     """Read all messages of known names.
 
     Yields:
@@ -81,7 +89,7 @@ def _messages(path: Path) -> Iterator[tuple[str, list[bytes]]]:
     """
     any_message = False
     number = 0
-    for number, line in numbered_lines(path):
+    for number, line in lines:
         if line.startswith(_KNOWN):
             fields = line.split()
             if fields[0] in _KNOWN:
@@ -189,13 +197,17 @@ def _scanner(where: str, start: float, step: float, count: float, range_max: flo
 def _range_max_of(path: Path, name: bytes) -> float:
     """Return range_max of a log's messages of one name, from their largest reading; see ``read_log``."""
     largest, times = 0.0, 0
-    for where, fields in _messages(path):
-        if fields[0] == name:
-            ranges, _ = _old_laser(where, fields)
-            top = float(np.max(ranges, where=np.isfinite(ranges), initial=0.0))
-            if top > largest:
-                largest, times = top, 0
-            times += int(np.count_nonzero(ranges == largest))
+
+    def each(lines: Iterator[tuple[int, bytes]]) -> Iterator[NDArray[np.float64]]:
+        for where, fields in _messages(path, lines):
+            if fields[0] == name:
+                yield _old_laser(where, fields)[0]
+
+    for ranges in until_cut(path, each):
+        top = float(np.max(ranges, where=np.isfinite(ranges), initial=0.0))
+        if top > largest:
+            largest, times = top, 0
+        times += int(np.count_nonzero(ranges == largest))
     if largest == 0.0:
         raise ValueError(f"{path}: must have a reading > 0 unless range_max is given, got none")
     return largest if times >= 3 else math.nextafter(largest, math.inf)

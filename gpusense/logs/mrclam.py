@@ -20,12 +20,13 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from gpusense._util import checks
-from gpusense._util.lines import numbered_lines
+from gpusense._util.lines import until_cut
 from gpusense.logs.records import Floats, Integers, LandmarkRun
 from gpusense.world.landmarks import LandmarkMap
 
@@ -146,13 +147,21 @@ def _table(path: Path, columns: tuple[str, ...], ordered: bool = False) -> tuple
     file = checks.existing_file(_file(path))
     rows: list[list[float]] = []
     where: list[str] = []
-    for number, line in numbered_lines(file):
-        fields = line.split()
-        if fields and not fields[0].startswith(b"#"):
-            where.append(f"{file}:{number}")
-            rows.append(_row(where[-1], fields, columns))
-            if ordered and len(rows) > 1 and rows[-1][0] < rows[-2][0]:
-                raise ValueError(f"{where[-1]}: time must not fall, got {rows[-1][0]:g}")
+
+    def each(lines: Iterator[tuple[int, bytes]]) -> Iterator[tuple[str, list[float]]]:
+        before = -math.inf
+        for number, line in lines:
+            fields = line.split()
+            if fields and not fields[0].startswith(b"#"):
+                row = _row(f"{file}:{number}", fields, columns)
+                if ordered and row[0] < before:
+                    raise ValueError(f"{file}:{number}: time must not fall, got {row[0]:g}")
+                before = row[0]
+                yield f"{file}:{number}", row
+
+    for place, row in until_cut(file, each):
+        where.append(place)
+        rows.append(row)
     if not rows:
         raise ValueError(f"{file}: must hold rows of {', '.join(columns)}, got none")
     return np.array(rows), where

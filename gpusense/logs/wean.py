@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gpusense._util.lines import numbered_lines
+from gpusense._util.lines import until_cut
 from gpusense.logs.records import Floats, Odometry, Pose, Scan
 from gpusense.world.scanner import Scanner
 
@@ -34,12 +34,14 @@ def read(path: Path, *, range_max: float | None, odometry: bool, rear: bool) -> 
     """Read the records of a log; see :func:`gpusense.read_log` for arguments and errors."""
     if rear:
         raise ValueError("rear: must be False for a Wean Hall log, whose robot has one laser, got True")
-    return _records(path, range_max or _RANGE_MAX, odometry)
+    return until_cut(path, lambda lines: _records(path, lines, range_max or _RANGE_MAX, odometry))
 
 
-def _records(path: Path, range_max: float, odometry: bool) -> Iterator[Scan | Odometry]:
+def _records(
+    path: Path, lines: Iterator[tuple[int, bytes]], range_max: float, odometry: bool
+) -> Iterator[Scan | Odometry]:
     scanner: Scanner | None = None
-    for number, line in numbered_lines(path):
+    for number, line in lines:
         fields = line.split()
         if not fields:
             continue

@@ -204,9 +204,7 @@ class MapBuilder:
             cells = cells.copy()
             if self._counts is not None:
                 self._write(self._counts, cells)
-        return grid_of_checked(
-            cells, self._frame.resolution, self._frame.origin, occupied_threshold=self._threshold
-        )
+        return grid_of_checked(cells, self._frame.resolution, self._frame.origin, occupied_threshold=self._threshold)
 
 
 def _occupancy(p_hit: float, p_miss: float, p_prior: float) -> tuple[float, float, float]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import secrets
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
 from gpusense._util.documents import read_mapping
+from gpusense._util.files import write_several
 from gpusense.world.grid import (
     FARTHEST_ORIGIN,
     LARGEST_RESOLUTION,
@@ -191,36 +191,7 @@ def write_map(
         image: lambda stream: write_image(stream, painting, grid.shape, image_format),
         target: lambda stream: stream.write(text.encode()),
     }
-    _write_all(writers)
-
-
-def _write_all(writers: dict[Path, Callable[[BinaryIO], object]]) -> None:
-    """Write several files atomically: either all are replaced or, after any failure, none is."""
-    tag = secrets.token_hex(4)
-    fresh = {target: target.with_name(f".{target.name}.{tag}.new") for target in writers}
-    backup = {target: target.with_name(f".{target.name}.{tag}.old") for target in writers}
-    existed = {target: target.exists() for target in writers}
-    try:
-        for target, write in writers.items():
-            with fresh[target].open("xb") as stream:
-                write(stream)
-        for target in writers:
-            if existed[target]:
-                os.replace(target, backup[target])
-            os.replace(fresh[target], target)
-    except BaseException:
-        for target in writers:
-            if backup[target].exists():
-                os.replace(backup[target], target)
-            elif not existed[target]:
-                target.unlink(missing_ok=True)
-        raise
-    else:
-        for file in backup.values():
-            file.unlink(missing_ok=True)
-    finally:
-        for file in fresh.values():
-            file.unlink(missing_ok=True)
+    write_several(writers)
 
 
 def _read_yaml(file: Path) -> _MapYaml:

@@ -92,7 +92,7 @@ for count, width in zip((37, 2100, 37), lanes):
         filter_.correct(ranges[0])
         clouds.append((filter_.estimate().pose, filter_.estimate().covariance))
         if one is both[0]:
-            filter_._cloud.shares(filter_._cloud.count)
+            filter_._cloud.device_shares(filter_._cloud.count)
     for found, right in zip(*clouds):
         near(found, right, atol=2e-2)
 both[0].info = before

@@ -8,6 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import pyopencl as cl
 
+from gpusense._util.interrupts import undisturbed
+
 _LOST = ("DEVICE_NOT_AVAILABLE", "INVALID_COMMAND_QUEUE", "INVALID_CONTEXT", "INVALID_DEVICE")
 _OUT_OF_MEMORY = ("OUT_OF_RESOURCES", "MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_HOST_MEMORY", "INVALID_BUFFER_SIZE")
 # Bytes: a cache line, and at least the alignment of each type of a kernel.
@@ -36,7 +38,7 @@ class SharedBuffer(cl.SVMAllocation):
         # The driver does not keep it alive for queued commands, as it does a buffer. Freed through the queue, as
         # pyopencl can also do, it ended in a corrupted heap with PoCL 3. Without an allocation there is no attribute.
         if (settle := getattr(self, "_settle", None)) is not None:
-            settle()
+            undisturbed(settle)
 
 
 class SharedPart(cl.SVM):  # type: ignore[type-arg]

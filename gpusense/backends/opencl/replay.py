@@ -10,6 +10,7 @@ from typing import Any
 import pyopencl as cl
 
 from gpusense._util.checks import show
+from gpusense._util.interrupts import undisturbed
 from gpusense.backends.opencl.arrays import check_in_order
 from gpusense.backends.opencl.memory import driver_errors
 from gpusense.backends.recording import Recording, counted
@@ -53,12 +54,18 @@ class OpenCLRecording(Recording):
         # Memory that is shared with the host must not go while a queue works on it.
         # An interrupt may come before there is one.
         if getattr(self, "_used", None):
-            self.wait()
+            undisturbed(self._wait_for_all)
 
     def wait(self) -> None:
         """See Recording.wait."""
+        self._wait_for_all()
         with self._lock:
-            used, self._used = [self._queue, *self._used], []
+            self._used.clear()
+
+    def _wait_for_all(self) -> None:
+        """Wait for the device's queue, and for those of users; repeated after an interrupt, it waits for all again."""
+        with self._lock:
+            used = [self._queue, *self._used]
         with driver_errors():
             for queue in used:
                 queue.finish()

@@ -109,12 +109,13 @@ def steps(plan: Plan) -> int:
     return len(plan.sources) * len(CLOUDS) * len(jobs(plan))
 
 
-def run(plan: Plan, step: Callable[[str], None] = lambda text: None) -> Outcome:
+def run(plan: Plan, step: Callable[[str], None] = lambda text: None, outcome: Outcome | None = None) -> Outcome:
     """Measure all points of a plan.
 
     Args:
         plan: The plan.
         step: Called with a text before each point.
+        outcome: Receives the scenes and points as they are measured; a new one by default.
 
     Raises:
         OSError, ValueError: a map cannot be read, or has no room for a robot.
@@ -122,7 +123,8 @@ def run(plan: Plan, step: Callable[[str], None] = lambda text: None) -> Outcome:
     device, spent = truth_device(), 0.0
     info = device.info
     note = "exact caster and models in float64; tests hold this device to the NumPy reference"
-    outcome = Outcome([], [], {"backend": info.selection, "device": info.name, "precision": "float64", "note": note})
+    outcome = Outcome([], []) if outcome is None else outcome
+    outcome.truth = {"backend": info.selection, "device": info.name, "precision": "float64", "note": note}
     for source in plan.sources:
         scene = make_scene(source, device, beams=plan.beams, particles=plan.cloud, seed=plan.seed)
         outcome.scenes.append(_description(scene))

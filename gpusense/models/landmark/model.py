@@ -161,6 +161,10 @@ class LandmarkModel(PointModel):
         _, which, parts = self._evaluate(poses, features, None, each=True)
         return which, parts
 
+    def _arguments(self) -> dict[str, Any]:
+        own = dict(landmarks=self.landmarks, association=self.association, negative=self.negative, mount=self.mount)
+        return super()._arguments() | own | {"specialize": self._specialize}
+
     def _options(self) -> tuple[str, ...]:
         return f"landmarks={len(self.landmarks)}", f"association={self.association!r}"
 

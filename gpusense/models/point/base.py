@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -19,6 +19,7 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, flags_of, launch
 from gpusense.interface.plan import ORDINARY_HEADINGS, Omission, Plan
 from gpusense.models.arguments import real_dtype
+from gpusense.models.pickled import Pickled
 from gpusense.models.poses import Part, Poses, pose_status
 from gpusense.models.run import Piece, chunk_of, finish, run_pieces
 from gpusense.reference import relative
@@ -46,13 +47,14 @@ def relative_omissions(mount: tuple[float, float], precision: str) -> list[Omiss
     return omissions
 
 
-class PointModel(ABC):
+class PointModel(Pickled):
     """Base of the measurement models of one reading, or a few, for each of many poses."""
 
     _specialize = True
 
     def __init__(self, backend: Selection, precision: str, temperature: float) -> None:
         self.temperature = checks.real("temperature", temperature, above=0, high=1)
+        self._selection = backend
         self._backend = get_backend(backend)
         self._real = real_dtype(precision, self._backend)
         self._workspace = Workspace(self._backend)
@@ -66,6 +68,11 @@ class PointModel(ABC):
     def __repr__(self) -> str:
         parts = (*self._options(), f"precision={self.precision!r}", f"backend={self.device.selection!r}")
         return f"{type(self).__name__}({', '.join(parts)})"
+
+    def _arguments(self) -> dict[str, Any]:
+        """See Pickled; subclasses add their own."""
+        names = ("parameters", "precision", "temperature")
+        return {name: getattr(self, name) for name in names}
 
     def _options(self) -> tuple[str, ...]:
         """Return the map and the options that only this kind of model has, as ``repr`` shows them."""

@@ -122,6 +122,9 @@ class BeaconModel(PointModel):
 
         return cast(np.ndarray, self._score(poses, out, program, left_out, items=count))
 
+    def _arguments(self) -> dict[str, Any]:
+        return super()._arguments() | {"xy": self.xy}
+
     def _options(self) -> tuple[str, ...]:
         return f"beacons={len(self.xy)}", f"kind={self.parameters.kind!r}"
 

@@ -94,6 +94,8 @@ class BumperModel(PointModel):
         self._check_scale("sigma", self.parameters.sigma)
         side = grid.resolution
         self._radius, self._points, self._start = sample_outline(outline, segments, side / 2)
+        # For copies; the caller may change an array.
+        self._outline = np.copy(outline), None if segments is None else np.copy(segments)
         self.segments = len(self._start) - 1
         extent = self._radius + float(np.hypot(*self._points.T).max())
         margin = math.ceil(extent / side) + min(math.ceil(_DEVIATIONS * self.parameters.sigma / side), _MOST_MARGIN)
@@ -156,6 +158,11 @@ class BumperModel(PointModel):
             return (*placed.launches(), score)
 
         return cast(np.ndarray, self._score(poses, out, program, left_out, items=int(kept.sum())))
+
+    def _arguments(self) -> dict[str, Any]:
+        outline, segments = self._outline
+        own = dict(grid=self.grid, outline=outline, segments=segments, unknown=self.unknown, outside=self.outside)
+        return super()._arguments() | own
 
     def _options(self) -> tuple[str, ...]:
         return map_words(self.grid), f"segments={self.segments}"

@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray, CasterName, Precision, Space
 from gpusense.backends import BackendInfo, Selection, get_backend
+from gpusense.backends.base import Backend
 from gpusense.models.arguments import check_scene, map_words, real_dtype
+from gpusense.models.pickled import Pickled
 from gpusense.models.poses import Poses
 from gpusense.models.scan.cones import Cones, require_exact
 from gpusense.models.scan.map_caster import MapCaster
@@ -24,7 +26,7 @@ from gpusense.world.plausible import look_at_bearings
 _NO_MOUNT: Mount = (0.0, 0.0, 0.0)
 
 
-class RayCaster:
+class RayCaster(Pickled):
     """Distance to the first occupied cell along rays.
 
     Args:
@@ -73,6 +75,7 @@ class RayCaster:
         self.unknown = checks.choice("unknown", unknown, ("free", "occupied"))
         self.outside = checks.choice("outside", outside, ("free", "occupied"))
         self._seen = False
+        self._selection = backend
         device = get_backend(backend)
         real = real_dtype(precision, device)
         self._caster = MapCaster(
@@ -105,6 +108,15 @@ class RayCaster:
     def method(self) -> Caster:
         """The same as ``caster``."""
         return self.caster
+
+    def _arguments(self) -> dict[str, Any]:
+        names = ("grid", "range_max", "caster", "precision", "unknown", "outside")
+        return {name: getattr(self, name) for name in names}
+
+    @property
+    def backend(self) -> Backend:
+        """The backend that holds the caster's buffers."""
+        return self._caster.backend
 
     @property
     def device(self) -> BackendInfo:

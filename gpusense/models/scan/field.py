@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -89,6 +90,9 @@ class LikelihoodFieldModel(ScanModel):
         self._field_pipeline = FieldPipeline(
             self._setting, grid, self.parameters, unknown=self.unknown, outside=self.outside
         )
+
+    def _arguments(self) -> dict[str, Any]:
+        return super()._arguments() | {"parameters": self.parameters}
 
     @property
     def _pipeline(self) -> FieldPipeline:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, Literal, cast, overload
 
@@ -16,6 +16,7 @@ from gpusense.backends import Backend, BackendInfo, Selection, get_backend
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.plan import Omission, Plan, share
 from gpusense.models.arguments import check_scene, map_words, real_dtype
+from gpusense.models.pickled import Pickled
 from gpusense.models.poses import Poses
 from gpusense.models.run import finish
 from gpusense.models.scan.binding import bind
@@ -31,7 +32,7 @@ from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
 
 
-class ScanModel(ABC):
+class ScanModel(Pickled):
     """Base of the models of whole scans: the beam model and the likelihood field."""
 
     def __init__(
@@ -64,6 +65,7 @@ class ScanModel(ABC):
         self.temperature = checks.real("temperature", temperature, above=0, high=1)
         self.beams = check_beams(beams, scanner.count)
         checks.boolean("specialize", specialize)
+        self._selection = backend
         device = get_backend(backend)
         rules = Rules(
             scanner, ray_vectors(scanner.bearings, scanner.mount), 0.0 if weights.is_peer else z_max, self.beams,
@@ -89,6 +91,11 @@ class ScanModel(ABC):
         parts += [] if self.compat is None else [f"compat={self.compat!r}"]
         parts += [f"precision={self.precision!r}", f"backend={self.device.selection!r}"]
         return f"{type(self).__name__}({', '.join(parts)})"
+
+    def _arguments(self) -> dict[str, Any]:
+        """See Pickled; subclasses add their own."""
+        names = ("grid", "scanner", "precision", "unknown", "outside", "temperature", "beams", "compat")
+        return {name: getattr(self, name) for name in names} | {"specialize": self._setting.rules.specialize}
 
     def _options(self) -> tuple[str, ...]:
         """Return the options that only this kind of model has, as ``repr`` shows them."""

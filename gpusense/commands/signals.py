@@ -1,0 +1,98 @@
+"""Signals that end a command: it keeps what it has computed, says so in one line, and leaves no unfinished file.
+
+Ctrl-C, the end of a terminal and the signal by which containers and ``timeout`` end a program are exceptions alike.
+Only the command line installs handlers, in the main thread, and puts the old ones back.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from types import FrameType
+from typing import Any
+
+from gpusense._util import interrupts
+
+# Signals that end a command, with the word for the end. One that the caller ignores, as nohup does, stays ignored.
+_WORDS = {name: word for name, word in (("SIGINT", "interrupted"), ("SIGTERM", "terminated"), ("SIGHUP", "hung up"))
+          if hasattr(signal, name)}  # fmt: skip
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal has asked the command to end.
+
+    Attributes:
+        number: The signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
+def code_of(stop: KeyboardInterrupt) -> int:
+    """Return the exit code of a command that was stopped: 128 and the number of the signal, as of a shell."""
+    return 128 + (stop.number if isinstance(stop, Stopped) else signal.SIGINT)
+
+
+def word_of(stop: KeyboardInterrupt) -> str:
+    """Return "interrupted" or the word for another signal."""
+    return _WORDS[signal.Signals(code_of(stop) - 128).name]
+
+
+@contextlib.contextmanager
+def stopping() -> Iterator[None]:
+    """Turn the signals that end a command into :class:`Stopped`; in other threads than the main one do nothing.
+
+    An exception in a destructor or a callback is ignored by Python. A signal that comes there is delivered again.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    process = os.getpid()
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        if os.getpid() != process:
+            # A forked child ends as it would without this handler.
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+            return
+        raise Stopped(number)
+
+    def ignored(lost: Any) -> None:
+        if issubclass(lost.exc_type, KeyboardInterrupt):
+            interrupts.deliver_later(code_of(lost.exc_value) - 128)
+        else:
+            before_hook(lost)
+
+    before_hook = sys.unraisablehook
+    # A program that calls the command line may have handlers of its own.
+    usual = (signal.SIG_DFL, signal.default_int_handler)
+    numbers = [number for name in _WORDS if signal.getsignal(number := getattr(signal, name)) in usual]
+    before = {}
+    try:
+        sys.unraisablehook = ignored
+        for number in numbers:
+            before[number] = signal.signal(number, stop)
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        sys.unraisablehook = before_hook
+
+
+@contextlib.contextmanager
+def ending() -> Iterator[None]:
+    """Ignore further signals for the last line of a command."""
+    numbers = [getattr(signal, name) for name in _WORDS]
+    main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in numbers} if main else {}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

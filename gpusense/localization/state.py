@@ -1,0 +1,105 @@
+"""State of a particle filter as plain data: to copy it, to store it, and to go on with it elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.backends import arrays
+from gpusense.backends.base import Backend
+from gpusense.localization.filter_cloud import Contents
+from gpusense.localization.options import Options
+from gpusense.localization.sensors import Sensor
+
+
+@dataclass(frozen=True, eq=False)
+class FilterState:
+    """State of a :class:`ParticleFilter`: particles, weights, step, options, and all that it has learned.
+
+    It holds no device and no models, and can be pickled. A filter with the same models and options takes it over by
+    ``restore``, and then continues with the bits of the one that it is of.
+
+    Attributes:
+        options: Keyword arguments of the filter's constructor.
+        models: Names of the classes of its models.
+        contents: Particles on the host.
+        memory: The rest: learned temperature, recent verdicts, the number of the step.
+
+    Example:
+        >>> import gpusense as gs, pickle
+        >>> model = gs.HeadingModel(backend="numpy")
+        >>> pf = gs.ParticleFilter(model, particles=500, seed=1)
+        >>> pf.initialize_uniform(bounds=((0.0, 0.0), (5.0, 5.0)))
+        >>> state = pickle.loads(pickle.dumps(pf.state()))
+        >>> other = gs.ParticleFilter(model, **state.options); other.restore(state); state
+        FilterState(500 particles, step=1, models=HeadingModel)
+    """
+
+    options: dict[str, Any]
+    models: tuple[str, ...]
+    contents: Contents
+    memory: dict[str, Any]
+
+    def __repr__(self) -> str:
+        return f"FilterState({len(self.particles)} particles, step={self.step}, models={', '.join(self.models)})"
+
+    @property
+    def particles(self) -> np.ndarray:
+        """(N, 3) poses after the last step; a predicted motion that has not run yet is in ``memory``."""
+        return self.contents.poses
+
+    @property
+    def weights(self) -> np.ndarray:
+        """(N,) weights of the particles; their sum is 1."""
+        return np.asarray(self.contents.weights / self.contents.weights.sum())
+
+    @property
+    def step(self) -> int:
+        """Number of the last step, which random numbers depend on."""
+        return int(self.memory["_step"])
+
+
+def constructor_options(options: Options, motion: Any) -> dict[str, Any]:
+    """Return the keyword arguments of a filter with these options."""
+    rest = options._asdict()
+    least, most = rest.pop("least"), rest.pop("most")
+    return {"motion": motion, "particles": most if least == most else (least, most), **rest}
+
+
+def model_names(sensors: Sequence[Sensor]) -> tuple[str, ...]:
+    """Return the names of the classes of models."""
+    return tuple(type(sensor.model).__name__ for sensor in sensors)
+
+
+def readings_on_host(readings: Mapping[int, tuple[Any, ...]], backend: Backend) -> dict[int, tuple[Any, ...]]:
+    """Return readings by the index of their sensor, with arrays in host memory."""
+    return {
+        index: tuple(
+            one
+            if one is None or isinstance(one, (int, float, str))
+            else arrays.copied_to_host(one, backend, "readings")
+            for one in each
+        )
+        for index, each in readings.items()
+    }
+
+
+def check_state(state: object, options: dict[str, Any], models: tuple[str, ...]) -> FilterState:
+    """Check that a state is of a filter with these options and models; the motion model may be another one.
+
+    Raises:
+        TypeError: it is none.
+        ValueError: it is of a filter with another option, or with other models.
+    """
+    if not isinstance(state, FilterState):
+        raise TypeError(f"state: must be a FilterState, got {checks.show(state)}")
+    if state.models != models:
+        raise ValueError(f"state: must be of a filter of {', '.join(models)}, got one of {', '.join(state.models)}")
+    for name, value in options.items():
+        if name != "motion" and state.options.get(name) != value:
+            raise ValueError(f"state: {name} must be {value!r} as in the filter, got {state.options.get(name)!r}")
+    return state

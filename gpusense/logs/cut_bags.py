@@ -1,0 +1,271 @@
+"""Bags that are cut off: of a recorder that was killed, a disk that was full, a copy that was interrupted.
+
+Such a bag has no index, or one of a longer file. A new one is made of its messages up to the cut, in a temporary folder
+that goes at the end of the process. Nothing is allocated on the word of a header: lengths are compared with the file.
+
+Formats: https://wiki.ros.org/Bags/Format/2.0, https://mcap.dev/spec, https://www.sqlite.org/fileformat.html.
+"""
+
+from __future__ import annotations
+
+import bz2
+import contextlib
+import functools
+import io
+import os
+import shutil
+import sqlite3
+import struct
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+_MCAP, _ROS1, _SQLITE = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n", b"SQLite format 3\0"
+# Kinds of records of MCAP: header, schema, channel, message, chunk; those of ROS 1: message, chunk, connection.
+_M_HEADER, _M_SCHEMA, _M_CHANNEL, _M_MESSAGE, _M_CHUNK = 1, 3, 4, 5, 6
+_R_MESSAGE, _R_CHUNK, _R_CONNECTION = 2, 5, 7
+# Most bytes of a chunk after decompression; recorders make chunks of about a megabyte.
+_LARGEST = 1 << 30
+
+
+class _Record(NamedTuple):
+    """A record: its kind, its fields by name (of ROS 1), and its data, cut off where the file ends."""
+
+    kind: int
+    fields: dict[bytes, bytes]
+    data: bytes
+    whole: bool
+
+
+def uncut(path: Path) -> Path | None:
+    """Return a bag of the messages up to the cut of one that is cut off; None for another one.
+
+    Args:
+        path: The bag: a file, or a folder with ``metadata.yaml``.
+    """
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    stats = tuple((file, file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.is_file())
+    return _uncut(path, stats)
+
+
+@functools.lru_cache(maxsize=4)
+def _uncut(path: Path, stats: tuple[tuple[Path, int, int], ...]) -> Path | None:
+    mended: dict[Path, Callable[[Path], object]] = {}
+    for file, size, _ in stats:
+        with file.open("rb") as stream:
+            begins = stream.read(100)
+        if begins.startswith(_MCAP):
+            if not _ends_with(file, _MCAP):
+                mended[file] = functools.partial(_mcap, file, size)
+        elif begins.startswith(_ROS1):
+            if _is_cut_ros1(file, size):
+                mended[file] = functools.partial(_ros1, file, size)
+        elif begins.startswith(_SQLITE):
+            page, pages = struct.unpack(">H", begins[16:18])[0], struct.unpack(">I", begins[28:32])[0]
+            if size < (65536 if page == 1 else page) * pages:
+                mended[file] = functools.partial(_sqlite, file)
+    if not mended:
+        return None
+    folder = _folder() / path.name
+    if path.is_dir():
+        folder.mkdir()
+        for file, _, _ in stats:
+            if file not in mended:
+                os.symlink(file.resolve(), folder / file.name)
+    for file, make in mended.items():
+        make(folder / file.name if path.is_dir() else folder)
+    return folder
+
+
+def _folder() -> Path:
+    """Make a folder that is kept until the end of the process."""
+    made = tempfile.TemporaryDirectory(prefix="gpusense-bag-")
+    _FOLDERS.append(made)
+    return Path(made.name)
+
+
+_FOLDERS: list[Any] = []
+
+
+def _ends_with(file: Path, end: bytes) -> bool:
+    with file.open("rb") as stream:
+        stream.seek(-min(len(end), file.stat().st_size), os.SEEK_END)
+        return stream.read() == end
+
+
+# ---- MCAP
+
+
+def _mcap(file: Path, size: int, out: Path) -> None:
+    """Write the records of a file up to its cut, without an index."""
+    with file.open("rb") as stream, out.open("wb") as target:
+        target.write(stream.read(len(_MCAP)))
+        for record in _mcap_records(stream, size):
+            if record.kind <= _M_CHUNK and record.whole:
+                _put(target, record)
+            elif record.kind == _M_CHUNK:
+                # Messages may stand outside chunks.
+                for inner in _mcap_messages(record.data):
+                    _put(target, inner)
+        # The end of the data, and the end of a file without an index.
+        target.write(b"\x0f" + struct.pack("<QI", 4, 0) + b"\x02" + struct.pack("<QQQI", 20, 0, 0, 0) + _MCAP)
+
+
+def _put(target: BinaryIO, record: _Record) -> None:
+    target.write(struct.pack("<BQ", record.kind, len(record.data)) + record.data)
+
+
+def _mcap_records(stream: BinaryIO, end: int) -> Iterator[_Record]:
+    """Yield records up to the end, the last one perhaps in part; the end of the data ends them."""
+    while len(head := stream.read(9)) == 9:
+        kind, length = struct.unpack("<BQ", head)
+        left = end - stream.tell()
+        if not 0 < kind < 0x0F or kind == 2:
+            # The end of the data, or no record.
+            return
+        yield _Record(kind, {}, stream.read(min(length, left)), length <= left)
+
+
+def _mcap_messages(chunk: bytes) -> Iterator[_Record]:
+    """Yield the whole records of a chunk that is cut off."""
+    if len(chunk) < 32:
+        return
+    length = struct.unpack("<I", chunk[28:32])[0]
+    if len(chunk) < 40 + length:
+        return
+    inner = _decompressed(chunk[40 + length :], chunk[32 : 32 + length])
+    for record in _mcap_records(io.BytesIO(inner), len(inner)):
+        if record.whole and record.kind in (_M_SCHEMA, _M_CHANNEL, _M_MESSAGE):
+            yield record
+
+
+def _decompressed(data: bytes, compression: bytes) -> bytes:
+    """Return as much of compressed data as can be read, without an end."""
+    if compression in (b"", b"none"):
+        return data
+    stream: Any
+    if compression == b"bz2":
+        stream = bz2.BZ2Decompressor()
+        return bytes(stream.decompress(data, _LARGEST))
+    if compression == b"lz4":
+        from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
+
+        stream = LZ4FrameDecompressor()
+        return bytes(stream.decompress(data, _LARGEST))
+    if compression == b"zstd":
+        from backports.zstd import ZstdDecompressor
+
+        stream = ZstdDecompressor()
+        return bytes(stream.decompress(data, _LARGEST))
+    raise ValueError(f"must have chunks of a known compression, got {compression[:20]!r}")
+
+
+# ---- ROS 1
+
+
+def _ros1(file: Path, size: int, out: Path) -> None:
+    """Write the messages of a file up to its cut into a new bag."""
+    from rosbags.rosbag1 import Writer
+
+    connections: dict[bytes, Any] = {}
+    with file.open("rb") as stream, Writer(out) as writer:
+        stream.seek(len(_ROS1))
+        for record in _ros1_records(stream, size):
+            if record.kind != _R_CHUNK:
+                continue
+            inner = _decompressed(record.data, record.fields.get(b"compression", b""))
+            for one in _ros1_records(io.BytesIO(inner), len(inner)):
+                if one.whole:
+                    _write(writer, connections, one)
+
+
+def _is_cut_ros1(file: Path, size: int) -> bool:
+    """Return whether the index, whose place the first record has, is absent or not whole."""
+    with file.open("rb") as stream:
+        stream.seek(len(_ROS1))
+        place = next((record.fields.get(b"index_pos", b"") for record in _ros1_records(stream, size)), b"")
+        index = struct.unpack("<Q", place)[0] if len(place) == 8 else 0
+        if not 0 < index < size:
+            return True
+        stream.seek(index)
+        whole = all(record.whole for record in _ros1_records(stream, size))
+        return not whole or stream.tell() < size
+
+
+def _ros1_records(stream: BinaryIO, end: int) -> Iterator[_Record]:
+    """Yield records up to the end, the last one perhaps in part."""
+    while len(head := stream.read(4)) == 4:
+        (length,) = struct.unpack("<I", head)
+        left = end - stream.tell()
+        header = stream.read(min(length, left))
+        head = stream.read(4)
+        if len(head) < 4:
+            yield _Record(0, {}, b"", False)
+            return
+        (length,) = struct.unpack("<I", head)
+        left, fields = end - stream.tell(), _fields(header)
+        if len(kind := fields.get(b"op", b"")) != 1:
+            # No record.
+            return
+        yield _Record(kind[0], fields, stream.read(min(length, left)), length <= left)
+
+
+def _fields(header: bytes) -> dict[bytes, bytes]:
+    """Return the fields of a header by name."""
+    found, at = {}, 0
+    while at + 4 <= len(header):
+        (length,) = struct.unpack("<I", header[at : at + 4])
+        name, mark, value = header[at + 4 : at + 4 + length].partition(b"=")
+        if mark:
+            found[name] = value
+        at += 4 + length
+    return found
+
+
+def _write(writer: Any, connections: dict[bytes, Any], record: _Record) -> None:
+    """Write a message of a chunk, or begin the connection of messages."""
+    key = record.fields.get(b"conn", b"")
+    if record.kind == _R_CONNECTION and key not in connections:
+        told = _fields(record.data)
+        kind = told[b"type"].decode().split("/")
+        connections[key] = writer.add_connection(
+            record.fields[b"topic"].decode(), f"{kind[0]}/msg/{kind[-1]}",
+            msgdef=told[b"message_definition"].decode(), md5sum=told[b"md5sum"].decode(),
+        )  # fmt: skip
+    elif record.kind == _R_MESSAGE and key in connections:
+        seconds, nanoseconds = struct.unpack("<II", record.fields[b"time"])
+        writer.write(connections[key], seconds * 1_000_000_000 + nanoseconds, record.data)
+
+
+# ---- SQLite
+
+
+def _sqlite(file: Path, out: Path) -> None:
+    """Write the topics and messages of a database up to its cut into a new one."""
+    padded = out.with_name(f"{out.name}.padded")
+    shutil.copyfile(file, padded)
+    with padded.open("r+b") as stream:
+        stream.seek(16)
+        page = struct.unpack(">H", stream.read(2))[0]
+        stream.seek(28)
+        pages = struct.unpack(">I", stream.read(4))[0]
+        # A hole in the file; no memory.
+        stream.truncate((65536 if page == 1 else page) * pages)
+    with contextlib.closing(sqlite3.connect(f"file:{padded}?mode=ro&immutable=1", uri=True)) as source, \
+            contextlib.closing(sqlite3.connect(out)) as target:  # fmt: skip
+        source.execute("PRAGMA trusted_schema = OFF")
+        target.executescript(
+            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT,"
+            " offered_qos_profiles TEXT);"
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);"
+        )
+        topics = "SELECT id, name, type, serialization_format, '' FROM topics"
+        messages = "SELECT id, topic_id, timestamp, data FROM messages ORDER BY id"
+        for table, query in (("topics", topics), ("messages", messages)):
+            with contextlib.suppress(sqlite3.DatabaseError):
+                for row in source.execute(query):
+                    target.execute(f"INSERT INTO {table} VALUES ({', '.join('?' * len(row))})", row)
+        target.execute("CREATE INDEX timestamp_idx ON messages (timestamp ASC)")
+        target.commit()
+    padded.unlink()

@@ -1,0 +1,202 @@
+"""A call of a filter that was interrupted at any line has changed all of the filter's state or none.
+
+What "interrupted" means to a model or a device is the matter of the tests of models; here it is the filter's own state.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from support.filter_scene import COVARIANCE, FILTERS, START, Filter, begun, everything, odometry, readings
+from support.interrupts import Line, executed_lines, interrupt
+from support.split_scene import field
+
+import gpusense as gs
+from gpusense.localization import journal, resetting
+
+# Rooms whose lines are interrupted: those below them know nothing of a filter.
+ROOMS = ("localization", "sweeps")
+CALLS: dict[str, Callable[[Filter], Any]] = {
+    "predict": lambda pf: pf.predict(*odometry(3)),
+    "correct": lambda pf: pf.correct(readings(pf, 3)),
+    "estimate": lambda pf: pf.estimate(),
+    "host_weights": lambda pf: pf.host_weights(),
+    "flush": lambda pf: pf.flush(),
+    "reset": lambda pf: pf.reset(),
+    "initialize": lambda pf: pf.initialize(mean=START, covariance=COVARIANCE, particles=40),
+    "initialize_uniform": lambda pf: pf.initialize_uniform(bounds=((1.0, 1.0), (4.0, 4.0))),
+    "restore": lambda pf: pf.restore(OTHER_STATES.setdefault(repr(pf.state().options), begun(again(pf), 1).state())),
+}
+OTHER_STATES: dict[str, Any] = {}
+
+
+@pytest.fixture(autouse=True)
+def few_tries(monkeypatch):
+    """A reset tries few poses: a state has all or nothing of any number."""
+    monkeypatch.setattr(resetting, "_LEAST_TRIES", 300)
+
+
+def again(pf: Filter) -> Filter:
+    """Return a new filter with the options of another."""
+    name = next(name for name, seed in SEEDS.items() if seed == pf.options.seed)
+    return FILTERS[name](pf.device.selection)
+
+
+SEEDS = {name: make("numpy").options.seed for name, make in FILTERS.items()}
+
+
+class Interrupted:
+    """One call of one filter."""
+
+    def __init__(self, name: str, backend: str, call: str) -> None:
+        self._make, self._call = (lambda: FILTERS[name](backend)), CALLS[call]
+        everywhere = name == "sensors, resetting"
+        pf = begun(self._make(), 4 if everywhere else 3, everywhere=everywhere)
+        pf.predict(*odometry(3))
+        self._start = pf.state()
+        self.pf = pf
+        self._before = everything(pf)
+        self._call(pf)
+        self._after = everything(pf)
+        # The motion is pending, so each call changes something.
+        assert self._after != self._before
+
+    def lines(self) -> list[Line]:
+        """Return the lines of the call in a steady state."""
+        self.pf.restore(self._start)
+        lines = executed_lines(lambda: self._call(self.pf))
+        return [line for line in lines if any(f"/gpusense/{room}/" in line[0].co_filename for room in ROOMS)]
+
+    def check(self, line: Line) -> bool:
+        """Interrupt the call at a line, and repeat it where it has changed nothing."""
+        self.pf.restore(self._start)
+        assert everything(self.pf) == self._before
+        interrupted = interrupt(lambda: self._call(self.pf), line)
+        found = everything(self.pf)
+        assert found in (self._before, self._after), line
+        if found == self._before != self._after or not interrupted:
+            self._call(self.pf)
+            assert not interrupted or everything(self.pf) == self._after, line
+        return interrupted
+
+
+def interrupt_lines(name: str, backend: str, call: str, most: int | None) -> None:
+    """Interrupt a call at all of its lines, or at most at some of them, others for each filter and call."""
+    case = Interrupted(name, backend, call)
+    lines = case.lines()
+    every = 1 if most is None else max(len(lines) // most, 1)
+    lines = lines[(3 * list(FILTERS).index(name) + list(CALLS).index(call)) % every :: every]
+    reached = sum(case.check(line) for line in lines)
+    # Lines that make and record programs are reached at first only.
+    assert reached > 0.7 * len(lines) > 0, (reached, len(lines))
+
+
+some_lines = pytest.mark.parametrize("most", [7, pytest.param(None, marks=pytest.mark.slow)], ids=["some", "all"])
+
+
+@some_lines
+@pytest.mark.parametrize("call", CALLS)
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_call_that_was_interrupted_has_changed_all_or_nothing(name, call, most):
+    interrupt_lines(name, "numpy", call, most)
+
+
+@some_lines
+@pytest.mark.parametrize("name", ["field", "split"])
+def test_a_correction_on_a_device_that_was_interrupted_has_changed_all_or_nothing(name, most, device):
+    interrupt_lines(name, device.info.selection, "correct", most)
+
+
+@some_lines
+def test_a_recorded_step_that_was_interrupted_has_changed_all_or_nothing(warp_as_gpu, most):
+    interrupt_lines("field", "warp:cpu", "correct", most)
+
+
+def test_readings_that_a_model_refuses_change_nothing(backend):
+    pf = begun(FILTERS["sensors, resetting"](backend))
+    pf.predict(*odometry(3))
+    before = everything(pf)
+    with pytest.raises(ValueError, match="heading"):
+        # The scan is scored before.
+        pf.correct({pf.models[0]: readings(pf, 3)[pf.models[0]], pf.models[1]: np.zeros((2, 2))})
+    assert everything(pf) == before
+
+
+class FailingError(Exception):
+    """An error of a model."""
+
+
+def test_a_model_that_fails_in_any_call_changes_nothing(backend, monkeypatch):
+    pf = begun(FILTERS["field"](backend))
+    pf.predict(*odometry(3))
+    start, before = pf.state(), everything(pf)
+    pf.correct(readings(pf, 3))
+    after = everything(pf)
+    model, count = pf.models[0], [0]
+    for name in ("start_scoring", "log_likelihood"):
+        inner = getattr(model, name)
+
+        def failing(*arguments, inner=inner, **options):
+            count[0] -= 1
+            if count[0] == 0:
+                raise FailingError
+            return inner(*arguments, **options)
+
+        monkeypatch.setattr(model, name, failing)
+    for fails in range(1, 10):
+        pf.restore(start)
+        count[0] = fails
+        try:
+            pf.correct(readings(pf, 3))
+        except FailingError:
+            assert everything(pf) == before
+            pf.correct(readings(pf, 3))
+        else:
+            assert fails > 2
+            break
+        finally:
+            count[0] = 0
+        assert everything(pf) == after
+    else:
+        pytest.fail("no correction without the failure")
+
+
+def test_an_interrupt_of_the_way_back_is_made_good_by_the_next_call(monkeypatch):
+    """A second Ctrl-C while the first one is handled."""
+    pf = begun(FILTERS["field"]("numpy"))
+    pf.predict(*odometry(3))
+    before, restore = everything(pf), journal.Journal.restore
+
+    def interrupted(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(journal.Journal, "restore", interrupted)
+    monkeypatch.setattr(type(pf._verdict), "corrected", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        pf.correct(readings(pf, 3))
+    monkeypatch.setattr(journal.Journal, "restore", restore)
+    assert pf.count == 200 and pf._step == 4 and everything(pf) == before
+
+
+def test_calls_of_threads_wait_for_one_another():
+    pf = begun(gs.ParticleFilter(field("numpy"), particles=300, seed=1))
+    wrong: list[object] = []
+
+    def read() -> None:
+        for _ in range(30):
+            if not np.isfinite(pf.estimate().pose).all() or abs(pf.host_weights().sum() - 1) > 1e-9:
+                wrong.append(pf)
+
+    threads = [threading.Thread(target=read) for _ in range(3)]
+    for each in threads:
+        each.start()
+    for step in range(3, 12):
+        pf.predict(*odometry(step))
+        pf.correct(readings(pf, step))
+    for each in threads:
+        each.join()
+    assert not wrong

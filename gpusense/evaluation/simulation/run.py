@@ -28,7 +28,8 @@ Bools = NDArray[np.bool]
 Rng = np.random.Generator
 
 READINGS = BeamParameters(z_hit=0.97, z_short=0.01, z_max=0.01, z_rand=0.01, sigma_hit=0.02, lambda_short=0.5)
-MOTION = OdometryMotion(reverse=0.0)
+# Per step about 5 % of the translation and of the turn, and 0.03 rad/m.
+MOTION = OdometryMotion((0.0025, 0.001, 0.0025, 0.0001), reverse=0.0, least=(0.001, 0.001))
 # Rays of one call of the caster.
 _RAYS = 1 << 20
 

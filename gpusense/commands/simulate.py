@@ -89,7 +89,7 @@ def _add_world(parser: argparse.ArgumentParser) -> None:
     add("--true-map", type=Path, metavar="YAML", help="the world as it is, in place of the robot's map with changes")
     add("--people", type=whole_number(low=0, high=1000), default=0, metavar="N",
         help="people who walk near the robot (default: 0)")  # fmt: skip
-    share = dict(type=not_negative_number, default=0.0, metavar="SHARE")
+    share: dict[str, Any] = dict(type=not_negative_number, default=0.0, metavar="SHARE")
     add("--hidden", **share, help="share of the beams that further people hide, up to 0.9 (default: 0)")
     add("--moved", **share, help="share of the walls that have moved by 0.5 to 2 m (default: 0)")
     add("--removed", **share, help="share of the walls that have gone (default: 0)")

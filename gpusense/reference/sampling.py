@@ -1,14 +1,14 @@
 """Readings drawn from the beam model, or from a table of a sensor, given their expected ranges.
 
-Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), section 6.3.1: a component is drawn by its weight, and a reading
-by inverting the component's distribution function. p_hit's is the normal on both sides of its mean, each with the mass
-that lies within [0, range_max]. Masses are sums of positive terms: x phi(x) (1 + x^2 / 3 + x^4 / 15 + ...), and beyond
-SERIES_END one half less the continued fraction of Laplace. Quantiles are those of Wichura, *Algorithm AS 241* (1988).
-p_short's is 1 - u (1 - exp(-lambda z*)), written as a sum of positive terms, or a series where lambda z* is small. All
-of it is float64 of +, -, *, / and sqrt, so that every device draws the same bits.
+Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), section 6.3.1: a component is drawn by its weight, and a
+reading by inverting the component's distribution function. p_hit's is the normal on both sides of its mean, each with
+the mass that lies within [0, range_max]. Masses are sums of positive terms: x phi(x) (1 + x^2 / 3 + x^4 / 15 + ...),
+and beyond SERIES_END one half less the continued fraction of Laplace. Quantiles are those of Wichura, *Algorithm AS
+241* (1988). p_short's is 1 - u (1 - exp(-lambda z*)), written as a sum of positive terms, or a series where lambda z*
+is small. All of it is float64 of +, -, *, / and sqrt, so that every device draws the same bits.
 
-``mixture`` = (z_hit, z_short, z_max, z_rand, sigma_hit, sigma_growth, range_bias, lambda_short) of each bin of angles of
-incidence. ``chances`` = for each bin of expected ranges, the cumulative probabilities of the bins of readings.
+``mixture`` = (z_hit, z_short, z_max, z_rand, sigma_hit, sigma_growth, range_bias, lambda_short) of each bin of angles
+of incidence. ``chances`` = for each bin of expected ranges, the cumulative probabilities of the bins of readings.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ def change_world(
     total = int(np.count_nonzero(surface))
     pieces = pieces_of(grid, surface, rng)
     gone, taken = [round(share * total) for share in shares], 0
-    for k, piece in enumerate(pieces):
+    for piece in pieces:
         if taken >= sum(gone):
             break
         rows, cols = piece

@@ -180,7 +180,6 @@ def _planned(
     roads = Roads(world, world.free & grid.free if same else world.free, clearance, rng)
     when = np.zeros(count, bool)
     when[rng.choice(np.arange(1, count), jumps, replace=False)] = True
-    ends = [*np.flatnonzero(when).tolist(), count]
     parts: list[Floats] = []
     begin = 0
     for end in (*np.flatnonzero(when).tolist(), count):

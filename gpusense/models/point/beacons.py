@@ -165,9 +165,7 @@ class BeaconModel(PointModel):
             from scipy.special import stdtr, stdtrit
 
             nu = float(p.nu)
-            return within(
-                u, mean, p.sigma_range, 0.0, p.range_max, lambda x: stdtr(nu, x), lambda q: stdtrit(nu, q)
-            )
+            return within(u, mean, p.sigma_range, 0.0, p.range_max, lambda x: stdtr(nu, x), lambda q: stdtrit(nu, q))
         hit = normal_within(u, mean, p.sigma_range, 0.0, p.range_max)
         if p.kind == "mixture":
             wide = normal_within(u, mean, p.sigma_heavy, 0.0, p.range_max)

@@ -1,8 +1,9 @@
 """Readings that point and landmark models draw.
 
-They are drawn on the host in float64, in one place for all backends, whose readings therefore have the same bits. Random
-numbers are those of Philox (reference/philox.py) with the counter (pose, step, stream, call). A distribution is drawn by
-inverting its distribution function, so that readings move smoothly with poses; a von Mises is drawn by rejection.
+They are drawn on the host in float64, in one place for all backends, whose readings therefore have the same bits.
+Random numbers are those of Philox (reference/philox.py) with the counter (pose, step, stream, call). A distribution is
+drawn by inverting its distribution function, so that readings move smoothly with poses; a von Mises is drawn by
+rejection.
 """
 
 from __future__ import annotations
@@ -73,9 +74,7 @@ def draws_at(poses: Any, backend: Backend, seed: object, step: object) -> Draws:
     host = checks.array("poses", read, ("S", "N", 3) if several else ("N", 3))
     shape = host.shape[:-1]
     scan, particle = np.indices(shape) if several else (np.zeros(shape, np.int64), np.arange(shape[0]))
-    return Draws(
-        host.reshape(-1, 3), shape, particle.ravel(), scan.ravel() + first, (key & 0xFFFFFFFF, key >> 32)
-    )
+    return Draws(host.reshape(-1, 3), shape, particle.ravel(), scan.ravel() + first, (key & 0xFFFFFFFF, key >> 32))
 
 
 def standard_normal(u: Floats) -> Floats:
@@ -144,7 +143,7 @@ def wrapped_normal_within(u: Floats, mean: Floats, sigma: float, half: float) ->
     begun = np.zeros_like(mean)
     for (low, high), mass in zip(parts, masses, strict=True):
         inside = (mark >= begun) & (mark < begun + mass)
-        share = np.where(mass > 0, (mark - begun) / np.where(mass > 0, mass, 1.0), 0.0)
+        share = np.where(inside, mark - begun, 0.0) / np.where(inside, mass, 1.0)
         # From the end nearer to the peak's other side, where the distribution function is small.
         flip = low + high > 0
         a, b = np.where(flip, -high, low), np.where(flip, -low, high)
@@ -184,8 +183,8 @@ def _mass(low: Floats, high: Floats, sigma: float) -> Floats:
 def von_mises(draws: Draws, stream: int, kappa: float) -> Floats:
     """Return angles in [-pi, pi] drawn from a von Mises around 0.
 
-    The density exp(-2 kappa sin^2(r / 2)) is below exp(-2 kappa r^2 / pi^2), a normal on [-pi, pi], from which angles are
-    drawn until one is accepted; 2 / pi of them are, or more.
+    The density exp(-2 kappa sin^2(r / 2)) is below exp(-2 kappa r^2 / pi^2), a normal on [-pi, pi], from which angles
+    are drawn until one is accepted; 2 / pi of them are, or more.
     """
     angles = np.full(len(draws.poses), np.nan)
     sigma = np.pi / 2 / np.sqrt(kappa) if kappa > 0 else np.inf

@@ -233,8 +233,8 @@ class BeamModel(ScanModel):
             out: The array for the readings, as in ``log_likelihood``.
 
         Returns:
-            (N, K) or (S, N, K) readings in the model's precision [m]: ranges in [0, range_max), range_max for no return,
-            NaN where no reading is possible, which happens only where z* = 0 and all weight is z_short.
+            (N, K) or (S, N, K) readings in the model's precision [m]: ranges in [0, range_max), range_max for no
+            return, NaN where no reading is possible, which happens only where z* = 0 and all weight is z_short.
 
         Raises:
             TypeError: an argument does not hold numbers of its kind.

@@ -126,10 +126,9 @@ def run(args: argparse.Namespace) -> int:
     grid = read_map(args.map) if args.map else _generated(args.world, args.seed)
     world = None if args.true_map is None else read_map(args.true_map)
     path = None if args.path is None else read_tum(args.path)[1]
-    scans = (200 if path is None else len(path)) if args.scans is None else args.scans
     parameters, motion = _noise(args)
     made = simulate_run(
-        grid, _scanner(args), scans=scans, world=world, path=path, parameters=parameters, motion=motion,
+        grid, _scanner(args), scans=args.scans, world=world, path=path, parameters=parameters, motion=motion,
         people=args.people, hidden=args.hidden, moved=args.moved, removed=args.removed, added=args.added,
         glass=args.glass, kidnaps=args.kidnaps, step=args.step, turn=args.turn, period=args.period,
         clearance=args.clearance, seed=args.seed, backend=args.backend,

@@ -42,7 +42,8 @@ def draw_odometry(
         if other[t] < step.reverse:
             ahead = -ahead
         stretch, gain, drift = systematic
-        ahead, drifted = ahead / (1 + stretch), drift * step.mean[1] / 2
+        ahead = ahead / (1 + stretch)
+        drifted = drift * ahead / 2
         first, second = (first - drifted) / (1 + gain), (second - drifted) / (1 + gain)
         c, s = math.cos(first), math.sin(first)
         moved = (c * ahead - s * left, s * ahead + c * left, first + second)

@@ -108,9 +108,9 @@ def _graph_of(chosen: Bools, nodes: NDArray[np.intp]) -> object:
     """Return the sparse matrix of distances between nodes that are neighbours, also diagonally."""
     from scipy.sparse import csr_matrix
 
-    index = np.full(chosen.size, -1)
-    index[nodes] = np.arange(len(nodes))
-    index = index.reshape(chosen.shape)
+    flat = np.full(chosen.size, -1)
+    flat[nodes] = np.arange(len(nodes))
+    index = flat.reshape(chosen.shape)
     pairs, lengths = [], []
     for (a, b), length in (
         ((index[:, :-1], index[:, 1:]), 1.0),
@@ -121,9 +121,11 @@ def _graph_of(chosen: Bools, nodes: NDArray[np.intp]) -> object:
         both = (a >= 0) & (b >= 0)
         pairs.append(np.stack([a[both], b[both]]))
         lengths.append(np.full(np.count_nonzero(both), length))
-    (i, j), length = np.concatenate(pairs, axis=1), np.concatenate(lengths)
+    i, j = np.concatenate(pairs, axis=1)
     shape = (len(nodes), len(nodes))
-    return csr_matrix((np.tile(length, 2), (np.concatenate([i, j]), np.concatenate([j, i]))), shape=shape)
+    return csr_matrix(
+        (np.tile(np.concatenate(lengths), 2), (np.concatenate([i, j]), np.concatenate([j, i]))), shape=shape
+    )
 
 
 def drive(corners: Floats, heading: float, step: float, turn: float, most: int) -> Floats:
@@ -140,7 +142,8 @@ def drive(corners: Floats, heading: float, step: float, turn: float, most: int) 
         (T, 3) poses after the start, at most ``most``.
     """
     x, y = corners[0].tolist()
-    poses, left = [], 1.0
+    poses: list[tuple[float, float, float]] = []
+    left = 1.0
     for gx, gy in corners[1:].tolist():
         while len(poses) < most:
             length = math.hypot(gx - x, gy - y)

@@ -18,6 +18,7 @@ from gpusense.evaluation.simulation.roads import Roads, drive
 from gpusense.evaluation.worlds import sample_readings
 from gpusense.localization.motion import OdometryMotion, OmniMotion
 from gpusense.localization.pose_algebra import compose_poses
+from gpusense.models.arguments import check_absent
 from gpusense.models.scan.beam import BeamModel
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters
@@ -30,6 +31,7 @@ Rng = np.random.Generator
 READINGS = BeamParameters(z_hit=0.97, z_short=0.01, z_max=0.01, z_rand=0.01, sigma_hit=0.02, lambda_short=0.5)
 # Per step about 5 % of the translation and of the turn, and 0.03 rad/m.
 MOTION = OdometryMotion((0.0025, 0.001, 0.0025, 0.0001), reverse=0.0, least=(0.001, 0.001))
+_SCANS = 200
 # Rays of one call of the caster.
 _RAYS = 1 << 20
 
@@ -72,7 +74,7 @@ def simulate_run(
     grid: OccupancyGrid,
     scanner: Scanner,
     *,
-    scans: int = 200,
+    scans: int | None = None,
     world: OccupancyGrid | None = None,
     path: ArrayLike | None = None,
     parameters: BeamParameters = READINGS,
@@ -100,7 +102,7 @@ def simulate_run(
     Args:
         grid: The map that the robot has.
         scanner: The geometry of its laser, mount and cones included.
-        scans: Number of scans T, at least 1; with ``path``, at most its length.
+        scans: Number of scans T, at least 1; None for 200, or those of ``path``, of which it takes the first ones.
         world: The world as it is; None for the map with the changes below. A world that is another building makes
             ``grid`` a wrong map; the path is then planned in the world alone.
         path: (T, 3) true poses of the robot in place of a planned path [m, m, rad].
@@ -133,37 +135,54 @@ def simulate_run(
         >>> run.scans.shape, run.odometry.shape
         ((20, 60), (20, 3))
     """
-    count = checks.integer("scans", scans, low=1)
+    given = None if path is None else checks.array("path", path, ("T", 3))
+    most = None if given is None else max(len(given), 1)
+    count = (most or _SCANS) if scans is None else checks.integer("scans", scans, low=1, high=most)
     jumps = checks.integer("kidnaps", kidnaps, low=0, high=count - 1)
     crowd_size = checks.integer("people", people, low=0, high=1000)
     share = checks.real("hidden", hidden, low=0, high=0.9)
     every = checks.real("period", period, above=0)
     room = checks.real("clearance", clearance, low=0)
     rates = checks.real("step", step, above=0), checks.real("turn", turn, above=0)
-    for name, value, kind in (("grid", grid, OccupancyGrid), ("scanner", scanner, Scanner)):
-        if not isinstance(value, kind):
-            raise TypeError(f"{name}: must be of {kind.__name__}, got {checks.show(value)}")
+    _check_kinds(grid, scanner, world, parameters, motion)
     # Each part has random numbers of its own: people do not change the odometry.
     streams = np.random.SeedSequence(checks.integer("seed", seed, low=0)).spawn(6)
     changing, driving, slipping, walking, reading, glazing = (np.random.default_rng(one) for one in streams)
-    given = None if path is None else checks.array("path", path, ("T", 3))[:count]
     true = world
-    if true is None:
-        keep = np.zeros((0, 3)) if given is None else given
+    if true is not None:
+        check_absent("with a world", moved=moved or None, removed=removed or None, added=added or None)
+    else:
+        keep = np.zeros((0, 3)) if given is None else given[:count]
         true = change_world(grid, changing, moved=moved, removed=removed, added=added, keep=keep, clearance=room)
     poses, kidnapped = (
         _planned(grid, true, world is None, count, jumps, room, rates, driving) if given is None
-        else _given(given, jumps)
+        else _given(given[:count], jumps)
     )  # fmt: skip
     odometry = draw_odometry(poses, motion, slipping, kidnapped)
     seen = _without_glass(true, glass, glazing)
     crowd = Crowd(crowd_size, share, _standing(true), every, walking)
     expected, covered, discs = _with_people(_cast(seen, scanner, poses, backend), scanner, poses, kidnapped, crowd)
     readings = _readings(expected, scanner.range_max, parameters, reading)
-    times = every * np.arange(1, len(poses) + 1)
+    times: Floats = every * np.arange(1, len(poses) + 1, dtype=np.float64)
     return SimulatedRun(
         grid, true, scanner, times, poses, odometry, readings, expected, covered, kidnapped, tuple(discs)
     )
+
+
+def _check_kinds(grid: object, scanner: object, world: object, parameters: object, motion: object) -> None:
+    """Refuse arguments of another type.
+
+    Raises:
+        TypeError: an argument has another type.
+    """
+    kinds: tuple[tuple[str, object, tuple[type, ...]], ...] = (
+        ("grid", grid, (OccupancyGrid,)), ("scanner", scanner, (Scanner,)),
+        ("world", grid if world is None else world, (OccupancyGrid,)), ("parameters", parameters, (BeamParameters,)),
+        ("motion", motion, (OdometryMotion, OmniMotion)),
+    )  # fmt: skip
+    for name, value, kind in kinds:
+        if not isinstance(value, kind):
+            raise TypeError(f"{name}: must be {' or '.join(one.__name__ for one in kind)}, got {checks.show(value)}")
 
 
 def _planned(

@@ -89,8 +89,8 @@ class BumperModel(PointModel):
         self.parameters = BumperParameters() if parameters is None else parameters
         if not isinstance(self.parameters, BumperParameters):
             raise TypeError(f"parameters: must be BumperParameters, got {checks.show(parameters)}")
-        self.unknown = checks.choice("unknown", unknown, ("free", "occupied"))
-        self.outside = checks.choice("outside", outside, ("free", "occupied"))
+        self.unknown = cast(Space, checks.choice("unknown", unknown, ("free", "occupied")))
+        self.outside = cast(Space, checks.choice("outside", outside, ("free", "occupied")))
         super().__init__(backend, precision, temperature)
         self._check_scale("sigma", self.parameters.sigma)
         side = grid.resolution

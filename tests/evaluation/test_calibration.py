@@ -29,7 +29,7 @@ def test_every_model_of_a_density_has_a_scene():
 
 WRONG = {
     "heading": dict(sigma=1.2), "heading, von Mises": dict(kappa=0.8), "beacons, normal": dict(sigma_range=3.0),
-    "position fix": dict(z_hit=1.0, z_rand=0.0),
+    "position fix": dict(covariance=((6.0, 3.6), (3.6, 12.0))),
 }  # fmt: skip
 
 

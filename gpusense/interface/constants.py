@@ -56,6 +56,10 @@ FIRST, WHOLE, DRAWN = 61, 62, 63
 SETTINGS = 64
 # Streams of random numbers within a step; a stage of a correction has DRAW_STREAMS of its own.
 MOTION_STREAM, DRAW_STREAM, DRAW_STREAMS = 0, 16, 4
+# Kernel file sampling: its stream of random numbers, one further for each beam; numbers of a mixture; numbers of its
+# settings by place. DRAW_SEED takes 2 places.
+READING_STREAM, DRAW_TERMS = 1 << 30, 8
+DRAW_SEED, DRAW_STEP, DRAW_FIRST, DRAW_PER_SCAN, DRAW_RANGE_MAX, DRAW_TOP, DRAW_MARGIN, DRAW_SETTINGS = 0, *range(2, 9)
 # Kinds of motion: a straight translation, or an arc.
 STRAIGHT, VELOCITY_MODEL = 0, 1
 # Rungs of the ladder of temperatures; columns of a block's sums: weights, their squares, and the weights before.

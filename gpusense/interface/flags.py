@@ -23,6 +23,7 @@ FLAGS = {
     "BELUGA_LINES": "Bresenham's lines are Beluga's: ties go straight on, and rays from outside the grid meet nothing",
     "ECHO": "a sensor hears the nearest of several rays, or its angle of incidence matters",
     "INCIDENCE": "the angle of incidence chooses the mixture's terms, or says whether anything returns",
+    "COSINES": "cosines of angles of incidence are wanted, not the angles",
     "SENSOR_TABLE": "log densities come from a table over readings and expected ranges",
     "CUBES": "a sum of cubes is wanted, as nav2_amcl and Beluga weigh scans",
     "AMCL": "the densities to be cubed are nav2_amcl's, not Beluga's",

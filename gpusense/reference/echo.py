@@ -131,7 +131,10 @@ def cast_echoes(
     caster: structs.Caster,
     scale: structs.RangeScale,
 ) -> None:
-    """Cast the cones of all particles to expected ranges and angles of incidence, NaN without a return."""
+    """Cast the cones of all particles to expected ranges and angles of incidence, NaN without a return.
+
+    With COSINES, the cosines take the place of the angles; 2 without a return.
+    """
     block = max(BLOCK // max(rays, 1), 1)
     for first in range(0, particles, block):
         part = slice(first, min(first + block, particles))
@@ -141,7 +144,8 @@ def cast_echoes(
         )  # fmt: skip
         ranges[entries] = expected_range(flags, t, scale)
         if "INCIDENCE" in flags:
-            incidence[entries] = np.where(t < scale.limit, np.arctan2(sine, cosine), np.nan)
+            angle = np.where(t < scale.limit, np.arctan2(sine, cosine), np.nan)
+            incidence[entries] = cosine if "COSINES" in flags else angle
 
 
 def echoes(

@@ -81,7 +81,8 @@ Echo nearest_echo(global const entry *map_table, global const real2 *normals, co
     return echo;
 }
 
-// Cast cones to expected ranges and angles of incidence, NaN without a return. One work-item takes a particle and cone.
+// Cast cones to expected ranges and angles of incidence, NaN without a return; with COSINES to the angles' cosines, 2
+// without a return. One work-item takes a particle and cone.
 kernel void cast_echoes(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
                         global const real4 *pose, global const real2 *ray, global real *ranges, global real *incidence,
                         const Window window, const int particles, const int rays, const Cone cone, const Caster caster,
@@ -92,7 +93,11 @@ kernel void cast_echoes(global const entry *map_table, global const real2 *norma
                                    scale.limit, caster);
     ranges[(long)n * rays + k] = expected_range(echo.t, scale);
 #if INCIDENCE
+#if COSINES
+    incidence[(long)n * rays + k] = echo.cosine;
+#else
     incidence[(long)n * rays + k] = echo.t < scale.limit ? atan2(echo.sine, echo.cosine) : NAN;
+#endif
 #endif
 }
 #endif

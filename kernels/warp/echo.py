@@ -137,10 +137,11 @@ def make(name, flags):
     nearest_echo = functions(flags).nearest_echo
     expected_range = ray_file.functions(flags).expected_range
     INCIDENCE = "INCIDENCE" in flags
+    COSINES = "COSINES" in flags
     NOWHERE = real(math.nan)
 
-    # Cast cones to expected ranges and angles of incidence, NaN without a return. One work-item takes a particle and
-    # cone; a launch has fewer than 2^31.
+    # Cast cones to expected ranges and angles of incidence, NaN without a return; with COSINES to the angles' cosines,
+    # 2 without a return. One work-item takes a particle and cone; a launch has fewer than 2^31.
     @kernel
     def cast_echoes(
         map_table: wp.array(dtype=ENTRY),
@@ -164,7 +165,9 @@ def make(name, flags):
             map_table, normals, window, pose_cell[n], pose[n], ray, k * cone.rays, cone, scale.limit, caster
         )
         ranges[n * rays + k] = expected_range(echo.t, scale)
-        if INCIDENCE:
+        if INCIDENCE and COSINES:
+            incidence[n * rays + k] = echo.cosine
+        elif INCIDENCE:
             incidence[n * rays + k] = wp.where(echo.t < scale.limit, wp.atan2(echo.sine, echo.cosine), NOWHERE)
 
     return {"cast_echoes": cast_echoes}[name]

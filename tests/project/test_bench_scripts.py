@@ -445,3 +445,12 @@ def test_sweeps_are_measured(tmp_path: Path) -> None:
     small = ["--workers", "1", "--jobs", "2", "--particles", "20", "--beams", "11", "--scans", "2", "--repeats", "2"]
     report = run_script("speed/sweeps.py", *small, output=tmp_path / "sweeps")
     assert report["differing"] == [] and report["rows"][0]["efficiency"] == 1 > report["rows"][0]["busy"] > 0
+
+
+def test_calibration_runs(tmp_path: Path) -> None:
+    report = run_script(
+        "accuracy/calibration.py", "--runs", "60", "--model", "heading", "--model", "beam", output=tmp_path / "ranks"
+    )
+    assert [row["model"] for row in report["rows"]] == ["heading", "beam"]
+    assert all(sum(counts) == 60 for row in report["rows"] for counts in row["counts"])
+    assert all(0 < row["least_p"] <= 1 for row in report["rows"])

@@ -58,6 +58,12 @@ KERNELS: dict[str, Kernel] = {
         "echo", "ray particle", *_CAST, *_NORMALS, *POSES, _CONES, "out real ranges [particles * rays]",
         "out real incidence [particles * rays]", WINDOW, "int particles", "int rays", "Cone cone", *_CASTING,
     ),
+    "draw_readings": kernel(
+        "sampling", "ray particle", "real incidence [particles * rays]", "double mixture [8 * tables.incidence_bins]",
+        "real edges [tables.incidence_bins]", "double chances [(tables.cells + 1) * (tables.cells + 1)]",
+        "double settings [9]", "out real ranges [particles * rays]", "int particles", "int rays",
+        "MixtureTables tables", "RangeScale scale",
+    ),
     "sum_parts": kernel(
         "sums", "place", "real parts [count * particles]", "int order [particles]", "int counts [scans]",
         "real constant_terms [scans]", "out real log_p [particles]", "int particles", "int count", "int block",

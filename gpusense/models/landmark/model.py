@@ -28,9 +28,11 @@ from gpusense.models.landmark.features import (
     prepare_features,
 )
 from gpusense.models.landmark.plan import feature_omissions, looked_at, parameter_omissions
+from gpusense.models.landmark.sampling import draw_features
 from gpusense.models.landmark.sensor import describe, full_circle
 from gpusense.models.landmark.tables import upload_tables
 from gpusense.models.point.base import PointModel
+from gpusense.models.point.sampling import draws_at
 from gpusense.models.poses import Frame, Part, PlacedPoses, Poses, place
 from gpusense.world.landmarks import LandmarkMap, make_buckets
 from gpusense.world.parameters import LandmarkParameters
@@ -164,6 +166,47 @@ class LandmarkModel(PointModel):
     def _arguments(self) -> dict[str, Any]:
         own = dict(landmarks=self.landmarks, association=self.association, negative=self.negative, mount=self.mount)
         return super()._arguments() | own | {"specialize": self._specialize}
+
+    def sample(
+        self, poses: AnyArray, seed: int = 0, *, step: int = 0, correspondence: ArrayLike | None = None
+    ) -> np.ndarray:
+        """Draw features from p(f | x, m) at each pose, on the host in float64; see ``BeamModel.sample``.
+
+        Without ``correspondence`` this is what the sensor reports at a pose: of every landmark within range_max and the
+        field of view a feature, with probability p_detect. With it, a feature of each landmark that it names, detected
+        for certain. With probability z_false a feature is a false positive, uniform within the sensor's limits. Given
+        their correspondence, features have the density of ``log_likelihood``.
+
+        Args:
+            poses: (N, 3) or (S, N, 3) robot poses in the world [m, m, rad].
+            seed: Seed of the random numbers, 0 to 2^64 - 1.
+            step: Step of a run, 0 to 2^31 - 1: other steps have other numbers.
+            correspondence: None, or (F,) indices of landmarks, -1 for a false positive.
+
+        Returns:
+            (N, M, 2) or (N, F, 2) ranges [m] and bearings [rad], (N, M, 3) with signatures where ``sigma_signature`` is
+            a number; (S, N, ...) for S scans. A NumPy array of float64. NaN for parts without a deviation, and for all
+            of a feature that is not detected or lies beyond the sensor's limits; ``log_likelihood`` leaves these out.
+
+        Raises:
+            TypeError: an argument does not hold numbers of its kind.
+            ValueError: a wrong shape, a pose that is not finite, a seed or step beyond its limits, or an index outside
+                the map.
+
+        Example:
+            >>> import gpusense as gs
+            >>> model = gs.LandmarkModel(gs.LandmarkMap([(2.0, 0.0), (0.0, 3.0)]), backend="numpy")
+            >>> model.sample([(0.0, 0.0, 0.0)] * 5, seed=1).shape
+            (5, 2, 2)
+        """
+        draws = draws_at(poses, self._backend, seed, step)
+        partners = np.arange(len(self.landmarks))
+        if correspondence is not None:
+            partners = check_correspondence(correspondence, np.size(correspondence), len(self.landmarks))
+        return draw_features(
+            draws, partners, self.landmarks, self.parameters, self._sensor.span, self.mount,
+            every=correspondence is not None,
+        )  # fmt: skip
 
     def _options(self) -> tuple[str, ...]:
         return f"landmarks={len(self.landmarks)}", f"association={self.association!r}"

@@ -20,6 +20,7 @@ from gpusense.interface.plan import Omission
 from gpusense.interface.terms import log_weight
 from gpusense.models.point.base import MISSING, PointModel, rand_omission, relative_omissions
 from gpusense.models.point.pairs import DIGITS, PI, exact, log_of, total, two_parts
+from gpusense.models.point.sampling import HEADING, POSITION, draws_at, mounted, standard_normal, von_mises
 from gpusense.models.poses import Part, Poses
 from gpusense.reference.relative import wrapped_difference
 from gpusense.world.sensor_parameters import HeadingParameters, PositionParameters, check_covariance
@@ -118,6 +119,51 @@ class PositionModel(PointModel):
             return (*placing, score)
 
         return cast(np.ndarray, self._score(poses, out, program, left_out))
+
+    def sample(
+        self, poses: AnyArray, seed: int = 0, *, step: int = 0, covariance: ArrayLike | None = None
+    ) -> np.ndarray:
+        """Draw a fix from p(z | x) at each pose, on the host in float64; see ``BeamModel.sample``.
+
+        Args:
+            poses: (N, 3) or (S, N, 3) robot poses in the world [m, m, rad].
+            seed: Seed of the random numbers, 0 to 2^64 - 1.
+            step: Step of a run, 0 to 2^31 - 1: other steps have other numbers.
+            covariance: None, or the (2, 2) covariance matrix of the fixes in the world [m^2].
+
+        Returns:
+            (N, 2) or (S, N, 2) x and y of the antenna [m], a NumPy array of float64.
+
+        Raises:
+            TypeError: an argument does not hold numbers of its kind.
+            ValueError: a wrong shape, a pose that is not finite, a seed or step beyond its limits, or no covariance.
+
+        Example:
+            >>> import gpusense as gs
+            >>> model = gs.PositionModel(gs.PositionParameters(sigma=0.5), backend="numpy")
+            >>> model.sample([(1.0, 2.0, 0.0)] * 3, seed=1).shape
+            (3, 2)
+        """
+        p = self.parameters
+        matrix = None if covariance is None else check_covariance("covariance", covariance)
+        if matrix is None and p.sigma is not None:
+            matrix = (p.sigma**2, 0.0), (0.0, p.sigma**2)
+        matrix = p.covariance if matrix is None else matrix
+        if matrix is None:
+            raise ValueError("covariance: must be given where the parameters have none, got None")
+        draws = draws_at(poses, self._backend, seed, step)
+        (kind, one), (other, _) = draws.uniform(POSITION), draws.uniform(POSITION, 1)
+        first, second = standard_normal(one), standard_normal(other)
+        # The factor of Cholesky.
+        xx = math.sqrt(matrix[0][0])
+        xy = matrix[0][1] / xx
+        yy = math.sqrt(max(matrix[1][1] - xy * xy, 0.0))
+        fix = mounted(draws.poses, p.mount) + np.stack([xx * first, xy * first + yy * second], axis=1)
+        if p.z_rand > 0 and p.region is not None:
+            x, y, far_x, far_y = p.region
+            random = np.stack([x + one * (far_x - x), y + other * (far_y - y)], axis=1)
+            fix = np.where((kind * (p.z_hit + p.z_rand) < p.z_hit)[:, None], fix, random)
+        return draws.reshaped(fix)
 
     def _describe(self) -> tuple[str, list[Omission]]:
         p = self.parameters
@@ -219,6 +265,36 @@ class HeadingModel(PointModel):
             return (*wrapping, score)
 
         return cast(np.ndarray, self._score(poses, out, program, []))
+
+    def sample(self, poses: AnyArray, seed: int = 0, *, step: int = 0) -> np.ndarray:
+        """Draw a heading from p(z | x) at each pose, on the host in float64; see ``BeamModel.sample``.
+
+        Args:
+            poses: (N, 3) or (S, N, 3) robot poses in the world [m, m, rad].
+            seed: Seed of the random numbers, 0 to 2^64 - 1.
+            step: Step of a run, 0 to 2^31 - 1: other steps have other numbers.
+
+        Returns:
+            (N,) or (S, N) headings in [-pi, pi] [rad], a NumPy array of float64.
+
+        Raises:
+            TypeError: an argument does not hold numbers of its kind.
+            ValueError: a wrong shape, a pose that is not finite, or a seed or step beyond its limits.
+
+        Example:
+            >>> import gpusense as gs
+            >>> model = gs.HeadingModel(gs.HeadingParameters(sigma=0.1), backend="numpy")
+            >>> model.sample([(0.0, 0.0, 0.5)] * 3, seed=1).shape
+            (3,)
+        """
+        p, draws = self.parameters, draws_at(poses, self._backend, seed, step)
+        kind, u = draws.uniform(HEADING)
+        error = von_mises(draws, HEADING, p.kappa) if p.kind == "von_mises" else p.sigma * standard_normal(u)
+        none = (np.zeros(1), np.zeros(1))
+        turned, offset = (wrapped_difference(angle, none)[0] for angle in (draws.poses[:, 2], np.array([p.offset])))
+        total = wrapped_difference(turned + (offset + error), none)[0]
+        hit = kind * (p.z_hit + p.z_rand) < p.z_hit
+        return draws.reshaped(np.where(hit, total, math.pi * (2 * u - 1)))
 
     def _options(self) -> tuple[str, ...]:
         return (f"kind={self.parameters.kind!r}",)

@@ -20,6 +20,7 @@ from gpusense.interface.plan import Omission, share
 from gpusense.interface.terms import log_weight
 from gpusense.models.point.base import PointModel, rand_omission, relative_omissions
 from gpusense.models.point.pairs import DIGITS, PI, exact, log_of, total, two_parts
+from gpusense.models.point.sampling import BEACONS, draws_at, mounted, normal_within, within
 from gpusense.models.poses import Part, Poses
 from gpusense.world.sensor_parameters import BeaconParameters
 
@@ -125,6 +126,72 @@ class BeaconModel(PointModel):
     def _arguments(self) -> dict[str, Any]:
         return super()._arguments() | {"xy": self.xy}
 
+    def sample(self, poses: AnyArray, seed: int = 0, *, step: int = 0, ids: ArrayLike | None = None) -> np.ndarray:
+        """Draw ranges from p(z | x) at each pose, on the host in float64; see ``BeamModel.sample``.
+
+        Args:
+            poses: (N, 3) or (S, N, 3) robot poses in the world [m, m, rad].
+            seed: Seed of the random numbers, 0 to 2^64 - 1.
+            step: Step of a run, 0 to 2^31 - 1: other steps have other numbers.
+            ids: None for all M beacons, or (F,) indices of the beacons; one may have several ranges.
+
+        Returns:
+            (N, F) or (S, N, F) ranges in [0, range_max] [m], a NumPy array of float64. NaN where distance and bias lie
+            beyond range_max, or below 0, and the range is not observed.
+
+        Raises:
+            TypeError: an argument does not hold numbers of its kind.
+            ValueError: a wrong shape, a pose that is not finite, a seed or step beyond its limits, or an index that is
+                no beacon's.
+
+        Example:
+            >>> import gpusense as gs
+            >>> model = gs.BeaconModel([(0.0, 0.0), (8.0, 0.0)], backend="numpy")
+            >>> model.sample([(4.0, 3.0, 0.0)] * 5, seed=1).shape
+            (5, 2)
+        """
+        p, index = self.parameters, self._indices(ids)
+        draws = draws_at(poses, self._backend, seed, step)
+        antenna = mounted(draws.poses, p.mount)
+        ranges = np.empty((len(antenna), len(index)))
+        for f, j in enumerate(index.tolist()):
+            (kind, u), (heavy, _) = draws.uniform(BEACONS + f), draws.uniform(BEACONS + f, 1)
+            mean = np.hypot(*(antenna - self.xy[j]).T) + self._bias[j]
+            hit = self._hits(u, heavy, mean)
+            ranges[:, f] = np.where(kind * (p.z_hit + p.z_rand) < p.z_hit, hit, u * p.range_max)
+        return draws.reshaped(ranges)
+
+    def _hits(self, u: np.ndarray, heavy: np.ndarray, mean: np.ndarray) -> np.ndarray:
+        """Return correct ranges around means."""
+        p = self.parameters
+        if p.kind == "student_t":
+            from scipy.special import stdtr, stdtrit
+
+            nu = float(p.nu)
+            return within(u, mean, p.sigma_range, 0.0, p.range_max, lambda x: stdtr(nu, x), lambda q: stdtrit(nu, q))
+        hit = normal_within(u, mean, p.sigma_range, 0.0, p.range_max)
+        if p.kind == "mixture":
+            wide = normal_within(u, mean, p.sigma_heavy, 0.0, p.range_max)
+            hit = np.where(heavy < p.heavy_weight, wide, hit)
+        return hit
+
+    def _indices(self, ids: object) -> np.ndarray:
+        """Return the (F,) indices of beacons.
+
+        Raises:
+            TypeError, ValueError: indices that are no integers, or no beacon's.
+        """
+        known = len(self.xy)
+        if ids is None:
+            return np.arange(known)
+        chosen = checks.as_array("ids", ids)
+        index = checks.array("ids", chosen.astype(np.int64) if chosen.size == 0 else chosen, ("F",), dtype=np.int64)
+        outside = (index < 0) | (index >= known)
+        if outside.any():
+            at = int(np.argmax(outside))
+            raise ValueError(f"ids: indices must be in [0, {known}), got {index[at]} at index {at}")
+        return index
+
     def _options(self) -> tuple[str, ...]:
         return f"beacons={len(self.xy)}", f"kind={self.parameters.kind!r}"
 
@@ -135,18 +202,10 @@ class BeaconModel(PointModel):
 
     def _prepare(self, ranges: object, ids: object) -> tuple[np.ndarray, list[Omission]]:
         """Return the (F, BEACON) numbers of the valid ranges, and the omissions of the others."""
-        p, known = self.parameters, len(self.xy)
+        p = self.parameters
         on_host = arrays.copied_to_host(ranges, self._backend, "ranges")
-        if ids is None:
-            z, index = checks.array("ranges", on_host, (known,), finite=False), np.arange(known)
-        else:
-            chosen = checks.as_array("ids", ids)
-            index = checks.array("ids", chosen.astype(np.int64) if chosen.size == 0 else chosen, ("F",), dtype=np.int64)
-            z = checks.array("ranges", on_host, (len(index),), finite=False)
-            outside = (index < 0) | (index >= known)
-            if outside.any():
-                at = int(np.argmax(outside))
-                raise ValueError(f"ids: indices must be in [0, {known}), got {index[at]} at index {at}")
+        index = self._indices(ids)
+        z = checks.array("ranges", on_host, (len(index),), finite=False)
         missing, valid = np.isnan(z), (z >= 0) & (z <= p.range_max)
         left_out = []
         reasons = (

@@ -20,6 +20,7 @@ from gpusense.interface.plan import Omission, share
 from gpusense.models.arguments import map_words
 from gpusense.models.point.base import PointModel
 from gpusense.models.point.pairs import DIGITS, exact, two_parts
+from gpusense.models.point.sampling import BUMPER, draws_at
 from gpusense.models.poses import Frame, Part, Poses, place
 from gpusense.tables.distances import squared_distances
 from gpusense.world.frames import split
@@ -88,15 +89,14 @@ class BumperModel(PointModel):
         self.parameters = BumperParameters() if parameters is None else parameters
         if not isinstance(self.parameters, BumperParameters):
             raise TypeError(f"parameters: must be BumperParameters, got {checks.show(parameters)}")
-        self.unknown = checks.choice("unknown", unknown, ("free", "occupied"))
-        self.outside = checks.choice("outside", outside, ("free", "occupied"))
+        self.unknown = cast(Space, checks.choice("unknown", unknown, ("free", "occupied")))
+        self.outside = cast(Space, checks.choice("outside", outside, ("free", "occupied")))
         super().__init__(backend, precision, temperature)
         self._check_scale("sigma", self.parameters.sigma)
         side = grid.resolution
         self._radius, self._points, self._start = sample_outline(outline, segments, side / 2)
-        # For copies; the caller may change an array.
-        self._outline = np.copy(outline), None if segments is None else np.copy(segments)
-        self.segments = len(self._start) - 1
+        self.segments, self._single = len(self._start) - 1, segments is None
+        self._outline, self._segments = _kept(outline), _kept(segments)
         extent = self._radius + float(np.hypot(*self._points.T).max())
         margin = math.ceil(extent / side) + min(math.ceil(_DEVIATIONS * self.parameters.sigma / side), _MOST_MARGIN)
         rows, cols = (size + 2 * margin for size in grid.shape)
@@ -160,9 +160,48 @@ class BumperModel(PointModel):
         return cast(np.ndarray, self._score(poses, out, program, left_out, items=int(kept.sum())))
 
     def _arguments(self) -> dict[str, Any]:
-        outline, segments = self._outline
-        own = dict(grid=self.grid, outline=outline, segments=segments, unknown=self.unknown, outside=self.outside)
+        own = dict(grid=self.grid, outline=self._outline, segments=self._segments, unknown=self.unknown, outside=self.outside)
         return super()._arguments() | own
+
+    def sample(self, poses: AnyArray, seed: int = 0, *, step: int = 0) -> np.ndarray:
+        """Draw the states of the bumper from P(pressed | x, m) at each pose, on the host; see ``BeamModel.sample``.
+
+        Args:
+            poses: (N, 3) or (S, N, 3) robot poses in the world [m, m, rad].
+            seed: Seed of the random numbers, 0 to 2^64 - 1.
+            step: Step of a run, 0 to 2^31 - 1: other steps have other numbers.
+
+        Returns:
+            (N,) or (S, N) whether the bumper is pressed, a NumPy array of bool; (N, B) or (S, N, B) with segments.
+
+        Raises:
+            TypeError: an argument does not hold numbers of its kind.
+            ValueError: a wrong shape, a pose that is not finite, or a seed or step beyond its limits.
+
+        Example:
+            >>> import gpusense as gs
+            >>> grid = gs.OccupancyGrid([[0] * 20 + [100]], resolution=0.1)
+            >>> model = gs.BumperModel(grid, 0.3, backend="numpy")
+            >>> model.sample([(0.5, 0.05, 0.0), (1.9, 0.05, 0.0)], seed=1).tolist()
+            [False, True]
+        """
+        draws = draws_at(poses, self._backend, seed, step)
+        # Probabilities of one backend and precision, so that all backends draw the same.
+        model = self if self.device.backend == "numpy" and self._real == np.float64 else self._on_host()
+        pressed = np.empty((len(draws.poses), self.segments), bool)
+        for segment in range(self.segments):
+            states: list[float] = [math.nan] * self.segments
+            states[segment] = 1
+            log_p = model.log_likelihood(draws.poses, states)
+            pressed[:, segment] = draws.uniform(BUMPER + segment)[0] < np.exp(log_p / model.temperature)
+        return draws.reshaped(pressed[:, 0] if self._single else pressed)
+
+    def _on_host(self) -> BumperModel:
+        """Return the same model of NumPy in float64."""
+        return BumperModel(
+            self.grid, self._outline, self.parameters, segments=self._segments, backend="numpy", precision="float64",
+            unknown=self.unknown, outside=self.outside,
+        )  # fmt: skip
 
     def _options(self) -> tuple[str, ...]:
         return map_words(self.grid), f"segments={self.segments}"
@@ -216,6 +255,11 @@ class BumperModel(PointModel):
         logs = [math.log(w) if w > 0 else -math.inf for w in weights]
         misses = [math.log1p(-w) if w < 1 else -math.inf for w in weights]
         return np.array([*pairs, *logs, *misses], self._real)
+
+
+def _kept(value: Any) -> Any:
+    """Return a copy of an array-like argument, which the caller may change."""
+    return np.array(value) if isinstance(value, (list, tuple, np.ndarray)) else value
 
 
 def sample_outline(outline: object, segments: object, spacing: float) -> tuple[float, np.ndarray, np.ndarray]:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray, CasterName, Compat, Precision, Space
 from gpusense.backends import Selection
+from gpusense.backends.results import Result
 from gpusense.models.arguments import check_absent, check_discrete
 from gpusense.models.scan.beam_explain import title_and_omissions
 from gpusense.models.scan.beam_pipeline import BeamPipeline
@@ -20,6 +21,7 @@ from gpusense.models.scan.map_caster import MapCaster
 from gpusense.models.scan.mixture import mixture_on_device
 from gpusense.models.scan.model import ScanModel
 from gpusense.models.scan.rules import Beams
+from gpusense.models.scan.sampling import drawing_of, poses_to_draw_at
 from gpusense.tables import casters
 from gpusense.tables.casters import Caster
 from gpusense.world.compat import Peer, check_weights, choose
@@ -216,6 +218,57 @@ class BeamModel(ScanModel):
         require_exact("caster", self._caster.method)
         with self._lock:
             return self._cast(poses, out, incidence=True)
+
+    def sample(self, poses: AnyArray, seed: int = 0, *, step: int = 0, out: Any = None) -> Any:
+        """Draw readings from p(z | x, m) of every beam of the scanner at each pose.
+
+        A reading depends on seed, step, index of the pose and index of the beam alone, by the counter-based generator
+        Philox; all backends draw the same bits. It is a component of the mixture drawn by its weight, and a range by
+        inverting the component's distribution function, so readings move smoothly with the poses (*Probabilistic
+        Robotics* section 6.3.1, the simulation of equation 6.12). With z* = 0, p_short has no mass, and the other
+        components share its weight.
+
+        ``temperature`` and ``beams`` of the model have no effect, and with ``sensor_table`` readings are those of the
+        mixture. Readings below ``range_min`` are drawn, too; they are missing readings to every model.
+
+        Args:
+            poses: (N, 3) robot poses in the world [m, m, rad], or (S, N, 3) of S scans; arrays of other libraries as
+                in ``log_likelihood``.
+            seed: Seed of the random numbers, 0 to 2^64 - 1.
+            step: Step of a run, or that of the first of S scans, 0 to 2^31 - 1: other steps have other numbers.
+            out: The array for the readings, as in ``log_likelihood``.
+
+        Returns:
+            (N, K) or (S, N, K) readings in the model's precision [m]: ranges in [0, range_max), range_max for no
+            return, NaN where no reading is possible, which happens only where z* = 0 and all weight is z_short.
+
+        Raises:
+            TypeError: an argument does not hold numbers of its kind.
+            ValueError: a wrong shape, a pose that is not finite, a seed or step beyond its limits, or a model with
+                ``compat``, whose weights are no density.
+
+        Example:
+            >>> import gpusense as gs, numpy as np
+            >>> grid = gs.OccupancyGrid([[0] * 20 + [100]], resolution=0.1)
+            >>> model = gs.BeamModel(grid, gs.Scanner([0.0, 0.1], range_max=4.0), backend="numpy")
+            >>> z = model.sample([(0.2, 0.05, 0.0)] * 1000, seed=1)
+            >>> z.shape, bool(abs(np.median(z[:, 0]) - 1.8) < 0.05)
+            ((1000, 2), True)
+        """
+        if self._setting.weights.is_peer:
+            raise ValueError(f"compat: must be None where readings are drawn, got {self.compat!r}, no density")
+        checked, shape = poses_to_draw_at(poses, self._setting.backend)
+        table = self._parameters if isinstance(self._parameters, SensorTable) else None
+        mixture = self._beam_pipeline.mixture
+        drawing = drawing_of(
+            self._mixtures, mixture.cosines, table, self.scanner.range_max, self._setting.real, seed=seed, step=step,
+            per_scan=shape[-1],
+        )  # fmt: skip
+        result = Result(poses, out, (*shape, self.scanner.count), self._setting.real, self._setting.backend)
+        pipeline = self._beam_pipeline
+        cones = dataclasses.replace(pipeline.cones, incidence=drawing.bins > 1)
+        self._caster.draw(checked, pipeline.cone_vectors, result.flat, cones, drawing)
+        return result.array()
 
     def explain(self) -> str:
         """Report what this scene leaves out, why, and the saving; readings and map as of the last call."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -156,6 +156,30 @@ class LikelihoodFieldModel(ScanModel):
         """
         with self._lock:
             self._field_pipeline.map.update(cells, region)
+
+    def sample(self, poses: AnyArray, seed: int = 0, **options: Any) -> NoReturn:
+        """Refuse to draw readings, since a likelihood field is no density of them.
+
+        Its sum over a beam's readings depends on the pose: readings drawn from the normalised field would have another
+        density than ``log_likelihood``. A :class:`BeamModel` of the same map draws.
+
+        Raises:
+            TypeError: always.
+
+        Example:
+            >>> import gpusense as gs
+            >>> grid = gs.OccupancyGrid([[0] * 20 + [100]], resolution=0.1)
+            >>> model = gs.LikelihoodFieldModel(grid, gs.Scanner([0.0], range_max=4.0), backend="numpy")
+            >>> try:
+            ...     model.sample([(0.2, 0.05, 0.0)])
+            ... except TypeError:
+            ...     print("no density")
+            no density
+        """
+        raise TypeError(
+            "sample: must be that of a model with a density of readings, got a LikelihoodFieldModel, whose sum over a "
+            "beam's readings depends on the pose: draw from a BeamModel of the same map"
+        )
 
     def explain(self) -> str:
         """Report what this scene leaves out, why, and the saving; readings and map as of the last call."""

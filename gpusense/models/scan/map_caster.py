@@ -21,6 +21,7 @@ from gpusense.interface.structs import RangeScale
 from gpusense.models.poses import Frame, PlacedPoses, Poses, place
 from gpusense.models.run import Piece, chunk_of, finish, run_pieces
 from gpusense.models.scan.cones import LASER, Cones
+from gpusense.models.scan.sampling import Drawing
 from gpusense.models.scan.tiles import all_within, order_of, tiles_of
 from gpusense.tables import casters
 from gpusense.tables.caster_base import Caster, CasterInput
@@ -176,33 +177,77 @@ class MapCaster:
                 finish(self._workspace, checked.on_device)
         return result.array()
 
+    def draw(self, poses: Poses, vectors: np.ndarray, flat: Any, cones: Cones, drawing: Drawing) -> None:
+        """Draw readings at S N poses into flat memory, in pieces that fit the device's memory.
+
+        A device without float64 casts the ranges, and the host draws: the bits are the same.
+        """
+        rays = len(vectors)
+        if not poses.count * rays:
+            return
+        with self._lock, self._workspace as space:
+            ray = space.upload("ray", vectors.astype(self.real))
+            chunk = chunk_of(self.backend, rays * cones.rays, 2 * self.real.itemsize)
+            # Numbers of drawings go by the index of a particle among all, so scans need not be whole.
+            run_pieces(
+                space, Piece(0, poses.count, poses.count), chunk,
+                lambda piece: self._draw(poses, piece, ray, rays, flat, cones, drawing),
+            )  # fmt: skip
+            finish(space, poses.on_device)
+
+    def _draw(
+        self, poses: Poses, piece: Piece, ray: Buffer, rays: int, flat: Any, cones: Cones, drawing: Drawing
+    ) -> None:
+        """Start to draw the readings of a piece."""
+        space, count, info = self._workspace, piece.count, self.backend.info
+        table, window = poses.window(self.map, piece.part)
+        placed = place(poses, piece.part, Frame(window, self.grid, self.mount), self.backend, space, self.real)
+        cosines = space.empty("cosines", count * rays if "INCIDENCE" in cones.flags else 1, self.real)
+        with space.result("ranges", flat, piece.begin * rays, count * rays, self.real) as result:
+            program = self._program(placed, table, ray, rays, (result, cosines), cones, frozenset({"COSINES"}))
+            self.backend.run((*placed.launches(), *program))
+            if info.float64:
+                self.backend.run((drawing.launch(space, piece.begin, count, rays, result, cosines),))
+        if not info.float64:
+            incidence = np.zeros(count * rays if drawing.bins > 1 else 1, self.real)
+            space.download(cosines, incidence)
+            space.wait()
+            drawing.on_host(piece.begin, count, rays, flat[piece.begin * rays : piece.end * rays], incidence)
+
     def _cast(self, poses: Poses, piece: Piece, ray: Buffer, rays: int, flat: Any, cones: Cones) -> None:
         """Start to cast the rays of a piece."""
         space, count = self._workspace, piece.count
         table, window = poses.window(self.map, piece.part)
         placed = place(poses, piece.part, Frame(window, self.grid, self.mount), self.backend, space, self.real)
         with space.result("ranges", flat, piece.begin * rays, count * rays, self.real) as result:
-            program = self._program(placed, table, ray, rays, result, cones)
+            other = space.empty("echoes", count * rays if "INCIDENCE" in cones.flags else 1, self.real)
+            both = (other, result) if cones.incidence else (result, other)
+            program = self._program(placed, table, ray, rays, both, cones)
             self.backend.run((*placed.launches(), *program))
 
     def _program(
-        self, placed: PlacedPoses, table: Buffer, ray: Buffer, rays: int, result: Buffer, cones: Cones
+        self,
+        placed: PlacedPoses,
+        table: Buffer,
+        ray: Buffer,
+        rays: int,
+        results: tuple[Buffer, Buffer],
+        cones: Cones,
+        more: frozenset[str] = frozenset(),
     ) -> Program:
-        """Return the launches that cast the rays of placed poses."""
+        """Return the launches that cast the rays of placed poses to ranges and, with INCIDENCE, angles of incidence."""
         space, window, count = self._workspace, placed.frame.window, placed.count
+        result, incidence = results
         flags = self.flags | self._precision_flags | cones.flags | flags_if(ORIGINS_OUTSIDE=not all_within(placed, 0))
         common = dict(
             map_table=table, pose_cell=placed.cell, pose=placed.pose, ray=ray, window=window, particles=count,
             rays=rays, caster=self.method.struct(), scale=self.scale,
         )  # fmt: skip
         if "ECHO" in flags:
-            other = space.empty("echoes", count * rays if "INCIDENCE" in flags else 1, self.real)
-            ranges, incidence = (other, result) if cones.incidence else (result, other)
             heard = dict(
-                normals=self.normals(window, cones.flags), ranges=ranges, incidence=incidence,
-                cone=cones.struct,
-            )  # fmt: skip
-            return (launch("cast_echoes", flags, (rays, count), **common, **heard),)
+                normals=self.normals(window, cones.flags), ranges=result, incidence=incidence, cone=cones.struct
+            )
+            return (launch("cast_echoes", flags | more, (rays, count), **common, **heard),)
         if self.backend.info.kind == "gpu":
             order = order_of(space, placed, rays, self.real)
             flags |= flags_if(ORDERED=order is not None)

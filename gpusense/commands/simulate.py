@@ -1,0 +1,227 @@
+"""Run ``gpusense simulate``: make a log of a robot that drives through a map, for tests and teaching."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gpusense.commands.arguments import (
+    add_backend,
+    add_json,
+    add_seed,
+    finite_number,
+    not_negative_number,
+    output_path,
+    positive_number,
+    whole_number,
+)
+from gpusense.commands.output import print_json
+
+if TYPE_CHECKING:
+    from gpusense.evaluation.simulation.run import SimulatedRun
+    from gpusense.localization.motion import OdometryMotion
+    from gpusense.world.grid import OccupancyGrid
+    from gpusense.world.parameters import BeamParameters
+
+NAME = "simulate"
+HELP = "Make the log of a robot that drives through a map, with noise, people and changes of the world."
+
+_EPILOG = """\
+The robot drives between random places, or along the poses of --path. Its readings are drawn from the beam model around
+the ranges to walls and people; its odometry has the noise of the odometry motion model. With --moved, --removed,
+--added and --glass the world differs from the map; with --true-map it is another one, so that --map is wrong. The same
+options and seed make the same log on every device.
+
+A CARMEN log holds the true poses, which 'gpusense localize', 'score', 'fit' and 'match' compare with; they are those of
+the laser. Bags hold LaserScan, Odometry and transforms; --tum writes the true poses of the robot for --reference.
+
+Exit codes: 0 success, 2 bad input.
+
+example:
+  gpusense simulate --world office --map-out office.yaml --log-out run.log
+  gpusense localize --map office.yaml --log run.log
+  gpusense simulate --map office.yaml --log-out crowded.log.gz --hidden 0.3 --moved 0.1 --seed 7
+  gpusense simulate --map office.yaml --log-out run.bag --format ros1 --mount 0.2 0 0 --tum truth.tum"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    parser.epilog = _EPILOG
+    add = parser.add_argument
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--map", type=Path, metavar="YAML", help="a map_server map: the map that the robot has")
+    source.add_argument("--world", metavar="NAME", help="a generated map instead: office, corridor, hall or twins, "
+                        "or one of these with a seed of its own, as in office:3")  # fmt: skip
+    add("--log-out", required=True, type=Path, metavar="FILE", help="the log to write")
+    add("--format", choices=("carmen", "ros1", "ros2"), default="carmen",
+        help="a CARMEN log, compressed where the name ends in .gz; a bag of ROS 1 (.bag); a new folder with a bag of "
+        "ROS 2 (default: %(default)s)")  # fmt: skip
+    add("--map-out", type=output_path(".yaml"), metavar="YAML", help="write the robot's map")
+    add("--world-out", type=output_path(".yaml"), metavar="YAML", help="write the world as it is, without people")
+    add("--tum", type=output_path(".tum", ".txt"), metavar="FILE", help="write the true poses of the robot")
+    _add_run(parser)
+    _add_world(parser)
+    _add_sensors(parser)
+    add_backend(parser, default="numpy")
+    add_seed(parser)
+    add_json(parser)
+
+
+def _add_run(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("--scans", type=whole_number(low=1, high=1_000_000), metavar="T",
+        help="number of scans (default: 200, or those of --path)")  # fmt: skip
+    add("--path", type=Path, metavar="FILE", help="a TUM trajectory of true poses of the robot to follow")
+    add("--step", type=positive_number, default=0.2, metavar="M", help="distance between scans [m] (default: 0.2)")
+    add("--turn", type=positive_number, default=0.35, metavar="RAD",
+        help="largest turn between scans [rad] (default: 0.35)")  # fmt: skip
+    add("--period", type=positive_number, default=0.25, metavar="S", help="time between scans [s] (default: 0.25)")
+    add("--clearance", type=not_negative_number, default=0.35, metavar="M",
+        help="least distance from walls [m] (default: 0.35)")  # fmt: skip
+    add("--kidnaps", type=whole_number(low=0), default=0, metavar="N",
+        help="how often the robot is carried elsewhere without odometry (default: 0)")  # fmt: skip
+
+
+def _add_world(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("--true-map", type=Path, metavar="YAML", help="the world as it is, in place of the robot's map with changes")
+    add("--people", type=whole_number(low=0, high=1000), default=0, metavar="N",
+        help="people who walk near the robot (default: 0)")  # fmt: skip
+    share: dict[str, Any] = dict(type=not_negative_number, default=0.0, metavar="SHARE")
+    add("--hidden", **share, help="share of the beams that further people hide, up to 0.9 (default: 0)")
+    add("--moved", **share, help="share of the walls that have moved by 0.5 to 2 m (default: 0)")
+    add("--removed", **share, help="share of the walls that have gone (default: 0)")
+    add("--added", **share, help="new furniture, as a share of the walls (default: 0)")
+    add("--glass", **share, help="share of the walls through which beams pass (default: 0)")
+
+
+def _add_sensors(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("--beams", type=whole_number(low=1, high=100_000), default=181, metavar="K",
+        help="beams of the laser (default: %(default)s)")  # fmt: skip
+    add("--view", type=positive_number, default=180.0, metavar="DEG",
+        help="angle between the first and the last beam [deg], below 360 (default: 180)")  # fmt: skip
+    add("--range-max", type=positive_number, default=20.0, metavar="M", help="largest range [m] (default: 20)")
+    add("--mount", type=finite_number, nargs=3, default=(0.0, 0.0, 0.0), metavar=("X", "Y", "THETA"),
+        help="pose of the laser on the robot [m, m, rad] (default: 0 0 0)")  # fmt: skip
+    add("--noise", type=positive_number, metavar="M", help="standard deviation of ranges [m] (default: 0.02)")
+    add("--motion-noise", type=not_negative_number, nargs=4, metavar=("A1", "A2", "A3", "A4"),
+        help="variances of the odometry per squared motion, as in 'gpusense localize' (default: those of a fair "
+        "odometer, 5 %% of turns and distances)")  # fmt: skip
+    add("--parameters", "--params", type=Path, metavar="YAML",
+        help="a file with beam_model or odometry_motion, such as 'gpusense fit --out' writes, for readings and "
+        "odometry")  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> int:
+    """Simulate, and write the files."""
+    from gpusense.evaluation.simulation.files import write_run
+    from gpusense.evaluation.simulation.run import simulate_run
+    from gpusense.evaluation.trajectory_files import read_tum, write_tum
+    from gpusense.world.map_files import read_map, write_map
+
+    _check_output(args)
+    grid = read_map(args.map) if args.map else _generated(args.world, args.seed)
+    world = None if args.true_map is None else read_map(args.true_map)
+    path = None if args.path is None else read_tum(args.path)[1]
+    parameters, motion = _noise(args)
+    made = simulate_run(
+        grid, _scanner(args), scans=args.scans, world=world, path=path, parameters=parameters, motion=motion,
+        people=args.people, hidden=args.hidden, moved=args.moved, removed=args.removed, added=args.added,
+        glass=args.glass, kidnaps=args.kidnaps, step=args.step, turn=args.turn, period=args.period,
+        clearance=args.clearance, seed=args.seed, backend=args.backend,
+    )  # fmt: skip
+    for file, content in ((args.map_out, made.grid), (args.world_out, made.world)):
+        if file is not None:
+            write_map(content, file)
+    if args.tum is not None:
+        write_tum(args.tum, made.times.tolist(), made.poses)
+    write_run(made, args.log_out, args.format)
+    _report(args, made)
+    return 0
+
+
+def _check_output(args: argparse.Namespace) -> None:
+    """Check that the log can be written before any work is done.
+
+    Raises:
+        ValueError, OSError: it cannot.
+    """
+    from gpusense._util.files import check_writable
+    from gpusense.logs.bag_writer import check_bag
+
+    if args.format == "carmen":
+        check_writable(args.log_out)
+        return
+    try:
+        check_bag(args.log_out, first=args.format == "ros1")
+    except ImportError as error:
+        raise ValueError(f"--format: {error}") from None
+
+
+def _generated(name: str, seed: int) -> OccupancyGrid:
+    """Return a generated world by a name such as ``office`` or ``office:3``.
+
+    Raises:
+        ValueError: there is none of this name.
+    """
+    from gpusense.evaluation.named_worlds import WORLDS
+
+    kind, colon, number = name.partition(":")
+    if kind not in WORLDS or (colon and not (number.isascii() and number.isdigit() and len(number) < 10)):
+        raise ValueError(f"--world: must be one of {', '.join(WORLDS)}, or with a seed as in office:3, got {name!r}")
+    return WORLDS[kind](int(number) if colon else seed)
+
+
+def _scanner(args: argparse.Namespace) -> Any:
+    from gpusense.world.scanner import Scanner
+
+    if args.view >= 360:
+        raise ValueError(f"--view: must be below 360, got {args.view:g}")
+    view = math.radians(args.view)
+    step = view / max(args.beams - 1, 1)
+    return Scanner.uniform(
+        angle_min=-view / 2 if args.beams > 1 else 0.0, angle_increment=step, count=args.beams,
+        range_max=args.range_max, mount=args.mount,
+    )  # fmt: skip
+
+
+def _noise(args: argparse.Namespace) -> tuple[BeamParameters, OdometryMotion]:
+    """Return the mixture of the readings and the noise of the odometry."""
+    import dataclasses
+
+    from gpusense.commands.parameter_files import read_localization
+    from gpusense.evaluation.simulation.run import MOTION, READINGS
+    from gpusense.localization.motion import OdometryMotion
+
+    beam, noise = (None, {}) if args.parameters is None else read_localization(args.parameters)
+    parameters = READINGS if beam is None else beam
+    if args.noise is not None:
+        parameters = parameters.replace(sigma_hit=args.noise)
+    motion = OdometryMotion(**noise) if noise else MOTION
+    if args.motion_noise is not None:
+        motion = dataclasses.replace(motion, alpha=tuple(args.motion_noise))
+    return parameters, motion
+
+
+def _report(args: argparse.Namespace, made: SimulatedRun) -> None:
+    import numpy as np
+
+    steps = np.hypot(*np.diff(made.poses[:, :2], axis=0).T)
+    length = float(steps[~made.kidnapped[1:]].sum())
+    changed = int(np.count_nonzero(made.world.occupied != made.grid.occupied)) if args.true_map is None else None
+    none = float(np.mean(np.isinf(made.scans))) if made.scans.size else 0.0
+    if args.json:
+        print_json({
+            "log": str(args.log_out), "format": args.format, "scans": len(made.times), "beams": made.scanner.count,
+            "length_m": length, "no_return": none, "hidden": float(made.hidden.mean()), "cells_changed": changed,
+            "kidnapped_at": np.flatnonzero(made.kidnapped), "seed": args.seed, "first_pose": made.poses[0],
+            "last_pose": made.poses[-1], "last_odometry": made.odometry[-1],
+        })  # fmt: skip
+        return
+    print(f"{args.log_out}: {len(made.times)} scans of {made.scanner.count} beams over {length:.1f} m; "
+          f"{none:.1%} without return, {made.hidden.mean():.1%} hidden by people")  # fmt: skip
+    if made.kidnapped.any():
+        print(f"carried elsewhere before scans {', '.join(map(str, np.flatnonzero(made.kidnapped).tolist()))}")

@@ -1,0 +1,76 @@
+"""Write simulated runs as logs."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.evaluation.simulation.run import SimulatedRun
+from gpusense.localization.pose_algebra import compose_poses
+from gpusense.logs.bag_writer import write_bag
+from gpusense.logs.carmen_writer import write_carmen
+from gpusense.logs.records import Scan
+from gpusense.world.scanner import Scanner
+
+FORMATS = ("carmen", "ros1", "ros2")
+
+
+def write_run(run: SimulatedRun, path: str | os.PathLike[str], kind: str = "carmen") -> None:
+    """Write a simulated run as a log that ``read_log`` reads.
+
+    Args:
+        run: The run.
+        path: The log.
+        kind: ``"carmen"``, compressed where the name ends in ``.gz``, whose poses are the true ones; they are those of
+            the laser, as the format has no mount. ``"ros1"``, a bag of ROS 1 whose name ends in ``.bag``; ``"ros2"``,
+            the folder of a bag of ROS 2, which must not exist: both have the mount, and no true poses.
+
+    Raises:
+        TypeError, ValueError: an argument is not of the kind described, or the format cannot hold the scans.
+        ImportError: a bag, and the library rosbags is absent.
+        OSError: the log cannot be written.
+
+    Example:
+        >>> import gpusense as gs, numpy as np, pathlib, tempfile
+        >>> scanner = gs.Scanner(np.radians(np.arange(-90, 91)), range_max=12.0)
+        >>> run = gs.worlds.simulate_run(gs.worlds.building(), scanner, scans=3)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     gs.worlds.write_run(run, log := pathlib.Path(folder, "run.log"))
+        ...     len(list(gs.read_log(log)))
+        3
+    """
+    if not isinstance(run, SimulatedRun):
+        raise TypeError(f"run: must be a SimulatedRun, got {checks.show(run)}")
+    file = checks.path("path", path)
+    if checks.choice("kind", kind, FORMATS) == "carmen":
+        write_carmen(file, records_of(run, of_laser=True))
+        return
+    write_bag(file, records_of(run), first=kind == "ros1")
+
+
+def records_of(run: SimulatedRun, *, of_laser: bool = False) -> Iterator[Scan]:
+    """Yield the scans of a run as records of a log, with true poses.
+
+    Args:
+        run: The run.
+        of_laser: Whether poses and odometry are those of the laser, and the scanner has no mount.
+    """
+    scanner, poses, odometry = run.scanner, run.poses, run.odometry
+    if of_laser and any(scanner.mount):
+        poses, odometry = (compose_poses(one, scanner.mount) for one in (poses, odometry))
+        scanner = Scanner(
+            scanner.bearings, scanner.range_max, scanner.range_min, cone=scanner.cone, cone_rays=scanner.cone_rays,
+            critical_incidence=scanner.critical_incidence,
+        )  # fmt: skip
+    for time, ranges, odometer, pose in zip(run.times.tolist(), run.scans, odometry, poses, strict=True):
+        readings = np.array(ranges)
+        readings.setflags(write=False)
+        yield Scan(time, readings, scanner, _pose(odometer), _pose(pose))
+
+
+def _pose(pose: np.ndarray) -> tuple[float, float, float]:
+    x, y, theta = pose.tolist()
+    return x, y, theta

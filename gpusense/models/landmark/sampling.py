@@ -1,0 +1,98 @@
+"""Features that a landmark sensor reports, drawn on the host; see ``gpusense.models.point.sampling``."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.models.point.sampling import LANDMARKS, Draws, mounted, normal_within, wrapped_normal_within
+from gpusense.reference.landmarks import ZERO_RANGE
+from gpusense.reference.relative import wrapped_difference
+from gpusense.world.landmarks import LandmarkMap
+from gpusense.world.parameters import LandmarkParameters
+
+Floats = NDArray[np.float64]
+Span = tuple[float, float]
+
+
+def draw_features(
+    draws: Draws,
+    partners: NDArray[np.int64],
+    landmarks: LandmarkMap,
+    p: LandmarkParameters,
+    span: Span,
+    mount: tuple[float, float, float],
+    *,
+    every: bool,
+) -> Floats:
+    """Return features of landmarks at poses.
+
+    Args:
+        draws: Poses and their random numbers.
+        partners: (F,) landmark of each feature, -1 for a false positive.
+        landmarks: The map.
+        p: The sensor's parameters.
+        span: Smallest and largest signature.
+        mount: The sensor's pose on the robot.
+        every: Whether every landmark is detected, even out of view.
+    """
+    columns = 2 if p.sigma_signature is None else 3
+    features = np.full((len(draws.poses), len(partners), columns), np.nan)
+    place, none = mounted(draws.poses, mount), (np.zeros(1), np.zeros(1))
+    turned = wrapped_difference(draws.poses[:, 2], none)[0] + wrapped_difference(np.array([mount[2]]), none)[0]
+    for f, j in enumerate(partners.tolist()):
+        stream = LANDMARKS + f
+        (kind, detected), (u, v) = draws.uniform(stream), draws.uniform(stream, 1)
+        w = draws.uniform(stream, 2)[0]
+        drawn = _false_positives(u, v, w, p, span)
+        if j >= 0:
+            dx, dy = (landmarks.xy[j] - place).T
+            distance = np.hypot(dx, dy)
+            bearing = wrapped_difference(np.arctan2(dy, dx) - turned, none)[0]
+            signature = None if landmarks.signatures is None else float(landmarks.signatures[j])
+            true = _detections(u, v, w, distance, bearing, signature, p, span)
+            drawn = np.where((kind * (p.z_detect + p.z_false) < p.z_detect)[:, None], true, drawn)
+            if not every:
+                seen = (distance <= p.range_max) & (np.abs(bearing) <= p.field_of_view / 2) & (detected < p.p_detect)
+                drawn[~seen] = np.nan
+        # A part that is measured but not observed leaves no feature.
+        measured = [sigma is not None for sigma in (p.sigma_range, p.sigma_bearing, p.sigma_signature)]
+        drawn[np.isnan(drawn[:, measured]).any(axis=1)] = np.nan
+        features[:, f] = drawn[:, :columns]
+    return draws.reshaped(features)
+
+
+def _false_positives(u: Floats, v: Floats, w: Floats, p: LandmarkParameters, span: Span) -> Floats:
+    """Return (N, 3) features uniform within the sensor's limits, NaN for parts without a deviation."""
+    return _parts(u * p.range_max, (v - 0.5) * p.field_of_view, span[0] + w * (span[1] - span[0]), p)
+
+
+def _detections(
+    u: Floats,
+    v: Floats,
+    w: Floats,
+    distance: Floats,
+    bearing: Floats,
+    signature: float | None,
+    p: LandmarkParameters,
+    span: Span,
+) -> Floats:
+    """Return (N, 3) features of a landmark, NaN for parts without a deviation and for unobserved ones."""
+    nan = np.full_like(u, np.nan)
+    r = nan if p.sigma_range is None else normal_within(u, distance, p.sigma_range, 0.0, p.range_max)
+    b = nan
+    if p.sigma_bearing is not None:
+        half = min(p.field_of_view / 2, np.pi)
+        b = wrapped_normal_within(v, bearing, p.sigma_bearing, half)
+        # A landmark at the sensor has no bearing.
+        b = np.where(distance > ZERO_RANGE, b, (2 * v - 1) * half)
+    s = nan
+    if p.sigma_signature is not None and signature is not None:
+        s = normal_within(w, np.full_like(u, signature), p.sigma_signature, *span)
+    return _parts(r, b, s, p)
+
+
+def _parts(r: Floats, b: Floats, s: Floats, p: LandmarkParameters) -> Floats:
+    parts = np.stack([r, b, s], axis=1)
+    parts[:, [sigma is None for sigma in (p.sigma_range, p.sigma_bearing, p.sigma_signature)]] = np.nan
+    return parts

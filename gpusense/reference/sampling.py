@@ -1,0 +1,211 @@
+"""Readings drawn from the beam model, or from a table of a sensor, given their expected ranges.
+
+Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), section 6.3.1: a component is drawn by its weight, and a
+reading by inverting the component's distribution function. p_hit's is the normal on both sides of its mean, each with
+the mass that lies within [0, range_max]. Masses are sums of positive terms: x phi(x) (1 + x^2 / 3 + x^4 / 15 + ...),
+and beyond SERIES_END one half less the continued fraction of Laplace. Quantiles are those of Wichura, *Algorithm AS
+241* (1988). p_short's is 1 - u (1 - exp(-lambda z*)), written as a sum of positive terms, or a series where lambda z*
+is small. All of it is float64 of +, -, *, / and sqrt, so that every device draws the same bits.
+
+``mixture`` = (z_hit, z_short, z_max, z_rand, sigma_hit, sigma_growth, range_bias, lambda_short) of each bin of angles
+of incidence. ``chances`` = for each bin of expected ranges, the cumulative probabilities of the bins of readings.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.interface import structs
+from gpusense.interface.constants import (
+    DRAW_FIRST,
+    DRAW_MARGIN,
+    DRAW_PER_SCAN,
+    DRAW_RANGE_MAX,
+    DRAW_SEED,
+    DRAW_STEP,
+    DRAW_TERMS,
+    DRAW_TOP,
+    READING_STREAM,
+)
+from gpusense.reference.elementary import exp_of, log_of
+from gpusense.reference.philox import random_words
+from gpusense.reference.sensor_table import range_bin
+
+BLOCK = 1 << 18
+# 2^20 and 2^-52.
+HALF_WORD, FINE = 1048576.0, 2.220446049250313e-16
+# 1 / sqrt(2 pi); the largest number below one half.
+NORMAL_PEAK, MOST_HALF = 0.3989422804014327, 0.49999999999999994
+# Where the series of the mass gives way to the continued fraction; where the mass is one half.
+SERIES_END, SERIES_TERMS, FRACTION_TERMS, HALF_FROM = 4.0, 48, 24, 9.0
+# AS 241: quantiles of central, outer and outermost probabilities, the highest power first.
+CENTRAL, CENTRAL_END, CENTRAL_OFFSET = 0.425, 5.0, 0.180625
+OUTER_OFFSET, OUTERMOST_OFFSET = 1.6, 5.0
+CENTRAL_OVER = (
+    2509.0809287301227, 33430.57558358813, 67265.7709270087, 45921.95393154987, 13731.69376550946, 1971.5909503065513,
+    133.14166789178438, 3.3871328727963665,
+)  # fmt: skip
+CENTRAL_UNDER = (
+    5226.495278852854, 28729.085735721943, 39307.89580009271, 21213.794301586597, 5394.196021424751, 687.1870074920579,
+    42.31333070160091, 1.0,
+)  # fmt: skip
+OUTER_OVER = (
+    0.0007745450142783414, 0.022723844989269184, 0.2417807251774506, 1.2704582524523684, 3.6478483247632045,
+    5.769497221460691, 4.630337846156546, 1.4234371107496835,
+)  # fmt: skip
+OUTER_UNDER = (
+    1.0507500716444169e-09, 0.0005475938084995345, 0.015198666563616457, 0.14810397642748008, 0.6897673349851,
+    1.6763848301838038, 2.053191626637759, 1.0,
+)  # fmt: skip
+OUTERMOST_OVER = (
+    2.0103343992922881e-07, 2.7115555687434876e-05, 0.0012426609473880784, 0.026532189526576124, 0.29656057182850487,
+    1.7848265399172913, 5.463784911164114, 6.657904643501103,
+)  # fmt: skip
+OUTERMOST_UNDER = (
+    2.0442631033899397e-15, 1.421511758316446e-07, 1.8463183175100548e-05, 0.0007868691311456133, 0.014875361290850615,
+    0.1369298809227358, 0.599832206555888, 1.0,
+)  # fmt: skip
+# Below this lambda z* the distribution of p_short is a series.
+SHORT_SERIES = 1e-4
+
+
+def fine_uniform(high: np.ndarray, low: np.ndarray) -> np.ndarray:
+    """Return a number in (0, 1) from two words: the centre of one of 2^52 intervals."""
+    whole = high.astype(np.float64) * HALF_WORD + (low >> np.uint64(12)).astype(np.float64)
+    return (whole + 0.5) * FINE
+
+
+def half_mass(x: np.ndarray) -> np.ndarray:
+    """Return the mass of the standard normal between 0 and x >= 0."""
+    near = np.minimum(x, SERIES_END)
+    square = near * near
+    term, total = np.ones_like(x), np.ones_like(x)
+    for n in range(1, SERIES_TERMS):
+        term = term * (square / (2.0 * n + 1.0))
+        total = total + term
+    series = near * (NORMAL_PEAK * exp_of(-0.5 * square)) * total
+    far = np.clip(x, SERIES_END, HALF_FROM)
+    fraction = far
+    for n in range(FRACTION_TERMS, 0, -1):
+        fraction = far + n / fraction
+    tail = NORMAL_PEAK * exp_of(-0.5 * far * far) / fraction
+    return np.where(x < SERIES_END, series, np.where(x < HALF_FROM, 0.5 - tail, 0.5))
+
+
+def polynomial(terms: tuple[float, ...], x: np.ndarray) -> np.ndarray:
+    """Return a polynomial by Horner's rule, the highest power first."""
+    value = np.full_like(x, terms[0])
+    for term in terms[1:]:
+        value = value * x + term
+    return value
+
+
+def half_quantile(mass: np.ndarray) -> np.ndarray:
+    """Return the x >= 0 with a mass of the standard normal between 0 and x, from 0 to MOST_HALF."""
+    r = CENTRAL_OFFSET - mass * mass
+    central = mass * (polynomial(CENTRAL_OVER, r) / polynomial(CENTRAL_UNDER, r))
+    root = np.sqrt(-log_of(0.5 - mass))
+    r = root - OUTER_OFFSET
+    outer = polynomial(OUTER_OVER, r) / polynomial(OUTER_UNDER, r)
+    r = root - OUTERMOST_OFFSET
+    outermost = polynomial(OUTERMOST_OVER, r) / polynomial(OUTERMOST_UNDER, r)
+    return np.where(mass <= CENTRAL, central, np.where(root <= CENTRAL_END, outer, outermost))
+
+
+def normal_within(u: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return a standard normal deviate between -low <= 0 and high >= 0."""
+    below, above = half_mass(low), half_mass(high)
+    mark = u * (below + above) - below
+    size = half_quantile(np.minimum(np.abs(mark), MOST_HALF))
+    return np.minimum(np.maximum(np.where(mark < 0.0, -size, size), -low), high)
+
+
+def short_of(u: np.ndarray, expected: np.ndarray, decay: np.ndarray) -> np.ndarray:
+    """Return a range drawn from p_short, up to the expected one, which is above 0."""
+    x = decay * expected
+    square = u * u
+    bend = (u / 6.0 - square / 2.0) + square * u / 3.0
+    series = expected * (u + x * ((square - u) / 2.0 + x * bend))
+    left = (1.0 - u) + u * exp_of(-x)
+    drawn = np.where(x < SHORT_SERIES, series, -log_of(left) / np.where(decay > 0.0, decay, 1.0))
+    return np.minimum(drawn, expected)
+
+
+def reading_of(
+    u: np.ndarray, v: np.ndarray, expected: np.ndarray, mixture: np.ndarray, bins: np.ndarray, range_max: float
+) -> np.ndarray:
+    """Return readings drawn from the mixture; infinity without return, NaN where no reading is possible.
+
+    Args:
+        u: Numbers in (0, 1) that choose the component.
+        v: Numbers in (0, 1) that choose the reading.
+        expected: Expected ranges in [0, range_max].
+        mixture: Numbers of the mixtures; see above.
+        bins: Mixture of each reading.
+        range_max: Longest range.
+    """
+    hit, short, none, rand, sigma, growth, bias, decay = mixture.reshape(-1, DRAW_TERMS)[bins].T
+    short = np.where(expected > 0.0, short, 0.0)
+    first, second = hit, hit + short
+    third = second + none
+    total = third + rand
+    mark = u * total
+    mean = np.minimum(np.maximum(expected + bias, 0.0), range_max)
+    spread = sigma + growth * expected
+    with np.errstate(over="ignore"):
+        low, high = mean / spread, (range_max - mean) / spread
+    drawn_hit = mean + spread * normal_within(v, low, high)
+    drawn = np.where(mark < third, np.inf, v * range_max)
+    drawn = np.where(mark < second, short_of(v, expected, decay), drawn)
+    drawn = np.where(mark < first, np.maximum(drawn_hit, 0.0), drawn)
+    return np.where(total > 0.0, drawn, np.nan)
+
+
+def cell_reading_of(
+    u: np.ndarray, v: np.ndarray, column: np.ndarray, chances: np.ndarray, cells: int, range_max: float, margin: float
+) -> np.ndarray:
+    """Return readings drawn from a table: uniform in a bin that is drawn, away from its ends by a margin of the bin."""
+    table = chances.reshape(cells + 1, cells + 1)
+    mark = u * table[column, cells]
+    low, high = np.zeros(len(u), np.int64), np.full(len(u), cells)
+    while (low < high).any():
+        middle = (low + high) // 2
+        above = table[column, middle] > mark
+        low, high = np.where(above | (low >= high), low, middle + 1), np.where(above & (low < high), middle, high)
+    return np.where(low == cells, np.inf, (low + (margin + v * (1.0 - 2.0 * margin))) * (range_max / cells))
+
+
+def draw_readings(
+    flags: frozenset[str],
+    incidence: np.ndarray,
+    mixture: np.ndarray,
+    edges: np.ndarray,
+    chances: np.ndarray,
+    settings: np.ndarray,
+    ranges: np.ndarray,
+    particles: int,
+    rays: int,
+    tables: structs.MixtureTables,
+    scale: structs.RangeScale,
+) -> None:
+    """Replace expected ranges by readings; ``incidence`` holds cosines, and ``edges`` those between bins."""
+    count, limit, top = particles * rays, settings[DRAW_RANGE_MAX], settings[DRAW_TOP]
+    for begin in range(0, count, BLOCK):
+        part = slice(begin, min(begin + BLOCK, count))
+        place = np.arange(part.start, part.stop)
+        n, stream = int(settings[DRAW_FIRST]) + place // rays, READING_STREAM + place % rays
+        scan, particle = np.divmod(n, int(settings[DRAW_PER_SCAN]))
+        counter = particle, scan + int(settings[DRAW_STEP]), stream, np.zeros_like(n)
+        words = random_words(counter, int(settings[DRAW_SEED]), int(settings[DRAW_SEED + 1]))
+        u, v = fine_uniform(words[0], words[1]), fine_uniform(words[2], words[3])
+        z = ranges[part]
+        if "SENSOR_TABLE" in flags:
+            column = range_bin(z, tables.per_metre, tables.cells, scale.range_max)
+            drawn = cell_reading_of(u, v, column, chances, tables.cells, limit, settings[DRAW_MARGIN])
+        else:
+            bins = np.zeros(len(n), np.int64)
+            if "INCIDENCE" in flags:
+                bins = (incidence[part, None] <= edges[: tables.incidence_bins - 1]).sum(axis=1)
+            expected = np.minimum(z.astype(np.float64), limit)
+            drawn = reading_of(u, v, expected, mixture, bins, limit)
+        ranges[part] = np.where(np.isinf(drawn), scale.range_max, np.minimum(drawn, top)).astype(ranges.dtype)

@@ -1,0 +1,190 @@
+// Readings drawn from the beam model, or from a table of a sensor, given their expected ranges.
+// Thrun, Burgard and Fox, "Probabilistic Robotics" (2005), section 6.3.1: a component is drawn by its weight, and a
+// reading by inverting the component's distribution function. p_hit's is the normal on both sides of its mean, each
+// with the mass that lies within [0, range_max]. Masses are sums of positive terms: x phi(x) (1 + x^2 / 3 + x^4 / 15 +
+// ...), and beyond SERIES_END one half less the continued fraction of Laplace. Quantiles are those of Wichura,
+// "Algorithm AS 241" (1988). p_short's is 1 - u (1 - exp(-lambda z*)), written as a sum of positive terms, or a series
+// where lambda z* is small. All of it is float64 of +, -, *, / and sqrt, so that every device draws the same bits.
+// mixture = (z_hit, z_short, z_max, z_rand, sigma_hit, sigma_growth, range_bias, lambda_short) of each bin of angles of
+// incidence. chances = for each bin of expected ranges, the cumulative probabilities of the bins of readings.
+// requires: philox sensor_table
+
+#define READING_STREAM 1073741824u
+#define DRAW_TERMS 8
+// Numbers of the settings by place; DRAW_SEED takes 2.
+#define DRAW_SEED 0
+#define DRAW_STEP 2
+#define DRAW_FIRST 3
+#define DRAW_PER_SCAN 4
+#define DRAW_RANGE_MAX 5
+#define DRAW_TOP 6
+#define DRAW_MARGIN 7
+// 2^20 and 2^-52.
+#define HALF_WORD 1048576.0
+#define FINE 2.220446049250313e-16
+// 1 / sqrt(2 pi); the largest number below one half.
+#define NORMAL_PEAK 0.3989422804014327
+#define MOST_HALF 0.49999999999999994
+// Where the series of the mass gives way to the continued fraction; where the mass is one half.
+#define SERIES_END 4.0
+#define SERIES_TERMS 48
+#define FRACTION_TERMS 24
+#define HALF_FROM 9.0
+// AS 241: quantiles of central, outer and outermost probabilities, the highest power first.
+#define CENTRAL 0.425
+#define CENTRAL_END 5.0
+#define CENTRAL_OFFSET 0.180625
+#define OUTER_OFFSET 1.6
+#define OUTERMOST_OFFSET 5.0
+constant double CENTRAL_OVER[8] = {
+    2509.0809287301227, 33430.57558358813, 67265.7709270087, 45921.95393154987, 13731.69376550946, 1971.5909503065513,
+    133.14166789178438, 3.3871328727963665,
+};
+constant double CENTRAL_UNDER[8] = {
+    5226.495278852854, 28729.085735721943, 39307.89580009271, 21213.794301586597, 5394.196021424751, 687.1870074920579,
+    42.31333070160091, 1.0,
+};
+constant double OUTER_OVER[8] = {
+    0.0007745450142783414, 0.022723844989269184, 0.2417807251774506, 1.2704582524523684, 3.6478483247632045,
+    5.769497221460691, 4.630337846156546, 1.4234371107496835,
+};
+constant double OUTER_UNDER[8] = {
+    1.0507500716444169e-09, 0.0005475938084995345, 0.015198666563616457, 0.14810397642748008, 0.6897673349851,
+    1.6763848301838038, 2.053191626637759, 1.0,
+};
+constant double OUTERMOST_OVER[8] = {
+    2.0103343992922881e-07, 2.7115555687434876e-05, 0.0012426609473880784, 0.026532189526576124, 0.29656057182850487,
+    1.7848265399172913, 5.463784911164114, 6.657904643501103,
+};
+constant double OUTERMOST_UNDER[8] = {
+    2.0442631033899397e-15, 1.421511758316446e-07, 1.8463183175100548e-05, 0.0007868691311456133, 0.014875361290850615,
+    0.1369298809227358, 0.599832206555888, 1.0,
+};
+// Below this lambda z* the distribution of p_short is a series.
+#define SHORT_SERIES 1e-4
+
+// Return a number in (0, 1) from two words: the centre of one of 2^52 intervals.
+double fine_uniform(const uint high, const uint low) {
+    return (((double)high * HALF_WORD + (double)(low >> 12)) + 0.5) * FINE;
+}
+
+// Return the mass of the standard normal between 0 and x >= 0.
+double half_mass(const double x) {
+    if (x >= HALF_FROM) return 0.5;
+    if (x >= SERIES_END) {
+        double fraction = x;
+        for (int n = FRACTION_TERMS; n > 0; --n) fraction = x + (double)n / fraction;
+        return 0.5 - NORMAL_PEAK * exp_of(-0.5 * x * x) / fraction;
+    }
+    const double square = x * x;
+    double term = 1.0, total = 1.0;
+    for (int n = 1; n < SERIES_TERMS; ++n) {
+        term = term * (square / (2.0 * (double)n + 1.0));
+        total = total + term;
+    }
+    return x * (NORMAL_PEAK * exp_of(-0.5 * square)) * total;
+}
+
+// Return a polynomial by Horner's rule, the highest power first.
+double polynomial(constant double *terms, const double x) {
+    double value = terms[0];
+    for (int i = 1; i < 8; ++i) value = value * x + terms[i];
+    return value;
+}
+
+// Return the x >= 0 with a mass of the standard normal between 0 and x, from 0 to MOST_HALF.
+double half_quantile(const double mass) {
+    if (mass <= CENTRAL) {
+        const double r = CENTRAL_OFFSET - mass * mass;
+        return mass * (polynomial(CENTRAL_OVER, r) / polynomial(CENTRAL_UNDER, r));
+    }
+    const double root = sqrt(-log_of(0.5 - mass));
+    if (root <= CENTRAL_END) {
+        const double r = root - OUTER_OFFSET;
+        return polynomial(OUTER_OVER, r) / polynomial(OUTER_UNDER, r);
+    }
+    const double r = root - OUTERMOST_OFFSET;
+    return polynomial(OUTERMOST_OVER, r) / polynomial(OUTERMOST_UNDER, r);
+}
+
+// Return a standard normal deviate between -low <= 0 and high >= 0.
+double normal_within(const double u, const double low, const double high) {
+    const double below = half_mass(low), above = half_mass(high);
+    const double mark = u * (below + above) - below;
+    const double size = half_quantile(fmin(fabs(mark), MOST_HALF));
+    return fmin(fmax(mark < 0.0 ? -size : size, -low), high);
+}
+
+// Return a range drawn from p_short, up to the expected one, which is above 0.
+double short_of(const double u, const double expected, const double decay) {
+    const double x = decay * expected;
+    if (x < SHORT_SERIES) {
+        const double square = u * u;
+        const double bend = (u / 6.0 - square / 2.0) + square * u / 3.0;
+        return fmin(expected * (u + x * ((square - u) / 2.0 + x * bend)), expected);
+    }
+    return fmin(-log_of((1.0 - u) + u * exp_of(-x)) / decay, expected);
+}
+
+// Return a reading drawn from the mixture; infinity without return, NaN where no reading is possible.
+double reading_of(const double u, const double v, const double expected, global const double *mixture, const int bins,
+                  const double range_max) {
+    global const double *p = mixture + DRAW_TERMS * bins;
+    const double first = p[0], second = first + (expected > 0.0 ? p[1] : 0.0), third = second + p[2];
+    const double total = third + p[3], mark = u * total;
+    if (!(total > 0.0)) return (double)NAN;
+    if (mark < first) {
+        const double mean = fmin(fmax(expected + p[6], 0.0), range_max), spread = p[4] + p[5] * expected;
+        return fmax(mean + spread * normal_within(v, mean / spread, (range_max - mean) / spread), 0.0);
+    }
+    if (mark < second) return short_of(v, expected, p[7]);
+    return mark < third ? (double)INFINITY : v * range_max;
+}
+
+// Return a reading drawn from a table: uniform in a bin that is drawn, away from its ends by a margin of the bin.
+double cell_reading_of(const double u, const double v, const int column, global const double *chances, const int cells,
+                       const double range_max, const double margin) {
+    global const double *row = chances + (long)column * (cells + 1);
+    const double mark = u * row[cells];
+    int low = 0, high = cells;
+    while (low < high) {
+        const int middle = (low + high) / 2;
+        if (row[middle] > mark) {
+            high = middle;
+        } else {
+            low = middle + 1;
+        }
+    }
+    if (low == cells) return (double)INFINITY;
+    return ((double)low + (margin + v * (1.0 - 2.0 * margin))) * (range_max / (double)cells);
+}
+
+// Replace expected ranges by readings; incidence holds cosines, and edges those between bins. One work-item takes a
+// particle and ray.
+kernel void draw_readings(global const real *incidence, global const double *mixture, global const real *edges,
+                          global const double *chances, global const double *settings, global real *ranges,
+                          const int particles, const int rays, const MixtureTables tables, const RangeScale scale) {
+    const int k = get_global_id(0), i = get_global_id(1);
+    if (k >= rays || i >= particles) return;
+    const long place = (long)i * rays + k, n = (long)settings[DRAW_FIRST] + i, each = (long)settings[DRAW_PER_SCAN];
+    const uint step = (uint)(n / each) + (uint)settings[DRAW_STEP];
+    const uint4 words = random_words((uint4)((uint)(n % each), step, READING_STREAM + (uint)k, 0),
+                                     (uint)settings[DRAW_SEED], (uint)settings[DRAW_SEED + 1]);
+    const double u = fine_uniform(words.x, words.y), v = fine_uniform(words.z, words.w);
+    const double limit = settings[DRAW_RANGE_MAX];
+#if SENSOR_TABLE
+    const int column = range_bin(ranges[place], tables.per_metre, tables.cells, scale.range_max);
+    const double drawn = cell_reading_of(u, v, column, chances, tables.cells, limit, settings[DRAW_MARGIN]);
+#else
+    int bins = 0;
+#if INCIDENCE
+    while (bins + 1 < tables.incidence_bins && incidence[place] <= edges[bins]) ++bins;
+#endif
+    const double drawn = reading_of(u, v, fmin((double)ranges[place], limit), mixture, bins, limit);
+#endif
+    if (isinf(drawn)) {
+        ranges[place] = scale.range_max;
+    } else {
+        ranges[place] = isnan(drawn) ? (real)NAN : (real)fmin(drawn, settings[DRAW_TOP]);
+    }
+}

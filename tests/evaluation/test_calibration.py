@@ -1,0 +1,56 @@
+"""Readings that a model draws have the density by which it scores them: ranks in posteriors are uniform."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.calibration import assert_uniform
+
+import gpusense as gs
+from gpusense.evaluation.calibration import posterior_ranks
+from gpusense.evaluation.calibration_scenes import MAKERS, make_scene
+
+RUNS = 300
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_readings_are_calibrated(name):
+    scene = make_scene(name)
+    assert_uniform(posterior_ranks(scene.poses, scene.draw, scene.score, RUNS))
+
+
+def test_every_model_of_a_density_has_a_scene():
+    models = {name for name in dir(gs) if name.endswith("Model") and hasattr(getattr(gs, name), "sample")}
+    assert models - {"LikelihoodFieldModel"} == {
+        "BeaconModel", "BeamModel", "BumperModel", "HeadingModel", "LandmarkModel", "PositionModel",
+    }  # fmt: skip
+    assert len(MAKERS) == 17
+
+
+WRONG = {
+    "heading": dict(sigma=1.2), "heading, von Mises": dict(kappa=0.8), "beacons, normal": dict(sigma_range=3.0),
+    "position fix": dict(covariance=((6.0, 3.6), (3.6, 12.0))),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_another_density_is_found(name):
+    # The test above can fail: readings of a sensor with other parameters are not calibrated.
+    scene = make_scene(name)
+    model = scene.draw.__self__
+    parameters = model.parameters.replace(**WRONG[name])
+    options = dict(xy=model.xy) if name.startswith("beacons") else {}
+    other = type(model)(parameters=parameters, backend="numpy", **options)
+    ranks = posterior_ranks(scene.poses, other.sample, scene.score, 4 * RUNS)
+    with pytest.raises(AssertionError, match="p = "):
+        assert_uniform(ranks)
+
+
+def test_ranks_of_a_known_posterior():
+    # Two poses and a reading that says nothing: ranks of one pose are uniform below one half, of the other above.
+    poses = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)])
+    ranks = posterior_ranks(poses, lambda at, seed: np.zeros(len(at)), lambda at, z: np.zeros(len(at)), 1000, seed=3)
+    assert_uniform(ranks)
+    # A reading that says all.
+    ranks = posterior_ranks(poses, lambda at, seed: at[:, 0], lambda at, z: -1e3 * np.abs(at[:, 0] - z), 1000, seed=3)
+    assert_uniform(ranks)

@@ -7,9 +7,10 @@ import functools
 import os
 import re
 import secrets
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO
 
 from gpusense._util import checks
 
@@ -61,6 +62,20 @@ def _fresh(path: Path) -> Iterator[BinaryIO]:
         raise FileNotFoundError(error.errno, error.strerror, str(path.parent)) from None
     finally:
         fresh.unlink(missing_ok=True)
+
+
+def unnamed_file() -> IO[bytes]:
+    """Open a temporary file without a name, in memory where no folder takes one.
+
+    Raises:
+        OSError: there is none.
+    """
+    try:
+        return tempfile.TemporaryFile()
+    except OSError:
+        if not hasattr(os, "memfd_create"):
+            raise
+        return os.fdopen(os.memfd_create("gpusense"), "w+b")
 
 
 @functools.cache

@@ -86,10 +86,11 @@ class Chain:
     def _present(self, entry: Entry) -> list[Device]:
         """Return the devices of a backend that may be chosen; note why one that is installed has none."""
         found, absent = listing.present(entry)
+        found = [device for device in found if device.kind != "simulator"]
         if not found and importlib.util.find_spec(entry.package) is not None:
             for part in absent:
                 self.failures.append(Failure("", part.reason, f"{part.name}: {part.reason}", True))
-        return [device for device in found if device.kind != "simulator"]
+        return found
 
 
 def best_of(candidates: list[Device], failures: list[Failure] | None = None) -> Device | None:
@@ -111,7 +112,7 @@ def best_of(candidates: list[Device], failures: list[Failure] | None = None) -> 
                     best, most = device, verdict.rate
             elif failures is not None:
                 candidates.remove(device)
-                reason = f"{verdict.reason}; {verdict.remedy}"
+                reason = proof.with_remedy(verdict.reason, verdict.remedy)
                 line = f"{_name_of(device)} is unusable: {reason}"
                 failures.append(Failure(device.selection, reason, line, not verdict.passing))
         if best is not None:

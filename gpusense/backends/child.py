@@ -15,9 +15,10 @@ import secrets
 import signal
 import subprocess
 import sys
-import tempfile
 from dataclasses import dataclass
 from typing import IO, Any
+
+from gpusense._util.files import unnamed_file
 
 # Seconds; a first compilation takes some three on a common processor.
 _LIMIT = 60.0
@@ -116,7 +117,7 @@ def run_text(arguments: list[str], job: dict[str, Any], variables: dict[str, str
     limit, token = time_limit(), secrets.token_hex(16)
     with contextlib.ExitStack() as stack:
         try:
-            out, errors = (stack.enter_context(_output()) for _ in range(2))
+            out, errors = (stack.enter_context(unnamed_file()) for _ in range(2))
             process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=out, stderr=errors, env=environment, start_new_session=True
             )
@@ -140,20 +141,6 @@ def run_text(arguments: list[str], job: dict[str, Any], variables: dict[str, str
             return Outcome(said, f"hangs: no answer in {limit:g} s")
         failure = _describe(code, _last_words(errors))
         return Outcome(said, failure, conclusive=-code not in _FOREIGN and not PASSING.search(failure))
-
-
-def _output() -> IO[bytes]:
-    """Return a file without a name for the output of a child, in memory where no folder takes one.
-
-    Raises:
-        OSError: there is none.
-    """
-    try:
-        return tempfile.TemporaryFile()
-    except OSError:
-        if not hasattr(os, "memfd_create"):
-            raise
-        return os.fdopen(os.memfd_create("gpusense-child"), "w+b")
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

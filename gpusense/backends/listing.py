@@ -130,7 +130,8 @@ def _absence(entry: Entry, *, anew: bool = False) -> tuple[Library | None, list[
         library.renew()
     listed, failure = _listed(library)
     if failure:
-        return library, [_absent(entry, f"{entry.name} (no device)", "cpu", failure)]
+        reason = f"the devices of {entry.package} cannot be listed: {failure}"
+        return library, [_absent(entry, f"{entry.name} (no device)", "cpu", reason)]
     absent = [_absent(entry, *part) for part in library.absent()]
     if not absent and not listed:
         reason = library.no_device(registry.remedy(entry))
@@ -144,7 +145,7 @@ def _listed(library: Library) -> tuple[list[tuple[BackendInfo, Any]], str]:
         return library.list_devices(), ""
     except Exception as error:
         # A library's own errors have any class.
-        return [], f"its devices cannot be listed: {one_line(error)}"
+        return [], one_line(error)
 
 
 def one_line(error: BaseException) -> str:
@@ -160,7 +161,7 @@ def _absent(entry: Entry, name: str, kind: str, reason: str) -> Device:
 def _device(info: BackendInfo, library: Library, verdict: Verdict | None = None) -> Device:
     """Return a device as users see it; without a verdict it is taken to be available."""
     verdict = proof.trust(info) if verdict is None else verdict
-    reason = f"{verdict.reason}; {verdict.remedy}" if verdict.reason else ""
+    reason = proof.with_remedy(verdict.reason, verdict.remedy)
     kind = "simulator" if library.is_simulator(info) else info.kind
     driver = info.driver if BY_NAME[info.backend].compiles else ""
     return Device(

@@ -30,6 +30,8 @@ _PROVE = "gpusense.evaluation.proof:prove"
 _LOG = logging.getLogger("gpusense")
 # Remedies by the words of a failure.
 _REMEDIES = (
+    # These say themselves what helps.
+    (r"compiled kernels need a folder|PoCL was used before", ""),
     (
         r'"ld" doesn\'t exist|linker command failed',
         "install the linker ld (on Debian: apt-get install binutils), then run 'gpusense devices --prove'",
@@ -117,8 +119,13 @@ def name_of(info: BackendInfo) -> str:
 def summary(info: BackendInfo, verdict: Verdict) -> str:
     """Return the failures of a device and their consequence, in one line."""
     if not verdict.usable:
-        return f"{name_of(info)} is unusable: {verdict.reason}; {verdict.remedy}"
-    return f"{name_of(info)}: {verdict.reason}, and so these are not used; {verdict.remedy}"
+        return f"{name_of(info)} is unusable: {with_remedy(verdict.reason, verdict.remedy)}"
+    return f"{name_of(info)}: {with_remedy(f'{verdict.reason}, and so these are not used', verdict.remedy)}"
+
+
+def with_remedy(reason: str, remedy: str) -> str:
+    """Return a failure and its remedy, where there is one, in one line."""
+    return f"{reason}; {remedy}" if remedy else reason
 
 
 def apply(info: BackendInfo, verdict: Verdict) -> BackendInfo:

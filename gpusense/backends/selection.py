@@ -232,10 +232,10 @@ def _find(selection: str) -> str:
     present, absent = listing.present(entry)
     if not present:
         raise ValueError(f"backend: {absent[0].reason}, got {show(selection)}")
-    return _choose(entry, rest, present, selection)
+    return _choose(entry, rest, present, absent, selection)
 
 
-def _choose(entry: Entry, rest: str, present: list[Device], selection: str) -> str:
+def _choose(entry: Entry, rest: str, present: list[Device], absent: list[Device], selection: str) -> str:
     """Return the device of a backend that a user's selection means; ``rest`` is what follows the backend's name."""
     for device in present:
         if device.selection == selection:
@@ -243,7 +243,8 @@ def _choose(entry: Entry, rest: str, present: list[Device], selection: str) -> s
     if not rest:
         real = [device for device in present if device.kind != "simulator"]
         if not real:
-            raise ValueError(f"backend: only simulators are present and must be named, got {show(selection)}")
+            others = "".join(f"; {part.name}: {part.reason}" for part in absent)
+            raise ValueError(f"backend: only simulators are present and must be named, got {show(selection)}{others}")
         # Where none is usable, opening the first one says why.
         return (best_of(real) or real[0]).selection
     if entry.by_name:

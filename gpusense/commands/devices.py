@@ -85,9 +85,13 @@ def _status(device: Device) -> str:
 
 def _auto() -> tuple[str | None, str | None]:
     """Return the selection of 'auto', or the error of opening it; this command reports it instead of failing."""
-    from gpusense.backends import get_backend
+    from gpusense.backends import get_backend, notices
 
     try:
-        return get_backend("auto").info.selection, None
+        with notices.held() as lines:
+            backend = get_backend("auto")
+            # The table says which devices failed, and why.
+            lines.clear()
+        return backend.info.selection, None
     except Exception as error:
         return None, f"{type(error).__name__}: {error}"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import logging
 import sqlite3
 import sys
 import threading
@@ -15,8 +16,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import pyopencl as cl
-
-from gpusense.backends import notices
 
 # Whether pyopencl's caches are off; once it is imported it has no other switch.
 _SWITCH = "_PYOPENCL_NO_CACHE"
@@ -33,7 +32,8 @@ def _open_database() -> None:
         importlib.import_module("pyopencl.invoker")
     except (ImportError, OSError, sqlite3.Error) as error:
         setattr(cl, _SWITCH, True)
-        notices.warn(f"pyopencl's cache cannot be used and is left out: {error}")
+        # Programs of gpusense are never kept there.
+        logging.getLogger("gpusense").info("gpusense: pyopencl's cache cannot be used and is left out: %s", error)
         error.__traceback__ = None
     finally:
         sys.unraisablehook = hook

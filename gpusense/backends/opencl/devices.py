@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pyopencl as cl
 
 from gpusense.backends.info import BackendInfo
@@ -33,13 +35,21 @@ def _devices_of(platform: cl.Platform) -> list[cl.Device]:
         return []
 
 
-def hides_pocl() -> bool:
-    """Return whether PoCL is loaded and offers no device."""
+def silence_of_pocl() -> str:
+    """Return why PoCL, which is loaded, offers no device, with the remedy; empty where it offers one or is absent."""
     try:
         platforms = drivers.platforms()
     except RuntimeError:
-        return False
-    return any(pocl.NAME in platform.name and not _devices_of(platform) for platform in platforms)
+        return ""
+    if not any(pocl.NAME in platform.name and not _devices_of(platform) for platform in platforms):
+        return ""
+    if chosen := os.environ.get("POCL_DEVICES"):
+        return f"PoCL offers no device with POCL_DEVICES={chosen}: unset this variable"
+    try:
+        pocl_kernels.pocl_kernels()
+    except OSError as error:
+        return str(error)
+    return "PoCL offers no device: set POCL_DEBUG=all to see why"
 
 
 def _describe(selection: str, device: cl.Device) -> BackendInfo:

@@ -12,7 +12,7 @@ from gpusense.backends.info import BackendInfo
 from gpusense.backends.opencl import devices, drivers
 from gpusense.backends.opencl.arrays import check_in_order
 from gpusense.backends.opencl.backend import OpenCLBackend
-from gpusense.backends.proof import remedy_for
+from gpusense.backends.proof import remedy_for, with_remedy
 from gpusense.backends.registry import Absent, Library
 
 # Variables that hide drivers and devices.
@@ -35,9 +35,8 @@ class OpenCLLibrary(Library):
     def absent(self) -> list[Absent]:
         """See Library.absent."""
         failed = devices.absent_drivers()
-        absent = [Absent(name, "cpu", f"it {failure}; {remedy_for(failure)}") for name, failure in failed]
-        if (chosen := os.environ.get("POCL_DEVICES")) and devices.hides_pocl():
-            reason = f"PoCL offers no device with POCL_DEVICES={chosen}: unset this variable"
+        absent = [Absent(name, "cpu", f"it {with_remedy(failure, remedy_for(failure))}") for name, failure in failed]
+        if reason := devices.silence_of_pocl():
             absent.append(Absent("PoCL (no device)", "cpu", reason))
         return absent
 

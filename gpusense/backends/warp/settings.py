@@ -6,7 +6,6 @@ import contextlib
 import functools
 import logging
 import os
-import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,8 +13,8 @@ from typing import Any
 
 import warp as wp
 
+from gpusense._util.files import unnamed_file
 from gpusense._version import __version__
-from gpusense.backends import notices
 from gpusense.backends.cache import load_entry, store_entry
 from gpusense.backends.packing import pack, unpack, write_files
 from gpusense.backends.processor import fingerprint
@@ -38,7 +37,8 @@ def initialize() -> None:
             wp.init()
         except OSError as error:
             folder = _folder()
-            notices.warn(f"Warp keeps its kernels in {folder}, as its own folder cannot be made: {error}")
+            # Kernels of gpusense are never kept there.
+            _LOG.info("gpusense: Warp's own folder of kernels is %s, as it cannot be made: %s", folder, error)
             wp.config.kernel_cache_dir = str(folder)
             wp.init()
 
@@ -121,7 +121,7 @@ def _filtered_stderr() -> Iterator[None]:
     """Filter the standard error of native code: the line on the absence of a CUDA driver is dropped."""
     with contextlib.ExitStack() as stack:
         try:
-            output = stack.enter_context(tempfile.TemporaryFile())
+            output = stack.enter_context(unnamed_file())
             saved = os.dup(2)
         except OSError:
             yield

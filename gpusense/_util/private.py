@@ -58,11 +58,11 @@ def check_private(folder: Path) -> None:
     if status.st_mode & _OTHERS_WRITE:
         mode = stat.S_IMODE(status.st_mode)
         raise UnsafeFolderError(f"{folder} must be writable by its owner only (mode 0700), got mode {mode:04o}")
-    for parent in folder.parents:
-        _check_parent(parent)
+    for child, parent in zip((folder, *folder.parents), folder.parents, strict=False):
+        _check_parent(parent, child.name)
 
 
-def _check_parent(folder: Path) -> None:
+def _check_parent(folder: Path, child: str) -> None:
     """Check that only this user and root can rename what other users do not own in a folder.
 
     Raises:
@@ -71,13 +71,13 @@ def _check_parent(folder: Path) -> None:
     status = os.stat(folder)
     if not _is_trusted(status.st_uid):
         owner = f"this user ({os.geteuid()}) or root, got owner {status.st_uid}"
-        raise UnsafeFolderError(f"{folder}, in which it lies, must be owned by {owner}")
+        raise UnsafeFolderError(f"{folder}, which holds {child}, must be owned by {owner}")
     if not status.st_mode & _OTHERS_WRITE or status.st_mode & stat.S_ISVTX:
         return
     if status.st_mode & stat.S_IWOTH or not _is_group_of_one(status.st_gid):
         mode = stat.S_IMODE(status.st_mode)
         raise UnsafeFolderError(
-            f"{folder}, in which it lies, must not be writable by others unless it is sticky, got mode {mode:04o}"
+            f"{folder}, which holds {child}, must not be writable by others unless it is sticky, got mode {mode:04o}"
         )
 
 

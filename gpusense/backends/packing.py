@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import struct
 import tempfile
 import zipfile
 import zlib
@@ -11,6 +12,10 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 # Of the files of one entry, in all.
 _MOST_BYTES = 256 << 20
+
+
+class RefusedError(ValueError):
+    """Packed files that are whole and not wanted."""
 
 
 def pack(files: dict[str, bytes]) -> bytes:
@@ -33,9 +38,11 @@ def unpack(payload: bytes) -> dict[str, bytes]:
         with zipfile.ZipFile(io.BytesIO(payload)) as archive:
             for name in archive.namelist():
                 if not _is_below(name):
-                    raise ValueError(f"entry: must hold paths below its folder, got {name!r}")
+                    raise RefusedError(f"entry: must hold paths below its folder, got {name!r}")
             return _read_all(archive)
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+    except RefusedError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, RuntimeError, ValueError) as error:
         raise ValueError(f"entry: must hold packed files, got other contents ({error})") from None
 
 
@@ -49,7 +56,7 @@ def _read_all(archive: zipfile.ZipFile) -> dict[str, bytes]:
     """Return all files of an archive, whatever sizes it claims.
 
     Raises:
-        ValueError: they are too large.
+        RefusedError: they are too large.
     """
     files, left = {}, _MOST_BYTES
     for name in archive.namelist():
@@ -57,7 +64,7 @@ def _read_all(archive: zipfile.ZipFile) -> dict[str, bytes]:
             files[name] = file.read(left + 1)
         left -= len(files[name])
         if left < 0:
-            raise ValueError(f"entry: must hold at most {_MOST_BYTES} bytes of files, got more")
+            raise RefusedError(f"entry: must hold at most {_MOST_BYTES} bytes of files, got more")
     return files
 
 

@@ -9,7 +9,7 @@ import pytest
 
 import gpusense as gs
 from gpusense import backends
-from gpusense.backends import get_backend, listing, registry, selection
+from gpusense.backends import chain, get_backend, listing, registry, selection
 from gpusense.backends.proof import Verdict
 
 
@@ -23,7 +23,12 @@ def use_devices(monkeypatch, listed: list[backends.Device], verdicts: dict[str, 
     rows = [*listed, backends.Device("numpy", "NumPy reference", "cpu", True, "", "numpy")]
     monkeypatch.setattr(listing, "present", lambda entry: ([d for d in rows if d.backend == entry.name], []))
     proved = Verdict(True, 1, True, rate=100.0)
-    monkeypatch.setattr(selection, "_verdict_of", lambda device: (verdicts or {}).get(device.selection, proved))
+    monkeypatch.setattr(chain, "_verdict_of", lambda device: (verdicts or {}).get(device.selection, proved))
+
+
+def fastest() -> str:
+    """Return the device that ``"auto"`` would open first."""
+    return next(iter(chain.Chain())).selection
 
 
 def test_devices_name_what_is_present_and_what_is_absent():
@@ -41,6 +46,9 @@ def test_an_absent_library_is_listed_with_its_remedy(monkeypatch):
         "load",
         lambda entry: load(entry) if entry.name == "numpy" else (None, f"py{entry.name} is not installed"),
     )
+    monkeypatch.setattr(registry, "_is_installed", lambda name: False)
+    monkeypatch.setattr(registry, "_has_wheel", lambda name: True)
+    monkeypatch.setattr(selection, "_looks", ((), {}))
     by_backend = {device.backend: device for device in gs.devices()}
     assert by_backend["opencl"].reason == "pyopencl is not installed: pip install pyopencl pocl-binary-distribution"
     assert by_backend["warp"].reason == "pywarp is not installed: pip install warp-lang"
@@ -48,6 +56,25 @@ def test_an_absent_library_is_listed_with_its_remedy(monkeypatch):
     with pytest.raises(ValueError, match="backend: pyopencl is not installed: pip install"):
         get_backend("opencl")
     assert get_backend("auto").info.backend == "numpy"
+
+
+def test_a_remedy_installs_what_is_absent(monkeypatch):
+    """A package that is installed and does not load is installed again; PoCL's wheel is for one kind of machine."""
+    entry, installed = registry.BY_NAME["opencl"], {"pyopencl"}
+    monkeypatch.setattr(registry, "_is_installed", installed.__contains__)
+    monkeypatch.setattr(registry, "_has_wheel", lambda name: True)
+    monkeypatch.setattr(registry, "load", lambda entry: (None, "pyopencl does not load (no library)"))
+    assert registry.remedy(entry) == "pip install pocl-binary-distribution"
+    installed.add("pocl-binary-distribution")
+    (absent,) = listing.present(entry)[1]
+    assert absent.reason == "pyopencl does not load (no library): pip install --force-reinstall pyopencl"
+    installed.discard("pocl-binary-distribution")
+    monkeypatch.undo()
+    monkeypatch.setattr(registry, "_is_installed", {"pyopencl"}.__contains__)
+    for system, machine, remedy in (("win32", "AMD64", ""), ("linux", "x86_64", "pip install pocl-binary-distribution")):
+        monkeypatch.setattr(registry.sys, "platform", system)
+        monkeypatch.setattr(registry.platform, "machine", lambda machine=machine: machine)
+        assert registry.remedy(entry) == remedy
 
 
 @pytest.mark.parametrize(
@@ -61,7 +88,7 @@ def test_an_absent_library_is_listed_with_its_remedy(monkeypatch):
 )
 def test_auto_takes_the_fastest_class_and_never_a_simulator(monkeypatch, present, chosen):
     use_devices(monkeypatch, fake_devices(*present))
-    assert selection._find("auto") == chosen
+    assert fastest() == chosen
 
 
 def test_a_backend_name_alone_prefers_a_gpu_and_refuses_simulators(monkeypatch):
@@ -96,20 +123,20 @@ def test_of_one_class_the_faster_device_is_taken_if_it_is_noticeably_so(monkeypa
     ):
         verdicts = {d.selection: Verdict(True, 1, True, rate=rate) for d, rate in zip(rows, rates, strict=True)}
         use_devices(monkeypatch, rows, verdicts)
-        assert selection._find("auto") == selection._find("opencl") == chosen
+        assert fastest() == selection._find("opencl") == chosen
 
 
 def test_an_unusable_device_is_passed_over_unless_it_is_named(monkeypatch):
     rows = fake_devices(("opencl", "GPU", "gpu"), ("opencl", "CPU", "cpu"), ("warp", "CPU", "cpu"))
     bad = Verdict(False, 1, False, "scalar kernels hang", "update the driver")
     use_devices(monkeypatch, rows, {"opencl:0:0": bad})
-    assert selection._find("auto") == selection._find("opencl") == "opencl:1:0"
+    assert fastest() == selection._find("opencl") == "opencl:1:0"
     assert selection._find("opencl:0:0") == selection._find("opencl:GPU") == "opencl:0:0"
     use_devices(monkeypatch, rows, {"opencl:0:0": bad, "opencl:1:0": bad})
-    assert selection._find("auto") == "warp:2:0"
+    assert fastest() == "warp:2:0"
     assert selection._find("opencl") == "opencl:0:0"
     use_devices(monkeypatch, rows, dict.fromkeys(("opencl:0:0", "opencl:1:0", "warp:2:0"), bad))
-    assert selection._find("auto") == "numpy"
+    assert fastest() == "numpy"
 
 
 def test_opening_an_unusable_device_says_why(monkeypatch, needs):
@@ -117,7 +144,7 @@ def test_opening_an_unusable_device_says_why(monkeypatch, needs):
     name = next(d.selection for d in gs.devices() if d.backend == "opencl" and d.kind != "simulator")
     bad = Verdict(False, 1, False, "scalar kernels hang: no answer in 60 s", "update the driver")
     monkeypatch.setattr(listing, "verdict_on", lambda *a, **k: bad)
-    selection._open.cache_clear()
+    selection.forget()
     try:
         with pytest.raises(
             ValueError, match=r"^backend: .* is unusable: scalar kernels hang.*; update the driver, got"
@@ -126,15 +153,15 @@ def test_opening_an_unusable_device_says_why(monkeypatch, needs):
         (listed,) = [device for device in gs.devices() if device.selection == name]
         assert not listed.available and listed.reason == "scalar kernels hang: no answer in 60 s; update the driver"
     finally:
-        selection._open.cache_clear()
+        selection.forget()
 
 
 def test_a_gpu_of_opencl_is_taken_without_loading_warp(monkeypatch):
     asked = []
     rows = {"opencl": fake_devices(("opencl", "GPU", "gpu")), "warp": fake_devices(("warp", "GPU", "gpu"))}
     monkeypatch.setattr(listing, "present", lambda entry: (asked.append(entry.name) or rows[entry.name], []))
-    monkeypatch.setattr(selection, "_verdict_of", lambda device: Verdict(True, 1, True))
-    assert selection._find("auto") == "opencl:0:0"
+    monkeypatch.setattr(chain, "_verdict_of", lambda device: Verdict(True, 1, True))
+    assert fastest() == "opencl:0:0"
     assert asked == ["opencl"]
 
 

@@ -1,53 +1,48 @@
-"""The cache on disk, the folder of a process, and runs whose caches are damaged, locked, full or shared."""
+"""The entries of the cache: what is kept, what is no entry, and what is deleted."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import errno
+import hashlib
 import os
-import random
-import shutil
 import signal
 import stat
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
-from support import fake_driver
+from support.cache_folders import BLOCKED, blocked, contents, entries_in
 
-from gpusense.backends import BackendInfo, cache, scratch
-from gpusense.backends.cache import ProgramCache, load_entry, pack, store_entry, unpack, write_files
+from gpusense.backends import BackendInfo, cache, folders, packing
+from gpusense.backends.cache import ProgramCache, discard_entry, load_entry, store_entry
+from gpusense.backends.packing import pack, unpack, write_files
+
+INFO = BackendInfo("opencl:0:0", "opencl", "Some device", "gpu", "Driver 1", 1 << 30, 1 << 28, True)
+needs_fifo = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no FIFOs")
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """Use a cache folder of this test alone."""
-    monkeypatch.setenv("GPUSENSE_CACHE_DIR", str(tmp_path / "cache"))
-    (tmp_path / "elsewhere").mkdir()
-    monkeypatch.setattr(cache.tempfile, "tempdir", str(tmp_path / "elsewhere"))
-    monkeypatch.delenv("GPUSENSE_CACHE", raising=False)
-    return tmp_path / "cache"
+def alarm():
+    """End a test that waits for a FIFO."""
+    before = signal.signal(signal.SIGALRM, lambda *_: pytest.fail("the test waits"))
+    signal.alarm(20)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
 
 
-INFO = BackendInfo("opencl:0:0", "opencl", "Some device", "gpu", "Driver 1", 1 << 30, 1 << 28, True)
-
-
-def test_a_program_is_kept_and_found_again(folder):
+def test_a_program_is_kept_and_found_again(place):
     programs = ProgramCache(INFO)
     assert programs.load("source", ["-a"]) is None
     programs.store("source", ["-a"], b"binary")
     assert programs.load("source", ["-a"]) == b"binary"
-    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-    assert [path.suffix for path in folder.iterdir()] == [".bin"]
+    assert [path.name for path in place.iterdir()] == [folders.OWN]
+    assert stat.S_IMODE((place / folders.OWN).stat().st_mode) == 0o700
+    assert sorted(path.suffix for path in (place / folders.OWN).iterdir()) == [".TAG", ".gpusense"]
 
 
 @pytest.mark.parametrize("other", ["source", "options", "driver", "device", "processor"])
-def test_entries_are_keyed_by_device_driver_options_and_source(folder, monkeypatch, other):
+def test_entries_are_keyed_by_device_driver_options_and_source(place, monkeypatch, other):
     base = dataclasses.replace(INFO, kind="cpu") if other == "processor" else INFO
     ProgramCache(base).store("source", ["-a"], b"binary")
     if other == "processor":
@@ -60,59 +55,177 @@ def test_entries_are_keyed_by_device_driver_options_and_source(folder, monkeypat
     assert ProgramCache(info).load(source, ["-b" if other == "options" else "-a"]) is None
 
 
-@pytest.mark.parametrize("damage", [b"", b"short", b"gpusense entry 2\n" + bytes(32) + b"binary"])
-def test_a_damaged_entry_is_dropped(folder, damage):
+@pytest.mark.parametrize("damage", [b"", b"short", b"gpusense entry 3\n" + bytes(64) + b"binary"])
+def test_a_damaged_entry_is_none_and_is_written_again(place, damage):
     programs = ProgramCache(INFO)
     programs.store("source", [], b"binary")
-    (entry,) = folder.iterdir()
+    (entry,) = entries_in(place)
     entry.write_bytes(damage)
     assert programs.load("source", []) is None
-    assert not entry.exists()
+    programs.store("source", [], b"binary")
+    assert programs.load("source", []) == b"binary" and entries_in(place) == [entry]
 
 
-def test_the_cache_is_bounded_and_drops_the_oldest(folder, monkeypatch):
+def test_two_entries_that_were_exchanged_are_none(place):
+    """Each is whole, and was written by gpusense."""
+    store_entry("first", b"one")
+    store_entry("second", b"two")
+    first, second = (place / folders.OWN / cache._file(key) for key in ("first", "second"))
+    first.rename(place / "away")
+    second.rename(first)
+    (place / "away").rename(second)
+    assert load_entry("first") is load_entry("second") is None
+
+
+def test_every_byte_of_an_entry_counts(place):
+    store_entry("key", b"payload")
+    (entry,) = entries_in(place)
+    data = entry.read_bytes()
+    for number in range(len(data)):
+        changed = bytearray(data)
+        changed[number] ^= 1 << number % 8
+        entry.write_bytes(changed)
+        assert load_entry("key") is None, number
+    entry.write_bytes(data + b"\0")
+    assert load_entry("key") is None
+    entry.write_bytes(data)
+    assert load_entry("key") == b"payload"
+
+
+def make_fifo(path: Path, tmp_path: Path) -> None:
+    os.mkfifo(path)
+
+
+def make_device(path: Path, tmp_path: Path) -> None:
+    try:
+        # Reads without end.
+        os.mknod(path, 0o666 | stat.S_IFCHR, os.makedev(1, 5))
+    except OSError:
+        pytest.skip("this user cannot make a device")
+
+
+def make_link(path: Path, tmp_path: Path) -> None:
+    """Make a link to a whole entry of that key."""
+    data = cache._head(cache._digest("key"), b"payload") + b"payload"
+    (tmp_path / "target").write_bytes(data)
+    path.symlink_to(tmp_path / "target")
+
+
+def make_folder(path: Path, tmp_path: Path) -> None:
+    path.mkdir()
+
+
+@needs_fifo
+@pytest.mark.parametrize("make", [make_fifo, make_device, make_link, make_folder])
+def test_what_is_no_regular_file_is_no_entry_and_stays(place, tmp_path, caplog, alarm, make):
+    store_entry("other", b"other")
+    path = place / folders.OWN / cache._file("key")
+    make(path, tmp_path)
+    before = contents(place)[f"{folders.OWN}/{path.name}"]
+    assert load_entry("key") is None
+    discard_entry("key")
+    store_entry("key", b"new")
+    # The folder among temporary files has it now.
+    assert load_entry("key") == b"new" and contents(place)[f"{folders.OWN}/{path.name}"] == before
+    (message,) = caplog.messages
+    assert f"the cache folder {place} cannot be written: " in message and "is no regular file" in message
+
+
+def test_a_large_file_in_the_place_of_an_entry_is_not_read(place, monkeypatch):
+    store_entry("key", b"payload")
+    (entry,) = entries_in(place)
+    os.truncate(entry, cache.MAX_ENTRY_BYTES + 1)
+    monkeypatch.setattr(os, "fdopen", lambda *_: pytest.fail("it is opened"))
+    assert load_entry("key") is None
+
+
+def test_an_entry_that_is_too_large_is_not_kept(place, monkeypatch):
+    monkeypatch.setattr(cache, "MAX_ENTRY_BYTES", 200)
+    for size in (200, 100):
+        store_entry("key", bytes(size))
+    assert load_entry("key") == bytes(100)
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root can give files away")
+def test_an_entry_of_another_user_is_none(place):
+    store_entry("key", b"payload")
+    (entry,) = entries_in(place)
+    os.chown(entry, 65534, -1)
+    assert load_entry("key") is None
+    discard_entry("key")
+    assert entry.exists()
+
+
+def test_the_cache_is_bounded_and_evicts_the_oldest(place, monkeypatch):
     monkeypatch.setattr(cache, "MAX_ENTRIES", 3)
     programs = ProgramCache(INFO)
     for number in range(5):
         programs.store(f"source {number}", [], b"binary")
-        for entry in folder.iterdir():
+        for entry in entries_in(place):
             os.utime(entry, (entry.stat().st_atime, entry.stat().st_mtime - 10))
     assert [programs.load(f"source {number}", []) for number in range(5)] == [None, None, *[b"binary"] * 3]
-    monkeypatch.setattr(cache, "MAX_BYTES", 100)
+    monkeypatch.setattr(cache, "MAX_BYTES", 200)
     programs.store("large", [], bytes(60))
-    assert sum(entry.stat().st_size for entry in folder.iterdir()) <= 100 + 60
+    assert len(entries_in(place)) == 1
 
 
-def test_the_cache_can_be_switched_off(folder, monkeypatch):
+def foreign_files(folder: Path) -> list[Path]:
+    """Make files that a cache did not write: other names, an entry's name without its head, another key's head."""
+    name = hashlib.sha256(b"x").hexdigest()
+    head = cache._head(cache._digest("key"), b"payload") + b"payload"
+    texts = {
+        "notes.txt": b"mine", "notes.tmp": b"mine", "a.bin": head, "data.gpusense": head, f"{name}.bin": head,
+        f"{name}.gpusense": b"mine", f"{hashlib.sha256(b'y').hexdigest()}.gpusense": head,
+        f"{name}-abcdefgh.new": b"mine", f"{name}-abc.new": b"", "gpusense entry.new": b"",
+    }  # fmt: skip
+    for other, text in texts.items():
+        (folder / other).write_bytes(text)
+        os.utime(folder / other, (time.time() - 1e6,) * 2)
+    (folder / f"{hashlib.sha256(b'z').hexdigest()}.gpusense").mkdir()
+    return sorted(path for path in folder.iterdir() if path.name != folders.MARKER)
+
+
+def test_only_entries_are_evicted(place, monkeypatch):
+    """Files that gpusense did not write stay, even in its own folder, whatever their names and age."""
+    folders.own_folder(place)
+    foreign = foreign_files(place / folders.OWN)
+    monkeypatch.setattr(cache, "MAX_ENTRIES", 1)
+    for number in range(4):
+        store_entry(f"entry {number}", b"payload")
+        for path in entries_in(place):
+            os.utime(path, (path.stat().st_mtime - 10,) * 2)
+    left = sorted(path for path in (place / folders.OWN).iterdir() if path.name != folders.MARKER)
+    assert set(foreign) <= set(left) and len(left) <= len(foreign) + 1
+
+
+def test_unfinished_files_of_killed_processes_are_removed(place):
+    store_entry("first", b"payload")
+    names = [hashlib.sha256(text).hexdigest() for text in (b"1", b"2", b"3", b"4")]
+    heads = [cache._head(bytes.fromhex(name), b"payload") for name in names]
+    begun = [b"", heads[1][:20], heads[2] + b"pay", heads[3] + b"pay"]
+    for turn, (name, text) in enumerate(zip(names, begun, strict=True)):
+        path = place / folders.OWN / f"{name}-abcd_123.new"
+        path.write_bytes(text)
+        os.utime(path, (time.time() - (7200 if turn < 3 else 0),) * 2)
+    store_entry("second", b"payload")
+    assert [path.name[:64] for path in (place / folders.OWN).glob("*.new")] == [names[3]]
+
+
+def test_the_cache_can_be_switched_off(place, monkeypatch):
     monkeypatch.setenv("GPUSENSE_CACHE", "off")
     ProgramCache(INFO).store("source", [], b"binary")
-    assert not folder.exists()
+    assert not place.exists()
     assert ProgramCache(INFO).load("source", []) is None
 
 
-@pytest.fixture
-def temporary(tmp_path, monkeypatch):
-    """Use a folder of temporary files of this test alone, with no failure reported before."""
-    (tmp_path / "tmp").mkdir()
-    monkeypatch.setattr(cache.tempfile, "tempdir", str(tmp_path / "tmp"))
-    monkeypatch.setattr(cache, "_reported", set())
-    cache._takes_files.cache_clear()
-    return tmp_path / "tmp"
+def test_a_folder_that_is_removed_meanwhile_is_made_again(place):
+    import shutil
 
-
-def blocked(tmp_path: Path, how: str) -> Path:
-    """Return a cache folder that no user can make or write."""
-    if how == "a file in its place":
-        (tmp_path / "file").write_text("not a folder")
-        return tmp_path / "file"
-    if how == "a file above it":
-        (tmp_path / "file").write_text("not a folder")
-        return tmp_path / "file" / "cache"
-    # Not even root writes there.
-    return Path("/proc/gpusense")
-
-
-BLOCKED = ["a file in its place", "a file above it", "a read-only system"]
+    store_entry("key", b"payload")
+    shutil.rmtree(place)
+    assert load_entry("key") is None
+    store_entry("key", b"payload")
+    assert load_entry("key") == b"payload"
 
 
 @pytest.mark.parametrize("how", BLOCKED)
@@ -127,24 +240,10 @@ def test_a_private_temporary_folder_takes_the_place_of_one_that_cannot_be_writte
         store_entry(f"key {number}", b"payload")
     assert [load_entry(f"key {number}") for number in range(3)] == [b"payload"] * 3
     (folder,) = temporary.iterdir()
-    assert stat.S_IMODE(folder.stat().st_mode) == 0o700 and len(list(folder.iterdir())) == 3
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700 and len(entries_in(folder)) == 3
     (message,) = caplog.messages
     assert message.startswith(f"gpusense: the cache folder {place} cannot be written: ")
-
-
-@pytest.mark.parametrize("how", ["others may write", "a link"])
-def test_a_temporary_folder_of_another_user_is_not_used(tmp_path, temporary, monkeypatch, how):
-    name = temporary / f"gpusense-{os.getuid()}"
-    if how == "a link":
-        (tmp_path / "elsewhere").mkdir()
-        name.symlink_to(tmp_path / "elsewhere")
-    else:
-        name.mkdir()
-        name.chmod(0o777)
-    monkeypatch.setenv("GPUSENSE_CACHE_DIR", str(blocked(tmp_path, "a file in its place")))
-    assert cache.temporary_folder() is None
-    store_entry("key", b"payload")
-    assert load_entry("key") is None
+    assert message.endswith("(the folder comes from GPUSENSE_CACHE_DIR)")
 
 
 def test_without_a_home_the_cache_is_temporary(temporary, monkeypatch):
@@ -157,16 +256,10 @@ def test_without_a_home_the_cache_is_temporary(temporary, monkeypatch):
     monkeypatch.setattr(Path, "home", no_home)
     store_entry("key", b"payload")
     assert load_entry("key") == b"payload"
-    assert len(list(temporary.rglob("*.bin"))) == 1
+    assert len(list(temporary.rglob("*.gpusense"))) == 1
 
 
-def test_unfinished_files_of_killed_processes_are_removed(folder):
-    store_entry("first", b"payload")
-    for name, age in (("old.tmp", 7200), ("new.tmp", 0)):
-        (folder / name).write_bytes(b"half")
-        os.utime(folder / name, (time.time() - age,) * 2)
-    store_entry("second", b"payload")
-    assert sorted(path.name for path in folder.glob("*.tmp")) == ["new.tmp"]
+# ---- packed files
 
 
 def test_files_are_packed_and_unpacked(tmp_path):
@@ -177,264 +270,24 @@ def test_files_are_packed_and_unpacked(tmp_path):
     assert {p.relative_to(tmp_path).as_posix(): p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == files
 
 
-@pytest.mark.parametrize("name", ["../out", "/etc/passwd", "a/../../out"])
+@pytest.mark.parametrize("name", ["../out", "/etc/passwd", "a/../../out", "C:/out", "..\\out", "\\\\host\\out"])
 def test_packed_files_stay_below_their_folder(name):
     with pytest.raises(ValueError, match="must hold paths below its folder"):
         unpack(pack({name: b""}))
+
+
+def test_other_contents_are_no_packed_files(monkeypatch):
+    """Each byte of packed files is changed, and the sizes that they claim are not believed."""
     with pytest.raises(ValueError, match="must hold packed files"):
         unpack(b"something else")
-
-
-# ---- the folder of a process
-
-
-@pytest.fixture
-def made(folder, monkeypatch):
-    """Return a function that makes this process's folder anew; remove all of them in the end."""
-    folders: list[Path] = []
-
-    def make() -> Path:
-        folders.append(scratch.scratch_folder.__wrapped__())
-        return folders[-1]
-
-    yield make
-    for path in folders:
-        shutil.rmtree(path, ignore_errors=True)
-
-
-def test_a_process_has_a_folder_in_the_cache(folder, made):
-    path = made()
-    assert path.parent == folder and stat.S_IMODE(path.stat().st_mode) == 0o700
-    assert [entry.name for entry in path.iterdir()] == ["lock"]
-
-
-def test_a_folder_without_room_or_code_is_passed_over(folder, made, temporary, monkeypatch):
-    real, full = os.posix_fallocate, {str(folder)}
-
-    def fallocate(handle, begin, size):
-        if any(os.readlink(f"/proc/self/fd/{handle}").startswith(name) for name in full):
-            raise OSError(errno.ENOSPC, "No space left on device")
-        real(handle, begin, size)
-
-    monkeypatch.setattr(os, "posix_fallocate", fallocate)
-    assert made().is_relative_to(temporary)
-    assert not list(folder.glob("run-*"))
-    full |= {str(temporary), "/dev/shm", "/var/tmp"}
-    with pytest.raises(OSError, match=r"there is none among .*No space left.*set GPUSENSE_CACHE_DIR or TMPDIR"):
-        made()
-    full.clear()
-    status = os.statvfs(folder)
-
-    class NoCode:
-        f_flag = status.f_flag | os.ST_NOEXEC
-
-    statvfs = os.statvfs
-    monkeypatch.setattr(os, "statvfs", lambda path: NoCode if Path(path) == folder else statvfs(path))
-    assert made().is_relative_to(temporary)
-
-
-_HOLD = """
-import sys, time
-from gpusense.backends.scratch import scratch_folder
-print(scratch_folder(), flush=True)
-sys.stdin.readline()
-"""
-
-
-def test_the_folder_goes_with_its_process_and_that_of_a_killed_one_later(folder, made):
-    holders = []
-    for _ in range(3):
-        process = subprocess.Popen([sys.executable, "-c", _HOLD], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-        assert process.stdout is not None
-        holders.append((process, Path(os.fsdecode(process.stdout.readline().strip()))))
-    (ends, first), (killed, second), (lives, third) = holders
-    ends.communicate(b"\n")
-    assert not first.exists()
-    killed.kill()
-    killed.wait()
-    assert second.exists()
-    # It may be a process that has not locked its folder yet.
-    made()
-    assert second.exists()
-    for path in (second, third):
-        os.utime(path, (time.time() - 7200,) * 2)
-    made()
-    assert not second.exists() and third.exists()
-    lives.communicate(b"\n")
-    assert not third.exists()
-
-
-# ---- whole runs
-
-
-_RUN = """
-import sys
-import numpy as np, gpusense as gs
-cells = np.zeros((20, 20), int); cells[5] = 100
-grid, scanner = gs.OccupancyGrid(cells, 1.0), gs.Scanner([0.0, 0.1], range_max=10.0)
-poses, ranges = [[2.5, 1.5, 1.5707963267948966], [3.5, 2.5, 1.0]], [3.5, 3.4]
-for kind in (gs.BeamModel, gs.LikelihoodFieldModel):
-    print(np.round(kind(grid, scanner, backend=sys.argv[1]).log_likelihood(poses, ranges), 3).tolist(), flush=True)
-"""
-
-
-def start(family: str, environment: dict[str, str]) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-P", "-c", _RUN, family], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        text=True, start_new_session=True,
-    )  # fmt: skip
-
-
-def outcome(process: subprocess.Popen[str]) -> tuple[int, str, str]:
-    out, errors = process.communicate(timeout=300)
-    return process.returncode, out, errors
-
-
-@pytest.fixture(scope="module")
-def expected() -> str:
-    code, out, errors = outcome(start("numpy", dict(os.environ)))
-    assert code == 0, errors
-    return out
-
-
-def entries(folder: Path) -> dict[str, int]:
-    return {path.name: path.stat().st_ino for path in folder.glob("*.bin")}
-
-
-@pytest.mark.parametrize("family", ["opencl", "warp:cpu"])
-def test_a_second_process_compiles_nothing(needs, tmp_path, expected, family):
-    """A compiled kernel is stored as an entry; a second process stores none."""
-    needs(family.split(":")[0])
-    environment = fake_driver.environment(tmp_path)
-    assert outcome(start(family, environment)) == (0, expected, "")
-    first = entries(tmp_path / "cold")
-    assert len(first) > 5
-    assert outcome(start(family, environment)) == (0, expected, "")
-    assert entries(tmp_path / "cold") == first
-    assert [path.name for path in (tmp_path / "cold").iterdir() if path.suffix != ".bin"] == []
-
-
-@pytest.mark.parametrize("family", ["opencl", "warp:cpu"])
-def test_with_the_cache_off_nothing_is_kept(needs, tmp_path, expected, family):
-    needs(family.split(":")[0])
-    environment = fake_driver.environment(tmp_path, GPUSENSE_CACHE="off", GPUSENSE_PROOF="off", TMPDIR=str(tmp_path))
-    assert outcome(start(family, environment)) == (0, expected, "")
-    # The database is pyopencl's own, and is empty.
-    assert [path for path in tmp_path.rglob("*") if path.is_file() and path.suffix != ".sqlite"] == []
-
-
-DAMAGES = {
-    "cut off": lambda data: data[: len(data) // 2],
-    "emptied": lambda data: b"",
-    "zeroed": lambda data: bytes(len(data)),
-    "a bit flipped in the head": lambda data: bytes([data[0] ^ 1]) + data[1:],
-    "a bit flipped in the contents": lambda data: data[:-9] + bytes([data[-9] ^ 16]) + data[-8:],
-    "another's contents": lambda data: b"gpusense entry 2\n" + bytes(200),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("family", ["opencl", "warp:cpu"])
-def test_damaged_files_of_every_kind_are_made_anew(needs, tmp_path, expected, family):
-    """Entries of verdicts, programs, and PoCL's and Warp's kernels, and folders in the place of entries."""
-    needs(family.split(":")[0])
-    environment = fake_driver.environment(tmp_path)
-    assert outcome(start(family, environment)) == (0, expected, "")
-    whole = entries(tmp_path / "cold")
-    assert len(whole) >= len(DAMAGES)
-    for number, name in enumerate(sorted(whole)):
-        path = tmp_path / "cold" / name
-        path.write_bytes(list(DAMAGES.values())[number % len(DAMAGES)](path.read_bytes()))
-    assert outcome(start(family, environment)) == (0, expected, "")
-    assert entries(tmp_path / "cold").keys() == whole.keys()
-    for name in whole:
-        (tmp_path / "cold" / name).unlink()
-        (tmp_path / "cold" / name).mkdir()
-    code, out, errors = outcome(start(family, environment))
-    assert (code, out, errors.count("\n")) == (0, expected, 1), errors
-    assert f"the cache folder {tmp_path / 'cold'} cannot be written" in errors
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("family", "how"), [("opencl", BLOCKED[0]), ("opencl", BLOCKED[2]), ("warp:cpu", BLOCKED[1])])
-def test_a_cache_that_cannot_be_written_is_named_and_stops_nothing(needs, tmp_path, expected, family, how):
-    """gpusense's own folder, and where PoCL and Warp would put theirs."""
-    needs(family.split(":")[0])
-    place = str(blocked(tmp_path, how))
-    (tmp_path / "tmp").mkdir()
-    places = dict.fromkeys(("GPUSENSE_CACHE_DIR", "XDG_CACHE_HOME", "POCL_CACHE_DIR", "WARP_CACHE_PATH"), place)
-    environment = fake_driver.environment(tmp_path, **places, TMPDIR=str(tmp_path / "tmp"))
-    for turn in range(2):
-        code, out, errors = outcome(start(family, environment))
-        assert (code, out) == (0, expected), errors
-        lines = [line for line in errors.splitlines() if line.startswith("gpusense: ")]
-        assert len(lines) == len(errors.splitlines()) and all(place in line for line in lines)
-        assert turn or lines
-    assert len(list((tmp_path / "tmp").rglob("*.bin"))) > 5
-
-
-@pytest.mark.slow
-def test_a_full_file_system_is_named_and_stops_nothing(needs, tmp_path, expected):
-    """A file system of 256 KiB as the cache; the folder of the process goes elsewhere."""
-    needs("opencl")
-    full = tmp_path / "full"
-    full.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(full)], capture_output=True)
-    if mounted.returncode:
-        pytest.skip("this user cannot mount a small file system")
-    try:
-        (full / "filler").write_bytes(bytes(200 << 10))
-        environment = fake_driver.environment(tmp_path, GPUSENSE_CACHE_DIR=str(full), XDG_CACHE_HOME=str(full))
-        for turn in range(2):
-            code, out, errors = outcome(start("opencl", environment))
-            assert (code, out) == (0, expected), errors
-            assert turn or f"the cache folder {full} cannot be written: No space left" in errors
-    finally:
-        subprocess.run(["umount", "-l", str(full)], check=True)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("family", ["opencl", "warp:cpu"])
-def test_killed_processes_leave_nothing_that_a_later_one_trips_over(needs, tmp_path, expected, family):
-    """Processes of each family are killed with all they started, half of them while they prove the device."""
-    needs(family.split(":")[0])
-    moments = random.Random(family)
-    ended = 0
-    for number in range(12):
-        proof = {} if number % 2 else {"GPUSENSE_PROOF": "off"}
-        environment = fake_driver.environment(tmp_path, **proof)
-        if number % 8 == 0:
-            shutil.rmtree(tmp_path / "cold", ignore_errors=True)
-        process = start(family, environment)
-        time.sleep(moments.uniform(0.2, 1.6))
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        code, out, errors = outcome(process)
-        assert code in (0, -signal.SIGKILL), errors
-        assert expected.startswith(out)
-        ended += code == 0
-    assert ended < 12
-    assert outcome(start(family, fake_driver.environment(tmp_path))) == (0, expected, "")
-
-
-@pytest.mark.slow
-@settings(max_examples=2, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    families=st.tuples(*[st.sampled_from(["opencl", "warp:cpu"])] * 2),
-    delay=st.floats(0, 2.5),
-    kill=st.none() | st.floats(0.3, 2.5),
-)
-def test_two_processes_may_start_cold_at_once_in_any_order(needs, tmp_path_factory, expected, families, delay, kill):
-    for family in families:
-        needs(family.split(":")[0])
-    environment = fake_driver.environment(tmp_path_factory.mktemp("cold"))
-    first = start(families[0], environment)
-    time.sleep(delay)
-    second = start(families[1], environment)
-    if kill is not None:
-        time.sleep(kill)
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(first.pid, signal.SIGKILL)
-    code, out, errors = outcome(first)
-    assert (code, out) == (0, expected) or (kill is not None and code == -signal.SIGKILL), errors
-    assert outcome(second) == (0, expected, "")
+    whole = pack({"a": b"some text" * 9, "b": b""})
+    for place in range(len(whole)):
+        for value in (0, 255):
+            try:
+                unpack(whole[:place] + bytes([value]) + whole[place + 1 :])
+            except ValueError as error:
+                assert str(error).startswith("entry: must hold ")
+    monkeypatch.setattr(packing, "_MOST_BYTES", 1000)
+    assert unpack(pack({"a": bytes(1000)})) == {"a": bytes(1000)}
+    with pytest.raises(ValueError, match="must hold at most 1000 bytes of files"):
+        unpack(pack({"a": bytes(600), "b": bytes(401)}))

@@ -7,7 +7,7 @@ import importlib
 import platformdirs
 import pytest
 
-from gpusense.backends import cache
+from gpusense.backends import folders
 
 
 @pytest.mark.parametrize(
@@ -26,4 +26,4 @@ def test_the_cache_is_where_the_system_has_caches(tmp_path, monkeypatch, module,
     if module == "windows":
         monkeypatch.setattr(system, "get_win_folder", lambda _: str(tmp_path / "local"))
     monkeypatch.setattr(platformdirs, "PlatformDirs", getattr(system, name))
-    assert cache.cache_folder() == tmp_path / place
+    assert folders.chosen_place().folder == tmp_path / place

@@ -33,13 +33,17 @@ def test_the_time_limit_is_a_number_of_seconds(monkeypatch, text):
 
 
 def run_text(text: str, **job):
-    return child.run_text(["-c", textwrap.dedent(text)], job)
+    read = "import json, sys; job = json.loads(sys.stdin.readline())\n"
+    return child.run_text(["-c", read + textwrap.dedent(text)], job)
 
 
 @pytest.mark.parametrize(
     ("text", "failure"),
     [
-        ("print('gpusense-child {\"a\": 1}')", ""),
+        ("print('gpusense-child {\"done\": \"%s\"}' % job['token'])", ""),
+        ("print('gpusense-child {\"done\": \"guessed\"}')", "ends the process with exit code 0, without an answer"),
+        ("print('gpusense-child {\"a\": 1}')", "ends the process with exit code 0, without an answer"),
+        ("import os; os._exit(0)", "ends the process with exit code 0, without an answer"),
         ("import sys; sys.exit(3)", "exit code 3"),
         ("raise ValueError('so it is')", "ValueError: so it is"),
         ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "ends the process with SIGSEGV"),

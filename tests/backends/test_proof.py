@@ -12,7 +12,8 @@ import pytest
 from support import fake_driver
 
 import gpusense as gs
-from gpusense.backends import BackendInfo, child, proof
+from gpusense._util import files
+from gpusense.backends import BackendInfo, child, proof, selection
 from gpusense.backends.child import Outcome
 from gpusense.backends.proof import FLOAT64, SCALAR, VECTORS, Verdict, verdict_on
 
@@ -26,6 +27,7 @@ def folder(tmp_path, monkeypatch):
     for name in ("GPUSENSE_CACHE", "GPUSENSE_PROOF", "GPUSENSE_PROOF_SECONDS", "GPUSENSE_BACKEND"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(proof, "_known", {})
+    monkeypatch.setattr(selection, "_looks", ((), {}))
     return tmp_path
 
 
@@ -143,7 +145,7 @@ def test_a_crash_after_the_end_of_a_proof_condemns_no_device(monkeypatch):
 def test_a_damaged_verdict_is_made_anew(driver, folder):
     tried = driver({})
     verdict_on(INFO)
-    (entry,) = (folder / "cache").glob("*.bin")
+    (entry,) = (folder / "cache").rglob("*.gpusense")
     for damage in (b"", entry.read_bytes()[:-3], bytes(100)):
         entry.write_bytes(damage)
         proof._known.clear()
@@ -173,7 +175,8 @@ def test_no_room_for_the_output_of_a_child_is_no_failure_of_a_driver(monkeypatch
     def full(*arguments, **options):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(child.tempfile, "TemporaryFile", full)
+    monkeypatch.setattr(files.tempfile, "TemporaryFile", full)
+    monkeypatch.setattr(files.os, "memfd_create", full, raising=False)
     assert verdict_on(INFO) == proof.trust(INFO)
     assert "no child process can be started: [Errno 28] No space left on device" in caplog.messages[-1]
 

@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 
 import gpusense as gs
-from gpusense.backends import BackendInfo, get_backend, listing, registry, selection
+from gpusense.backends import BackendInfo, get_backend, chain, listing, registry, selection
 from gpusense.backends.numpy.backend import NumpyBackend
 from gpusense.backends.proof import Verdict
 from gpusense.backends.registry import BY_NAME, ENTRIES, SPEED_CLASSES, Absent, Entry, Library
@@ -56,16 +56,16 @@ def metal(monkeypatch):
     library.LIBRARY, package.Array = Metal(), type("Array", (), {})
     package.__spec__ = sys.__spec__
     entries = (*ENTRIES, METAL)
-    for module in (registry, listing, selection):
+    for module in (registry, listing, selection, chain):
         monkeypatch.setattr(module, "ENTRIES", entries)
         monkeypatch.setattr(module, "BY_NAME", {entry.name: entry for entry in entries})
-    monkeypatch.setattr(selection, "SPEED_CLASSES", (("metal", "gpu"), *SPEED_CLASSES))
+    monkeypatch.setattr(chain, "SPEED_CLASSES", (("metal", "gpu"), *SPEED_CLASSES))
     monkeypatch.setitem(sys.modules, "metal_library", library)
     monkeypatch.setitem(sys.modules, "metalpy", package)
     monkeypatch.setattr(listing.proof, "verdict_on", lambda info, **options: Verdict(True, 4, info.float64))
-    selection._open.cache_clear()
+    selection.forget()
     yield library.LIBRARY
-    selection._open.cache_clear()
+    selection.forget()
 
 
 def test_every_entry_has_its_folder_and_its_words():
@@ -157,7 +157,9 @@ def test_defaults_of_a_library():
         None,
         None,
     )
-    assert library.no_device() == "no driver offers a device" and not library.is_simulator(INFO)
+    assert library.no_device("pip install it") == "no driver offers a device: pip install it"
+    assert library.no_device("") == "no driver offers a device: install or update the driver of its vendor"
+    assert not library.is_simulator(INFO)
     library.renew()
     library.set_up_child(None)
 

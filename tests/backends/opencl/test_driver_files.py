@@ -13,7 +13,7 @@ import pytest
 from support import fake_driver
 
 pytest.importorskip("pyopencl")
-from gpusense.backends.opencl import drivers
+from gpusense.backends.opencl import driver_files, drivers
 
 _CHOICE = drivers.choice
 
@@ -31,12 +31,12 @@ def machine(tmp_path, monkeypatch):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("GPUSENSE_PROOF", "off")
     monkeypatch.setenv("GPUSENSE_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(drivers, "_SYSTEM", str(vendors))
+    monkeypatch.setattr(driver_files, "_SYSTEM", str(vendors))
     monkeypatch.setattr(drivers.cl, "__file__", str(beside.parent / "__init__.py"))
     monkeypatch.setattr(drivers, "_choice", None)
     monkeypatch.setattr(drivers, "_loaded", False)
     monkeypatch.setattr(drivers, "choice", lambda: drivers._chosen())
-    monkeypatch.setattr(drivers, "scratch_folder", lambda: tmp_path)
+    monkeypatch.setattr(drivers, "scratch_folder", lambda **_: tmp_path)
     return tmp_path
 
 
@@ -50,7 +50,7 @@ def intel(machine, monkeypatch):
         SimpleNamespace(name="readme", locate=lambda: machine),
         SimpleNamespace(name=library.name, locate=lambda: library),
     ]
-    monkeypatch.setattr(drivers.importlib.metadata, "files", lambda name: files)
+    monkeypatch.setattr(driver_files.importlib.metadata, "files", lambda name: files)
     return library
 
 
@@ -97,9 +97,9 @@ def test_half_a_wheel_is_none(machine, intel, monkeypatch, problem):
     if problem == "not installed":
 
         def absent(name):
-            raise drivers.importlib.metadata.PackageNotFoundError(name)
+            raise driver_files.importlib.metadata.PackageNotFoundError(name)
 
-        monkeypatch.setattr(drivers.importlib.metadata, "files", absent)
+        monkeypatch.setattr(driver_files.importlib.metadata, "files", absent)
     assert drivers.choice() == drivers.Choice(None)
 
 

@@ -162,6 +162,8 @@ def test_other_processes_are_refused(as_gpu, queue, there, monkeypatch):
     call()
     call.check()
     monkeypatch.setattr(as_gpu, "_process", -1)
+    # The child looks selection strings up anew.
+    monkeypatch.setattr(selection, "_looks", ((), {}))
     for refused in (call, call.check, lambda: get_backend(queue), lambda: get_backend("opencl")):
         with pytest.raises(RuntimeError, match="does not survive a fork"):
             refused()

@@ -118,7 +118,7 @@ def test_warp_starts_without_a_word_and_keeps_its_settings(needs: Callable[[str]
     needs("warp")
     run_quietly(tmp_path, GPUSENSE_CACHE="")
     # Warp's own folder is left alone.
-    assert list(tmp_path.glob("*.bin")) and not list(tmp_path.rglob("*.o"))
+    assert list(tmp_path.rglob("*.gpusense")) and not list(tmp_path.rglob("*.o"))
 
 
 def test_the_cache_can_be_switched_off(needs: Callable[[str], str], tmp_path: Path) -> None:

@@ -1,0 +1,29 @@
+"""Fixtures of tests of caches and of the choice of a device."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from gpusense.backends import cache, folders
+
+
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Use a folder of temporary files of this test alone, with no failure reported before."""
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    monkeypatch.setattr(folders, "_reported", set())
+    monkeypatch.setattr(cache, "_failed", set())
+    cache._takes_files.cache_clear()
+    return tmp_path / "tmp"
+
+
+@pytest.fixture
+def place(tmp_path: Path, temporary: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Use a place for the cache of this test alone."""
+    monkeypatch.setenv("GPUSENSE_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.delenv("GPUSENSE_CACHE", raising=False)
+    return tmp_path / "cache"

@@ -109,6 +109,8 @@ def _look(selection: str) -> Backend:
     """Look up the backend of a user's selection string, and keep it."""
     global _looks
     now = _circumstances()
+    if selection == "auto":
+        _passed_over.clear()
     if selection == "auto" and (chosen := os.environ.get(VARIABLE)) and chosen != "auto":
         try:
             backend = _opened(chosen)

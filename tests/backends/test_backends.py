@@ -71,7 +71,10 @@ def test_a_remedy_installs_what_is_absent(monkeypatch):
     installed.discard("pocl-binary-distribution")
     monkeypatch.undo()
     monkeypatch.setattr(registry, "_is_installed", {"pyopencl"}.__contains__)
-    for system, machine, remedy in (("win32", "AMD64", ""), ("linux", "x86_64", "pip install pocl-binary-distribution")):
+    for system, machine, remedy in (
+        ("win32", "AMD64", ""),
+        ("linux", "x86_64", "pip install pocl-binary-distribution"),
+    ):
         monkeypatch.setattr(registry.sys, "platform", system)
         monkeypatch.setattr(registry.platform, "machine", lambda machine=machine: machine)
         assert registry.remedy(entry) == remedy

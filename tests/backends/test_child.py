@@ -41,7 +41,7 @@ def run_text(text: str, **job):
     ("text", "failure"),
     [
         ("print('gpusense-child {\"done\": \"%s\"}' % job['token'])", ""),
-        ("print('gpusense-child {\"done\": \"guessed\"}')", "ends the process with exit code 0, without an answer"),
+        ('print(\'gpusense-child {"done": "guessed"}\')', "ends the process with exit code 0, without an answer"),
         ("print('gpusense-child {\"a\": 1}')", "ends the process with exit code 0, without an answer"),
         ("import os; os._exit(0)", "ends the process with exit code 0, without an answer"),
         ("import sys; sys.exit(3)", "exit code 3"),

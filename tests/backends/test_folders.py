@@ -68,9 +68,7 @@ def test_no_code_is_read_from_a_folder_that_others_can_change(
         assert load_entry(f"{variable} {rule}") is None
         store_entry(f"{variable} {rule}", b"new")
         messages = [message for message in caplog.messages if "is not used" in message]
-        assert messages == [
-            f"gpusense: the cache folder {place} is not used: {messages[0].split('is not used: ')[1]}"
-        ]
+        assert messages == [f"gpusense: the cache folder {place} is not used: {messages[0].split('is not used: ')[1]}"]
         assert str(folder) in messages[0] and text in messages[0]
         assert messages[0].endswith(f"(the folder comes from {variable})")
         os.chown(folder, 0, -1)

@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 
 import gpusense as gs
-from gpusense.backends import BackendInfo, get_backend, chain, listing, registry, selection
+from gpusense.backends import BackendInfo, chain, get_backend, listing, registry, selection
 from gpusense.backends.numpy.backend import NumpyBackend
 from gpusense.backends.proof import Verdict
 from gpusense.backends.registry import BY_NAME, ENTRIES, SPEED_CLASSES, Absent, Entry, Library

@@ -88,6 +88,7 @@ static int32_t platforms(uint32_t most, void **found, uint32_t *number) {
 
 void *clGetExtensionFunctionAddress(const char *name) {
     if (!strcmp(MODE, "load")) abort();
+    if (!strcmp(MODE, "exit")) _exit(0);
     if (!strcmp(name, "clIcdGetPlatformIDsKHR")) return (void *)platforms;
     return ((address_fn)real("clGetExtensionFunctionAddress"))(name);
 }
@@ -115,7 +116,8 @@ def build(folder: Path, mode: str, word: str = "distance", instead: str = "") ->
     Args:
         folder: The folder for the library and ``vendors``.
         mode: ``"abort"``, ``"hang"`` or ``"refuse"`` when it builds a program, ``"wrong"`` to change what a program
-            computes, ``"load"`` to abort when it is loaded, ``""`` for none of these.
+            computes, ``"load"`` to abort when it is loaded, ``"exit"`` to end the process then as if all were well,
+            ``""`` for none of these.
         word: A text of the programs that it spoils.
         instead: The text of the same length that replaces it in a wrong program.
     """

@@ -1,7 +1,7 @@
 """The devices among which ``"auto"`` chooses, the fastest first, and those that failed on the way.
 
-Each device is tried in turn: its library is loaded, its verdict is asked for, it is opened. What fails gives way to the
-next slower one, and NumPy, which needs no driver, is the last. The failures are reported in one line.
+Each device is tried in turn: its library is loaded, its verdict is asked for, it is opened. A device that fails gives
+way to the next slower one, and NumPy, which needs no driver, is the last. The failures are reported in one line.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ _MARKER_TEXT = (
     b"# gpusense keeps compiled kernels in this folder, and deletes old ones. The folder may be removed.\n"
     b"# gpusense cache 3\n"
 )
-# The folders that were checked, for a user; nobody else can change them afterwards.
+# The folders that were checked, for a user; no other user can change them afterwards.
 _checked: set[tuple[str, int]] = set()
 # Folders that were reported.
 _reported: set[str] = set()

@@ -2,7 +2,7 @@
 
 Drivers do not check the files in their folders: one that another process left half-written, or that a disk has damaged,
 ends the run. So every process begins with an empty folder, and only files whose checksums hold are copied into
-it (see :mod:`gpusense.backends.cache`). Nobody but this user may change it. Its name, owner and lock file tell it from
+it (see :mod:`gpusense.backends.cache`). Only this user may change it. Its name, owner and lock file tell it from
 folders of others, which are never removed.
 """
 

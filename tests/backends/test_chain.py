@@ -135,7 +135,7 @@ def test_a_device_that_is_named_is_not_replaced(machine, monkeypatch):
 
 def test_where_not_even_numpy_opens_all_failures_are_named(machine):
     machine([WARP], dict.fromkeys(("warp:cpu", "numpy"), BROKEN))
-    with pytest.raises(ValueError, match="no device is usable, got 'auto': warp:cpu .* does not open.*; numpy .*"):
+    with pytest.raises(ValueError, match=r"no device is usable, got 'auto': warp:cpu .* does not open.*; numpy .*"):
         get_backend("auto")
 
 
@@ -219,7 +219,8 @@ def test_variables_are_compared_where_the_environment_has_no_dictionary_of_its_o
 def test_a_forked_process_looks_anew(looks, monkeypatch):
     get_backend("auto")
     count = len(looks)
-    monkeypatch.setattr(os, "getpid", lambda number=os.getpid(): number + 1)
+    child = os.getpid() + 1
+    monkeypatch.setattr(os, "getpid", lambda: child)
     get_backend("auto")
     assert len(looks) > count
 

@@ -206,7 +206,7 @@ def test_a_marker_that_is_another_programs_stays(place):
     own = place / folders.OWN
     own.mkdir(parents=True, mode=0o700)
     (own / folders.MARKER).write_bytes(b"Signature: mine\n")
-    with pytest.raises(UnsafeFolderError, match="one without its CACHEDIR.TAG"):
+    with pytest.raises(UnsafeFolderError, match=r"one without its CACHEDIR\.TAG"):
         folders.own_folder(place)
     assert (own / folders.MARKER).read_bytes() == b"Signature: mine\n"
 

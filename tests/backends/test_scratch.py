@@ -78,7 +78,7 @@ def test_where_no_code_may_run_only_drivers_that_read_files_have_a_folder(place,
     # One folder serves both where it can.
     assert made(executable=False).is_relative_to(temporary)
     no_code(monkeypatch, "/")
-    with pytest.raises(OSError, match="from which code may run, and there is none among .*no code may run from there"):
+    with pytest.raises(OSError, match=r"from which code may run, and there is none among .*no code may run from there"):
         made()
     assert made(executable=False).is_relative_to(place)
 

@@ -21,19 +21,24 @@ class UnsafeFolderError(PermissionError):
     """A folder that another user could change; the text names the folder and the rule."""
 
 
-def make_folders(folder: Path) -> None:
-    """Make a folder and those above it, each for this user alone where it is absent.
+def make_private(folder: Path) -> None:
+    """Make a folder and those above it, each for this user alone where it is absent, and check it.
+
+    Args:
+        folder: As for :func:`check_private`. Nothing is made where others could replace it.
 
     Raises:
+        UnsafeFolderError: as of :func:`check_private`.
         OSError: it cannot be made.
     """
-    for path in reversed([folder, *folder.parents]):
-        if not os.path.lexists(path):
-            try:
-                path.mkdir(mode=0o700)
-            except FileExistsError:
-                # Another process has made it.
-                continue
+    absent = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]
+    if absent and _HAS_OWNERS:
+        _check_parents(absent[-1])
+    for path in reversed(absent):
+        # Another process may have made it.
+        with contextlib.suppress(FileExistsError):
+            path.mkdir(mode=0o700)
+    check_private(folder)
 
 
 def check_private(folder: Path) -> None:
@@ -58,6 +63,15 @@ def check_private(folder: Path) -> None:
     if status.st_mode & _OTHERS_WRITE:
         mode = stat.S_IMODE(status.st_mode)
         raise UnsafeFolderError(f"{folder} must be writable by its owner only (mode 0700), got mode {mode:04o}")
+    _check_parents(folder)
+
+
+def _check_parents(folder: Path) -> None:
+    """Check that other users can rename none of the folders that lead to a folder, nor the folder.
+
+    Raises:
+        UnsafeFolderError: they can.
+    """
     for child, parent in zip((folder, *folder.parents), folder.parents, strict=False):
         _check_parent(parent, child.name)
 

@@ -14,7 +14,7 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-from gpusense._util.private import UnsafeFolderError, check_private, make_folders, read_regular
+from gpusense._util.private import UnsafeFolderError, make_private, read_regular
 from gpusense.backends import notices
 
 OWN = "gpusense-kernels"
@@ -80,8 +80,7 @@ def own_folder(place: Path) -> Path:
     folder = Path(os.path.realpath(place)) / OWN
     key = str(folder), _user()
     if key not in _checked or not os.path.lexists(folder / MARKER):
-        make_folders(folder)
-        check_private(folder)
+        make_private(folder)
         _mark(folder)
         _checked.add(key)
     return folder
@@ -95,8 +94,7 @@ def private_folder(place: Path) -> Path:
         OSError: it cannot be made.
     """
     folder = Path(os.path.realpath(place.parent)) / place.name
-    make_folders(folder)
-    check_private(folder)
+    make_private(folder)
     return folder
 
 

@@ -81,6 +81,14 @@ def test_no_code_is_read_from_a_folder_that_others_can_change(
 
 
 @with_owners
+def test_nothing_is_made_where_others_could_replace_it(place, temporary):
+    place.mkdir()
+    place.chmod(0o777)
+    store_entry("key", b"code")
+    assert contents(place) == {} and len(entries_in(temporary / f"gpusense-{os.geteuid()}")) == 1
+
+
+@with_owners
 def test_a_link_is_no_folder_of_gpusense(tmp_path, place, caplog):
     store_entry("key", b"code")
     (place / folders.OWN).rename(tmp_path / "elsewhere")

@@ -220,6 +220,8 @@ def test_a_forked_process_looks_anew(looks, monkeypatch):
     get_backend("auto")
     count = len(looks)
     child = os.getpid() + 1
+    # A device that the parent has opened would be refused.
+    monkeypatch.setattr(selection, "_OPENED", [])
     monkeypatch.setattr(os, "getpid", lambda: child)
     get_backend("auto")
     assert len(looks) > count

@@ -25,7 +25,11 @@ def forms(values, mask):
     masked = np.ma.array(values, mask=mask)
     missing = np.where(mask, np.nan, values)
     if np.ndim(values) == 2:
-        return missing, {"array": masked, "list": list(masked), "mixed": [masked[0], *np.where(mask, np.nan, values)[1:]]}
+        return missing, {
+            "array": masked,
+            "list": list(masked),
+            "mixed": [masked[0], *np.where(mask, np.nan, values)[1:]],
+        }
     return missing, {"array": masked, "list": [v if not m else np.ma.masked for v, m in zip(values, mask, strict=True)]}
 
 

@@ -21,10 +21,10 @@ _FORMER = {"bench/RESULTS.md": {"speed.py", "several_scans.py", "work_items.py"}
 # Folders in which a path may begin, beside that of the file that names it.
 _BASES = ("", "gpusense", "kernels", "kernels/opencl", "kernels/warp", "bench", "tests", "docs")
 _ENDINGS = "py|pyi|cl|md|toml|cpp|svg|png|json|yaml|yml|xml|cfg"
-_PATH = re.compile(
-    rf"(?<![\w/.:<>{{}}*$~-])((?:[\w.-]+/)*[\w.-]*\w\.(?:{_ENDINGS})|(?:[\w.-]+/)+)(?![\w/*<{{-])"
+_PATH = re.compile(rf"(?<![\w/.:<>{{}}*$~-])((?:[\w.-]+/)*[\w.-]*\w\.(?:{_ENDINGS})|(?:[\w.-]+/)+)(?![\w/*<{{-])")
+_LINK = re.compile(
+    r"!?\[[^\]]*\]\(\s*<?([^)\s>]+)>?[^)]*\)|^\s*\[[^\]]+\]:\s*(\S+)|(?:src|href)=\"([^\"]+)\"", re.MULTILINE
 )
-_LINK = re.compile(r"!?\[[^\]]*\]\(\s*<?([^)\s>]+)>?[^)]*\)|^\s*\[[^\]]+\]:\s*(\S+)|(?:src|href)=\"([^\"]+)\"", re.MULTILINE)
 
 
 def every_file() -> dict[str, Path]:
@@ -53,7 +53,11 @@ def prose(name: str, text: str) -> Iterator[tuple[int, str]]:
             if token.type == tokenize.COMMENT:
                 yield token.start[0], token.string
         for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            if (
+                isinstance(node, ast.Expr)
+                and isinstance(node.value, ast.Constant)
+                and isinstance(node.value.value, str)
+            ):
                 yield from enumerate(node.value.value.splitlines(), node.lineno)
         return
     mark = {".cl": "//", ".cpp": "//", ".md": ""}.get(Path(name).suffix, "#")
@@ -129,9 +133,9 @@ def broken_links(name: str, text: str) -> list[str]:
             continue
         path, _, anchor = target.partition("#")
         file = normal(Path(name).parent / path) if path else name
-        if file not in FILES and file not in FOLDERS:
-            broken.append(f"{name}: {target}")
-        elif anchor and (not file.endswith(".md") or anchor not in anchors(FILES[file].read_text(encoding="utf-8"))):
+        if (file not in FILES and file not in FOLDERS) or (
+            anchor and (not file.endswith(".md") or anchor not in anchors(FILES[file].read_text(encoding="utf-8")))
+        ):
             broken.append(f"{name}: {target}")
     return broken
 

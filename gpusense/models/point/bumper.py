@@ -160,7 +160,9 @@ class BumperModel(PointModel):
         return cast(np.ndarray, self._score(poses, out, program, left_out, items=int(kept.sum())))
 
     def _arguments(self) -> dict[str, Any]:
-        own = dict(grid=self.grid, outline=self._outline, segments=self._segments, unknown=self.unknown, outside=self.outside)
+        own = dict(
+            grid=self.grid, outline=self._outline, segments=self._segments, unknown=self.unknown, outside=self.outside
+        )
         return super()._arguments() | own
 
     def sample(self, poses: AnyArray, seed: int = 0, *, step: int = 0) -> np.ndarray:

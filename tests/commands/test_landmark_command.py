@@ -161,7 +161,8 @@ def test_broken_gzip_is_named(capsys, swapped, tmp_path):
     for name in swapped.iterdir():
         (tmp_path / name.name).write_bytes(name.read_bytes())
     file = tmp_path / "Robot1_Odometry.dat.gz"
-    file.write_bytes(file.read_bytes()[:200])
+    data = file.read_bytes()
+    file.write_bytes(data[:150] + bytes(50) + data[200:])
     found = error_of(["landmarks", "--folder", str(tmp_path), "--robot", "1"], capsys)
     assert found.startswith(f"{file}:") and "must be a whole gzip file, got a broken one" in found
 

@@ -16,11 +16,18 @@ from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.recording import Recording, Repeated
 from gpusense.interface.constants import (
     DEGENERATE,
+    DEPTH,
     ESTIMATE,
+    FARTHEST_THETA,
+    FARTHEST_X,
+    JITTER,
     LEFT,
+    LOWEST,
     MOMENTS,
     RUNG,
     SAMPLE_SIZE,
+    SETTINGS,
+    SHARE,
     STAGE,
     STATE,
     WIDE_HEADINGS,
@@ -28,16 +35,21 @@ from gpusense.interface.constants import (
 from gpusense.interface.launches import Program
 from gpusense.localization.particles import Particles, Stage
 from gpusense.localization.sums import weight_block
+from gpusense.reference.rungs import left_of
 
 _DOUBLE = np.dtype(np.float64)
 _MOST_RECORDED = 32
+# Lowest depth of a ladder: distances of a million deviations differ by 2^-39 on its last rung.
+_DEEPEST = LOWEST**5
+# Jitter of a stage on such a ladder: the peak lies beyond the particles, and they must not shrink before they reach it.
+_WIDE_JITTER = 0.7
 
 
 class Summary(NamedTuple):
     """The state of a filter after a correction.
 
     Attributes:
-        effective_sample_size: Of the last stage.
+        effective_sample_size: Of the last stage, and at most the number of distinct particles after the earlier ones.
         temperature: Share of the temperature that all stages used.
         degenerate: No particle was possible.
         stages: Stages that ran.
@@ -49,6 +61,20 @@ class Summary(NamedTuple):
     degenerate: bool
     stages: int
     numbers: np.ndarray
+
+
+def is_starved(numbers: np.ndarray, settings: np.ndarray, stage: int, count: int) -> bool:
+    """Tell whether even the last rung of a stage leaves too few particles with weight.
+
+    Args:
+        numbers: The state after the stage.
+        settings: Numbers of the step.
+        stage: The stage.
+        count: Particles.
+    """
+    own = numbers[stage * STAGE : (stage + 1) * STAGE]
+    lowest = left_of(numbers, stage) * settings[DEPTH] * LOWEST
+    return bool(own[RUNG] == lowest > 0.0 and not own[DEGENERATE] and own[SAMPLE_SIZE] < settings[SHARE] * count)
 
 
 class Cloud(Particles):
@@ -74,6 +100,7 @@ class Cloud(Particles):
         self._recordings: dict[Hashable, tuple[Recording, object]] = {}
         self._estimates, self._stages = Repeated(backend, 8), Repeated(backend, 16)
         self._uploads: list[np.ndarray] = []
+        self._step = np.zeros(SETTINGS)
 
     def set_pool(self, poses: np.ndarray) -> None:
         """Upload the poses from which recovery injects particles."""
@@ -83,6 +110,7 @@ class Cloud(Particles):
 
     def upload_settings(self, settings: np.ndarray) -> None:
         """Copy the numbers of a step to the device."""
+        self._step = settings
         self._uploads.append(settings)
         self.backend.upload(settings, self.settings, wait=False)
         if len(self._uploads) > 64:
@@ -119,16 +147,30 @@ class Cloud(Particles):
         self.use(sensors)
         self.moved, source = False, self.next
         for number in range(stages):
-            last = number + 1 == stages
+            last, settings = stages == 1, self._step
             stage = Stage(source, number, stages, drawn if last else 0, None if number else kind)
             score(stage)
             if not last:
-                last = self._read(self.state, STATE)[number * STAGE + LEFT] == 0.0
+                last = self._deepen(stage, settings)[number * STAGE + LEFT] == 0.0
                 self._draw(stage, drawn if last else self.count)
+                if self._step is not settings:
+                    self.upload_settings(settings)
             self.shown, self.next = source, 1 - source
             if last:
                 break
             source = 1 - source
+
+    def _deepen(self, stage: Stage, settings: np.ndarray) -> np.ndarray:
+        """Weigh a stage on ever lower rungs, until enough particles have weight; return the state."""
+        numbers = self._read(self.state, STATE)
+        while settings[DEPTH] > _DEEPEST and is_starved(numbers, settings, stage.number, self.count):
+            settings = settings.copy()
+            settings[DEPTH] *= LOWEST
+            settings[JITTER], settings[FARTHEST_X], settings[FARTHEST_THETA] = _WIDE_JITTER, math.inf, math.pi
+            self.upload_settings(settings)
+            self.backend.run(self.weighing(stage))
+            numbers = self._read(self.state, STATE)
+        return numbers
 
     def begin(self, kind: int) -> None:
         """Start the motion of a correction."""
@@ -177,15 +219,17 @@ class Cloud(Particles):
     def summary(self) -> Summary:
         """Return the state after the last correction."""
         numbers = self._read(self.state, STATE)
-        used, stage = 0.0, 0
+        used, stage, distinct = 0.0, 0, math.inf
         while True:
-            used += float(numbers[stage * STAGE + RUNG])
-            if numbers[stage * STAGE + LEFT] == 0.0:
+            own = numbers[stage * STAGE : (stage + 1) * STAGE]
+            used += float(own[RUNG])
+            if own[LEFT] == 0.0:
                 break
+            # Each copy moves by the difference of two others: m parents have at most m^3 distinct copies.
+            distinct = min(distinct, float(own[SAMPLE_SIZE]) ** 3)
             stage += 1
-        own = numbers[stage * STAGE : (stage + 1) * STAGE]
         degenerate = bool(numbers[DEGENERATE])
-        return Summary(float(own[SAMPLE_SIZE]), min(used, 1.0), degenerate, stage + 1, numbers)
+        return Summary(min(float(own[SAMPLE_SIZE]), distinct), min(used, 1.0), degenerate, stage + 1, numbers)
 
     def shares(self, count: int) -> Any:
         """Return the weights of the shown particles, whose sum is 1, as an array of the device's library."""

@@ -54,8 +54,9 @@ class Estimate:
 
 
 def covariance_of(numbers: np.ndarray) -> np.ndarray:
-    """Return the covariance in the numbers of the kernel ``finish_estimate``."""
+    """Return the covariance in the numbers of the kernel ``finish_estimate``; rounding makes no variance negative."""
     xx, xy, xt, yy, yt, tt = numbers[3:9]
+    xx, yy, tt = (max(float(variance), 0.0) for variance in (xx, yy, tt))
     return np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.backends import arrays
 from gpusense.backends.base import Backend
-from gpusense.interface.constants import FIRST, TEMPERATURE
+from gpusense.interface.constants import DEPTH, TEMPERATURE
 from gpusense.interface.launches import Program
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.temperature import BeamCorrelation, axes_of, poses_around
@@ -23,7 +23,7 @@ from gpusense.models.scan.model import ScanModel
 _DOUBLE = np.dtype(np.float64)
 # Calls that are started before one waits.
 _MOST_STARTED = 64
-_MOST_SENSORS = FIRST - TEMPERATURE
+_MOST_SENSORS = DEPTH - TEMPERATURE
 
 
 class Sensor:

@@ -170,6 +170,11 @@ class Recorder(Proxy):
         self._listening = False
 
     @property
+    def watched(self) -> Backend:
+        """The backend behind this one."""
+        return self._backend
+
+    @property
     def gathers(self) -> bool:
         """See Backend.gathers; while launches are recorded each copy and launch is started by itself."""
         return not self._listening and super().gathers
@@ -237,7 +242,9 @@ def on_device(device: Any, array: np.ndarray) -> Any:
     if device.info.backend == "opencl":
         import pyopencl.array
 
-        return pyopencl.array.to_device(device.queue, array)
+        # The queue is that of the backend, not of what watches it.
+        queue = device.watched.queue if isinstance(device, Recorder) else device.queue
+        return pyopencl.array.to_device(queue, array)
     import warp as wp
 
     dtype = {"float32": wp.float32, "float64": wp.float64}[array.dtype.name]

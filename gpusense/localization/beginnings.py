@@ -9,11 +9,11 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray
-from gpusense.interface.constants import STATE
 from gpusense.localization import starts
 from gpusense.localization.calibration import is_together
 from gpusense.localization.defaults import DEFAULTS
-from gpusense.localization.motion import STILL, SampledMotion
+from gpusense.localization.journal import whole
+from gpusense.localization.motion import SampledMotion
 from gpusense.localization.results import Results
 from gpusense.localization.trust import Trust
 
@@ -23,7 +23,7 @@ class Beginnings(Results):
 
     # Number of the last step, the motion that the next one begins with, and corrections left at a low temperature.
     _step: int
-    _pending: SampledMotion
+    _pending: SampledMotion | None
     _wide: int
     # Whether the particles lie together, as far as is known.
     _together: bool
@@ -31,6 +31,7 @@ class Beginnings(Results):
     _pool: tuple[int, starts.Spread]
     _trust: Trust | None
 
+    @whole
     def initialize(self, *, mean: AnyArray, covariance: AnyArray, particles: int | None = None) -> None:
         """Draw particles from a normal density.
 
@@ -45,6 +46,7 @@ class Beginnings(Results):
         self._place(starts.normal(mean, covariance, self._number(particles), self._key()))
         self._together = is_together(np.asarray(covariance))
 
+    @whole
     def initialize_uniform(self, *, bounds: AnyArray | None = None, particles: int | None = None) -> None:
         """Draw particles uniformly over the free cells of the map, with any heading.
 
@@ -64,6 +66,7 @@ class Beginnings(Results):
         if bounds is None and self.options.recovery is None:
             self._trust = Trust()
 
+    @whole
     def initialize_from(self, likelihood: Any, *, particles: int | None = None) -> None:
         """Draw particles from a likelihood over poses.
 
@@ -101,9 +104,8 @@ class Beginnings(Results):
         """
         self._cloud.place(poses)
         self._shown, self._started, self._wide, self._together = len(poses), True, 0, False
-        self._backend.upload(np.zeros(STATE), self._cloud.state)
         if not again:
-            self._pending, self._last, self._trust = STILL, {}, None
+            self._pending, self._last, self._trust = None, {}, None
             self._verdict.reset()
             for sensor in self._sensors:
                 sensor.restart()
@@ -125,6 +127,6 @@ class Beginnings(Results):
         try:
             pool, spread = starts.free_pool([sensor.model for sensor in self._sensors], None)
         except ValueError:
-            centre = self._cloud.host_poses(self._cloud.shown, self._shown).mean(axis=0)
+            centre = self._cloud.host_poses(self._cloud.places.shown, self._shown).mean(axis=0)
             pool, spread = centre[None], (10.0, 10.0, math.pi)
         return starts.spread(pool, spread, count, key)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gpusense.localization.scoring import Given
+from gpusense.localization.filter_cloud import Given
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.skipping import TOGETHER
 

@@ -8,73 +8,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.recording import Recording, Repeated
-from gpusense.interface.constants import (
-    DEGENERATE,
-    DEPTH,
-    ESTIMATE,
-    FARTHEST_THETA,
-    FARTHEST_X,
-    JITTER,
-    LEFT,
-    LOWEST,
-    MOMENTS,
-    RUNG,
-    SAMPLE_SIZE,
-    SETTINGS,
-    SHARE,
-    STAGE,
-    STATE,
-    WIDE_HEADINGS,
-)
+from gpusense.interface.constants import ESTIMATE, LEFT, MOMENTS, SLOW_RATE, STAGE, STATE, WIDE_HEADINGS
 from gpusense.interface.launches import Program
+from gpusense.localization.filter_cloud import Contents, Summary, deeper, is_starved, summary_of
 from gpusense.localization.particles import Particles, Stage
 from gpusense.localization.sums import weight_block
-from gpusense.reference.rungs import left_of
 
 _DOUBLE = np.dtype(np.float64)
 _MOST_RECORDED = 32
-# Lowest depth of a ladder: distances of a million deviations differ by 2^-39 on its last rung.
-_DEEPEST = LOWEST**5
-# Jitter of a stage on such a ladder: the peak lies beyond the particles, and they must not shrink before they reach it.
-_WIDE_JITTER = 0.7
-
-
-class Summary(NamedTuple):
-    """The state of a filter after a correction.
-
-    Attributes:
-        effective_sample_size: Of the last stage, and at most the number of distinct particles after the earlier ones.
-        temperature: Share of the temperature that all stages used.
-        degenerate: No particle was possible.
-        stages: Stages that ran.
-        numbers: The state as the kernels hold it.
-    """
-
-    effective_sample_size: float
-    temperature: float
-    degenerate: bool
-    stages: int
-    numbers: np.ndarray
-
-
-def is_starved(numbers: np.ndarray, settings: np.ndarray, stage: int, count: int) -> bool:
-    """Tell whether even the last rung of a stage leaves too few particles with weight.
-
-    Args:
-        numbers: The state after the stage.
-        settings: Numbers of the step.
-        stage: The stage.
-        count: Particles.
-    """
-    own = numbers[stage * STAGE : (stage + 1) * STAGE]
-    lowest = left_of(numbers, stage) * settings[DEPTH] * LOWEST
-    return bool(own[RUNG] == lowest > 0.0 and not own[DEGENERATE] and own[SAMPLE_SIZE] < settings[SHARE] * count)
 
 
 class Cloud(Particles):
@@ -86,12 +33,7 @@ class Cloud(Particles):
         sensors: Most sensors of a correction.
         precision: Of their log-likelihoods.
         residual: Whether draws are those of residual resampling.
-
-    Attributes:
-        moved: Whether the motion of the last correction was started.
     """
-
-    moved = False
 
     def __init__(
         self, backend: Backend, capacity: int, sensors: int, precision: np.dtype, *, residual: bool = False
@@ -100,17 +42,30 @@ class Cloud(Particles):
         self._recordings: dict[Hashable, tuple[Recording, object]] = {}
         self._estimates, self._stages = Repeated(backend, 8), Repeated(backend, 16)
         self._uploads: list[np.ndarray] = []
-        self._step = np.zeros(SETTINGS)
+
+    def place(self, poses: np.ndarray, weights: np.ndarray | None = None) -> None:
+        """Replace all particles."""
+        count = len(poses)
+        w = np.ones(count) if weights is None else weights * (count / weights.sum())
+        places = self.places.placed()
+        self._fill((self.poses[places.shown], poses), (self.weights[places.weight], w),
+                   (self.states[places.state], np.zeros(STATE)))  # fmt: skip
+        self.set_particles(places, count, weight_block(self.backend, count))
+
+    def _fill(self, *arrays: tuple[Buffer, np.ndarray]) -> None:
+        """Copy arrays to buffers that work of earlier steps may use."""
+        self.backend.synchronize()
+        for buffer, array in arrays:
+            self.backend.upload(np.ascontiguousarray(array, np.float64), buffer)
 
     def set_pool(self, poses: np.ndarray) -> None:
         """Upload the poses from which recovery injects particles."""
-        self.pool = self.backend.upload(np.ascontiguousarray(poses, np.float64))
         self._recordings.clear()
         self._stages.clear()
+        self.pool = self.backend.upload(np.ascontiguousarray(poses, np.float64))
 
     def upload_settings(self, settings: np.ndarray) -> None:
         """Copy the numbers of a step to the device."""
-        self._step = settings
         self._uploads.append(settings)
         self.backend.upload(settings, self.settings, wait=False)
         if len(self._uploads) > 64:
@@ -123,67 +78,73 @@ class Cloud(Particles):
 
     # ---- steps
 
-    def move(self, kind: int) -> None:
+    def move(self, settings: np.ndarray, kind: int) -> None:
         """Move the particles now."""
-        self.backend.run(self.motion(kind))
-        if self.shown == self.next:
-            return
-        # The weights of moved particles are those that the next correction begins with.
-        self.shown = self.next
-        self.backend.copy(self.before, self.weight, self.count * 8) if self.backend.info.kind == "gpu" else (
-            self.backend.upload(self._read(self.before, self.count), self.weight)
-        )
+        places = self.places.moved()
+        self.upload_settings(settings)
+        self.backend.run(self.motion(self.places.next, places.next, kind))
+        self.places = places
 
-    def correct(self, kind: int, stages: int, drawn: int, sensors: int, score: Callable[[Stage], None]) -> None:
-        """Run a step: stages until nothing is left of the temperature.
+    def run_stages(
+        self, settings: np.ndarray, stages: list[Stage], drawn: int, sensors: int, score: Callable[[Stage], None]
+    ) -> None:
+        """Run a correction: stages until nothing is left of the temperature.
 
         Args:
-            kind: Kind of the motion that begins the step.
-            stages: Most stages.
+            settings: Numbers of the step.
+            stages: The stages.
             drawn: Particles of the next step.
             sensors: Sensors that are used, the first ones of ``log_p``.
             score: Runs the launches of a stage: the motion of the first one, the log-likelihoods, and the weighing.
         """
         self.use(sensors)
-        self.moved, source = False, self.next
-        for number in range(stages):
-            last, settings = stages == 1, self._step
-            stage = Stage(source, number, stages, drawn if last else 0, None if number else kind)
+        self.upload_settings(settings)
+        if settings[SLOW_RATE] > 0:
+            # Averages of the likelihood last.
+            self._copy_state(self.places.state, stages[0].state)
+        for stage in stages:
+            last, deep = stage.most == 1, settings
             score(stage)
             if not last:
-                last = self._deepen(stage, settings)[number * STAGE + LEFT] == 0.0
+                numbers, deep = self._deepen(stage, settings)
+                last = numbers[stage.number * STAGE + LEFT] == 0.0
                 self._draw(stage, drawn if last else self.count)
-                if self._step is not settings:
-                    self.upload_settings(settings)
-            self.shown, self.next = source, 1 - source
+            if deep is not settings:
+                self.upload_settings(settings)
             if last:
                 break
-            source = 1 - source
+        self.set_particles(stage.places, drawn, weight_block(self.backend, drawn))
 
-    def _deepen(self, stage: Stage, settings: np.ndarray) -> np.ndarray:
-        """Weigh a stage on ever lower rungs, until enough particles have weight; return the state."""
-        numbers = self._read(self.state, STATE)
-        while settings[DEPTH] > _DEEPEST and is_starved(numbers, settings, stage.number, self.count):
-            settings = settings.copy()
-            settings[DEPTH] *= LOWEST
-            settings[JITTER], settings[FARTHEST_X], settings[FARTHEST_THETA] = _WIDE_JITTER, math.inf, math.pi
+    def _deepen(self, stage: Stage, settings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Weigh a stage on lower rungs while too few particles have weight; return the state and the settings."""
+        numbers = self._read(self.states[stage.state], STATE)
+        while is_starved(numbers, settings, stage.number, self.count):
+            settings = deeper(settings)
             self.upload_settings(settings)
             self.backend.run(self.weighing(stage))
-            numbers = self._read(self.state, STATE)
-        return numbers
+            numbers = self._read(self.states[stage.state], STATE)
+        return numbers, settings
 
-    def begin(self, kind: int) -> None:
+    def _copy_state(self, source: int, target: int) -> None:
+        if self.backend.info.kind == "gpu":
+            self.backend.copy(self.states[source], self.states[target], STATE * _DOUBLE.itemsize)
+        else:
+            self.backend.upload(self._read(self.states[source], STATE), self.states[target])
+
+    def begin(self, stage: Stage) -> None:
         """Start the motion of a correction."""
-        self.moved = True
-        self.backend.run(self.motion(kind))
+        if stage.kind is not None:
+            self.backend.run(self.motion(stage.origin, stage.source, stage.kind))
 
     def weigh(self, stage: Stage) -> None:
         """Run the launches of a stage after its scores."""
-        self._stages.run((stage[:4], self.count, self._sensors), lambda: self.weighing(stage))
+        key = stage._replace(origin=0, kind=None)
+        self._stages.run((key, self.count, self._sensors), lambda: self.weighing(stage))
 
     def _draw(self, stage: Stage, drawn: int) -> None:
         """Draw into the other buffer."""
-        self._stages.run((stage[:2], drawn, self.count, "draw"), lambda: self.draw(stage, drawn))
+        key = stage._replace(origin=0, kind=None)
+        self._stages.run((key, drawn, self.count, "draw"), lambda: self.draw(stage, drawn))
 
     def replay(self, stage: Stage, key: Hashable, scoring: Callable[[int], tuple[Program, object]]) -> None:
         """Run a stage as one recorded program.
@@ -197,10 +158,9 @@ class Cloud(Particles):
         if whole not in self._recordings:
             if len(self._recordings) > _MOST_RECORDED:
                 self._recordings.clear()
-            move = () if stage.kind is None else self.motion(stage.kind)
+            move = () if stage.kind is None else self.motion(stage.origin, stage.source, stage.kind)
             program, owners = scoring(stage.source)
             self._recordings[whole] = self.backend.record(move + program + self.weighing(stage)), owners
-        self.moved = True
         self._recordings[whole][0]()
 
     def explain(self) -> str:
@@ -209,44 +169,39 @@ class Cloud(Particles):
             return "launches one by one"
         return next(reversed(self._recordings.values()))[0].explain()
 
-    def resized(self, drawn: int) -> None:
-        """Set the number of particles, after a step that has drawn that number."""
-        self.count = drawn
-        self.block = weight_block(self.backend, drawn)
-
     # ---- what crosses to the host
 
     def summary(self) -> Summary:
         """Return the state after the last correction."""
-        numbers = self._read(self.state, STATE)
-        used, stage, distinct = 0.0, 0, math.inf
-        while True:
-            own = numbers[stage * STAGE : (stage + 1) * STAGE]
-            used += float(own[RUNG])
-            if own[LEFT] == 0.0:
-                break
-            # Each copy moves by the difference of two others: m parents have at most m^3 distinct copies.
-            distinct = min(distinct, float(own[SAMPLE_SIZE]) ** 3)
-            stage += 1
-        degenerate = bool(numbers[DEGENERATE])
-        return Summary(min(float(own[SAMPLE_SIZE]), distinct), min(used, 1.0), degenerate, stage + 1, numbers)
+        return summary_of(self._read(self.states[self.places.state], STATE))
 
     def shares(self, count: int) -> Any:
-        """Return the weights of the shown particles, whose sum is 1, as an array of the device's library."""
-        out = self.backend.blank(count, _DOUBLE)
-        program = self.sums.estimate(self.poses[self.shown], self.weight, self.estimated, count)
-        program += self.sums.launch("normalize_weights", count, weight=self.weight, estimate=self.estimated, share=out,
+        """Return the weights of the shown particles, whose sum is 1: on a GPU an array of the device's library."""
+        if self.backend.info.kind != "gpu":
+            weights = self.host_weights(count)
+            return weights / weights.sum()
+        out, weight = self.backend.blank(count, _DOUBLE), self.weights[self.places.weight]
+        program = self.sums.estimate(self.poses[self.places.shown], weight, self.estimated, count)
+        program += self.sums.launch("normalize_weights", count, weight=weight, estimate=self.estimated, share=out,
                                     particles=count)  # fmt: skip
         self.backend.run(program)
         return self.backend.lend(out, (count,), _DOUBLE)
 
     def moments(self, count: int) -> Any:
-        """Return mean and covariance of the shown particles as an array of the device's library."""
-        out = self.backend.blank(ESTIMATE, _DOUBLE)
+        """Return mean and covariance of the shown particles: on a GPU an array of the device's library."""
+        if self.backend.info.kind != "gpu":
+            return self.estimate(count)[:MOMENTS]
+        out, poses, weight = self.backend.blank(ESTIMATE, _DOUBLE), self.poses[self.places.shown], self.places.weight
         for again in (0, 1):
             # The second pass is right for any headings.
-            self.backend.run(self.sums.estimate(self.poses[self.shown], self.weight, out, count, again))
-        return self.lent(out, (MOMENTS,))
+            self.backend.run(self.sums.estimate(poses, self.weights[weight], out, count, again))
+        return self._lent(out, (MOMENTS,))
+
+    def particles(self, count: int) -> Any:
+        """Return the shown poses: on a GPU an array of the device's library."""
+        if self.backend.info.kind != "gpu":
+            return self.host_poses(self.places.shown, count)
+        return self._lent(self.poses[self.places.shown], (count, 3))
 
     def estimate(self, count: int) -> np.ndarray:
         """Return the kernels' estimate of the shown particles: mean, covariance, sum of weights."""
@@ -255,10 +210,11 @@ class Cloud(Particles):
 
     def _estimate(self, count: int, again: int) -> np.ndarray:
         """Return the numbers after a pass of the estimate."""
+        shown, weight = self.places.shown, self.places.weight
         # Clouds that change their size seldom ask twice for the same.
         self._estimates.run(
-            (self.shown, count, again),
-            lambda: self.sums.estimate(self.poses[self.shown], self.weight, self.estimated, count, again),
+            (shown, weight, count, again),
+            lambda: self.sums.estimate(self.poses[shown], self.weights[weight], self.estimated, count, again),
         )
         return self._read(self.estimated, ESTIMATE)
 
@@ -268,11 +224,28 @@ class Cloud(Particles):
 
     def host_weights(self, count: int) -> np.ndarray:
         """Return a copy of the weights of the shown particles, before they are normalised."""
-        return self._read(self.weight, count)
+        return self._read(self.weights[self.places.weight], count)
+
+    def contents(self, count: int) -> Contents:
+        """Return a copy of all particles, given the number of the shown ones."""
+        places, weighed = self.places, self.places.shown != self.places.next
+        return Contents(
+            self.host_poses(places.shown, count), self.host_weights(count),
+            self.host_poses(places.next, self.count) if weighed else None,
+            self._read(self.weights[places.before], self.count) if weighed else None,
+            self._read(self.states[places.state], STATE),
+        )  # fmt: skip
+
+    def restore(self, contents: Contents) -> None:
+        """Replace all particles by those of ``contents``."""
+        places, arrays = contents.places_and_arrays(self.places)
+        self._fill(*((getattr(self, name)[index], array) for name, index, array in arrays),
+                   (self.states[places.state], contents.state))  # fmt: skip
+        self.set_particles(places, contents.next_count, weight_block(self.backend, contents.next_count))
 
     def _read(self, buffer: Buffer, count: int) -> np.ndarray:
         return self.backend.download(buffer, np.empty(count))
 
-    def lent(self, buffer: Buffer, shape: tuple[int, ...]) -> Any:
+    def _lent(self, buffer: Buffer, shape: tuple[int, ...]) -> Any:
         """Return the head of a buffer as an array of the device's library."""
         return self.backend.lend(self.backend.part(buffer, 0, math.prod(shape), _DOUBLE), shape, _DOUBLE)

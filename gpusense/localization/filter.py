@@ -11,11 +11,13 @@ from gpusense.localization import options, resetting, skipping
 from gpusense.localization.adaptive import kld_count
 from gpusense.localization.beginnings import Beginnings
 from gpusense.localization.calibration import LOOK, Due, due_of, is_together
-from gpusense.localization.cloud import Cloud
 from gpusense.localization.defaults import DEFAULTS
+from gpusense.localization.device_cloud import DeviceCloud
 from gpusense.localization.estimates import covariance_of
+from gpusense.localization.filter_cloud import FilterCloud, Step
+from gpusense.localization.journal import whole
 from gpusense.localization.motion import STILL, MotionModel, OdometryMotion, SampledMotion
-from gpusense.localization.scoring import Given, Scoring, given_of
+from gpusense.localization.scoring import given_of
 from gpusense.localization.sensors import sensors_of
 from gpusense.localization.verdict import Verdict
 
@@ -66,6 +68,11 @@ class ParticleFilter(Beginnings):
         True
     """
 
+    MEMORY = (
+        "_step", "_started", "_pending", "_shown", "_wide", "_corrections", "_together", "_pool", "_last", "_trust",
+        "_verdict", "_sensors", "_cloud",
+    )  # fmt: skip
+
     def __init__(
         self,
         models: Any,
@@ -91,9 +98,9 @@ class ParticleFilter(Beginnings):
         )  # fmt: skip
         if self.options.recovery == "augmented" and not any(hasattr(one.model, "grid") for one in self._sensors):
             raise ValueError("recovery: 'augmented' needs a model with a map, got none")
+        self._begin_journals()
         self._cloud = self._new_cloud()
-        self._scoring = Scoring(self._cloud, self._sensors)
-        self._step, self._started, self._pending = 0, False, STILL
+        self._step, self._started, self._pending = 0, False, None
         self._shown, self._wide = self.options.most, 0
         self._corrections, self._together = 0, False
         self._pool = 0, (0.0, 0.0, 0.0)
@@ -101,10 +108,9 @@ class ParticleFilter(Beginnings):
         self._last: dict[int, tuple[Any, ...]] = {}
         self._trust = None
 
-    def _new_cloud(self) -> Cloud:
+    def _new_cloud(self) -> FilterCloud:
         """Return room for the particles."""
-        residual, precision = self.options.resampling == "residual", self._sensors[0].precision
-        return Cloud(self._backend, self.options.most, len(self._sensors), precision, residual=residual)
+        return DeviceCloud(self._sensors, self.options.most, residual=self.options.resampling == "residual")
 
     def __repr__(self) -> str:
         one = self.options
@@ -115,6 +121,7 @@ class ParticleFilter(Beginnings):
             f"stages={one.stages}, backend={self.device.selection!r})"
         )
 
+    @whole
     def predict(self, *motion: Any) -> None:
         """Move the particles: by the odometry before and after the step, or what the motion model takes.
 
@@ -127,11 +134,11 @@ class ParticleFilter(Beginnings):
         """
         self._check_started()
         sampled = self.motion.sampled(*motion)
-        if self._pending is not STILL:
-            self.flush()
+        self.flush()
         # The next correction begins with the move: one program has both.
         self._pending = sampled
 
+    @whole
     def correct(self, readings: Any) -> None:
         """Weigh the particles by readings, and draw new ones where it is due.
 
@@ -140,6 +147,9 @@ class ParticleFilter(Beginnings):
                 ``log_likelihood`` takes several arguments, a tuple has them: ``(features, correspondence)``,
                 ``(ranges, ids)``, ``(fix, covariance)``. None is a missing reading.
                 :meth:`estimate` and :meth:`reset` read arrays of a device again, which must not change until then.
+
+        Where it raises, an interrupt by the user included, the filter is as it was before, so a correction can be
+        repeated. So are all calls of a filter.
 
         Raises:
             RuntimeError: the filter is not initialised.
@@ -156,18 +166,11 @@ class ParticleFilter(Beginnings):
         if chosen.beam_skip is not None:
             particles = self.host_particles(), self.host_weights()
             given = skipping.skipped(self._sensors, given, particles, self._verdict.anywhere, chosen.beam_skip)
-        motion, self._pending = self._pending, STILL
+        motion = STILL if self._pending is None else self._pending
         drawn = self._cloud.count if chosen.least == chosen.most else self._wanted()
-        self._cloud.upload_settings(self._settings(motion, [index for index, _ in given]))
-        self._cloud.moved = False
-        try:
-            self._score(given, motion.kind, drawn)
-        except BaseException:
-            # Readings that a model refuses cost no motion. An equal one that is not STILL shows moved particles.
-            self._pending = STILL._replace() if self._cloud.moved else motion
-            raise
-        self._shown = self._cloud.count
-        self._cloud.resized(drawn)
+        settings = self._settings(motion, [index for index, _ in given])
+        self._shown, self._pending = self._cloud.count, None
+        self._cloud.correct(Step(settings, motion.kind, chosen.stages, drawn, given))
         # The caller may write the next readings to the same arrays.
         self._last = {index: tuple(map(_copied, reading)) for index, reading in whole.items()}
         self._wide = max(self._wide - 1, 0)
@@ -194,6 +197,7 @@ class ParticleFilter(Beginnings):
             return self.estimate().lost
         return self._trust is not None and self._trust.contradicted(self.estimate())
 
+    @whole
     def reset(self) -> None:
         """Replace half of the particles by poses at which the last readings are likely (sensor resetting).
 
@@ -205,24 +209,19 @@ class ParticleFilter(Beginnings):
         if not self._last:
             raise RuntimeError("reset: needs a correction first")
         tries = self._random_poses(resetting.tries_of(self._cloud.count))
-        poses = self._cloud.host_poses(self._cloud.next, self._cloud.count)
+        poses = self._cloud.host_poses(self._cloud.places.next, self._cloud.count)
         chosen = resetting.with_likely_poses(
             poses, tries, self._sensors, self._last, self.options.temperature, self._key()
         )
         self._place(chosen, again=True)
 
+    @whole
     def flush(self) -> None:
         """Run the motion of the last ``predict`` now, as a step of its own; the next correction does it otherwise."""
-        if self._pending is STILL:
+        if (motion := self._pending) is None:
             return
-        motion, self._pending = self._pending, STILL
-        self._cloud.upload_settings(self._settings(motion, []))
-        self._cloud.move(motion.kind)
-        self._shown = self._cloud.count
-
-    def _score(self, given: list[Given], kind: int, drawn: int) -> None:
-        """Run the stages of a correction, the last of which draws a number of particles."""
-        self._scoring.correct(given, kind, self.options.stages, drawn)
+        self._cloud.move(self._settings(motion, []), motion.kind)
+        self._shown, self._pending = self._cloud.count, None
 
     def _settings(self, motion: SampledMotion, given: list[int]) -> np.ndarray:
         """Return the numbers of a step."""
@@ -236,7 +235,7 @@ class ParticleFilter(Beginnings):
 
     def _wanted(self) -> int:
         """Return the particles of the next step by KLD sampling."""
-        poses = self._cloud.host_poses(self._cloud.next, self._cloud.count)
+        poses = self._cloud.host_poses(self._cloud.places.next, self._cloud.count)
         return kld_count(poses, self.options.least, self.options.most)
 
 

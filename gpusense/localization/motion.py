@@ -20,6 +20,8 @@ from gpusense.localization.defaults import DEFAULTS
 
 # Below this translation [m] no direction can be read from it.
 SHORTEST = 0.01
+# Largest turn of a step, and largest deviation of turns [rad]: kernels take headings of up to LARGEST_HEADING.
+_MOST_TURNED = 1e5
 
 
 class SampledMotion(NamedTuple):
@@ -249,16 +251,21 @@ class VelocityMotion:
             raise TypeError(f"predict: must have velocities and a duration, got {len(arguments)} values")
         v, w = (float(value) for value in checks.array("velocity", arguments[0], (2,)))
         seconds = checks.real("seconds", arguments[1], low=0)
+        if abs(w * seconds) > _MOST_TURNED:
+            raise ValueError(f"velocity: must turn by at most {_MOST_TURNED:g} rad in a step, got {w * seconds}")
         a1, a2, a3, a4, a5, a6 = self.alpha
         at, ar = self.least
         length = math.hypot(math.sqrt(a1 * v * v + a2 * w * w) * seconds, at)
         half = math.sqrt(a3 * v * v + a4 * w * w) * seconds / 2
         last = math.hypot(math.sqrt(a5 * v * v + a6 * w * w) * seconds, ar)
-        # The last turn takes whole turns back: the kernel wraps a heading once.
+        # The last turn takes whole turns back.
         back = math.tau * -round(w * seconds / math.tau)
         return SampledMotion((w * seconds / 2, v * seconds, 0.0, back), (half, length, 0.0, last), VELOCITY_MODEL)
 
 
 def settings_of(motion: SampledMotion) -> tuple[np.ndarray, float]:
     """Return means and deviations as a (8,) array, and the probability of a reverse."""
-    return np.array([*motion.mean, *motion.deviation]), motion.reverse
+    first, ahead, left, second = motion.deviation
+    # A heading whose deviation is many turns is uniform, so a limit changes nothing but the size of its numbers.
+    turns = min(first, _MOST_TURNED), min(second, _MOST_TURNED)
+    return np.array([*motion.mean, turns[0], ahead, left, turns[1]]), motion.reverse

@@ -1,11 +1,13 @@
 """The particles of a filter on their device, and the launches of its steps.
 
-Two buffers hold poses: a stage of a correction scores and weighs those of one, and draws those of the other.
+Four buffers hold poses and four hold weights, in two banks: a step reads those of one bank and writes those of the
+other. So an interrupted step has changed nothing. A stage of a correction scores and weighs the poses of a buffer, and
+draws into the other one of its bank.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -18,14 +20,65 @@ from gpusense.localization.sums import Sums, weight_block
 _DOUBLE = np.dtype(np.float64)
 
 
+class Places(NamedTuple):
+    """Buffers of a filter's particles, by their indices.
+
+    Attributes:
+        shown: Weighted poses.
+        next: Poses of the next step; the same where no step has weighed them.
+        weight: Weights of the shown poses.
+        before: Weights with which the next step begins.
+        state: State of the last correction.
+    """
+
+    shown: int = 0
+    next: int = 0
+    weight: int = 1
+    before: int = 1
+    state: int = 0
+
+    def placed(self) -> Places:
+        """Return the buffers of new particles, which leave these as they are."""
+        poses, weights = self._free()
+        return Places(poses, poses, weights + 1, weights + 1, 1 - self.state)
+
+    def moved(self) -> Places:
+        """Return the buffers after a move by itself: weights stay those that the next correction begins with."""
+        poses = self._free()[0]
+        return self._replace(shown=poses, next=poses, weight=self.before)
+
+    def stages(self, most: int, drawn: int, kind: int) -> list[Stage]:
+        """Return the stages of a correction.
+
+        Args:
+            most: Their largest number.
+            drawn: Particles of the next step.
+            kind: Kind of the motion that begins the first one.
+        """
+        poses, weights = self._free()
+        first = Stage(poses, 0, most, drawn if most == 1 else 0, self.before, weights, 1 - self.state, self.next, kind)
+        return [first] + [
+            Stage(poses + number % 2, number, most, 0, weights + 1, weights, first.state)
+            for number in range(1, most)
+        ]
+
+    def _free(self) -> tuple[int, int]:
+        """Return the first poses and the first weights of the banks that hold none of these."""
+        return 2 - self.shown // 2 * 2, 2 - self.weight // 2 * 2
+
+
 class Stage(NamedTuple):
     """A stage of a correction.
 
     Attributes:
-        source: Index of the buffer with its poses.
+        source: Index of the buffer with its poses; it draws into the other one of the bank.
         number: Its number, from 0.
         most: Most stages of the correction.
         drawn: Particles that it draws; 0 where the number follows from its weights.
+        before: Index of the weights before it.
+        weight: Index of the weights that it sets; those that it draws are in the buffer behind.
+        state: Index of the state that it writes.
+        origin: Index of the poses before the motion.
         kind: Kind of the motion before it; None where there is none.
     """
 
@@ -33,7 +86,26 @@ class Stage(NamedTuple):
     number: int
     most: int
     drawn: int
-    kind: int | None
+    before: int
+    weight: int
+    state: int
+    origin: int = 0
+    kind: int | None = None
+
+    @property
+    def target(self) -> int:
+        """Index of the buffer into which it draws."""
+        return self.source ^ 1
+
+    @property
+    def after(self) -> int:
+        """Index of the weights of drawn particles."""
+        return self.weight + 1
+
+    @property
+    def places(self) -> Places:
+        """The buffers after it."""
+        return Places(self.source, self.target, self.weight, self.after, self.state)
 
 
 class Particles:
@@ -47,25 +119,27 @@ class Particles:
         residual: Whether draws are those of residual resampling.
 
     Attributes:
-        count: Particles.
-        shown: Index of the buffer with the weighted poses.
-        next: Index of the buffer with the poses of the next step.
+        count: Particles of the next step.
+        places: Buffers of the particles.
     """
+
+    MEMORY: ClassVar[tuple[str, ...]] = ("count", "block", "places", "pool")
 
     def __init__(
         self, backend: Backend, capacity: int, sensors: int, precision: np.dtype, *, residual: bool = False
     ) -> None:
         self.backend, self.capacity, self.precision, self._sensors = backend, capacity, precision, sensors
-        self.count, self.shown, self.next = capacity, 0, 0
+        self.count, self.places = capacity, Places()
         self.block = weight_block(backend, capacity)
         # Memory that a processor shares with the host is not lent.
         make = backend.blank if backend.info.kind == "gpu" else backend.empty
-        self.poses = [make(3 * capacity, _DOUBLE) for _ in range(2)]
-        self.weight, self.before = make(capacity, _DOUBLE), make(capacity, _DOUBLE)
+        self.poses = [make(3 * capacity, _DOUBLE) for _ in range(4)]
+        self.weights = [make(capacity, _DOUBLE) for _ in range(4)]
         self.log_p = [make(capacity, precision) for _ in range(sensors)]
         self.score, self.ends = backend.empty(capacity, _DOUBLE), backend.empty(capacity, _DOUBLE)
         self.sums, self.estimated = Sums(backend, capacity), backend.empty(ESTIMATE, _DOUBLE)
-        self.settings, self.state = backend.empty(SETTINGS, _DOUBLE), backend.upload(np.zeros(STATE))
+        self.settings = backend.empty(SETTINGS, _DOUBLE)
+        self.states = [backend.upload(np.zeros(STATE)) for _ in range(2)]
         self.pool = backend.upload(np.zeros(3))
         # Cumulative numbers of certain copies.
         self._copies = backend.empty(capacity, _DOUBLE) if residual else None
@@ -75,15 +149,9 @@ class Particles:
         """Number of blocks of particles."""
         return -(-self.count // self.block)
 
-    def place(self, poses: np.ndarray, weights: np.ndarray | None = None) -> None:
-        """Replace all particles."""
-        self.count, self.shown, self.next = len(poses), 0, 0
-        self.block = weight_block(self.backend, self.count)
-        w = np.ones(self.count) if weights is None else weights * (self.count / weights.sum())
-        self.backend.synchronize()
-        self.backend.upload(np.ascontiguousarray(poses, np.float64), self.poses[0])
-        self.backend.upload(np.ascontiguousarray(w, np.float64), self.weight)
-        self.backend.upload(np.ascontiguousarray(w, np.float64), self.before)
+    def set_particles(self, places: Places, count: int, block: int) -> None:
+        """Set the buffers and the number of particles, and those of a block of weights."""
+        self.places, self.count, self.block = places, count, block
 
     def use(self, sensors: int) -> None:
         """Set the number of sensors of the next correction."""
@@ -91,20 +159,19 @@ class Particles:
 
     # ---- launches
 
-    def motion(self, kind: int) -> Program:
-        """Return the launch that moves the particles of the next step."""
-        buffer = self.poses[self.next]
-        return self.sums.launch("move_particles", self.count, source=buffer, settings=self.settings, target=buffer,
-                                particles=self.count, kind=kind)  # fmt: skip
+    def motion(self, origin: int, target: int, kind: int) -> Program:
+        """Return the launch that moves particles from a buffer to another."""
+        return self.sums.launch("move_particles", self.count, source=self.poses[origin], settings=self.settings,
+                                target=self.poses[target], particles=self.count, kind=kind)  # fmt: skip
 
     def sizes(self) -> dict[str, int]:
         """Return numbers of particles by the names of arguments."""
         return dict(particles=self.count, block=self.block)
 
-    def numbers(self) -> dict[str, Any]:
+    def numbers(self, stage: Stage) -> dict[str, Any]:
         """Return what weights are made of, by the names of arguments."""
-        return dict(score=self.score, before=self.before, settings=self.settings, state=self.state, blocks=self.blocks,
-                    **self.sizes())  # fmt: skip
+        return dict(score=self.score, before=self.weights[stage.before], settings=self.settings,
+                    state=self.states[stage.state], blocks=self.blocks, **self.sizes())  # fmt: skip
 
     def scoring(self, sensors: int) -> Program:
         """Return the launches that add up the log-likelihoods of sensors."""
@@ -116,21 +183,26 @@ class Particles:
         )  # fmt: skip
 
     def drawing(
-        self, source: tuple[Buffer, Buffer, int], target: Buffer, drawn: int, stage: int, copies: Buffer | None = None
+        self, source: tuple[Buffer, Buffer, int], stage: Stage, drawn: int, copies: Buffer | None = None
     ) -> Program:
         """Return the launch that draws from poses with cumulative weights, given with their number."""
         poses, ends, count = source
         copies = next(one for one in (copies, self._copies, ends) if one is not None)
-        return self.sums.launch("draw_particles", drawn, source=poses, weight=self.weight, ends=ends, copies=copies,
-                                settings=self.settings, state=self.state, pool=self.pool, target=target,
-                                after=self.before, particles=count, drawn=drawn, stage=stage)  # fmt: skip
+        return self.sums.launch("draw_particles", drawn, source=poses, weight=self.weights[stage.weight], ends=ends,
+                                copies=copies, settings=self.settings, state=self.states[stage.state], pool=self.pool,
+                                target=self.poses[stage.target], after=self.weights[stage.after], particles=count,
+                                drawn=drawn, stage=stage.number)  # fmt: skip
+
+    def setting(self, stage: Stage) -> Program:
+        """Return the launch that sets the weights of a stage."""
+        out = self.weights[stage.weight], self.ends
+        return self.sums.set_weights(self.numbers(stage), (stage.number, stage.most), out)
 
     def weighing(self, stage: Stage) -> Program:
         """Return the launches of a stage after its scores: weights, and the draw where its size is known."""
         find, *scored = self.sums.highest(self.blocks)
-        found, numbers = (scored[0], scored[1]), self.numbers()
-        weights = self.sums.weigh(numbers, found, stage.number)
-        weights += self.sums.set_weights(numbers, (stage.number, stage.most), (self.weight, self.ends))
+        found = scored[0], scored[1]
+        weights = self.sums.weigh(self.numbers(stage), found, stage.number) + self.setting(stage)
         draw = self.draw(stage, stage.drawn) if stage.drawn else ()
         return self.scoring(self._sensors) + find + weights + draw
 
@@ -138,7 +210,6 @@ class Particles:
         """Return the launches that draw into the other buffer."""
         copies: Program = ()
         if self._copies is not None:
-            given = {name: self.numbers()[name] for name in ("state", "particles", "block", "blocks")}
+            given = {name: self.numbers(stage)[name] for name in ("state", "particles", "block", "blocks")}
             copies = self.sums.copies(dict(given, ends=self.ends), self._copies, drawn, stage.number)
-        source, target = self.poses[stage.source], self.poses[1 - stage.source]
-        return copies + self.drawing((source, self.ends, self.count), target, drawn, stage.number)
+        return copies + self.drawing((self.poses[stage.source], self.ends, self.count), stage, drawn)

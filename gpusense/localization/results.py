@@ -11,17 +11,16 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.backends import BackendInfo
 from gpusense.backends.base import Backend
-from gpusense.interface.constants import MOMENTS
-from gpusense.localization.cloud import Cloud
 from gpusense.localization.estimates import Estimate, clustered, covariance_of
+from gpusense.localization.filter_cloud import FilterCloud
+from gpusense.localization.journal import Whole, whole
 from gpusense.localization.options import Options
-from gpusense.localization.scoring import Scoring
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.verdict import Verdict
 from gpusense.world.grid import OccupancyGrid
 
 
-class Results(ABC):
+class Results(Whole, ABC):
     """The part of a particle filter that reads its state.
 
     Attributes:
@@ -30,8 +29,7 @@ class Results(ABC):
 
     options: Options
     _backend: Backend
-    _cloud: Cloud
-    _scoring: Scoring
+    _cloud: FilterCloud
     _sensors: list[Sensor]
     _verdict: Verdict
     # Whether there are particles, the number of those that are shown, and the last readings.
@@ -55,10 +53,12 @@ class Results(ABC):
         return self._backend.info
 
     @property
+    @whole
     def count(self) -> int:
         """Number of particles of the next step."""
         return self._cloud.count
 
+    @whole
     def estimate(self, method: str = "mean") -> Estimate:
         """Return the pose of the robot.
 
@@ -76,7 +76,7 @@ class Results(ABC):
         numbers, summary = self._cloud.estimate(self._shown), self._cloud.summary()
         pose, covariance = numbers[:3].copy(), covariance_of(numbers)
         if method != "mean":
-            poses = self._cloud.host_poses(self._cloud.shown, self._shown)
+            poses = self._cloud.host_poses(self._cloud.places.shown, self._shown)
             if method == "best":
                 pose = poses[int(np.argmax(self._cloud.host_weights(self._shown)))]
             else:
@@ -92,6 +92,7 @@ class Results(ABC):
             summary.degenerate, self._shown,
         )  # fmt: skip
 
+    @whole
     def mean_and_covariance(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the weighted mean (3,) and the covariance (3, 3), without the verdict of :meth:`estimate`."""
         self._check_started()
@@ -105,11 +106,13 @@ class Results(ABC):
         return tuple(sensor.model for sensor in self._sensors)
 
     @property
+    @whole
     def temperatures(self) -> tuple[float, ...]:
         """Temperature of each model now."""
         return tuple(sensor.temperature(self.options.temperature) for sensor in self._sensors)
 
     @property
+    @whole
     def gain(self) -> float:
         """Mean gain of recent features over features anywhere or false ones [nats]; below 1 the filter is lost.
 
@@ -121,13 +124,14 @@ class Results(ABC):
     def scoring_seconds(self) -> float:
         """Seconds that the models' log-likelihoods have taken, if ``time_scoring`` was called before.
 
-        Without it they are the seconds in which they were started; 0 where a step is one recorded program.
+        Without it they are the seconds in which they were started; 0 where a step is one recorded program. Those of a
+        filter over several devices are added up.
         """
-        return sum(sensor.seconds for sensor in self._sensors)
+        return self._cloud.scoring_seconds
 
     def time_scoring(self) -> None:
         """Wait for the log-likelihoods of each stage from now on, so that ``scoring_seconds`` is their time."""
-        self._scoring.timed = True
+        self._cloud.time_scoring()
 
     @property
     def grid(self) -> OccupancyGrid:
@@ -141,12 +145,14 @@ class Results(ABC):
                 return sensor.model.grid
         raise ValueError("models: must have a map, got none with one")
 
+    @whole
     def host_particles(self) -> np.ndarray:
         """Return a copy of the (N, 3) poses after the last step in host memory."""
         self._check_started()
         self.flush()
-        return self._cloud.host_poses(self._cloud.shown, self._shown)
+        return self._cloud.host_poses(self._cloud.places.shown, self._shown)
 
+    @whole
     def host_weights(self) -> np.ndarray:
         """Return a copy of the (N,) weights of the particles in host memory; their sum is 1."""
         self._check_started()
@@ -155,32 +161,28 @@ class Results(ABC):
         return weights / weights.sum()
 
     @property
+    @whole
     def particles(self) -> Any:
         """(N, 3) poses after the last step: on a GPU an array of the device, which other libraries use in place."""
         self._check_started()
         self.flush()
-        return self._array(self._cloud.poses[self._cloud.shown], (self._shown, 3))
+        return self._cloud.particles(self._shown)
 
     @property
+    @whole
     def weights(self) -> Any:
         """(N,) weights of the particles, whose sum is 1: on a GPU an array of the device."""
         self._check_started()
         self.flush()
-        return self._cloud.shares(self._shown) if self._backend.info.kind == "gpu" else self.host_weights()
+        return self._cloud.shares(self._shown)
 
     @property
+    @whole
     def moments(self) -> Any:
         """(9,) mean x, y, theta and covariance xx, xy, xt, yy, yt, tt: on a GPU an array of the device."""
         self._check_started()
         self.flush()
-        if self._backend.info.kind == "gpu":
-            return self._cloud.moments(self._shown)
-        return self._cloud.estimate(self._shown)[:MOMENTS]
-
-    def _array(self, buffer: Any, shape: tuple[int, ...]) -> Any:
-        if self._backend.info.kind == "gpu":
-            return self._cloud.lent(buffer, shape)
-        return self._backend.download(buffer, np.empty(shape))
+        return self._cloud.moments(self._shown)
 
     def explain(self) -> str:
         """Return in one line how a step is started on the device."""

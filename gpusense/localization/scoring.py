@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,13 +11,12 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.interface.launches import Program
 from gpusense.localization.cloud import Cloud
+from gpusense.localization.filter_cloud import Given
 from gpusense.localization.particles import Stage
 from gpusense.localization.sensors import Sensor
 
 # Programs of scores that are kept.
 _MOST_PROGRAMS = 8
-# Index of a sensor, and its readings.
-Given = tuple[int, tuple[Any, ...]]
 
 
 def given_of(readings: Any, sensors: Sequence[Sensor]) -> list[Given]:
@@ -72,26 +71,18 @@ class Scoring:
         gpu = self._backend.info.kind == "gpu"
         return gpu and all(self._sensors[index].records(reading) for index, reading in given)
 
-    def correct(self, given: Sequence[Given], kind: int, stages: int, drawn: int) -> None:
-        """Run a step.
-
-        Args:
-            given: Indices of sensors with their readings.
-            kind: Kind of the motion that begins the step.
-            stages: Most stages.
-            drawn: Particles of the next step.
-        """
-        run = functools.partial(self._called, given)
-        if self.records(given):
-            for index, reading in given:
-                self._sensors[index].upload(reading)
-            run = functools.partial(self._recorded, given)
-        self._cloud.correct(kind, stages, drawn, len(given), run)
+    def of(self, given: Sequence[Given]) -> Callable[[Stage], None]:
+        """Return the function that runs a stage with the readings of sensors, given by their indices."""
+        if not self.records(given):
+            return functools.partial(self._called, given)
+        for index, reading in given:
+            self._sensors[index].upload(reading)
+        return functools.partial(self._recorded, given)
 
     def _called(self, given: Sequence[Given], stage: Stage) -> None:
         """Start the log-likelihoods of a stage call by call, and weigh."""
         poses, cloud = self._poses(stage.source), self._cloud
-        before = None if stage.kind is None else functools.partial(cloud.begin, stage.kind)
+        before = None if stage.kind is None else functools.partial(cloud.begin, stage)
         for place, (index, reading) in enumerate(given):
             self._sensors[index].score(poses, reading, self._log_p(place), before=before, timed=self.timed)
             before = None

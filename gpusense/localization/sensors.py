@@ -47,6 +47,8 @@ class Sensor:
         ValueError: a model with a temperature other than 1.
     """
 
+    MEMORY = ("_correlation", "_seen", "_learned")
+
     def __init__(self, model: Any) -> None:
         if not isinstance(model, (ScanModel, PointModel, LandmarkModel)):
             raise TypeError(f"models: must be measurement models, got {checks.show(model)}")

@@ -16,7 +16,7 @@ import numpy as np
 
 from gpusense.backends import arrays
 from gpusense.localization.pose_algebra import mean_pose
-from gpusense.localization.scoring import Given
+from gpusense.localization.filter_cloud import Given
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.verdict import boundary
 

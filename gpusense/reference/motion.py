@@ -11,11 +11,14 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.interface.constants import DEVIATION, FIRST, MEAN, MOTION_STREAM, REVERSE, SEED, STEP, VELOCITY_MODEL
+from gpusense.reference.elementary import angle_of
 from gpusense.reference.heading import cos_sin
 from gpusense.reference.philox import normal_pair, random_words, uniform_of
 
 SMALL_ARC = 1e-4
 WHOLE_TURN, HALF_TURN = 6.283185307179586, 3.141592653589793
+# A whole turn beyond HALF_TURN, rounded down.
+FARTHEST_ONCE = 9.424777960769378
 
 
 def chord_of(length: np.ndarray, half_turn: np.ndarray) -> np.ndarray:
@@ -28,6 +31,15 @@ def chord_of(length: np.ndarray, half_turn: np.ndarray) -> np.ndarray:
 def wrap_once(theta: np.ndarray) -> np.ndarray:
     """Return a heading less than a turn beyond [-pi, pi] in that interval."""
     return np.where(theta > HALF_TURN, theta - WHOLE_TURN, np.where(theta < -HALF_TURN, theta + WHOLE_TURN, theta))
+
+
+def wrap_any(theta: np.ndarray) -> np.ndarray:
+    """Return any heading in [-pi, pi]: more than a turn beyond it goes by its cosine and sine."""
+    far = np.abs(theta) > FARTHEST_ONCE
+    wrapped = wrap_once(theta)
+    if far.any():
+        wrapped[far] = angle_of(*cos_sin(theta[far]))
+    return wrapped
 
 
 def move_particles(
@@ -59,5 +71,5 @@ def move_particles(
     moved = target[: 3 * particles].reshape(-1, 3)
     x = pose[:, 0] + (ahead * cosine - left * sine)
     y = pose[:, 1] + (ahead * sine + left * cosine)
-    moved[:, 2] = wrap_once(theta + second)
+    moved[:, 2] = wrap_any(theta + second)
     moved[:, 0], moved[:, 1] = x, y

@@ -28,6 +28,7 @@ from gpusense.interface.constants import (
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
 from gpusense.localization.cloud import Cloud
+from gpusense.localization.particles import Places, Stage
 from gpusense.localization.sensors import Sensor
 from gpusense.reference.rungs import left_of, rung_of
 from gpusense.sweeps.gathered import Gathered
@@ -57,6 +58,7 @@ class Shard:
         # Ones, and numbers of a step whose only temperature is a sum of weights.
         self._ones: tuple[Any, Any] | None = None
         self._recordings: dict[Hashable, tuple[Recording, object]] = {}
+        self._timed = False
 
     @property
     def _gpu(self) -> bool:
@@ -64,13 +66,12 @@ class Shard:
 
     # ---- beginnings
 
-    def place(self, part: Part, poses: np.ndarray, state: np.ndarray) -> Step:
-        """Replace the particles."""
-        self._part = part
-        if part.size:
-            self._cloud.place(poses)
-        self._cloud.count, self._cloud.block = part.size, part.block
-        self._backend.upload(state, self._cloud.state)
+    def fill(self, arrays: Sequence[tuple[str, int, np.ndarray]]) -> Step:
+        """Copy arrays to buffers, which are named by "poses" or "weights" and an index."""
+        self._backend.synchronize()
+        for name, index, array in arrays:
+            if array.size:
+                self._backend.upload(np.ascontiguousarray(array, np.float64), getattr(self._cloud, name)[index])
         yield
 
     def set_pool(self, poses: np.ndarray) -> Step:
@@ -80,17 +81,26 @@ class Shard:
 
     # ---- a step
 
-    def begin(self, settings: np.ndarray, kind: int | None, sensors: int) -> Step:
-        """Begin a step: the numbers of the whole filter, a move, and the number of sensors that are used."""
+    def begin(self, part: Part, settings: np.ndarray, origin: int, target: int, kind: int) -> Step:
+        """Begin a step: move particles from a buffer to another.
+
+        Args:
+            part: The particles.
+            settings: Numbers of the step of the whole filter.
+            origin: Index of the poses before the move.
+            target: Index of the poses after it.
+            kind: Kind of the motion.
+        """
         self._settings = settings.copy()
-        self._upload_settings(self._part)
-        if kind is not None and self._part.size:
-            if sensors:
-                self._cloud.use(sensors)
-                self._backend.run(self._cloud.motion(kind))
-            else:
-                self._cloud.move(kind)
+        self._set_part(part)
+        self._upload_settings(part)
+        if part.size:
+            self._backend.run(self._cloud.motion(origin, target, kind))
         yield
+
+    def _set_part(self, part: Part) -> None:
+        self._part = part
+        self._cloud.set_particles(Places(), part.size, part.block)
 
     def _upload_settings(self, drawn: Part, share: float | None = None) -> None:
         """Upload the numbers of the step for the particles of a part, with another share where one is given."""
@@ -112,7 +122,8 @@ class Shard:
             self._recorded(source, given)()
         else:
             for place, (index, reading) in enumerate(given):
-                self._sensors[index].score(self._poses(source), reading, self._scores(place))
+                out = self._scores(place)
+                self._sensors[index].score(self._poses(source), reading, out, timed=self._timed)
             self._backend.run(cloud.scoring(len(given)))
         yield
         return float(self._read(cloud.sums.largest, cloud.blocks).max())
@@ -141,46 +152,43 @@ class Shard:
     def _scores(self, place: int) -> Any:
         return self._backend.view(self._cloud.log_p[place], (self._part.size,), self._cloud.precision)
 
-    def weigh(self, high: float, stage: int) -> Step:
+    def weigh(self, high: float, stage: Stage) -> Step:
         """Return the sums of integer weights, given the largest score of the whole filter."""
         cloud, part = self._cloud, self._part
         if not part.size:
             yield
             return np.zeros(WEIGHT_SUMS)
         self._backend.upload(np.array([high]), cloud.sums.largest)
-        self._backend.run(cloud.sums.weigh(cloud.numbers(), (cloud.sums.largest, 1), stage))
+        self._backend.run(cloud.sums.weigh(cloud.numbers(stage), (cloud.sums.largest, 1), stage.number))
         yield
         return self._read(cloud.sums.totals, WEIGHT_SUMS)
 
     def set_weights(
-        self, source: int, totals: np.ndarray, state: np.ndarray, place: tuple[int, int], offset: float, marks: Marks
+        self, stage: Stage, totals: np.ndarray, state: np.ndarray, offset: float, marks: Marks
     ) -> Step:
         """Set the weights by the sums and the state of the whole filter; return the particles that draws need.
 
         Args:
-            source: Buffer of the poses.
+            stage: The stage.
             totals: Sums of the whole filter.
             state: Its state after this stage.
-            place: The stage, and the most stages.
             offset: Sum of the weights of the shards before.
             marks: The lowest and the highest mark that each shard draws at; None where nothing is drawn.
 
         Returns:
             For each pair of marks, poses and cumulative weights of the particles from the one to the other.
         """
-        cloud, part, stage = self._cloud, self._part, place[0]
-        cloud.shown, cloud.next = source, 1 - source
+        cloud, part = self._cloud, self._part
         if part.size:
-            self._choose_rung(totals, left_of(state, stage))
+            self._choose_rung(totals, left_of(state, stage.number))
             self._backend.upload(totals, cloud.sums.totals)
-            out = cloud.weight, cloud.ends
-            self._backend.run(cloud.sums.set_weights(cloud.numbers(), place, out))
+            self._backend.run(cloud.setting(stage))
         yield
         # The kernel knows the number of particles of the shard only: the state is that of the filter.
-        self._backend.upload(state, cloud.state)
+        self._backend.upload(state, cloud.states[stage.state])
         if marks is None or not part.size:
             return [(np.empty((0, 3)), np.empty(0))] * len(marks or ())
-        ends, poses = self._read(cloud.ends, part.size) + offset, cloud.host_poses(source, part.size)
+        ends, poses = self._read(cloud.ends, part.size) + offset, cloud.host_poses(stage.source, part.size)
         begins, finals = (np.searchsorted(ends, side, side="right") for side in np.array(marks).T)
         return [(poses[a : b + 1], ends[a : b + 1]) for a, b in zip(begins, finals, strict=True)]
 
@@ -229,18 +237,17 @@ class Shard:
         """Tell whether the device copies from the device of another shard."""
         return self._gpu and self._backend.copies_from(other._backend)
 
-    def draw(self, source: int, stage: int, drawn: Part, pieces: Sequence[Piece] | bool) -> Step:
+    def draw(self, stage: Stage, drawn: Part, pieces: Sequence[Piece] | bool) -> Step:
         """Draw the particles of the next stage or step.
 
         Args:
-            source: Buffer of the poses.
             stage: The stage.
             drawn: Particles to draw.
             pieces: Poses and cumulative weights of shards in their order; True for those that the device has taken, and
                 False to copy the own ones.
         """
         cloud, found = self._cloud, self._gathered
-        of: tuple[Any, Any, int] = cloud.poses[source], cloud.ends, self._part.size
+        of: tuple[Any, Any, int] = cloud.poses[stage.source], cloud.ends, self._part.size
         if pieces is not False:
             if pieces is not True:
                 found.upload(pieces, self._part.whole)
@@ -250,9 +257,9 @@ class Shard:
             counting: Program = ()
             copies = None
             if self._residual and pieces is not False:
-                counting, copies = found.copies(cloud.state, drawn.whole, stage)
-            self._backend.run(counting + cloud.drawing(of, cloud.poses[1 - source], drawn.size, stage, copies))
-        self._part, cloud.count, cloud.block = drawn, drawn.size, drawn.block
+                counting, copies = found.copies(cloud.states[stage.state], drawn.whole, stage.number)
+            self._backend.run(counting + cloud.drawing(of, stage, drawn.size, copies))
+        self._set_part(drawn)
         yield
 
     # ---- results
@@ -262,13 +269,13 @@ class Shard:
         yield
         return self._cloud.host_poses(index, count)
 
-    def weights(self, count: int) -> Step:
-        """Return the weights of the shown particles."""
+    def weights(self, index: int, count: int) -> Step:
+        """Return weights of a buffer."""
         yield
-        return self._cloud.host_weights(count)
+        return self._read(self._cloud.weights[index], count)
 
-    def sum_poses(self, index: int, count: int, block: int, reference: np.ndarray) -> Step:
-        """Return (blocks, 13) sums of weighted poses relative to a reference pose."""
+    def sum_poses(self, buffers: tuple[int, int], count: int, block: int, reference: np.ndarray) -> Step:
+        """Return (blocks, 13) sums of weighted poses relative to a reference pose, given the buffers of both."""
         cloud, blocks = self._cloud, -(-count // block)
         if not count:
             yield
@@ -277,12 +284,24 @@ class Shard:
         estimate[:3] = reference
         self._backend.upload(estimate, cloud.estimated)
         self._backend.run(
-            cloud.sums.launch("sum_poses", blocks, poses=cloud.poses[index], weight=cloud.weight,
+            cloud.sums.launch("sum_poses", blocks, poses=cloud.poses[buffers[0]], weight=cloud.weights[buffers[1]],
                               estimate=cloud.estimated, sums=cloud.sums.rows, particles=count, block=block,
                               lanes=ESTIMATE_LANES, again=1),
         )  # fmt: skip
         yield
         return self._read(cloud.sums.rows, blocks * ESTIMATE_SUMS).reshape(blocks, ESTIMATE_SUMS)
+
+    # ---- times
+
+    def time_scoring(self) -> Step:
+        """Wait for the log-likelihoods of each stage from now on."""
+        self._timed = True
+        yield
+
+    def scoring_seconds(self) -> Step:
+        """Return the seconds of all log-likelihoods."""
+        yield
+        return sum(sensor.seconds for sensor in self._sensors)
 
     def _read(self, buffer: Any, count: int) -> np.ndarray:
         return self._backend.download(buffer, np.empty(count))

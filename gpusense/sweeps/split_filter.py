@@ -7,7 +7,6 @@ from concurrent.futures import Executor
 from typing import Any
 
 from gpusense._util import checks
-from gpusense.interface.constants import MOMENTS
 from gpusense.localization.filter import ParticleFilter
 from gpusense.sweeps.held import models_of
 from gpusense.sweeps.parts import parts_of
@@ -78,30 +77,10 @@ class SplitParticleFilter(ParticleFilter):
             team = Here([self.models, *(models_of(make, device) for device in devices[1:])], share, residual)
         else:
             team = There(executors, make, devices, share, residual)
-        return SplitCloud(team, self._backend, most, self._sensors[0].precision, residual=residual)
+        return SplitCloud(team, most, residual=residual)
 
     def __repr__(self) -> str:
         return f"Split{super().__repr__()[:-1]}, {self._cloud.explain()})"
-
-    def _score(self, given: list[tuple[int, tuple[Any, ...]]], kind: int, drawn: int) -> None:
-        self._cloud.step(kind, self.options.stages, drawn, given)
-
-    @property
-    def particles(self) -> Any:
-        """(N, 3) poses after the last step, in host memory."""
-        return self.host_particles()
-
-    @property
-    def weights(self) -> Any:
-        """(N,) weights of the particles, whose sum is 1, in host memory."""
-        return self.host_weights()
-
-    @property
-    def moments(self) -> Any:
-        """(9,) mean x, y, theta and covariance xx, xy, xt, yy, yt, tt, in host memory."""
-        self._check_started()
-        self.flush()
-        return self._cloud.estimate(self._shown)[:MOMENTS]
 
     @property
     def exchanged(self) -> int:

@@ -15,6 +15,8 @@
 #define VELOCITY_MODEL 1
 #define SMALL_ARC 1e-4
 #define WHOLE_TURN 6.283185307179586
+// A whole turn beyond HALF_TURN, rounded down.
+#define FARTHEST_ONCE 9.424777960769378
 
 // Return the chord of an arc that turns by twice half_turn.
 double chord_of(const double length, const double half_turn) {
@@ -25,6 +27,13 @@ double chord_of(const double length, const double half_turn) {
 // Return a heading less than a turn beyond [-pi, pi] in that interval.
 double wrap_once(const double theta) {
     return theta > HALF_TURN ? theta - WHOLE_TURN : theta < -HALF_TURN ? theta + WHOLE_TURN : theta;
+}
+
+// Return any heading in [-pi, pi]: more than a turn beyond it goes by its cosine and sine.
+double wrap_any(const double theta) {
+    if (!(fabs(theta) > FARTHEST_ONCE)) return wrap_once(theta);
+    const double2 turn = cos_sin(theta);
+    return angle_of(turn.x, turn.y);
 }
 
 // Move particles from source to target, which may be the same array: one work-item takes a particle.
@@ -53,5 +62,5 @@ kernel void move_particles(global const double *source, global const double *set
     const double2 heading = cos_sin(theta);
     target[place] = x + (ahead * heading.x - left * heading.y);
     target[place + 1] = y + (ahead * heading.y + left * heading.x);
-    target[place + 2] = wrap_once(theta + second);
+    target[place + 2] = wrap_any(theta + second);
 }

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import heading, philox
+from . import elementary, heading, philox
 from .prelude import kernel
 
 SEED, STEP, MEAN, DEVIATION, REVERSE, FIRST = (wp.constant(place) for place in (0, 2, 3, 7, 11, 61))
@@ -19,6 +19,8 @@ MOTION_STREAM, REVERSE_STREAM = wp.constant(wp.uint32(0)), wp.constant(wp.uint32
 VELOCITY_MODEL = wp.constant(1)
 SMALL_ARC, SIX = wp.constant(wp.float64(1e-4)), wp.constant(wp.float64(6.0))
 WHOLE_TURN, HALF_TURN = wp.constant(wp.float64(6.283185307179586)), wp.constant(wp.float64(3.141592653589793))
+# A whole turn beyond HALF_TURN, rounded down.
+FARTHEST_ONCE = wp.constant(wp.float64(9.424777960769378))
 MINUS_HALF_TURN = wp.constant(wp.float64(-3.141592653589793))
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 
@@ -27,6 +29,7 @@ ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 def functions(flags):
     """Make the functions of the file; no flag changes them."""
     cos_sin = heading.functions(frozenset()).cos_sin
+    angle_of = elementary.functions(frozenset()).angle_of
 
     # Return the chord of an arc that turns by twice half_turn.
     @wp.func
@@ -43,14 +46,23 @@ def functions(flags):
         less = wp.where(theta < MINUS_HALF_TURN, theta + WHOLE_TURN, theta)
         return wp.where(theta > HALF_TURN, theta - WHOLE_TURN, less)
 
-    return SimpleNamespace(chord_of=chord_of, wrap_once=wrap_once, cos_sin=cos_sin)
+    # Return any heading in [-pi, pi]: more than a turn beyond it goes by its cosine and sine.
+    @wp.func
+    def wrap_any(theta: wp.float64):
+        wrapped = wrap_once(theta)
+        if wp.abs(theta) > FARTHEST_ONCE:
+            turn = cos_sin(theta)
+            wrapped = angle_of(turn.x, turn.y)
+        return wrapped
+
+    return SimpleNamespace(chord_of=chord_of, wrap_once=wrap_once, wrap_any=wrap_any, cos_sin=cos_sin)
 
 
 @functools.cache
 def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     made = functions(frozenset())
-    chord_of, wrap_once, cos_sin = made.chord_of, made.wrap_once, made.cos_sin
+    chord_of, wrap_any, cos_sin = made.chord_of, made.wrap_any, made.cos_sin
     numbers = philox.functions(frozenset())
     random_words, uniform_of, normal_pair = numbers.random_words, numbers.uniform_of, numbers.normal_pair
 
@@ -90,6 +102,6 @@ def make(name, flags):
         turn = cos_sin(theta)
         target[3 * n] = x + (ahead * turn.x - left * turn.y)
         target[3 * n + 1] = y + (ahead * turn.y + left * turn.x)
-        target[3 * n + 2] = wrap_once(theta + second)
+        target[3 * n + 2] = wrap_any(theta + second)
 
     return {"move_particles": move_particles}[name]

@@ -7,7 +7,7 @@ import pytest
 
 import gpusense as gs
 from gpusense.interface import constants as c
-from gpusense.localization.cloud import is_starved
+from gpusense.localization.filter_cloud import is_starved, summary_of
 
 
 def follow(backend, prior, sigma, far, corrections, **options):
@@ -42,15 +42,11 @@ def test_a_plain_filter_says_that_one_particle_has_all_the_weight():
 
 
 def test_copies_of_few_parents_are_not_counted_as_particles():
-    model = gs.PositionModel(gs.PositionParameters(sigma=0.1), backend="numpy")
-    pf = gs.ParticleFilter(model, particles=1000, seed=0)
-    pf.initialize(mean=(0, 0, 0), covariance=np.eye(3))
     state = np.zeros(c.STATE)
     for stage, (size, left) in enumerate(((2.0, 0.5), (900.0, 0.0))):
         own = state[stage * c.STAGE : (stage + 1) * c.STAGE]
         own[c.SAMPLE_SIZE], own[c.LEFT], own[c.RUNG] = size, left, 0.5
-    pf._cloud.backend.upload(state, pf._cloud.state)
-    summary = pf._cloud.summary()
+    summary = summary_of(state)
     assert summary.effective_sample_size == 8 and summary.temperature == 1.0
 
 

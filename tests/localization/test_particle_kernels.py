@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
+import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.interface import constants as c
 from gpusense.interface.launches import launch
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.estimates import covariance_of
+from gpusense.localization.motion import settings_of
 from gpusense.localization.sums import Sums
 from gpusense.reference.drawing import draw_particles
 from gpusense.reference.elementary import angle_of, exp_of, log_of
@@ -278,3 +280,47 @@ def test_estimates_are_the_moments_of_the_cloud(backend, name):
     # Offsets of 20 m from the reference, squared, cost 9 digits of squares of a millimetre.
     np.testing.assert_allclose(covariance_of(numbers), expected, rtol=1e-10, atol=2e-12 * max(far, spread) ** 2)
     assert numbers[c.WIDE_HEADINGS] == (turn > 1)
+
+
+# Deviations of turns: none, of a jump of 100 m, and the largest that a filter asks for.
+@pytest.mark.parametrize("deviation", [0.1, 14.2, 1e5])
+@pytest.mark.parametrize("lanes", [False, True], ids=["scalars", "lanes"])
+@pytest.mark.parametrize("kind", [c.STRAIGHT, c.VELOCITY_MODEL])
+def test_headings_are_wrapped_after_any_move_with_the_same_bits(backend, deviation, lanes, kind):
+    count, rng = 1003, np.random.default_rng(3)
+    poses = rng.uniform(-np.pi, np.pi, 3 * count)
+    settings = settings_of_step(MEAN=[0.1, 1.0, 0.0, 0.2], DEVIATION=[deviation, 0.1, 0.05, deviation])
+    expected = np.zeros(3 * count)
+    move_particles(PLAIN, poses, settings, expected, count, kind)
+    # The same noise, in a plain sum of turns.
+    n, zero = np.arange(count), np.zeros(count)
+    words = random_words((n, zero + 3, zero, zero), 5, 0)
+    first = 0.1 + deviation * normal_pair(words[0], words[1])[0]
+    second = 0.2 + deviation * normal_pair(words[2], words[3])[1] + (first if kind == c.VELOCITY_MODEL else 0)
+    turned = poses[2::3] + first + second
+    assert (np.abs(expected[2::3]) <= np.pi).all() and (np.abs(turned).max() > 3 * np.pi) == (deviation > 1)
+    np.testing.assert_allclose(np.exp(1j * expected[2::3]), np.exp(1j * turned), atol=1e-15 * max(np.abs(turned)))
+    device = get_backend(backend)
+    program = Sums(device, count).launch("move_particles", count, source=(on := device.upload(poses)),
+                                         settings=device.upload(settings), target=on, particles=count, kind=kind)  # fmt: skip
+    if not lanes:
+        program = tuple(one._replace(flags=one.flags - {"WIDE"}) for one in program)
+    device.run(program)
+    assert np.array_equal(device.download(on, np.empty(3 * count)), expected)
+
+
+def test_an_estimate_after_a_jump_has_the_moments_of_wrapped_headings(backend):
+    model = gs.PositionModel(gs.PositionParameters(sigma=0.1), backend=backend)
+    pf = gs.ParticleFilter(model, particles=4000, seed=2)
+    pf.initialize(mean=(0.0, 0.0, 0.3), covariance=np.diag([1e-4, 1e-4, 1e-4]))
+    pf.predict((0.0, 0.0, 0.0), (100.0, 0.0, 0.0))
+    found, poses = pf.estimate(), pf.host_particles()
+    assert np.abs(poses[:, 2]).max() <= np.pi
+    # Uniform on the circle, nearly: one deviation of any heading about any mean.
+    # Beyond the limit as well.
+    far = gs.OdometryMotion().sampled((0.0, 0.0, 0.0), (1e9, 0.0, 0.0))
+    assert far.deviation[0] > 1e8 and settings_of(far)[0][4] == 1e5
+    assert 1.6 < np.sqrt(found.covariance[2, 2]) < 2.0 and abs(found.pose[2]) <= np.pi
+    rest = poses - found.pose
+    rest[:, 2] = np.remainder(rest[:, 2] + np.pi, 2 * np.pi) - np.pi
+    np.testing.assert_allclose(found.covariance, rest.T @ rest / len(rest), rtol=1e-9, atol=1e-9)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import json
 import math
@@ -115,6 +116,25 @@ def test_rates_are_never_too_low(scaling: ModuleType) -> None:
         6.0,
         6.0,
     ]
+
+
+def test_limits_measures_small_calls_on_a_gpu(
+    needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """PoCL's processor as a GPU, whose poses and results are arrays of pyopencl."""
+    monkeypatch.syspath_prepend(str(BENCH))
+    limits = importlib.import_module("speed.limits")
+    device = get_backend(needs("opencl"))
+    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu", lanes=1))
+    output = tmp_path / "limits"
+    arguments = ["--rows", "small", "--repeats", "1", "--seconds", "0.01", "--size", "20", "--output", str(output)]
+    monkeypatch.setattr(sys, "argv", ["limits.py", "--backend", "opencl", *arguments])
+    assert limits.main() == 0
+    rows = json.loads(output.with_suffix(".json").read_text())["rows"]
+    names = {row["what"] for row in rows if row["call_s"] > 0 and row["launches"]}
+    for model in ("field", "beam model"):
+        for count in (2000, 4000):
+            assert f"{model}, tracking, {count} x 60, poses and result on the device" in names
 
 
 @pytest.mark.parametrize("selection", ["opencl"])

@@ -11,6 +11,7 @@
 #define VELOCITY_MODEL 1
 #define SMALL_ARC 1e-4
 #define WHOLE_TURN 6.283185307179586
+#define FARTHEST_ONCE 9.424777960769378
 
 // Return the chords of arcs that turn by twice half_turn.
 doubles chord_of_lanes(const doubles length, const doubles half_turn) {
@@ -24,6 +25,20 @@ doubles chord_of_lanes(const doubles length, const doubles half_turn) {
 // Return headings less than a turn beyond [-pi, pi] in that interval.
 doubles wrap_once_lanes(const doubles theta) {
     return theta > HALF_TURN ? theta - WHOLE_TURN : theta < -HALF_TURN ? theta + WHOLE_TURN : theta;
+}
+
+// Return any headings in [-pi, pi]: those more than a turn beyond it go by their cosines and sines, one by one.
+doubles wrap_any_lanes(const doubles theta) {
+    const choices far = (theta > FARTHEST_ONCE) | (theta < -FARTHEST_ONCE);
+    doubles wrapped = wrap_once_lanes(theta);
+    if (!any(far)) return wrapped;
+    for (int lane = 0; lane < DOUBLES; lane++) {
+        const double one = ((const double *)&theta)[lane];
+        if (!(fabs(one) > FARTHEST_ONCE)) continue;
+        const double2 turn = cos_sin(one);
+        ((double *)&wrapped)[lane] = angle_of(turn.x, turn.y);
+    }
+    return wrapped;
 }
 
 // Move the particles from begin on, at most DOUBLES of them.
@@ -55,7 +70,7 @@ void move_lanes(global const double *source, global const double *settings, glob
     doubles cosine, sine;
     cos_sin_lanes(theta, &cosine, &sine);
     const doubles to_x = x + (ahead * cosine - left * sine), to_y = y + (ahead * sine + left * cosine);
-    const doubles turned = wrap_once_lanes(theta + second);
+    const doubles turned = wrap_any_lanes(theta + second);
     store_poses(to_x, to_y, turned, target, begin, count);
 }
 

@@ -1,0 +1,39 @@
+"""The particles of a filter on one device, scored by its sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from gpusense.localization.cloud import Cloud
+from gpusense.localization.filter_cloud import FilterCloud, Step
+from gpusense.localization.scoring import Scoring
+from gpusense.localization.sensors import Sensor
+
+
+class DeviceCloud(Cloud, FilterCloud):
+    """Particles of a filter on the device of its sensors.
+
+    Args:
+        sensors: The sensors of the filter.
+        capacity: Most particles.
+        residual: Whether draws are those of residual resampling.
+    """
+
+    def __init__(self, sensors: Sequence[Sensor], capacity: int, *, residual: bool = False) -> None:
+        super().__init__(sensors[0].backend, capacity, len(sensors), sensors[0].precision, residual=residual)
+        self._scored, self._scoring = sensors, Scoring(self, sensors)
+
+    def correct(self, step: Step) -> None:
+        """See FilterCloud.correct."""
+        score = self._scoring.of(step.given)
+        stages = self.places.stages(step.stages, step.drawn, step.kind)
+        self.run_stages(step.settings, stages, step.drawn, len(step.given), score)
+
+    @property
+    def scoring_seconds(self) -> float:
+        """See FilterCloud.scoring_seconds; 0 where a step is one recorded program."""
+        return sum(sensor.seconds for sensor in self._scored)
+
+    def time_scoring(self) -> None:
+        """See FilterCloud.time_scoring."""
+        self._scoring.timed = True

@@ -1,0 +1,237 @@
+"""What a particle filter asks of its particles, on one device or split over several."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from gpusense.interface.constants import (
+    DEGENERATE,
+    DEPTH,
+    FARTHEST_THETA,
+    FARTHEST_X,
+    JITTER,
+    LEFT,
+    LOWEST,
+    RUNG,
+    SAMPLE_SIZE,
+    SHARE,
+    STAGE,
+)
+from gpusense.localization.particles import Places
+from gpusense.reference.rungs import left_of
+
+# Lowest depth of a ladder: distances of a million deviations differ by 2^-39 on its last rung.
+_DEEPEST = LOWEST**5
+# Jitter of a stage on a deeper ladder: the peak lies beyond the particles, and they must not shrink before they reach it.
+_WIDE_JITTER = 0.7
+# Index of a sensor, and its readings.
+Given = tuple[int, tuple[Any, ...]]
+
+
+class Step(NamedTuple):
+    """A correction.
+
+    Attributes:
+        settings: Its numbers, by the places in ``interface.constants``.
+        kind: Kind of the motion that begins it.
+        stages: Most stages.
+        drawn: Particles of the next step.
+        given: Indices of sensors with their readings.
+    """
+
+    settings: np.ndarray
+    kind: int
+    stages: int
+    drawn: int
+    given: list[Given]
+
+
+class Contents(NamedTuple):
+    """Particles on the host.
+
+    Attributes:
+        poses: (N, 3) shown poses.
+        weights: (N,) their weights, before they are normalised.
+        next_poses: (M, 3) poses of the next step; None where they are those shown, as they were not weighed.
+        next_weights: (M,) weights with which the next step begins; None together with ``next_poses``.
+        state: State of the last correction, as the kernels hold it.
+    """
+
+    poses: np.ndarray
+    weights: np.ndarray
+    next_poses: np.ndarray | None
+    next_weights: np.ndarray | None
+    state: np.ndarray
+
+    @property
+    def next_count(self) -> int:
+        """Number of particles of the next step."""
+        return len(self.poses if self.next_poses is None else self.next_poses)
+
+    def places_and_arrays(self, now: Places) -> tuple[Places, list[tuple[str, int, np.ndarray]]]:
+        """Return the buffers of these particles, which leave others as they are, and the array that each takes.
+
+        Args:
+            now: The others.
+
+        Returns:
+            Names of buffers are "poses" and "weights".
+        """
+        places = now.placed()
+        if self.next_poses is None or self.next_weights is None:
+            return places, [("poses", places.shown, self.poses), ("weights", places.weight, self.weights)]
+        places = places._replace(next=places.shown + 1, weight=places.before - 1)
+        return places, [
+            ("poses", places.shown, self.poses), ("weights", places.weight, self.weights),
+            ("poses", places.next, self.next_poses), ("weights", places.before, self.next_weights),
+        ]  # fmt: skip
+
+
+class Summary(NamedTuple):
+    """The state of a filter after a correction.
+
+    Attributes:
+        effective_sample_size: Of the last stage, and at most the number of distinct particles after earlier ones.
+        temperature: Share of the temperature that all stages used.
+        degenerate: No particle was possible.
+        stages: Stages that ran.
+        numbers: The state as the kernels hold it.
+    """
+
+    effective_sample_size: float
+    temperature: float
+    degenerate: bool
+    stages: int
+    numbers: np.ndarray
+
+
+def summary_of(numbers: np.ndarray) -> Summary:
+    """Return the summary of a state as the kernels hold it."""
+    used, stage, distinct = 0.0, 0, math.inf
+    while True:
+        own = numbers[stage * STAGE : (stage + 1) * STAGE]
+        used += float(own[RUNG])
+        if own[LEFT] == 0.0:
+            break
+        # Each copy moves by the difference of two others: m parents have at most m^3 distinct copies.
+        distinct = min(distinct, float(own[SAMPLE_SIZE]) ** 3)
+        stage += 1
+    size = min(float(own[SAMPLE_SIZE]), distinct)
+    return Summary(size, min(used, 1.0), bool(numbers[DEGENERATE]), stage + 1, numbers)
+
+
+def is_starved(numbers: np.ndarray, settings: np.ndarray, stage: int, count: int) -> bool:
+    """Tell whether even the last rung of a stage leaves too few particles with weight, and a deeper one may not.
+
+    Args:
+        numbers: The state after the stage.
+        settings: Numbers of the step.
+        stage: The stage.
+        count: Particles.
+    """
+    own = numbers[stage * STAGE : (stage + 1) * STAGE]
+    lowest = left_of(numbers, stage) * settings[DEPTH] * LOWEST
+    few = own[RUNG] == lowest > 0.0 and not own[DEGENERATE] and own[SAMPLE_SIZE] < settings[SHARE] * count
+    return bool(few and settings[DEPTH] > _DEEPEST)
+
+
+def deeper(settings: np.ndarray) -> np.ndarray:
+    """Return the numbers of a step whose ladder begins below the last rung of the present one."""
+    result = settings.copy()
+    result[DEPTH] *= LOWEST
+    result[JITTER], result[FARTHEST_X], result[FARTHEST_THETA] = _WIDE_JITTER, math.inf, math.pi
+    return result
+
+
+class FilterCloud(ABC):
+    """Particles of a filter.
+
+    A step reads the buffers in ``places`` and writes others. Its last assignments name the new ones, so a step that
+    was interrupted has changed nothing once the attributes in ``MEMORY`` have their old values again.
+
+    Attributes:
+        MEMORY: Names of the attributes that a step changes.
+        count: Particles of the next step.
+        places: Buffers of the particles.
+    """
+
+    MEMORY: ClassVar[tuple[str, ...]]
+    count: int
+    places: Places
+
+    # ---- steps
+
+    @abstractmethod
+    def place(self, poses: np.ndarray) -> None:
+        """Replace all particles by (N, 3) poses of equal weight, and forget the state of corrections."""
+
+    @abstractmethod
+    def set_pool(self, poses: np.ndarray) -> None:
+        """Set the (M, 3) poses from which recovery injects particles."""
+
+    @abstractmethod
+    def move(self, settings: np.ndarray, kind: int) -> None:
+        """Move the particles now, by the numbers of a step and a kind of motion."""
+
+    @abstractmethod
+    def correct(self, step: Step) -> None:
+        """Run a correction."""
+
+    # ---- results, where ``count`` is the number of shown particles
+
+    @abstractmethod
+    def estimate(self, count: int) -> np.ndarray:
+        """Return the estimate of the shown particles: mean, covariance, sum of weights."""
+
+    @abstractmethod
+    def summary(self) -> Summary:
+        """Return the state after the last correction."""
+
+    @abstractmethod
+    def particles(self, count: int) -> Any:
+        """Return the shown poses: on a GPU an array of the device's library."""
+
+    @abstractmethod
+    def shares(self, count: int) -> Any:
+        """Return the weights of the shown particles, whose sum is 1: on a GPU an array of the device's library."""
+
+    @abstractmethod
+    def moments(self, count: int) -> Any:
+        """Return mean and covariance of the shown particles: on a GPU an array of the device's library."""
+
+    @abstractmethod
+    def host_poses(self, index: int, count: int) -> np.ndarray:
+        """Return a copy of the poses of a buffer."""
+
+    @abstractmethod
+    def host_weights(self, count: int) -> np.ndarray:
+        """Return a copy of the weights of the shown particles, before they are normalised."""
+
+    @abstractmethod
+    def explain(self) -> str:
+        """Return in one line how a step is started."""
+
+    # ---- state
+
+    @abstractmethod
+    def contents(self, count: int) -> Contents:
+        """Return a copy of all particles."""
+
+    @abstractmethod
+    def restore(self, contents: Contents) -> None:
+        """Replace all particles by those of ``contents``."""
+
+    # ---- times
+
+    @property
+    @abstractmethod
+    def scoring_seconds(self) -> float:
+        """Seconds of all log-likelihoods, added up over devices."""
+
+    @abstractmethod
+    def time_scoring(self) -> None:
+        """Wait for the log-likelihoods of each stage from now on, so that ``scoring_seconds`` is their time."""

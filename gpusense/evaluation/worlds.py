@@ -154,8 +154,8 @@ def simulate_scan(
 def sample_readings(expected: ArrayLike, range_max: float, parameters: BeamParameters, rng: Rng) -> Floats:
     """Draw readings from the beam mixture (*Probabilistic Robotics*, section 6.3.1) by inverting each component's CDF.
 
-    With z* the expected range and Z = range_max, a reading is with probability z_hit normal around z* with sigma_hit,
-    truncated to [0, Z]; z_short exponential with lambda_short, truncated to [0, z*]; z_max no return; z_rand uniform
+    With z* the expected range and Z = range_max, a reading is with probability z_hit normal around z* + range_bias,
+    clamped to [0, Z], with the deviation sigma_hit + sigma_growth z*, truncated to [0, Z]; z_short exponential with lambda_short, truncated to [0, z*]; z_max no return; z_rand uniform
     on [0, Z).
 
     Args:
@@ -186,8 +186,9 @@ def sample_readings(expected: ArrayLike, range_max: float, parameters: BeamParam
         raise ValueError(f"expected: every range must be from 0 to range_max = {limit}, got {z.min()} to {z.max()}")
     weights = np.array([p.z_hit, p.z_short, p.z_max, p.z_rand])
     kind = rng.choice(4, size=z.shape, p=weights / weights.sum())
-    u, low, high = rng.random(z.shape), ndtr(-z / p.sigma_hit), ndtr((limit - z) / p.sigma_hit)
-    hit = z + p.sigma_hit * ndtri(low + u * (high - low))
+    mean, sigma = np.clip(z + p.range_bias, 0, limit), p.sigma_hit + p.sigma_growth * z
+    u, low, high = rng.random(z.shape), ndtr(-mean / sigma), ndtr((limit - mean) / sigma)
+    hit = mean + sigma * ndtri(low + u * (high - low))
     decay = np.maximum(p.lambda_short * z, 1e-12)  # below, the exponential is uniform to rounding
     short = -np.log1p(u * np.expm1(-decay)) / decay * z
     drawn = np.choose(kind, [np.clip(hit, 0, limit), np.minimum(short, z), np.inf, u * limit])

@@ -1,0 +1,1 @@
+"""Simulate a robot's run: a path, odometry, people, changes of the world, and readings."""

@@ -1,0 +1,258 @@
+"""Simulate a robot that drives through a world, and what its laser and its odometer report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gpusense._util import checks
+from gpusense.backends import Selection
+from gpusense.evaluation.simulation.changes import change_world, make_glass
+from gpusense.evaluation.simulation.crowd import Crowd
+from gpusense.evaluation.simulation.odometry import draw_odometry
+from gpusense.evaluation.simulation.roads import Roads, drive
+from gpusense.evaluation.worlds import sample_readings
+from gpusense.localization.motion import OdometryMotion, OmniMotion
+from gpusense.localization.pose_algebra import compose_poses
+from gpusense.models.scan.beam import BeamModel
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.parameters import BeamParameters
+from gpusense.world.scanner import Scanner
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool]
+Rng = np.random.Generator
+
+READINGS = BeamParameters(z_hit=0.97, z_short=0.01, z_max=0.01, z_rand=0.01, sigma_hit=0.02, lambda_short=0.5)
+MOTION = OdometryMotion(reverse=0.0)
+# Rays of one call of the caster.
+_RAYS = 1 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedRun:
+    """A run of a robot: what it reports, and the truth.
+
+    Attributes:
+        grid: The map that the robot has.
+        world: The world as it is, without people.
+        scanner: The geometry of the laser.
+        times: (T,) times of the scans [s].
+        poses: (T, 3) true poses of the robot [m, m, rad].
+        odometry: (T, 3) poses by odometry alone, the first one 0 [m, m, rad].
+        scans: (T, K) readings [m], +inf where there is no return.
+        expected: (T, K) ranges in the world with its people, before noise [m]; ``range_max`` where nothing is nearer.
+        hidden: (T, K) whether a person hides what lies behind.
+        kidnapped: (T,) whether the robot was carried to this pose.
+        people: T arrays (P, 3) of the discs that people are: x, y and radius [m].
+    """
+
+    grid: OccupancyGrid
+    world: OccupancyGrid
+    scanner: Scanner
+    times: Floats
+    poses: Floats
+    odometry: Floats
+    scans: Floats
+    expected: Floats
+    hidden: Bools
+    kidnapped: Bools
+    people: tuple[Floats, ...]
+
+    def __repr__(self) -> str:
+        return f"SimulatedRun({len(self.times)} scans of {self.scanner.count} beams, {self.hidden.mean():.0%} hidden)"
+
+
+def simulate_run(
+    grid: OccupancyGrid,
+    scanner: Scanner,
+    *,
+    scans: int = 200,
+    world: OccupancyGrid | None = None,
+    path: ArrayLike | None = None,
+    parameters: BeamParameters = READINGS,
+    motion: OdometryMotion | OmniMotion = MOTION,
+    people: int = 0,
+    hidden: float = 0.0,
+    moved: float = 0.0,
+    removed: float = 0.0,
+    added: float = 0.0,
+    glass: float = 0.0,
+    kidnaps: int = 0,
+    step: float = 0.2,
+    turn: float = 0.35,
+    period: float = 0.25,
+    clearance: float = 0.35,
+    seed: int = 0,
+    backend: Selection = "numpy",
+) -> SimulatedRun:
+    """Simulate a robot that drives between random places of a world.
+
+    The robot keeps to cells that are free in the map and in the world. It turns on the spot at the corners of its path.
+    A beam that meets nothing within ``range_max`` gives no return, but for the shares of short and random readings;
+    all other readings are drawn from the beam model around the range to the nearest wall or person.
+
+    Args:
+        grid: The map that the robot has.
+        scanner: The geometry of its laser, mount and cones included.
+        scans: Number of scans T, at least 1; with ``path``, at most its length.
+        world: The world as it is; None for the map with the changes below. A world that is another building makes
+            ``grid`` a wrong map; the path is then planned in the world alone.
+        path: (T, 3) true poses of the robot in place of a planned path [m, m, rad].
+        parameters: Mixture of the readings.
+        motion: Noise of the odometry.
+        people: How many people walk near the robot.
+        hidden: Share of the beams that further people hide, about, from 0 to 0.9.
+        moved: Share of the walls that have moved, as in :func:`change_world`.
+        removed: Share of the walls that have gone.
+        added: New furniture, as a share of the walls.
+        glass: Share of the world's walls through which beams pass, from 0 to 1.
+        kidnaps: How often the robot is carried to another place, without odometry.
+        step: Distance between two scans [m], > 0.
+        turn: Largest turn between two scans [rad], > 0.
+        period: Time between two scans [s], > 0.
+        clearance: Least distance of the robot from walls on a planned path [m].
+        seed: Seed of the random numbers: the same arguments give the same run on every device.
+        backend: Device that casts the beams; see ``gpusense.devices()``.
+
+    Returns:
+        The run.
+
+    Raises:
+        TypeError, ValueError: an argument is not of the kind described, or breaks its rule.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> scanner = gs.Scanner(np.linspace(-2.0, 2.0, 60), range_max=12.0)
+        >>> run = gs.worlds.simulate_run(gs.worlds.building(), scanner, scans=20, hidden=0.1, moved=0.1, seed=1)
+        >>> run.scans.shape, run.odometry.shape
+        ((20, 60), (20, 3))
+    """
+    count = checks.integer("scans", scans, low=1)
+    jumps = checks.integer("kidnaps", kidnaps, low=0, high=count - 1)
+    crowd_size = checks.integer("people", people, low=0, high=1000)
+    share = checks.real("hidden", hidden, low=0, high=0.9)
+    every = checks.real("period", period, above=0)
+    room = checks.real("clearance", clearance, low=0)
+    rates = checks.real("step", step, above=0), checks.real("turn", turn, above=0)
+    for name, value, kind in (("grid", grid, OccupancyGrid), ("scanner", scanner, Scanner)):
+        if not isinstance(value, kind):
+            raise TypeError(f"{name}: must be of {kind.__name__}, got {checks.show(value)}")
+    # Each part has random numbers of its own: people do not change the odometry.
+    streams = np.random.SeedSequence(checks.integer("seed", seed, low=0)).spawn(6)
+    changing, driving, slipping, walking, reading, glazing = (np.random.default_rng(one) for one in streams)
+    given = None if path is None else checks.array("path", path, ("T", 3))[:count]
+    true = world
+    if true is None:
+        keep = np.zeros((0, 3)) if given is None else given
+        true = change_world(
+            grid, changing, moved=moved, removed=removed, added=added, keep=keep, clearance=room
+        )
+    poses, kidnapped = (
+        _planned(grid, true, world is None, count, jumps, room, rates, driving) if given is None
+        else _given(given, jumps)
+    )  # fmt: skip
+    odometry = draw_odometry(poses, motion, slipping, kidnapped)
+    seen = _without_glass(true, glass, glazing)
+    crowd = Crowd(crowd_size, share, _standing(true), every, walking)
+    expected, covered, discs = _with_people(_cast(seen, scanner, poses, backend), scanner, poses, kidnapped, crowd)
+    readings = _readings(expected, scanner.range_max, parameters, reading)
+    times = every * np.arange(1, len(poses) + 1)
+    return SimulatedRun(
+        grid, true, scanner, times, poses, odometry, readings, expected, covered, kidnapped, tuple(discs)
+    )
+
+
+def _planned(
+    grid: OccupancyGrid,
+    world: OccupancyGrid,
+    same: bool,
+    count: int,
+    jumps: int,
+    clearance: float,
+    rates: tuple[float, float],
+    rng: Rng,
+) -> tuple[Floats, Bools]:
+    """Return true poses along planned paths, and which of them the robot was carried to."""
+    roads = Roads(world, world.free & grid.free if same else world.free, clearance, rng)
+    when = np.zeros(count, bool)
+    when[rng.choice(np.arange(1, count), jumps, replace=False)] = True
+    ends = [*np.flatnonzero(when).tolist(), count]
+    parts: list[Floats] = []
+    begin = 0
+    for end in (*np.flatnonzero(when).tolist(), count):
+        pace = rng.uniform(0.6, 1.0)
+        corners = roads.wander((end - begin) * rates[0] * pace, rng)
+        heading = rng.uniform(-math.pi, math.pi)
+        parts.append(np.array([[*corners[0], heading]]))
+        parts.append(drive(corners, heading, rates[0] * pace, rates[1], end - begin - 1))
+        begin = end
+    return np.concatenate(parts), when
+
+
+def _given(path: Floats, jumps: int) -> tuple[Floats, Bools]:
+    """Return the poses of a path; the robot is not carried along it."""
+    if not len(path):
+        raise ValueError("path: must hold at least one pose, got shape (0, 3)")
+    if jumps:
+        raise ValueError(f"kidnaps: must be 0 with a path, got {jumps}")
+    return path, np.zeros(len(path), bool)
+
+
+def _standing(world: OccupancyGrid) -> Callable[[Floats], Bools]:
+    """Return a function that says whether people can stand at (P, 2) places: a free cell of the world."""
+    free = world.free
+
+    def is_free(places: Floats) -> Bools:
+        cols, rows = np.floor(world.world_to_cells(places)).astype(np.int64).T
+        inside = (rows >= 0) & (rows < free.shape[0]) & (cols >= 0) & (cols < free.shape[1])
+        return inside & free[np.where(inside, rows, 0), np.where(inside, cols, 0)]
+
+    return is_free
+
+
+def _without_glass(world: OccupancyGrid, share: float, rng: Rng) -> OccupancyGrid:
+    """Return the world as beams meet it."""
+    if checks.real("glass", share, low=0, high=1) == 0:
+        return world
+    cells = np.array(world.cells)
+    cells[make_glass(world, share, rng)] = 0
+    return OccupancyGrid(cells, world.resolution, world.origin, occupied_threshold=world.occupied_threshold)
+
+
+def _cast(world: OccupancyGrid, scanner: Scanner, poses: Floats, backend: Selection) -> Floats:
+    """Return the (T, K) ranges to walls: float32, whose bits are the same on every device."""
+    model = BeamModel(world, scanner, BeamParameters(), backend=backend, precision="float32")
+    each = max(_RAYS // max(scanner.ray_bearings.size, 1), 1)
+    parts = [np.asarray(model.expected_ranges(poses[i : i + each])) for i in range(0, len(poses), each)]
+    # The nearest float32 of range_max may exceed it.
+    walls = np.concatenate(parts).astype(np.float64)
+    return np.where(walls >= np.float32(scanner.range_max), scanner.range_max, np.minimum(walls, scanner.range_max))
+
+
+def _with_people(
+    walls: Floats, scanner: Scanner, poses: Floats, kidnapped: Bools, crowd: Crowd
+) -> tuple[Floats, Bools, list[Floats]]:
+    """Return ranges to the nearer of walls and people, the beams that people hide, and the discs they are."""
+    expected, hidden, discs = walls.copy(), np.zeros(walls.shape, bool), []
+    lasers = compose_poses(poses, scanner.mount)
+    for t, laser in enumerate(lasers):
+        if kidnapped[t]:
+            crowd.leave()
+        expected[t], hidden[t] = crowd.ranges(laser, scanner.ray_bearings, walls[t])
+        discs.append(crowd.discs())
+    return expected, hidden, discs
+
+
+def _readings(expected: Floats, range_max: float, parameters: BeamParameters, rng: Rng) -> Floats:
+    """Draw readings; where nothing is within range, a hit is no return."""
+    p = parameters
+    nothing = p.replace(z_hit=0.0, z_max=p.z_hit + p.z_max)
+    flat = expected.ravel()
+    near = sample_readings(flat, range_max, p, rng)
+    far = sample_readings(flat, range_max, nothing, rng)
+    return np.where(flat >= range_max, far, near).reshape(expected.shape)

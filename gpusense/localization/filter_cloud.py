@@ -16,6 +16,7 @@ from gpusense.interface.constants import (
     JITTER,
     LEFT,
     LOWEST,
+    RESAMPLED,
     RUNG,
     SAMPLE_SIZE,
     SHARE,
@@ -26,6 +27,8 @@ from gpusense.reference.rungs import left_of
 
 # Lowest depth of a ladder: distances of a million deviations differ by 2^-39 on its last rung.
 _DEEPEST = LOWEST**5
+# Effective sample size below which a stage is weighed again on a deeper ladder.
+_FEWEST = 10.0
 # Jitter of a stage on a deeper ladder: the peak lies beyond the particles, and they must not shrink before they reach it.
 _WIDE_JITTER = 0.7
 # Index of a sensor, and its readings.
@@ -100,6 +103,7 @@ class Summary(NamedTuple):
         degenerate: No particle was possible.
         stages: Stages that ran.
         numbers: The state as the kernels hold it.
+        resampled: Whether particles were drawn at the end.
     """
 
     effective_sample_size: float
@@ -107,6 +111,7 @@ class Summary(NamedTuple):
     degenerate: bool
     stages: int
     numbers: np.ndarray
+    resampled: bool
 
 
 def summary_of(numbers: np.ndarray) -> Summary:
@@ -121,7 +126,7 @@ def summary_of(numbers: np.ndarray) -> Summary:
         distinct = min(distinct, float(own[SAMPLE_SIZE]) ** 3)
         stage += 1
     size = min(float(own[SAMPLE_SIZE]), distinct)
-    return Summary(size, min(used, 1.0), bool(numbers[DEGENERATE]), stage + 1, numbers)
+    return Summary(size, min(used, 1.0), bool(numbers[DEGENERATE]), stage + 1, numbers, bool(own[RESAMPLED]))
 
 
 def is_starved(numbers: np.ndarray, settings: np.ndarray, stage: int, count: int) -> bool:
@@ -135,7 +140,8 @@ def is_starved(numbers: np.ndarray, settings: np.ndarray, stage: int, count: int
     """
     own = numbers[stage * STAGE : (stage + 1) * STAGE]
     lowest = left_of(numbers, stage) * settings[DEPTH] * LOWEST
-    few = own[RUNG] == lowest > 0.0 and not own[DEGENERATE] and own[SAMPLE_SIZE] < settings[SHARE] * count
+    least = min(settings[SHARE] * count, _FEWEST)
+    few = own[RUNG] == lowest > 0.0 and not own[DEGENERATE] and own[SAMPLE_SIZE] < least
     return bool(few and settings[DEPTH] > _DEEPEST)
 
 

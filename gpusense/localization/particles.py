@@ -58,8 +58,7 @@ class Places(NamedTuple):
         poses, weights = self._free()
         first = Stage(poses, 0, most, drawn if most == 1 else 0, self.before, weights, 1 - self.state, self.next, kind)
         return [first] + [
-            Stage(poses + number % 2, number, most, 0, weights + 1, weights, first.state)
-            for number in range(1, most)
+            Stage(poses + number % 2, number, most, 0, weights + 1, weights, first.state) for number in range(1, most)
         ]
 
     def _free(self) -> tuple[int, int]:

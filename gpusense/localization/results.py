@@ -15,6 +15,7 @@ from gpusense.localization.estimates import Estimate, clustered, covariance_of
 from gpusense.localization.filter_cloud import FilterCloud
 from gpusense.localization.journal import Whole, whole
 from gpusense.localization.options import Options
+from gpusense.localization.rival import Rival
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.spread import is_narrow, is_wide, share_off, share_off_of
 from gpusense.localization.verdict import Verdict
@@ -40,6 +41,10 @@ class Results(Whole, ABC):
     # Whether there are particles, the number of those that are shown, and the last readings.
     _started: bool
     _shown: int
+    # The rival of the particles, if there was one.
+    _rival: Rival | None
+    # Share of distinct particles before the last correction.
+    _distinct: float
     _last: dict[int, tuple[Any, ...]]
 
     @abstractmethod
@@ -98,6 +103,7 @@ class Results(Whole, ABC):
             # The kernels have summed no squares: before a correction, or where no weighted particle was possible.
             weights = self._cloud.host_weights(self._shown)
             size = float(weights.sum() ** 2 / (weights @ weights))
+        size *= self._distinct
         return Estimate(
             pose, covariance, size, p_lost, word, explained, self.temperatures[0], summary.temperature,
             summary.degenerate, self._shown,
@@ -124,6 +130,8 @@ class Results(Whole, ABC):
         else:
             poses = self._cloud.host_poses(self._cloud.places.shown, self._shown)
             share = share_off_of(poses, self._cloud.host_weights(self._shown), pose)
+        if self._rival is not None:
+            share = 1 - (1 - share) * (1 - self._rival.probability(pose))
         wrong = self._verdict.wrong
         return wrong + (1 - wrong) * share
 

@@ -185,7 +185,7 @@ def sensors_of(models: Any) -> list[Sensor]:
         raise ValueError(f"models: must be 1 to {_MOST_SENSORS} measurement models, got {len(chosen)}")
     if len({id(model) for model in chosen}) < len(chosen):
         raise ValueError("models: must be different ones, since readings are found by their model, got one twice")
-    sensors = [Sensor(model) for model in chosen]
+    sensors = [model if isinstance(model, Sensor) else Sensor(model) for model in chosen]
     backend = sensors[0].backend
     if any(sensor.backend is not backend for sensor in sensors):
         names = ", ".join(sorted({sensor.backend.info.selection for sensor in sensors}))

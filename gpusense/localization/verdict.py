@@ -28,6 +28,8 @@ from gpusense.models.landmark.model import LandmarkModel
 
 # Random poses; corrections between two judgements of a start anywhere.
 _RANDOM, _INTERVAL = 64, 5
+# Share of explained beams below which it is worth while to look elsewhere.
+_FEW = 0.4
 
 
 class VerdictState(NamedTuple):
@@ -117,6 +119,15 @@ class Verdict:
     def due(self) -> bool:
         """Tell whether enough corrections have passed for a new judgement of a start anywhere."""
         return self.state.corrections % _INTERVAL == 0
+
+    def doubt(self) -> None:
+        """Take the pose for right or wrong with equal probability, as one that was just searched for."""
+        self.state = self.state._replace(belief=Belief(0.0), judged=-1)
+
+    @property
+    def explains_little(self) -> bool:
+        """Whether the last judged scans had beams of which the pose explains few: people explain it, too."""
+        return self.state.explained < _FEW
 
     @property
     def wrong(self) -> float:

@@ -163,9 +163,7 @@ class Shard:
         yield
         return self._read(cloud.sums.totals, WEIGHT_SUMS)
 
-    def set_weights(
-        self, stage: Stage, totals: np.ndarray, state: np.ndarray, offset: float, marks: Marks
-    ) -> Step:
+    def set_weights(self, stage: Stage, totals: np.ndarray, state: np.ndarray, offset: float, marks: Marks) -> Step:
         """Set the weights by the sums and the state of the whole filter; return the particles that draws need.
 
         Args:

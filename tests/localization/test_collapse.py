@@ -15,25 +15,27 @@ def follow(backend, prior, sigma, far, corrections, **options):
     model = gs.PositionModel(gs.PositionParameters(sigma=sigma), backend=backend)
     pf = gs.ParticleFilter(model, particles=2000, seed=1, **options)
     pf.initialize(mean=(0, 0, 0), covariance=np.diag([prior**2, prior**2, 1.0]))
-    found = []
+    found, distinct = [], []
     for _ in range(corrections):
         pf.correct(np.array([far, 0.0]))
         found.append(pf.estimate())
-    return pf, found
+        distinct.append(len(np.unique(pf.host_particles(), axis=0)))
+    return distinct, found
 
 
-@pytest.mark.parametrize("prior, sigma, far", [(10.0, 0.1, 40.0), (1.0, 1e-3, 4.0), (100.0, 0.1, 300.0), (10.0, 0.1, 0.0)])
+@pytest.mark.parametrize(
+    "prior, sigma, far", [(10.0, 0.1, 40.0), (1.0, 1e-3, 4.0), (100.0, 0.1, 300.0), (10.0, 0.1, 0.0)]
+)
 def test_particles_reach_a_fix_that_is_far_from_all_of_them(backend, prior, sigma, far):
-    pf, found = follow(backend, prior, sigma, far, 4)
-    for one in found:
+    distinct, found = follow(backend, prior, sigma, far, 4)
+    for one, particles in zip(found, distinct, strict=True):
         deviations = np.sqrt(np.diag(one.covariance)[:2])
         assert (deviations > sigma / 4).all()
-        assert (np.abs(one.pose[:2] - (far, 0.0)) < 4 * deviations).all(), one
-        assert one.effective_sample_size > 50
+        assert (np.abs(one.pose[:2] - (far, 0.0)) < 4 * deviations + sigma / 2).all(), one
+        assert one.effective_sample_size < 1.2 * particles + 5
     # The first correction cannot use all of such a fix, and says so.
-    assert found[0].used < 0.1 and found[-1].used == 1.0
+    assert found[0].used < 0.7 and found[-1].used == 1.0
     assert np.abs(found[-1].pose[:2] - (far, 0.0)).max() < 4 * sigma
-    assert len(np.unique(pf.host_particles(), axis=0)) > 50
 
 
 def test_a_plain_filter_says_that_one_particle_has_all_the_weight():
@@ -53,8 +55,11 @@ def test_copies_of_few_parents_are_not_counted_as_particles():
 def test_a_stage_is_starved_on_its_last_rung_only():
     settings, state = np.zeros(c.SETTINGS), np.zeros(c.STATE)
     settings[c.SHARE], settings[c.DEPTH] = 0.1, 1.0
-    state[c.RUNG], state[c.SAMPLE_SIZE] = c.LOWEST, 99.0
-    assert is_starved(state, settings, 0, 1000) and not is_starved(state, settings, 0, 900)
+    state[c.RUNG], state[c.SAMPLE_SIZE] = c.LOWEST, 9.0
+    assert is_starved(state, settings, 0, 1000) and not is_starved(state, settings, 0, 80)
+    state[c.SAMPLE_SIZE] = 11.0
+    assert not is_starved(state, settings, 0, 1000)
+    state[c.SAMPLE_SIZE] = 9.0
     state[c.RUNG] = 2 * c.LOWEST
     assert not is_starved(state, settings, 0, 1000)
     state[c.RUNG], state[c.DEGENERATE] = c.LOWEST, 1.0

@@ -149,9 +149,7 @@ def simulate_run(
     true = world
     if true is None:
         keep = np.zeros((0, 3)) if given is None else given
-        true = change_world(
-            grid, changing, moved=moved, removed=removed, added=added, keep=keep, clearance=room
-        )
+        true = change_world(grid, changing, moved=moved, removed=removed, added=added, keep=keep, clearance=room)
     poses, kidnapped = (
         _planned(grid, true, world is None, count, jumps, room, rates, driving) if given is None
         else _given(given, jumps)

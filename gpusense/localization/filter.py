@@ -197,13 +197,13 @@ class ParticleFilter(Beginnings):
         self._wide = max(self._wide - 1, 0)
 
     def _distinct_share(self) -> float:
-        """Return the share of distinct particles before a correction without motion: copies were drawn, and are alike."""
+        """Return the share of distinct particles before a correction without motion, where copies are alike."""
         last = self._cloud.summary()
         before = self._distinct if last.stages == 1 else 1.0
         return before * min(last.effective_sample_size / self._shown, 1.0) if last.resampled else before
 
     def _learn(self, given: list[Given]) -> None:
-        """Find out whether the particles lie together, and if so learn from scans at a pose that no scan contradicts."""
+        """Find out whether the particles lie together, and learn from scans at a pose that none contradicts."""
         due = due_of(self._sensors, given) if self.options.temperature == "auto" else []
         if not (due or not self._together or self._corrections % LOOK == 0):
             return

@@ -29,7 +29,7 @@ from gpusense.reference.rungs import left_of
 _DEEPEST = LOWEST**5
 # Effective sample size below which a stage is weighed again on a deeper ladder.
 _FEWEST = 10.0
-# Jitter of a stage on a deeper ladder: the peak lies beyond the particles, and they must not shrink before they reach it.
+# Jitter of a stage on a deeper ladder: the peak lies beyond the particles, which must not shrink before they reach it.
 _WIDE_JITTER = 0.7
 # Index of a sensor, and its readings.
 Given = tuple[int, tuple[Any, ...]]

@@ -9,16 +9,17 @@ each cloud, the mean likelihood of its predicted particles, the logarithm of the
     B = sum over later scans t of log p_rival(z_t | ...) - log p_filter(z_t | ...)
 
 counts for the rival (Kass and Raftery, "Bayes factors" (1995)); the scan by which the rival was chosen does not. The
-rival replaces the particles where it lies together and B exceeds ``WIN`` after ``SCANS`` scans. Until then the estimate is
-that of the particles, and the probability that the rival is right adds to that of being lost. A rival that ends at the
-pose of the particles, falls behind, or is still apart after ``LONGEST`` scans is given up.
+rival replaces the particles once B exceeds ``WIN``, after ``SCANS`` scans if it lies together, and after ``APART`` scans if
+several places are as likely. Until then the estimate is that of the particles, and the probability that the rival is
+right adds to that of being lost. A rival that ends at the pose of the particles, falls behind, or has not won after
+``LONGEST`` scans is given up.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -35,9 +36,9 @@ from gpusense.models.landmark.model import LandmarkModel
 if TYPE_CHECKING:
     from gpusense.localization.filter import ParticleFilter
 
-# Logarithm of the Bayes factor that wins, and that ends a rival that falls behind; scans that are needed to win, and
-# after which a rival that is still apart, or neither wins nor loses, is given up.
-WIN, LOSE, SCANS, LONGEST = 7.0, -7.0, 3, 15
+# Logarithm of the Bayes factor that wins, and that ends a rival that falls behind; scans that are needed to win by a rival
+# that lies together, and by one of several places; scans after which one that neither wins nor loses is given up.
+WIN, LOSE, SCANS, APART, LONGEST = 7.0, -7.0, 3, 8, 15
 # Prior odds of a rival of a tracked pose: its place was not known before.
 PRIOR = -7.0
 # Particles of a rival; poses that are tried; effective number of these that begin it.
@@ -152,20 +153,18 @@ class Rival:
             self.log_odds, gain = (0.0, 0.0) if self._prior == 0.0 else (self.log_odds, gain)
         if together and self.is_at(pose, _SAME, _SAME_TURN):
             self.stop()
-        elif together and self._scans >= SCANS and gain > WIN:
+        elif gain > WIN and self._scans >= (SCANS if together else APART):
             self.stop()
             return self._filter.host_particles(), self._filter.host_weights()
-        elif gain < LOSE and (self._settled or self._prior < 0.0):
-            self.stop()
-        elif self._scans >= LONGEST and self._is_late(gain):
+        elif self._is_late(gain):
             self.stop()
         return None
 
     def _is_late(self, gain: float) -> bool:
-        """Tell whether a rival has had enough scans: equals that lie together may both be right."""
+        """Tell whether a rival has fallen behind or has had enough scans; equals that lie together may both be right."""
         if self._prior == 0.0:
-            return not self._settled
-        return gain < WIN or self._scans >= 4 * LONGEST
+            return gain < LOSE if self._settled else self._scans >= LONGEST
+        return gain < LOSE or self._scans >= LONGEST
 
     def is_at(self, pose: np.ndarray, far: float = FAR, turn: float = FAR_TURN) -> bool:
         """Tell whether the rival is at a pose, within a distance [m] and an angle [rad]."""
@@ -180,7 +179,7 @@ class Rival:
 
 
 def drawn(score: np.ndarray, count: int) -> np.ndarray | None:
-    """Return indices drawn by likelihoods at the highest temperature that leaves ``CHOSEN`` of them; None without any."""
+    """Return indices drawn by likelihoods, at the highest temperature that leaves ``CHOSEN`` of them; None without one."""
     possible = np.isfinite(score)
     if not possible.any():
         return None

@@ -142,7 +142,8 @@ def run_step(selection, count, flags=PLAIN, *, lanes=True, draws=c.SYSTEMATIC, l
     settings = settings_of_step(
         SEED=[123456789, 4000000000], MEAN=[0.1, 1, 0.02, -0.2], DEVIATION=[0.1, 0.2, 0.05, 0.1], REVERSE=0.1,
         JITTER=0.2, FARTHEST_X=1, FARTHEST_THETA=0.5, POOL=[5, 0.1, 0.1, 3.0], SCALE=2.0**36,
-        PER_BEAM_SCALE=0.01, SLOW_RATE=0.05, FAST_RATE=0.3, MOST_INJECTED=0.3, TEMPERATURE=[0.7, 0.9], STRATIFIED=draws, DEPTH=depth,
+        PER_BEAM_SCALE=0.01, SLOW_RATE=0.05, FAST_RATE=0.3, MOST_INJECTED=0.3, TEMPERATURE=[0.7, 0.9], STRATIFIED=draws,
+        DEPTH=depth,
     )  # fmt: skip
     state = np.zeros(c.STATE)
     state[c.SLOW], state[c.FAST] = 0.9, 0.6

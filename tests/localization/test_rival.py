@@ -1,4 +1,4 @@
-"""The rival of a filter: it costs a sound track nothing, finds a robot that was carried away, and keeps a second place."""
+"""The rival of a filter: it costs a sound track nothing, finds a robot that was carried away, and keeps a twin place."""
 
 from __future__ import annotations
 

@@ -226,7 +226,8 @@ class ParticleFilter(Beginnings):
         rival = self._rival
         if rival is not None and rival.active:
             rival.correct(given, evidence_of(self._cloud))
-            won = rival.judge(self._cloud.estimate(self._shown)[:3])
+            numbers = self._cloud.estimate(self._shown)
+            won = rival.judge(numbers[:3], covariance_of(numbers), given)
             if won is not None:
                 self._take_over(*won)
             return

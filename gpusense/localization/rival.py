@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,8 +29,10 @@ from gpusense.localization.estimates import covariance_of
 from gpusense.localization.filter_cloud import FilterCloud, Given
 from gpusense.localization.motion import SampledMotion
 from gpusense.localization.pose_algebra import wrap_angle
+from gpusense.localization.ratio import ratio_of_scan
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.spread import FAR, FAR_TURN, deviations
+from gpusense.localization.verdict import sightings
 from gpusense.models.landmark.model import LandmarkModel
 
 if TYPE_CHECKING:
@@ -47,6 +49,8 @@ PARTICLES, TRIES, CHOSEN = 1000, 20_000, 100
 _NEARBY, _SPREAD = 1.0, (0.1, 0.1, 0.05)
 # A cloud lies together up to this deviation [m]. Two clouds are at one place up to these [m, rad].
 _TOGETHER, _SAME, _SAME_TURN = 0.5, 0.5, 0.3
+# Mean ratio of wrong against right up to which the beams speak for a pose; weight of a scan in the mean at the next one.
+_RIGHT, _KEPT = -1.0, 0.6
 # Most that a scan counts [nats], and margin around landmarks [m].
 _MOST, _MARGIN = 50.0, 1.0
 
@@ -73,6 +77,8 @@ class Rival:
         self.active, self.log_odds = False, PRIOR
         self._scans, self._place = 0, np.zeros(3)
         self._prior, self._settled = PRIOR, False
+        # Weighted sums of the ratios of wrong against right, of the rival and of the particles, and of the weights.
+        self._ratios = np.zeros(3)
         self._pool: tuple[np.ndarray, starts.Spread] | None = None
 
     def stop(self) -> None:
@@ -106,6 +112,7 @@ class Rival:
             starts.spread(tries[chosen], _SPREAD, self._filter.options.most, key, each=True), again=True
         )
         self.active, self.log_odds, self._prior, self._scans, self._settled = True, prior, prior, 0, False
+        self._ratios = np.zeros(3)
 
     def _tries(self, pose: np.ndarray, covariance: np.ndarray, key: starts.Key, *, everywhere: bool) -> np.ndarray:
         """Return poses anywhere, and around the estimate with any heading."""
@@ -137,28 +144,46 @@ class Rival:
             self.log_odds += min(max(mine - evidence, -_MOST), _MOST)
         self._scans += 1
 
-    def judge(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    def judge(self, pose: np.ndarray, covariance: np.ndarray, readings: list[Given]) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the rival's particles and their weights if it has won; give it up where it cannot.
 
         Args:
             pose: (3,) estimated pose of the particles.
+            covariance: (3, 3) their covariance.
+            readings: Indices of sensors with their readings.
         """
         numbers = self._filter._cloud.estimate(self._filter._shown)
         self._place = numbers[:3].copy()
         gain = self.log_odds - self._prior
-        together = deviations(covariance_of(numbers))[0] < _TOGETHER
+        own = covariance_of(numbers)
+        together = deviations(own)[0] < _TOGETHER
+        self._compare(own, pose, covariance, dict(readings))
         if together and not self._settled:
             self._settled = True
             # The particles were spread once, too: two clouds that lie together begin as equals.
             self.log_odds, gain = (0.0, 0.0) if self._prior == 0.0 else (self.log_odds, gain)
         if together and self.is_at(pose, _SAME, _SAME_TURN):
             self.stop()
-        elif gain > WIN and self._scans >= (SCANS if together else APART):
+        elif gain > WIN and self._scans >= (SCANS if together else APART) and self._is_plausible():
             self.stop()
             return self._filter.host_particles(), self._filter.host_weights()
         elif self._is_late(gain):
             self.stop()
         return None
+
+    def _compare(
+        self, own: np.ndarray, pose: np.ndarray, covariance: np.ndarray, readings: dict[int, tuple[Any, ...]]
+    ) -> None:
+        """Add the ratios of both poses: a likelihood alone prefers places with many walls where people hide the scene."""
+        sensors = self._filter._sensors
+        pair = [ratio_of_scan(sightings(sensors, readings, *at)) for at in ((self._place, own), (pose, covariance))]
+        if not any(map(math.isnan, pair)):
+            self._ratios = _KEPT * self._ratios + np.array([*pair, 1.0])
+
+    def _is_plausible(self) -> bool:
+        """Tell whether the beams that meet walls speak for the rival, and more so than for the particles."""
+        mine, other, weight = self._ratios
+        return not weight or (mine / weight < _RIGHT and mine < other)
 
     def _is_late(self, gain: float) -> bool:
         """Tell whether a rival has fallen behind or has had enough scans; equals that lie together may both be right."""
@@ -173,7 +198,7 @@ class Rival:
 
     def probability(self, pose: np.ndarray) -> float:
         """Return the probability that the rival is right and a pose is not."""
-        if not self.active or not self._scans or self.is_at(pose):
+        if not self.active or not self._scans or self.is_at(pose) or not self._is_plausible():
             return 0.0
         return 1 / (1 + math.exp(-min(max(self.log_odds, -_MOST), _MOST)))
 

@@ -19,7 +19,7 @@ from gpusense.evaluation.steps import read_steps
 from gpusense.evaluation.tracking import START
 from gpusense.localization.defaults import DEFAULTS
 
-CARMEN = {"intel": "intel", "csail": "csail", "fr079": "freiburg-079", "aces": "aces"}
+CARMEN = {name: name for name in ("intel", "csail", "aces", "belgioioso", "fhw", "seattle")} | {"fr079": "freiburg-079"}
 JARVIS = ("jarvis-s3000", "jarvis-nav350", "jarvis-fused")
 NAMES = (*CARMEN, "intel-raw", *JARVIS, "olin")
 

@@ -192,15 +192,16 @@ def _noise(args: argparse.Namespace) -> tuple[BeamParameters, OdometryMotion]:
     """Return the mixture of the readings and the noise of the odometry."""
     import dataclasses
 
-    from gpusense.commands.parameter_files import read_localization
+    from gpusense.commands.parameter_files import Localization, read_localization
     from gpusense.evaluation.simulation.run import MOTION, READINGS
     from gpusense.localization.motion import OdometryMotion
+    from gpusense.world.parameters import BeamParameters
 
-    beam, noise = (None, {}) if args.parameters is None else read_localization(args.parameters)
-    parameters = READINGS if beam is None else beam
+    given = Localization(None, {}) if args.parameters is None else read_localization(args.parameters)
+    parameters = given.sensor if isinstance(given.sensor, BeamParameters) else READINGS
     if args.noise is not None:
         parameters = parameters.replace(sigma_hit=args.noise)
-    motion = OdometryMotion(**noise) if noise else MOTION
+    motion = OdometryMotion(**given.noise) if given.noise else MOTION
     if args.motion_noise is not None:
         motion = dataclasses.replace(motion, alpha=tuple(args.motion_noise))
     return parameters, motion

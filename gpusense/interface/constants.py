@@ -50,6 +50,8 @@ SHARE, THRESHOLD, SCALE, PER_BEAM_SCALE, SLOW_RATE, FAST_RATE, MOST_INJECTED, ST
 TEMPERATURE = 27
 # Kinds of draws, by the setting STRATIFIED.
 SYSTEMATIC, INDEPENDENT, RESIDUAL = 0, 1, 2
+# Factor of all rungs of a stage: 1, or less where even the last rung leaves too few particles with weight.
+DEPTH = 60
 # Where a filter is split: index of the first particle here, particles of the whole filter now and in the next step; the
 # last two are 0 where all particles are here.
 FIRST, WHOLE, DRAWN = 61, 62, 63

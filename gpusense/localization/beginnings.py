@@ -15,7 +15,6 @@ from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.journal import whole
 from gpusense.localization.motion import SampledMotion
 from gpusense.localization.results import Results
-from gpusense.localization.trust import Trust
 from gpusense.world.plausible import look_at_heading, look_at_start
 
 
@@ -30,7 +29,8 @@ class Beginnings(Results):
     _together: bool
     # Poses that recovery injects: their number, and half widths of the box around each.
     _pool: tuple[int, starts.Spread]
-    _trust: Trust | None
+    # Whether places anywhere are to be compared with the one that is found.
+    _everywhere: bool
 
     @whole
     def initialize(self, *, mean: AnyArray, covariance: AnyArray, particles: int | None = None) -> None:
@@ -68,8 +68,7 @@ class Beginnings(Results):
         pool, spread = starts.free_pool([sensor.model for sensor in self._sensors], bounds)
         self._place(starts.spread(pool, spread, self._number(particles), self._key()))
         self._wide = DEFAULTS.wide_scans
-        if bounds is None and self.options.recovery is None:
-            self._trust = Trust()
+        self._everywhere = bounds is None
 
     @whole
     def initialize_from(self, likelihood: Any, *, particles: int | None = None) -> None:
@@ -95,6 +94,7 @@ class Beginnings(Results):
         """
         pool, spread = starts.likely_pool(likelihood, self._number(particles), self._key())
         self._place(starts.spread(pool, spread, self._number(particles), self._key(), each=True))
+        self._everywhere = True
 
     def _look_at_start(self, pose: np.ndarray) -> None:
         """Warn of a start that cannot be meant."""
@@ -119,7 +119,9 @@ class Beginnings(Results):
         self._cloud.place(poses)
         self._shown, self._started, self._wide, self._together = len(poses), True, 0, False
         if not again:
-            self._pending, self._last, self._trust = None, {}, None
+            self._pending, self._last, self._everywhere = None, {}, False
+            if self._rival is not None:
+                self._rival.stop()
             self._verdict.reset()
             for sensor in self._sensors:
                 sensor.restart()

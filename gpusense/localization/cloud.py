@@ -16,7 +16,7 @@ from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.recording import Recording, Repeated
 from gpusense.interface.constants import ESTIMATE, LEFT, MOMENTS, SLOW_RATE, STAGE, STATE, WIDE_HEADINGS
 from gpusense.interface.launches import Program
-from gpusense.localization.filter_cloud import Contents, Summary, meaningful, summary_of
+from gpusense.localization.filter_cloud import Contents, Summary, deeper, is_starved, meaningful, summary_of
 from gpusense.localization.particles import Particles, Stage
 from gpusense.localization.sums import weight_block
 
@@ -103,14 +103,27 @@ class Cloud(Particles):
             # Averages of the likelihood last.
             self._copy_state(self.places.state, stages[0].state)
         for stage in stages:
-            last = stage.number + 1 == stage.most
+            last, deep = stage.most == 1, settings
             score(stage)
             if not last:
-                last = self._read(self.states[stage.state], STATE)[stage.number * STAGE + LEFT] == 0.0
+                numbers, deep = self._deepen(stage, settings)
+                last = numbers[stage.number * STAGE + LEFT] == 0.0
                 self._draw(stage, drawn if last else self.count)
+            if deep is not settings:
+                self.upload_settings(settings)
             if last:
                 break
         self.set_particles(stage.places, drawn, weight_block(self.backend, drawn))
+
+    def _deepen(self, stage: Stage, settings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Weigh a stage on lower rungs while too few particles have weight; return the state and the settings."""
+        numbers = self._read(self.states[stage.state], STATE)
+        while is_starved(numbers, settings, stage.number, self.count):
+            settings = deeper(settings)
+            self.upload_settings(settings)
+            self.backend.run(self.weighing(stage))
+            numbers = self._read(self.states[stage.state], STATE)
+        return numbers, settings
 
     def _copy_state(self, source: int, target: int) -> None:
         if self.backend.info.kind == "gpu":

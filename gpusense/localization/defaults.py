@@ -27,6 +27,7 @@ class Defaults(NamedTuple):
         slow: Rate of the slow average of the likelihood.
         fast: Rate of the fast average.
         most_injected: Largest share of injected particles.
+        recovery: Of the filter.
         temperature: Of the filter.
         calibrations: Corrections from which the temperature is learned at first; later two of ten.
         field: Parameters of the likelihood field of ``gpusense localize``.
@@ -53,6 +54,7 @@ class Defaults(NamedTuple):
     slow: float = 0.02
     fast: float = 0.3
     most_injected: float = 0.2
+    recovery: str = "sensor"
     temperature: str = "auto"
     calibrations: int = 60
     field: Mapping[str, Any] = MappingProxyType(

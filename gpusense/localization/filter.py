@@ -10,17 +10,22 @@ from gpusense._util import checks
 from gpusense.localization import options, resetting, skipping
 from gpusense.localization.adaptive import kld_count
 from gpusense.localization.beginnings import Beginnings
-from gpusense.localization.calibration import LOOK, Due, due_of, is_together
+from gpusense.localization.calibration import LOOK, due_of, is_together
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.device_cloud import DeviceCloud
 from gpusense.localization.estimates import covariance_of
-from gpusense.localization.filter_cloud import FilterCloud, Step
+from gpusense.localization.filter_cloud import FilterCloud, Given, Step
 from gpusense.localization.journal import plain_state, set_state, settled, whole
 from gpusense.localization.motion import STILL, MotionModel, OdometryMotion, SampledMotion
+from gpusense.localization.rival import PARTICLES, PRIOR, Rival, can_search, evidence_of
 from gpusense.localization.scoring import given_of
 from gpusense.localization.sensors import sensors_of
 from gpusense.localization.state import FilterState, check_state, constructor_options, model_names, readings_on_host
 from gpusense.localization.verdict import Verdict
+from gpusense.localization.words import TRACKING as DOUBT
+
+# Makes the seed of a rival from that of its filter.
+_RIVAL = 0x9E3779B97F4A7C15
 
 
 class ParticleFilter(Beginnings):
@@ -70,7 +75,8 @@ class ParticleFilter(Beginnings):
     """
 
     MEMORY = (
-        "_step", "_started", "_pending", "_shown", "_wide", "_corrections", "_together", "_pool", "_last", "_trust",
+        "_step", "_started", "_pending", "_shown", "_wide", "_corrections", "_together", "_pool", "_last", "_rival",
+        "_everywhere", "_distinct",
         "_verdict", "_sensors", "_cloud",
     )  # fmt: skip
 
@@ -85,7 +91,7 @@ class ParticleFilter(Beginnings):
         resampling: str = "systematic",
         threshold: float = DEFAULTS.threshold,
         stages: int = DEFAULTS.stages,
-        recovery: str | None = None,
+        recovery: str | None = DEFAULTS.recovery,
         beam_skip: float | None = None,
     ) -> None:
         self._sensors = sensors_of(models)
@@ -107,7 +113,9 @@ class ParticleFilter(Beginnings):
         self._pool = 0, (0.0, 0.0, 0.0)
         self._verdict = Verdict(self._sensors, self._random_poses, seed=self.options.seed)
         self._last: dict[int, tuple[Any, ...]] = {}
-        self._trust = None
+        self._rival: Rival | None = None
+        self._distinct = 1.0
+        self._everywhere = False
 
     def _new_cloud(self) -> FilterCloud:
         """Return room for the particles."""
@@ -115,6 +123,8 @@ class ParticleFilter(Beginnings):
 
     def _keep(self) -> None:
         self._cloud.kept = self._cloud.places
+        if self._rival is not None:
+            self._rival.keep()
 
     def __repr__(self) -> str:
         one = self.options
@@ -138,11 +148,24 @@ class ParticleFilter(Beginnings):
         """
         self._check_started()
         sampled = self.motion.sampled(*motion)
-        # The next correction begins with the move: one program has both.
-        if self._pending is None:
-            self._pending = sampled
+        if self._rival is None or not self._rival.active:
+            self._follow(sampled)
         else:
-            self._move(sampled)
+            self._follow_both(sampled)
+
+    def _follow(self, motion: SampledMotion) -> None:
+        """Move the particles when the next correction begins: one program has both."""
+        if self._pending is None:
+            self._pending = motion
+        else:
+            self._move(motion)
+
+    @whole
+    def _follow_both(self, motion: SampledMotion) -> None:
+        """Move the particles and their rival."""
+        self._follow(motion)
+        if self._rival is not None:
+            self._rival.predict(motion)
 
     @whole
     def correct(self, readings: Any) -> None:
@@ -172,36 +195,85 @@ class ParticleFilter(Beginnings):
         if chosen.beam_skip is not None:
             particles = self.host_particles(), self.host_weights()
             given = skipping.skipped(self._sensors, given, particles, self._verdict.anywhere, chosen.beam_skip)
-        motion = STILL if self._pending is None else self._pending
+        self._weigh(given)
+        # The caller may write the next readings to the same arrays.
+        self._last = {index: tuple(map(_copied, reading)) for index, reading in whole.items()}
+        self._verdict.corrected()
+        self._corrections += 1
+        self._learn(given)
+        self._recover(given)
+
+    def _weigh(self, given: list[Given]) -> None:
+        """Run the motion, and correct the particles by readings of sensors."""
+        chosen, motion = self.options, STILL if self._pending is None else self._pending
+        self._distinct = self._distinct_share() if self._pending is None and self._last else 1.0
         drawn = self._cloud.count if chosen.least == chosen.most else self._wanted()
         settings = self._settings(motion, [index for index, _ in given])
         self._shown, self._pending = self._cloud.count, None
         self._cloud.correct(Step(settings, motion.kind, chosen.stages, drawn, given))
-        # The caller may write the next readings to the same arrays.
-        self._last = {index: tuple(map(_copied, reading)) for index, reading in whole.items()}
         self._wide = max(self._wide - 1, 0)
-        self._verdict.corrected()
-        self._corrections += 1
-        due = due_of(self._sensors, given) if chosen.temperature == "auto" else []
-        if due or not self._together or self._corrections % LOOK == 0:
-            self._look(due)
-        if self._verdict.due and self._is_contradicted():
-            self.reset()
 
-    def _look(self, due: Due) -> None:
-        """Find out whether the particles lie together, and if so learn from scans at the estimated pose."""
+    def _distinct_share(self) -> float:
+        """Return the share of distinct particles before a correction without motion, where copies are alike."""
+        last = self._cloud.summary()
+        before = self._distinct if last.stages == 1 else 1.0
+        return before * min(last.effective_sample_size / self._shown, 1.0) if last.resampled else before
+
+    def _learn(self, given: list[Given]) -> None:
+        """Find out whether the particles lie together, and learn from scans at a pose that none contradicts."""
+        due = due_of(self._sensors, given) if self.options.temperature == "auto" else []
+        if not (due or not self._together or self._corrections % LOOK == 0):
+            return
         numbers = self._cloud.estimate(self._shown)
         covariance = covariance_of(numbers)
         self._together = is_together(covariance)
-        if due and self._together and self._cloud.summary().effective_sample_size >= 2:
+        if due and self._together and not self._is_doubted() and self._cloud.summary().effective_sample_size >= 2:
             for sensor, reading in due:
                 sensor.correlate(numbers[:3], covariance, reading)
 
-    def _is_contradicted(self) -> bool:
-        """Tell whether scans contradict the pose so that half of the particles should be replaced."""
-        if self.options.recovery == "sensor":
-            return self.estimate().lost
-        return self._trust is not None and self._trust.contradicted(self.estimate())
+    def _is_doubted(self) -> bool:
+        """Tell whether the last scans that were judged contradict the pose, or a rival competes with it."""
+        rival = self._rival is not None and self._rival.active
+        return rival or not self._together or self._verdict.wrong > DOUBT or self._verdict.explains_little
+
+    def _recover(self, given: list[Given]) -> None:
+        """Compare the particles with their rival, or search for one where scans contradict the pose."""
+        if self.options.recovery != "sensor" or not can_search(self._sensors):
+            return
+        rival = self._rival
+        if rival is not None and rival.active:
+            rival.correct(given, evidence_of(self._cloud))
+            numbers = self._cloud.estimate(self._shown)
+            won = rival.judge(numbers[:3], covariance_of(numbers), given)
+            if won is not None:
+                self._take_over(*won)
+            return
+        if self._wide or (self._everywhere and not self._together):
+            return
+        if not (self._everywhere or self._is_doubted() or self._verdict.due):
+            return
+        found = self.estimate()
+        if self._everywhere or self._is_doubted():
+            rival = self._rival = self._rival or Rival(self._new_rival())
+            prior = 0.0 if self._everywhere else PRIOR
+            self._everywhere = False
+            rival.start(found.pose, found.covariance, list(self._last.items()), prior=prior)
+
+    def _new_rival(self) -> ParticleFilter:
+        """Return a filter for a rival, with the sensors of this one."""
+        one = self.options
+        return ParticleFilter(
+            self._sensors, motion=self.motion, particles=PARTICLES, seed=one.seed ^ _RIVAL, temperature=one.temperature,
+            resampling=one.resampling, threshold=one.threshold, stages=one.stages, recovery=None,
+        )  # fmt: skip
+
+    def _take_over(self, poses: np.ndarray, weights: np.ndarray) -> None:
+        """Replace the particles by those of the rival, which the next scans have to confirm."""
+        count = self._cloud.count
+        ends = np.cumsum(weights)
+        rows = np.searchsorted(ends, (np.arange(count) + 0.5) / count * ends[-1], side="right")
+        self._place(poses[np.minimum(rows, len(poses) - 1)], again=True)
+        self._verdict.doubt()
 
     @whole
     def reset(self) -> None:
@@ -239,7 +311,8 @@ class ParticleFilter(Beginnings):
     @settled
     def state(self) -> FilterState:
         """Return a copy of the filter's state, without models and device: see :class:`FilterState`."""
-        memory = plain_state(self, without=("_cloud", "_last"))
+        memory = plain_state(self, without=("_cloud", "_last", "_rival"))
+        memory["rival"] = None if self._rival is None or not self._rival.active else self._rival.state()
         memory["_last"] = readings_on_host(self._last, self._backend)
         options, models = constructor_options(self.options, self.motion), model_names(self._sensors)
         return FilterState(options, models, self._cloud.contents(self._shown), memory)
@@ -257,7 +330,12 @@ class ParticleFilter(Beginnings):
         """
         given = check_state(state, constructor_options(self.options, self.motion), model_names(self._sensors))
         self._cloud.restore(given.contents)
-        set_state(self, given.memory)
+        set_state(self, {name: value for name, value in given.memory.items() if name != "rival"})
+        if given.memory["rival"] is not None:
+            self._rival = self._rival or Rival(self._new_rival())
+            self._rival.restore(given.memory["rival"])
+        elif self._rival is not None:
+            self._rival.stop()
 
     def __getstate__(self) -> dict[str, Any]:
         return {"models": self.models, "state": self.state()}

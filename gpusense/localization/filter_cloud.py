@@ -2,14 +2,38 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from gpusense.interface.constants import DEGENERATE, EVIDENCE, INJECTED, LEFT, RUNG, SAMPLE_SIZE, STAGE, STATE
+from gpusense.interface.constants import (
+    DEGENERATE,
+    DEPTH,
+    EVIDENCE,
+    FARTHEST_THETA,
+    FARTHEST_X,
+    INJECTED,
+    JITTER,
+    LEFT,
+    LOWEST,
+    RESAMPLED,
+    RUNG,
+    SAMPLE_SIZE,
+    SHARE,
+    STAGE,
+    STATE,
+)
 from gpusense.localization.particles import Places
+from gpusense.reference.rungs import left_of
 
+# Lowest depth of a ladder: distances of a million deviations differ by 2^-39 on its last rung.
+_DEEPEST = LOWEST**5
+# Effective sample size below which a stage is weighed again on a deeper ladder.
+_FEWEST = 10.0
+# Jitter of a stage on a deeper ladder: the peak lies beyond the particles, which must not shrink before they reach it.
+_WIDE_JITTER = 0.7
 # Index of a sensor, and its readings.
 Given = tuple[int, tuple[Any, ...]]
 
@@ -79,11 +103,12 @@ class Summary(NamedTuple):
     """The state of a filter after a correction.
 
     Attributes:
-        effective_sample_size: Of the last stage.
+        effective_sample_size: Of the last stage, and at most the number of distinct particles after earlier ones.
         temperature: Share of the temperature that all stages used.
         degenerate: No particle was possible.
         stages: Stages that ran.
         numbers: The state as the kernels hold it.
+        resampled: Whether particles were drawn at the end.
     """
 
     effective_sample_size: float
@@ -91,18 +116,46 @@ class Summary(NamedTuple):
     degenerate: bool
     stages: int
     numbers: np.ndarray
+    resampled: bool
 
 
 def summary_of(numbers: np.ndarray) -> Summary:
     """Return the summary of a state as the kernels hold it."""
-    used, stage = 0.0, 0
+    used, stage, distinct = 0.0, 0, math.inf
     while True:
-        used += float(numbers[stage * STAGE + RUNG])
-        if numbers[stage * STAGE + LEFT] == 0.0:
+        own = numbers[stage * STAGE : (stage + 1) * STAGE]
+        used += float(own[RUNG])
+        if own[LEFT] == 0.0:
             break
+        # Each copy moves by the difference of two others: m parents have at most m^3 distinct copies.
+        distinct = min(distinct, float(own[SAMPLE_SIZE]) ** 3)
         stage += 1
+    size = min(float(own[SAMPLE_SIZE]), distinct)
+    return Summary(size, min(used, 1.0), bool(numbers[DEGENERATE]), stage + 1, numbers, bool(own[RESAMPLED]))
+
+
+def is_starved(numbers: np.ndarray, settings: np.ndarray, stage: int, count: int) -> bool:
+    """Tell whether even the last rung of a stage leaves too few particles with weight, and a deeper one may not.
+
+    Args:
+        numbers: The state after the stage.
+        settings: Numbers of the step.
+        stage: The stage.
+        count: Particles.
+    """
     own = numbers[stage * STAGE : (stage + 1) * STAGE]
-    return Summary(float(own[SAMPLE_SIZE]), min(used, 1.0), bool(numbers[DEGENERATE]), stage + 1, numbers)
+    lowest = left_of(numbers, stage) * settings[DEPTH] * LOWEST
+    least = min(settings[SHARE] * count, _FEWEST)
+    few = own[RUNG] == lowest > 0.0 and not own[DEGENERATE] and own[SAMPLE_SIZE] < least
+    return bool(few and settings[DEPTH] > _DEEPEST)
+
+
+def deeper(settings: np.ndarray) -> np.ndarray:
+    """Return the numbers of a step whose ladder begins below the last rung of the present one."""
+    result = settings.copy()
+    result[DEPTH] *= LOWEST
+    result[JITTER], result[FARTHEST_X], result[FARTHEST_THETA] = _WIDE_JITTER, math.inf, math.pi
+    return result
 
 
 def meaningful(numbers: np.ndarray, averages: bool) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.interface.constants import (
+    DEPTH,
     DEVIATION,
     FARTHEST_THETA,
     FARTHEST_X,
@@ -141,6 +142,7 @@ def settings_of_step(
     s[POOL], s[POOL + 1 : POOL + 4] = pool
     s[SHARE] = min(DEFAULTS.share, DEFAULTS.enough / count) if one_peak else DEFAULTS.share_apart
     s[THRESHOLD] = options.threshold
+    s[DEPTH] = 1.0
     s[STRATIFIED] = _DRAWS[options.resampling]
     # Sums of weights stay below 2^53: a weight is 1 on average, and their squares at most 1 / threshold. An effective
     # sample size of one particle is above any lower threshold.

@@ -61,8 +61,7 @@ class Places(NamedTuple):
         (poses, weights), state = kept.free(), 1 - kept.state
         first = Stage(poses, 0, most, drawn if most == 1 else 0, self.before, weights, state, self.next, kind)
         return [first] + [
-            Stage(poses + number % 2, number, most, drawn if number + 1 == most else 0, weights + 1, weights, state)
-            for number in range(1, most)
+            Stage(poses + number % 2, number, most, 0, weights + 1, weights, state) for number in range(1, most)
         ]
 
     def free(self) -> tuple[int, int]:

@@ -11,7 +11,7 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.backends import arrays
 from gpusense.backends.base import Backend
-from gpusense.interface.constants import FIRST, TEMPERATURE
+from gpusense.interface.constants import DEPTH, TEMPERATURE
 from gpusense.interface.launches import Program
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.temperature import BeamCorrelation, axes_of, poses_around
@@ -23,7 +23,7 @@ from gpusense.models.scan.model import ScanModel
 _DOUBLE = np.dtype(np.float64)
 # Calls that are started before one waits.
 _MOST_STARTED = 64
-_MOST_SENSORS = FIRST - TEMPERATURE
+_MOST_SENSORS = DEPTH - TEMPERATURE
 
 
 class Sensor:
@@ -185,7 +185,7 @@ def sensors_of(models: Any) -> list[Sensor]:
         raise ValueError(f"models: must be 1 to {_MOST_SENSORS} measurement models, got {len(chosen)}")
     if len({id(model) for model in chosen}) < len(chosen):
         raise ValueError("models: must be different ones, since readings are found by their model, got one twice")
-    sensors = [Sensor(model) for model in chosen]
+    sensors = [model if isinstance(model, Sensor) else Sensor(model) for model in chosen]
     backend = sensors[0].backend
     if any(sensor.backend is not backend for sensor in sensors):
         names = ", ".join(sorted({sensor.backend.info.selection for sensor in sensors}))

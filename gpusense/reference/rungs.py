@@ -1,4 +1,6 @@
-"""The ladder of temperatures of a correction, and the state of its stages: b_k = b / 2^k, where b is what is left.
+"""The ladder of temperatures of a correction, and the state of its stages: b_k = d b / 2^k, where b is what is left.
+
+The depth d is 1. Where the last rung leaves too few particles, the host weighs the stage again with a lower one.
 
 See weighing.py.
 
@@ -11,6 +13,7 @@ import numpy as np
 
 from gpusense.interface.constants import (
     DEGENERATE,
+    DEPTH,
     EVIDENCE,
     FAST,
     FAST_RATE,
@@ -97,16 +100,17 @@ def set_stage(
     stage: int,
     stages: int,
 ) -> None:
-    """Write the state of a stage that uses a rung; at stage 0, follow the evidence."""
-    if stage == 0:
+    """Write the state of a stage that uses a rung; at stage 0, follow the evidence of the whole temperature."""
+    if stage == 0 and settings[DEPTH] == 1.0:
         follow_evidence(totals[0], totals[2 * RUNGS], high, settings, state)
     with np.errstate(invalid="ignore"):
         size = totals[rung] * totals[rung] / (settings[SCALE] * totals[RUNGS + rung])
-    rest = left - left * 0.5**rung
+    part = left * settings[DEPTH] * 0.5**rung
+    rest = left - part
     state[stage * STAGE + LEFT] = rest if stage + 1 < stages else 0.0
     state[stage * STAGE + TOTAL] = totals[column_of(high, rung)]
     state[stage * STAGE + SAMPLE_SIZE] = size
     wanted = size < settings[THRESHOLD] * particles or rest > 0.0 or (stage == 0 and state[INJECTED] > 0.0)
     state[stage * STAGE + RESAMPLED] = 1.0 if wanted else 0.0
     state[stage * STAGE + DEGENERATE] = 1.0 if high == -np.inf else 0.0
-    state[stage * STAGE + RUNG] = left * 0.5**rung
+    state[stage * STAGE + RUNG] = part

@@ -1,9 +1,10 @@
 """Weights of particles from the log-likelihoods of sensors, at the highest temperature that leaves enough particles.
 
 w_k = v exp(b_k (l - max l)), where v is the weight before, l the sum over sensors of temperature times log p, and b_k
-= b / 2^k a ladder. The first rung with an effective sample size (sum w)^2 / sum w^2 of at least SHARE of that before
-is taken; what is left of b belongs to the next stage of the correction (annealing: Neal, *Annealed importance
-sampling*, 2001). Weights are rounded to integers below 2^53 / N, so that sums of them are exact in any order.
+= d b / 2^k a ladder of depth d. The first rung with an effective sample size (sum w)^2 / sum w^2 of at least SHARE of
+that before is taken; what is left of b belongs to the next stage of the correction (annealing: Neal, *Annealed
+importance sampling*, 2001). Weights are rounded to integers below 2^53 / N, so that sums of them are exact in any
+order.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.interface.constants import (
+    DEPTH,
     RUNGS,
     SCALE,
     SHARE,
@@ -61,7 +63,7 @@ def weigh_particles(
     """Sum the integer weights of each block on each rung, their squares, and the weights before."""
     scale, old = settings[SCALE], before[:particles]
     highest[0] = largest_of(largest, 0, groups)
-    likelihood = tempered(score[:particles], highest[0], left_of(state, stage))
+    likelihood = tempered(score[:particles], highest[0], left_of(state, stage) * settings[DEPTH])
     table, starts = sums[: blocks * WEIGHT_SUMS].reshape(blocks, WEIGHT_SUMS), np.arange(0, particles, block)
     table[:, 2 * RUNGS] = np.add.reduceat(np.floor(old * scale), starts)
     for rung in reversed(range(RUNGS)):
@@ -103,7 +105,7 @@ def set_weights(
     """Choose the rung, set the weights and their exact cumulative sums, and write the stage's state."""
     scale, left, high = settings[SCALE], left_of(state, stage), possible_of(totals, highest[0])
     rung = rung_of(totals, settings, settings[SHARE] * particles) if left > 0.0 else 0
-    likelihood = tempered(score[:particles], high, left)
+    likelihood = tempered(score[:particles], high, left * settings[DEPTH])
     for _ in range(rung, RUNGS - 1):
         likelihood = likelihood * likelihood
     weight[:particles] = before[:particles] * likelihood

@@ -1,5 +1,6 @@
-// The ladder of temperatures of a correction, and the state of its stages: b_k = b / 2^k, where b is what earlier stages
-// have left. See weighing.cl.
+// The ladder of temperatures of a correction, and the state of its stages: b_k = d b / 2^k, where b is what earlier
+// stages have left. See weighing.cl.
+// The depth d is 1. Where the last rung leaves too few particles, the host weighs the stage again with a lower one.
 // Recovery: augmented MCL, "Probabilistic Robotics" table 8.3, with the mean likelihood per beam.
 // requires: elementary
 
@@ -11,6 +12,7 @@
 #define FAST_RATE 24
 #define MOST_INJECTED 25
 #define TEMPERATURE 27
+#define DEPTH 60
 #define RUNGS 8
 // 2^-(RUNGS - 1).
 #define LOWEST 0.0078125
@@ -111,12 +113,12 @@ void follow_evidence(const double total, const double before, const double large
     state[INJECTED] = least < settings[MOST_INJECTED] ? least : settings[MOST_INJECTED];
 }
 
-// Write the state of a stage that uses a rung; at stage 0, follow the evidence.
+// Write the state of a stage that uses a rung; at stage 0, follow the evidence of the whole temperature.
 void set_stage(global const double *totals, global const double *settings, global double *state, const double high,
                const double left, const int rung, const int particles, const int stage, const int stages) {
-    if (stage == 0) follow_evidence(totals[0], totals[2 * RUNGS], high, settings, state);
+    if (stage == 0 && settings[DEPTH] == 1.0) follow_evidence(totals[0], totals[2 * RUNGS], high, settings, state);
     const double size = totals[rung] * totals[rung] / (settings[SCALE] * totals[RUNGS + rung]);
-    double part = left;
+    double part = left * settings[DEPTH];
     for (int k = 0; k < rung; k++) part *= 0.5;
     const double rest = left - part;
     const int wanted = size < settings[THRESHOLD] * (double)particles || rest > 0.0 ||

@@ -1,8 +1,9 @@
 // Weights of particles from the log-likelihoods of sensors, at the highest temperature that leaves enough particles.
-// w_k = v exp(b_k (l - max l)), where v is the weight before, l the sum over sensors of temperature times log p, and b_k
-// = b / 2^k a ladder. The first rung with an effective sample size (sum w)^2 / sum w^2 of at least SHARE of that before
-// is taken; what is left of b belongs to the next stage of the correction (annealing: Neal, "Annealed importance
-// sampling", 2001). Weights are rounded to integers below 2^53 / N, so that sums of them are exact in any order.
+// w_k = v exp(b_k (l - max l)), where v is the weight before, l the sum over sensors of temperature times log p, and
+// b_k = d b / 2^k a ladder of depth d. The first rung with an effective sample size (sum w)^2 / sum w^2 of at least
+// SHARE of that before is taken; what is left of b belongs to the next stage of the correction (annealing: Neal,
+// "Annealed importance sampling", 2001). Weights are rounded to integers below 2^53 / N, so that sums of them are exact
+// in any order.
 // requires: rungs
 
 // Rows that a work-item reads before it adds any up.
@@ -41,7 +42,8 @@ kernel void weigh_particles(global const double *score, global const double *bef
                             const int groups, const int stage) {
     const int b = get_global_id(0), begin = b * block;
     if (begin >= particles) return;
-    const double high = largest_of(largest, 0, groups), left = left_of(state, stage), scale = settings[SCALE];
+    const double high = largest_of(largest, 0, groups), left = left_of(state, stage) * settings[DEPTH];
+    const double scale = settings[SCALE];
     const int end = min(begin + block, particles);
     double weights[RUNGS], squares[RUNGS], old = 0.0;
     for (int k = 0; k < RUNGS; k++) weights[k] = squares[k] = 0.0;
@@ -99,10 +101,11 @@ kernel void set_weights(global const double *score, global const double *before,
         return;
     }
     const int end = min(begin + block, particles);
+    const double low = left * settings[DEPTH];
     double sum = sum_before(sums, joined, b, fan, column_of(high, rung));
     for (int n = begin; n < end; n += 8) {
         const double8 scores = eight_at(score, n, end, -INFINITY), prior = eight_at(before, n, end, 0.0);
-        double8 likelihood = tempered(scores, high, left);
+        double8 likelihood = tempered(scores, high, low);
         for (int k = rung; k < RUNGS - 1; k++) likelihood *= likelihood;
         const double8 chosen = prior * likelihood, whole = floor(chosen * scale);
 #pragma unroll

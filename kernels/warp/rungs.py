@@ -1,4 +1,6 @@
-"""The ladder of temperatures of a correction, and the state of its stages: b_k = b / 2^k, where b is what is left.
+"""The ladder of temperatures of a correction, and the state of its stages: b_k = d b / 2^k, where b is what is left.
+
+The depth d is 1. Where the last rung leaves too few particles, the host weighs the stage again with a lower one.
 
 See weighing.py.
 
@@ -15,6 +17,7 @@ from .prelude import reader
 SHARE, THRESHOLD, SCALE = (wp.constant(place) for place in (19, 20, 21))
 PER_BEAM_SCALE, SLOW_RATE, FAST_RATE, MOST_INJECTED = (wp.constant(place) for place in (22, 23, 24, 25))
 RUNGS, WEIGHT_SUMS = wp.constant(8), wp.constant(17)
+DEPTH = wp.constant(60)
 # Places in the state: of a stage, and of what lasts.
 LEFT, TOTAL, SAMPLE_SIZE, RESAMPLED, DEGENERATE, RUNG = (wp.constant(place) for place in range(6))
 STAGE = wp.constant(8)
@@ -149,7 +152,7 @@ def follow_evidence(
         state[INJECTED] = wp.min(wp.max(share, ZERO), settings[MOST_INJECTED])
 
 
-# Write the state of a stage that uses a rung; at stage 0, follow the evidence.
+# Write the state of a stage that uses a rung; at stage 0, follow the evidence of the whole temperature.
 @wp.func
 def set_stage(
     totals: wp.array(dtype=wp.float64),
@@ -162,10 +165,10 @@ def set_stage(
     stage: wp.int32,
     stages: wp.int32,
 ):
-    if stage == 0:
+    if stage == 0 and settings[DEPTH] == ONE:
         follow_evidence(totals[0], totals[2 * RUNGS], high, settings, state)
     size = totals[rung] * totals[rung] / (settings[SCALE] * totals[RUNGS + rung])
-    part = left * ONE
+    part = left * settings[DEPTH]
     for _k in range(rung):
         part = part * HALF
     rest = left - part

@@ -1,9 +1,10 @@
 """Weights of particles from the log-likelihoods of sensors, at the highest temperature that leaves enough particles.
 
 w_k = v exp(b_k (l - max l)), where v is the weight before, l the sum over sensors of temperature times log p, and b_k
-= b / 2^k a ladder. The first rung with an effective sample size (sum w)^2 / sum w^2 of at least SHARE of that before
-is taken; what is left of b belongs to the next stage of the correction (annealing: Neal, *Annealed importance
-sampling*, 2001). Weights are rounded to integers below 2^53 / N, so that sums of them are exact in any order.
+= d b / 2^k a ladder of depth d. The first rung with an effective sample size (sum w)^2 / sum w^2 of at least SHARE of
+that before is taken; what is left of b belongs to the next stage of the correction (annealing: Neal, *Annealed
+importance sampling*, 2001). Weights are rounded to integers below 2^53 / N, so that sums of them are exact in any
+order.
 """
 
 import functools
@@ -12,6 +13,7 @@ import warp as wp
 
 from .prelude import kernel, loader, precision, writer
 from .rungs import (
+    DEPTH,
     NEVER,
     RUNGS,
     SCALE,
@@ -102,7 +104,7 @@ def make(name, flags):
         if begin >= particles:
             return
         high = largest_of(largest, 0, groups)
-        left = left_of(state, stage)
+        left = left_of(state, stage) * settings[DEPTH]
         scale = settings[SCALE]
         end = wp.min(begin + block, particles)
         weights = eight()
@@ -191,12 +193,13 @@ def make(name, flags):
             set_stage(totals, settings, state, high, left, rung, particles, stage, stages)
             return
         total = sum_before(sums, joined, b, fan, column_of(high, rung))
+        low = left * settings[DEPTH]
         n = b * block
         end = wp.min(n + block, particles)
         while n < end:
             scores = eight_at(score, n, end, NEVER)
             prior = eight_at(before, n, end, ZERO)
-            likelihood = tempered(scores, high, left)
+            likelihood = tempered(scores, high, low)
             for _k in range(rung, RUNGS - 1):
                 likelihood = wp.cw_mul(likelihood, likelihood)
             chosen = wp.cw_mul(prior, likelihood)

@@ -67,7 +67,7 @@ def test_deviates_are_uniform_and_standard_normal():
 def settings_of_step(**values):
     settings = np.zeros(c.SETTINGS)
     settings[c.SEED], settings[c.STEP], settings[c.SCALE] = 5, 3, 2.0**30
-    settings[c.THRESHOLD], settings[c.SHARE] = 0.5, 0.2
+    settings[c.THRESHOLD], settings[c.SHARE], settings[c.DEPTH] = 0.5, 0.2, 1.0
     for name, value in values.items():
         place = getattr(c, name)
         settings[place : place + np.size(value)] = value
@@ -132,7 +132,7 @@ def test_draws_keep_the_expected_copies(stratified):
     np.testing.assert_allclose(copies / repeats, expected, atol=5 * np.sqrt(expected.max() / repeats))
 
 
-def run_step(selection, count, flags=PLAIN, *, lanes=True, draws=c.SYSTEMATIC, lone=False):
+def run_step(selection, count, flags=PLAIN, *, lanes=True, draws=c.SYSTEMATIC, lone=False, depth=1.0):
     """Return all buffers after two motions, a correction of two stages and an estimate.
 
     Where ``lone`` is set, only particles without a weight are possible.
@@ -143,6 +143,7 @@ def run_step(selection, count, flags=PLAIN, *, lanes=True, draws=c.SYSTEMATIC, l
         SEED=[123456789, 4000000000], MEAN=[0.1, 1, 0.02, -0.2], DEVIATION=[0.1, 0.2, 0.05, 0.1], REVERSE=0.1,
         JITTER=0.2, FARTHEST_X=1, FARTHEST_THETA=0.5, POOL=[5, 0.1, 0.1, 3.0], SCALE=2.0**36,
         PER_BEAM_SCALE=0.01, SLOW_RATE=0.05, FAST_RATE=0.3, MOST_INJECTED=0.3, TEMPERATURE=[0.7, 0.9], STRATIFIED=draws,
+        DEPTH=depth,
     )  # fmt: skip
     state = np.zeros(c.STATE)
     state[c.SLOW], state[c.FAST] = 0.9, 0.6
@@ -199,6 +200,17 @@ def test_every_backend_has_the_bits_of_the_reference(backend, count, flags, lane
     expected, found = run_step("numpy", count, flags), run_step(backend, count, flags, lanes=lanes)
     for name, values in expected.items():
         assert np.array_equal(values, found[name]), name
+
+
+@pytest.mark.parametrize("lanes", [False, True], ids=["scalars", "lanes"])
+def test_deep_ladders_have_the_bits_of_the_reference(backend, lanes):
+    expected, found = run_step("numpy", 1500, depth=2.0**-14), run_step(backend, 1500, lanes=lanes, depth=2.0**-14)
+    for name, values in expected.items():
+        assert np.array_equal(values, found[name]), name
+    state = found["state"]
+    assert state[c.RUNG] == 2.0**-14 and state[c.LEFT] == 1 - 2.0**-14
+    # The evidence is that of the whole temperature.
+    assert state[c.EVIDENCE] == 0 and state[c.SLOW] == 0.9
 
 
 @pytest.mark.parametrize("lanes", [False, True], ids=["scalars", "lanes"])

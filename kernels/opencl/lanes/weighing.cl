@@ -13,7 +13,8 @@ kernel void weigh_particles(global const double *score, global const double *bef
                             const int groups, const int stage) {
     const int b = get_global_id(0), begin = b * block;
     if (begin >= particles) return;
-    const double high = largest_of(largest, 0, groups), left = left_of(state, stage), scale = settings[SCALE];
+    const double high = largest_of(largest, 0, groups), left = left_of(state, stage) * settings[DEPTH];
+    const double scale = settings[SCALE];
     const int end = min(begin + block, particles);
     doubles weights[RUNGS], squares[RUNGS], old = 0.0;
     for (int k = 0; k < RUNGS; k++) weights[k] = squares[k] = 0.0;
@@ -53,10 +54,11 @@ kernel void set_weights(global const double *score, global const double *before,
         return;
     }
     const int end = min(begin + block, particles);
+    const double low = left * settings[DEPTH];
     double sum = sum_before(sums, joined, b, fan, column_of(high, rung));
     for (int n = begin; n < end; n += DOUBLES) {
         const int count = min(DOUBLES, end - n);
-        doubles likelihood = tempered_lanes(load_doubles(score, n, count), high, left);
+        doubles likelihood = tempered_lanes(load_doubles(score, n, count), high, low);
         for (int k = rung; k < RUNGS - 1; k++) likelihood *= likelihood;
         const doubles chosen = load_doubles(before, n, count) * likelihood, whole = floor_lanes(chosen * scale);
         store_doubles(chosen, weight, n, count);

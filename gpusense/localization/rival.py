@@ -1,0 +1,256 @@
+"""A rival of a filter's particles: a second cloud that is searched for where scans contradict the pose, and must win.
+
+Sensor resetting (Lenser and Veloso, "Sensor resetting localization for poorly modelled mobile robots" (2000)) and
+augmented MCL (*Probabilistic Robotics* table 8.3) mix new poses into the particles at once. A person in front of the
+scanner then costs a sound track, since a pose that was chosen for a scan explains that scan. Here new poses are a cloud
+of their own, which moves with the same odometry and is corrected by the same readings. With p(z_t | z_1 .. z_t-1) of
+each cloud, the mean likelihood of its predicted particles, the logarithm of the Bayes factor
+
+    B = sum over later scans t of log p_rival(z_t | ...) - log p_filter(z_t | ...)
+
+counts for the rival (Kass and Raftery, "Bayes factors" (1995)); the scan by which the rival was chosen does not. The
+rival replaces the particles once B exceeds ``WIN``, after ``SCANS`` scans if it lies together, and after ``APART`` scans if
+several places are as likely. Until then the estimate is that of the particles, and the probability that the rival is
+right adds to that of being lost. A rival that ends at the pose of the particles, falls behind, or has not won after
+``LONGEST`` scans is given up.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gpusense.interface.constants import EVIDENCE
+from gpusense.localization import starts
+from gpusense.localization.estimates import covariance_of
+from gpusense.localization.filter_cloud import FilterCloud, Given
+from gpusense.localization.journal import plain_state, set_state
+from gpusense.localization.motion import SampledMotion
+from gpusense.localization.pose_algebra import wrap_angle
+from gpusense.localization.ratio import ratio_of_scan
+from gpusense.localization.sensors import Sensor
+from gpusense.localization.spread import FAR, FAR_TURN, deviations
+from gpusense.localization.verdict import sightings
+from gpusense.models.landmark.model import LandmarkModel
+
+if TYPE_CHECKING:
+    from gpusense.localization.filter import ParticleFilter
+    from gpusense.localization.state import FilterState
+
+# Logarithm of the Bayes factor that wins, and that ends a rival that falls behind; scans that are needed to win by a rival
+# that lies together, and by one of several places; scans after which one that neither wins nor loses is given up.
+WIN, LOSE, SCANS, APART, LONGEST = 7.0, -7.0, 3, 8, 15
+# Prior odds of a rival of a tracked pose: its place was not known before.
+PRIOR = -7.0
+# Particles of a rival; poses that are tried; effective number of these that begin it.
+PARTICLES, TRIES, CHOSEN = 1000, 20_000, 100
+# Deviation of poses that are tried around the estimate, at least [m]; half widths around a chosen pose [m, m, rad].
+_NEARBY, _SPREAD = 1.0, (0.1, 0.1, 0.05)
+# A cloud lies together up to this deviation [m]. Two clouds are at one place up to these [m, rad].
+_TOGETHER, _SAME, _SAME_TURN = 0.5, 0.5, 0.3
+# Mean ratio of wrong against right up to which the beams speak for a pose; weight of a scan in the mean at the next one.
+_RIGHT, _KEPT = -1.0, 0.6
+# Most that a scan counts [nats], and margin around landmarks [m].
+_MOST, _MARGIN = 50.0, 1.0
+
+
+def evidence_of(cloud: FilterCloud) -> float:
+    """Return log p(z | earlier readings) of the last correction; -inf where no particle was possible."""
+    summary = cloud.summary()
+    return -math.inf if summary.degenerate else float(summary.numbers[EVIDENCE])
+
+
+class Rival:
+    """The rival of a filter.
+
+    Args:
+        rival: A filter of its own with the sensors of the filter.
+
+    Attributes:
+        active: Whether there is a rival now.
+        log_odds: Its log odds against the particles.
+    """
+
+    def __init__(self, rival: ParticleFilter) -> None:
+        self._filter = rival
+        self.active, self.log_odds = False, PRIOR
+        self._scans, self._place = 0, np.zeros(3)
+        self._prior, self._settled = PRIOR, False
+        # Weighted sums of the ratios of wrong against right, of the rival and of the particles, and of the weights.
+        self._ratios = np.zeros(3)
+        self._pool: tuple[np.ndarray, starts.Spread] | None = None
+
+    def keep(self) -> None:
+        """Note what the call that begins must leave as it is."""
+        self._filter._keep()
+
+    def state(self) -> tuple[dict[str, Any], FilterState]:
+        """Return the rival as plain data."""
+        return plain_state(self, without=("_filter", "_pool")), self._filter.state()
+
+    def restore(self, state: tuple[dict[str, Any], FilterState]) -> None:
+        """Take over a rival."""
+        set_state(self, state[0])
+        self._filter.restore(state[1])
+
+    def stop(self) -> None:
+        """Give the rival up."""
+        self.active = False
+
+    def start(
+        self, pose: np.ndarray, covariance: np.ndarray, readings: Sequence[Given], *, prior: float = PRIOR
+    ) -> None:
+        """Search for a rival by the last readings.
+
+        Args:
+            pose: (3,) estimated pose of the particles.
+            covariance: (3, 3) their covariance.
+            readings: Indices of sensors with the last readings.
+            prior: Prior log odds; at 0 places near the estimate are no rivals.
+        """
+        key = self._filter._key()
+        tries = self._tries(pose, covariance, key, everywhere=prior == 0.0)
+        score = np.zeros(len(tries))
+        for index, reading in readings:
+            sensor = self._filter._sensors[index]
+            score += sensor.temperature(self._filter.options.temperature) * np.asarray(
+                sensor.log_likelihood(tries, reading), np.float64
+            )
+        chosen = drawn(score, self._filter.options.most)
+        if chosen is None:
+            return
+        self._filter._pending = None
+        self._filter._place(
+            starts.spread(tries[chosen], _SPREAD, self._filter.options.most, key, each=True), again=True
+        )
+        self.active, self.log_odds, self._prior, self._scans, self._settled = True, prior, prior, 0, False
+        self._ratios = np.zeros(3)
+
+    def _tries(self, pose: np.ndarray, covariance: np.ndarray, key: starts.Key, *, everywhere: bool) -> np.ndarray:
+        """Return poses anywhere, and around the estimate with any heading."""
+        if self._pool is None:
+            self._pool = _anywhere(self._filter._sensors)
+        anywhere = starts.spread(*self._pool, TRIES if everywhere else TRIES // 2, key)
+        if everywhere:
+            far = np.hypot(*(anywhere[:, :2] - pose[:2]).T) > FAR
+            return anywhere[far | (np.abs(wrap_angle(anywhere[:, 2] - pose[2])) > 2 * FAR_TURN)]
+        wide = max(2 * deviations(covariance)[0], _NEARBY)
+        around = starts.normal(pose, np.diag([wide**2, wide**2, math.pi**2]), TRIES // 2, key)
+        return np.vstack([anywhere, around])
+
+    def predict(self, motion: SampledMotion) -> None:
+        """Move the rival."""
+        if self.active:
+            self._filter._follow(motion)
+
+    def correct(self, readings: list[Given], evidence: float) -> None:
+        """Correct the rival, and compare it with the particles.
+
+        Args:
+            readings: Indices of sensors with their readings.
+            evidence: That of the filter (:func:`evidence_of`).
+        """
+        self._filter._weigh(readings)
+        mine = evidence_of(self._filter._cloud)
+        if math.isfinite(mine) or math.isfinite(evidence):
+            self.log_odds += min(max(mine - evidence, -_MOST), _MOST)
+        self._scans += 1
+
+    def judge(
+        self, pose: np.ndarray, covariance: np.ndarray, readings: list[Given]
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the rival's particles and their weights if it has won; give it up where it cannot.
+
+        Args:
+            pose: (3,) estimated pose of the particles.
+            covariance: (3, 3) their covariance.
+            readings: Indices of sensors with their readings.
+        """
+        numbers = self._filter._cloud.estimate(self._filter._shown)
+        self._place = numbers[:3].copy()
+        gain = self.log_odds - self._prior
+        own = covariance_of(numbers)
+        together = deviations(own)[0] < _TOGETHER
+        self._compare(own, pose, covariance, dict(readings))
+        if together and not self._settled:
+            self._settled = True
+            # The particles were spread once, too: two clouds that lie together begin as equals.
+            self.log_odds, gain = (0.0, 0.0) if self._prior == 0.0 else (self.log_odds, gain)
+        if together and self.is_at(pose, _SAME, _SAME_TURN):
+            self.stop()
+        elif gain > WIN and self._scans >= (SCANS if together else APART) and self._is_plausible():
+            self.stop()
+            return self._filter.host_particles(), self._filter.host_weights()
+        elif self._is_late(gain):
+            self.stop()
+        return None
+
+    def _compare(
+        self, own: np.ndarray, pose: np.ndarray, covariance: np.ndarray, readings: dict[int, tuple[Any, ...]]
+    ) -> None:
+        """Add the ratios of both poses: a likelihood alone prefers places with many walls where people hide the scene."""
+        sensors = self._filter._sensors
+        pair = [ratio_of_scan(sightings(sensors, readings, *at)) for at in ((self._place, own), (pose, covariance))]
+        if not any(map(math.isnan, pair)):
+            self._ratios = _KEPT * self._ratios + np.array([*pair, 1.0])
+
+    def _is_plausible(self) -> bool:
+        """Tell whether the beams that meet walls speak for the rival, and more so than for the particles."""
+        mine, other, weight = self._ratios
+        return not weight or (mine / weight < _RIGHT and mine < other)
+
+    def _is_late(self, gain: float) -> bool:
+        """Tell whether a rival has fallen behind or has had enough scans; equals that lie together may both be right."""
+        if self._prior == 0.0:
+            return gain < LOSE if self._settled else self._scans >= LONGEST
+        return gain < LOSE or self._scans >= LONGEST
+
+    def is_at(self, pose: np.ndarray, far: float = FAR, turn: float = FAR_TURN) -> bool:
+        """Tell whether the rival is at a pose, within a distance [m] and an angle [rad]."""
+        d = self._place - pose
+        return math.hypot(d[0], d[1]) <= far and abs(math.remainder(float(d[2]), math.tau)) <= turn
+
+    def probability(self, pose: np.ndarray) -> float:
+        """Return the probability that the rival is right and a pose is not."""
+        if not self.active or not self._scans or self.is_at(pose) or not self._is_plausible():
+            return 0.0
+        return 1 / (1 + math.exp(-min(max(self.log_odds, -_MOST), _MOST)))
+
+
+def drawn(score: np.ndarray, count: int) -> np.ndarray | None:
+    """Return indices drawn by likelihoods, at the highest temperature that leaves ``CHOSEN`` of them; None without one."""
+    possible = np.isfinite(score)
+    if not possible.any():
+        return None
+    distance = np.where(possible, score - score[possible].max(), -np.inf)
+    low, high = 0.0, 1.0
+    for _ in range(40):
+        middle = high if low == 0.0 and high == 1.0 else (low + high) / 2
+        weight = np.exp(middle * distance, where=possible, out=np.zeros(len(score)))
+        size = weight.sum() ** 2 / (weight @ weight)
+        if size >= min(CHOSEN, np.count_nonzero(possible)):
+            low = middle
+        else:
+            high = middle
+        if low >= high:
+            break
+    weight = np.exp(low * distance, where=possible, out=np.zeros(len(score)))
+    ends = np.cumsum(weight)
+    return np.minimum(np.searchsorted(ends, (np.arange(count) + 0.5) / count * ends[-1], side="right"), len(score) - 1)
+
+
+def _anywhere(sensors: Sequence[Sensor]) -> tuple[np.ndarray, starts.Spread]:
+    """Return centres and half widths of all places where a robot may be: free cells, or the box of the landmarks."""
+    models = [sensor.model for sensor in sensors]
+    if any(hasattr(model, "grid") for model in models):
+        return starts.free_pool(models, None)
+    xy = np.vstack([model.landmarks.xy for model in models if isinstance(model, LandmarkModel)])
+    return starts.free_pool([], np.array([xy.min(axis=0) - _MARGIN, xy.max(axis=0) + _MARGIN]))
+
+
+def can_search(sensors: Sequence[Sensor]) -> bool:
+    """Tell whether a sensor has a map in which a rival can be searched for."""
+    return any(hasattr(one.model, "grid") or isinstance(one.model, LandmarkModel) for one in sensors)

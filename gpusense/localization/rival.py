@@ -9,10 +9,10 @@ each cloud, the mean likelihood of its predicted particles, the logarithm of the
     B = sum over later scans t of log p_rival(z_t | ...) - log p_filter(z_t | ...)
 
 counts for the rival (Kass and Raftery, "Bayes factors" (1995)); the scan by which the rival was chosen does not. The
-rival replaces the particles once B exceeds ``WIN``, after ``SCANS`` scans if it lies together, and after ``APART`` scans if
-several places are as likely. Until then the estimate is that of the particles, and the probability that the rival is
-right adds to that of being lost. A rival that ends at the pose of the particles, falls behind, or has not won after
-``LONGEST`` scans is given up.
+rival replaces the particles once B exceeds ``WIN``, after ``SCANS`` scans if it lies together, and after ``APART`` scans
+if several places are as likely, provided that the beams that meet walls speak for it. Until then the estimate is that of
+the particles, and the probability that the rival is right adds to that of being lost. A rival that ends at the pose of
+the particles, falls behind, or has not won after ``LONGEST`` scans is given up.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from gpusense.localization.filter import ParticleFilter
     from gpusense.localization.state import FilterState
 
-# Logarithm of the Bayes factor that wins, and that ends a rival that falls behind; scans that are needed to win by a rival
-# that lies together, and by one of several places; scans after which one that neither wins nor loses is given up.
+# Logarithm of the Bayes factor that wins, and that ends a rival that falls behind; scans that a rival needs to win if it
+# lies together, and if it has several places; scans after which one that neither wins nor loses is given up.
 WIN, LOSE, SCANS, APART, LONGEST = 7.0, -7.0, 3, 8, 15
 # Prior odds of a rival of a tracked pose: its place was not known before.
 PRIOR = -7.0
@@ -51,7 +51,7 @@ PARTICLES, TRIES, CHOSEN = 1000, 20_000, 100
 _NEARBY, _SPREAD = 1.0, (0.1, 0.1, 0.05)
 # A cloud lies together up to this deviation [m]. Two clouds are at one place up to these [m, rad].
 _TOGETHER, _SAME, _SAME_TURN = 0.5, 0.5, 0.3
-# Mean ratio of wrong against right up to which the beams speak for a pose; weight of a scan in the mean at the next one.
+# Mean ratio of wrong against right up to which the beams speak for a pose; share of the mean that a scan leaves.
 _RIGHT, _KEPT = -1.0, 0.6
 # Most that a scan counts [nats], and margin around landmarks [m].
 _MOST, _MARGIN = 50.0, 1.0
@@ -191,7 +191,7 @@ class Rival:
     def _compare(
         self, own: np.ndarray, pose: np.ndarray, covariance: np.ndarray, readings: dict[int, tuple[Any, ...]]
     ) -> None:
-        """Add the ratios of both poses: a likelihood alone prefers places with many walls where people hide the scene."""
+        """Add the ratios of both poses: among people, the likelihood alone prefers places with many walls."""
         sensors = self._filter._sensors
         pair = [ratio_of_scan(sightings(sensors, readings, *at)) for at in ((self._place, own), (pose, covariance))]
         if not any(map(math.isnan, pair)):
@@ -200,10 +200,10 @@ class Rival:
     def _is_plausible(self) -> bool:
         """Tell whether the beams that meet walls speak for the rival, and more so than for the particles."""
         mine, other, weight = self._ratios
-        return not weight or (mine / weight < _RIGHT and mine < other)
+        return bool(not weight or (mine / weight < _RIGHT and mine < other))
 
     def _is_late(self, gain: float) -> bool:
-        """Tell whether a rival has fallen behind or has had enough scans; equals that lie together may both be right."""
+        """Tell whether a rival has fallen behind or had enough scans; equals that lie together may both be right."""
         if self._prior == 0.0:
             return gain < LOSE if self._settled else self._scans >= LONGEST
         return gain < LOSE or self._scans >= LONGEST
@@ -221,7 +221,7 @@ class Rival:
 
 
 def drawn(score: np.ndarray, count: int) -> np.ndarray | None:
-    """Return indices drawn by likelihoods, at the highest temperature that leaves ``CHOSEN`` of them; None without one."""
+    """Return indices drawn by likelihoods, tempered so that ``CHOSEN`` are effective; None if none is possible."""
     possible = np.isfinite(score)
     if not possible.any():
         return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from gpusense._util.files import read_mapping
+from gpusense._util.documents import read_mapping
 
 _ENDINGS = (".pgm", ".ppm", ".pnm", ".png", ".bmp", ".jpg", ".jpeg", ".tif", ".tiff")
 # YAML files of a folder that are read to find the one of an image.

@@ -134,7 +134,9 @@ def main() -> int:
                 (checksum,) = {run[3] for run in each}
                 rows.append([what, side, name, *(f"{number:.2f}" for number in numbers), checksum])
     remark = f"Median of {arguments.repeats} runs; {arguments.scans} scans in built maps."
-    publish(__file__, arguments, table(COLUMNS, rows), {"rows": [dict(zip(COLUMNS, r, strict=True)) for r in rows]}, remark)
+    publish(
+        __file__, arguments, table(COLUMNS, rows), {"rows": [dict(zip(COLUMNS, r, strict=True)) for r in rows]}, remark
+    )
     return 0
 
 

@@ -75,7 +75,7 @@ def check_yaml(text: str | bytes) -> None:
         if isinstance(event, yaml.AliasEvent):
             if any(anchor == event.anchor for anchor, _ in nested):
                 raise ValueError(f"no part may contain itself, got *{event.anchor} within &{event.anchor}")
-            part = known.get(event.anchor, 0)
+            part = known.get(str(event.anchor), 0)
             size, repeated = size + part, repeated + part
             if repeated > MOST_REPEATED:
                 raise ValueError(f"its aliases must repeat at most {MOST_REPEATED} values, got more")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 
 from gpusense.interface import casters, structs
-from gpusense.interface.flags import FLAGS
 from gpusense.interface.directives import resolve
+from gpusense.interface.flags import FLAGS
 from gpusense.interface.kernel_files import has_opencl_source, opencl_source
 
 _PRELUDE = """\

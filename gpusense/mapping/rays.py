@@ -136,8 +136,7 @@ class CellRays:
                 for xy in (start, end)
             ]
         (self.start_cell, self.start_inside), (self.end_cell, self.end_inside) = (
-            ((place >> RAY_BITS).astype(np.int32), (place & ((1 << RAY_BITS) - 1)).astype(np.int32))
-            for place in places
+            ((place >> RAY_BITS).astype(np.int32), (place & ((1 << RAY_BITS) - 1)).astype(np.int32)) for place in places
         )
         self.hit = ends.hit[meets].astype(np.int32)
 

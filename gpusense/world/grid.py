@@ -197,9 +197,7 @@ class OccupancyGrid:
             raise ValueError(f"region: must put {size}, got ({row}, {col})")
         changed = self._cells.copy()
         changed[row : row + rows, col : col + cols] = patch
-        return grid_of_checked(
-            changed, self._resolution, self._origin, occupied_threshold=self._occupied_threshold
-        )
+        return grid_of_checked(changed, self._resolution, self._origin, occupied_threshold=self._occupied_threshold)
 
     def bounds(self) -> tuple[float, float, float, float]:
         """Return the axis-aligned box around the grid in the world: (x_min, y_min, x_max, y_max) [m]."""

@@ -63,7 +63,11 @@ def test_a_chain_takes_its_first_true_branch():
         ("#if NO_SUCH_FLAG", 1, "condition must be one known flag, got 'NO_SUCH_FLAG'"),
         ("#if {a}\n#elif NO_SUCH_FLAG\n#endif", 2, "condition must be one known flag, got 'NO_SUCH_FLAG'"),
         ("#if {a}\n#elif\n#endif", 2, "condition must be one known flag, got ''"),
-        ("#ifdef {a}\n#endif", 1, "a directive must be #if, #elif, #else, #endif, #define or #pragma, got '#ifdef {a}'"),
+        (
+            "#ifdef {a}\n#endif",
+            1,
+            "a directive must be #if, #elif, #else, #endif, #define or #pragma, got '#ifdef {a}'",
+        ),
         ("\n#ifndef {a}\n#endif", 2, "a directive must be #if"),
         ("#if {a}\n#elifdef {b}\n#endif", 2, "a directive must be #if"),
         ("#if {a}\n#elseif {b}\n#endif", 2, "a directive must be #if"),
@@ -86,7 +90,7 @@ def test_a_chain_takes_its_first_true_branch():
 )
 def test_what_is_not_resolved_is_refused_with_file_and_line(text, line, message):
     text, message = text.format(a=NAMES[0], b=NAMES[1]), message.format(a=NAMES[0], b=NAMES[1])
-    with pytest.raises(ValueError) as caught:  # noqa: PT011  # the whole beginning is compared
+    with pytest.raises(ValueError) as caught:  # the whole beginning is compared
         resolve(text, frozenset(), "beam.cl")
     assert str(caught.value).startswith(f"beam.cl:{line}: {message}") and "\n" not in str(caught.value)
 
@@ -100,5 +104,7 @@ def test_no_directive_of_a_kernel_is_left_to_the_compiler():
     """Whatever the flags, the compiler sees only ``#define`` and ``#pragma``."""
     for name in opencl_names():
         for flags in (frozenset(), frozenset(FLAGS)):
-            left = [line.split()[0] for line in resolve(opencl_source(name), flags, name).splitlines() if "#" in line[:1]]
+            left = [
+                line.split()[0] for line in resolve(opencl_source(name), flags, name).splitlines() if "#" in line[:1]
+            ]
             assert set(left) <= {"#define", "#pragma"}, name

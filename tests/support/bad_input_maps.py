@@ -235,8 +235,7 @@ MAP_CASES = [
         "map-png-claims-gigabytes",
         map_with(png(20_000, 20_000, b"\0" * 100), "map.png"),
         ValueError,
-        "{tmp}/input/map.png: must be a whole PNG image, got a broken one: "
-        "its data inflates to 100 of 400020000 bytes",
+        "{tmp}/input/map.png: must be a whole PNG image, got a broken one: its data inflates to 100 of 400020000 bytes",
     ),
     (
         "map-png-of-many-pixels",

@@ -61,7 +61,9 @@ def count_pairs(ranges: object, expected: object, range_max: float, bins: int) -
     """Count readings; see ``DiscreteBeamModel.learn`` for arguments and errors."""
     range_max = checks.real("range_max", range_max, above=0)
     bins = checks.integer("bins", bins, low=1, high=MOST_BINS)
-    z, z_exp = (checks.as_array(name, value, masked=True) for name, value in (("ranges", ranges), ("expected", expected)))
+    z, z_exp = (
+        checks.as_array(name, value, masked=True) for name, value in (("ranges", ranges), ("expected", expected))
+    )
     if z.shape != z_exp.shape:
         shapes = checks.shape_text(z.shape), checks.shape_text(z_exp.shape)
         raise ValueError(f"expected: shape must be {shapes[0]}, got {shapes[1]}")

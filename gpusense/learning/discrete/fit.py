@@ -63,7 +63,9 @@ def _block_counts(data: Counts, ranges: object, expected: object, range_max: flo
         TypeError: The labels are not integers.
         ValueError: The shape differs from that of the readings, or fewer than 2 blocks have a reading.
     """
-    z, z_exp = (checks.as_array(name, value, masked=True) for name, value in (("ranges", ranges), ("expected", expected)))
+    z, z_exp = (
+        checks.as_array(name, value, masked=True) for name, value in (("ranges", ranges), ("expected", expected))
+    )
     labels = checks.array("blocks", blocks, z.shape, dtype=np.int64).ravel()
     readings, expected_ranges = check_pairs(z.ravel(), z_exp.ravel(), range_max)
     i, j = (bins_of(each, range_max, data.bins) for each in (readings, expected_ranges))

@@ -122,7 +122,7 @@ def read_json(file: Path, kind: str) -> Any:
 
     Args:
         file: The file.
-        kind: What it must be, with an article, such as ``"a report of gpusense bench"``.
+        kind: Description of the file for messages, with an article, such as ``"a report of gpusense bench"``.
 
     Raises:
         FileNotFoundError: The file is missing.

@@ -19,7 +19,7 @@ from gpusense.world.windows import LONGEST_SIDE, Window
 
 BAND_CELLS = 1 << 22
 """Most cells of a band of rows, whose counts are on the device at once."""
-# Scans of at most so many readings keep their rays from the look for the map's extent.
+# Most readings of scans whose rays are kept after the search for the map's extent.
 _KEPT_RAYS = 1 << 20
 
 

@@ -8,12 +8,12 @@
 alone, and keeps a digest of every result: rays by every caster, likelihoods by every model in many configurations,
 bound calls, arrays on the device, tables of maps. ``compare`` says what differs; exit code 1 where anything does.
 
-Maps, poses and readings are drawn to be awkward, as in bench/accuracy/fuzz_rays.py. A case depends on its configuration and its
-number alone, and cases of a configuration share models, so ``--part 0/4`` to ``--part 3/4`` may run beside each other;
-``compare old.json new-0.json new-1.json ...`` takes parts together. Run both sides on one machine with the same
-options. ``--as-gpu`` (OpenCL) lets a processor pass for a GPU, whose launches are others: this alone reaches for a name
-that is not public, ``gpusense.backends.get_backend``. ``--only`` takes the configurations with these words in their
-names.
+Maps, poses and readings are drawn to be awkward, as in bench/accuracy/fuzz_rays.py. A case depends on its
+configuration and its number alone, and cases of a configuration share models, so ``--part 0/4`` to ``--part 3/4`` may
+run beside each other; ``compare old.json new-0.json new-1.json ...`` takes parts together. Run both sides on one
+machine with the same options. ``--as-gpu`` (OpenCL) lets a processor pass for a GPU, whose launches are others: this
+alone reaches for a name that is not public, ``gpusense.backends.get_backend``. ``--only`` takes the configurations
+with these words in their names.
 """
 
 from __future__ import annotations

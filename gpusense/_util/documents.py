@@ -75,7 +75,7 @@ def check_yaml(text: str | bytes) -> None:
         if isinstance(event, yaml.AliasEvent):
             if any(anchor == event.anchor for anchor, _ in nested):
                 raise ValueError(f"no part may contain itself, got *{event.anchor} within &{event.anchor}")
-            part = known.get(event.anchor, 0)
+            part = known.get(str(event.anchor), 0)
             size, repeated = size + part, repeated + part
             if repeated > MOST_REPEATED:
                 raise ValueError(f"its aliases must repeat at most {MOST_REPEATED} values, got more")
@@ -122,7 +122,7 @@ def read_json(file: Path, kind: str) -> Any:
 
     Args:
         file: The file.
-        kind: What it must be, with an article, such as ``"a report of gpusense bench"``.
+        kind: Description of the file for messages, with an article, such as ``"a report of gpusense bench"``.
 
     Raises:
         FileNotFoundError: The file is missing.

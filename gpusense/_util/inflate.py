@@ -11,7 +11,7 @@ _PIECE = 1 << 20
 
 
 def most_bytes(compressed: int) -> int:
-    """Return the most bytes that a stream of so many compressed bytes may hold."""
+    """Return the most bytes that a stream may hold, from the number of its compressed bytes."""
     return FLOOR + RATIO * compressed
 
 

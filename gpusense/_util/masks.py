@@ -10,8 +10,10 @@ import numpy as np
 
 def is_masked(value: object) -> bool:
     """Return whether a value is a masked array, or a list or tuple with one in it, however deep."""
+    if type(value) is np.ndarray:
+        return False
     library = sys.modules.get("numpy.ma")
-    if library is None or type(value) is np.ndarray:
+    if library is None:
         return False
     if isinstance(value, (list, tuple)):
         # Lists of numbers are long: only their types are looked at.

@@ -25,7 +25,7 @@ def check_room(name: str, needed: int, what: str) -> None:
     Args:
         name: Name of the file or argument.
         needed: Memory [bytes].
-        what: What it is for, such as ``"20000 x 20000 cells"``.
+        what: Contents of the memory, such as ``"20000 x 20000 cells"``.
 
     Raises:
         MemoryError: Less is available.

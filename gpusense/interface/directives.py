@@ -2,7 +2,7 @@
 
 ``#if FLAG``, ``#if !FLAG``, ``#elif``, ``#else`` and ``#endif`` are resolved here, nested as in C. ``#define`` and
 ``#pragma`` are left to the compiler, and a kernel may define no name of a flag. All other directives are refused: a
-compiler would resolve them without knowing the flags, in code that nobody asked for.
+compiler would resolve them without knowing the flags.
 """
 
 from __future__ import annotations

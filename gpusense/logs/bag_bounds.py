@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bz2
 import functools
+import importlib
 import io
 import os
 import shutil
@@ -46,24 +47,26 @@ def install() -> None:
     Raises:
         ImportError: rosbags, or a table of it, is absent.
     """
-    from lz4.frame import LZ4FrameDecompressor
-    from rosbags import rosbag1, rosbag2  # noqa: F401  # imports the modules below
-    from rosbags.rosbag1 import reader as reader1
-    from rosbags.rosbag2 import metadata, storage_mcap, storage_sqlite3
-    from rosbags.rosbag2 import reader as reader2
-
-    zstd = reader2.zstd
-    mcap, first = _table(storage_mcap, "DECOMPRESSORS"), _table(reader1, "decompressors")
-    for name, make in (("lz4", LZ4FrameDecompressor), ("zstd", zstd.ZstdDecompressor)):
-        mcap[name] = functools.partial(_chunk, make)
-    for name, make in (("lz4", LZ4FrameDecompressor), ("bz2", bz2.BZ2Decompressor)):
+    lz4 = importlib.import_module("lz4.frame").LZ4FrameDecompressor
+    reader1, reader2, mcap, sqlite = (
+        importlib.import_module(f"rosbags.{name}")
+        for name in ("rosbag1.reader", "rosbag2.reader", "rosbag2.storage_mcap", "rosbag2.storage_sqlite3")
+    )
+    zstd, parse = reader2.zstd, reader2.parse_qos
+    chunks, first = _table(mcap, "DECOMPRESSORS"), _table(reader1, "decompressors")
+    for name, make in (("lz4", lz4), ("zstd", zstd.ZstdDecompressor)):
+        chunks[name] = functools.partial(_chunk, make)
+    for name, make in (("lz4", lz4), ("bz2", bz2.BZ2Decompressor)):
         first[name] = functools.partial(_whole, make)
-    reader2.zstd = SimpleNamespace(
-        decompress=functools.partial(_whole, zstd.ZstdDecompressor), open=functools.partial(_Bounded, zstd.open)
-    )  # fmt: skip
-    parse = functools.partial(_qos, metadata.parse_qos)
-    for module in (reader2, storage_mcap, storage_sqlite3):
-        module.parse_qos = parse
+    bounded: dict[str, Any] = {
+        "zstd": SimpleNamespace(
+            decompress=functools.partial(_whole, zstd.ZstdDecompressor), open=functools.partial(_Bounded, zstd.open)
+        ),
+        "parse_qos": functools.partial(_qos, parse),
+    }
+    for module in (reader2, mcap, sqlite):
+        module.__dict__["parse_qos"] = bounded["parse_qos"]
+    reader2.__dict__["zstd"] = bounded["zstd"]
 
 
 def _table(module: Any, name: str) -> Any:

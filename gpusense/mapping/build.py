@@ -19,7 +19,7 @@ from gpusense.world.windows import LONGEST_SIDE, Window
 
 BAND_CELLS = 1 << 22
 """Most cells of a band of rows, whose counts are on the device at once."""
-# Scans of at most so many readings keep their rays from the look for the map's extent.
+# Most readings of scans whose rays are kept after the search for the map's extent.
 _KEPT_RAYS = 1 << 20
 
 
@@ -45,7 +45,7 @@ def build_map(
     Each ray adds ``log(p_miss / (1 - p_miss))`` to the log-odds of the cells that it crosses, and ``log(p_hit / (1 -
     p_hit))`` to the cell where it ends at an obstacle (*Probabilistic Robotics* tables 9.1 and 9.2, with an obstacle of
     one cell's thickness). The device counts hits and misses in integers by an exact walk from cell to cell, so all
-    backends build the same map. Cells without a ray are unknown. Rays may start or end outside the map, at any distance.
+    backends build the same map. Cells without a ray are unknown. Rays may start or end far outside the map.
     A large map is built in bands of rows, so that it takes little more memory than its result, a byte a cell.
 
     Args:
@@ -165,7 +165,7 @@ class MapBuilder:
         for band, parts in zip(self._bands, chosen, strict=True):
             self._counts = BandCounts(self._backend, self._frame, self._shape, band)
             for part in parts:
-                self._counts.add(self._kept.pop(part.tobytes(), None) or self._survey.rays(part))
+                self._counts.add(self._rays_of(part))
                 done += len(part)
                 if done < total:
                     yield done / total
@@ -177,6 +177,11 @@ class MapBuilder:
         """Return the indices of the scans with rays that meet a band."""
         low, high = self._rows.T
         return np.flatnonzero((high >= band.row - 1) & (low <= band.row + band.rows + 1))
+
+    def _rays_of(self, part: np.ndarray) -> RayEnds:
+        """Return the rays of some scans, which are kept no longer."""
+        key = part.tobytes()
+        return self._kept.pop(key) if key in self._kept else self._survey.rays(part)
 
     def _write(self, counts: BandCounts, cells: np.ndarray) -> None:
         """Write the occupancies of a band."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 
@@ -28,7 +29,7 @@ def bands(shape: tuple[int, int], most: int) -> list[Window]:
     rows, cols = shape
     count = -(-rows // max(most // cols, 1))
     edges = [rows * i // count for i in range(count + 1)]
-    return [Window(first, 0, last - first, cols) for first, last in zip(edges, edges[1:], strict=False)]
+    return [Window(first, 0, last - first, cols) for first, last in itertools.pairwise(edges)]
 
 
 class BandCounts:

@@ -1,7 +1,7 @@
 // Counts of hits and misses of cells, of which the log-odds of an occupancy grid are sums (book section 9.2). Start and
-// end of a ray are cells and places inside them in units of 1/4096 cell, and the walk from cell to cell compares products
-// of integers, so that all backends visit the same cells. A ray misses each cell that it leaves. Its last cell is hit
-// where the ray ends at an obstacle, and missed otherwise. A tie, the ray through a corner, steps in x first.
+// end of a ray are cells and places inside them in units of 1/4096 cell, and the walk from cell to cell compares
+// products of integers, so that all backends visit the same cells. A ray misses each cell that it leaves. Its last cell
+// is hit where the ray ends at an obstacle, and missed otherwise. A tie, the ray through a corner, steps in x first.
 
 // Fraction bits of a coordinate.
 #define BITS 12
@@ -39,10 +39,12 @@ kernel void count_rays(global const int2 *start_cell, global const int2 *start_i
     int left_x = step_x * across.x, left_y = step_y * across.y;
     const int first_x = to_boundary(begin.x, step_x), first_y = to_boundary(begin.y, step_y);
     // The steps that bring the walk to the grid's columns and rows are not taken one by one.
-    const int need_x = max(step_x > 0 ? -col : col - (cols - 1), 0), need_y = max(step_y > 0 ? -row : row - (rows - 1), 0);
+    const int need_x = max(step_x > 0 ? -col : col - (cols - 1), 0);
+    const int need_y = max(step_y > 0 ? -row : row - (rows - 1), 0);
     if (need_x > left_x || need_y > left_y) return;
     long done_x = need_x, done_y = 0;
-    if (need_x > 0) done_y = min(crossed_before(first_y, size_y, first_x + (done_x - 1) * UNIT, size_x, 0), (long)left_y);
+    if (need_x > 0)
+        done_y = min(crossed_before(first_y, size_y, first_x + (done_x - 1) * UNIT, size_x, 0), (long)left_y);
     if (done_y < need_y) {
         done_y = need_y;
         done_x = min(crossed_before(first_x, size_x, first_y + (done_y - 1) * UNIT, size_y, 1), (long)left_x);

@@ -294,5 +294,5 @@ def test_a_map_beyond_the_memory_or_the_earth_is_refused(monkeypatch):
     with pytest.raises(ValueError, match=r"^origin\[1\]: must be finite and >= -1000000000.0"):
         gs.build_map([[1.0]], [(0, 0, 0)], scanner, origin=(0, -1e17, 0), shape=(3, 3), backend="numpy")
     monkeypatch.setattr(memory, "available", lambda: 1 << 20)
-    with pytest.raises(MemoryError, match="^shape: 20000 x 20000 cells must fit into the available memory"):
+    with pytest.raises(MemoryError, match=r"^shape: 20000 x 20000 cells must fit into the available memory"):
         gs.build_map([[1.0]], [(0, 0, 0)], scanner, origin=(0, 0, 0), shape=(20000, 20000), backend="numpy")

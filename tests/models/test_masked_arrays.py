@@ -74,11 +74,11 @@ TWICE = np.stack([RANGES, RANGES[::-1]])
 FEATURES = np.array([[1.5, 0.2], [2.5, -0.7], [3.0, 0.1]])
 READINGS = {
     **{
-        f"{kind}, {name}": (lambda z, kind=kind, name=name: make(kind, GRID, name).log_likelihood(POSES, z), RANGES, MASK)
+        f"{kind}, {name}": (lambda z, k=kind, on=name: make(k, GRID, on).log_likelihood(POSES, z), RANGES, MASK)
         for kind in ("beam", "field") for name in ("numpy", "opencl", "warp:cpu")
     },
     "several scans": (
-        lambda z: make("beam", GRID, "numpy").log_likelihood(np.stack([POSES, POSES]), z), TWICE, np.stack([MASK, ~MASK])
+        lambda z: make("beam", GRID, "numpy").log_likelihood(np.stack([POSES] * 2), z), TWICE, np.stack([MASK, ~MASK])
     ),
     "models": (lambda z: gs.log_likelihoods([make("field", GRID, "numpy")], POSES, z)[0], RANGES, MASK),
     "bound": (lambda z: np.array(make("field", GRID, "numpy").bind(POSES, z)()), RANGES, MASK),

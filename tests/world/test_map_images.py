@@ -289,5 +289,5 @@ def test_the_available_memory_is_that_of_the_machine_its_container_and_the_proce
     room = memory.available()
     assert room is None or 1 << 20 < room < 1 << 60
     memory.check_room("x", 1, "a cell")
-    with pytest.raises(MemoryError, match="^x: 3 cells must fit into the available memory"):
+    with pytest.raises(MemoryError, match=r"^x: 3 cells must fit into the available memory"):
         memory.check_room("x", 1 << 62, "3 cells")

@@ -2,8 +2,8 @@
 // through memory. With |r| <= log(2) / 2 and 1 + f from sqrt(1/2) to sqrt(2):
 //     e^a = 2^k e^r,  e^r = 1 + r + r^2 E(r);   log(2^k (1 + f)) = k log 2 + f - f^2 / 2 + f^3 L(f);
 //     erf(x) = 1 - exp(-x W(x));   arctan t = t + t^3 A(t^2).
-// bench/derive/lane_constants.py derives the constants; tests/kernels/test_lane_math.py measures the worst errors that stand below, in
-// ulps of float32.
+// bench/derive/lane_constants.py derives the constants; tests/kernels/test_lane_math.py measures the worst errors that
+// stand below, in ulps of float32.
 // requires: lanes/types
 
 // log 2 in two parts; the first has 16 bits, so that its products with counts are exact.

@@ -6,7 +6,6 @@ one worker, which gets the next one after its answer: where that worker ends, on
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, CancelledError
@@ -17,7 +16,6 @@ from gpusense.sweeps.deaths import WorkerDied
 from gpusense.sweeps.supervised import Limits, result_of
 from gpusense.sweeps.worker import error_text
 
-_LOG = logging.getLogger("gpusense")
 # Seconds between two looks at the scheduler's list of workers.
 LOOK = 1.0
 # Seconds to wait for a finished call's result before asking whether it still exists, and how often.

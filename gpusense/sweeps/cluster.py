@@ -22,8 +22,9 @@ from gpusense._util.extras import library
 from gpusense.sweeps import on_worker
 from gpusense.sweeps.executors import device_names
 from gpusense.sweeps.local_cluster import RESOURCE, local_cluster
-from gpusense.sweeps.remote import Link, RemoteWorker, Watch
+from gpusense.sweeps.remote import Found, Link, RemoteWorker
 from gpusense.sweeps.supervised import limits_of
+from gpusense.sweeps.watch import Watch
 
 # Seconds for the scheduler to answer, and for workers to end what they run.
 _ANSWER, _GOODBYE = 5.0, 10.0
@@ -135,15 +136,15 @@ class DaskExecutor(Executor):
         workers: Mapping[str, Any] = answer["workers"]
         return workers
 
-    def _usable(self) -> list[tuple[str, str]] | None:
-        """Return address and folder of the workers that take jobs."""
+    def _usable(self) -> list[Found] | None:
+        """Return the workers that take jobs."""
         workers = self._workers()
         if workers is None:
             return None
         return [
-            (address, one["local_directory"])
+            Found(address, one["local_directory"], one.get("status", "running") == "running")
             for address, one in workers.items()
-            if one.get("status", "running") == "running" and (one["resources"].get(RESOURCE) or not self._pinned)
+            if one["resources"].get(RESOURCE) or not self._pinned
         ]
 
     @property

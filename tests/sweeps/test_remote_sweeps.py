@@ -292,3 +292,25 @@ def test_a_worker_that_cannot_run_calls_is_left_out(caplog):
             second.place = next(place for place, one in executor._watched.workers.items() if one is second)
             executor.submit(abs, -1).result(timeout=60)
         assert caplog.text.count("a worker is left out") == 2
+
+
+def test_a_worker_that_pauses_ends_its_call_and_begins_none(tmp_path):
+    with gs.sweep.DaskExecutor(timeout=60) as executor:
+        (worker,) = executor._watched.workers.values()
+        found, pause = executor._usable, True
+        executor._watched._found = lambda: [one._replace(ready=not pause) for one in found()]
+        running = executor.submit(await_file, str(tmp_path / "file"))
+        awaited(lambda: not worker.ready)
+        queued = executor.submit(abs, -1)
+        (tmp_path / "file").touch()
+        assert running.result(timeout=60) == "there" and not worker.gone.is_set()
+        time.sleep(0.5)
+        assert not queued.running() and not queued.done()
+        pause = False
+        assert queued.result(timeout=60) == 1
+
+
+def await_file(path):
+    while not os.path.exists(path):
+        time.sleep(0.02)
+    return "there"

@@ -8,6 +8,7 @@ from collections.abc import Callable, Hashable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gpusense._util import checks
 from gpusense.sweeps.job import Job
 
 if TYPE_CHECKING:
@@ -78,17 +79,17 @@ class Store:
         """Return the scans of a job with their odometry."""
         from gpusense.evaluation.steps import read_steps
 
-        chosen = _chosen(job)
-        key = (job.log, *chosen.items())
-        return self.keep("logs", key, lambda: read_steps(self.path(job.log), **chosen))
+        chosen, topic = _chosen(job), _topic(job)
+        key, sensors = (job.log, topic, *chosen.items()), () if topic is None else (topic,)
+        return self.keep("logs", key, lambda: read_steps(self.path(job.log), sensors=sensors, **chosen))
 
     def scans(self, job: Job, group: str = "") -> list[tuple[int, Scan]]:
         """Return the scans of a job that have logged poses; those of the options below a dotted name, if given."""
         from gpusense.evaluation.scoring import chosen_scans, with_poses
 
-        chosen, path = _chosen(job, group), self.path(job.log)
-        key = ("poses", job.log, *chosen.items())
-        return self.keep("logs", key, lambda: with_poses(chosen_scans(path, **chosen), path))
+        chosen, topic, path = _chosen(job, group), _topic(job), self.path(job.log)
+        key = ("poses", job.log, topic, *chosen.items())
+        return self.keep("logs", key, lambda: with_poses(chosen_scans(path, topic=topic, **chosen), path))
 
     def keep(self, kind: str, key: Hashable, make: Callable[[], Any]) -> Any:
         """Return an object of a kind; make it where it is not kept."""
@@ -105,6 +106,18 @@ class Store:
 # Scans from which parameters are learned: every 20th.
 TRAINING = {"every": 20, "offset": 0, "limit": None}
 _ALL = {"every": 1, "offset": 0, "limit": None}
+
+
+def _topic(job: Job) -> str | None:
+    """Return the option ``topic``, the laser of the log; None for its only or main one.
+
+    Raises:
+        ValueError: it is no text.
+    """
+    topic = job.option("topic")
+    if topic is not None and not isinstance(topic, str):
+        raise ValueError(f"topic: must be a text, got {checks.show(topic)}")
+    return topic
 
 
 def _chosen(job: Job, group: str = "") -> dict[str, Any]:

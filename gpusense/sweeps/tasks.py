@@ -70,7 +70,7 @@ def fit(job: Job, store: Store) -> Values:
     from gpusense.learning.beam.fit import fit_beam_parameters
 
     scans, block = store.scans(job), job.option("block", 10)
-    chosen = [job.option(name) for name in ("range_max", "every", "offset", "limit")]
+    chosen = [job.option(name) for name in ("range_max", "topic", "every", "offset", "limit")]
 
     def cast() -> Any:
         return data_of_log(store.grid(job.map), scans, backend=store.device, block=block)
@@ -91,7 +91,8 @@ def fit(job: Job, store: Store) -> Values:
     return {**found.parameters.to_dict(), **figures, "converged": found.converged, "readings": len(ranges)}
 
 
-_SCANS = ("every", "offset", "limit")
+_STRIDES = ("every", "offset", "limit")
+_SCANS = (*_STRIDES, "topic")
 TASKS: dict[str, Task] = {
     "localize": Task(
         localize,
@@ -131,7 +132,7 @@ def check_options(job: Job) -> None:
     known = (*TASKS[job.task].options, *MODEL_OPTIONS)
     for name, _ in job.options:
         group, dot, rest = name.partition(".")
-        training = group == "training" and rest in _SCANS
+        training = group == "training" and rest in _STRIDES
         if name not in known and not training and not (dot and group == "parameters"):
             rule = f"options: of the task {job.task} are {', '.join(sorted(known))}, parameters.* and training.*"
             raise ValueError(f"{rule}, got {name!r}")

@@ -175,6 +175,17 @@ def test_noise_reaches_the_match(place, capsys, monkeypatch):
     assert "argument --noise: must be a finite number > 0" in error_of([*argv, "--noise", "0"], capsys)
 
 
+def test_a_sweep_over_lasers(place, tmp_path):
+    (tmp_path / "plan.yaml").write_text(
+        "options: {everywhere: true, particles: 2000, log: run, map: map.yaml}\naxes: {topic: [/front, /rear]}\n"
+    )
+    table = tmp_path / "table.csv"
+    argv = ["sweep", str(tmp_path / "plan.yaml"), "--root", str(place), "--table", str(table), "--device", "numpy"]
+    assert cli.main(argv) == 0
+    rows = gs.sweep.read_table(table)
+    assert rows["topic"] == ["/front", "/rear"] and rows["scans"] == [8, 8] and rows["error"] == [None, None]
+
+
 NAV2 = """
 amcl:
   ros__parameters:

@@ -92,7 +92,7 @@ def _landmarks(narrow: bool, options: dict[str, Any]) -> Scene:
     if narrow:
         # Poses that see all landmarks: what lies beyond a limit is left out, and that says something, too.
         parameters = parameters.replace(field_of_view=4.0, range_max=6.0)
-        poses[:, :2] = _MAP.xy.mean(axis=0) + (-5.0, 0.0) + 0.3 * poses[:, :2]
+        poses[:, :2] = _MAP.xy.mean(axis=0) + (-3.0, 0.0) + 0.3 * poses[:, :2]
         poses[:, 2] = -0.3 + 0.05 * poses[:, 2]
     model = LandmarkModel(_MAP, parameters, mount=(0.2, 0.1, 0.3), **options)
 

@@ -27,6 +27,17 @@ def test_every_model_of_a_density_has_a_scene():
     assert len(MAKERS) == 17
 
 
+def test_poses_of_a_narrow_view_see_all_landmarks():
+    # Else it says something, too, that a feature is left out.
+    scene = make_scene("landmarks, narrow view")
+    model = scene.draw.__closure__[0].cell_contents
+    at = gs.compose_poses(scene.poses, model.mount)
+    for landmark in model.landmarks.xy:
+        x, y = (landmark - at[:, :2]).T
+        assert np.hypot(x, y).max() < model.parameters.range_max
+        assert np.abs(gs.wrap_angle(np.arctan2(y, x) - at[:, 2])).max() < model.parameters.field_of_view / 2
+
+
 WRONG = {
     "heading": dict(sigma=1.2), "heading, von Mises": dict(kappa=0.8), "beacons, normal": dict(sigma_range=3.0),
     "position fix": dict(covariance=((6.0, 3.6), (3.6, 12.0))),

@@ -23,8 +23,11 @@ from gpusense.learning.point.bumper import fit_bumper_parameters as fit_bumper_p
 from gpusense.learning.point.heading import fit_heading_parameters as fit_heading_parameters
 from gpusense.learning.point.position import fit_position_parameters as fit_position_parameters
 from gpusense.learning.point.result import PointFit as PointFit
+from gpusense.localization.diagnosis import Diagnosis as Diagnosis
 from gpusense.localization.estimates import Estimate as Estimate
 from gpusense.localization.filter import ParticleFilter as ParticleFilter
+from gpusense.localization.monitor import PoseMonitor as PoseMonitor
+from gpusense.localization.monitor import PoseVerdict as PoseVerdict
 from gpusense.localization.motion import OdometryMotion as OdometryMotion
 from gpusense.localization.motion import OmniMotion as OmniMotion
 from gpusense.localization.motion import VelocityMotion as VelocityMotion

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpusense.localization.pose_algebra import mean_pose, wrap_angle
+from gpusense.localization.words import LOST, Word
 
 # Bins of which neighbours belong to a cluster [m, rad].
 _BIN, _BIN_TURN = 0.5, 0.35
@@ -20,8 +21,11 @@ class Estimate:
         pose: (3,) x, y, theta [m, m, rad].
         covariance: (3, 3) covariance of the particles about it.
         effective_sample_size: ``1 / sum w^2`` of the last correction, 1 to N.
-        lost: Whether recent scans or features contradict the pose; see ``docs/localization.md``.
-        explained: Share of the beams of the last scan that the pose explains; NaN without one.
+        p_lost: Probability that the pose is off by more than 1 m or 0.5 rad; see ``docs/localization.md``.
+        verdict: "tracking"; "uncertain", where the particles are spread wide or over several places, or p_lost is above
+            0.2; or "lost", where scans or features contradict the pose and p_lost is above 0.5.
+        explained: Share of the beams of the last scan that agree with the map at the pose, of those that the map could
+            explain; NaN without one.
         temperature: Of the first sensor.
         used: Share of the temperature that the stages of the last correction used: less than 1 where even the last
             stage would have left too few particles.
@@ -30,14 +34,15 @@ class Estimate:
 
     Example:
         >>> import gpusense as gs, numpy as np
-        >>> gs.Estimate(np.zeros(3), np.eye(3) * 0.01, 250.0, False, 0.9, 0.1, 1.0, False, 500)
-        Estimate(x=0.000, y=0.000, theta=0.000, deviations=(0.1, 0.1, 0.1), effective_sample_size=250, lost=False)
+        >>> gs.Estimate(np.zeros(3), np.eye(3) * 0.01, 250.0, 0.02, "tracking", 0.9, 0.1, 1.0, False, 500)
+        Estimate(x=0.000, y=0.000, theta=0.000, deviations=(0.1, 0.1, 0.1), p_lost=0.02, verdict='tracking')
     """
 
     pose: np.ndarray
     covariance: np.ndarray
     effective_sample_size: float
-    lost: bool
+    p_lost: float
+    verdict: Word
     explained: float
     temperature: float
     used: float
@@ -49,8 +54,13 @@ class Estimate:
         deviations = ", ".join(f"{value:.3g}" for value in np.sqrt(np.maximum(np.diag(self.covariance), 0)))
         return (
             f"Estimate(x={x:.3f}, y={y:.3f}, theta={theta:.3f}, deviations=({deviations}), "
-            f"effective_sample_size={self.effective_sample_size:.3g}, lost={self.lost})"
+            f"p_lost={self.p_lost:.2g}, verdict={self.verdict!r})"
         )
+
+    @property
+    def lost(self) -> bool:
+        """Whether p_lost is above 0.5: the pose is of no use, whether scans contradict it or the spread is wide."""
+        return self.p_lost > LOST
 
 
 def covariance_of(numbers: np.ndarray) -> np.ndarray:

@@ -9,8 +9,7 @@ nats; one on a wrong map, or at a wrong place, gains none, and noise that was fi
 from __future__ import annotations
 
 import math
-from collections import deque
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +18,13 @@ from gpusense.models.landmark.model import LandmarkModel
 
 Floats = NDArray[np.float64]
 
-# Least gain of a filter that is not lost [nats for a feature]; scans with features over which it is averaged; poses
-# anywhere, and their margin around the landmarks [m].
-LEAST_GAIN, _MEMORY, _ANYWHERE, _MARGIN = 1.0, 20, 1000, 1.0
+# Gain at which right and wrong are equally likely [nats for a feature]; scans over which the shown gain is averaged;
+# poses anywhere, and their margin around the landmarks [m].
+LEAST_GAIN, MEMORY, _ANYWHERE, _MARGIN = 1.0, 20, 1000, 1.0
 
 
 class Evidence:
-    """Running gain of the predictions of features.
+    """Gain of the predictions of features.
 
     Args:
         model: The model of the landmarks.
@@ -39,10 +38,9 @@ class Evidence:
         self._poses = np.column_stack(
             [rng.uniform(low, high, (_ANYWHERE, 2)), rng.uniform(-math.pi, math.pi, _ANYWHERE)]
         )
-        self._recent: deque[tuple[float, int]] = deque(maxlen=_MEMORY)
 
-    def predicted(self, poses: Floats, weights: Floats, features: Floats) -> None:
-        """Add a scan, before the filter is corrected by it.
+    def gain(self, poses: Floats, weights: Floats, features: Floats) -> float:
+        """Return by how much particles predict a scan better than chance [nats], before they are corrected by it.
 
         Landmarks count as unknown: where two are exchanged in the map, a pose is right all the same.
 
@@ -50,6 +48,9 @@ class Evidence:
             poses: (N, 3) predicted particles.
             weights: (N,) their weights.
             features: (F, 2 or 3) features of the scan, F > 0.
+
+        Returns:
+            The gain of all features; NaN where neither particles nor chance can have given them.
         """
         count = len(features)
         false = self._log_p(self._poses[:1], features, np.full(count, -1))[0]
@@ -58,23 +59,31 @@ class Evidence:
         if z_false > 0:
             chance = max(chance, float(false) - count * math.log(z_false))
         reached = _log_mean(self._log_p(poses, features), weights)
-        if math.isfinite(chance) or math.isfinite(reached):
-            self._recent.append((reached - chance, count))
+        return reached - chance if math.isfinite(chance) or math.isfinite(reached) else math.nan
 
     def _log_p(self, poses: Floats, features: Floats, ids: Any = None) -> Floats:
         return np.asarray(self._model.log_likelihood(poses, features, ids), np.float64)
 
-    @property
-    def gain(self) -> float:
-        """Mean gain of recent features [nats]; NaN before there are enough scans."""
-        if len(self._recent) < _MEMORY:
-            return math.nan
-        return sum(gain for gain, _ in self._recent) / sum(count for _, count in self._recent)
+
+class Gains(NamedTuple):
+    """Gains of recent scans; immutable.
+
+    Attributes:
+        recent: Gain [nats] and number of features of each scan, the last ``MEMORY`` ones.
+    """
+
+    recent: tuple[tuple[float, int], ...] = ()
+
+    def added(self, gain: float, count: int) -> Gains:
+        """Return the gains with those of a scan more."""
+        return Gains((*self.recent, (gain, count))[-MEMORY:])
 
     @property
-    def lost(self) -> bool:
-        """Tell whether recent features are hardly likelier than by chance; False before there are enough scans."""
-        return self.gain < LEAST_GAIN
+    def mean(self) -> float:
+        """Mean gain of a feature [nats]; NaN before there are enough scans."""
+        if len(self.recent) < MEMORY:
+            return math.nan
+        return sum(gain for gain, _ in self.recent) / sum(count for _, count in self.recent)
 
 
 def _log_mean(log_p: Floats, weights: Floats) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from typing import Any
 
@@ -13,12 +12,18 @@ from gpusense.backends import BackendInfo
 from gpusense.backends.base import Backend
 from gpusense.interface.constants import MOMENTS
 from gpusense.localization.cloud import Cloud
+from gpusense.localization.diagnosis import Diagnosis, diagnose
 from gpusense.localization.estimates import Estimate, clustered, covariance_of
 from gpusense.localization.options import Options
 from gpusense.localization.scoring import Scoring
 from gpusense.localization.sensors import Sensor
+from gpusense.localization.spread import is_narrow, is_wide, share_off, share_off_of
 from gpusense.localization.verdict import Verdict
+from gpusense.localization.words import word_of
 from gpusense.world.grid import OccupancyGrid
+
+# Most particles whose spread is counted one by one; of more, and of narrow clouds, a normal density is taken.
+_MOST_LOOKED_AT = 100_000
 
 
 class Results(ABC):
@@ -38,6 +43,10 @@ class Results(ABC):
     _started: bool
     _shown: int
     _last: dict[int, tuple[Any, ...]]
+
+    @abstractmethod
+    def _random_poses(self, count: int) -> np.ndarray:
+        """Return poses anywhere in the free space."""
 
     @abstractmethod
     def flush(self) -> None:
@@ -81,16 +90,41 @@ class Results(ABC):
                 pose = poses[int(np.argmax(self._cloud.host_weights(self._shown)))]
             else:
                 pose, covariance = clustered(poses, self._cloud.host_weights(self._shown))
-        explained = self._verdict.explained(pose, self._last) if self._last else math.nan
+        explained = self._verdict.judge(pose, covariance, self._last)
+        p_lost = self._p_lost(pose, covariance)
+        word = word_of(p_lost, self._verdict.wrong, wide=is_wide(covariance))
         size = summary.effective_sample_size
         if not size > 0:
             # The kernels have summed no squares: before a correction, or where no weighted particle was possible.
             weights = self._cloud.host_weights(self._shown)
             size = float(weights.sum() ** 2 / (weights @ weights))
         return Estimate(
-            pose, covariance, size, self._verdict.lost, explained, self.temperatures[0], summary.temperature,
+            pose, covariance, size, p_lost, word, explained, self.temperatures[0], summary.temperature,
             summary.degenerate, self._shown,
         )  # fmt: skip
+
+    def diagnose(self, *, search: bool = True) -> Diagnosis:
+        """Return the evidence of the last readings at the estimate, and the likely cause where they contradict it.
+
+        Args:
+            search: Whether to look for a better pose elsewhere on the map, which takes some milliseconds.
+
+        Raises:
+            RuntimeError: the filter is not initialised.
+        """
+        pose, _ = self.mean_and_covariance()
+        search = search and any(hasattr(sensor.model, "grid") for sensor in self._sensors)
+        return diagnose(self._sensors, self._last, pose, self._random_poses if search else None)
+
+    def _p_lost(self, pose: np.ndarray, covariance: np.ndarray) -> float:
+        """Return the probability that a pose is far off, by the scans and by the particles."""
+        if is_narrow(covariance) or self._shown > _MOST_LOOKED_AT:
+            share = share_off(covariance)
+        else:
+            poses = self._cloud.host_poses(self._cloud.shown, self._shown)
+            share = share_off_of(poses, self._cloud.host_weights(self._shown), pose)
+        wrong = self._verdict.wrong
+        return wrong + (1 - wrong) * share
 
     def mean_and_covariance(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the weighted mean (3,) and the covariance (3, 3), without the verdict of :meth:`estimate`."""

@@ -17,6 +17,8 @@ from gpusense.localization.estimates import Estimate
 _MOVED, _TURNED, _MOST = 0.3, 0.3, 10
 # Deviation of the particles above which they have no common pose yet [m].
 _APART = 1.0
+# Least share of the beams that a trusted pose explains.
+_EXPLAINED = 0.6
 
 
 class Trust:
@@ -34,7 +36,9 @@ class Trust:
         moved = math.hypot(dx, dy) > _MOVED or abs(math.remainder(turn, math.tau)) > _TURNED
         if moved:
             self._last = estimate.pose
-        if estimate.lost and not self._count:
+        # Beams that are only too short do not make a pose lost, but a place that was searched for should explain more.
+        against = estimate.verdict != "tracking" or estimate.explained < _EXPLAINED
+        if against and not self._count:
             return True
-        self._count = min(self._count + (-moved if estimate.lost else moved), _MOST)
+        self._count = min(self._count + (-moved if against else moved), _MOST)
         return False

@@ -1,33 +1,57 @@
-"""Whether a filter is lost: how many beams of scans the estimated pose explains, how well features were predicted.
+"""Verdict of a filter or of any localiser: the probability that its pose is lost, and a word for it.
 
-A beam is explained if its log-likelihood at the estimate is nearer to a good one than to a poor one. Poor is the median
-of the beams of the scan at random poses in the free space, good the 99th percentile there: a random pose meets the
-right range by chance now and then. The share that a filter on the right map explains is near 1, even among people. A
-filter on a wrong map fits some walls and explains about half.
+``p_lost`` is the probability that the pose is off by more than 1 m or 0.5 rad. With W the belief that another place is
+right (:mod:`gpusense.localization.belief`), and s the share of the particles, or of a covariance, beyond these limits,
+
+    p_lost = W + (1 - W) s.
+
+W comes from the scans (:mod:`gpusense.localization.ratio`), s from the spread. Models without a map, of positions or
+headings, give no evidence: their W stays at the prior and its rates, so for them W is left out.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from gpusense.localization.evidence import Evidence
+from gpusense.backends import arrays
+from gpusense.localization.belief import Belief
+from gpusense.localization.evidence import LEAST_GAIN, Evidence, Gains
+from gpusense.localization.passages import Passages, passages
+from gpusense.localization.ratio import explained_of_scan, ratio_of_features, ratio_of_scan
 from gpusense.localization.sensors import Sensor
+from gpusense.localization.spread import deviations, is_wide
 from gpusense.models.landmark.model import LandmarkModel
-from gpusense.models.scan.beam import BeamModel
 
-# Random poses; corrections over which the share is averaged.
-_RANDOM, _MEMORY = 64, 5
-# Least share of a filter that is not lost, between those of right and wrong maps (bench/studies/verdict.py).
-# A likelihood field explains an end near any wall; a beam model asks for the wall that the beam meets.
-_LEAST_OF_FIELD, _LEAST_OF_BEAMS = 0.8, 0.55
+# Random poses; corrections between two judgements of a start anywhere.
+_RANDOM, _INTERVAL = 64, 5
+
+
+class VerdictState(NamedTuple):
+    """All that a verdict remembers; immutable, so it is kept and put back by assignment.
+
+    Attributes:
+        belief: Belief that the pose is wrong.
+        corrections: Corrections since the filter began.
+        judged: Corrections at the last judgement; -1 before.
+        explained: Share of explained beams there; NaN without beams.
+        gains: Gains of recent features by the index of their sensor.
+        ratios: Ratios of features since the last judgement.
+    """
+
+    belief: Belief = Belief()
+    corrections: int = 0
+    judged: int = -1
+    explained: float = math.nan
+    gains: tuple[tuple[int, Gains], ...] = ()
+    ratios: tuple[float, ...] = ()
 
 
 class Verdict:
-    """Running share of explained beams.
+    """Running verdict of a filter.
 
     Args:
         sensors: The filter's sensors.
@@ -35,24 +59,25 @@ class Verdict:
         seed: Seed of the poses among landmarks.
 
     Attributes:
-        corrections: Corrections since the filter began.
+        state: All that it remembers.
     """
 
+    MEMORY: ClassVar[tuple[str, ...]] = ("state",)
+
     def __init__(self, sensors: Sequence[Sensor], random_poses: Callable[[int], np.ndarray], *, seed: int = 0) -> None:
-        self._sensors, self._random_poses, self._seed = sensors, random_poses, seed
+        self._sensors, self._random_poses = sensors, random_poses
         self._poses: np.ndarray | None = None
-        self.reset()
+        self._evidence = {
+            index: Evidence(sensor.model, seed=seed)
+            for index, sensor in enumerate(sensors)
+            if isinstance(sensor.model, LandmarkModel)
+        }
+        self._informed = bool(self._evidence) or any(sensor.calibrates for sensor in sensors)
+        self.state = VerdictState()
 
     def reset(self) -> None:
         """Forget all scans."""
-        self.corrections, self._judged, self._share = 0, 0, math.nan
-        self._last = math.nan
-        self._least = 0.0
-        self._evidence = {
-            index: Evidence(sensor.model, seed=self._seed)
-            for index, sensor in enumerate(self._sensors)
-            if isinstance(sensor.model, LandmarkModel)
-        }
+        self.state = VerdictState()
 
     def watches(self, readings: Mapping[int, tuple[Any, ...]]) -> bool:
         """Tell whether readings have features, whose prediction is judged before the correction."""
@@ -60,15 +85,22 @@ class Verdict:
 
     def predicted(self, poses: np.ndarray, weights: np.ndarray, readings: Mapping[int, tuple[Any, ...]]) -> None:
         """Add the features of a scan, before the filter is corrected by them."""
+        gains, ratios = dict(self.state.gains), list(self.state.ratios)
         for index, evidence in self._evidence.items():
-            if index in readings and _count(readings[index]):
-                evidence.predicted(poses, weights, np.asarray(readings[index][0], np.float64))
+            if index not in readings or not _count(readings[index]):
+                continue
+            features = np.asarray(readings[index][0], np.float64)
+            gain = evidence.gain(poses, weights, features)
+            if not math.isnan(gain):
+                gains[index] = gains.get(index, Gains()).added(gain, len(features))
+                ratios.append(ratio_of_features(gain, len(features), LEAST_GAIN))
+        self.state = self.state._replace(gains=tuple(gains.items()), ratios=tuple(ratios))
 
     @property
     def gain(self) -> float:
         """Least mean gain of the predictions of features [nats]; NaN without enough of them."""
-        gains = [evidence.gain for evidence in self._evidence.values() if not math.isnan(evidence.gain)]
-        return min(gains, default=math.nan)
+        means = [gains.mean for _, gains in self.state.gains]
+        return min((mean for mean in means if not math.isnan(mean)), default=math.nan)
 
     def anywhere(self) -> np.ndarray:
         """Return poses anywhere in the free space, with which a pose is compared."""
@@ -78,37 +110,58 @@ class Verdict:
 
     def corrected(self) -> None:
         """Count a correction."""
-        self.corrections += 1
+        state = self.state
+        self.state = state._replace(corrections=state.corrections + 1, belief=state.belief.counted())
 
     @property
     def due(self) -> bool:
-        """Tell whether enough corrections have passed for a new judgement."""
-        return self.corrections % _MEMORY == 0
+        """Tell whether enough corrections have passed for a new judgement of a start anywhere."""
+        return self.state.corrections % _INTERVAL == 0
 
     @property
-    def lost(self) -> bool:
-        """Tell whether recent scans or features contradict the pose; False before any was judged."""
-        return self._share < self._least or any(evidence.lost for evidence in self._evidence.values())
+    def wrong(self) -> float:
+        """Probability that another place is right, by the scans; 0 for sensors without a map."""
+        return self.state.belief.wrong if self._informed else 0.0
 
-    def explained(self, pose: np.ndarray, readings: Mapping[int, tuple[Any, ...]]) -> float:
-        """Return the share of the beams of the last scans that a pose explains; NaN where no reading has beams."""
-        if self._judged == self.corrections:
-            return self._last
-        anywhere = self.anywhere()
-        shares, least = [], []
-        for index, reading in readings.items():
-            if self._sensors[index].calibrates:
-                parts = self._sensors[index].parts(np.vstack([pose[None], anywhere]), reading)
-                shares.append(explained_share(parts[0], parts[1:]))
-                beams = isinstance(self._sensors[index].model, BeamModel)
-                least.append(_LEAST_OF_BEAMS if beams else _LEAST_OF_FIELD)
-        self._judged = self.corrections
-        self._last = float(np.mean(shares)) if shares else math.nan
-        if not math.isnan(self._last):
-            self._least = float(np.mean(least))
-            rate = 1 / min(self.corrections, _MEMORY) if self.corrections else 1.0
-            self._share = self._last if math.isnan(self._share) else self._share + rate * (self._last - self._share)
-        return self._last
+    def judge(self, pose: np.ndarray, covariance: np.ndarray, readings: Mapping[int, tuple[Any, ...]]) -> float:
+        """Judge a pose by the last readings, once for each correction.
+
+        Args:
+            pose: (3,) estimated pose.
+            covariance: (3, 3) its covariance.
+            readings: Last readings by the index of their sensor.
+
+        Returns:
+            Share of the beams that the pose explains; NaN without beams.
+        """
+        state = self.state
+        if state.judged == state.corrections:
+            return state.explained
+        scans = sightings(self._sensors, readings, pose, covariance)
+        explained, belief = explained_of_scan(scans), state.belief
+        if is_wide(covariance):
+            belief = belief.widened()
+        else:
+            told = [ratio_of_scan(scans), float(np.mean(state.ratios)) if state.ratios else math.nan]
+            known = [ratio for ratio in told if not math.isnan(ratio)]
+            x, y, theta = (float(value) for value in pose)
+            belief = belief.judged((x, y, theta), sum(known) if known else math.nan)
+        self.state = state._replace(belief=belief, judged=state.corrections, explained=explained, ratios=())
+        return explained
+
+
+def sightings(
+    sensors: Sequence[Sensor], readings: Mapping[int, tuple[Any, ...]], pose: np.ndarray, covariance: np.ndarray
+) -> list[Passages]:
+    """Return the judged beams of all scans among readings."""
+    spread = deviations(covariance)
+    result = []
+    for index, reading in readings.items():
+        sensor = sensors[index]
+        if sensor.calibrates:
+            ranges = np.asarray(arrays.copied_to_host(reading[0], sensor.backend, "ranges"), np.float64)
+            result.append(passages(sensor.model.grid, sensor.model.scanner, pose, ranges, spread))
+    return result
 
 
 def _count(reading: tuple[Any, ...]) -> int:

@@ -10,13 +10,17 @@ import pytest
 import gpusense as gs
 from gpusense.localization.trust import Trust
 
-HERE = gs.Estimate(np.zeros(3), np.eye(3) * 0.01, 100.0, False, 0.9, 0.1, 1.0, False, 100)
+HERE = gs.Estimate(np.zeros(3), np.eye(3) * 0.01, 100.0, 0.0, "tracking", 0.9, 0.1, 1.0, False, 100)
 
 
 def judged(trust: Trust, x: float, *, lost: bool, deviation: float = 0.1) -> bool:
     covariance = np.diag([deviation**2, deviation**2, 0.01])
     pose = np.array([x, 0.0, 0.0])
-    return trust.contradicted(dataclasses.replace(HERE, pose=pose, covariance=covariance, lost=lost))
+    return trust.contradicted(
+        dataclasses.replace(
+            HERE, pose=pose, covariance=covariance, p_lost=float(lost), verdict="lost" if lost else "tracking"
+        )
+    )
 
 
 def test_trust_grows_and_falls_with_the_way():

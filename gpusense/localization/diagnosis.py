@@ -1,0 +1,205 @@
+"""Evidence for and against a pose in words and numbers, and the likely cause where readings contradict it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.localization.passages import AGREES, SHORT, THROUGH, Passages
+from gpusense.localization.ratio import ratio_of_scan
+from gpusense.localization.sensors import Sensor
+from gpusense.localization.verdict import sightings
+
+Floats = NDArray[np.float64]
+Cause = Literal["none", "people", "start", "mount", "map", "unknown"]
+
+# Poses that are tried elsewhere; the best of them that are refined, the refinements of each, and how far they reach.
+_TRIED, _REFINED, _AROUND, _REACH = 8192, 12, 64, (0.4, 0.4, 0.2)
+# A pose explains a scan where at least this share of the beams that meet walls agree, and of all that tell anything.
+_FITS, _FITS_OF_ALL = 0.85, 0.6
+# Another mount is a cause from this angle on [rad]; steps in which it is tried.
+_LEAST_TURN, _TURNS = math.radians(20), 72
+# Radius within which beams pass through one place [m]; least distance of another place [m]; share of beams that a crowd
+# makes short.
+_ONE_PLACE, _ELSEWHERE, _CROWD = 1.5, 1.0, 0.3
+_STILL = np.zeros((3, 3))
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Evidence of the last readings at a pose.
+
+    Attributes:
+        agree: Number of beams that end at a mapped wall, as they should.
+        through: Number of beams that pass through a mapped wall.
+        short: Number of beams that end in mapped free space.
+        place: (x, y) around which most beams pass through walls [m]; None without one.
+        inside: Whether the pose is inside of solid cells.
+        off: Whether the pose is in unknown cells or off the map.
+        elsewhere: (x, y, theta) of a pose that explains the scan better; None without one, or without a search.
+        turned: Angle by which the scanner seems to be turned against its mount [rad]; pi with ``mirrored`` for one that
+            is upside down; None where the mount fits or no other one does.
+        mirrored: Whether the readings seem to run the other direction.
+        cause: Likely cause: "none", nothing contradicts the pose; "people", beams are short only; "start", the robot is
+            elsewhere on this map; "mount", the scanner is mounted otherwise; "map", no place of the map explains the
+            scan; "unknown".
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.Diagnosis(12, 8, 3, (4.0, 1.5), cause="map").text
+        '40 % of the beams that meet walls pass through them, most near x = 4.0, y = 1.5; likely cause: wrong map'
+    """
+
+    agree: int
+    through: int
+    short: int
+    place: tuple[float, float] | None = None
+    inside: bool = False
+    off: bool = False
+    elsewhere: tuple[float, float, float] | None = None
+    turned: float | None = None
+    mirrored: bool = False
+    cause: Cause = "unknown"
+
+    @property
+    def told(self) -> int:
+        """Number of beams that tell anything."""
+        return self.agree + self.through + self.short
+
+    @property
+    def text(self) -> str:
+        """The evidence and the likely cause in one line."""
+        parts = [self._beams()]
+        if self.inside:
+            parts.append("the pose is inside of solid cells")
+        if self.off:
+            parts.append("the pose is in unknown cells or off the map")
+        cause = self._cause()
+        return "; ".join([*parts, f"likely cause: {cause}"] if cause else parts)
+
+    def _beams(self) -> str:
+        if not self.told:
+            return "no beam meets mapped cells that tell anything"
+        met = self.agree + self.through
+        if self.through and 10 * self.through >= met:
+            at = "" if self.place is None else ", most near x = {:.1f}, y = {:.1f}".format(*self.place)
+            return f"{100 * self.through / met:.0f} % of the beams that meet walls pass through them{at}"
+        return f"{100 * self.agree / self.told:.0f} % of the beams agree with the map"
+
+    def _cause(self) -> str:
+        if self.cause == "start" and self.elsewhere is not None:
+            return "wrong start, or carried away: x = {:.1f}, y = {:.1f}, theta = {:.2f} fits".format(*self.elsewhere)
+        if self.cause == "mount":
+            how = "mirrored" if self.mirrored else f"turned by {math.degrees(self.turned or 0.0):.0f} degrees"
+            return f"wrong mount: the scan fits {how}"
+        return {"people": "people or furniture that the map lacks", "map": "wrong map"}.get(self.cause, "")
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def diagnose(
+    sensors: Sequence[Sensor],
+    readings: Mapping[int, tuple[Any, ...]],
+    pose: Floats,
+    random_poses: Callable[[int], Floats] | None,
+) -> Diagnosis:
+    """Return the evidence of readings at a pose.
+
+    Args:
+        sensors: Sensors of a filter.
+        readings: Readings by the index of their sensor.
+        pose: (3,) pose.
+        random_poses: Returns poses anywhere on the map; None to look nowhere else.
+    """
+    scans = sightings(sensors, readings, pose, _STILL)
+    agree, through, short = (sum(one.count(kind) for one in scans) for kind in (AGREES, THROUGH, SHORT))
+    inside, off = any(one.inside for one in scans), any(one.off for one in scans)
+    found = Diagnosis(agree, through, short, _place(scans), inside, off)
+    if not scans or (not agree + through + short and not (inside or off)):
+        return found
+    if _fits(scans) or ratio_of_scan(scans) < 0:
+        crowded = short > _CROWD * (agree + through + short)
+        return replace(found, cause="people" if crowded else "none")
+    if random_poses is None:
+        return found
+    turned, mirrored = _mount(sensors, readings, pose)
+    if turned is not None:
+        return replace(found, turned=turned, mirrored=mirrored, cause="mount")
+    best = _best_elsewhere(sensors, readings, random_poses)
+    if best is None or math.dist(best[:2], pose[:2]) < _ELSEWHERE:
+        return found
+    if _fits(sightings(sensors, readings, best, _STILL)):
+        x, y, theta = (float(value) for value in best)
+        return replace(found, elsewhere=(x, y, theta), cause="start")
+    return replace(found, cause="map")
+
+
+def _fits(scans: Sequence[Passages]) -> bool:
+    """Tell whether a pose explains scans: most beams that meet walls agree, and most of all."""
+    agree, through, short = (sum(one.count(kind) for one in scans) for kind in (AGREES, THROUGH, SHORT))
+    inside = any(one.inside or one.off for one in scans)
+    return not inside and agree > _FITS * (agree + through) and agree > _FITS_OF_ALL * (agree + through + short)
+
+
+def _place(scans: Sequence[Passages]) -> tuple[float, float] | None:
+    """Return the wall near which most beams pass through walls; None without such beams."""
+    walls = [one.wall[one.kind == THROUGH] for one in scans]
+    points = np.concatenate(walls) if walls else np.zeros((0, 2))
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return None
+    near = np.hypot(*(points[:, None] - points[None]).T) < _ONE_PLACE
+    x, y = points[near[int(np.argmax(near.sum(axis=1)))]].mean(axis=0)
+    return float(x), float(y)
+
+
+def _mount(
+    sensors: Sequence[Sensor], readings: Mapping[int, tuple[Any, ...]], pose: Floats
+) -> tuple[float | None, bool]:
+    """Return the angle by which scans must be turned to fit at a pose, None for no angle, and whether mirrored."""
+    best: tuple[float, float | None, bool] = (0.0, None, False)
+    for mirrored in (False, True):
+        given = {index: _mirrored(reading) for index, reading in readings.items()} if mirrored else readings
+        for k in range(_TURNS):
+            angle = math.remainder(k * math.tau / _TURNS, math.tau)
+            if not mirrored and abs(angle) < _LEAST_TURN:
+                continue
+            scans = sightings(sensors, given, pose + np.array([0.0, 0.0, angle]), _STILL)
+            agree = sum(one.count(AGREES) for one in scans)
+            if agree > best[0] and _fits(scans):
+                best = agree, angle, mirrored
+    return best[1], best[2]
+
+
+def _mirrored(reading: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return a scan whose readings run the other direction."""
+    return (reading[0][::-1], *reading[1:])
+
+
+def _best_elsewhere(
+    sensors: Sequence[Sensor], readings: Mapping[int, tuple[Any, ...]], random_poses: Callable[[int], Floats]
+) -> Floats | None:
+    """Return the likeliest of random poses after a refinement; None without a sensor that has a map."""
+    scanning = {index: reading for index, reading in readings.items() if sensors[index].calibrates}
+    if not scanning:
+        return None
+
+    def score(poses: Floats) -> Floats:
+        total = np.zeros(len(poses))
+        for index, reading in scanning.items():
+            total += np.asarray(sensors[index].log_likelihood(poses, reading), np.float64)
+        return total
+
+    poses, rng = random_poses(_TRIED), np.random.default_rng(0)
+    for reach in (1.0, 0.3, 0.1):
+        best = poses[np.argsort(-score(poses), kind="stable")[:_REFINED]]
+        offsets = rng.uniform(-reach, reach, (_REFINED, _AROUND, 3)) * _REACH
+        offsets[:, 0] = 0.0
+        poses = (best[:, None] + offsets).reshape(-1, 3)
+    return np.asarray(poses[int(np.argmax(score(poses)))])

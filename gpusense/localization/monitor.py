@@ -1,0 +1,176 @@
+"""Verdict on the poses of any localiser: pose and readings in, probability of being lost out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense._util.typing import AnyArray
+from gpusense.localization import starts
+from gpusense.localization.diagnosis import Diagnosis, diagnose
+from gpusense.localization.scoring import given_of
+from gpusense.localization.sensors import sensors_of
+from gpusense.localization.spread import is_wide, share_off
+from gpusense.localization.verdict import Verdict, VerdictState
+from gpusense.localization.words import LOST, Word, word_of
+from gpusense.models.point.base import PointModel
+
+# Poses drawn from a covariance, by which features are predicted.
+_DRAWN = 64
+
+
+@dataclass(frozen=True)
+class PoseVerdict:
+    """Verdict on a pose.
+
+    Attributes:
+        p_lost: Probability that the pose is off by more than 1 m or 0.5 rad.
+        verdict: "tracking"; "uncertain", where the covariance is wide or p_lost is above 0.2; or "lost", where readings
+            contradict the pose and p_lost is above 0.5.
+        explained: Share of the beams that agree with the map at the pose, of those that the map could explain; NaN
+            without one.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.PoseVerdict(0.7, "lost", 0.2).lost
+        True
+    """
+
+    p_lost: float
+    verdict: Word
+    explained: float
+
+    @property
+    def lost(self) -> bool:
+        """Whether p_lost is above 0.5."""
+        return self.p_lost > LOST
+
+
+class PoseMonitor:
+    """Judge the poses of a localiser by its scans, one after the other.
+
+    It needs no particle filter: poses may come from AMCL, from a graph, or from a motion capture. Each call adds a scan
+    to a belief that is kept from call to call (``docs/localization.md``), so pass the scans in their order.
+
+    Args:
+        models: A model of scans or landmarks with the map, or several of one device.
+        seed: Seed of the random poses with which features are compared.
+
+    Raises:
+        TypeError: Another object.
+        ValueError: No model, models of several devices, or only models that have no map.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> room = np.pad(np.zeros((50, 80), int), 1, constant_values=100)
+        >>> scanner = gs.Scanner.uniform(angle_min=-3.1, angle_increment=0.2, count=32, range_max=10.0)
+        >>> model = gs.BeamModel(gs.OccupancyGrid(room, 0.1), scanner, gs.BeamParameters(), backend="numpy")
+        >>> monitor, pose = gs.PoseMonitor(model), np.array([2.0, 3.0, 0.5])
+        >>> monitor.update(pose, model.expected_ranges(pose[None])[0]).verdict
+        'tracking'
+    """
+
+    def __init__(self, models: Any, *, seed: int = 0) -> None:
+        self._sensors = sensors_of(models)
+        if all(isinstance(sensor.model, PointModel) for sensor in self._sensors):
+            raise ValueError("models: must have a map of walls or landmarks, got none that has")
+        self._seed = checks.integer("seed", seed, low=0, high=(1 << 64) - 1)
+        self._verdict = Verdict(self._sensors, self._random_poses, seed=self._seed)
+        self._pose: np.ndarray | None = None
+        self._last: dict[int, tuple[Any, ...]] = {}
+
+    def __repr__(self) -> str:
+        names = ", ".join(type(sensor.model).__name__ for sensor in self._sensors)
+        return f"PoseMonitor([{names}], scans={self._verdict.state.corrections}, wrong={self._verdict.wrong:.2g})"
+
+    def update(self, pose: AnyArray, ranges: Any, covariance: AnyArray | None = None) -> PoseVerdict:
+        """Judge a pose by the readings that were taken there.
+
+        Args:
+            pose: (3,) x, y, theta [m, m, rad].
+            ranges: (K,) readings of the only model, or a mapping from models to their readings; for landmarks a tuple
+                ``(features,)``. None, or no reading, gives no evidence.
+            covariance: (3, 3) covariance of the pose, which may be infinite; None if the localiser states none.
+
+        Raises:
+            TypeError, ValueError: an argument breaks its rule.
+        """
+        place = checks.array("pose", pose, (3,))
+        spread = np.zeros((3, 3)) if covariance is None else _checked(covariance)
+        given = dict(given_of(ranges, self._sensors))
+        for index, reading in given.items():
+            if self._sensors[index].calibrates:
+                count = self._sensors[index].model.scanner.count
+                given[index] = (checks.array("ranges", reading[0], (count,), finite=False), *reading[1:])
+        self._verdict.corrected()
+        if self._verdict.watches(given):
+            drawn = starts.normal(place, _finite(spread), _DRAWN, (self._seed & 0xFFFFFFFF, self._seed >> 32, 0))
+            self._verdict.predicted(drawn, np.full(_DRAWN, 1 / _DRAWN), given)
+        explained = self._verdict.judge(place, spread, given)
+        self._pose, self._last = place, given
+        wrong = self._verdict.wrong
+        p_lost = wrong + (1 - wrong) * share_off(spread)
+        return PoseVerdict(p_lost, word_of(p_lost, wrong, wide=is_wide(spread)), explained)
+
+    @property
+    def state(self) -> VerdictState:
+        """All that the monitor remembers of the scans: an immutable value, which may be kept and put back."""
+        return self._verdict.state
+
+    @state.setter
+    def state(self, state: VerdictState) -> None:
+        if not isinstance(state, VerdictState):
+            raise TypeError(f"state: must be that of a PoseMonitor, got {checks.show(state)}")
+        self._verdict.state = state
+
+    def reset(self) -> None:
+        """Forget all scans, as after the localiser was given a new pose."""
+        self._verdict.reset()
+        self._pose, self._last = None, {}
+
+    def diagnose(self, *, search: bool = True) -> Diagnosis:
+        """Return the evidence of the last readings at the last pose, and the likely cause where they contradict it.
+
+        Args:
+            search: Whether to look for a better pose elsewhere on the map, which takes some milliseconds.
+
+        Raises:
+            RuntimeError: there is no pose yet.
+        """
+        if self._pose is None:
+            raise RuntimeError("diagnose: needs an update first")
+        search = search and any(hasattr(sensor.model, "grid") for sensor in self._sensors)
+        return diagnose(self._sensors, self._last, self._pose, self._random_poses if search else None)
+
+    def _random_poses(self, count: int) -> np.ndarray:
+        pool, spread = starts.free_pool([sensor.model for sensor in self._sensors], None)
+        return starts.spread(pool, spread, count, (self._seed & 0xFFFFFFFF, self._seed >> 32, 1))
+
+
+def _checked(covariance: AnyArray) -> np.ndarray:
+    """Return a covariance.
+
+    Raises:
+        TypeError, ValueError: it is not symmetric, or has a NaN or a negative variance.
+    """
+    matrix = checks.array("covariance", covariance, (3, 3), finite=False)
+    if np.isnan(matrix).any():
+        raise ValueError("covariance: must have no NaN, got one that has")
+    finite = np.where(np.isfinite(matrix), matrix, 0.0)
+    if np.abs(finite - finite.T).max() > 1e-6 * max(np.abs(finite).max(), 1e-300):
+        raise ValueError("covariance: must be symmetric, got one that is not")
+    if (np.diag(matrix) < 0).any():
+        raise ValueError(f"covariance: must have variances >= 0, got {float(np.diag(matrix).min())}")
+    return matrix
+
+
+def _finite(covariance: np.ndarray) -> np.ndarray:
+    """Return a covariance from which poses can be drawn."""
+    if np.isfinite(covariance).all():
+        values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+        return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
+    return np.diag([1.0, 1.0, math.pi / 4])

@@ -1,0 +1,92 @@
+"""Probability that a pose is far off if the particles, or a covariance, are right: what the spread alone says."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.localization.pose_algebra import wrap_angle
+
+Floats = NDArray[np.float64]
+
+# A pose is off beyond these [m, rad]: the definition of p_lost.
+FAR, FAR_TURN = 1.0, 0.5
+# Particles beyond these deviations do not lie together [m, rad].
+WIDE, WIDE_TURN = 0.5, 0.25
+# Deviations below which nothing is far off [m, rad], and up to which a normal density is taken in place of particles.
+_NARROW, _NARROW_TURN = 0.2, 0.1
+# Nodes and weights of a Gauss-Legendre quadrature on [-1, 1].
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)
+
+
+def deviations(covariance: Floats) -> tuple[float, float]:
+    """Return the largest deviation of the position along any direction [m], and that of the heading [rad]."""
+    if not np.isfinite(covariance).all():
+        return math.inf, math.inf
+    xx, xy, yy = float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1])
+    largest = (xx + yy) / 2 + math.hypot((xx - yy) / 2, xy)
+    return math.sqrt(max(largest, 0.0)), math.sqrt(max(float(covariance[2, 2]), 0.0))
+
+
+def is_wide(covariance: Floats) -> bool:
+    """Tell whether the deviation of the position is above half a metre, or that of the heading above 0.25 rad."""
+    position, heading = deviations(covariance)
+    return position > WIDE or heading > WIDE_TURN
+
+
+def is_narrow(covariance: Floats) -> bool:
+    """Tell whether deviations are so small that a normal density describes the particles well enough."""
+    position, heading = deviations(covariance)
+    return position < _NARROW and heading < _NARROW_TURN
+
+
+def share_off(covariance: Floats) -> float:
+    """Return the probability that a normal error is beyond 1 m or 0.5 rad.
+
+    Position and heading count as independent: the probability of either is then right to second order in each.
+
+    Args:
+        covariance: (3, 3) covariance of x, y [m] and heading [rad]; infinite entries are certainly off.
+    """
+    if not np.isfinite(covariance).all():
+        return 1.0
+    large, heading = deviations(covariance)
+    trace = max(float(covariance[0, 0] + covariance[1, 1]), 0.0)
+    small = math.sqrt(max(trace - large * large, 0.0))
+    within = _within_disc(large, small) * _within(FAR_TURN, heading)
+    return min(max(1.0 - within, 0.0), 1.0)
+
+
+def share_off_of(poses: Floats, weights: Floats, pose: Floats) -> float:
+    """Return the share of weighted particles that are beyond 1 m or 0.5 rad of a pose.
+
+    Args:
+        poses: (N, 3) particles.
+        weights: (N,) weights >= 0, of any positive sum.
+        pose: (3,) pose.
+    """
+    total = float(weights.sum())
+    if not total > 0:
+        return 1.0
+    d = poses - pose
+    far = (d[:, 0] ** 2 + d[:, 1] ** 2 > FAR**2) | (np.abs(wrap_angle(d[:, 2])) > FAR_TURN)
+    return float(weights[far].sum()) / total
+
+
+def _within(limit: float, deviation: float) -> float:
+    """Return the probability of a normal number within limits on both sides."""
+    return 1.0 if deviation == 0 else math.erf(limit / deviation / math.sqrt(2))
+
+
+def _within_disc(large: float, small: float) -> float:
+    """Return the probability that a normal error with deviations along two axes is within the disc of radius FAR."""
+    if large < _NARROW:
+        return 1.0
+    reach = min(FAR, 8 * large)
+    along = reach * _NODES
+    chord = np.sqrt(np.maximum(FAR**2 - along**2, 0.0))
+    across = np.array([_within(half, small) for half in chord.tolist()])
+    density = np.exp(-0.5 * (along / large) ** 2) / (large * math.sqrt(2 * math.pi))
+    return float(reach * (_WEIGHTS @ (density * across)))

@@ -61,6 +61,7 @@ class Beginnings(Results):
         pool, spread = starts.free_pool([sensor.model for sensor in self._sensors], bounds)
         self._place(starts.spread(pool, spread, self._number(particles), self._key()))
         self._wide = DEFAULTS.wide_scans
+        self._verdict.reset(anywhere=True)
         if bounds is None and self.options.recovery is None:
             self._trust = Trust()
 

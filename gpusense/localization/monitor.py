@@ -14,7 +14,7 @@ from gpusense.localization import starts
 from gpusense.localization.diagnosis import Diagnosis, diagnose
 from gpusense.localization.scoring import given_of
 from gpusense.localization.sensors import sensors_of
-from gpusense.localization.spread import is_wide, share_off
+from gpusense.localization.spread import is_apart, is_wide, share_off
 from gpusense.localization.verdict import Verdict, VerdictState
 from gpusense.localization.words import LOST, Word, word_of
 from gpusense.models.point.base import PointModel
@@ -29,7 +29,7 @@ class PoseVerdict:
 
     Attributes:
         p_lost: Probability that the pose is off by more than 1 m or 0.5 rad.
-        verdict: "tracking"; "uncertain", where the covariance is wide or p_lost is above 0.2; or "lost", where readings
+        verdict: "tracking"; "uncertain", where the covariance is wide or p_lost is above 0.1; or "lost", where readings
             contradict the pose and p_lost is above 0.5.
         explained: Share of the beams that agree with the map at the pose, of those that the map could explain; NaN
             without one.
@@ -114,7 +114,7 @@ class PoseMonitor:
         self._pose, self._last = place, given
         wrong = self._verdict.wrong
         p_lost = wrong + (1 - wrong) * share_off(spread)
-        return PoseVerdict(p_lost, word_of(p_lost, wrong, wide=is_wide(spread)), explained)
+        return PoseVerdict(p_lost, word_of(p_lost, wrong, wide=is_wide(spread), apart=is_apart(spread)), explained)
 
     @property
     def state(self) -> VerdictState:

@@ -23,7 +23,7 @@ from gpusense.localization.evidence import LEAST_GAIN, Evidence, Gains
 from gpusense.localization.passages import Passages, passages
 from gpusense.localization.ratio import explained_of_scan, ratio_of_features, ratio_of_scan
 from gpusense.localization.sensors import Sensor
-from gpusense.localization.spread import deviations, is_wide
+from gpusense.localization.spread import deviations, is_apart, is_wide
 from gpusense.models.landmark.model import LandmarkModel
 
 # Random poses; corrections between two judgements of a start anywhere.
@@ -75,9 +75,13 @@ class Verdict:
         self._informed = bool(self._evidence) or any(sensor.calibrates for sensor in sensors)
         self.state = VerdictState()
 
-    def reset(self) -> None:
-        """Forget all scans."""
-        self.state = VerdictState()
+    def reset(self, *, anywhere: bool = False) -> None:
+        """Forget all scans.
+
+        Args:
+            anywhere: Whether the pose is searched for on the whole map.
+        """
+        self.state = VerdictState(Belief.anywhere() if anywhere else Belief())
 
     def watches(self, readings: Mapping[int, tuple[Any, ...]]) -> bool:
         """Tell whether readings have features, whose prediction is judged before the correction."""
@@ -139,12 +143,14 @@ class Verdict:
             return state.explained
         scans = sightings(self._sensors, readings, pose, covariance)
         explained, belief = explained_of_scan(scans), state.belief
-        if is_wide(covariance):
+        x, y, theta = (float(value) for value in pose)
+        if is_apart(covariance):
             belief = belief.widened()
+        elif is_wide(covariance):
+            belief = belief.judged((x, y, theta), math.nan)
         else:
             told = [ratio_of_scan(scans), float(np.mean(state.ratios)) if state.ratios else math.nan]
             known = [ratio for ratio in told if not math.isnan(ratio)]
-            x, y, theta = (float(value) for value in pose)
             belief = belief.judged((x, y, theta), sum(known) if known else math.nan)
         self.state = state._replace(belief=belief, judged=state.corrections, explained=explained, ratios=())
         return explained

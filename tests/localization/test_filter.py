@@ -173,7 +173,7 @@ def test_people_in_the_room_are_no_wrong_map():
             pf.correct(ranges)
             found = pf.estimate()
         assert found.verdict == "tracking" and found.p_lost < 0.05, (share, found)
-        assert abs(found.explained - (1 - share)) < 0.15
+        assert abs(found.explained - (1 - share)) < 0.25
         assert np.hypot(*(found.pose - TRUTH)[:2]) < 0.1
 
 

@@ -30,6 +30,8 @@ START = 0.1
 PER_SCAN, PER_METRE, FOUND, WIDE = 1e-3, 2e-3, 0.003, 0.05
 # Correlation of the ratios of two scans at one place, and the way in which it falls to 1 / e [m, rad].
 STAYS, LENGTH, TURN = 0.95, 1.5, 1.0
+# Longest way from one scan to the next that counts [m]; a longer one is a jump of the localiser.
+_FASTEST = 1.0
 
 
 class Belief(NamedTuple):
@@ -81,7 +83,7 @@ class Belief(NamedTuple):
             way = math.hypot(pose[0] - self.pose[0], pose[1] - self.pose[1])
             turn = abs(math.remainder(pose[2] - self.pose[2], math.tau))
             rho = STAYS * math.exp(-way / LENGTH - turn / TURN)
-        lost = 1 - math.exp(-PER_SCAN * self.scans - PER_METRE * min(way, 1.0 * max(self.scans, 1)))
+        lost = 1 - math.exp(-PER_SCAN * self.scans - PER_METRE * min(way, _FASTEST * self.scans))
         log_odds = self._moved(lost, 1 - (1 - FOUND) ** self.scans, 1)
         if math.isnan(ratio):
             return self._replace(log_odds=log_odds, scans=0)

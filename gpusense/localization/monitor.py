@@ -17,7 +17,6 @@ from gpusense.localization.sensors import sensors_of
 from gpusense.localization.spread import is_apart, is_wide, share_off
 from gpusense.localization.verdict import Verdict, VerdictState
 from gpusense.localization.words import LOST, Word, word_of
-from gpusense.models.point.base import PointModel
 
 # Poses drawn from a covariance, by which features are predicted.
 _DRAWN = 64
@@ -76,10 +75,10 @@ class PoseMonitor:
 
     def __init__(self, models: Any, *, seed: int = 0) -> None:
         self._sensors = sensors_of(models)
-        if all(isinstance(sensor.model, PointModel) for sensor in self._sensors):
-            raise ValueError("models: must have a map of walls or landmarks, got none that has")
         self._seed = checks.integer("seed", seed, low=0, high=(1 << 64) - 1)
         self._verdict = Verdict(self._sensors, self._random_poses, seed=self._seed)
+        if not self._verdict.informed:
+            raise ValueError("models: must have a map of walls or landmarks, got none that has")
         self._pose: np.ndarray | None = None
         self._last: dict[int, tuple[Any, ...]] = {}
 

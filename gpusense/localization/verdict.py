@@ -60,6 +60,7 @@ class Verdict:
 
     Attributes:
         state: All that it remembers.
+        informed: Whether a sensor has a map, so that readings can contradict a pose.
     """
 
     MEMORY: ClassVar[tuple[str, ...]] = ("state",)
@@ -72,7 +73,7 @@ class Verdict:
             for index, sensor in enumerate(sensors)
             if isinstance(sensor.model, LandmarkModel)
         }
-        self._informed = bool(self._evidence) or any(sensor.calibrates for sensor in sensors)
+        self.informed = bool(self._evidence) or any(sensor.calibrates for sensor in sensors)
         self.state = VerdictState()
 
     def reset(self, *, anywhere: bool = False) -> None:
@@ -125,7 +126,7 @@ class Verdict:
     @property
     def wrong(self) -> float:
         """Probability that another place is right, by the scans; 0 for sensors without a map."""
-        return self.state.belief.wrong if self._informed else 0.0
+        return self.state.belief.wrong if self.informed else 0.0
 
     def judge(self, pose: np.ndarray, covariance: np.ndarray, readings: Mapping[int, tuple[Any, ...]]) -> float:
         """Judge a pose by the last readings, once for each correction.

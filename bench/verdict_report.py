@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import itertools
 import json
 
 import numpy as np
@@ -47,7 +48,7 @@ def figures(found):
     """Return figures of runs."""
     parts = [(rows, *labelled(job, rows)) for job, rows in found]
     rows = np.concatenate([part[0] for part in parts])
-    near, off, late = (np.concatenate([part[k] for part in parts]) for k in (1, 2, 3))
+    near, late = (np.concatenate([part[k] for part in parts]) for k in (1, 3))
     p, word = rows[:, P_LOST], rows[:, WORD]
     finals = [_final(*part) for part in parts]
     judged = [one for one in finals if one is not None]
@@ -95,7 +96,7 @@ def reliability(found):
     p = np.concatenate([part[0][:, P_LOST] for part in parts])
     near, off = (np.concatenate([part[k] for part in parts]) for k in (1, 2))
     known, result = near | off, []
-    for k, (low, high) in enumerate(zip(BINS, BINS[1:], strict=False)):
+    for k, (low, high) in enumerate(itertools.pairwise(BINS)):
         chosen = known & (p >= low) & ((p < high) | (k == len(BINS) - 2))
         result.append((low, high, int(chosen.sum()), _share(p[chosen]), _share(off[chosen])))
     return result
@@ -107,16 +108,17 @@ def _text(value, form=".2f", scale=100.0):
 
 def _line(name, r):
     return (
-        f"| {name} | {r['runs']} | {_text(r['false'])} | {_text(r['not_tracking'])} | {_text(r['missed'])} | "
+        f"| {name} | {r['runs']} | {_text(r['false'])} | {_text(r['false_word'])} | {_text(r['not_tracking'])} | "
+        f"{_text(r['missed'])} | "
         f"{_text(r['missed_tracking'])} | {r['finals'] - r['finals_wrong']} of {r['finals']} | "
         f"{_text(r['auroc'], '.4f', 1.0)} |"
     )
 
 
 _HEAD = (
-    "| runs of | runs | false alarms [%] | right, not tracking [%] | missed [%] | missed, tracking [%] | last verdict right "
-    "| AUROC |",
-    "| --- | --- | --- | --- | --- | --- | --- | --- |",
+    "| runs of | runs | false alarms [%] | said 'lost' [%] | right, not tracking [%] | missed [%] "
+    "| missed, tracking [%] | last verdict right | AUROC |",
+    "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
 )
 
 

@@ -1,12 +1,13 @@
-"""The verdict of a filter, said against happened: people, moved walls, glass, wrong maps and jumps, logs and simulation.
+"""The verdict of a filter, said against happened: people, moved walls, glass, wrong maps and jumps.
 
 The logs of the data folder are split by name before any run: alternate ones are "tuning" and "held out"
 (``verdict_runs.TUNING``, ``HELD_OUT``). Constants of the verdict were chosen on simulated runs
 (``bench/studies/verdict_fit.py``) and looked at on the tuning half; the table has both halves side by side.
 
-A false alarm is a scan with p_lost above 0.5 whose pose is within 1 m and 0.5 rad of the reference. A miss is a scan with
-p_lost of at most 0.5 whose pose has been more than 2 m off, or on a wrong map, for more than 20 scans. A shard writes
-its runs to a file; ``--join`` makes the page of all shards.
+A false alarm is a scan with p_lost above 0.5 whose pose is within 1 m and 0.5 rad of the reference, for a wide cloud or
+contradicting scans; the next column counts those with the verdict "lost" alone. A miss is a scan
+with p_lost of at most 0.5 whose pose has been more than 2 m off, or on a wrong map, for more than 20 scans. A shard
+writes its runs to a file; ``--join`` makes the page of all shards.
 
     python bench/studies/verdict.py --shard 1/16 --seeds 4 --maps 10 --simulated 2000 --raw shard_1.npz
     python bench/studies/verdict.py --join shard_*.npz --out bench/results/verdict_cpu.json

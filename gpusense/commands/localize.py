@@ -42,9 +42,9 @@ of reference poses inside the 50, 80 and 95 % regions of the estimate. A rank is
 reference pose, to its right, or clockwise of it: many near 0 and 100 % are overconfidence. NEES is the squared distance
 of a reference pose in deviations.
 
-The verdict at the end does not need reference poses. It is 'tracking'; 'uncertain', where the particles lie apart or the
-scans leave doubt; or 'lost', where scans contradict the pose, as beams that pass through walls do on a wrong map. p_lost
-is the probability that the pose is off by more than 1 m or 0.5 rad. Evidence and the likely cause are printed with it.
+The verdict at the end does not need reference poses. It is 'tracking'; 'uncertain', where the particles lie apart or
+the scans leave doubt; or 'lost', where scans contradict the pose, as beams that pass through walls do on a wrong map.
+p_lost is the probability that the pose is off by more than 1 m or 0.5 rad. Evidence and the likely cause follow it.
 
 Ctrl-C ends the run with the results so far, and writes the files.
 

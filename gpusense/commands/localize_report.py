@@ -146,7 +146,7 @@ def _verdict(result: dict[str, Any], deviations: list[float]) -> str:
     evidence = result["evidence"]["text"]
     if result["verdict"] == "lost":
         return f"LOST, {p_lost}: {evidence}"
-    wide = "the particles lie {:.1f} m and {:.2f} rad apart; ".format(max(deviations[:2]), deviations[2])
+    wide = f"the particles lie {max(deviations[:2]):.1f} m and {deviations[2]:.2f} rad apart; "
     return f"UNCERTAIN, {p_lost}: {wide if result['p_lost'] > 0.5 else ''}{evidence}"
 
 

@@ -57,7 +57,7 @@ class Track:
 
     @property
     def verdict(self) -> Word:
-        """Verdict at the end: the most frequent one of the last tenth of the scans, at most 10; of equal ones the worse."""
+        """Most frequent verdict of the last tenth of the scans, at most 10 of them; the worse of equal ones."""
         tail = self.verdicts[-min(max(len(self.verdicts) // 10, 1), _TAIL) :]
         return max(WORDS, key=lambda word: (tail.count(word), WORDS.index(word)))
 

@@ -29,7 +29,7 @@ from typing import NamedTuple
 START = 0.1
 PER_SCAN, PER_METRE, FOUND, WIDE = 1e-3, 2e-3, 0.003, 0.05
 # Correlation of the ratios of two scans at one place, and the way in which it falls to 1 / e [m, rad].
-STAYS, LENGTH, TURN = 0.95, 1.5, 1.0
+STAYS, LENGTH, TURN = 0.95, 2.0, 1.0
 # Longest way from one scan to the next that counts [m]; a longer one is a jump of the localiser.
 _FASTEST = 1.0
 

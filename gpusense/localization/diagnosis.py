@@ -69,7 +69,7 @@ class Diagnosis:
     cause: Cause = "unknown"
 
     @property
-    def told(self) -> int:
+    def counted(self) -> int:
         """Number of beams that tell anything."""
         return self.agree + self.through + self.short
 
@@ -85,13 +85,13 @@ class Diagnosis:
         return "; ".join([*parts, f"likely cause: {cause}"] if cause else parts)
 
     def _beams(self) -> str:
-        if not self.told:
+        if not self.counted:
             return "no beam meets mapped cells that tell anything"
         met = self.agree + self.through
         if self.through and 10 * self.through >= met:
             at = "" if self.place is None else ", most near x = {:.1f}, y = {:.1f}".format(*self.place)
             return f"{100 * self.through / met:.0f} % of the beams that meet walls pass through them{at}"
-        return f"{100 * self.agree / self.told:.0f} % of the beams agree with the map"
+        return f"{100 * self.agree / self.counted:.0f} % of the beams agree with the map"
 
     def _cause(self) -> str:
         if self.cause == "start" and self.elsewhere is not None:
@@ -121,10 +121,10 @@ def diagnose(
     """
     scans = sightings(sensors, readings, pose, _STILL)
     found = evidence_of(scans)
-    if not found.told and not (found.inside or found.off):
+    if not found.counted and not (found.inside or found.off):
         return found
     if _fits(scans) or ratio_of_scan(scans) < 0:
-        crowded = found.short > _CROWD * found.told
+        crowded = found.short > _CROWD * found.counted
         return replace(found, cause="people" if crowded else "none")
     if random_poses is None:
         return found

@@ -150,8 +150,8 @@ class Verdict:
         elif is_wide(covariance):
             belief = belief.judged((x, y, theta), math.nan)
         else:
-            told = [ratio_of_scan(scans), float(np.mean(state.ratios)) if state.ratios else math.nan]
-            known = [ratio for ratio in told if not math.isnan(ratio)]
+            ratios = [ratio_of_scan(scans), float(np.mean(state.ratios)) if state.ratios else math.nan]
+            known = [ratio for ratio in ratios if not math.isnan(ratio)]
             belief = belief.judged((x, y, theta), sum(known) if known else math.nan)
         self.state = state._replace(belief=belief, judged=state.corrections, explained=explained, ratios=())
         return explained

@@ -39,7 +39,7 @@ def test_right_poses_are_tracked_and_wrong_ones_lost(model):
     monitor, found = watched(model, POSES, scans)
     assert all(one.verdict == "tracking" for one in found) and found[-1].p_lost < 0.02 and found[-1].explained > 0.95
     assert monitor.diagnose().cause == "none" and "agree with the map" in str(monitor.diagnose())
-    monitor, found = watched(model, [pose + (3.5, 2.0, 1.5) for pose in POSES], scans)
+    monitor, found = watched(model, [pose + np.array([3.5, 2.0, 1.5]) for pose in POSES], scans)
     assert found[-1].verdict == "lost" and found[-1].lost and found[-1].p_lost > 0.9 and found[-1].explained < 0.5
     told = monitor.diagnose()
     assert told.cause == "start" and math.dist(told.elsewhere[:2], POSES[-1][:2]) < 0.3
@@ -56,7 +56,7 @@ def test_another_map_and_another_mount_are_told_apart(model):
     assert found[-1].verdict == "lost" and monitor.diagnose().cause == "map"
     assert "% of the beams that meet walls pass through them, most near x = " in monitor.diagnose().text
     # The laser is turned by 90 degrees, or upside down.
-    turned = [scan_at(pose + (0.0, 0.0, math.pi / 2)) for pose in POSES]
+    turned = [scan_at(pose + np.array([0.0, 0.0, math.pi / 2])) for pose in POSES]
     monitor, found = watched(model, POSES, turned)
     assert found[-1].verdict == "lost" and monitor.diagnose().cause == "mount"
     assert monitor.diagnose().turned == pytest.approx(math.pi / 2, abs=0.1)
@@ -86,7 +86,7 @@ def test_covariances(model):
 def test_state_and_reset(model):
     scans = [scan_at(pose) for pose in POSES]
     monitor, found = watched(model, POSES, scans)
-    state, wrong = monitor.state, POSES[-1] + (3.5, 2.0, 1.5)
+    state, wrong = monitor.state, POSES[-1] + np.array([3.5, 2.0, 1.5])
     first = monitor.update(wrong, scans[-1])
     monitor.state = state
     assert monitor.update(wrong, scans[-1]) == first
@@ -116,7 +116,7 @@ def test_several_sensors_and_landmarks():
         for pose in POSES:
             d = points - pose[:2]
             seen = np.column_stack([np.hypot(*d.T), gs.wrap_angle(np.arctan2(d[:, 1], d[:, 0]) - pose[2])])
-            found = monitor.update(pose + (off, off, 0.0), {front: scan_at(pose), landmarks: (seen,)})
+            found = monitor.update(pose + np.array([off, off, 0.0]), {front: scan_at(pose), landmarks: (seen,)})
         assert found.verdict == word
     # Landmarks alone, with a covariance of 0.
     for off, word in ((0.0, "tracking"), (2.5, "lost")):
@@ -124,7 +124,7 @@ def test_several_sensors_and_landmarks():
         for pose in POSES:
             d = points - pose[:2]
             seen = np.column_stack([np.hypot(*d.T), gs.wrap_angle(np.arctan2(d[:, 1], d[:, 0]) - pose[2])])
-            found = monitor.update(pose + (off, off, 0.0), (seen,))
+            found = monitor.update(pose + np.array([off, off, 0.0]), (seen,))
         assert found.verdict == word and math.isnan(found.explained)
 
 

@@ -364,7 +364,7 @@ def test_the_watcher_publishes_the_verdict(watcher: ModuleType, conversions: Mod
     assert not step(0.5, truth, truth) and own.status(0.6)["level"] == 3
     own.set_map(message)
     for k in range(5):
-        assert step(1.0 + k, truth + (0.1 * k, 0.0, 0.0), truth + (0.1 * k, 0.0, 0.0))
+        assert step(1.0 + k, truth + np.array([0.1 * k, 0.0, 0.0]), truth + np.array([0.1 * k, 0.0, 0.0]))
     status = own.status(5.5)
     assert status["level"] == 0 and status["message"] == "tracking"
     assert status["values"][0]["key"] == "p_lost" and float(status["values"][0]["value"]) < 0.05
@@ -374,7 +374,7 @@ def test_the_watcher_publishes_the_verdict(watcher: ModuleType, conversions: Mod
     own.reset()
     assert own.status(6.0)["level"] == 3
     for k in range(8):
-        assert step(7.0 + k, truth + (0.1 * k, 0.0, 0.0), truth + (1.8 + 0.1 * k, 1.5, 2.0))
+        assert step(7.0 + k, truth + np.array([0.1 * k, 0.0, 0.0]), truth + np.array([1.8 + 0.1 * k, 1.5, 2.0]))
     status = own.status(15.0)
     assert status["level"] == 2 and status["message"].startswith("lost: ") and "likely cause" in status["message"]
     # No scan of this time, and a scan that breaks a rule.

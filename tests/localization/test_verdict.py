@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense.localization.belief import FOUND, PER_METRE, PER_SCAN, STAYS, Belief
+from gpusense.localization.belief import FOUND, LENGTH, PER_METRE, PER_SCAN, STAYS, Belief
 from gpusense.localization.passages import AGREES, NOTHING, SHORT, THROUGH, VANISHED, passages
 from gpusense.localization.ratio import LIMITS, explained_of_scan, ratio_of_scan
 from gpusense.localization.spread import share_off, share_off_of
@@ -45,13 +45,13 @@ def test_beams_of_the_right_pose_agree_and_those_through_walls_do_not():
     agree, short, through, vanished, _ = kinds(POSE, ranges)
     assert agree >= 29 and short == through == vanished == 0
     # 5 cm and 1 degree off are no contradiction, nor is a person.
-    assert kinds(POSE + (0.05, 0.0, 0.017), ranges)[2] == 0
+    assert kinds(POSE + np.array([0.05, 0.0, 0.017]), ranges)[2] == 0
     hidden = ranges.copy()
     hidden[20:40] = 0.6
     agree, short, through, _, _ = kinds(POSE, hidden)
     assert 8 <= short <= 10 and through == 0 and agree >= 19
     # Behind the wall at x = 5 the same scan passes through it.
-    elsewhere = kinds(POSE + (3.5, 0.0, 0.0), ranges)
+    elsewhere = kinds(POSE + np.array([3.5, 0.0, 0.0]), ranges)
     assert elsewhere[2] >= 10
 
 
@@ -91,7 +91,7 @@ def test_a_diagonal_pair_of_walls_stops_a_beam():
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (5e6, -3e6, 0.7)])
 def test_the_map_may_lie_anywhere_and_be_turned(origin):
     grid = gs.OccupancyGrid(house().cells, 0.1, origin)
-    place = gs.compose_poses(np.array(origin), POSE + (0.6, 0.6, 0.0))
+    place = gs.compose_poses(np.array(origin), POSE + np.array([0.6, 0.6, 0.0]))
     assert kinds(place, scan_at(POSE), grid) == kinds(POSE, scan_at(POSE))
 
 
@@ -109,7 +109,7 @@ def test_the_ratio_ignores_short_beams_and_has_limits():
     one = ratio_of_scan([passages(GRID, SCANNER, POSE, right)])
     two = ratio_of_scan([passages(GRID, SCANNER, POSE, hidden)])
     assert one == two == LIMITS[0]
-    elsewhere = ratio_of_scan([passages(GRID, SCANNER, POSE + (3.5, 0.0, 0.0), right)])
+    elsewhere = ratio_of_scan([passages(GRID, SCANNER, POSE + np.array([3.5, 0.0, 0.0]), right)])
     assert 0 < elsewhere <= LIMITS[1]
     assert math.isnan(ratio_of_scan([])) and math.isnan(explained_of_scan([]))
     nothing = passages(GRID, SCANNER, POSE, np.full(64, np.nan))
@@ -121,7 +121,7 @@ def test_the_belief_is_the_exact_filter_of_two_states():
     rng = np.random.default_rng(0)
     for gap in (0.0, 0.5, 2.0):
         # Ratios of N(+-m, 2 m) are those of normal data; a way of `gap` between the scans gives their correlation.
-        rho, mean = STAYS * math.exp(-gap / 1.5), 1.3
+        rho, mean = STAYS * math.exp(-gap / LENGTH), 1.3
         ratios = rng.normal(mean, math.sqrt(2 * mean), 6)
         covariance = 2 * mean * rho ** np.abs(np.subtract.outer(np.arange(6), np.arange(6)))
         exact = 2 * mean * np.ones(6) @ np.linalg.solve(covariance, ratios)
@@ -211,13 +211,13 @@ def circle(count, step=0.15):
 
 def test_a_carried_robot_is_lost_within_a_few_scans(model):
     poses = circle(20)
-    scans = [scan_at(pose if k < 10 else pose + (3.5, 2.0, 1.0)) for k, pose in enumerate(poses)]
+    scans = [scan_at(pose if k < 10 else pose + np.array([3.5, 2.0, 1.0])) for k, pose in enumerate(poses)]
     pf, found = followed(model, poses, scans)
     assert all(one.verdict == "tracking" and one.p_lost < 0.05 for one in found[:10])
     assert found[-1].verdict == "lost" and found[-1].lost and found[-1].p_lost > 0.9
     # The evidence names the robot's place.
     told = pf.diagnose()
-    assert told.cause == "start" and math.dist(told.elsewhere[:2], (poses[-1] + (3.5, 2.0, 0.0))[:2]) < 0.3
+    assert told.cause == "start" and math.dist(told.elsewhere[:2], (poses[-1] + np.array([3.5, 2.0, 0.0]))[:2]) < 0.3
 
 
 def test_people_and_a_state_that_is_put_back(model):
@@ -235,7 +235,7 @@ def test_people_and_a_state_that_is_put_back(model):
     # An estimate judges a correction once.
     assert pf._verdict.state == state and again.p_lost == found[-1].p_lost
     kept = dataclasses.replace(again)
-    pf.correct(scan_at(poses[-1] + (3.5, 2.0, 1.0)))
+    pf.correct(scan_at(poses[-1] + np.array([3.5, 2.0, 1.0])))
     pf.estimate()
     assert pf._verdict.state != state
     pf._verdict.state = state

@@ -2,8 +2,8 @@
 
 Each run has people, moved and new furniture, glass, another building or a jump at random, and 16 to 360 beams. The
 beams of each scan are judged at the estimate, if it is not wide. A logistic regression with half of the weight for
-wrong poses gives the coefficients. The table compares fitted ratios with those of the counts in bins, and the correlation of
-ratios with the way between their scans. Poses between 0.5 and 1 m off are left out.
+wrong poses gives the coefficients. The tables compare fitted ratios with those of the counts in bins, and the
+correlation of ratios with the way between their scans. Poses between 0.5 and 1 m off are left out.
 
     python bench/studies/verdict_fit.py --runs 200 --out bench/results/verdict_fit.json
 """
@@ -104,7 +104,8 @@ def main() -> None:
     shorts = weight * np.log((short + 0.5) / (agree + 0.5))
     with_short = regression(np.column_stack([weight, weight * feature, shorts]), wrong)
     ratio = weight * (bias + slope * feature)
-    lines = [f"BIAS {bias:.2f}, SLOPE {slope:.2f}; with the short beams {', '.join(f'{v:.2f}' for v in with_short)}", "",
+    three = ", ".join(f"{value:.2f}" for value in with_short)
+    lines = [f"BIAS {bias:.2f}, SLOPE {slope:.2f}; with the short beams {three}", "",
              f"{len(rows)} scans of {args.runs} runs, {100 * wrong.mean():.0f} % at wrong poses", "",
              "| fitted ratio | right | wrong | ratio of the counts |", "| --- | --- | --- | --- |"]  # fmt: skip
     for low, high in itertools.pairwise(EDGES):

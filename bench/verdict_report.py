@@ -122,7 +122,14 @@ _HEAD = (
 )
 
 
-def write(files, out, command):
+def commands(files):
+    """Return the commands that made shards."""
+    for file in files:
+        with np.load(file) as data:
+            yield str(data["command"])
+
+
+def write(files, out):
     """Print the page of shards, and write it with its figures."""
     found = read(files)
     groups = {name: [one for one in found if one[0]["group"] == name] for name in ("tuning", "held out", "simulated")}
@@ -154,7 +161,9 @@ def write(files, out, command):
         lines.append(f"| {BINS[k]} to {BINS[k + 1]} | {' | '.join(cells)} |")
     print("\n".join(lines))
     if out is not None:
-        document = dict(machine=machine(), command=command, figures=result, roc=curves, reliability=bins)
+        made = list(commands(files))
+        document = dict(machine=machine(), commands=made, figures=result, roc=curves, reliability=bins)
         out.write_text(json.dumps(document, indent=1))
         table = "\n".join(lines)
-        out.with_suffix(".md").write_text(f"{machine_line()}\n\n`python {command}`\n\n{table}\n")
+        text = "\n".join(f"`python {command}`\\" for command in made)
+        out.with_suffix(".md").write_text(f"{machine_line()}\n\n{text}\n`--join`\n\n{table}\n")

@@ -152,7 +152,9 @@ def run_shard(args):
                                beams=args.beams, seed=job[-1]))  # fmt: skip
             kept.append(repr(job))
     lengths = np.array([len(one) for one in rows])
-    np.savez_compressed(args.raw, jobs=np.array(kept), lengths=lengths, rows=np.concatenate(rows).astype(np.float32))
+    options = [word for k, word in enumerate(sys.argv) if k and "--raw" not in sys.argv[k - 1 : k + 1]]
+    np.savez_compressed(args.raw, jobs=np.array(kept), lengths=lengths, rows=np.concatenate(rows).astype(np.float32),
+                        command=" ".join(["bench/studies/verdict.py", *options]))  # fmt: skip
     print(f"{len(kept)} runs, {lengths.sum()} scans in {time.time() - begin:.0f} s: {args.raw}")
 
 
@@ -182,7 +184,7 @@ def main() -> None:
     if args.join is None:
         run_shard(args)
         return
-    write(args.join, args.out, " ".join(["bench/studies/verdict.py", *sys.argv[1:]]))
+    write(args.join, args.out)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import recordings
 
 import gpusense as gs
 from gpusense.evaluation.steps import read_steps
-from gpusense.evaluation.tracking import START
+from gpusense.evaluation.tracking import START as START
 from gpusense.localization.pose_algebra import compose_poses
 
 # Names of the logs in the data folder; intel-rawodom is a part of intel, and the lasers of jarvis are one log.
@@ -54,8 +54,8 @@ def parts_of(log):
 def crowded(events, bearings, share, rng):
     """Return events in which people hide a share of the beams on average.
 
-    A person covers 10 to 25 degrees at 0.4 to 2.5 m, walks around the robot by a few degrees a scan, and stays for 10 to
-    40 scans. Their number is the share times the field of view by the mean width.
+    A person covers 10 to 25 degrees at 0.4 to 2.5 m, walks around the robot by a few degrees a scan, and stays for 10
+    to 40 scans. Their number is the share times the field of view by the mean width.
     """
     if not share:
         return events
@@ -102,7 +102,7 @@ def rearranged(grid, share, rng, *, shift=(0.3, 1.0), gone=0.0):
     rng.shuffle(blocks)
     moves = []
     for r, c in blocks[: round(share * len(blocks))]:
-        own = np.argwhere(old[r : r + side, c : c + side]) + (r, c)
+        own = np.argwhere(old[r : r + side, c : c + side]) + np.array([r, c])
         cells[own[:, 0], own[:, 1]] = 0
         angle, distance = rng.uniform(-math.pi, math.pi), rng.uniform(*shift) / grid.resolution
         if rng.random() >= gone:

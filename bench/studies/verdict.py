@@ -1,87 +1,190 @@
-"""Shares of beams that poses explain, on the right map and on a wrong one: where a filter counts as lost.
+"""The verdict of a filter, said against happened: people, moved walls, glass, wrong maps and jumps.
 
-On the right map the pose is the likeliest of 500 near the reference, on a wrong one the likeliest of 4 000 anywhere and
-2 000 around that one. The filter averages shares over five scans or so.
+The logs of the data folder are split by name before any run: alternate ones are "tuning" and "held out"
+(``verdict_runs.TUNING``, ``HELD_OUT``). Constants of the verdict were chosen on simulated runs
+(``bench/studies/verdict_fit.py``) and looked at on the tuning half; the table has both halves side by side.
 
-    python bench/studies/verdict.py --out bench/results/verdict_cpu.json
+A false alarm is a scan with p_lost above 0.5 whose pose is within 1 m and 0.5 rad of the reference, for a wide cloud or
+contradicting scans; the next column counts those with the verdict "lost" alone. A miss is a scan
+with p_lost of at most 0.5 whose pose has been more than 2 m off, or on a wrong map, for more than 20 scans. A shard
+writes its runs to a file; ``--join`` makes the page of all shards.
+
+    python bench/studies/verdict.py --shard 1/16 --seeds 4 --maps 10 --simulated 2000 --raw shard_1.npz
+    python bench/studies/verdict.py --join shard_*.npz --out bench/results/verdict_cpu.json
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+import itertools
+import math
 import sys
+import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "accuracy"))
 
 import numpy as np
 import recordings
-from localization_logs import makers
+import verdict_runs as runs
+from verdict_report import write
 
-from gpusense.evaluation.machine import machine, machine_line
-from gpusense.localization import starts
-from gpusense.localization.verdict import explained_share
+import gpusense as gs
+from gpusense._util.progress import progress
 
-# Map of another log for each.
-WRONG = {
-    "intel": "csail", "csail": "aces", "fr079": "intel", "aces": "fr079", "jarvis-s3000": "intel", "olin": "csail",
-}  # fmt: skip
-ANYWHERE, AROUND, NEAR = 4000, 2000, 500
-LEVELS = (5, 25, 50, 75, 95)
-
-
-def likeliest(model, ranges, centre, deviations, count, rng):
-    """Return the likeliest of normal poses around a pose."""
-    poses = centre + rng.normal(0, deviations, (count, 3))
-    return poses[np.argmax(model.log_likelihood(poses, ranges))]
+SHARES = (0.0, 0.1, 0.3)
+CASES = ("own", "kidnapped", "wrong")
+GROUPS = ("tuning", "held out", "simulated")
+WORDS = ("tracking", "uncertain", "lost")
+SCANS, EVERYWHERE = 70, 5000
 
 
-def shares(model, events, *, right, rng):
-    """Return the explained share of each scan."""
-    pool, spread = starts.free_pool([model], None)
-    anywhere, result = starts.spread(pool, spread, ANYWHERE, (1, 2, 3)), []
-    for event in events:
-        terms = np.asarray(model.log_likelihood(anywhere, event.ranges, per_beam=True)[1], np.float64)
-        if right:
-            pose = likeliest(model, event.ranges, event.truth, (0.05, 0.05, 0.01), NEAR, rng)
-        else:
-            best = anywhere[np.argmax(terms.sum(axis=1))]
-            pose = likeliest(model, event.ranges, best, (0.1, 0.1, 0.05), AROUND, rng)
-        at = np.asarray(model.log_likelihood(pose[None], event.ranges, per_beam=True)[1], np.float64)[0]
-        result.append(explained_share(at, terms[:64]))
-    return np.array(result)
+def follow(places, events, start, *, backend, particles, kind, beams, seed):
+    """Return a row for each scan: errors, p_lost, word, ratio, whether wide, pose.
+
+    Args:
+        places: A map and a scanner for each laser.
+        events: Scans with odometry and references.
+        start: Pose to begin around, or None to begin anywhere.
+        backend: The device.
+        particles: Their number.
+        kind: "field", "beam" or "discrete".
+        beams: Beams of a scan that the filter uses.
+        seed: Seed of the filter.
+    """
+    make = recordings.makers(kind, backend, beams)
+    models = [make(grid, scanner) for grid, scanner in places]
+    pf = gs.ParticleFilter(models, particles=particles, seed=seed)
+    if start is None:
+        pf.initialize_uniform()
+    else:
+        pf.initialize(mean=start, covariance=np.diag(np.square(runs.START)))
+    rows = []
+    for before, event in zip([None, *events], events, strict=False):
+        if before is not None:
+            pf.predict(before.odometry, event.odometry)
+        pf.correct({models[event.scanner]: event.ranges})
+        e = pf.estimate()
+        d = e.pose - event.truth
+        belief, word = pf._verdict.state.belief, WORDS.index(e.verdict)
+        rows.append((math.hypot(d[0], d[1]), abs(math.remainder(d[2], math.tau)), e.p_lost, word, belief.ratio,
+                     math.sqrt(e.covariance[0, 0] + e.covariance[1, 1]), *e.pose))  # fmt: skip
+    return np.array(rows)
+
+
+def jobs(args):
+    """Return all runs: (group, name, case, other map or None, people, moved, glass, seed)."""
+    found = []
+    for group, logs in (("tuning", runs.TUNING), ("held out", runs.HELD_OUT)):
+        every = [log for log in runs.LOGS if log in logs]
+        for log, people, moved, seed in itertools.product(every, SHARES, SHARES, range(args.seeds)):
+            others = [other for other in runs.LOGS if other != log]
+            rng = np.random.default_rng((runs.LOGS.index(log), round(100 * people), round(100 * moved), seed))
+            chosen = rng.permutation(others)[: args.maps].tolist()
+            for case, other in [("own", None), ("kidnapped", None), *(("wrong", one) for one in chosen)]:
+                found.append((group, log, case, other, people, moved, 0.0, seed))
+    for k in range(args.simulated):
+        rng = np.random.default_rng((99, k))
+        case = CASES[int(rng.choice(3, p=(0.5, 0.25, 0.25)))]
+        people, moved = rng.choice(SHARES, 2)
+        found.append(("simulated", "building", case, None, float(people), float(moved), float(k % 4 == 3) * 0.1, k))
+    # In any order but the same one, so that shards take equally long.
+    order = np.random.default_rng(1).permutation(len(found))
+    return [found[k] for k in order if found[k][0] in args.groups]
+
+
+def prepared(job, args):
+    """Return places, events and start of a run; None where a log has no such part."""
+    group, name, case, other, people, moved, glass, seed = job
+    rng = np.random.default_rng((7, seed, CASES.index(case), round(100 * people), round(100 * moved)))
+    if group == "simulated":
+        beams, around, step = (
+            int(rng.choice([16, 36, 180, 360])),
+            bool(rng.integers(2)),
+            float(rng.choice([0.1, 0.2, 0.3])),
+        )
+        grid, scanner, events = runs.simulated(
+            1000 + seed,
+            scans=60,
+            hidden=people,
+            moved=moved,
+            glass=glass,
+            beams=beams,
+            around=around,
+            step=step,
+            case=case,
+        )
+        return [(grid, scanner)], events, _start(case, grid, events, rng)
+    parts = runs.parts_of(name)
+    recording = runs.load(parts[seed % len(parts)])
+    events, _ = runs.window(recording.events, SCANS, rng, kidnapped=case == "kidnapped")
+    if events is None:
+        return None
+    places = recording.places
+    if other is not None:
+        places = [(runs.load(runs.parts_of(other)[0]).places[0][0], scanner) for _, scanner in places]
+    places = [(runs.rearranged(grid, moved, rng), scanner) for grid, scanner in places]
+    events = runs.crowded(events, places[0][1].bearings, people, rng)
+    return places, events, _start(case, places[0][0], events, rng)
+
+
+def _start(case, grid, events, rng):
+    """Return where a run begins: at the reference; on a wrong map anywhere, or around a free pose."""
+    if case != "wrong":
+        return events[0].truth
+    return None if rng.integers(2) else gs.worlds.free_pose(grid, rng, 0.2)
+
+
+def run_shard(args):
+    """Run the jobs of a shard and write their rows."""
+    first, count = args.shard
+    chosen = jobs(args)[first - 1 :: count][: args.limit]
+    kept, rows, begin = [], [], time.time()
+    with progress(len(chosen)) as step:
+        for job in chosen:
+            step(f"{job[1]} {job[2]}")
+            made = prepared(job, args)
+            if made is None:
+                continue
+            places, events, start = made
+            particles = EVERYWHERE if start is None else args.particles
+            rows.append(follow(places, events, start, backend=args.backend, particles=particles, kind=args.model,
+                               beams=args.beams, seed=job[-1]))  # fmt: skip
+            kept.append(repr(job))
+    lengths = np.array([len(one) for one in rows])
+    options = [word for k, word in enumerate(sys.argv) if k and "--raw" not in sys.argv[k - 1 : k + 1]]
+    np.savez_compressed(args.raw, jobs=np.array(kept), lengths=lengths, rows=np.concatenate(rows).astype(np.float32),
+                        command=" ".join(["bench/studies/verdict.py", *options]))  # fmt: skip
+    print(f"{len(kept)} runs, {lengths.sum()} scans in {time.time() - begin:.0f} s: {args.raw}")
+
+
+def _shard(text):
+    first, count = map(int, text.split("/"))
+    if not 1 <= first <= count:
+        raise argparse.ArgumentTypeError(f"must be i/n with 1 <= i <= n, got {text}")
+    return first, count
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--backend", default="opencl")
-    parser.add_argument("--logs", nargs="+", default=list(WRONG), choices=list(WRONG))
-    parser.add_argument("--models", nargs="+", default=["field", "beam", "discrete"])
+    parser.add_argument("--model", default="field", choices=("field", "beam", "discrete"))
+    parser.add_argument("--particles", type=int, default=500)
     parser.add_argument("--beams", type=int, default=60)
-    parser.add_argument("--scans", type=int, default=40, help="scans of each log, evenly")
-    parser.add_argument("--out", type=Path, help="a .json file; the table goes to the .md file beside it")
+    parser.add_argument("--seeds", type=int, default=1, help="windows of each log and setting")
+    parser.add_argument("--maps", type=int, default=2, help="other maps of each log and setting")
+    parser.add_argument("--simulated", type=int, default=300, help="simulated runs")
+    parser.add_argument("--groups", nargs="+", default=list(GROUPS), choices=GROUPS)
+    parser.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N")
+    parser.add_argument("--limit", type=int, help="most runs of the shard")
+    parser.add_argument("--raw", type=Path, default=Path("verdict_shard.npz"), help="file of the shard's runs")
+    parser.add_argument("--join", type=Path, nargs="+", help="files of shards to report on")
+    parser.add_argument("--out", type=Path, help="a .json file; the page goes to the .md file beside it")
     args = parser.parse_args()
-    rng, results = np.random.default_rng(0), []
-    lines = [f"| log | model | map | {', '.join(map(str, LEVELS))} % of the shares |", "| --- | --- | --- | --- |"]
-    for name in args.logs:
-        recording, other = recordings.load(name), recordings.load(WRONG[name])
-        chosen = np.linspace(20, len(recording.events) - 1, args.scans).astype(int)
-        events = [recording.events[k] for k in chosen]
-        scanner = recording.places[0][1]
-        for kind in args.models:
-            for which, grid in (("right", recording.places[0][0]), ("wrong", other.places[0][0])):
-                model = makers(kind, args.backend, args.beams)(grid, scanner)
-                levels = np.percentile(shares(model, events, right=which == "right", rng=rng), LEVELS).round(2)
-                results.append(dict(log=name, model=kind, map=which, levels=levels.tolist()))
-                lines.append(f"| {name} | {kind} | {which} | {', '.join(f'{v:.2f}' for v in levels)} |")
-                print(lines[-1], flush=True)
-    if args.out is not None:
-        command = " ".join(["bench/studies/verdict.py", *sys.argv[1:]])
-        args.out.write_text(json.dumps(dict(machine=machine(), command=command, results=results), indent=1))
-        table = "\n".join(lines)
-        args.out.with_suffix(".md").write_text(f"{machine_line()}\n\n`python {command}`\n\n{table}\n")
+    if args.join is None:
+        run_shard(args)
+        return
+    write(args.join, args.out)
 
 
 if __name__ == "__main__":

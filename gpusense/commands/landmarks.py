@@ -213,7 +213,7 @@ def _verdict(track: Track) -> str:
     s = track.summary()
     if s["gain_last"] is None:
         return "none: too few scans with readings"
-    share = f"the particles predict a reading {s['gain_last']:.1f} nats better than chance"
+    share = f"the particles predict a reading {s['gain_last']:.1f} nats better than chance; p_lost {s['p_lost']:.2g}"
     if track.lost:
         return f"LOST since {s['lost_since']:.0f} s: {share}; is this the map of the run, and --drift large enough?"
     before = f"; lost in {s['scans_lost']} scans before" if s["scans_lost"] else ""

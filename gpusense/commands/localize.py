@@ -41,15 +41,17 @@ of reference poses inside the 50, 80 and 95 % regions of the estimate. A rank is
 reference pose, to its right, or clockwise of it: many near 0 and 100 % are overconfidence. NEES is the squared distance
 of a reference pose in deviations.
 
-The verdict at the end does not need reference poses: it is 'lost' if the estimates of the last tenth of the scans
-explain too few of their beams, as on a wrong map.
+The verdict at the end does not need reference poses. It is 'tracking'; 'uncertain', where the particles lie apart or
+the scans leave doubt; or 'lost', where scans contradict the pose, as beams that pass through walls do on a wrong map.
+p_lost is the probability that the pose is off by more than 1 m or 0.5 rad. Evidence and the likely cause follow it.
 
 A file of nav2 gives amcl's model, beams, particles, noise of the odometry, recovery and initial pose; options of this
 command come first. Its frames, topics and gates (update_min_d, update_min_a, resample_interval) have no effect.
 
 Ctrl-C ends the run with the results so far, and writes the files.
 
-Exit codes: 0 success, 1 lost at the end, or no reading there to judge by, 2 bad input, 130 interrupted, 143 terminated.
+Exit codes: 0 the verdict is 'tracking', 1 uncertain or lost at the end, or no reading there to judge by, 2 bad input,
+130 interrupted, 143 terminated.
 
 example:
   gpusense localize --map map.yaml --log run.log.gz
@@ -105,6 +107,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_seed(parser)
     add_json(parser)
     add("--tum", type=output_path(".tum", ".txt"), metavar="FILE", help="write the trajectory, as evo reads it")
+    add("--tum-from", choices=("tracking", "start"), default="tracking",
+        help="where the trajectory begins: at the first scan whose verdict is 'tracking', or at the first one "
+        "(default: %(default)s)")  # fmt: skip
     add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
         help="draw map, particles, estimated and reference poses")  # fmt: skip
     add("--record", type=output_path(".rrd"), metavar="FILE", help="record the run for the viewer Rerun")
@@ -136,7 +141,7 @@ def run(args: argparse.Namespace) -> int:
             report(args, pf, track, len(steps), recording)
         raise
     found = report(args, pf, track, len(steps), recording)
-    return LOST if found["lost"] or found["explained_at_end"] is None else 0
+    return 0 if found["verdict"] == "tracking" and found["explained_at_end"] is not None else LOST
 
 
 def _recording(args: argparse.Namespace, pf: ParticleFilter) -> Recording | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,10 @@ if TYPE_CHECKING:
     from gpusense.evaluation.tracking import Track
     from gpusense.localization.filter import ParticleFilter
     from gpusense.plots.viewer import Recording
+
+
+# Figures that are no single number.
+_NO_NUMBER = ("rank_histogram", "verdict", "evidence")
 
 
 def report(
@@ -40,9 +45,12 @@ def report(
     from gpusense.evaluation.trajectory_files import write_tum
 
     result = summary(track)
+    found = None if result["verdict"] == "tracking" else pf.diagnose()
+    result["evidence"] = None if found is None else asdict(found) | {"text": found.text}
     if args.tum is not None:
         times, indices = scan_times([step.scan.time for step in track.steps])
-        write_tum(args.tum, times, track.poses, indices=indices)
+        first = 0 if args.tum_from == "start" else _left_out(track)
+        write_tum(args.tum, times[first:], track.poses[first:], indices=indices)
     if args.plot is not None:
         _draw(args.plot, pf, track)
     if recording is not None:
@@ -61,9 +69,18 @@ def report(
     return result
 
 
+def _left_out(track: Track) -> int:
+    """Return how many scans there are before the filter has converged, and say so where there are any."""
+    first = len(track.poses) if track.converged is None else track.converged
+    if first:
+        rule = f"the first {first} of {len(track.poses)} scans, before the verdict is 'tracking', are left out"
+        print(f"gpusense: --tum: {rule}; --tum-from start writes them", file=sys.stderr)
+    return first
+
+
 def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track) -> None:
     """Print the summary."""
-    s = {name: "-" if value is None else f"{value:.4g}" for name, value in result.items() if name != "rank_histogram"}
+    s = {name: "-" if value is None else f"{value:.4g}" for name, value in result.items() if name not in _NO_NUMBER}
     print(f"{pf!r}\n")
     if result["scans"] < chosen:
         print(f"interrupted: results of {result['scans']} of {chosen} scans")
@@ -95,7 +112,7 @@ def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track
         f"effective sample size median {s['effective_sample_size_median']}\n"
         f"ms per scan           predict {s['ms_predict']}, score {s['ms_score']}, resample {s['ms_resample']}, "
         f"estimate {s['ms_estimate']}\n\n"
-        f"verdict: {_verdict(result)}\n\n{machine_line()}",
+        f"verdict: {_verdict(result, deviations)}\n\n{machine_line()}",
     )
     sys.stdout.flush()
 
@@ -108,13 +125,19 @@ def _ranks(histogram: list[float]) -> str:
     return " ".join(f"{100 * share:.0f}" for share in histogram)
 
 
-def _verdict(result: dict[str, Any]) -> str:
+def _verdict(result: dict[str, Any], deviations: list[float]) -> str:
+    """Return the verdict with its evidence, and the likely cause where there is one."""
+    p_lost = f"p_lost {result['p_lost']:.2g}"
     if result["explained_at_end"] is None:
-        return "none, no scan at the end has a reading to judge by"
-    share = f"the last estimates explain {100 * result['explained_at_end']:.0f} % of the beams of a scan"
-    if result["lost"]:
-        return f"LOST: {share}; is this the map of the log?"
-    return f"not lost: {share}"
+        return f"none, no scan at the end has a reading to judge by; {result['verdict']}, {p_lost}"
+    if result["verdict"] == "tracking":
+        share = f"{100 * result['explained_at_end']:.0f} % of the beams of the last scans agree with the map"
+        return f"not lost (tracking), {p_lost}: {share}"
+    evidence = result["evidence"]["text"]
+    if result["verdict"] == "lost":
+        return f"LOST, {p_lost}: {evidence}"
+    wide = f"the particles lie {max(deviations[:2]):.1f} m and {deviations[2]:.2f} rad apart; "
+    return f"UNCERTAIN, {p_lost}: {wide if result['p_lost'] > 0.5 else ''}{evidence}"
 
 
 def _draw(path: Path, pf: ParticleFilter, track: Track) -> None:

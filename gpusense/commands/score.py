@@ -43,12 +43,13 @@ weighted mean excludes the logged pose. Default parameters are those of BeamPara
 Beams of a scan are not independent, so the temperature multiplies their sum. By default it is calibrated: from the
 correlation of beams at the logged poses of the first 100 chosen scans. --temperature 1 is the plain product.
 
-The verdict tells whether the logged poses explain the beams of their scans, which they do not on another map.
+The verdict tells whether the logged poses explain the beams of their scans. On another map beams pass through walls:
+the message says what share of them and near which place. Between the two it is uncertain.
 
 A row is printed as soon as its scan is scored. Ctrl-C ends the run with the results so far.
 
-Exit codes: 0 success, 1 two backends rank the particles differently by more than rounding explains, or the logged poses
-do not fit the map, 2 bad input, 130 interrupted, 143 terminated.
+Exit codes: 0 the log fits the map, 1 it does not or the verdict is uncertain, or two backends rank the particles
+differently by more than rounding explains, 2 bad input, 130 interrupted, 143 terminated.
 
 example:
   gpusense score --map map.yaml --log run.log.gz --model field --particles 20000

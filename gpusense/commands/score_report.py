@@ -25,7 +25,10 @@ def print_report(
 ) -> None:
     """Print the results of all scans, or of those before an interrupt."""
     if args.json:
-        more = {"scans_chosen": chosen, "fitness": asdict(fitness) | {"fits": fitness.fits}}
+        more = {
+            "scans_chosen": chosen,
+            "fitness": asdict(fitness) | {"fits": fitness.fits, "verdict": fitness.verdict},
+        }
         print_json(_document(args, models, scores, agreements) | more)
         return
     pose = pose_name(args)
@@ -94,15 +97,21 @@ def _verdict(a: Agreement, pose: str) -> str:
 
 
 def _fitness(fitness: Fitness, pose: str) -> str:
-    if fitness.explained is None or fitness.better is None:
+    """Return the verdict of a log's poses with its evidence."""
+    if fitness.p_lost is None:
         return "none, no scan has a reading to judge by"
+    explained, better = (
+        "-" if share is None else f"{100 * share:.0f} %" for share in (fitness.explained, fitness.better)
+    )
     share = (
-        f"the {pose}s explain {100 * fitness.explained:.0f} % of the beams of a scan, and are likelier than "
-        f"{100 * fitness.better:.0f} % of poses anywhere"
+        f"the {pose}s explain {explained} of the beams of a scan, and are likelier than {better} of poses anywhere; "
+        f"p_lost {fitness.p_lost:.2g}"
     )
     if fitness.fits:
         return f"the log fits the map: {share}"
-    return f"WRONG MAP: {share}; is this the map of the log, and are its poses on the map?"
+    if fitness.verdict == "uncertain":
+        return f"UNCERTAIN: {share}; {fitness.evidence.text}"
+    return f"WRONG MAP: {share}; {fitness.evidence.text}; is this the map of the log, and are its poses on the map?"
 
 
 def number_text(value: float | None, absent: str = "-") -> str:

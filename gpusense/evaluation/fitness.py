@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gpusense.evaluation.agreement import Model
 from gpusense.evaluation.worlds import cloud_uniform
+from gpusense.localization.belief import Belief
+from gpusense.localization.diagnosis import Diagnosis, evidence_of
+from gpusense.localization.passages import Passages, passages
+from gpusense.localization.ratio import explained_of_scan, ratio_of_scan
 from gpusense.localization.temperature import BeamCorrelation, learn_from_scan
-from gpusense.localization.verdict import explained_share
+from gpusense.localization.words import LOST, TRACKING, Word
 from gpusense.logs import Scan
 
 # Random poses of a scan, and the stream of their random numbers.
 _RANDOM, _STREAM = 64, 1
-# Least share of explained beams of a log on its own map. The beam model and the field have 73 to 100 % there (intel,
-# csail, fr079, aces), and 0 to 30 % on another map. A filter's share is larger: it moves to where scans fit best.
-LEAST_EXPLAINED = 0.5
 # Least share of the random poses that a logged pose excels: 1/2 by chance.
 LEAST_BETTER = 0.9
 
@@ -28,21 +29,33 @@ class Fitness:
     """How well the logged poses explain their scans.
 
     Attributes:
-        scans: Scans with at least one beam.
+        scans: Scans that tell anything.
         explained: Median share of the beams that the logged poses explain; None without such scans.
         better: Median share of poses anywhere in the free space at which a scan is less likely, or None.
+        p_lost: Median over the scans of the probability that the logged pose is wrong, or None.
+        evidence: Beams of all scans.
     """
 
     scans: int
     explained: float | None
     better: float | None
+    p_lost: float | None
+    evidence: Diagnosis
+
+    @property
+    def verdict(self) -> Word:
+        """Return "tracking" for a log of this map, "lost" for one of another map, and "uncertain" between."""
+        if self.p_lost is None:
+            return "uncertain"
+        if self.p_lost > LOST:
+            return "lost"
+        better = self.better is None or self.better >= LEAST_BETTER
+        return "tracking" if self.p_lost <= TRACKING and better else "uncertain"
 
     @property
     def fits(self) -> bool:
-        """Tell whether the log is one of this map; True where no scan could be judged."""
-        if self.explained is None or self.better is None:
-            return True
-        return self.explained >= LEAST_EXPLAINED and self.better >= LEAST_BETTER
+        """Tell whether the log is one of this map; False where no scan could be judged."""
+        return self.verdict == "tracking"
 
 
 class FitnessOfLog:
@@ -55,28 +68,41 @@ class FitnessOfLog:
 
     def __init__(self, model: Model, *, seed: int = 0) -> None:
         self._model, self._seed = model, seed
+        self._belief = Belief()
+        self._scans: list[Passages] = []
         self._shares: list[float] = []
         self._better: list[float] = []
+        self._p_lost: list[float] = []
 
     def add(self, index: int, scan: Scan) -> float:
-        """Return the share of a scan's beams that its logged pose explains; NaN where readings do not depend on it."""
+        """Return the share of a scan's beams that its logged pose explains; NaN where the map could explain none."""
         random = np.random.default_rng((self._seed, index, _STREAM))
-        poses = np.vstack([np.array([scan.pose]), cloud_uniform(self._model.grid, _RANDOM, random)])
-        log_p, terms = self._model.log_likelihood(poses, scan.ranges, per_beam=True)
-        parts = np.asarray(terms, np.float64)
-        share = explained_share(parts[0], parts[1:])
-        # Readings that are alike at all poses, as no returns, tell nothing.
-        if np.isfinite(log_p[0]) and (log_p == log_p[0]).all():
-            return math.nan
-        if not math.isnan(share):
+        pose = np.array(scan.pose, np.float64)
+        poses = np.vstack([pose[None], cloud_uniform(self._model.grid, _RANDOM, random)])
+        log_p = self._model.log_likelihood(poses, scan.ranges)
+        found = passages(self._model.grid, scan.scanner, pose, np.asarray(scan.ranges, np.float64))
+        share, ratio = explained_of_scan([found]), ratio_of_scan([found])
+        x, y, theta = (float(value) for value in pose)
+        self._belief = self._belief.counted().judged((x, y, theta), ratio)
+        if not math.isnan(ratio):
+            self._scans.append(found)
             self._shares.append(share)
-            self._better.append(float(np.mean(log_p[1:] < log_p[0])))
+            # Readings that are equally likely or impossible everywhere tell nothing.
+            if np.isfinite(log_p).any() and (log_p != log_p[0]).any():
+                self._better.append(float(np.mean(log_p[1:] < log_p[0])))
+            self._p_lost.append(self._belief.wrong)
         return share
 
     def result(self) -> Fitness:
         """Return the judgement of the scans so far."""
-        explained, better = (float(np.median(v)) if v else None for v in (self._shares, self._better))
-        return Fitness(len(self._shares), explained, better)
+        known = [share for share in self._shares if not math.isnan(share)]
+        explained, better, p_lost = (
+            float(np.median(values)) if values else None for values in (known, self._better, self._p_lost)
+        )
+        evidence = evidence_of(self._scans)
+        if p_lost is not None and p_lost > LOST:
+            evidence = replace(evidence, cause="map")
+        return Fitness(len(self._scans), explained, better, p_lost, evidence)
 
 
 def temperature_of_log(model: Model, scans: Sequence[tuple[int, Scan]], *, most: int = 100) -> float:

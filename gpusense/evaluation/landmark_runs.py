@@ -13,6 +13,7 @@ from gpusense.learning.landmark.fit import fit_landmark_parameters
 from gpusense.learning.landmark.result import LandmarkFit
 from gpusense.learning.landmark.suspicious import Suspicions, suspicious_landmarks
 from gpusense.localization.filter import ParticleFilter
+from gpusense.localization.words import LOST
 from gpusense.logs.records import LandmarkRun
 from gpusense.models.landmark.model import LandmarkModel
 from gpusense.world.landmarks import LandmarkMap
@@ -40,7 +41,8 @@ class Track:
         degenerate: Number of scans that are impossible at every particle.
         time: (S,) time of each scan [s].
         gain: (S,) logarithm by which the particles predict recent features better than chance [nats for a feature].
-        scans_lost: (S,) verdict after each scan.
+        scans_lost: (S,) whether p_lost is above 0.5 after each scan.
+        p_lost: (S,) probability that the estimate is off by more than 1 m or 0.5 rad.
     """
 
     estimate: Floats
@@ -50,6 +52,7 @@ class Track:
     time: Floats
     gain: Floats
     scans_lost: NDArray[np.bool_]
+    p_lost: Floats
 
     @property
     def lost(self) -> bool:
@@ -68,12 +71,14 @@ class Track:
 
     def summary(self) -> dict[str, float | bool | None]:
         """Return medians, 90 % quantiles and largest errors, and the verdict."""
-        tail = self.gain[-max(len(self.time) // 10, 1) :]
+        last = max(len(self.time) // 10, 1)
+        tail = self.gain[-last:]
         return {
             "error_median": float(np.median(self.error)), "error_90": float(np.quantile(self.error, 0.9)),
             "error_max": float(self.error.max()), "heading_median": float(np.median(self.error_heading)),
             "heading_90": float(np.quantile(self.error_heading, 0.9)), "degenerate": self.degenerate,
             "lost": self.lost, "lost_since": self.lost_since, "scans_lost": int(self.scans_lost.sum()),
+            "p_lost": float(np.median(self.p_lost[-last:])),
             "gain_last": None if np.isnan(tail).all() else float(np.nanmedian(tail)),
         }  # fmt: skip
 
@@ -152,11 +157,11 @@ def localise(
     pf = ParticleFilter(model, motion=run_motion(run) if motion is None else motion, particles=particles, seed=seed)
     pf.initialize(mean=run.truth[0], covariance=np.diag([START**2, START**2, START_HEADING**2]))
     degenerate = 0
-    estimate, gain, lost = np.empty_like(run.truth), np.empty(len(run.time)), np.zeros(len(run.time), np.bool_)
+    estimate, gain, p_lost = np.empty_like(run.truth), np.empty(len(run.time)), np.empty(len(run.time))
     rows = {int(run.scan[first]): slice(first, last) for first, last in _scans(run)}
     for s in range(len(run.time)):
         if step is not None and s % 100 == 0:
-            step(f"scan {s}" + (", lost" if s and lost[s - 1] else ""))
+            step(f"scan {s}" + (", lost" if s and p_lost[s - 1] > LOST else ""))
         if s:
             pf.predict(run.odometry[s - 1], run.odometry[s], float(run.time[s] - run.time[s - 1]))
         if s in rows:
@@ -164,15 +169,16 @@ def localise(
             pf.correct((features, ids))
         found = pf.estimate()
         degenerate += found.degenerate and s in rows
-        estimate[s], gain[s], lost[s] = found.pose, pf.gain, found.lost
-    return _track(run, estimate, degenerate, gain, lost)
+        estimate[s], gain[s], p_lost[s] = found.pose, pf.gain, found.p_lost
+    return _track(run, estimate, degenerate, gain, p_lost)
 
 
-def _track(run: LandmarkRun, estimate: Floats, degenerate: int, gain: Floats, lost: NDArray[np.bool_]) -> Track:
+def _track(run: LandmarkRun, estimate: Floats, degenerate: int, gain: Floats, p_lost: Floats) -> Track:
     """Return a filter's result with its errors against the logged poses."""
     away = estimate - run.truth
     turn = np.abs(np.arctan2(np.sin(away[:, 2]), np.cos(away[:, 2])))
-    return Track(estimate, np.hypot(away[:, 0], away[:, 1]), turn, degenerate, run.time, gain, lost)
+    position = np.hypot(away[:, 0], away[:, 1])
+    return Track(estimate, position, turn, degenerate, run.time, gain, p_lost > LOST, p_lost)
 
 
 def _scans(run: LandmarkRun) -> list[tuple[int, int]]:

@@ -16,10 +16,13 @@ from gpusense.evaluation.steps import Step, repeats_odometry
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.filter import ParticleFilter
 from gpusense.localization.pose_algebra import pose_difference, wrap_angle
+from gpusense.localization.words import WORDS, Word
 
 Floats = NDArray[np.float64]
 # A track has converged where the next scans are within these of the truth [m, rad].
 CONVERGED, CONVERGED_TURN, CONVERGED_SCANS = 1.0, math.radians(20), 5
+# Most scans from which the verdict at the end is taken.
+_TAIL = 10
 # Deviations of a tracking start: x, y [m] and heading [rad].
 START = DEFAULTS.start
 
@@ -34,7 +37,8 @@ class Track:
         covariances: Their covariances.
         ranks: Ranks of the reference poses among the particles (:func:`rank_of`), of the steps that have one.
         sizes: Effective sample sizes.
-        lost: Verdicts.
+        p_lost: Probabilities that the estimates are off by more than 1 m or 0.5 rad.
+        verdicts: Verdicts: "tracking", "uncertain" or "lost".
         explained: Shares of beams that the estimates explain; NaN for a scan without beams.
         temperatures: Temperatures.
         seconds: Seconds of each step: predict, score, resample, estimate.
@@ -45,10 +49,22 @@ class Track:
     covariances: list[Floats] = field(default_factory=list)
     ranks: list[Floats] = field(default_factory=list)
     sizes: list[float] = field(default_factory=list)
-    lost: list[bool] = field(default_factory=list)
+    p_lost: list[float] = field(default_factory=list)
+    verdicts: list[Word] = field(default_factory=list)
     explained: list[float] = field(default_factory=list)
     temperatures: list[float] = field(default_factory=list)
     seconds: list[tuple[float, float, float, float]] = field(default_factory=list)
+
+    @property
+    def verdict(self) -> Word:
+        """Most frequent verdict of the last tenth of the scans, at most 10 of them; the worse of equal ones."""
+        tail = self.verdicts[-min(max(len(self.verdicts) // 10, 1), _TAIL) :]
+        return max(WORDS, key=lambda word: (tail.count(word), WORDS.index(word)))
+
+    @property
+    def converged(self) -> int | None:
+        """First scan with the verdict "tracking"; None if there is none."""
+        return next((k for k, word in enumerate(self.verdicts) if word == "tracking"), None)
 
     @property
     def references(self) -> Floats | None:
@@ -127,7 +143,8 @@ def follow(pf: ParticleFilter, steps: Iterable[Step], track: Track) -> Iterable[
         if rank is not None:
             track.ranks.append(rank)
         track.sizes.append(found.effective_sample_size)
-        track.lost.append(found.lost)
+        track.p_lost.append(found.p_lost)
+        track.verdicts.append(found.verdict)
         track.explained.append(found.explained)
         track.temperatures.append(found.temperature)
         track.seconds.append((float(predict), scoring, float(correct) - scoring, float(estimate)))
@@ -144,13 +161,17 @@ def summary(track: Track) -> dict[str, Any]:
     count = len(track.steps)
     seconds = np.array(track.seconds).reshape(-1, 4) * 1000
     means = np.median(seconds, axis=0)
-    tail = track.lost[-max(count // 10, 1) :]
+    tail = max(count // 10, 1)
     result: dict[str, Any] = {
         "scans": count,
-        "lost": bool(np.mean(tail) > 0.5),
-        "scans_lost": int(np.sum(track.lost)),
+        "verdict": track.verdict,
+        "lost": track.verdict == "lost",
+        "p_lost": float(track.p_lost[-1]),
+        "scans_lost": track.verdicts.count("lost"),
+        "scans_uncertain": track.verdicts.count("uncertain"),
+        "tracking_since": track.converged,
         "odometry_moves": len({step.odometry for step in track.steps}) > 1,
-        "explained_at_end": _median(track.explained[-len(tail) :]),
+        "explained_at_end": _median(track.explained[-tail:]),
         "explained_median": _median(track.explained),
         "temperature": track.temperatures[-1],
         "effective_sample_size_median": float(np.median(track.sizes)),

@@ -68,6 +68,7 @@ class Beginnings(Results):
         pool, spread = starts.free_pool([sensor.model for sensor in self._sensors], bounds)
         self._place(starts.spread(pool, spread, self._number(particles), self._key()))
         self._wide = DEFAULTS.wide_scans
+        self._verdict.reset(anywhere=True)
         self._everywhere = bounds is None
 
     @whole

@@ -1,20 +1,23 @@
 """Belief that a localiser follows a wrong pose: a hidden Markov model of two states, right and wrong.
 
 The states are "right", the robot is where the localiser's distribution says, and "wrong", it is elsewhere. The prior
-probability of "wrong" is ``START``. From one scan to the next a right pose goes wrong, by a silent divergence or because
-the robot is carried away, with probability ``1 - exp(-(PER_SCAN n + PER_METRE d))`` after n scans and d metres, and a
-wrong one becomes right with probability ``FOUND`` a scan. While the distribution is wide it has no pose that a scan
-could confirm, and both happen with probability ``WIDE`` a scan.
+probability of "wrong" is ``START``. From one scan to the next a right pose goes wrong, by a silent divergence or
+because the robot is carried away, with probability ``1 - exp(-(PER_SCAN n + PER_METRE d))`` after n scans and d metres,
+and a wrong one becomes right with probability ``FOUND`` a scan. While the distribution is so wide that it has several
+places, both happen with probability ``WIDE`` a scan.
 
 A scan gives a log-likelihood ratio r of "wrong" against "right". Consecutive ratios are dependent: the same furniture
 is wrong in all scans of a room. They are modelled as an autoregressive process of first order whose correlation
-``rho = STAYS exp(-d / LENGTH - turn / TURN)`` falls with the way between two scans. For normal ratios of one variance the
-exact increment of the log odds is then
+``rho = STAYS exp(-d / LENGTH - turn / TURN)`` falls with the way between two scans. For normal ratios of one variance
+the exact increment of the log odds is then
 
     (r_t - rho r_{t-1}) / (1 + rho),
 
 so a robot that stands gains next to nothing from its hundredth scan, and a change is seen at once (Hamilton, "A new
 approach to the economic analysis of nonstationary time series", *Econometrica* 57 (1989), treats such regimes).
+
+A place that was searched for, as after a start anywhere, was chosen because the scans agree with it, so that this
+agreement is no evidence any more: it counts as that of the scan before. A contradiction counts in full.
 """
 
 from __future__ import annotations
@@ -24,9 +27,11 @@ from typing import NamedTuple
 
 # Prior probability of "wrong" for a start at a pose; rates of going wrong, of being found again, of both while wide.
 START = 0.1
-PER_SCAN, PER_METRE, FOUND, WIDE = 1e-4, 1e-3, 0.01, 0.05
+PER_SCAN, PER_METRE, FOUND, WIDE = 1e-3, 2e-3, 0.003, 0.05
 # Correlation of the ratios of two scans at one place, and the way in which it falls to 1 / e [m, rad].
-STAYS, LENGTH, TURN = 0.95, 1.5, 1.0
+STAYS, LENGTH, TURN = 0.95, 2.0, 1.0
+# Longest way from one scan to the next that counts [m]; a longer one is a jump of the localiser.
+_FASTEST = 1.0
 
 
 class Belief(NamedTuple):
@@ -37,17 +42,24 @@ class Belief(NamedTuple):
         ratio: Log-likelihood ratio of the last judged scan.
         pose: Pose at which it was judged; None before.
         scans: Scans since then.
+        chosen: Whether the next pose will be one that scans have chosen among many.
     """
 
     log_odds: float = math.log(START / (1 - START))
     ratio: float = 0.0
     pose: tuple[float, float, float] | None = None
     scans: int = 0
+    chosen: bool = False
 
     @property
     def wrong(self) -> float:
         """Probability of "wrong"."""
         return 1 / (1 + math.exp(-self.log_odds))
+
+    @classmethod
+    def anywhere(cls) -> Belief:
+        """Return the belief at a start anywhere on a map."""
+        return cls(0.0, chosen=True)
 
     def counted(self) -> Belief:
         """Return the belief with one scan more."""
@@ -55,7 +67,7 @@ class Belief(NamedTuple):
 
     def widened(self) -> Belief:
         """Return the belief after scans that found no common pose: the next pose may be any."""
-        return Belief(self._moved(WIDE, WIDE, self.scans))
+        return Belief(self._moved(WIDE, WIDE, min(self.scans, 100)), chosen=True)
 
     def judged(self, pose: tuple[float, float, float], ratio: float) -> Belief:
         """Return the belief after a scan.
@@ -64,16 +76,18 @@ class Belief(NamedTuple):
             pose: Pose at which the scan was judged [m, m, rad].
             ratio: Log-likelihood ratio of "wrong" against "right"; NaN where the scan tells nothing.
         """
-        way, turn, rho = 0.0, 0.0, 0.0
-        if self.pose is not None:
+        way, turn, rho, before = 0.0, 0.0, 0.0, self.ratio
+        if self.chosen and ratio < 0:
+            rho, before = STAYS, ratio
+        elif self.pose is not None:
             way = math.hypot(pose[0] - self.pose[0], pose[1] - self.pose[1])
             turn = abs(math.remainder(pose[2] - self.pose[2], math.tau))
             rho = STAYS * math.exp(-way / LENGTH - turn / TURN)
-        lost = 1 - math.exp(-PER_SCAN * self.scans - PER_METRE * min(way, 1.0 * max(self.scans, 1)))
+        lost = 1 - math.exp(-PER_SCAN * self.scans - PER_METRE * min(way, _FASTEST * self.scans))
         log_odds = self._moved(lost, 1 - (1 - FOUND) ** self.scans, 1)
         if math.isnan(ratio):
             return self._replace(log_odds=log_odds, scans=0)
-        return Belief(log_odds + (ratio - rho * self.ratio) / (1 + rho), ratio, pose, 0)
+        return Belief(log_odds + (ratio - rho * before) / (1 + rho), ratio, pose, 0)
 
     def _moved(self, lost: float, found: float, times: int) -> float:
         """Return the log odds after transitions."""

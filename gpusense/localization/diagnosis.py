@@ -27,6 +27,8 @@ _LEAST_TURN, _TURNS = math.radians(20), 72
 # Radius within which beams pass through one place [m]; least distance of another place [m]; share of beams that a crowd
 # makes short.
 _ONE_PLACE, _ELSEWHERE, _CROWD = 1.5, 1.0, 0.3
+# Most points among which the place is looked for.
+_MOST_POINTS = 1000
 _STILL = np.zeros((3, 3))
 
 
@@ -67,7 +69,7 @@ class Diagnosis:
     cause: Cause = "unknown"
 
     @property
-    def told(self) -> int:
+    def counted(self) -> int:
         """Number of beams that tell anything."""
         return self.agree + self.through + self.short
 
@@ -83,13 +85,13 @@ class Diagnosis:
         return "; ".join([*parts, f"likely cause: {cause}"] if cause else parts)
 
     def _beams(self) -> str:
-        if not self.told:
+        if not self.counted:
             return "no beam meets mapped cells that tell anything"
         met = self.agree + self.through
         if self.through and 10 * self.through >= met:
             at = "" if self.place is None else ", most near x = {:.1f}, y = {:.1f}".format(*self.place)
             return f"{100 * self.through / met:.0f} % of the beams that meet walls pass through them{at}"
-        return f"{100 * self.agree / self.told:.0f} % of the beams agree with the map"
+        return f"{100 * self.agree / self.counted:.0f} % of the beams agree with the map"
 
     def _cause(self) -> str:
         if self.cause == "start" and self.elsewhere is not None:
@@ -118,13 +120,11 @@ def diagnose(
         random_poses: Returns poses anywhere on the map; None to look nowhere else.
     """
     scans = sightings(sensors, readings, pose, _STILL)
-    agree, through, short = (sum(one.count(kind) for one in scans) for kind in (AGREES, THROUGH, SHORT))
-    inside, off = any(one.inside for one in scans), any(one.off for one in scans)
-    found = Diagnosis(agree, through, short, _place(scans), inside, off)
-    if not scans or (not agree + through + short and not (inside or off)):
+    found = evidence_of(scans)
+    if not found.counted and not (found.inside or found.off):
         return found
     if _fits(scans) or ratio_of_scan(scans) < 0:
-        crowded = short > _CROWD * (agree + through + short)
+        crowded = found.short > _CROWD * found.counted
         return replace(found, cause="people" if crowded else "none")
     if random_poses is None:
         return found
@@ -138,6 +138,13 @@ def diagnose(
         x, y, theta = (float(value) for value in best)
         return replace(found, elsewhere=(x, y, theta), cause="start")
     return replace(found, cause="map")
+
+
+def evidence_of(scans: Sequence[Passages]) -> Diagnosis:
+    """Return the evidence of judged beams, without a cause."""
+    agree, through, short = (sum(one.count(kind) for one in scans) for kind in (AGREES, THROUGH, SHORT))
+    inside, off = any(one.inside for one in scans), any(one.off for one in scans)
+    return Diagnosis(agree, through, short, _place(scans), inside, off)
 
 
 def _fits(scans: Sequence[Passages]) -> bool:
@@ -154,6 +161,7 @@ def _place(scans: Sequence[Passages]) -> tuple[float, float] | None:
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         return None
+    points = points[:: len(points) // _MOST_POINTS + 1]
     near = np.hypot(*(points[:, None] - points[None]).T) < _ONE_PLACE
     x, y = points[near[int(np.argmax(near.sum(axis=1)))]].mean(axis=0)
     return float(x), float(y)

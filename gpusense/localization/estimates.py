@@ -23,7 +23,7 @@ class Estimate:
         effective_sample_size: ``1 / sum w^2`` of the last correction, 1 to N.
         p_lost: Probability that the pose is off by more than 1 m or 0.5 rad; see ``docs/localization.md``.
         verdict: "tracking"; "uncertain", where the particles are spread wide or over several places, or p_lost is above
-            0.2; or "lost", where scans or features contradict the pose and p_lost is above 0.5.
+            0.1; or "lost", where scans or features contradict the pose and p_lost is above 0.5.
         explained: Share of the beams of the last scan that agree with the map at the pose, of those that the map could
             explain; NaN without one.
         temperature: Of the first sensor.

@@ -14,10 +14,9 @@ from gpusense.localization import starts
 from gpusense.localization.diagnosis import Diagnosis, diagnose
 from gpusense.localization.scoring import given_of
 from gpusense.localization.sensors import sensors_of
-from gpusense.localization.spread import is_wide, share_off
+from gpusense.localization.spread import is_apart, is_wide, share_off
 from gpusense.localization.verdict import Verdict, VerdictState
 from gpusense.localization.words import LOST, Word, word_of
-from gpusense.models.point.base import PointModel
 
 # Poses drawn from a covariance, by which features are predicted.
 _DRAWN = 64
@@ -29,7 +28,7 @@ class PoseVerdict:
 
     Attributes:
         p_lost: Probability that the pose is off by more than 1 m or 0.5 rad.
-        verdict: "tracking"; "uncertain", where the covariance is wide or p_lost is above 0.2; or "lost", where readings
+        verdict: "tracking"; "uncertain", where the covariance is wide or p_lost is above 0.1; or "lost", where readings
             contradict the pose and p_lost is above 0.5.
         explained: Share of the beams that agree with the map at the pose, of those that the map could explain; NaN
             without one.
@@ -76,10 +75,10 @@ class PoseMonitor:
 
     def __init__(self, models: Any, *, seed: int = 0) -> None:
         self._sensors = sensors_of(models)
-        if all(isinstance(sensor.model, PointModel) for sensor in self._sensors):
-            raise ValueError("models: must have a map of walls or landmarks, got none that has")
         self._seed = checks.integer("seed", seed, low=0, high=(1 << 64) - 1)
         self._verdict = Verdict(self._sensors, self._random_poses, seed=self._seed)
+        if not self._verdict.informed:
+            raise ValueError("models: must have a map of walls or landmarks, got none that has")
         self._pose: np.ndarray | None = None
         self._last: dict[int, tuple[Any, ...]] = {}
 
@@ -114,7 +113,7 @@ class PoseMonitor:
         self._pose, self._last = place, given
         wrong = self._verdict.wrong
         p_lost = wrong + (1 - wrong) * share_off(spread)
-        return PoseVerdict(p_lost, word_of(p_lost, wrong, wide=is_wide(spread)), explained)
+        return PoseVerdict(p_lost, word_of(p_lost, wrong, wide=is_wide(spread), apart=is_apart(spread)), explained)
 
     @property
     def state(self) -> VerdictState:

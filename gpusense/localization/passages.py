@@ -152,19 +152,21 @@ def _first_cells(
 ) -> tuple[Floats, Floats]:
     """Return distances to the first wall and to the first unknown cell of rays in cells [cells]; inf for none."""
     rays, (rows, columns) = len(x), grid.shape
-    ends = np.cumsum(steps)
     ray = np.repeat(np.arange(rays), steps)
-    number = np.arange(len(ray)) - np.repeat(ends - steps, steps)
+    number = np.arange(len(ray)) - np.repeat(np.cumsum(steps) - steps, steps)
     distance = _STEP * number
-    column = np.floor(x[ray] + distance * along[ray]).astype(np.int64)
-    row = np.floor(y[ray] + distance * up[ray]).astype(np.int64)
-    within = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-    cells = grid.cells.reshape(-1)
-    place = np.where(within, row * columns + column, 0)
-    value = np.where(within, cells[place], np.int8(-1))
+    column = np.floor(np.repeat(x, steps) + distance * np.repeat(along, steps)).astype(np.int64)
+    row = np.floor(np.repeat(y, steps) + distance * np.repeat(up, steps)).astype(np.int64)
+    # As unsigned numbers, negative ones are beyond every limit.
+    within = (column.view(np.uint64) < columns) & (row.view(np.uint64) < rows)
+    cells, place = grid.cells.reshape(-1), row * columns + column
+    # -1, unknown, is what is off the map, too.
+    value = np.full(len(ray), -1, np.int8)
+    np.copyto(value, cells.take(place, mode="clip"), where=within)
     wall = value >= grid.occupied_threshold
     # Between two cells that share a corner only, both others may be walls.
-    corner = np.flatnonzero((np.diff(column) != 0) & (np.diff(row) != 0) & (number[1:] > 0) & within[1:] & within[:-1])
+    corner = np.flatnonzero((column[1:] != column[:-1]) & (row[1:] != row[:-1]))
+    corner = corner[(number[corner + 1] > 0) & within[corner + 1] & within[corner]]
     one, two = row[corner + 1] * columns + column[corner], row[corner] * columns + column[corner + 1]
     wall[corner + 1] |= (cells[one] >= grid.occupied_threshold) & (cells[two] >= grid.occupied_threshold)
     return _firsts(wall, ray, number, rays), _firsts(value < 0, ray, number, rays)

@@ -6,8 +6,9 @@ n = A + S + T beams that tell anything, S of them short,
 
     r = n / (n + FEW) (BIAS + SLOPE log((T + 1/2) / (A + 1/2))),
 
-limited to LIMIT on both sides; a pose inside of solid cells adds SOLID, one in unknown cells UNKNOWN. The coefficients
-are those of a logistic regression on simulated runs (``bench/studies/verdict_fit.py``): people, moved and new
+within LIMITS: no agreement excludes that another place looks alike. A pose inside of solid cells adds SOLID, one in
+unknown cells UNKNOWN. The coefficients are those of a logistic regression on simulated runs
+(``bench/studies/verdict_fit.py``): people, moved and new
 furniture, glass, wrong maps, 16 to 360 beams and kidnapping, half of the weight for right poses and half for wrong
 ones. No recorded log is among them.
 
@@ -21,8 +22,8 @@ from collections.abc import Sequence
 
 from gpusense.localization.passages import AGREES, SHORT, THROUGH, Passages
 
-BIAS, SLOPE, FEW = 1.64, 2.07, 4.0
-SOLID, UNKNOWN, LIMIT = 2.0, 1.0, 4.0
+BIAS, SLOPE, FEW = 1.9, 1.75, 4.0
+SOLID, UNKNOWN, LIMITS = 2.0, 1.0, (-3.0, 5.0)
 # Share of a feature's gain that counts, since features of a scan and of the next one are dependent; its limit.
 _OF_GAIN, _LIMIT_OF_GAIN = 0.25, 3.0
 
@@ -36,19 +37,19 @@ def ratio_of_scan(scans: Sequence[Passages]) -> float:
     if not scans:
         return math.nan
     agree, through, short = (sum(one.count(kind) for one in scans) for kind in (AGREES, THROUGH, SHORT))
-    told = agree + through + short
+    counted = agree + through + short
     place = SOLID * any(one.inside for one in scans) + UNKNOWN * any(one.off for one in scans)
-    if not told and not place:
+    if not counted and not place:
         return math.nan
-    ratio = told / (told + FEW) * (BIAS + SLOPE * math.log((through + 0.5) / (agree + 0.5)))
-    return min(max(ratio + place, -LIMIT), LIMIT)
+    ratio = counted / (counted + FEW) * (BIAS + SLOPE * math.log((through + 0.5) / (agree + 0.5)))
+    return min(max(ratio + place, LIMITS[0]), LIMITS[1])
 
 
 def explained_of_scan(scans: Sequence[Passages]) -> float:
     """Return the share of the beams that agree, of those that the map could explain; NaN without any."""
     agree, through, short = (sum(one.count(kind) for one in scans) for kind in (AGREES, THROUGH, SHORT))
-    told = agree + through + short
-    return agree / told if told else math.nan
+    counted = agree + through + short
+    return agree / counted if counted else math.nan
 
 
 def ratio_of_features(gain: float, count: int, least: float) -> float:

@@ -17,7 +17,7 @@ from gpusense.localization.journal import Whole, settled, whole
 from gpusense.localization.options import Options
 from gpusense.localization.rival import Rival
 from gpusense.localization.sensors import Sensor
-from gpusense.localization.spread import is_narrow, is_wide, share_off, share_off_of
+from gpusense.localization.spread import is_apart, is_narrow, is_wide, share_off, share_off_of
 from gpusense.localization.verdict import Verdict
 from gpusense.localization.words import word_of
 from gpusense.world.grid import OccupancyGrid
@@ -97,7 +97,7 @@ class Results(Whole, ABC):
                 pose, covariance = clustered(poses, self._cloud.host_weights(self._shown))
         explained = self._verdict.judge(pose, covariance, self._last)
         p_lost = self._p_lost(pose, covariance)
-        word = word_of(p_lost, self._verdict.wrong, wide=is_wide(covariance))
+        word = word_of(p_lost, self._verdict.wrong, wide=is_wide(covariance), apart=is_apart(covariance))
         size = summary.effective_sample_size
         if not size > 0:
             # The kernels have summed no squares: before a correction, or where no weighted particle was possible.

@@ -36,6 +36,12 @@ def is_wide(covariance: Floats) -> bool:
     return position > WIDE or heading > WIDE_TURN
 
 
+def is_apart(covariance: Floats) -> bool:
+    """Tell whether deviations are above 1 m or 0.5 rad, so that no place is more than one of several."""
+    position, heading = deviations(covariance)
+    return position > FAR or heading > FAR_TURN
+
+
 def is_narrow(covariance: Floats) -> bool:
     """Tell whether deviations are so small that a normal density describes the particles well enough."""
     position, heading = deviations(covariance)

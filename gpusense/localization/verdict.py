@@ -24,7 +24,7 @@ from gpusense.localization.evidence import LEAST_GAIN, Evidence, Gains
 from gpusense.localization.passages import Passages, passages
 from gpusense.localization.ratio import explained_of_scan, ratio_of_features, ratio_of_scan
 from gpusense.localization.sensors import Sensor
-from gpusense.localization.spread import deviations, is_wide
+from gpusense.localization.spread import deviations, is_apart, is_wide
 from gpusense.models.landmark.model import LandmarkModel
 
 # Random poses; corrections between two judgements of a start anywhere.
@@ -63,6 +63,7 @@ class Verdict:
 
     Attributes:
         state: All that it remembers.
+        informed: Whether a sensor has a map, so that readings can contradict a pose.
     """
 
     MEMORY: ClassVar[tuple[str, ...]] = ("state",)
@@ -75,12 +76,16 @@ class Verdict:
             for index, sensor in enumerate(sensors)
             if isinstance(sensor.model, LandmarkModel)
         }
-        self._informed = bool(self._evidence) or any(sensor.calibrates for sensor in sensors)
+        self.informed = bool(self._evidence) or any(sensor.calibrates for sensor in sensors)
         self.state = VerdictState()
 
-    def reset(self) -> None:
-        """Forget all scans."""
-        self.state = VerdictState()
+    def reset(self, *, anywhere: bool = False) -> None:
+        """Forget all scans.
+
+        Args:
+            anywhere: Whether the pose is searched for on the whole map.
+        """
+        self.state = VerdictState(Belief.anywhere() if anywhere else Belief())
 
     def watches(self, readings: Mapping[int, tuple[Any, ...]]) -> bool:
         """Tell whether readings have features, whose prediction is judged before the correction."""
@@ -133,7 +138,7 @@ class Verdict:
     @property
     def wrong(self) -> float:
         """Probability that another place is right, by the scans; 0 for sensors without a map."""
-        return self.state.belief.wrong if self._informed else 0.0
+        return self.state.belief.wrong if self.informed else 0.0
 
     def judge(self, pose: np.ndarray, covariance: np.ndarray, readings: Mapping[int, tuple[Any, ...]]) -> float:
         """Judge a pose by the last readings, once for each correction.
@@ -151,12 +156,14 @@ class Verdict:
             return state.explained
         scans = sightings(self._sensors, readings, pose, covariance)
         explained, belief = explained_of_scan(scans), state.belief
-        if is_wide(covariance):
+        x, y, theta = (float(value) for value in pose)
+        if is_apart(covariance):
             belief = belief.widened()
+        elif is_wide(covariance):
+            belief = belief.judged((x, y, theta), math.nan)
         else:
-            told = [ratio_of_scan(scans), float(np.mean(state.ratios)) if state.ratios else math.nan]
-            known = [ratio for ratio in told if not math.isnan(ratio)]
-            x, y, theta = (float(value) for value in pose)
+            ratios = [ratio_of_scan(scans), float(np.mean(state.ratios)) if state.ratios else math.nan]
+            known = [ratio for ratio in ratios if not math.isnan(ratio)]
             belief = belief.judged((x, y, theta), sum(known) if known else math.nan)
         self.state = state._replace(belief=belief, judged=state.corrections, explained=explained, ratios=())
         return explained

@@ -5,20 +5,20 @@ from __future__ import annotations
 from typing import Literal
 
 Word = Literal["tracking", "uncertain", "lost"]
+WORDS: tuple[Word, ...] = ("tracking", "uncertain", "lost")
 # Probabilities above which a pose is lost, and up to which it is tracked.
-LOST, TRACKING = 0.5, 0.2
+LOST, TRACKING = 0.5, 0.1
 
 
-def word_of(p_lost: float, wrong: float, *, wide: bool) -> Word:
+def word_of(p_lost: float, wrong: float, *, wide: bool, apart: bool) -> Word:
     """Return the word for a probability of being lost.
 
     Args:
         p_lost: The probability.
         wrong: Probability that another place is right, by the scans.
-        wide: Whether the distribution is too wide to have one place.
+        wide: Whether the distribution is too wide for a pose that is tracked.
+        apart: Whether it is so wide that it has several places, none of which scans can contradict.
     """
-    if wide or (p_lost > LOST and wrong <= LOST):
-        return "uncertain"
-    if p_lost > LOST:
+    if wrong > LOST and not apart:
         return "lost"
-    return "tracking" if p_lost <= TRACKING else "uncertain"
+    return "uncertain" if wide or apart or p_lost > TRACKING else "tracking"

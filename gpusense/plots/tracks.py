@@ -47,6 +47,8 @@ def track_figure(pf: ParticleFilter, track: Track) -> Figure:
     upper.semilogy(index, np.maximum(deviation, 1e-4), color=CLOUD, lw=0.8, label="deviation of the particles")
     upper.set(xlabel="scan", ylabel="position [m]")
     upper.legend(loc="best", fontsize="small")
-    lower.plot(index, track.explained, color=CLOUD, lw=0.8)
-    lower.set(xlabel="scan", ylabel="share of beams explained", ylim=(0, 1.02))
+    lower.plot(index, track.explained, color=CLOUD, lw=0.8, label="share of beams explained")
+    lower.plot(index, track.p_lost, color=ESTIMATED, lw=0.8, label="p_lost")
+    lower.set(xlabel="scan", ylim=(0, 1.02))
+    lower.legend(loc="best", fontsize="small")
     return figure

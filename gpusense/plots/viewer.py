@@ -61,7 +61,7 @@ class Recording:
             error = float(np.hypot(*(pose[:2] - step.reference[:2])))
             self._stream.log("error", rr.Scalars(error))
         self._stream.log("effective_sample_size", rr.Scalars(track.sizes[-1]))
-        self._stream.log("lost", rr.Scalars(float(track.lost[-1])))
+        self._stream.log("p_lost", rr.Scalars(float(track.p_lost[-1])))
 
     def write(self, track: Track, path: Path) -> None:
         """Write the recording as a file .rrd, whole or not at all.

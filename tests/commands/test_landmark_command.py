@@ -66,7 +66,8 @@ def test_dead_reckoning_of_an_arc():
 
 @pytest.mark.parametrize("kind", ["--known", "--unknown"])
 def test_command_localises(capsys, folder, kind):
-    document = json.loads(run(capsys, folder, kind, "--particles", "300", "--scans", "90", "--json"))
+    # Later scans have so few readings that a filter that does not know them gets lost, and says so.
+    document = json.loads(run(capsys, folder, kind, "--particles", "300", "--scans", "72", "--json"))
     p = document["fit"]["parameters"]
     # Deviations of the made-up run are 0.08 m and 0.03 rad, of about 400 readings.
     assert p["sigma_range"] == pytest.approx(0.08, rel=0.15) and p["sigma_bearing"] == pytest.approx(0.03, rel=0.15)

@@ -76,9 +76,10 @@ def test_convergence_is_counted_in_scans_not_in_references(place):
         track.poses.append(pose + np.array([3.0, 0.0, 0.0]) if index <= 4 else pose)
         track.covariances.append(np.eye(3))
         track.ranks += [] if step.reference is None else [np.full(3, 0.5)]
-        for column, value in ((track.sizes, 9.0), (track.lost, False), (track.explained, 1.0)):
+        for column, value in ((track.sizes, 9.0), (track.p_lost, 0.0), (track.explained, 1.0)):
             column.append(value)
         track.temperatures.append(1.0)
+        track.verdicts.append("tracking")
         track.seconds.append((0.0, 0.0, 0.0, 0.0))
     # Four references are left, and five of them are wanted.
     assert summary(track)["converged_at"] is None

@@ -365,3 +365,60 @@ def test_the_localizer_localises(localizer: ModuleType) -> None:
         message.ranges = caster.cast([truth], bearings)[0]
         assert own.update(message, (0.1 * k * math.cos(0.25), -0.1 * k * math.sin(0.25), 0.0), (0.0, 0.0, 0.0))
     assert np.hypot(*(np.asarray(own.estimate.pose)[:2] - truth[:2])) < 0.1
+
+
+# ------------------------------------------------------------------------------------------------- the watching node
+
+
+@pytest.fixture
+def watcher(conversions: ModuleType) -> ModuleType:
+    return importlib.import_module("gpusense_localization.watcher")
+
+
+def stamped(time: float, **fields: Any) -> Any:
+    stamp = SimpleNamespace(sec=int(time), nanosec=round((time - int(time)) * 1e9))
+    return SimpleNamespace(header=SimpleNamespace(stamp=stamp, frame_id="laser"), **fields)
+
+
+def pose_message(conversions: ModuleType, time: float, pose: Any, deviation: float = 0.05) -> Any:
+    place = SimpleNamespace(position=SimpleNamespace(), orientation=SimpleNamespace())
+    conversions.fill(place, conversions.pose_fields(tuple(map(float, pose))))
+    covariance = conversions.covariance_fields(np.diag([deviation**2, deviation**2, 0.0025]))
+    return stamped(time, pose=SimpleNamespace(pose=place, covariance=covariance))
+
+
+def test_the_watcher_publishes_the_verdict(watcher: ModuleType, conversions: ModuleType) -> None:
+    own, message = watcher.Watcher(backend="numpy"), map_message()
+    message.data = message.data.reshape(40, 40)
+    message.data[:25, 20] = 100
+    message.data = message.data.ravel()
+    grid = gs.OccupancyGrid.from_message(message)
+    bearings = np.linspace(-math.pi, math.pi, 48, endpoint=False)
+    caster = gs.RayCaster(grid, range_max=8.0, backend="numpy")
+
+    def step(time: float, truth: np.ndarray, pose: np.ndarray, **more: Any) -> bool:
+        fields = vars(scan_of(48)) | {"ranges": caster.cast(truth[None], bearings)[0]}
+        own.add_scan(stamped(time, **fields), (0.0, 0.0, 0.0))
+        return own.add_pose(pose_message(conversions, time + 0.01, pose, **more))
+
+    truth = np.array([1.0, 1.0, 0.2])
+    assert not step(0.5, truth, truth) and own.status(0.6)["level"] == 3
+    own.set_map(message)
+    for k in range(5):
+        assert step(1.0 + k, truth + np.array([0.1 * k, 0.0, 0.0]), truth + np.array([0.1 * k, 0.0, 0.0]))
+    status = own.status(5.5)
+    assert status["level"] == 0 and status["message"] == "tracking"
+    assert status["values"][0]["key"] == "p_lost" and float(status["values"][0]["value"]) < 0.05
+    assert own.status(30.0)["level"] == 3
+    # A wide pose, and one on the other side of the wall.
+    assert step(6.0, truth, truth, deviation=0.8) and own.status(6.0)["level"] == 1
+    own.reset()
+    assert own.status(6.0)["level"] == 3
+    for k in range(8):
+        assert step(7.0 + k, truth + np.array([0.1 * k, 0.0, 0.0]), truth + np.array([1.8 + 0.1 * k, 1.5, 2.0]))
+    status = own.status(15.0)
+    assert status["level"] == 2 and status["message"].startswith("lost: ") and "likely cause" in status["message"]
+    # No scan of this time, and a scan that breaks a rule.
+    assert not own.add_pose(pose_message(conversions, 20.0, truth))
+    own.add_scan(stamped(21.0, **(vars(scan_of(48)) | {"range_max": math.inf})), (0.0, 0.0, 0.0))
+    assert "range_max" in own.problem

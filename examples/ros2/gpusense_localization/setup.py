@@ -15,5 +15,5 @@ setup(
     ],
     install_requires=["setuptools", "gpusense"],
     license="Apache-2.0",
-    entry_points={"console_scripts": [f"localize = {NAME}.node:main"]},
+    entry_points={"console_scripts": [f"localize = {NAME}.node:main", f"watch = {NAME}.watch_node:main"]},
 )

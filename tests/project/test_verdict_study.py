@@ -1,0 +1,26 @@
+"""The study of the verdict counts false alarms and misses as its page says."""
+
+from __future__ import annotations
+
+import importlib
+
+import numpy as np
+import pytest
+from support.paths import ROOT
+
+
+def test_the_study_of_the_verdict_counts_alarms_and_misses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "bench"))
+    report = importlib.import_module("verdict_report")
+    job = dict.fromkeys(report.FIELDS, 0.0) | {"case": "own"}
+    rows = np.zeros((60, 9))
+    # The robot is carried away after 20 scans, and the filter notices it 30 scans later; one alarm is false.
+    rows[20:, report.ERROR], rows[[5, *range(50, 60)], report.P_LOST] = 8.0, 0.9
+    found = report.figures([(job, rows)])
+    assert found["right"] == 20 and found["false"] == 1 / 20
+    # The first 20 scans after the jump are no misses yet.
+    assert found["late"] == 20 and found["missed"] == 10 / 20 and found["finals_wrong"] == 0
+    assert found["auroc"] == pytest.approx((10 * 19.5 + 10 * 9.5) / (20 * 20))
+    wrong = report.figures([(job | {"case": "wrong"}, rows)])
+    assert wrong["right"] == 0 and wrong["late"] == 40 and wrong["missed"] == 30 / 40
+    assert sum(row[2] for row in report.reliability([(job, rows)])) == 60

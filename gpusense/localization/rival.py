@@ -9,10 +9,10 @@ each cloud, the mean likelihood of its predicted particles, the logarithm of the
     B = sum over later scans t of log p_rival(z_t | ...) - log p_filter(z_t | ...)
 
 counts for the rival (Kass and Raftery, "Bayes factors" (1995)); the scan by which the rival was chosen does not. The
-rival replaces the particles once B exceeds ``WIN``, after ``SCANS`` scans if it lies together, and after ``APART`` scans
-if several places are as likely, provided that the beams that meet walls speak for it. Until then the estimate is that of
-the particles, and the probability that the rival is right adds to that of being lost. A rival that ends at the pose of
-the particles, falls behind, or has not won after ``LONGEST`` scans is given up.
+rival replaces the particles once B exceeds ``WIN``, after ``SCANS`` scans if it lies together, and after ``APART`` ones
+if several places are as likely, provided that the beams that meet walls speak for it. Until then the estimate is that
+of the particles, and the probability that the rival is right adds to that of being lost. A rival that ends at the pose
+of the particles, falls behind, or has not won after ``LONGEST`` scans is given up.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from gpusense.localization.filter import ParticleFilter
     from gpusense.localization.state import FilterState
 
-# Logarithm of the Bayes factor that wins, and that ends a rival that falls behind; scans that a rival needs to win if it
-# lies together, and if it has several places; scans after which one that neither wins nor loses is given up.
+# Logarithm of the Bayes factor that wins, and that ends a rival that falls behind; scans that a rival needs to win if
+# it lies together, and if it has several places; scans after which one that neither wins nor loses is given up.
 WIN, LOSE, SCANS, APART, LONGEST = 7.0, -7.0, 3, 8, 15
 # Prior odds of a rival of a tracked pose: its place was not known before.
 PRIOR = -7.0

@@ -22,6 +22,9 @@ from gpusense.logs import Scan
 _RANDOM, _STREAM = 64, 1
 # Least share of the random poses that a logged pose excels: 1/2 by chance.
 LEAST_BETTER = 0.9
+# Right poses excel a share b of random ones with the density EXCELS b^(EXCELS - 1), wrong ones with the density 1; the
+# log-likelihood ratio is limited.
+_EXCELS, _LIMIT = 20, 3.0
 
 
 @dataclass(frozen=True)
@@ -81,15 +84,17 @@ class FitnessOfLog:
         poses = np.vstack([pose[None], cloud_uniform(self._model.grid, _RANDOM, random)])
         log_p = self._model.log_likelihood(poses, scan.ranges)
         found = passages(self._model.grid, scan.scanner, pose, np.asarray(scan.ranges, np.float64))
-        share, ratio = explained_of_scan([found]), ratio_of_scan([found])
+        share, ratio, better = explained_of_scan([found]), ratio_of_scan([found]), math.nan
+        # Readings that are equally likely or impossible everywhere tell nothing.
+        if np.isfinite(log_p).any() and (log_p != log_p[0]).any():
+            better = float(np.mean(log_p[1:] < log_p[0]))
+            ratio += _ratio_of_rank(better)
         x, y, theta = (float(value) for value in pose)
         self._belief = self._belief.counted().judged((x, y, theta), ratio)
         if not math.isnan(ratio):
             self._scans.append(found)
             self._shares.append(share)
-            # Readings that are equally likely or impossible everywhere tell nothing.
-            if np.isfinite(log_p).any() and (log_p != log_p[0]).any():
-                self._better.append(float(np.mean(log_p[1:] < log_p[0])))
+            self._better += [] if math.isnan(better) else [better]
             self._p_lost.append(self._belief.wrong)
         return share
 
@@ -103,6 +108,12 @@ class FitnessOfLog:
         if p_lost is not None and p_lost > LOST:
             evidence = replace(evidence, cause="map")
         return Fitness(len(self._scans), explained, better, p_lost, evidence)
+
+
+def _ratio_of_rank(better: float) -> float:
+    """Return the log-likelihood ratio of a wrong pose against a right one, given the share of poses that it excels."""
+    ratio = math.inf if better == 0 else -math.log(_EXCELS) - (_EXCELS - 1) * math.log(better)
+    return min(max(ratio, -_LIMIT), _LIMIT)
 
 
 def temperature_of_log(model: Model, scans: Sequence[tuple[int, Scan]], *, most: int = 100) -> float:

@@ -110,6 +110,12 @@ class Shard:
             settings[SHARE] = share
         self._backend.upload(settings, self._cloud.settings)
 
+    def use_settings(self, settings: np.ndarray) -> Step:
+        """Take other numbers for the step."""
+        self._settings = settings.copy()
+        self._upload_settings(self._part)
+        yield
+
     def score(self, source: int, given: Sequence[Given]) -> Step:
         """Score the poses of a buffer by readings, and return the largest score."""
         cloud, part = self._cloud, self._part

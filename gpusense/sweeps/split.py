@@ -19,7 +19,16 @@ from gpusense.interface.constants import (
     WEIGHT_SUMS,
     WIDE_HEADINGS,
 )
-from gpusense.localization.filter_cloud import Contents, FilterCloud, Step, Summary, meaningful, summary_of
+from gpusense.localization.filter_cloud import (
+    Contents,
+    FilterCloud,
+    Step,
+    Summary,
+    deeper,
+    is_starved,
+    meaningful,
+    summary_of,
+)
 from gpusense.localization.particles import Places, Stage
 from gpusense.localization.sums import fans_of
 from gpusense.reference.draws import mark_of
@@ -116,17 +125,11 @@ class SplitCloud(FilterCloud):
 
     def _run(self, stage: Stage, step: Step, state: np.ndarray) -> None:
         """Score and weigh the particles of a stage, and draw: those of the next step where nothing is left."""
-        number, settings = stage.number, step.settings
-        high = max(self._all("score", stage.source, step.given))
-        each = self._all("weigh", high, stage)
-        totals = np.zeros(WEIGHT_SUMS)
-        join_rows(_PLAIN, np.concatenate(each), totals, self._size, WEIGHT_SUMS, self._size)
-        left, high = left_of(state, number), possible_of(totals, high)
-        rung = rung_of(totals, settings, settings[SHARE] * self.count) if left > 0.0 else 0
-        set_stage(totals, settings, state, high, left, rung, self.count, number, stage.most)
+        number = stage.number
+        each, totals, column, settings = self._weigh(stage, step, state)
         drawn = self._parts(self.count if state[number * STAGE + LEFT] > 0.0 else step.drawn)
         marks = self._marks(state[number * STAGE : (number + 1) * STAGE], drawn)
-        offsets = np.cumsum([0.0, *(one[column_of(high, rung)] for one in each[:-1])])
+        offsets = np.cumsum([0.0, *(one[column] for one in each[:-1])])
         shown = state.copy()
         if marks is not None:
             # A filter that changes its size draws, whatever its weights.
@@ -135,6 +138,27 @@ class SplitCloud(FilterCloud):
         found = self._team.each("set_weights", [(stage, totals, shown, float(offset), asked) for offset in offsets])
         pieces = self._exchanged(stage, marks, found, offsets)
         self._team.each("draw", [(stage, *pair) for pair in zip(drawn, pieces, strict=True)])
+        if settings is not step.settings:
+            self._all("use_settings", step.settings)
+
+    def _weigh(self, stage: Stage, step: Step, state: np.ndarray) -> tuple[list[Any], np.ndarray, int, np.ndarray]:
+        """Score the particles, and weigh them on lower rungs while too few have weight; write the stage's state.
+
+        Returns:
+            Sums of weights of each shard and of all, the column that counts, and the settings that were used.
+        """
+        number, settings = stage.number, step.settings
+        highest = max(self._all("score", stage.source, step.given))
+        while True:
+            each, totals = self._all("weigh", highest, stage), np.zeros(WEIGHT_SUMS)
+            join_rows(_PLAIN, np.concatenate(each), totals, self._size, WEIGHT_SUMS, self._size)
+            left, high = left_of(state, number), possible_of(totals, highest)
+            rung = rung_of(totals, settings, settings[SHARE] * self.count) if left > 0.0 else 0
+            set_stage(totals, settings, state, high, left, rung, self.count, number, stage.most)
+            if stage.most == 1 or not is_starved(state, settings, number, self.count):
+                return each, totals, column_of(high, rung), settings
+            settings = deeper(settings)
+            self._all("use_settings", settings)
 
     def _exchanged(self, stage: Stage, marks: object, found: list[Any], offsets: np.ndarray) -> list[Any]:
         """Hand particles to the shards that draw from them; return for each what its method ``draw`` takes."""

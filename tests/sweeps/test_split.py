@@ -197,3 +197,18 @@ def test_other_processes_have_the_same_particles():
 def test_bad_input(options, message):
     with pytest.raises((TypeError, ValueError), match=message):
         SplitParticleFilter(options.pop("make", field), **options)
+
+
+def far_fix(device):
+    return gs.PositionModel(gs.PositionParameters(sigma=0.1), backend=device)
+
+
+def test_a_split_filter_reaches_a_fix_that_is_far_from_all_particles():
+    whole = gs.ParticleFilter(far_fix("numpy"), particles=400, seed=1)
+    split = SplitParticleFilter(far_fix, devices=["numpy"] * 2, particles=400, seed=1)
+    for pf in (whole, split):
+        pf.initialize(mean=(0, 0, 0), covariance=np.diag([100.0, 100.0, 1.0]))
+        for _ in range(3):
+            pf.correct(np.array([40.0, 0.0]))
+    assert np.array_equal(split.host_particles(), whole.host_particles())
+    assert np.hypot(*(split.estimate().pose[:2] - (40.0, 0.0))) < 0.5

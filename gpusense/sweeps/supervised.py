@@ -157,15 +157,15 @@ class Supervised:
         while True:
             left = look if limits.seconds is None else limits.seconds - (time.monotonic() - begin)
             most = max(most, memory_of(process.pid))
+            if limits.memory is not None and most > limits.memory:
+                self._buried(forced=True)
+                raise WorkerDied(f"beyond the memory limit of {size_text(limits.memory)}", most)
             ready = wait([link, process.sentinel], max(min(look, left), 0))
             if ready or not self._alive():
                 message = self._received()
                 if message is not None:
                     return message
                 raise self._buried(most, short)
-            if limits.memory is not None and most > limits.memory:
-                self._buried(forced=True)
-                raise WorkerDied(f"beyond the memory limit of {size_text(limits.memory)}", most)
             if not wanted():
                 self._buried(forced=True)
                 raise WorkerDied("as nothing waits for its job any more", most)

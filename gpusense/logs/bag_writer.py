@@ -59,7 +59,7 @@ def check_bag(path: Path, *, first: bool) -> None:
     try:
         import rosbags  # noqa: F401
     except ImportError as error:
-        raise ImportError(f"{path}: {INSTALL} ({error})") from None
+        raise ImportError(f"{path}: writing {INSTALL} ({error})") from None
 
 
 def _write(writer: _Writer, scans: Iterable[Scan]) -> None:

@@ -15,7 +15,7 @@ SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 # ROS 1's first version of transforms has the layout of the second.
 _SAME_LAYOUT = {"tf/msg/tfMessage": TRANSFORMS}
-INSTALL = "ROS bags need the library rosbags: pip install 'gpusense[ros]'"
+INSTALL = "ROS bags needs the library rosbags: pip install 'gpusense[ros]'"
 
 
 class Message(NamedTuple):
@@ -93,7 +93,7 @@ def _open(path: Path) -> Iterator[tuple[Any, Any]]:
         from rosbags.rosbag2 import Reader as Reader2
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError as error:
-        raise ImportError(f"{path}: {INSTALL} ({error})") from None
+        raise ImportError(f"{path}: reading {INSTALL} ({error})") from None
     first = path.suffix.lower() == ".bag"
     store = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
     if TRANSFORMS not in store.types:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import gzip
 import math
+import sys
 
 import numpy as np
 import pytest
+from support.command_line import error_of
 
 import gpusense as gs
 from gpusense.logs.bag_writer import write_bag
@@ -116,3 +118,12 @@ def test_bags_are_written_whole_or_not_at_all(tmp_path):
     write_bag(tmp_path / "run.bag", scans(2), first=True)
     write_bag(tmp_path / "run.bag", scans(3), first=True)
     assert len(list(gs.read_log(tmp_path / "run.bag"))) == 3
+
+
+def test_a_bag_without_the_library(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    with pytest.raises(ImportError, match="writing ROS bags needs the library rosbags: pip install"):
+        write_bag(tmp_path / "run.bag", scans(), first=True)
+    command = ["simulate", "--world", "office", "--format", "ros1", "--log-out", str(tmp_path / "run.bag")]
+    assert "writing ROS bags needs the library rosbags" in error_of(command, capsys)
+    assert not list(tmp_path.iterdir())

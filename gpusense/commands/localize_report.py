@@ -128,7 +128,8 @@ def _ranks(histogram: list[float]) -> str:
 def _verdict(result: dict[str, Any], deviations: list[float]) -> str:
     """Return the verdict with its evidence, and the likely cause where there is one."""
     p_lost = f"p_lost {result['p_lost']:.2g}"
-    if result["explained_at_end"] is None:
+    # A cloud that lies apart needs no reading to be uncertain.
+    if result["explained_at_end"] is None and result["p_lost"] <= 0.5:
         return f"none, no scan at the end has a reading to judge by; {result['verdict']}, {p_lost}"
     if result["verdict"] == "tracking":
         share = f"{100 * result['explained_at_end']:.0f} % of the beams of the last scans agree with the map"

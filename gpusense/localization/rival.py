@@ -151,7 +151,7 @@ class Rival:
 
         Args:
             readings: Indices of sensors with their readings.
-            evidence: That of the filter (:func:`evidence_of`).
+            evidence: Evidence of the filter, by :func:`evidence_of`.
         """
         self._filter._weigh(readings)
         mine = evidence_of(self._filter._cloud)

@@ -5,35 +5,16 @@ from __future__ import annotations
 import importlib
 import json
 import math
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
+from support.bench_scripts import BENCH, run_script
 from support.paths import ROOT
 
 from gpusense.backends import get_backend
-
-BENCH = ROOT / "bench"
-
-
-def run_script(name: str, *arguments: str, output: Path) -> dict:
-    """Run a script and return its report; its Markdown must be there, too."""
-    command = [sys.executable, str(BENCH / name), *arguments, "--output", str(output)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
-    assert done.returncode == 0, done.stderr[-3000:]
-    assert output.with_suffix(".md").read_text() == done.stdout.removesuffix("\n")
-
-    def refuse(word: str) -> float:
-        raise ValueError(f"{word} is no JSON")
-
-    report = json.loads(output.with_suffix(".json").read_text(), parse_constant=refuse)
-    assert report["command"].startswith(f"python bench/{name} ")
-    assert str(output.parent) not in json.dumps(report)
-    return report
 
 
 @pytest.fixture
@@ -399,33 +380,6 @@ def test_whole_calls_run(needs: Callable[[str], str], tmp_path: Path) -> None:
     assert all(row["ms"] == sorted(row["ms"]) and row["ms"][0] > 0 for row in report["rows"])
 
 
-def test_global_matching_runs(data_dir: Path, needs: Callable[[str], str], tmp_path: Path) -> None:
-    report = run_script(
-        "studies/global_matching.py", "--data", str(data_dir), "--backend", needs("opencl"), "--part", "window",
-        "--part", "olin", "--scans", "2", "--repeats", "1", output=tmp_path / "matching",
-    )  # fmt: skip
-    assert [row["level"] for row in report["window"]] == [0, 1, 2, 3]
-    assert report["window"][0]["evaluated"] == 1 > report["window"][3]["evaluated"]
-    (olin,) = report["olin"]
-    assert olin["right"] == 1 and olin["found_wrong"] == 0
-
-
-def test_matching_odometry_runs(data_dir: Path, needs: Callable[[str], str], tmp_path: Path) -> None:
-    arguments = ["--recorded", str(data_dir), "--backend", needs("opencl"), "--scans", "4", "--log", "csail"]
-    report = run_script("accuracy/matching_odometry.py", *arguments, output=tmp_path / "odometry")
-    assert len(report["rows"]) == 2
-    # The odometry of a scan is a copy of its pose; that of the wheels is not.
-    assert all(row["wheels_p95_mm"] > 1 for row in report["rows"])
-
-
-def test_matching_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
-    """Generated buildings alone, which need no data."""
-    arguments = ["--matches", "6", "--backend", needs("opencl")]
-    report = run_script("accuracy/matching.py", *arguments, output=tmp_path / "matching")
-    assert len(report["rows"]) == 6
-    assert all(row["wrong_percent"] == 0 and row["median_mm"] < 20 for row in report["rows"])
-
-
 def test_field_gradients_are_measured(needs: Callable[[str], str], tmp_path: Path) -> None:
     small = ["--particles", "60", "--beams", "11", "--repeats", "1", "--backend", needs("opencl")]
     report = run_script("speed/field_gradient.py", *small, output=tmp_path / "small")
@@ -448,9 +402,8 @@ def test_sweeps_are_measured(tmp_path: Path) -> None:
 
 
 def test_calibration_runs(tmp_path: Path) -> None:
-    report = run_script(
-        "accuracy/calibration.py", "--runs", "60", "--model", "heading", "--model", "beam", output=tmp_path / "ranks"
-    )
+    small = ["--runs", "60", "--model", "heading", "--model", "beam"]
+    report = run_script("accuracy/calibration.py", *small, output=tmp_path / "ranks")
     assert [row["model"] for row in report["rows"]] == ["heading", "beam"]
     assert all(sum(counts) == 60 for row in report["rows"] for counts in row["counts"])
     assert all(0 < row["least_p"] <= 1 for row in report["rows"])

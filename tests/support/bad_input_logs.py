@@ -17,7 +17,7 @@ WEAN_LINE = "L 0 0 0 25 0 0 " + "100 " * 180 + "0.5"
 
 def log_with(*lines: str, name: str = "run.log", **options: Any) -> Action:
     """Read a whole log of these lines."""
-    return lambda tmp: list(read_log(put(tmp, name, "\n".join(lines)), **options))
+    return lambda tmp: list(read_log(put(tmp, name, "".join(f"{line}\n" for line in lines)), **options))
 
 
 LOG = "{tmp}/input/run.log"
@@ -130,7 +130,7 @@ LOG_CASES = [
         "log-gzip-truncated",
         lambda tmp: list(read_log(put(tmp, "run.log", gzip.compress(GOOD_LINE.encode())[:-9]), range_max=5)),
         ValueError,
-        f"{LOG}:1: must be a whole gzip file, got a broken one: "
+        f"{LOG}:1: must be a whole gzip file, got one that is cut off: "
         "Compressed file ended before the end-of-stream marker was reached",
     ),
 ]

@@ -1,0 +1,35 @@
+"""The benchmark scripts of matching run on tiny sizes and write their reports."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from support.bench_scripts import run_script
+
+
+def test_global_matching_runs(data_dir: Path, needs: Callable[[str], str], tmp_path: Path) -> None:
+    report = run_script(
+        "studies/global_matching.py", "--data", str(data_dir), "--backend", needs("opencl"), "--part", "window",
+        "--part", "olin", "--scans", "2", "--repeats", "1", output=tmp_path / "matching",
+    )  # fmt: skip
+    assert [row["level"] for row in report["window"]] == [0, 1, 2, 3]
+    assert report["window"][0]["evaluated"] == 1 > report["window"][3]["evaluated"]
+    (olin,) = report["olin"]
+    assert olin["right"] == 1 and olin["found_wrong"] == 0
+
+
+def test_matching_odometry_runs(data_dir: Path, needs: Callable[[str], str], tmp_path: Path) -> None:
+    arguments = ["--recorded", str(data_dir), "--backend", needs("opencl"), "--scans", "4", "--log", "csail"]
+    report = run_script("accuracy/matching_odometry.py", *arguments, output=tmp_path / "odometry")
+    assert len(report["rows"]) == 2
+    # The odometry of a scan is a copy of its pose; that of the wheels is not.
+    assert all(row["wheels_p95_mm"] > 1 for row in report["rows"])
+
+
+def test_matching_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
+    """Generated buildings alone, which need no data."""
+    arguments = ["--matches", "6", "--backend", needs("opencl")]
+    report = run_script("accuracy/matching.py", *arguments, output=tmp_path / "matching")
+    assert len(report["rows"]) == 6
+    assert all(row["wrong_percent"] == 0 and row["median_mm"] < 20 for row in report["rows"])

@@ -15,6 +15,7 @@ from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.journal import whole
 from gpusense.localization.motion import SampledMotion
 from gpusense.localization.results import Results
+from gpusense.localization.rival import COMPARISONS
 from gpusense.world.plausible import look_at_heading, look_at_start
 
 
@@ -29,8 +30,8 @@ class Beginnings(Results):
     _together: bool
     # Poses that recovery injects: their number, and half widths of the box around each.
     _pool: tuple[int, starts.Spread]
-    # Whether places anywhere are to be compared with the one that is found.
-    _everywhere: bool
+    # How many places anywhere are still to be compared with the one that is found.
+    _everywhere: int
 
     @whole
     def initialize(self, *, mean: AnyArray, covariance: AnyArray, particles: int | None = None) -> None:
@@ -69,7 +70,7 @@ class Beginnings(Results):
         self._place(starts.spread(pool, spread, self._number(particles), self._key()))
         self._wide = DEFAULTS.wide_scans
         self._verdict.reset(anywhere=True)
-        self._everywhere = bounds is None
+        self._everywhere = COMPARISONS if bounds is None else 0
 
     @whole
     def initialize_from(self, likelihood: Any, *, particles: int | None = None) -> None:
@@ -95,7 +96,7 @@ class Beginnings(Results):
         """
         pool, spread = starts.likely_pool(likelihood, self._number(particles), self._key())
         self._place(starts.spread(pool, spread, self._number(particles), self._key(), each=True))
-        self._everywhere = True
+        self._everywhere = COMPARISONS
 
     def _look_at_start(self, pose: np.ndarray) -> None:
         """Warn of a start that cannot be meant."""
@@ -120,7 +121,7 @@ class Beginnings(Results):
         self._cloud.place(poses)
         self._shown, self._started, self._wide, self._together = len(poses), True, 0, False
         if not again:
-            self._pending, self._last, self._everywhere = None, {}, False
+            self._pending, self._last, self._everywhere = None, {}, 0
             if self._rival is not None:
                 self._rival.stop()
             self._verdict.reset()

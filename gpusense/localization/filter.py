@@ -17,15 +17,16 @@ from gpusense.localization.estimates import covariance_of
 from gpusense.localization.filter_cloud import FilterCloud, Given, Step
 from gpusense.localization.journal import plain_state, set_state, settled, whole
 from gpusense.localization.motion import STILL, MotionModel, OdometryMotion, SampledMotion
-from gpusense.localization.rival import PARTICLES, PRIOR, Rival, can_search, evidence_of
+from gpusense.localization.rival import COMPARISONS, PARTICLES, PRIOR, Rival, can_search, evidence_of
 from gpusense.localization.scoring import given_of
 from gpusense.localization.sensors import sensors_of
 from gpusense.localization.state import FilterState, check_state, constructor_options, model_names, readings_on_host
 from gpusense.localization.verdict import Verdict
-from gpusense.localization.words import TRACKING as DOUBT
 
 # Makes the seed of a rival from that of its filter.
 _RIVAL = 0x9E3779B97F4A7C15
+# Probability that another place is right above which a rival is searched for; more than before the first scan.
+_DOUBT = 0.2
 
 
 class ParticleFilter(Beginnings):
@@ -115,7 +116,7 @@ class ParticleFilter(Beginnings):
         self._last: dict[int, tuple[Any, ...]] = {}
         self._rival: Rival | None = None
         self._distinct = 1.0
-        self._everywhere = False
+        self._everywhere = 0
 
     def _new_cloud(self) -> FilterCloud:
         """Return room for the particles."""
@@ -234,7 +235,7 @@ class ParticleFilter(Beginnings):
     def _is_doubted(self) -> bool:
         """Tell whether the last scans that were judged contradict the pose, or a rival competes with it."""
         rival = self._rival is not None and self._rival.active
-        return rival or not self._together or self._verdict.wrong > DOUBT or self._verdict.explains_little
+        return rival or not self._together or self._verdict.wrong > _DOUBT or self._verdict.explains_little
 
     def _recover(self, given: list[Given]) -> None:
         """Compare the particles with their rival, or search for one where scans contradict the pose."""
@@ -256,8 +257,8 @@ class ParticleFilter(Beginnings):
         if self._everywhere or self._is_doubted():
             rival = self._rival = self._rival or Rival(self._new_rival())
             prior = 0.0 if self._everywhere else PRIOR
-            self._everywhere = False
-            rival.start(found.pose, found.covariance, list(self._last.items()), prior=prior)
+            self._everywhere = max(self._everywhere - 1, 0)
+            rival.start(found.pose, found.covariance, list(self._last.items()), step=self._step, prior=prior)
 
     def _new_rival(self) -> ParticleFilter:
         """Return a filter for a rival, with the sensors of this one."""
@@ -274,6 +275,7 @@ class ParticleFilter(Beginnings):
         rows = np.searchsorted(ends, (np.arange(count) + 0.5) / count * ends[-1], side="right")
         self._place(poses[np.minimum(rows, len(poses) - 1)], again=True)
         self._verdict.doubt()
+        self._everywhere = COMPARISONS
 
     @whole
     def reset(self) -> None:

@@ -43,12 +43,14 @@ if TYPE_CHECKING:
 # Logarithm of the Bayes factor that wins, and that ends a rival that falls behind; scans that a rival needs to win if
 # it lies together, and if it has several places; scans after which one that neither wins nor loses is given up.
 WIN, LOSE, SCANS, APART, LONGEST = 7.0, -7.0, 3, 8, 15
+# Rivals with which a pose is compared that was searched for on the whole map.
+COMPARISONS = 3
 # Prior odds of a rival of a tracked pose: its place was not known before.
 PRIOR = -7.0
 # Particles of a rival; poses that are tried; effective number of these that begin it.
 PARTICLES, TRIES, CHOSEN = 1000, 20_000, 100
 # Deviation of poses that are tried around the estimate, at least [m]; half widths around a chosen pose [m, m, rad].
-_NEARBY, _SPREAD = 1.0, (0.1, 0.1, 0.05)
+_NEARBY, _SPREAD = 2.0, (0.1, 0.1, 0.05)
 # A cloud lies together up to this deviation [m]. Two clouds are at one place up to these [m, rad].
 _TOGETHER, _SAME, _SAME_TURN = 0.5, 0.5, 0.3
 # Mean ratio of wrong against right up to which the beams speak for a pose; share of the mean that a scan leaves.
@@ -101,7 +103,7 @@ class Rival:
         self.active = False
 
     def start(
-        self, pose: np.ndarray, covariance: np.ndarray, readings: Sequence[Given], *, prior: float = PRIOR
+        self, pose: np.ndarray, covariance: np.ndarray, readings: Sequence[Given], *, step: int, prior: float = PRIOR
     ) -> None:
         """Search for a rival by the last readings.
 
@@ -109,8 +111,10 @@ class Rival:
             pose: (3,) estimated pose of the particles.
             covariance: (3, 3) their covariance.
             readings: Indices of sensors with the last readings.
+            step: Number of the last step of the filter: the same ones have the same rival.
             prior: Prior log odds; at 0 places near the estimate are no rivals.
         """
+        self._filter._step = step
         key = self._filter._key()
         tries = self._tries(pose, covariance, key, everywhere=prior == 0.0)
         score = np.zeros(len(tries))
@@ -133,13 +137,14 @@ class Rival:
         """Return poses anywhere, and around the estimate with any heading."""
         if self._pool is None:
             self._pool = _anywhere(self._filter._sensors)
-        anywhere = starts.spread(*self._pool, TRIES if everywhere else TRIES // 2, key)
-        if everywhere:
-            far = np.hypot(*(anywhere[:, :2] - pose[:2]).T) > FAR
-            return anywhere[far | (np.abs(wrap_angle(anywhere[:, 2] - pose[2])) > 2 * FAR_TURN)]
+        anywhere = starts.spread(*self._pool, TRIES // 2, key)
         wide = max(2 * deviations(covariance)[0], _NEARBY)
         around = starts.normal(pose, np.diag([wide**2, wide**2, math.pi**2]), TRIES // 2, key)
-        return np.vstack([anywhere, around])
+        tries = np.vstack([anywhere, around])
+        if not everywhere:
+            return tries
+        far = np.hypot(*(tries[:, :2] - pose[:2]).T) > FAR
+        return tries[far | (np.abs(wrap_angle(tries[:, 2] - pose[2])) > 2 * FAR_TURN)]
 
     def predict(self, motion: SampledMotion) -> None:
         """Move the rival."""
@@ -181,7 +186,7 @@ class Rival:
             self.log_odds, gain = (0.0, 0.0) if self._prior == 0.0 else (self.log_odds, gain)
         if together and self.is_at(pose, _SAME, _SAME_TURN):
             self.stop()
-        elif gain > WIN and self._scans >= (SCANS if together else APART) and self._is_plausible():
+        elif gain > WIN and self._scans >= (SCANS if together else APART) and self._is_plausible(better=True):
             self.stop()
             return self._filter.host_particles(), self._filter.host_weights()
         elif self._is_late(gain):
@@ -197,16 +202,18 @@ class Rival:
         if not any(map(math.isnan, pair)):
             self._ratios = _KEPT * self._ratios + np.array([*pair, 1.0])
 
-    def _is_plausible(self) -> bool:
-        """Tell whether the beams that meet walls speak for the rival, and more so than for the particles."""
+    def _is_plausible(self, *, better: bool = False) -> bool:
+        """Tell whether the beams that meet walls speak for the rival, or more so than for the particles."""
         mine, other, weight = self._ratios
-        return bool(not weight or (mine / weight < _RIGHT and mine < other))
+        return bool(not weight or (mine / weight < _RIGHT and (mine < other or not better)))
 
     def _is_late(self, gain: float) -> bool:
         """Tell whether a rival has fallen behind or had enough scans; equals that lie together may both be right."""
-        if self._prior == 0.0:
-            return gain < LOSE if self._settled else self._scans >= LONGEST
-        return gain < LOSE or self._scans >= LONGEST
+        over = self._scans >= LONGEST
+        if self._prior == 0.0 and self._settled:
+            return gain < LOSE or (over and not self._is_plausible())
+        # A cloud that is still spread predicts a scan badly.
+        return over or (gain < LOSE and self._prior < 0.0 and (self._settled or self._scans >= SCANS))
 
     def is_at(self, pose: np.ndarray, far: float = FAR, turn: float = FAR_TURN) -> bool:
         """Tell whether the rival is at a pose, within a distance [m] and an angle [rad]."""

@@ -127,8 +127,8 @@ class Verdict:
         return self.state.corrections % _INTERVAL == 0
 
     def doubt(self) -> None:
-        """Take the pose for right or wrong with equal probability, as one that was just searched for."""
-        self.state = self.state._replace(belief=Belief(0.0), judged=-1)
+        """Begin anew with a pose that was just searched for: that scans chose it is no evidence."""
+        self.state = self.state._replace(belief=Belief.anywhere(), judged=-1)
 
     @property
     def explains_little(self) -> bool:

@@ -315,7 +315,7 @@ def test_poses_that_are_not_finite_are_reported_and_harmless(yaw, real, given_as
 
 def test_a_position_that_overflows_is_far_away(backend):
     """Finite poses whose sums are not: no NaN, and no index that is not one."""
-    grid = gs.OccupancyGrid(np.zeros((3, 3), np.int8), 1.0, (-1.7e308, 1.7e308, 2.0))
+    grid = gs.OccupancyGrid(np.zeros((3, 3), np.int8), 1e-4, (-1e9, 1e9, 2.0))
     poses = np.array([[1.7e308, -1.7e308, 0.0], [1.7e308, 1.7e308, 1.0], [-1.7e308, -1.7e308, 1.0]])
     found = launch(get_backend(backend), poses, grid, NO_MOUNT, "float32")
     assert found["pose_status"].tolist() == [0, 1]

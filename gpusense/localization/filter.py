@@ -73,6 +73,7 @@ class ParticleFilter(Beginnings):
         "_step", "_started", "_pending", "_shown", "_wide", "_corrections", "_together", "_pool", "_last", "_trust",
         "_verdict", "_sensors", "_cloud",
     )  # fmt: skip
+    PARTS = ("_trust",)
 
     def __init__(
         self,
@@ -115,6 +116,12 @@ class ParticleFilter(Beginnings):
 
     def _keep(self) -> None:
         self._cloud.kept = self._cloud.places
+
+    def _changing(self, method: str) -> tuple[Any, ...]:
+        if method == "estimate" and self._pending is None:
+            # It runs the pending motion, and judges the pose.
+            return (self._verdict,)
+        return self, self._cloud, self._verdict, *self._sensors
 
     def __repr__(self) -> str:
         one = self.options

@@ -264,6 +264,9 @@ def _merged(now: Any, value: Any) -> Any:
                 raise ValueError(f"state: must hold objects of gpusense, got one of {module}")
             made = getattr(importlib.import_module(module), name)
             target = made.__new__(made)
+        elif not hasattr(kind, "MEMORY"):
+            # Another object, so that one assignment changes all of it.
+            target = copy.copy(now)
         set_state(target, value.values)
         return target
     if isinstance(value, dict):

@@ -8,9 +8,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from types import FrameType
 
 # Until the destructor has ended [s].
 _LATER = 0.002
+# Name of functions that are installed as ``sys.unraisablehook``.
+HOOK = "report_unraisable"
 
 
 def undisturbed(work: Callable[[], object]) -> None:
@@ -31,19 +34,32 @@ def undisturbed(work: Callable[[], object]) -> None:
 
 
 def deliver_later(number: int) -> None:
-    """Send a signal to the main thread shortly.
+    """Send a signal to the main thread once it has left its destructor, or the hook that reports errors of one.
 
     Signals are handled between the lines of the main thread, which are those of the destructor still.
     """
-    threading.Thread(target=_deliver, args=(number,), daemon=True).start()
+    # Without the wait for the start of a Thread.
+    _thread.start_new_thread(_deliver, (number,))
 
 
 def _deliver(number: int) -> None:
+    main = threading.main_thread().ident
+    if main is None:
+        return
     time.sleep(_LATER)
+    while _is_lost_in(sys._current_frames().get(main)):
+        time.sleep(_LATER)
     if sys.platform == "win32":
         _thread.interrupt_main(number)
     else:
         # Also where the main thread waits for the system, which a signal to another thread does not end.
-        main = threading.main_thread().ident
-        if main is not None:
-            signal.pthread_kill(main, number)
+        signal.pthread_kill(main, number)
+
+
+def _is_lost_in(frame: FrameType | None) -> bool:
+    """Return whether an exception in a call would be ignored."""
+    while frame is not None:
+        if frame.f_code.co_name in ("__del__", HOOK):
+            return True
+        frame = frame.f_back
+    return False

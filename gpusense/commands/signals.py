@@ -63,7 +63,7 @@ def stopping() -> Iterator[None]:
             return
         raise Stopped(number)
 
-    def ignored(lost: Any) -> None:
+    def report_unraisable(lost: Any) -> None:
         if issubclass(lost.exc_type, KeyboardInterrupt):
             interrupts.deliver_later(code_of(lost.exc_value) - 128)
         else:
@@ -75,7 +75,7 @@ def stopping() -> Iterator[None]:
     numbers = [number for name in _WORDS if signal.getsignal(number := getattr(signal, name)) in usual]
     before = {}
     try:
-        sys.unraisablehook = ignored
+        sys.unraisablehook = report_unraisable
         for number in numbers:
             before[number] = signal.signal(number, stop)
         yield

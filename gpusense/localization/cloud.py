@@ -40,7 +40,7 @@ class Cloud(Particles):
     ) -> None:
         super().__init__(backend, capacity, sensors, precision, residual=residual)
         self._recordings: dict[Hashable, tuple[Recording, object]] = {}
-        self._estimates, self._stages = Repeated(backend, 8), Repeated(backend, 16)
+        self._estimates, self._stages = Repeated(backend, 8), Repeated(backend, 24)
         self._uploads: list[np.ndarray] = []
 
     def place(self, poses: np.ndarray, weights: np.ndarray | None = None) -> None:
@@ -82,8 +82,11 @@ class Cloud(Particles):
         """Move the particles now."""
         places = self.places.moved(self.kept)
         self.upload_settings(settings)
-        self.backend.run(self.motion(self.places.next, places.next, kind))
+        self._move(self.places.next, places.next, kind)
         self.places = places
+
+    def _move(self, origin: int, target: int, kind: int) -> None:
+        self._stages.run((origin, target, kind, self.count, "move"), lambda: self.motion(origin, target, kind))
 
     def run_stages(
         self, settings: np.ndarray, stages: list[Stage], drawn: int, sensors: int, score: Callable[[Stage], None]
@@ -134,7 +137,7 @@ class Cloud(Particles):
     def begin(self, stage: Stage) -> None:
         """Start the motion of a correction."""
         if stage.kind is not None:
-            self.backend.run(self.motion(stage.origin, stage.source, stage.kind))
+            self._move(stage.origin, stage.source, stage.kind)
 
     def weigh(self, stage: Stage) -> None:
         """Run the launches of a stage after its scores."""

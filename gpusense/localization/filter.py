@@ -80,6 +80,7 @@ class ParticleFilter(Beginnings):
         "_everywhere", "_distinct",
         "_verdict", "_sensors", "_cloud",
     )  # fmt: skip
+    PARTS = ("_trust",)
 
     def __init__(
         self,
@@ -126,6 +127,12 @@ class ParticleFilter(Beginnings):
         self._cloud.kept = self._cloud.places
         if self._rival is not None:
             self._rival.keep()
+
+    def _changing(self, method: str) -> tuple[Any, ...]:
+        if method == "estimate" and self._pending is None:
+            # It runs the pending motion, and judges the pose.
+            return (self._verdict,)
+        return self, self._cloud, self._verdict, *self._sensors
 
     def __repr__(self) -> str:
         one = self.options

@@ -180,12 +180,14 @@ class FilterCloud(ABC):
 
     Attributes:
         MEMORY: Names of the attributes that a step changes.
+        PARTS: Names of those that hold state themselves; none.
         count: Particles of the next step.
         places: Buffers of the particles.
         kept: Those at the beginning of the call of the filter that is running.
     """
 
     MEMORY: ClassVar[tuple[str, ...]]
+    PARTS: ClassVar[tuple[str, ...]]
     count: int
     places: Places
     kept: Places

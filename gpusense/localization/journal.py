@@ -5,7 +5,8 @@ attributes in a journal, and drops it at its end by one assignment. If the call 
 puts the attributes back, at once or, if another interrupt prevents that, before the next call. Buffers on a device
 need no copy: a step writes those that the attributes do not name yet.
 
-State are the attributes in ``MEMORY`` of a class; of classes of this package without it, all attributes. Dictionaries,
+State are the attributes in ``MEMORY`` of a class, of which those in ``PARTS`` hold state themselves; of classes of this
+package without it, all attributes. Dictionaries,
 lists and queues are kept by their items, objects of this package by their own attributes, and everything else, arrays
 included, by identity: arrays of state are replaced, and never written.
 """
@@ -19,7 +20,7 @@ import importlib
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from types import FrameType
 from typing import Any, Concatenate, NamedTuple, ParamSpec, TypeVar
 
@@ -27,6 +28,8 @@ import numpy as np
 
 _PACKAGE = "gpusense.localization."
 _PLAIN = (bool, int, float, str, np.generic)
+# Sensors are state of the filter, and not of others that know them.
+_SENSORS = "_sensors"
 # Containers whose items are state.
 _CONTAINERS = (dict, list, deque)
 
@@ -61,33 +64,39 @@ def _attributes(owner: Any) -> dict[str, Any]:
 
 
 class Journal:
-    """All of an object's state at one moment.
+    """All state of objects at one moment.
 
     Args:
-        owner: The object.
-        frame: The call that may change it.
+        owners: The objects.
+        frame: The call that may change them.
     """
 
-    def __init__(self, owner: Any, frame: FrameType | None = None) -> None:
+    __slots__ = ("_containers", "_frame", "_objects")
+
+    def __init__(self, owners: Iterable[Any], frame: FrameType | None = None) -> None:
         self._frame = frame
         self._objects: list[tuple[Any, dict[str, Any]]] = []
         self._containers: list[tuple[Any, Any]] = []
-        kinds, seen, open_ = _KINDS, set[int](), [owner]
+        kinds, open_ = _KINDS, list(owners)
+        # By identity: each object or container once.
+        seen: set[int] = set()
         for one in open_:
             if id(one) in seen:
                 continue
             seen.add(id(one))
             kind = type(one)
-            kept: Any
-            if kinds[kind] == _OBJECT:
-                kept = _attributes(one)
-                self._objects.append((one.__dict__, kept))
+            if kinds[kind] == _CONTAINER:
+                items = one.copy()
+                self._containers.append((one, items))
+                open_ += [item for item in (items.values() if kind is dict else items) if kinds[type(item)]]
+                continue
+            # Faster than to choose attributes, which is left to ``restore``.
+            kept = one.__dict__.copy()
+            self._objects.append((one, kept))
+            if (parts := getattr(kind, "PARTS", None)) is not None:
+                open_ += [kept[name] for name in parts if kinds[type(kept[name])]]
             else:
-                kept = one.copy()
-                self._containers.append((one, kept))
-            for item in kept.values() if type(kept) is dict else kept:
-                if kinds[type(item)]:
-                    open_.append(item)
+                open_ += [item for name, item in kept.items() if kinds[type(item)] and name != _SENSORS]
 
     def is_running(self) -> bool:
         """Return whether the call that may change the object has called the present one."""
@@ -104,8 +113,9 @@ class Journal:
 
     def restore(self) -> None:
         """Put everything back; repeated if it was interrupted."""
-        for attributes, values in self._objects:
-            attributes.update(values)
+        for one, values in self._objects:
+            names = getattr(one, "MEMORY", values)
+            one.__dict__.update({name: values[name] for name in names if name in values})
         for container, items in self._containers:
             container.clear()
             (container.update if type(container) is dict else container.extend)(items)
@@ -125,6 +135,10 @@ class Whole:
 
     def _keep(self) -> None:
         """Note what the call that begins must leave as it is."""
+
+    def _changing(self, method: str) -> tuple[Any, ...]:
+        """Return the objects whose state a method may change: this one and its parts, or a few of these."""
+        return (self,)
 
     def settle(self) -> None:
         """Put the state back that an interrupted call has left behind."""
@@ -147,7 +161,7 @@ def whole(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W, P],
                 # Part of a call that is whole.
                 return method(self, *args, **kwargs)
             self._keep()
-            journal = self._journal = Journal(self, sys._getframe())
+            journal = self._journal = Journal(self._changing(method.__name__), sys._getframe())
             try:
                 result = method(self, *args, **kwargs)
                 self._journal = None
@@ -250,6 +264,9 @@ def _merged(now: Any, value: Any) -> Any:
                 raise ValueError(f"state: must hold objects of gpusense, got one of {module}")
             made = getattr(importlib.import_module(module), name)
             target = made.__new__(made)
+        elif not hasattr(kind, "MEMORY"):
+            # Another object, so that one assignment changes all of it.
+            target = copy.copy(now)
         set_state(target, value.values)
         return target
     if isinstance(value, dict):

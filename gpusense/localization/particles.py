@@ -133,6 +133,7 @@ class Particles:
     """
 
     MEMORY: ClassVar[tuple[str, ...]] = ("count", "block", "places", "pool", "pool_size")
+    PARTS: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
         self, backend: Backend, capacity: int, sensors: int, precision: np.dtype, *, residual: bool = False

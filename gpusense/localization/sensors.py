@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -47,7 +48,7 @@ class Sensor:
         ValueError: a model with a temperature other than 1.
     """
 
-    MEMORY = ("_correlation", "_seen", "_learned")
+    MEMORY, PARTS = ("_correlation", "_seen", "_learned"), ()
 
     def __init__(self, model: Any) -> None:
         if not isinstance(model, (ScanModel, PointModel, LandmarkModel)):
@@ -87,8 +88,10 @@ class Sensor:
         """Learn how much beams are worth from the scan that was counted last, at the estimated pose."""
         axes, scanner = axes_of(covariance), self.model.scanner
         parts = self.parts(poses_around(pose, axes), reading)
-        self._correlation.add(parts, axes, scanner.bearings + pose[2], follows=self._learned == self._seen - 1)
-        self._learned = self._seen
+        # Another object, as it is part of the state.
+        correlation = copy.copy(self._correlation)
+        correlation.add(parts, axes, scanner.bearings + pose[2], follows=self._learned == self._seen - 1)
+        self._correlation, self._learned = correlation, self._seen
 
     def parts(self, poses: np.ndarray, reading: tuple[Any, ...]) -> np.ndarray:
         """Return (N, K) log-likelihoods of the beams of a scan, in float64."""

@@ -61,6 +61,7 @@ class SplitCloud(FilterCloud):
     """
 
     MEMORY: ClassVar[tuple[str, ...]] = ("count", "places", "exchanged", "_state", "_pool")
+    PARTS: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, team: Here | There, capacity: int, *, residual: bool = False) -> None:
         self._team, self._residual = team, residual

@@ -9,11 +9,13 @@ from typing import NamedTuple
 import numpy as np
 
 from gpusense.backends import Backend
-from gpusense.matching.icp import IcpPairs, space_of
+from gpusense.matching.evidence import DOUBTED, pair_evidence, probability_right
+from gpusense.matching.icp import LONG_WIDTH, WIDTH, IcpPairs, points_of_line, space_of
+from gpusense.matching.observability import Observed, axes_of, covariance_of
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import ScanPoints
-from gpusense.matching.result import ScanMatch
-from gpusense.matching.uncertainty import Uncertainty, inflation_of, statuses, symmetric, uncertainty
+from gpusense.matching.result import USABLE, ScanMatch
+from gpusense.matching.uncertainty import inflation_of, observed_pairs, statuses, symmetric, variance_of
 
 # A score below this starts a search of the window, and a score below the second one, far from the guess, a search
 # nearby: far is in capture radii and rad.
@@ -30,8 +32,12 @@ _PROMISING = 0.15
 _OTHER, _OTHER_TURN, _CLOSE = 0.25, 0.1, 0.012
 
 
+# Lines turn with noise by this much in the mean square [rad^2] where longer ones tell what is observed.
+_TURNED_LINES = 0.02
+
+
 class Best(NamedTuple):
-    """The best results (S, 32), and the offset to a pose that agrees about as well (S, 3); NaN without one."""
+    """The best results (S, 35), and the offset to a pose that agrees about as well (S, 3); NaN without one."""
 
     result: np.ndarray
     other: np.ndarray
@@ -80,8 +86,9 @@ def match_pairs(
                     which = np.flatnonzero(some)
                     _search(device, which, sensor[which], reach, best, options, most, points.gap)
             _repeat(device, sensor, best, options, most, points.gap)
+        sums = _tested(device, best.result, points, pairs, options)
         space.wait()
-    return _finished(best, points.rms_range(pairs[:, 1]), options, mount)
+    return _finished(best, sums, pairs, points, guess, options, mount)
 
 
 def _search(
@@ -124,10 +131,10 @@ def _compare(rows: np.ndarray, guess: np.ndarray, found: np.ndarray, best: Best,
 
 
 def _prior(result: np.ndarray, guess: np.ndarray, options: MatchOptions) -> np.ndarray:
-    """Return what results lose of their scores by the distance from their guesses, and by not having converged."""
-    offset = result[:, :2] - guess[:, :2]
+    """Return what results lose of their scores: far from their guesses, outside the window, or without convergence."""
+    offset = result[:, :3] - guess
     distance = np.hypot(offset[:, 0], offset[:, 1]) / options.capture
-    lost: np.ndarray = _FARTHER * distance + _UNSETTLED * (result[:, 5] == 0)
+    lost: np.ndarray = _FARTHER * distance + _UNSETTLED * (result[:, 5] == 0) + options.is_outside(offset)
     return lost
 
 
@@ -189,9 +196,45 @@ def to_sensor(pose: np.ndarray, mount: tuple[float, float]) -> np.ndarray:
     return np.stack([pose[:, 0] + c * x - s * y - x, pose[:, 1] + s * x + c * y - y, pose[:, 2]], axis=1)
 
 
-def _finished(best: Best, lever: np.ndarray, options: MatchOptions, mount: tuple[float, float]) -> ScanMatch:
-    """Return the matches in the robot's frame, with covariance and status."""
-    result = best.result
+class _Sums(NamedTuple):
+    """What the pairs of matches observe in the sensors' frames, variances of points and factors of covariances (S,)."""
+
+    found: Observed
+    variance: np.ndarray
+    factor: np.ndarray
+
+
+def _tested(
+    device: IcpPairs, result: np.ndarray, points: ScanPoints, pairs: np.ndarray, options: MatchOptions
+) -> _Sums:
+    """Return what pairs observe: by the lines of the matches, and where noise may turn these, by longer ones."""
+    lever = points.rms_range(pairs[:, 1])
+    squared = result[:, 20] / np.maximum(result[:, 19], 1e-30)
+    variance, factor = variance_of(squared, options.least_scale, inflation_of(result[:, 24:32]))
+    noise = np.maximum(variance, options.noise**2)
+    lines = result[:, 19] / points_of_line(points.gap, options.noise, lever)
+
+    def observed(sums: np.ndarray, rows: np.ndarray) -> Observed:
+        information, doubt = symmetric(sums[:, 6:12]), symmetric(sums[:, 12:18])
+        return observed_pairs(information, doubt, noise[rows], lever[rows], lines[rows])
+
+    found = observed(result, np.arange(len(result)))
+    turned = (result[:, 12] + result[:, 15]) * noise > _TURNED_LINES * np.maximum(result[:, 19], 1e-30)
+    rows = np.flatnonzero((found.lost > 0) | turned)
+    if len(rows) and LONG_WIDTH * options.noise > WIDTH:
+        device.fit_lines(LONG_WIDTH * options.noise)
+        longer = device.run(rows, result[rows, None, :3], options.last_rules(points.gap))[:, 0]
+        for values, others in zip(found, observed(longer, rows), strict=True):
+            values[rows] = others
+    return _Sums(found, variance, factor)
+
+
+def _finished(
+    best: Best, sums: _Sums, pairs: np.ndarray, points: ScanPoints, guess: np.ndarray, options: MatchOptions,
+    mount: tuple[float, float],
+) -> ScanMatch:  # fmt: skip
+    """Return the matches in the robot's frame, with information and status."""
+    result, lever = best.result, points.rms_range(pairs[:, 1])
     x, y = mount
     theta = wrapped(result[:, 2])
     c, s = np.cos(theta), np.sin(theta)
@@ -199,31 +242,80 @@ def _finished(best: Best, lever: np.ndarray, options: MatchOptions, mount: tuple
     # Derivative of the sensor's pose with respect to the robot's.
     moved = np.tile(np.eye(3), (len(pose), 1, 1))
     moved[:, 0, 2], moved[:, 1, 2] = -s * x - c * y, c * x - s * y
-    information, doubt = (moved.transpose(0, 2, 1) @ symmetric(result[:, at : at + 6]) @ moved for at in (6, 12))
-    squared = result[:, 20] / np.maximum(result[:, 19], 1e-30)
-    inflation = inflation_of(result[:, 24:])
-    found = uncertainty(information, doubt, squared, options.least_scale, result[:, 19], lever, inflation)
-    status = statuses(result, found.observed)
-    return concluded(pose, found, result[:, 3], result[:, 4], status, lever, best.other)
+    found, factor = sums.found, sums.factor
+    final = moved.transpose(0, 2, 1) @ found.information @ moved / factor[:, None, None]
+    step = np.linalg.solve(moved, result[:, 32:35, None])[..., 0]
+    length = np.sqrt(np.maximum(np.einsum("si,sij,sj->s", step, final, step), 0))
+    status = statuses(result, found.lost, length)
+    evidence = pair_evidence(result, found.lost, best.other, options)
+    match = concluded(
+        pose, final, factor, result[:, 3], result[:, 4], status, lever, best.other,
+        evidence, result[:, 19], options,
+    )  # fmt: skip
+    return within_window(match, guess, options)
 
 
 def concluded(
-    pose: np.ndarray,
-    found: Uncertainty,
-    score: np.ndarray,
-    iterations: np.ndarray,
-    status: np.ndarray,
-    lever: np.ndarray,
-    other: np.ndarray,
-) -> ScanMatch:
-    """Return matches whose covariance is infinite where they failed, and spans both poses where there are two."""
-    converged = np.isin(status, ("converged", "unobservable"))
-    two = converged & np.isfinite(other).all(axis=1)
-    covariance = found.covariance.copy()
-    covariance[two] += 0.25 * other[two, :, None] * other[two, None, :]
-    covariance[~converged] = np.where(np.eye(3) > 0, np.inf, 0.0)
+    pose: np.ndarray, information: np.ndarray, factor: np.ndarray, score: np.ndarray, iterations: np.ndarray,
+    status: np.ndarray, lever: np.ndarray, other: np.ndarray, evidence: np.ndarray, pairs: np.ndarray,
+    options: MatchOptions,
+) -> ScanMatch:  # fmt: skip
+    """Return matches whose information is 0 where they failed, and spans both poses where there are two.
+
+    Args:
+        pose: (S, 3) poses.
+        information: (S, 3, 3) of them.
+        factor: (S,) by which it is multiplied for a sum over pairs [m^2].
+        score: (S,) scores.
+        iterations: (S,) iterations.
+        status: (S,) statuses so far.
+        lever: (S,) root mean square ranges [m].
+        other: (S, 3) offsets to poses that agree about as well, NaN without one.
+        evidence: (S, E) numbers of ``evidence.NAMES``.
+        pairs: (S,) sums of weights.
+        options: The window and the noise.
+    """
+    usable = np.isin(status, USABLE)
+    p_right = np.where(usable, probability_right(evidence), 0.0)
+    two = usable & np.isfinite(other).all(axis=1)
+    offset = np.where(two[:, None], other, 0.0)
+    # The covariance plus a quarter of the offset's square, by Woodbury's identity.
+    side = np.einsum("sij,sj->si", information, offset)
+    information = information - side[:, :, None] * (side / (4 + (side * offset).sum(axis=1))[:, None])[:, None, :]
     status = np.where(two, "ambiguous", status)
+    status = np.where(usable & (p_right < DOUBTED), "doubtful", status)
+    usable = np.isin(status, USABLE)
+    values, vectors = axes_of(information, lever)
+    shares = values * (factor / np.maximum(pairs, 1))[:, None]
+    information = np.where(usable[:, None, None], information, 0.0)
     return ScanMatch(
-        pose, covariance, score, iterations.astype(np.int64), converged, found.eigenvalues, found.directions, lever,
-        status,
+        pose, covariance_of(information, lever, options.window), information, p_right, score,
+        iterations.astype(np.int64), shares, vectors.transpose(0, 2, 1), lever, np.full(len(pose), options.noise),
+        evidence, status,
     )  # fmt: skip
+
+
+def within_window(match: ScanMatch, guess: np.ndarray, options: MatchOptions) -> ScanMatch:
+    """Return S matches of which those outside the window around their guesses (S, 3) have failed."""
+    outside = (match.usable | (match.status == "doubtful")) & options.is_outside(match.pose - guess)
+    if not outside.any():
+        return match
+    some = outside[:, None, None]
+    return replace(
+        match, status=np.where(outside, "outside window", match.status), p_right=np.where(outside, 0, match.p_right),
+        information=np.where(some, 0.0, match.information),
+        covariance=np.where(some, np.where(np.eye(3) > 0, np.inf, 0.0), match.covariance),
+    )  # fmt: skip
+
+
+def pair_sums(
+    backend: Backend, real: np.dtype, points: ScanPoints, pairs: np.ndarray, options: MatchOptions
+) -> np.ndarray:
+    """Return results (S, 35) of pairs of scans that stay where they are, but for one last step."""
+    lock, space = space_of(backend)
+    rules = options.last_rules(points.gap)._replace(score_stride=options.rules(int(points.counts.max(initial=0)), 0.0).score_stride)
+    with lock, space:
+        device = IcpPairs(backend, real, points, pairs, options.noise, space)
+        result = device.run(np.arange(len(pairs)), np.zeros((len(pairs), 1, 3)), rules)[:, 0]
+        space.wait()
+    return result

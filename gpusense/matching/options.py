@@ -14,6 +14,10 @@ from gpusense.interface.structs import MatchRules
 _COARSE_POINTS, _SEARCH_POINTS = 200, 30
 # Most points of the reference in a search.
 _SEARCH_REFERENCE = 64
+# Poses on the edge of a window are in it [m, rad].
+_MARGIN = 1e-3
+# Points apart of those that make a score: a single one.
+_NO_SCORE = 1 << 24
 # Largest translation of a guess between scans [m]; float32 has 6 cm there.
 _FARTHEST = 1e6
 
@@ -32,6 +36,13 @@ class MatchOptions:
     capture: float
     window: tuple[float, float]
 
+    def is_outside(self, offset: np.ndarray) -> np.ndarray:
+        """Return whether (S, 3) offsets from guesses are beyond the window, but for what a start may move."""
+        turn = np.abs((offset[:, 2] + math.pi) % (2 * math.pi) - math.pi)
+        reach, half = self.window
+        outside: np.ndarray = (np.hypot(offset[:, 0], offset[:, 1]) > reach + _MARGIN) | (turn > half + _MARGIN)
+        return outside
+
     @property
     def least_scale(self) -> float:
         """Scale of the last weights [m]."""
@@ -44,6 +55,11 @@ class MatchOptions:
         near = max(0.3 * self.capture, 3 * least)
         return MatchRules(40, stride, 1, (stride + 1) // 2, 0, self.capture, near, max(scale, least), least, 0.85, gap,
                           near, 1e-4 * self.capture)  # fmt: skip
+
+    def last_rules(self, gap: float) -> MatchRules:
+        """Return the rules of a single last iteration at the poses of matches, whose scores do not count."""
+        full = self.rules(1, gap)
+        return full._replace(iterations=1, capture=full.least_capture, scale=full.least_scale, score_stride=_NO_SCORE)
 
     def search_rules(self, points: int, gap: float) -> MatchRules:
         """Return the rules of the many starts of a search: few points, few iterations."""

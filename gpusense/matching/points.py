@@ -14,7 +14,7 @@ _FULL_TURN = 2 * math.pi
 # Points nearer than this have no bearing [m].
 _NEAREST = 1e-6
 # Largest step between bearings that hides nothing, in steps of the scanner.
-_GAP = 3.0
+GAP = 3.0
 
 
 @dataclass(frozen=True)
@@ -88,5 +88,5 @@ def _points(point: np.ndarray, hit: np.ndarray, bearing: np.ndarray, squares: np
     """Return points with the starts of their scans, and the gap of a scanner's ascending bearings."""
     start = np.append(0, np.cumsum(np.count_nonzero(hit, axis=1))).astype(np.int32)
     steps = np.diff(bearing.astype(np.float64))
-    gap = _GAP * float(np.median(steps)) if len(steps) else _FULL_TURN
+    gap = GAP * float(np.median(steps)) if len(steps) else _FULL_TURN
     return ScanPoints(np.ascontiguousarray(point), start, gap, squares)

@@ -7,8 +7,8 @@
 // Numbers of a result: pose (3), score, iterations, whether the last step was below ten tolerances, information (6),
 // and its part that is due to errors of the lines (6), pairs, sum of weights, weighted sum of squared errors, points
 // that the other scan should see, points that contradict it, points that it did not see, and for blocks of 1, 2, 4 to
-// 128 successive points the sum of squares of the blocks' sums of weighted errors (8), 0 with thin.
-#define MATCH_RESULT 32
+// 128 successive points the sum of squares of the blocks' sums of weighted errors (8), 0 with thin; the last step (3).
+#define MATCH_RESULT 35
 // Rounding errors of bounds are far below this share.
 #define ALMOST ((real)0.999)
 // Weight in the score of a point that the other scan did not see; one that disagrees has 1.
@@ -116,6 +116,7 @@ kernel void match_scans(global const real4 *point, global const int *start, glob
     real4 pose = guess[n];
     real sums[MATCH_SUMS], squares[MATCH_BLOCKS], open[MATCH_BLOCKS];
     real capture = rules.capture, scale = rules.scale, cosine = cos(pose.z), sine = sin(pose.z);
+    real4 moved = (real4)(0);
     int iteration = 0, settled = 0, calm = 0, ahead = 0;
     for (int i = 0; i < MATCH_SUMS; ++i) sums[i] = 0;
     for (int i = 0; i < MATCH_BLOCKS; ++i) squares[i] = open[i] = 0;
@@ -141,6 +142,7 @@ kernel void match_scans(global const real4 *point, global const int *start, glob
         const real length = sqrt(step.x * step.x + step.y * step.y), most = (real)0.5 * rules.capture;
         if (length > most) step.xy *= most / length;
         step.z = fmax(fmin(step.z, (real)0.3), (real)-0.3);
+        moved = step;
         pose += step;
         cosine = cos(pose.z);
         sine = sin(pose.z);
@@ -174,4 +176,5 @@ kernel void match_scans(global const real4 *point, global const int *start, glob
     out[18] = sums[17], out[19] = sums[15], out[20] = sums[16];
     out[21] = both.y, out[22] = both.z, out[23] = both.w;
     for (int i = 0; i < MATCH_BLOCKS; ++i) out[24 + i] = squares[i];
+    out[32] = moved.x, out[33] = moved.y, out[34] = moved.z;
 }

@@ -313,7 +313,9 @@ def pair_sums(
 ) -> np.ndarray:
     """Return results (S, 35) of pairs of scans that stay where they are, but for one last step."""
     lock, space = space_of(backend)
-    rules = options.last_rules(points.gap)._replace(score_stride=options.rules(int(points.counts.max(initial=0)), 0.0).score_stride)
+    rules = options.last_rules(points.gap)._replace(
+        score_stride=options.rules(int(points.counts.max(initial=0)), 0.0).score_stride
+    )
     with lock, space:
         device = IcpPairs(backend, real, points, pairs, options.noise, space)
         result = device.run(np.arange(len(pairs)), np.zeros((len(pairs), 1, 3)), rules)[:, 0]

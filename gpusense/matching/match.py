@@ -149,7 +149,9 @@ def _matches(
         shared = len(first) == 1
         one, moved_before = (first, before) if shared else (first[rows], None if before is None else before[rows])
         moved = None if motion is None else motion[rows]
-        return _to_scans(one, second[rows], scanner, poses[rows], method, device, precision, chosen, moved_before, moved)
+        return _to_scans(
+            one, second[rows], scanner, poses[rows], method, device, precision, chosen, moved_before, moved
+        )
 
     noise = np.full(len(second), options.noise)
     if not given:

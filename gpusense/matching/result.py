@@ -145,5 +145,7 @@ class ScanMatch:
     def __repr__(self) -> str:
         if isinstance(self.status, str):
             x, y, theta = self.pose
-            return f"ScanMatch({self.status}, x={x:.4g}, y={y:.4g}, theta={theta:.4g}, p_right={float(self.p_right):.3g})"
+            return (
+                f"ScanMatch({self.status}, x={x:.4g}, y={y:.4g}, theta={theta:.4g}, p_right={float(self.p_right):.3g})"
+            )
         return f"ScanMatch({len(self)} matches, {np.count_nonzero(self.converged)} converged)"

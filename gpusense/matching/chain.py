@@ -9,13 +9,13 @@ from typing import NamedTuple
 import numpy as np
 
 from gpusense.backends import Backend
-from gpusense.matching.evidence import DOUBTED, pair_evidence, probability_right
-from gpusense.matching.icp import LONG_WIDTH, WIDTH, IcpPairs, points_of_line, space_of
-from gpusense.matching.observability import Observed, axes_of, covariance_of
+from gpusense.matching.evidence import pair_evidence
+from gpusense.matching.icp import IcpPairs, space_of
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import ScanPoints
-from gpusense.matching.result import USABLE, ScanMatch
-from gpusense.matching.uncertainty import inflation_of, observed_pairs, statuses, symmetric, variance_of
+from gpusense.matching.result import ScanMatch
+from gpusense.matching.uncertainty import statuses
+from gpusense.matching.verdicts import PairSums, concluded, tested
 
 # A score below this starts a search of the window, and a score below the second one, far from the guess, a search
 # nearby: far is in capture radii and rad.
@@ -30,10 +30,6 @@ _FARTHER, _UNSETTLED = 0.03, 0.05
 _PROMISING = 0.15
 # Poses farther apart than this whose scores are this close make a match ambiguous.
 _OTHER, _OTHER_TURN, _CLOSE = 0.25, 0.1, 0.012
-
-
-# Lines turn with noise by this much in the mean square [rad^2] where longer ones tell what is observed.
-_TURNED_LINES = 0.02
 
 
 class Best(NamedTuple):
@@ -53,7 +49,7 @@ def match_pairs(
     options: MatchOptions,
     mount: tuple[float, float],
 ) -> ScanMatch:
-    """Match pairs of scans.
+    """Match pairs of scans; ``judged`` says how probable the matches are.
 
     Args:
         backend: The device.
@@ -70,7 +66,7 @@ def match_pairs(
     with lock, space:
         device = IcpPairs(backend, real, points, pairs, options.noise, space)
         everything = np.arange(len(pairs))
-        most = int(points.counts.max(initial=0))
+        before, most = (int(points.counts[pairs[:, i]].max(initial=0)) for i in (0, 1))
         result = device.run(everything, sensor[:, None], options.rules(most, points.gap))[:, 0]
         best = Best(result, np.full((len(pairs), 3), np.nan))
         if method == "auto":
@@ -84,11 +80,11 @@ def match_pairs(
             ):
                 if some.any():
                     which = np.flatnonzero(some)
-                    _search(device, which, sensor[which], reach, best, options, most, points.gap)
+                    _search(device, which, sensor[which], reach, best, options, (before, most), points.gap)
             _repeat(device, sensor, best, options, most, points.gap)
-        sums = _tested(device, best.result, points, pairs, options)
+        sums = tested(device, best.result, points, pairs, options)
         space.wait()
-    return _finished(best, sums, pairs, points, guess, options, mount)
+    return _finished(best, sums, pairs, points, options, mount)
 
 
 def _search(
@@ -98,15 +94,18 @@ def _search(
     offsets: np.ndarray,
     best: Best,
     options: MatchOptions,
-    most: int,
+    most: tuple[int, int],
     gap: float,
 ) -> None:
-    """Search around the guesses of some pairs, and put better results in place."""
-    coarse = device.run(poor, guess[:, None] + offsets, options.search_rules(most, gap))
+    """Search around the guesses of some pairs, and put better results in place.
+
+    ``most`` is the number of points of the largest reference and of the largest second scan.
+    """
+    coarse = device.run(poor, guess[:, None] + offsets, options.search_rules(most[1], gap, most[0]))
     which, chosen = distinct(coarse[..., :3], coarse[..., 3], best.result[poor, :3], options.capture)
     if not len(which):
         return
-    fine = device.run(poor[which], chosen[:, None], options.final_rules(most, gap))[:, 0]
+    fine = device.run(poor[which], chosen[:, None], options.final_rules(most[1], gap))[:, 0]
     rows = poor[which]
     order = np.arange(len(rows)) - np.searchsorted(rows, rows)
     # The starts of a pair one after another, those of all pairs together.
@@ -196,41 +195,8 @@ def to_sensor(pose: np.ndarray, mount: tuple[float, float]) -> np.ndarray:
     return np.stack([pose[:, 0] + c * x - s * y - x, pose[:, 1] + s * x + c * y - y, pose[:, 2]], axis=1)
 
 
-class _Sums(NamedTuple):
-    """What the pairs of matches observe in the sensors' frames, variances of points and factors of covariances (S,)."""
-
-    found: Observed
-    variance: np.ndarray
-    factor: np.ndarray
-
-
-def _tested(
-    device: IcpPairs, result: np.ndarray, points: ScanPoints, pairs: np.ndarray, options: MatchOptions
-) -> _Sums:
-    """Return what pairs observe: by the lines of the matches, and where noise may turn these, by longer ones."""
-    lever = points.rms_range(pairs[:, 1])
-    squared = result[:, 20] / np.maximum(result[:, 19], 1e-30)
-    variance, factor = variance_of(squared, options.least_scale, inflation_of(result[:, 24:32]))
-    noise = np.maximum(variance, options.noise**2)
-    lines = result[:, 19] / points_of_line(points.gap, options.noise, lever)
-
-    def observed(sums: np.ndarray, rows: np.ndarray) -> Observed:
-        information, doubt = symmetric(sums[:, 6:12]), symmetric(sums[:, 12:18])
-        return observed_pairs(information, doubt, noise[rows], lever[rows], lines[rows])
-
-    found = observed(result, np.arange(len(result)))
-    turned = (result[:, 12] + result[:, 15]) * noise > _TURNED_LINES * np.maximum(result[:, 19], 1e-30)
-    rows = np.flatnonzero((found.lost > 0) | turned)
-    if len(rows) and LONG_WIDTH * options.noise > WIDTH:
-        device.fit_lines(LONG_WIDTH * options.noise)
-        longer = device.run(rows, result[rows, None, :3], options.last_rules(points.gap))[:, 0]
-        for values, others in zip(found, observed(longer, rows), strict=True):
-            values[rows] = others
-    return _Sums(found, variance, factor)
-
-
 def _finished(
-    best: Best, sums: _Sums, pairs: np.ndarray, points: ScanPoints, guess: np.ndarray, options: MatchOptions,
+    best: Best, sums: PairSums, pairs: np.ndarray, points: ScanPoints, options: MatchOptions,
     mount: tuple[float, float],
 ) -> ScanMatch:  # fmt: skip
     """Return the matches in the robot's frame, with information and status."""
@@ -247,77 +213,8 @@ def _finished(
     step = np.linalg.solve(moved, result[:, 32:35, None])[..., 0]
     length = np.sqrt(np.maximum(np.einsum("si,sij,sj->s", step, final, step), 0))
     status = statuses(result, found.lost, length)
-    evidence = pair_evidence(result, found.lost, best.other, options)
-    match = concluded(
+    evidence = pair_evidence(result, found.lost, best.other, options.noise)
+    return concluded(
         pose, final, factor, result[:, 3], result[:, 4], status, lever, best.other,
         evidence, result[:, 19], options,
     )  # fmt: skip
-    return within_window(match, guess, options)
-
-
-def concluded(
-    pose: np.ndarray, information: np.ndarray, factor: np.ndarray, score: np.ndarray, iterations: np.ndarray,
-    status: np.ndarray, lever: np.ndarray, other: np.ndarray, evidence: np.ndarray, pairs: np.ndarray,
-    options: MatchOptions,
-) -> ScanMatch:  # fmt: skip
-    """Return matches whose information is 0 where they failed, and spans both poses where there are two.
-
-    Args:
-        pose: (S, 3) poses.
-        information: (S, 3, 3) of them.
-        factor: (S,) by which it is multiplied for a sum over pairs [m^2].
-        score: (S,) scores.
-        iterations: (S,) iterations.
-        status: (S,) statuses so far.
-        lever: (S,) root mean square ranges [m].
-        other: (S, 3) offsets to poses that agree about as well, NaN without one.
-        evidence: (S, E) numbers of ``evidence.NAMES``.
-        pairs: (S,) sums of weights.
-        options: The window and the noise.
-    """
-    usable = np.isin(status, USABLE)
-    p_right = np.where(usable, probability_right(evidence), 0.0)
-    two = usable & np.isfinite(other).all(axis=1)
-    offset = np.where(two[:, None], other, 0.0)
-    # The covariance plus a quarter of the offset's square, by Woodbury's identity.
-    side = np.einsum("sij,sj->si", information, offset)
-    information = information - side[:, :, None] * (side / (4 + (side * offset).sum(axis=1))[:, None])[:, None, :]
-    status = np.where(two, "ambiguous", status)
-    status = np.where(usable & (p_right < DOUBTED), "doubtful", status)
-    usable = np.isin(status, USABLE)
-    values, vectors = axes_of(information, lever)
-    shares = values * (factor / np.maximum(pairs, 1))[:, None]
-    information = np.where(usable[:, None, None], information, 0.0)
-    return ScanMatch(
-        pose, covariance_of(information, lever, options.window), information, p_right, score,
-        iterations.astype(np.int64), shares, vectors.transpose(0, 2, 1), lever, np.full(len(pose), options.noise),
-        evidence, status,
-    )  # fmt: skip
-
-
-def within_window(match: ScanMatch, guess: np.ndarray, options: MatchOptions) -> ScanMatch:
-    """Return S matches of which those outside the window around their guesses (S, 3) have failed."""
-    outside = (match.usable | (match.status == "doubtful")) & options.is_outside(match.pose - guess)
-    if not outside.any():
-        return match
-    some = outside[:, None, None]
-    return replace(
-        match, status=np.where(outside, "outside window", match.status), p_right=np.where(outside, 0, match.p_right),
-        information=np.where(some, 0.0, match.information),
-        covariance=np.where(some, np.where(np.eye(3) > 0, np.inf, 0.0), match.covariance),
-    )  # fmt: skip
-
-
-def pair_sums(
-    backend: Backend, real: np.dtype, points: ScanPoints, pairs: np.ndarray, options: MatchOptions
-) -> np.ndarray:
-    """Return results (S, 35) of pairs of scans that stay where they are, but for one last step."""
-    lock, space = space_of(backend)
-    rules = options.last_rules(points.gap)._replace(
-        score_stride=options.rules(int(points.counts.max(initial=0)), 0.0).score_stride
-    )
-    with lock, space:
-        device = IcpPairs(backend, real, points, pairs, options.noise, space)
-        result = device.run(np.arange(len(pairs)), np.zeros((len(pairs), 1, 3)), rules)[:, 0]
-        space.wait()
-    return result

@@ -2,10 +2,10 @@
 
 A score of a cell is its log density in 255 steps. With the nearest cell's distance the sum of scores differs from the
 log-likelihood by rounding alone. With bilinear distances an end point's density depends on its place within a cell. All
-positions are centres of cells, so this place is the same at all positions with one heading. A cell is divided into tiles;
-each kind of tile has a table of its own with the largest density within the tile, rounded up. A bilinear function has its
-least value over a tile at a corner, so these are bounds, and every pose whose bound reaches the log-likelihood of some
-known pose is evaluated by the model.
+positions are centres of cells, so this place is the same at all positions with one heading. A cell is divided into
+tiles; each kind of tile has a table of its own with the largest density within the tile, rounded up. A bilinear
+function has its least value over a tile at a corner, so these are bounds, and every pose whose bound reaches the
+log-likelihood of some known pose is evaluated by the model.
 """
 
 from __future__ import annotations

@@ -24,6 +24,8 @@ REACH, _MOST, _FEWER, _RATIO, _SLACK = 2, 48, 16, 0.1, 0.05
 WIDTH, LONG_WIDTH = 0.04, 8.0
 # Neighbours may be this many deviations apart, or this many of the scanner's steps in bearing times the range.
 _SLACK_DEVIATIONS, _STEPS = 6.0, 2.5
+# With farther steps of bearing lines have three points [rad].
+_SPARSE = 0.12
 # Most starts of one launch; a call can be interrupted between launches.
 _MOST_STARTS = {"cpu": 1 << 12, "gpu": 1 << 18}
 
@@ -77,7 +79,8 @@ class IcpPairs:
         flags = widened(self._backend.info.lanes, "fit_lines", self._flags)
         lines = launch(
             "fit_lines", flags, (self._most, self._counts[0]), point=self._point, start=self._start, line=self._line,
-            scans=self._counts[0], points=self._counts[1], reach=REACH, most=_MOST if width > WIDTH else _FEWER,
+            scans=self._counts[0], points=self._counts[1], reach=1 if self._gap > GAP * _SPARSE else REACH,
+            most=_MOST if width > WIDTH else _FEWER,
             ratio=max(_RATIO, _STEPS * self._gap / GAP), slack=max(_SLACK, _SLACK_DEVIATIONS * self._noise),
             width=width, gap=self._gap,
         )  # fmt: skip

@@ -20,6 +20,7 @@ from gpusense.matching.points import scan_points
 from gpusense.matching.result import ScanMatch
 from gpusense.matching.scan_map import match_by_maps
 from gpusense.matching.to_map import match_to_map
+from gpusense.matching.verdicts import judged
 from gpusense.models.arguments import real_dtype
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
@@ -183,7 +184,8 @@ def _to_scans(
     moved = [np.zeros((len(scans), 3)) if m is None else m for scans, m in ((first, before), (second, motion))]
     points = scan_points(np.concatenate([first, second]), scanner, real, np.concatenate(moved))
     pairs = np.stack([np.arange(len(second)) % max(len(first), 1), len(first) + np.arange(len(second))], axis=1)
-    return match_pairs(device, real, points, pairs, poses, method, options, scanner.mount[:2])
+    match = match_pairs(device, real, points, pairs, poses, method, options, scanner.mount[:2])
+    return judged(match, poses, options)
 
 
 def _still(ranges: np.ndarray, scanner: Scanner, motion: np.ndarray | None) -> np.ndarray:

@@ -54,7 +54,7 @@ def scan_noise(ranges: np.ndarray, scanner: Scanner) -> np.ndarray:
 
 
 def _range_steps(ranges: np.ndarray) -> np.ndarray:
-    """Return the step (S,) in which ranges (S, K) come [m], 0 where they do not; those that do not count are infinite."""
+    """Return the step (S,) in which ranges (S, K) come [m], 0 without one; infinite ranges do not count."""
     with np.errstate(invalid="ignore"):
         gap = np.diff(np.sort(ranges, axis=1), axis=1)
     gap = np.where(np.isfinite(gap) & (gap > 0.5 * _LEAST_STEP), gap, np.inf)

@@ -8,20 +8,22 @@ from __future__ import annotations
 
 import math
 import threading
+from dataclasses import replace
 
 import numpy as np
 
 from gpusense.backends import Backend
 from gpusense.matching.alone import own_information
-from gpusense.matching.chain import DOUBTFUL, concluded, match_pairs, pair_sums, within_window, wrapped
+from gpusense.matching.chain import DOUBTFUL, match_pairs, wrapped
 from gpusense.matching.climb import climb
 from gpusense.matching.evidence import pair_evidence
 from gpusense.matching.observability import axes_of, balance_of, observed_information, orthonormal
 from gpusense.matching.options import MatchOptions
-from gpusense.matching.points import ScanPoints, scan_points
+from gpusense.matching.points import ScanPoints, dense_scanner, scan_points
 from gpusense.matching.result import ScanMatch
 from gpusense.matching.score_tables import ScoreTables, field_scores
 from gpusense.matching.search import PoseGrid, Search
+from gpusense.matching.verdicts import concluded, judged, pair_sums
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.tables.distances import distance_transform
@@ -35,7 +37,7 @@ _RANDOM = 0.2
 # Least deviation of a field in cells.
 _LEAST_CELLS = 1.5
 # A score below this is a failure. Least hits, and least pairs and share of pairs that observe a direction.
-_POOR, _FEW, _LEAST_PAIRS, _LEAST_SHARE = 0.3, 8, 2.0, 0.01
+_POOR, _FEW, _LEAST_PAIRS, _LEAST_SHARE = 0.3, 5, 2.0, 0.01
 # In maps drawn of end points, readings end this far behind surfaces; most that field and expected scan differ [cells].
 _BEHIND, _MOST_OFF = 0.1, 3.0
 # Sine of the angle between directions that are not the same.
@@ -65,6 +67,10 @@ class MapMatcher:
             sigmas.append(2.5 * sigmas[-1])
         self._sigmas = sigmas[::-1]
         self._models = [self._model(sigma, precision) for sigma in self._sigmas]
+        # A scan of few beams is matched to an expected one of many.
+        self._dense = dense_scanner(scanner)
+        if self._dense is not scanner:
+            self._options = replace(options, one_way=True)
         self._search: Search | None = None
         self._stride = max(round(_SEARCH_CELL * options.capture / grid.resolution), 1)
         self._real = np.dtype(precision)
@@ -89,7 +95,7 @@ class MapMatcher:
         else:
             pose, iterations, calm = self.refined(ranges, guess)
         found = self._finished(ranges, pose, iterations, calm, method)
-        return within_window(found, guess, self._options)
+        return judged(found, guess, self._options)
 
     def _chain(self, ranges: np.ndarray, guess: np.ndarray) -> ScanMatch:
         """Match to expected scans at the guesses, then at the poses found; search the map where that fails."""
@@ -105,7 +111,7 @@ class MapMatcher:
             centred = self._finished(ranges[behind], pose, iterations, calm, "gauss_newton")
             off = np.abs(pose - found.pose[behind])[:, :2].max(axis=1)
             found = found.replaced(behind, centred, centred.usable & (off < _MOST_OFF * self._grid.resolution))
-        return within_window(found, guess, self._options)
+        return judged(found, guess, self._options)
 
     def _behind_surfaces(self, ranges: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """Return whether end points lie behind the surfaces of occupied cells, as in maps drawn of end points."""
@@ -133,9 +139,13 @@ class MapMatcher:
 
     def _expected_points(self, ranges: np.ndarray, pose: np.ndarray) -> tuple[ScanPoints, np.ndarray]:
         """Return the points of the expected scans at poses and of the readings, and their pairs."""
-        expected = self._caster.cast(self._sensors(pose), self._scanner.bearings)
-        points = scan_points(np.concatenate([expected, ranges.astype(expected.dtype)]), self._scanner, self._real)
-        return points, np.arange(2 * len(pose)).reshape(2, -1).T
+        dense, scanner = self._dense, self._scanner
+        expected = self._caster.cast(self._sensors(pose), dense.bearings)
+        numbers = np.arange(2 * len(pose)).reshape(2, -1).T
+        if dense is scanner:
+            points = scan_points(np.concatenate([expected, ranges.astype(expected.dtype)]), scanner, self._real)
+            return points, numbers
+        return scan_points(expected, dense, self._real).joined(scan_points(ranges, scanner, self._real)), numbers
 
     def refined(
         self, ranges: np.ndarray, guess: np.ndarray, *, finest: bool = False
@@ -213,7 +223,7 @@ class MapMatcher:
         points, couples = self._expected_points(ranges, pose)
         sums = pair_sums(self._backend, self._real, points, couples, self._options)
         unknown = np.full((len(pose), 3), np.nan)
-        evidence = pair_evidence(sums, lost, unknown, self._options)
+        evidence = pair_evidence(sums, lost, unknown, self._options.noise)
         status = np.full(len(pose), "converged", dtype="<U16")
         status[lost > 0] = "unobservable"
         status[~calm] = "no convergence"

@@ -18,7 +18,9 @@ import numpy as np
 from gpusense.matching.observability import LEAST_PAIRS, Observed, observed_information
 
 # Least pairs of points of a match, least share of points in common sight, and least score.
-_FEW, _OVERLAP, _POOR = 8, 0.1, 0.46
+_FEW, _OVERLAP, _POOR = 5, 0.1, 0.46
+# Pairs for which the noise counts.
+_PRIOR_PAIRS = 2.0
 # Least variance of a point [m^2]: float32 has some micrometres at ten metres.
 _LEAST_VARIANCE = 1e-9
 # A last step has converged that is shorter than this in deviations of the pose, along observed directions.
@@ -79,16 +81,24 @@ def inflation_of(squares: np.ndarray) -> np.ndarray:
     return inflation
 
 
-def variance_of(squared: np.ndarray, scale: float, inflation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def variance_of(
+    squared: np.ndarray, pairs: np.ndarray, scale: float, noise: float, inflation: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the variance of single errors (S,) [m^2], and the factor (S,) of the inverse information.
+
+    Three numbers of a pose are fitted to the pairs, and the noise counts like some pairs more.
 
     Args:
         squared: (S,) weighted mean squared error [m^2].
+        pairs: (S,) sums of weights.
+        noise: Standard deviation of ranges [m].
         scale: Scale of the weights [m].
         inflation: (S,) factor of the covariance because errors of neighbours are correlated.
     """
     sigma, factor = noise_of(squared / scale**2)
-    return (sigma * scale) ** 2, np.maximum(inflation * factor * scale**2, _LEAST_VARIANCE)
+    whole = inflation * factor * scale**2
+    whole = (whole * pairs + _PRIOR_PAIRS * noise**2) / (np.maximum(pairs - 3, 0.5) + _PRIOR_PAIRS)
+    return (sigma * scale) ** 2, np.maximum(whole, _LEAST_VARIANCE)
 
 
 def observed_pairs(

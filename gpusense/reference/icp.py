@@ -94,25 +94,28 @@ def match_scans(
     """Match pairs of scans (reference, second scan) from guesses (x, y, theta).
 
     A guess is the pose of the second scan in the reference's frame. Every ``stride``-th point and every ``skip``-th of
-    the reference take part until capture radius and scale have shrunk, with ``thin`` also afterwards. A result is the
-    pose (3), the score, iterations, whether the last step was below ten tolerances, the information (6), its part that
-    is due to errors of the lines (6), pairs, sum of weights, weighted sum of squared errors, points that the other scan
-    should see, points that contradict it, points that it did not see, and for blocks of 1, 2, 4 to 128 successive
-    points the sum of squares of the blocks' sums of weighted errors (8), 0 with ``thin``; the last step (3).
+    the reference take part until capture radius and scale have shrunk, with ``thin`` also afterwards. With ``one_way``
+    the reference's points do not count in the score. A result is the pose (3), the score, iterations, whether the last
+    step was below ten tolerances, the information (6), its part that is due to errors of the lines (6), pairs, sum of
+    weights, weighted sum of squared errors, points that the other scan should see, points that contradict it, points
+    that it did not see, and for blocks of 1, 2, 4 to 128 successive points the sum of squares of the blocks' sums of
+    weighted errors (8), 0 with ``thin``; the last step (3).
     """
     out = result[: MATCH_RESULT * pairs * starts].reshape(-1, MATCH_RESULT)
     upper = np.triu_indices(3)
     for n in range(pairs * starts):
         first, second = (slice(start[scan], start[scan + 1]) for scan in pair[n // starts])
         one, other, lines = point[first], point[second], line[first]
-        pose, iteration, calm, information, doubt, numbers, squares, moved = _refine(one, other, lines, guess[n, :3], rules)
+        refined = _refine(one, other, lines, guess[n, :3], rules)
+        pose, iteration, calm, information, doubt, numbers, squares, moved = refined
         both = np.zeros(4, point.dtype)
         if len(one) and len(other):
             (x, y), c, s = pose[:2], np.cos(pose[2]), np.sin(pose[2])
             inverse = np.array([-c * x - s * y, s * x - c * y, c, -s])
             step, skip, near, gap = rules.score_stride, rules.skip if rules.thin else 1, rules.near, rules.gap
             both += agreement(one, lines, other, step, skip, np.array([x, y, c, s]), near, gap)
-            both += agreement(other, line[second], one, step, skip, inverse, near, gap)
+            if not rules.one_way:
+                both += agreement(other, line[second], one, step, skip, inverse, near, gap)
         everything = both[1] + both[2] + UNSEEN * both[3]
         out[n, :3] = pose
         out[n, 3] = (both[0] - 0.5 * both[2]) / everything if everything > 0 else 0

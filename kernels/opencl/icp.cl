@@ -104,7 +104,7 @@ real4 agreement(global const real4 *point, global const real4 *line, const int c
 
 // Match scans: one work-item takes a pair (reference, second scan) and a guess (x, y, theta), the pose of the second
 // scan in the reference's frame. Every stride-th point and every skip-th of the reference take part until capture
-// radius and scale have shrunk, with thin also afterwards.
+// radius and scale have shrunk, with thin also afterwards. With one_way the reference's points do not count in the score.
 kernel void match_scans(global const real4 *point, global const int *start, global const real4 *line,
                         global const int2 *pair, global const real4 *guess, global real *result, const int scans,
                         const int points, const int pairs, const int starts, const MatchRules rules) {
@@ -161,8 +161,9 @@ kernel void match_scans(global const real4 *point, global const int *start, glob
         const real4 inverse = (real4)(-cosine * pose.x - sine * pose.y, sine * pose.x - cosine * pose.y, cosine, -sine);
         there = agreement(point + first, line + first, count, point + second, others, rules.score_stride, skip,
                           (real4)(pose.x, pose.y, cosine, sine), rules.near, rules.gap);
-        back = agreement(point + second, line + second, others, point + first, count, rules.score_stride, skip, inverse,
-                         rules.near, rules.gap);
+        if (!rules.one_way)
+            back = agreement(point + second, line + second, others, point + first, count, rules.score_stride, skip, inverse,
+                             rules.near, rules.gap);
     }
     const real4 both = there + back;
     const real all = both.y + both.z + UNSEEN * both.w;

@@ -180,7 +180,7 @@ def make(name, flags):
 
     # Match scans: one work-item takes a pair (reference, second scan) and a guess (x, y, theta), the pose of the second
     # scan in the reference's frame. Every stride-th point takes part until capture radius and scale have shrunk, with
-    # thin also afterwards.
+    # thin also afterwards. With one_way the reference's points do not count in the score.
     @kernel
     def match_scans(
         point: wp.array(dtype=vec4),
@@ -275,7 +275,8 @@ def make(name, flags):
             if rules.thin == 1:
                 skip = rules.skip
             both = agreement(point, line, first, count, second, others, stride, skip, forward, rules.near, rules.gap)
-            both += agreement(point, line, second, others, first, count, stride, skip, inverse, rules.near, rules.gap)
+            if rules.one_way == 0:
+                both += agreement(point, line, second, others, first, count, stride, skip, inverse, rules.near, rules.gap)
         everything = both.y + both.z + UNSEEN * both.w
         score = real(0.0)
         if everything > ZERO:

@@ -33,7 +33,7 @@ BEACON, BEACON_TERMS = 7, 12
 # Kernel file ray_counts: fraction bits of a coordinate in cells.
 RAY_BITS = 12
 # Kernel file icp: numbers of the result of a match.
-MATCH_RESULT = 32
+MATCH_RESULT = 35
 # Kernel file field_gradient: numbers of a particle, log p, its gradient (3) and the information (9).
 GRADIENT_NUMBERS = 13
 

@@ -134,6 +134,7 @@ class MatchRules(NamedTuple):
     skip: int
     score_stride: int
     thin: int
+    one_way: int
     capture: real
     least_capture: real
     scale: real

@@ -9,18 +9,18 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.backends import Backend
-from gpusense.matching.icp import IcpPairs, space_of
+from gpusense.matching.icp import LONG_WIDTH, WIDTH, IcpPairs, points_of_line, space_of
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import scan_points
-from gpusense.matching.uncertainty import LEAST_PAIRS, Uncertainty, spread, symmetric
+from gpusense.matching.uncertainty import observed_pairs, symmetric
 from gpusense.world.scanner import Scanner
 
 
-def own_uncertainty(
+def own_information(
     ranges: np.ndarray, pose: np.ndarray, variance: np.ndarray, scanner: Scanner, backend: Backend, real: np.dtype,
     options: MatchOptions,
-) -> Uncertainty:  # fmt: skip
-    """Return the uncertainty of poses that the lines of the scans leave.
+) -> np.ndarray:  # fmt: skip
+    """Return the information (S, 3, 3) on poses that the lines of the scans leave, 0 along what they do not observe.
 
     Args:
         ranges: (S, K) readings [m].
@@ -36,28 +36,16 @@ def own_uncertainty(
     lock, space = space_of(backend)
     with lock, space:
         device = IcpPairs(backend, real, points, np.stack([everything, everything], axis=1), options.noise, space)
+        device.fit_lines(max(WIDTH, LONG_WIDTH * options.noise))
         rules = options.rules(int(points.counts.max(initial=0)), points.gap)
         result = device.run(everything, np.zeros((len(pose), 1, 3)), rules)[:, 0].astype(np.float64)
         space.wait()
     turned = _turned(pose[:, 2], scanner.mount[:2])
     information, doubt = (turned @ symmetric(result[:, at : at + 6]) @ turned.transpose(0, 2, 1) for at in (6, 12))
-    least = np.full(len(pose), LEAST_PAIRS)
     lever = points.rms_range(everything)
-    return spread(information, doubt * options.noise**2, variance, result[:, 19], lever, least)
-
-
-def with_own(field: Uncertainty, own: Uncertainty) -> Uncertainty:
-    """Return what fields and the scans' own lines leave: the sum of the covariances, and the fewer directions."""
-    less = own.observed.sum(axis=1) < field.observed.sum(axis=1)
-    # Infinite parts of opposite signs: the direction that the scan itself does not observe prevails.
-    with np.errstate(invalid="ignore"):
-        covariance = field.covariance + own.covariance
-    covariance = np.where(np.isnan(covariance), own.covariance, covariance)
-    pick = less[:, None, None]
-    return Uncertainty(
-        covariance, np.where(less[:, None], own.eigenvalues, field.eigenvalues),
-        np.where(pick, own.directions, field.directions), np.where(less[:, None], own.observed, field.observed),
-    )  # fmt: skip
+    lines = result[:, 19] / points_of_line(points.gap, options.noise, lever)
+    found = observed_pairs(information, doubt, np.full(len(pose), options.noise**2), lever, lines)
+    return found.information / np.maximum(variance, 1e-12)[:, None, None]
 
 
 def _turned(heading: np.ndarray, mount: tuple[float, float]) -> np.ndarray:

@@ -9,11 +9,13 @@ from typing import NamedTuple
 import numpy as np
 
 from gpusense.backends import Backend
+from gpusense.matching.evidence import pair_evidence
 from gpusense.matching.icp import IcpPairs, space_of
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import ScanPoints
 from gpusense.matching.result import ScanMatch
-from gpusense.matching.uncertainty import Uncertainty, inflation_of, statuses, symmetric, uncertainty
+from gpusense.matching.uncertainty import statuses
+from gpusense.matching.verdicts import PairSums, concluded, tested
 
 # A score below this starts a search of the window, and a score below the second one, far from the guess, a search
 # nearby: far is in capture radii and rad.
@@ -31,7 +33,7 @@ _OTHER, _OTHER_TURN, _CLOSE = 0.25, 0.1, 0.012
 
 
 class Best(NamedTuple):
-    """The best results (S, 32), and the offset to a pose that agrees about as well (S, 3); NaN without one."""
+    """The best results (S, 35), and the offset to a pose that agrees about as well (S, 3); NaN without one."""
 
     result: np.ndarray
     other: np.ndarray
@@ -47,7 +49,7 @@ def match_pairs(
     options: MatchOptions,
     mount: tuple[float, float],
 ) -> ScanMatch:
-    """Match pairs of scans.
+    """Match pairs of scans; ``judged`` says how probable the matches are.
 
     Args:
         backend: The device.
@@ -64,7 +66,7 @@ def match_pairs(
     with lock, space:
         device = IcpPairs(backend, real, points, pairs, options.noise, space)
         everything = np.arange(len(pairs))
-        most = int(points.counts.max(initial=0))
+        before, most = (int(points.counts[pairs[:, i]].max(initial=0)) for i in (0, 1))
         result = device.run(everything, sensor[:, None], options.rules(most, points.gap))[:, 0]
         best = Best(result, np.full((len(pairs), 3), np.nan))
         if method == "auto":
@@ -78,10 +80,11 @@ def match_pairs(
             ):
                 if some.any():
                     which = np.flatnonzero(some)
-                    _search(device, which, sensor[which], reach, best, options, most, points.gap)
+                    _search(device, which, sensor[which], reach, best, options, (before, most), points.gap)
             _repeat(device, sensor, best, options, most, points.gap)
+        sums = tested(device, best.result, points, pairs, options)
         space.wait()
-    return _finished(best, points.rms_range(pairs[:, 1]), options, mount)
+    return _finished(best, sums, pairs, points, options, mount)
 
 
 def _search(
@@ -91,15 +94,18 @@ def _search(
     offsets: np.ndarray,
     best: Best,
     options: MatchOptions,
-    most: int,
+    most: tuple[int, int],
     gap: float,
 ) -> None:
-    """Search around the guesses of some pairs, and put better results in place."""
-    coarse = device.run(poor, guess[:, None] + offsets, options.search_rules(most, gap))
+    """Search around the guesses of some pairs, and put better results in place.
+
+    ``most`` is the number of points of the largest reference and of the largest second scan.
+    """
+    coarse = device.run(poor, guess[:, None] + offsets, options.search_rules(most[1], gap, most[0]))
     which, chosen = distinct(coarse[..., :3], coarse[..., 3], best.result[poor, :3], options.capture)
     if not len(which):
         return
-    fine = device.run(poor[which], chosen[:, None], options.final_rules(most, gap))[:, 0]
+    fine = device.run(poor[which], chosen[:, None], options.final_rules(most[1], gap))[:, 0]
     rows = poor[which]
     order = np.arange(len(rows)) - np.searchsorted(rows, rows)
     # The starts of a pair one after another, those of all pairs together.
@@ -124,10 +130,10 @@ def _compare(rows: np.ndarray, guess: np.ndarray, found: np.ndarray, best: Best,
 
 
 def _prior(result: np.ndarray, guess: np.ndarray, options: MatchOptions) -> np.ndarray:
-    """Return what results lose of their scores by the distance from their guesses, and by not having converged."""
-    offset = result[:, :2] - guess[:, :2]
+    """Return what results lose of their scores: far from their guesses, outside the window, or without convergence."""
+    offset = result[:, :3] - guess
     distance = np.hypot(offset[:, 0], offset[:, 1]) / options.capture
-    lost: np.ndarray = _FARTHER * distance + _UNSETTLED * (result[:, 5] == 0)
+    lost: np.ndarray = _FARTHER * distance + _UNSETTLED * (result[:, 5] == 0) + options.is_outside(offset)
     return lost
 
 
@@ -189,9 +195,12 @@ def to_sensor(pose: np.ndarray, mount: tuple[float, float]) -> np.ndarray:
     return np.stack([pose[:, 0] + c * x - s * y - x, pose[:, 1] + s * x + c * y - y, pose[:, 2]], axis=1)
 
 
-def _finished(best: Best, lever: np.ndarray, options: MatchOptions, mount: tuple[float, float]) -> ScanMatch:
-    """Return the matches in the robot's frame, with covariance and status."""
-    result = best.result
+def _finished(
+    best: Best, sums: PairSums, pairs: np.ndarray, points: ScanPoints, options: MatchOptions,
+    mount: tuple[float, float],
+) -> ScanMatch:  # fmt: skip
+    """Return the matches in the robot's frame, with information and status."""
+    result, lever = best.result, points.rms_range(pairs[:, 1])
     x, y = mount
     theta = wrapped(result[:, 2])
     c, s = np.cos(theta), np.sin(theta)
@@ -199,31 +208,13 @@ def _finished(best: Best, lever: np.ndarray, options: MatchOptions, mount: tuple
     # Derivative of the sensor's pose with respect to the robot's.
     moved = np.tile(np.eye(3), (len(pose), 1, 1))
     moved[:, 0, 2], moved[:, 1, 2] = -s * x - c * y, c * x - s * y
-    information, doubt = (moved.transpose(0, 2, 1) @ symmetric(result[:, at : at + 6]) @ moved for at in (6, 12))
-    squared = result[:, 20] / np.maximum(result[:, 19], 1e-30)
-    inflation = inflation_of(result[:, 24:])
-    found = uncertainty(information, doubt, squared, options.least_scale, result[:, 19], lever, inflation)
-    status = statuses(result, found.observed)
-    return concluded(pose, found, result[:, 3], result[:, 4], status, lever, best.other)
-
-
-def concluded(
-    pose: np.ndarray,
-    found: Uncertainty,
-    score: np.ndarray,
-    iterations: np.ndarray,
-    status: np.ndarray,
-    lever: np.ndarray,
-    other: np.ndarray,
-) -> ScanMatch:
-    """Return matches whose covariance is infinite where they failed, and spans both poses where there are two."""
-    converged = np.isin(status, ("converged", "unobservable"))
-    two = converged & np.isfinite(other).all(axis=1)
-    covariance = found.covariance.copy()
-    covariance[two] += 0.25 * other[two, :, None] * other[two, None, :]
-    covariance[~converged] = np.where(np.eye(3) > 0, np.inf, 0.0)
-    status = np.where(two, "ambiguous", status)
-    return ScanMatch(
-        pose, covariance, score, iterations.astype(np.int64), converged, found.eigenvalues, found.directions, lever,
-        status,
+    found, factor = sums.found, sums.factor
+    final = moved.transpose(0, 2, 1) @ found.information @ moved / factor[:, None, None]
+    step = np.linalg.solve(moved, result[:, 32:35, None])[..., 0]
+    length = np.sqrt(np.maximum(np.einsum("si,sij,sj->s", step, final, step), 0))
+    status = statuses(result, found.lost, length)
+    evidence = pair_evidence(result, found.lost, best.other, options.noise)
+    return concluded(
+        pose, final, factor, result[:, 3], result[:, 4], status, lever, best.other,
+        evidence, result[:, 19], options,
     )  # fmt: skip

@@ -14,18 +14,31 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import widened
 from gpusense.interface.launches import launch
 from gpusense.interface.structs import MatchRules
-from gpusense.matching.points import ScanPoints
+from gpusense.matching.points import GAP, ScanPoints
 
 # Neighbours on either side to which a line is fitted, and how far they may be from one another: a share of the range
-# and a distance [m]. Bodies in vectors have room for 16.
-REACH, _MOST, _RATIO, _SLACK = 2, 16, 0.1, 0.05
-# Half of the least length of a line, in standard deviations of ranges.
-_WIDTH = 4.0
+# and a distance [m]. Bodies in vectors have room for 48.
+REACH, _MOST, _FEWER, _RATIO, _SLACK = 2, 48, 16, 0.1, 0.05
+# Half of the least length of a line [m]; and of lines that tell what is observed, in standard deviations of ranges.
+# Lines as long as these do not turn with noise, but round corners, which costs accuracy.
+WIDTH, LONG_WIDTH = 0.04, 8.0
+# Neighbours may be this many deviations apart, or this many of the scanner's steps in bearing times the range.
+_SLACK_DEVIATIONS, _STEPS = 6.0, 2.5
+# With farther steps of bearing lines have three points [rad].
+_SPARSE = 0.12
 # Most starts of one launch; a call can be interrupted between launches.
 _MOST_STARTS = {"cpu": 1 << 12, "gpu": 1 << 18}
 
 _SPACES: weakref.WeakKeyDictionary[Backend, tuple[threading.RLock, Workspace]] = weakref.WeakKeyDictionary()
 _LOCK = threading.Lock()
+
+
+def points_of_line(gap: float, noise: float, lever: np.ndarray) -> np.ndarray:
+    """Return the points (S,) that share a long line, at half of a scan's rms range ``lever``; see ``IcpPairs``."""
+    spacing = 0.5 * lever * gap / GAP
+    width = max(WIDTH, LONG_WIDTH * noise)
+    points: np.ndarray = np.clip(2 * width / np.maximum(spacing, 1e-9), 2 * REACH + 1, 2 * _MOST + 1)
+    return points
 
 
 def space_of(backend: Backend) -> tuple[threading.RLock, Workspace]:
@@ -56,15 +69,22 @@ class IcpPairs:
         point = points.point if len(points.point) else np.zeros((1, 4), real)
         self._point, self._start = space.upload("match points", point), space.upload("match start", points.start)
         self._line = space.empty("match lines", point.size, real)
-        most = int(points.counts.max(initial=0))
-        if most:
-            flags = widened(backend.info.lanes, "fit_lines", self._flags)
-            lines = launch(
-                "fit_lines", flags, (most, self._counts[0]), point=self._point, start=self._start, line=self._line,
-                scans=self._counts[0], points=self._counts[1], reach=REACH, most=_MOST, ratio=_RATIO, slack=_SLACK,
-                width=_WIDTH * noise,
-            )  # fmt: skip
-            backend.run((lines,))
+        self._most, self._gap, self._noise = int(points.counts.max(initial=0)), points.gap, noise
+        self.fit_lines(WIDTH)
+
+    def fit_lines(self, width: float) -> None:
+        """Fit lines to all points, over at least ``width`` [m] on either side, as far as there are points."""
+        if not self._most:
+            return
+        flags = widened(self._backend.info.lanes, "fit_lines", self._flags)
+        lines = launch(
+            "fit_lines", flags, (self._most, self._counts[0]), point=self._point, start=self._start, line=self._line,
+            scans=self._counts[0], points=self._counts[1], reach=1 if self._gap > GAP * _SPARSE else REACH,
+            most=_MOST if width > WIDTH else _FEWER,
+            ratio=max(_RATIO, _STEPS * self._gap / GAP), slack=max(_SLACK, _SLACK_DEVIATIONS * self._noise),
+            width=width, gap=self._gap,
+        )  # fmt: skip
+        self._backend.run((lines,))
 
     def run(self, pairs: np.ndarray, guesses: np.ndarray, rules: MatchRules) -> np.ndarray:
         """Match some pairs from several guesses each.
@@ -75,7 +95,7 @@ class IcpPairs:
             rules: See the kernel file ``icp``.
 
         Returns:
-            (P, M, 32) results in float64, as the kernel file describes them.
+            (P, M, 35) results in float64, as the kernel file describes them.
         """
         starts = guesses.shape[1]
         result = np.empty((len(pairs), starts, MATCH_RESULT), self._real)

@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 import math
-import threading
-import weakref
-from dataclasses import replace
-from typing import Literal, cast
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks, masks
-from gpusense._util.typing import Space
-from gpusense.backends import get_backend
-from gpusense.interface.terms import log_weight
 from gpusense.matching.climb import climb
+from gpusense.matching.field_search import Candidates, FieldSearch, field_search
 from gpusense.matching.location import Location, PoseMode, Status
-from gpusense.matching.score_tables import TOP, ScoreTables, quantized
-from gpusense.matching.search import Found, PoseGrid, Search
+from gpusense.matching.search import PoseGrid
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.models.scan.rules import BeamChoice
-from gpusense.tables.distances import distance_transform
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Reading, classify
@@ -109,69 +102,19 @@ def locate_scan(
     if not len(points):
         nothing = np.full(3, np.nan)
         return Location(nothing, 0.0, 0.0, 0.0, (), "no match", evaluated=0, **options)  # type: ignore[arg-type]
-    place = _place_of(model, stride)
-    with place.lock:
-        slack = max(len(points), math.ceil(_DEPTH * TOP * len(points)))
-        found = place.search.find([points / cell], searched, slack=slack, allowed=allowed)
-    best = _likeliest(model, ranges, grid, searched, found, stride, len(points))
-    chosen = _modes(model, ranges, hits, place, grid, searched, found, stride, best, modes)
+    search = field_search(model, stride)
+    with search.lock:
+        found = search.find(np.asarray(ranges, np.float64), points, searched, allowed, _DEPTH)
+    chosen = _modes(model, ranges, hits, search, found, modes)
     top = chosen[0]
     pose = top.pose
     if refine:
-        near = _refined(place.smooth, np.asarray(ranges, np.float64), pose, 2 * stride * cell, 4 * math.pi / turns)
+        near = _refined(search.smooth, np.asarray(ranges, np.float64), pose, 2 * stride * cell, 4 * math.pi / turns)
         pose = near if positions == "all" or _is_free(grid, near) else pose
     return Location(
         pose, top.score, top.log_likelihood, top.agreement, chosen, _status(chosen, min_agreement),
         evaluated=found.evaluated, **options,  # type: ignore[arg-type]
     )  # fmt: skip
-
-
-class _Place:
-    """The tables of a model for searches, made on the first call."""
-
-    def __init__(self, model: LikelihoodFieldModel, stride: int) -> None:
-        self.lock = threading.Lock()
-        self.grid, self.stride = model.grid, stride
-        backend = get_backend(model.device.selection)
-        p, cell = model.parameters, model.grid.resolution
-        unknown, outside = cast(Space, model.unknown), cast(Space, model.outside)
-        obstacles = model.grid.obstacles(unknown)
-        walled = outside == "occupied"
-        obstacles = np.pad(obstacles, 1, constant_values=True) if walled else obstacles
-        distances = distance_transform(obstacles, resolution=cell, backend=backend)
-        distances = distances[1:-1, 1:-1] if walled else distances
-        shortest = min(model.grid.shape) / stride
-        levels = min(math.log2(max(_BLOCK * p.max_distance / (cell * stride), 1)), math.log2(max(shortest / 4, 1)))
-        low, high = (float(_log_density(model, np.array([d]))[0]) for d in (p.max_distance, 0.0))
-        scores = quantized(_log_density(model, np.minimum(distances, p.max_distance)), low, high)
-        self.search = Search(
-            ScoreTables(
-                backend, scores, levels=min(int(levels), _MOST_LEVELS), stride=stride, beyond=TOP if walled else 0
-            )
-        )
-        self.caster = RayCaster(model.grid, model.scanner.range_max, backend=backend, unknown=unknown, outside=outside)
-        self.smooth = LikelihoodFieldModel(
-            model.grid, model.scanner, replace(p, interpolation="bilinear"), backend=backend,
-            precision=model.precision, unknown=unknown, outside=outside, beams=model.beams,
-        )  # fmt: skip
-
-
-_PLACES: weakref.WeakKeyDictionary[LikelihoodFieldModel, _Place] = weakref.WeakKeyDictionary()
-
-
-def _place_of(model: LikelihoodFieldModel, stride: int) -> _Place:
-    """Return the tables of a model; a model whose map has changed has new ones."""
-    place = _PLACES.get(model)
-    if place is None or place.grid is not model.grid or place.stride != stride:
-        place = _PLACES[model] = _Place(model, stride)
-    return place
-
-
-def _log_density(model: LikelihoodFieldModel, distance: np.ndarray) -> np.ndarray:
-    """Return log densities of distances [m] to the nearest obstacle; see the kernel file ``field``."""
-    p = model.parameters
-    hit = log_weight(p.z_hit) - math.log(p.sigma_hit * math.sqrt(2 * math.pi)) - 0.5 * (distance / p.sigma_hit) ** 2
-    return np.logaddexp(hit, log_weight(p.z_rand) - math.log(model.scanner.range_max))
 
 
 def _end_points(model: LikelihoodFieldModel, ranges: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
@@ -196,50 +139,14 @@ def _allowed(grid: OccupancyGrid, stride: int) -> np.ndarray:
     return allowed
 
 
-def _to_world(grid: OccupancyGrid, cells: np.ndarray) -> np.ndarray:
-    """Convert (M, 3) poses in the grid's frame [cells, cells, rad] to the world, headings from -pi to pi."""
-    xy = grid._to_world(cells[:, :2] * grid.resolution)
-    theta = np.remainder(cells[:, 2] + grid.origin[2] + math.pi, 2 * math.pi) - math.pi
-    return np.column_stack([xy, theta])
-
-
-def _likeliest(
-    model: LikelihoodFieldModel,
-    ranges: ArrayLike,
-    grid: OccupancyGrid,
-    searched: PoseGrid,
-    found: Found,
-    stride: int,
-    hits: int,
-) -> int:
-    """Return the index of the likeliest pose by the model; rounding moves a score by half a step for each hit."""
-    near = found.score >= found.score[0] - hits
-    poses = _to_world(grid, searched.poses(found, stride)[near])
-    log_p = model.log_likelihood(poses, ranges)
-    index = np.flatnonzero(near)
-    likeliest = index[log_p == log_p.max()]
-    order = np.lexsort((found.heading[likeliest], found.col[likeliest], found.row[likeliest]))
-    return int(likeliest[order[0]])
-
-
 def _modes(
-    model: LikelihoodFieldModel,
-    ranges: ArrayLike,
-    hits: np.ndarray,
-    place: _Place,
-    grid: OccupancyGrid,
-    searched: PoseGrid,
-    found: Found,
-    stride: int,
-    best: int,
-    most: int,
+    model: LikelihoodFieldModel, ranges: ArrayLike, hits: np.ndarray, search: FieldSearch, found: Candidates, most: int
 ) -> tuple[PoseMode, ...]:
     """Return the best pose and the other local maxima among the poses, by falling score."""
-    poses = _to_world(grid, searched.poses(found, stride))
-    left = np.ones(len(poses), bool)
+    poses, left = found.poses, np.ones(len(found.poses), bool)
     chosen: list[int] = []
-    following: int | None = best
-    radius = max(_MODE_RADIUS, 2 * stride * grid.resolution)
+    following: int | None = found.best
+    radius = max(_MODE_RADIUS, 2 * search.stride * search.grid.resolution)
     while following is not None and len(chosen) < most:
         chosen.append(following)
         off = poses - poses[following]
@@ -247,11 +154,9 @@ def _modes(
         left &= (np.hypot(off[:, 0], off[:, 1]) > radius) | (turn > _MODE_ANGLE)
         following = int(np.argmax(left)) if left.any() else None
     log_p = model.log_likelihood(poses[chosen], ranges)
-    scale = TOP * len(hits)
-    agreement = _agreement(model, np.asarray(ranges, np.float64), hits, place.caster, poses[chosen])
+    agreement = _agreement(model, np.asarray(ranges, np.float64), hits, search.caster, poses[chosen])
     return tuple(
-        PoseMode(poses[i], float(found.score[i]) / scale, float(log_p[n]), float(agreement[n]))
-        for n, i in enumerate(chosen)
+        PoseMode(poses[i], float(found.score[i]), float(log_p[n]), float(agreement[n])) for n, i in enumerate(chosen)
     )
 
 

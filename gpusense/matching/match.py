@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
@@ -13,11 +14,13 @@ from gpusense._util.typing import AnyArray, Precision
 from gpusense.backends import Selection, arrays, get_backend
 from gpusense.backends.base import Backend
 from gpusense.matching.chain import match_pairs
+from gpusense.matching.noise import ASSUMED_NOISE, map_noise, match_noise, scan_noise
 from gpusense.matching.options import MatchOptions, check_guess, check_options
 from gpusense.matching.points import scan_points
 from gpusense.matching.result import ScanMatch
 from gpusense.matching.scan_map import match_by_maps
 from gpusense.matching.to_map import match_to_map
+from gpusense.matching.verdicts import judged
 from gpusense.models.arguments import real_dtype
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
@@ -37,7 +40,7 @@ def match_scan(
     backend: Selection = "auto",
     *,
     precision: Precision = "float32",
-    noise: float = 0.01,
+    noise: float | Literal["auto"] = "auto",
     capture: float = 1.0,
     window: ArrayLike = (1.2, 1.05),
     temperature: float = 1.0,
@@ -64,7 +67,9 @@ def match_scan(
             window, without refinement, by branch and bound.
         backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
-        noise: Standard deviation of ranges [m]; errors beyond some three of them lose their weight.
+        noise: Standard deviation of ranges [m]; errors beyond some three of them lose their weight. ``"auto"``: that of
+            each match, from the scans' own deviations from straight walls, at least that of the steps in which ranges
+            come, and 4 mm; see the field ``noise`` of the result.
         capture: Farthest distance between paired points at the start [m]: the error of a good guess.
         window: Half widths of the search: distance from the guess [m], and turn [rad].
         temperature: In (0, 1]: multiplies the information, for errors that the scans do not show, such as motion during
@@ -94,21 +99,27 @@ def match_scan(
     if not isinstance(scanner, Scanner):
         raise TypeError(f"scanner: must be a Scanner, got {checks.show(scanner)}")
     checks.choice("method", method, METHODS)
-    options = check_options(noise, capture, window)
+    given = not (isinstance(noise, str) and noise == "auto")
+    options = check_options(noise if given else ASSUMED_NOISE, capture, window)
     checks.real("temperature", temperature, above=0, high=1)
     device = get_backend(backend)
     real_dtype(precision, device)
     moved = motion, reference_motion
-    matches, single = _matches(reference, ranges, scanner, guess, method, device, precision, options, moved)
-    matches = replace(matches, covariance=matches.covariance / temperature)
+    matches, single = _matches(reference, ranges, scanner, guess, method, device, precision, options, moved, given)
+    if temperature != 1:
+        covariance, information = matches.covariance / temperature, matches.information * temperature
+        matches = replace(matches, covariance=covariance, information=information)
     return matches[0] if single else matches
 
 
 def _matches(
     reference: AnyArray | OccupancyGrid, ranges: AnyArray, scanner: Scanner, guess: ArrayLike, method: Method,
-    device: Backend, precision: Precision, options: MatchOptions, motions: tuple[object, object],
+    device: Backend, precision: Precision, options: MatchOptions, motions: tuple[object, object], given: bool,
 ) -> tuple[ScanMatch, bool]:  # fmt: skip
-    """Check the scans, the guess and the motions; return S matches, and whether a single one is wanted."""
+    """Check the scans, the guess and the motions; return S matches, and whether a single one is wanted.
+
+    ``given`` says whether the options have the noise; else it is that of the scans.
+    """
     second = readings("ranges", ranges, scanner, device)
     motion = check_motion("motion", motions[0], 1 if second.ndim == 1 else len(second))
     if isinstance(reference, OccupancyGrid):
@@ -118,8 +129,12 @@ def _matches(
             raise ValueError("reference_motion: must be None with a map, got a motion")
         poses = check_guess(guess, None if second.ndim == 1 else len(second), np.inf)
         still = _still(np.atleast_2d(second), scanner, motion)
-        matches = match_to_map(reference, still, scanner, poses, method, device, precision, options)
-        return matches, second.ndim == 1
+
+        def to_map(rows: np.ndarray, chosen: MatchOptions) -> ScanMatch:
+            return match_to_map(reference, still[rows], scanner, poses[rows], method, device, precision, chosen)
+
+        noise = np.full(len(still), options.noise) if given else map_noise(scan_noise(still, scanner), reference)
+        return _by_noise(noise, options, to_map), second.ndim == 1
     first = readings("reference", reference, scanner, device)
     single = first.ndim == 1 and second.ndim == 1
     first, second = np.atleast_2d(first), np.atleast_2d(second)
@@ -130,16 +145,47 @@ def _matches(
     if motion is not None and len(motion) != len(second):
         motion = np.repeat(motion, len(second), axis=0)
     before = check_motion("reference_motion", motions[1], len(first))
+
+    def to_scan(rows: np.ndarray, chosen: MatchOptions) -> ScanMatch:
+        shared = len(first) == 1
+        one, moved_before = (first, before) if shared else (first[rows], None if before is None else before[rows])
+        moved = None if motion is None else motion[rows]
+        return _to_scans(
+            one, second[rows], scanner, poses[rows], method, device, precision, chosen, moved_before, moved
+        )
+
+    noise = np.full(len(second), options.noise)
+    if not given:
+        noise = match_noise(np.broadcast_to(scan_noise(first, scanner), len(second)), scan_noise(second, scanner))
+    return _by_noise(noise, options, to_scan), single
+
+
+def _by_noise(
+    noise: np.ndarray, options: MatchOptions, matched: Callable[[np.ndarray, MatchOptions], ScanMatch]
+) -> ScanMatch:
+    """Return the matches of all rows, those of equal noise (S,) in one call each."""
+    levels = np.unique(noise)
+    if len(levels) < 2:
+        return matched(np.arange(len(noise)), replace(options, noise=float(levels[0])) if len(levels) else options)
+    rows = [np.flatnonzero(noise == level) for level in levels]
+    parts = [matched(row, replace(options, noise=float(level))) for row, level in zip(rows, levels, strict=True)]
+    return ScanMatch.joined(parts).ordered(np.argsort(np.concatenate(rows)))
+
+
+def _to_scans(
+    first: np.ndarray, second: np.ndarray, scanner: Scanner, poses: np.ndarray, method: Method, device: Backend,
+    precision: Precision, options: MatchOptions, before: np.ndarray | None, motion: np.ndarray | None,
+) -> ScanMatch:  # fmt: skip
+    """Match (S, K) scans to (S, K) or (1, K) others."""
     if method in ("gauss_newton", "correlative") and len(second):
         first, second = _still(first, scanner, before), _still(second, scanner, motion)
-        matches = match_by_maps(first, second, scanner, poses, method, device, precision, options)
-        return matches, single
+        return match_by_maps(first, second, scanner, poses, method, device, precision, options)
     real = np.dtype(precision)
     moved = [np.zeros((len(scans), 3)) if m is None else m for scans, m in ((first, before), (second, motion))]
     points = scan_points(np.concatenate([first, second]), scanner, real, np.concatenate(moved))
     pairs = np.stack([np.arange(len(second)) % max(len(first), 1), len(first) + np.arange(len(second))], axis=1)
-    matches = match_pairs(device, real, points, pairs, poses, method, options, scanner.mount[:2])
-    return matches, single
+    match = match_pairs(device, real, points, pairs, poses, method, options, scanner.mount[:2])
+    return judged(match, poses, options)
 
 
 def _still(ranges: np.ndarray, scanner: Scanner, motion: np.ndarray | None) -> np.ndarray:

@@ -9,11 +9,18 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.interface.structs import MatchRules
+from gpusense.matching.points import GAP
 
 # Points that take part while the scale shrinks, and of each start of a search.
 _COARSE_POINTS, _SEARCH_POINTS = 200, 30
 # Most points of the reference in a search.
 _SEARCH_REFERENCE = 64
+# Poses on the edge of a window are in it [m, rad].
+_MARGIN = 1e-3
+# Half the distance of neighbouring points, over their step of bearing: pairs may be as far apart [m / rad].
+_SPARSE = 1.5
+# Points apart of those that make a score: a single one.
+_NO_SCORE = 1 << 24
 # Largest translation of a guess between scans [m]; float32 has 6 cm there.
 _FARTHEST = 1e6
 
@@ -26,11 +33,20 @@ class MatchOptions:
         noise: Standard deviation of ranges [m].
         capture: Farthest distance between paired points at the start [m].
         window: Half widths of the search in x and y [m] and theta [rad] about a guess from which ICP fails.
+        one_way: Whether the second scan alone says how well it agrees, because the reference has many more points.
     """
 
     noise: float
     capture: float
     window: tuple[float, float]
+    one_way: bool = False
+
+    def is_outside(self, offset: np.ndarray) -> np.ndarray:
+        """Return whether (S, 3) offsets from guesses are beyond the window, but for what a start may move."""
+        turn = np.abs((offset[:, 2] + math.pi) % (2 * math.pi) - math.pi)
+        reach, half = self.window
+        outside: np.ndarray = (np.hypot(offset[:, 0], offset[:, 1]) > reach + _MARGIN) | (turn > half + _MARGIN)
+        return outside
 
     @property
     def least_scale(self) -> float:
@@ -41,16 +57,23 @@ class MatchOptions:
         """Return the rules of a match from a guess; ``points`` is the number of points of a scan."""
         stride = max(points // _COARSE_POINTS, 1)
         scale, least = self.capture, self.least_scale
-        near = max(0.3 * self.capture, 3 * least)
-        return MatchRules(40, stride, 1, (stride + 1) // 2, 0, self.capture, near, max(scale, least), least, 0.85, gap,
-                          near, 1e-4 * self.capture)  # fmt: skip
+        near = max(0.3 * self.capture, 3 * least, _SPARSE * gap / GAP)
+        return MatchRules(
+            40, stride, 1, (stride + 1) // 2, 0, int(self.one_way), max(self.capture, near), near, max(scale, least),
+            least, 0.85, gap, near, 1e-4 * self.capture,
+        )  # fmt: skip
 
-    def search_rules(self, points: int, gap: float) -> MatchRules:
-        """Return the rules of the many starts of a search: few points, few iterations."""
+    def last_rules(self, gap: float) -> MatchRules:
+        """Return the rules of a single last iteration at the poses of matches, whose scores do not count."""
+        full = self.rules(1, gap)
+        return full._replace(iterations=1, capture=full.least_capture, scale=full.least_scale, score_stride=_NO_SCORE)
+
+    def search_rules(self, points: int, gap: float, reference: int) -> MatchRules:
+        """Return the rules of the many starts of a search: few points, few of the reference's, few iterations."""
         full = self.rules(points, gap)
         stride, least = max(points // _SEARCH_POINTS, 1), max(2.5 * full.least_scale, 0.08 * self.capture)
         return full._replace(
-            iterations=4, stride=stride, skip=-(-points // _SEARCH_REFERENCE) or 1, score_stride=stride, thin=1,
+            iterations=4, stride=stride, skip=-(-reference // _SEARCH_REFERENCE) or 1, score_stride=stride, thin=1,
             capture=max(0.7 * self.capture, full.near), scale=max(0.35 * self.capture, least),
             least_scale=least, shrink=0.55, tolerance=3e-3 * self.capture,
         )  # fmt: skip

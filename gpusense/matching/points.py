@@ -13,8 +13,10 @@ from gpusense.world.sweep import sensor_points
 _FULL_TURN = 2 * math.pi
 # Points nearer than this have no bearing [m].
 _NEAREST = 1e-6
+# Beams are dense up to this step [rad].
+_DENSE = math.radians(2.5)
 # Largest step between bearings that hides nothing, in steps of the scanner.
-_GAP = 3.0
+GAP = 3.0
 
 
 @dataclass(frozen=True)
@@ -38,9 +40,31 @@ class ScanPoints:
         """(S,) points of each scan."""
         return np.diff(self.start)
 
+    def joined(self, others: ScanPoints) -> ScanPoints:
+        """Return these scans and others behind them; steps of bearings are those of these scans."""
+        start = np.concatenate([self.start, self.start[-1] + others.start[1:]]).astype(np.int32)
+        squares = np.concatenate([self.squares, others.squares])
+        return ScanPoints(np.concatenate([self.point, others.point]), start, self.gap, squares)
+
     def rms_range(self, scan: np.ndarray) -> np.ndarray:
         """Return the root mean square range of some scans, at least 1e-3 m."""
         return np.maximum(np.sqrt(self.squares / np.maximum(self.counts, 1)), 1e-3)[scan]
+
+
+def dense_scanner(scanner: Scanner) -> Scanner:
+    """Return a scanner with more beams over the same field of view, or the scanner itself if its beams are dense."""
+    turned = np.sort(np.mod(scanner.bearings, _FULL_TURN))
+    if len(turned) < 3:
+        return scanner
+    steps = np.diff(np.append(turned, turned[0] + _FULL_TURN))
+    usual = float(np.median(steps))
+    parts = math.ceil(usual / _DENSE)
+    if parts < 2:
+        return scanner
+    inner = np.where(steps < GAP * usual, steps, 0.0)
+    bearings = (turned[:, None] + inner[:, None] * np.arange(parts) / parts).ravel()
+    bearings = np.unique(np.mod(bearings + math.pi, _FULL_TURN) - math.pi)
+    return Scanner(bearings, scanner.range_max, scanner.range_min, scanner.mount)
 
 
 def scan_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype, motion: np.ndarray | None = None) -> ScanPoints:
@@ -88,5 +112,5 @@ def _points(point: np.ndarray, hit: np.ndarray, bearing: np.ndarray, squares: np
     """Return points with the starts of their scans, and the gap of a scanner's ascending bearings."""
     start = np.append(0, np.cumsum(np.count_nonzero(hit, axis=1))).astype(np.int32)
     steps = np.diff(bearing.astype(np.float64))
-    gap = _GAP * float(np.median(steps)) if len(steps) else _FULL_TURN
+    gap = GAP * float(np.median(steps)) if len(steps) else _FULL_TURN
     return ScanPoints(np.ascontiguousarray(point), start, gap, squares)

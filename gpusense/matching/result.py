@@ -8,18 +8,25 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense.matching.observability import covariance_of
+
 Floats = NDArray[np.float64]
 
 STATUSES = {
     "converged": "the scans agree, and every direction of the pose is observed",
     "unobservable": "the scans agree, but some direction of the pose is not observed, as along a corridor",
     "ambiguous": "another pose agrees about as well; the covariance spans both",
+    "doubtful": "the scans agree no better than scans of different places often do: nothing is known about the pose",
+    "outside window": "the scans agree best at a pose outside the window: nothing is known about the pose",
     "few points": "too few pairs of points: nothing is known about the pose",
     "no overlap": "the scans see hardly anything in common: nothing is known about the pose",
     "poor": "too much of one scan contradicts the other: nothing is known about the pose",
     "no convergence": "the iterations ended before the steps were small: nothing is known about the pose",
 }
 """The meaning of each status."""
+
+USABLE = ("converged", "unobservable", "ambiguous")
+"""Statuses of poses that may be used along their observed directions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,16 +38,21 @@ class ScanMatch:
     Attributes:
         pose: (3,) x, y [m] and theta [rad, in -pi to pi] of the second scan's robot frame in the reference's robot
             frame, or in the world for a map.
-        covariance: (3, 3) of x, y, theta [m^2, m rad, rad^2]; infinite along directions that nothing constrains, and
-            where the match failed.
+        covariance: (3, 3) of x, y, theta [m^2, m rad, rad^2]; infinite in every coordinate in which a direction lies
+            that nothing constrains, and where the match failed.
+        information: (3, 3) inverse of the covariance, finite: exactly 0 along directions that nothing constrains, and
+            where the match failed. A pose graph adds it as it is.
+        p_right: Probability that the pose is right: off by at most 0.2 m and 5 degrees along its observed directions.
+            It holds where as many matches are tried of places that meet as of places that do not.
         score: Share of the points in common sight that agree, 1 at best; points that one scan saw through count
             against it.
         iterations: Iterations of the last refinement.
-        converged: Whether the pose may be used along its observed directions.
         eigenvalues: (3,) ascending: the share of pairs of points that constrain each direction of the pose; 0 if none.
         directions: (3, 3) rows: the directions of the eigenvalues in x [m], y [m] and theta, where theta is multiplied
             by ``lever``.
         lever: Root mean square range of the second scan [m].
+        noise: Standard deviation of ranges that was used [m].
+        evidence: (E,) what ``p_right`` is made of, see :data:`gpusense.matching.evidence.NAMES`.
         status: One of :data:`gpusense.matching.result.STATUSES`; an array of strings for S matches.
 
     Example:
@@ -55,13 +67,26 @@ class ScanMatch:
 
     pose: Floats
     covariance: Floats
+    information: Floats
+    p_right: Floats
     score: Floats
     iterations: NDArray[np.int64]
-    converged: NDArray[np.bool]
     eigenvalues: Floats
     directions: Floats
     lever: Floats
+    noise: Floats
+    evidence: Floats
     status: str | NDArray[np.str_]
+
+    @property
+    def converged(self) -> NDArray[np.bool]:
+        """Whether the status is ``"converged"``: one pose, observed in every direction. For S matches (S,)."""
+        return np.asarray(self.status) == "converged"
+
+    @property
+    def usable(self) -> NDArray[np.bool]:
+        """Whether the pose may be used along its observed directions, with ``information``. For S matches (S,)."""
+        return np.isin(self.status, USABLE)
 
     def __len__(self) -> int:
         if self.pose.ndim == 1:
@@ -80,21 +105,27 @@ class ScanMatch:
         """Return the matches of several calls as one, in their order; at least one."""
         return cls(**{f.name: np.concatenate([getattr(match, f.name) for match in matches]) for f in fields(cls)})
 
-    def moved(self, frame: Floats) -> ScanMatch:
-        """Return S matches in the frame in which the reference's robot frames are at (S, 3) poses."""
+    def ordered(self, order: NDArray[np.intp]) -> ScanMatch:
+        """Return S matches in another order."""
+        return ScanMatch(**{field.name: np.asarray(getattr(self, field.name))[order] for field in fields(self)})
+
+    def moved(self, frame: Floats, reach: tuple[float, float]) -> ScanMatch:
+        """Return S matches in the frame in which the reference's robot frames are at (S, 3) poses.
+
+        Args:
+            frame: The poses.
+            reach: Farthest distance [m] and angle [rad] from a guess, see ``covariance_of``.
+        """
         c, s = np.cos(frame[:, 2]), np.sin(frame[:, 2])
         x, y, theta = self.pose.T
         turn = (theta + frame[:, 2] + math.pi) % (2 * math.pi) - math.pi
         pose = np.stack([frame[:, 0] + c * x - s * y, frame[:, 1] + s * x + c * y, turn], axis=1)
         zero, one = np.zeros(len(c)), np.ones(len(c))
         turned = np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=1).reshape(-1, 3, 3)
-        lost = np.isinf(self.covariance)
-        finite = turned @ np.where(lost, 0, self.covariance) @ turned.transpose(0, 2, 1)
-        # The signs of infinite parts, and no trace of rounding.
-        part = turned @ np.where(lost, np.sign(self.covariance), 0) @ turned.transpose(0, 2, 1)
-        covariance = np.where(np.abs(part) > 1e-3, np.copysign(np.inf, part), finite)
+        information = turned @ self.information @ turned.transpose(0, 2, 1)
         directions = self.directions @ turned.transpose(0, 2, 1)
-        return replace(self, pose=pose, covariance=covariance, directions=directions)
+        covariance = covariance_of(information, self.lever, reach)
+        return replace(self, pose=pose, information=information, covariance=covariance, directions=directions)
 
     def replaced(self, rows: NDArray[np.intp], others: ScanMatch, chosen: NDArray[np.bool]) -> ScanMatch:
         """Return S matches with the chosen ones of others in place of some rows."""
@@ -114,5 +145,7 @@ class ScanMatch:
     def __repr__(self) -> str:
         if isinstance(self.status, str):
             x, y, theta = self.pose
-            return f"ScanMatch({self.status}, x={x:.4g}, y={y:.4g}, theta={theta:.4g}, score={float(self.score):.3g})"
+            return (
+                f"ScanMatch({self.status}, x={x:.4g}, y={y:.4g}, theta={theta:.4g}, p_right={float(self.p_right):.3g})"
+            )
         return f"ScanMatch({len(self)} matches, {np.count_nonzero(self.converged)} converged)"

@@ -49,6 +49,7 @@ class Search:
         level: int | None = None,
         allowed: np.ndarray | None = None,
         images: Sequence[np.ndarray] | None = None,
+        floor: int = -1,
     ) -> Found:
         """Return the best pose of each scan, and all poses whose scores are at most ``slack`` lower.
 
@@ -59,13 +60,14 @@ class Search:
             level: Blocks of ``2^level`` x ``2^level`` positions are bounded first; 0 is brute force. None: all levels
                 of the tables.
             allowed: (height, width) bool: positions that may be found. None: all.
-            images: (K_s,) table of each point. None: those of the scans.
+            images: (K_s,) table of each point, or (A, K_s) at each heading. None: those of the scans.
+            floor: Least score of a pose that is found.
 
         Returns:
             The poses. A scan without points scores 0 everywhere. Without an allowed position there is no pose.
         """
         level = self.tables.levels if level is None else level
-        run = _Run(self, grid, slack, allowed, level)
+        run = _Run(self, grid, slack, allowed, level, floor)
         run.upload(points, images)
         bounds = run.block_bounds()
         if level == 0:
@@ -79,13 +81,16 @@ class Search:
 class _Run:
     """One search: its items, the lower bounds of scans, and the poses so far."""
 
-    def __init__(self, search: Search, grid: PoseGrid, slack: int, allowed: np.ndarray | None, level: int) -> None:
+    def __init__(
+        self, search: Search, grid: PoseGrid, slack: int, allowed: np.ndarray | None, level: int, floor: int
+    ) -> None:
         self._tables, self._backend, self._space = search.tables, search._backend, search._space
         self._grid, self._slack, self._level = grid, slack, level
         scans, self._turns = grid.headings.shape
         self._best = np.full(scans, -1, np.int64)
         # Poses with lower scores are dropped.
-        self._floor = np.full(scans, -1, np.int64)
+        self._least = floor
+        self._floor = np.full(scans, floor, np.int64)
         self._complete = np.ones(scans, bool)
         self._kept: list[tuple[np.ndarray, np.ndarray]] = []
         self._evaluated = 0
@@ -104,7 +109,8 @@ class _Run:
         if images is None:
             several = tables.shape.tables > 1
             images = [np.full(len(part), scan if several else 0) for scan, part in enumerate(points)]
-        image = np.concatenate([np.tile(part, self._turns) for part in images]).astype(np.int32)
+        each = [np.tile(part, self._turns) if part.ndim == 1 else part.reshape(-1) for part in images]
+        image = np.concatenate(each).astype(np.int32)
         self._host = flat, image
         upload = self._space.upload
         self._points = (
@@ -228,7 +234,7 @@ class _Run:
     def keep_all(self, scores: np.ndarray) -> None:
         """Keep the best of all poses of each scan."""
         self._best = scores.reshape(len(self._best), -1).max(axis=1, initial=-1).astype(np.int64)
-        self._floor = np.where(self._best >= 0, self._best - self._slack, -1)
+        self._floor = np.maximum(np.where(self._best >= 0, self._best - self._slack, -1), self._least)
         self.keep(*self.above(scores, self._floor))
 
     def keep(self, candidates: np.ndarray, score: np.ndarray) -> None:

@@ -8,19 +8,22 @@ from __future__ import annotations
 
 import math
 import threading
+from dataclasses import replace
 
 import numpy as np
 
 from gpusense.backends import Backend
-from gpusense.matching.alone import own_uncertainty, with_own
-from gpusense.matching.chain import DOUBTFUL, concluded, match_pairs, wrapped
+from gpusense.matching.alone import own_information
+from gpusense.matching.chain import DOUBTFUL, match_pairs, wrapped
 from gpusense.matching.climb import climb
+from gpusense.matching.evidence import pair_evidence
+from gpusense.matching.observability import axes_of, balance_of, observed_information, orthonormal
 from gpusense.matching.options import MatchOptions
-from gpusense.matching.points import scan_points
+from gpusense.matching.points import ScanPoints, dense_scanner, scan_points
 from gpusense.matching.result import ScanMatch
 from gpusense.matching.score_tables import ScoreTables, field_scores
 from gpusense.matching.search import PoseGrid, Search
-from gpusense.matching.uncertainty import Uncertainty, spread
+from gpusense.matching.verdicts import concluded, judged, pair_sums
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.tables.distances import distance_transform
@@ -34,9 +37,11 @@ _RANDOM = 0.2
 # Least deviation of a field in cells.
 _LEAST_CELLS = 1.5
 # A score below this is a failure. Least hits, and least pairs and share of pairs that observe a direction.
-_POOR, _FEW, _LEAST_PAIRS, _LEAST_SHARE = 0.3, 8, 2.0, 0.01
+_POOR, _FEW, _LEAST_PAIRS, _LEAST_SHARE = 0.3, 5, 2.0, 0.01
 # In maps drawn of end points, readings end this far behind surfaces; most that field and expected scan differ [cells].
 _BEHIND, _MOST_OFF = 0.1, 3.0
+# Sine of the angle between directions that are not the same.
+_APART = 0.3
 # Positions and headings of a search: cells apart, and points apart at a scan's rms range; most levels of its tables.
 _SEARCH_CELL, _LEVELS = 0.1, 4
 
@@ -62,6 +67,10 @@ class MapMatcher:
             sigmas.append(2.5 * sigmas[-1])
         self._sigmas = sigmas[::-1]
         self._models = [self._model(sigma, precision) for sigma in self._sigmas]
+        # A scan of few beams is matched to an expected one of many.
+        self._dense = dense_scanner(scanner)
+        if self._dense is not scanner:
+            self._options = replace(options, one_way=True)
         self._search: Search | None = None
         self._stride = max(round(_SEARCH_CELL * options.capture / grid.resolution), 1)
         self._real = np.dtype(precision)
@@ -85,7 +94,8 @@ class MapMatcher:
             calm = np.ones(len(guess), bool)
         else:
             pose, iterations, calm = self.refined(ranges, guess)
-        return self._finished(ranges, pose, iterations, calm, method)
+        found = self._finished(ranges, pose, iterations, calm, method)
+        return judged(found, guess, self._options)
 
     def _chain(self, ranges: np.ndarray, guess: np.ndarray) -> ScanMatch:
         """Match to expected scans at the guesses, then at the poses found; search the map where that fails."""
@@ -95,13 +105,13 @@ class MapMatcher:
             pose = self.refined(ranges[poor], self.searched(ranges[poor], guess[poor]))[0]
             again = self._to_expected(ranges[poor], pose, "icp")
             found = found.replaced(poor, again, again.score > found.score[poor])
-        behind = np.flatnonzero(self._behind_surfaces(ranges, found.pose) & found.converged)
+        behind = np.flatnonzero(self._behind_surfaces(ranges, found.pose) & found.usable)
         if len(behind):
             pose, iterations, calm = self.refined(ranges[behind], found.pose[behind], finest=True)
             centred = self._finished(ranges[behind], pose, iterations, calm, "gauss_newton")
             off = np.abs(pose - found.pose[behind])[:, :2].max(axis=1)
-            found = found.replaced(behind, centred, centred.converged & (off < _MOST_OFF * self._grid.resolution))
-        return found
+            found = found.replaced(behind, centred, centred.usable & (off < _MOST_OFF * self._grid.resolution))
+        return judged(found, guess, self._options)
 
     def _behind_surfaces(self, ranges: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """Return whether end points lie behind the surfaces of occupied cells, as in maps drawn of end points."""
@@ -120,14 +130,22 @@ class MapMatcher:
 
     def _to_expected(self, ranges: np.ndarray, pose: np.ndarray, method: str) -> ScanMatch:
         """Match readings to the expected readings at poses."""
-        scanner = self._scanner
-        expected = self._caster.cast(self._sensors(pose), scanner.bearings)
-        points = scan_points(np.concatenate([expected, ranges.astype(expected.dtype)]), scanner, self._real)
-        pairs = np.arange(2 * len(pose)).reshape(2, -1).T
+        points, pairs = self._expected_points(ranges, pose)
         local = match_pairs(
-            self._backend, self._real, points, pairs, np.zeros((len(pose), 3)), method, self._options, scanner.mount[:2]
-        )
-        return local.moved(pose)
+            self._backend, self._real, points, pairs, np.zeros((len(pose), 3)), method, self._options,
+            self._scanner.mount[:2],
+        )  # fmt: skip
+        return local.moved(pose, self._options.window)
+
+    def _expected_points(self, ranges: np.ndarray, pose: np.ndarray) -> tuple[ScanPoints, np.ndarray]:
+        """Return the points of the expected scans at poses and of the readings, and their pairs."""
+        dense, scanner = self._dense, self._scanner
+        expected = self._caster.cast(self._sensors(pose), dense.bearings)
+        numbers = np.arange(2 * len(pose)).reshape(2, -1).T
+        if dense is scanner:
+            points = scan_points(np.concatenate([expected, ranges.astype(expected.dtype)]), scanner, self._real)
+            return points, numbers
+        return scan_points(expected, dense, self._real).joined(scan_points(ranges, scanner, self._real)), numbers
 
     def refined(
         self, ranges: np.ndarray, guess: np.ndarray, *, finest: bool = False
@@ -142,7 +160,7 @@ class MapMatcher:
         return pose, count, calm
 
     def searched(self, ranges: np.ndarray, guess: np.ndarray) -> np.ndarray:
-        """Return the poses with the largest scores in the windows around guesses, by branch and bound."""
+        """Return the poses with the largest scores in the round windows about guesses, by branch and bound."""
         grid, (reach, half) = self._grid, self._options.window
         stride = self._stride
         if self._search is None:
@@ -159,7 +177,9 @@ class MapMatcher:
         local = grid.world_to_cells(guess[:, :2])
         centres = np.column_stack([local, guess[:, 2] - grid.origin[2]])
         poses = PoseGrid.around(centres, (side, side), int(half / angle), angle, stride)
-        found = self._search.find(points, poses)
+        offset = stride * grid.resolution * np.arange(-side, side + 1)
+        within = np.hypot(offset[:, None], offset) <= reach * (1 + 1e-9)
+        found = self._search.find(points, poses, allowed=within)
         best = poses.poses(found, stride)[found.best]
         return np.column_stack(
             [grid._to_world(best[:, :2] * grid.resolution), wrapped(best[:, 2] + grid.origin[2])]
@@ -191,23 +211,50 @@ class MapMatcher:
         variance = (near * squared).sum(axis=1) / np.maximum(near.sum(axis=1), 1e-9)
         squares = np.where(hits, ranges, 0).astype(np.float64) ** 2
         lever = np.maximum(np.sqrt(squares.sum(axis=1) / np.maximum(hits.sum(axis=1), 1)), 1e-3)
-        least = np.maximum(_LEAST_PAIRS, _LEAST_SHARE * near.sum(axis=1))
-        found: Uncertainty = spread(information, 0 * information, variance, near.sum(axis=1), lever, least)
+        pairs = near.sum(axis=1)
+        least, nothing = np.maximum(_LEAST_PAIRS, _LEAST_SHARE * pairs), np.zeros((len(pose), 3, 3))
+        of_field = observed_information(information, nothing, lever, pairs, least).information
+        of_field /= np.maximum(variance, 1e-12)[:, None, None]
+        own = own_information(ranges, pose, variance, self._scanner, self._backend, self._real, self._options)
         # Surfaces are half a cell off the centres of cells, and poses of a search are on a grid.
         spacing = self._stride * self._grid.resolution / math.sqrt(12) if method == "correlative" else 0.0
         bias = np.hypot(0.5 * self._grid.resolution, spacing)
-        covariance = found.covariance.copy()
-        covariance[:, [0, 1], [0, 1]] += bias**2
-        covariance[:, 2, 2] += (bias / lever) ** 2
-        own = own_uncertainty(ranges, pose, variance, self._scanner, self._backend, self._real, self._options)
-        found = with_own(found._replace(covariance=covariance), own)
+        joint, lost = _joint(of_field, own, bias, lever)
+        points, couples = self._expected_points(ranges, pose)
+        sums = pair_sums(self._backend, self._real, points, couples, self._options)
+        unknown = np.full((len(pose), 3), np.nan)
+        evidence = pair_evidence(sums, lost, unknown, self._options.noise)
         status = np.full(len(pose), "converged", dtype="<U16")
-        status[~found.observed.all(axis=1)] = "unobservable"
+        status[lost > 0] = "unobservable"
         status[~calm] = "no convergence"
         status[score < _POOR] = "poor"
         status[hits.sum(axis=1) < _FEW] = "few points"
-        other = np.full((len(pose), 3), np.nan)
-        return concluded(pose, found, score, iterations, status, lever, other)
+        return concluded(
+            pose, joint, variance, score, iterations, status, lever, unknown, evidence, pairs, self._options
+        )  # fmt: skip
+
+
+def _joint(field: np.ndarray, own: np.ndarray, bias: float, lever: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the information (S, 3, 3) whose covariance is the sum of both and of a bias [m], and its lost directions.
+
+    What either of them does not observe is lost.
+    """
+    scale = balance_of(lever)
+    both = scale[:, :, None] * scale[:, None, :]
+    gone = []
+    for part in (own, field):
+        values, vectors = axes_of(part, lever)
+        gone.append(np.where((values == 0)[:, None, :], vectors, 0.0))
+    # Directions of the field that differ little from the scan's own ones are the same ones.
+    apart = gone[1] - gone[0] @ (gone[0].transpose(0, 2, 1) @ gone[1])
+    apart = np.where(np.linalg.norm(apart, axis=1, keepdims=True) > _APART, apart, 0.0)
+    lost = orthonormal(np.concatenate([gone[0], apart], axis=2))
+    keep = np.eye(3) - lost @ lost.transpose(0, 2, 1)
+    total = keep * bias**2
+    for part in (own, field):
+        total = total + np.linalg.pinv(keep @ (part * both) @ keep, rcond=1e-9, hermitian=True)
+    joint = np.linalg.pinv(total, rcond=1e-12, hermitian=True) / both
+    return joint, np.count_nonzero((lost != 0).any(axis=1), axis=1)
 
 
 _LOCK = threading.Lock()

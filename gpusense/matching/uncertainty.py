@@ -1,7 +1,7 @@
-"""Covariance of a match, the directions that nothing constrains, and the status.
+"""Information of a match, from its pairs, and its status.
 
-The information of Gauss-Newton counts errors of the lines as information: in a corridor, noise turns lines, and turned
-lines seem to constrain the position along it. Its expected value, ``variance * doubt``, is subtracted first.
+The inverse information of Gauss-Newton times the variance of the errors is a covariance, both corrected for the weights
+of normal errors; ``observability`` takes out first what noise makes up.
 
 Errors of neighbours are correlated: they share points of a line, and errors of a surface. The variance of their
 weighted sum is 1 + 2 sum rho_k times that of independent errors, with the autocorrelation rho_k over k points. Blocks
@@ -12,24 +12,19 @@ sum of squares of the sums of blocks of b points is 1 + 2 sum (1 - k / b) rho_k 
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
 
 import numpy as np
 
+from gpusense.matching.observability import LEAST_PAIRS, Observed, observed_information
+
 # Least pairs of points of a match, least share of points in common sight, and least score.
-_FEW, _OVERLAP, _POOR = 8, 0.1, 0.46
-# A direction is observed if it has this many pairs, and more than this times the information that errors of lines make
-# up.
-LEAST_PAIRS, _LEAST_RATIO = 1.5, 1.0
-
-
-class Uncertainty(NamedTuple):
-    """Covariance (S, 3, 3), eigenvalues (S, 3), directions (S, 3, 3), and whether each direction is observed (S, 3)."""
-
-    covariance: np.ndarray
-    eigenvalues: np.ndarray
-    directions: np.ndarray
-    observed: np.ndarray
+_FEW, _OVERLAP, _POOR = 5, 0.1, 0.46
+# Pairs for which the noise counts.
+_PRIOR_PAIRS = 2.0
+# Least variance of a point [m^2]: float32 has some micrometres at ten metres.
+_LEAST_VARIANCE = 1e-9
+# A last step has converged that is shorter than this in deviations of the pose, along observed directions.
+_SHORT = 0.5
 
 
 def symmetric(upper: np.ndarray) -> np.ndarray:
@@ -86,71 +81,54 @@ def inflation_of(squares: np.ndarray) -> np.ndarray:
     return inflation
 
 
-def uncertainty(
-    information: np.ndarray, doubt: np.ndarray, squared: np.ndarray, scale: float, pairs: np.ndarray,
-    lever: np.ndarray, inflation: np.ndarray,
-) -> Uncertainty:  # fmt: skip
-    """Return covariances, eigenvalues and observed directions.
+def variance_of(
+    squared: np.ndarray, pairs: np.ndarray, scale: float, noise: float, inflation: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the variance of single errors (S,) [m^2], and the factor (S,) of the inverse information.
+
+    Three numbers of a pose are fitted to the pairs, and the noise counts like some pairs more.
+
+    Args:
+        squared: (S,) weighted mean squared error [m^2].
+        pairs: (S,) sums of weights.
+        noise: Standard deviation of ranges [m].
+        scale: Scale of the weights [m].
+        inflation: (S,) factor of the covariance because errors of neighbours are correlated.
+    """
+    sigma, factor = noise_of(squared / scale**2)
+    whole = inflation * factor * scale**2
+    whole = (whole * pairs + _PRIOR_PAIRS * noise**2) / (np.maximum(pairs - 3, 0.5) + _PRIOR_PAIRS)
+    return (sigma * scale) ** 2, np.maximum(whole, _LEAST_VARIANCE)
+
+
+def observed_pairs(
+    information: np.ndarray, doubt: np.ndarray, variance: np.ndarray, lever: np.ndarray, lines: np.ndarray
+) -> Observed:
+    """Return what pairs of points and lines observe.
 
     Args:
         information: (S, 3, 3) sums of w J J'.
         doubt: (S, 3, 3) the part of it that a unit variance of the points makes up.
-        squared: (S,) weighted mean squared error [m^2].
-        scale: Scale of the weights [m].
-        pairs: (S,) sums of weights.
+        variance: (S,) variance of the points [m^2].
         lever: (S,) length by which headings are multiplied [m].
-        inflation: (S,) factor of the covariance because errors of neighbours are correlated.
+        lines: (S,) lines without a common point.
     """
-    sigma, factor = noise_of(squared / scale**2)
-    doubted = doubt * ((sigma * scale) ** 2)[:, None, None]
-    variance = inflation * factor * scale**2
-    return spread(information, doubted, variance, pairs, lever, np.full(len(lever), LEAST_PAIRS))
+    least = np.full(len(lever), LEAST_PAIRS)
+    return observed_information(information, doubt * variance[:, None, None], lever, lines, least)
 
 
-def spread(
-    information: np.ndarray,
-    doubted: np.ndarray,
-    variance: np.ndarray,
-    pairs: np.ndarray,
-    lever: np.ndarray,
-    least: np.ndarray,
-) -> Uncertainty:
-    """Return covariances, eigenvalues and observed directions of (S, 3, 3) sums of w J J'.
+def statuses(result: np.ndarray, lost: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Return the status of (S, 35) results of the kernel ``match_scans``.
 
     Args:
-        information: The sums.
-        doubted: The part of them that errors of the lines make up.
-        variance: (S,) factor of the inverse [m^2].
-        pairs: (S,) sums of weights.
-        lever: (S,) length by which headings are multiplied [m].
-        least: (S,) least eigenvalue of an observed direction.
+        result: The results.
+        lost: (S,) number of lost directions.
+        step: (S,) length of the last step in deviations of the pose, along observed directions.
     """
-    balance = np.stack([np.ones_like(lever), np.ones_like(lever), 1 / lever], axis=1)
-    both = balance[:, :, None] * balance[:, None, :]
-    values, vectors = np.linalg.eigh((information - doubted) * both)
-    spurious = np.einsum("sik,sij,sjk->sk", vectors, doubted * both, vectors)
-    observed = values > np.maximum(least[:, None], _LEAST_RATIO * spurious)
-    inverse = np.where(observed, 1 / np.where(observed, values, 1), 0)
-    # To meters and radians.
-    axes = vectors * balance[:, :, None]
-    covariance = np.einsum("sik,sk,sjk->sij", axes, variance[:, None] * inverse, axes)
-    lost = np.where(observed[:, None, :], 0.0, vectors)
-    covariance += _infinite(np.einsum("sik,sjk->sij", lost, lost))
-    shares = np.clip(values / np.maximum(pairs, 1)[:, None], 0, None)
-    return Uncertainty(covariance, shares, vectors.transpose(0, 2, 1), observed)
-
-
-def _infinite(lost: np.ndarray) -> np.ndarray:
-    """Return (S, 3, 3) matrices that are infinite where projections on lost directions are not almost 0."""
-    return np.where(np.abs(lost) > 1e-3, np.copysign(np.inf, lost), 0.0)
-
-
-def statuses(result: np.ndarray, observed: np.ndarray) -> np.ndarray:
-    """Return the status of (S, 32) results of the kernel ``match_scans``."""
     pairs, seen, through, unseen = result[:, 18], result[:, 21], result[:, 22], result[:, 23]
     status = np.full(len(result), "converged", dtype="<U16")
-    status[~observed.all(axis=1)] = "unobservable"
-    status[result[:, 5] == 0] = "no convergence"
+    status[lost > 0] = "unobservable"
+    status[(result[:, 5] == 0) & ~(step < _SHORT)] = "no convergence"
     status[result[:, 3] < _POOR] = "poor"
     status[seen < _OVERLAP * np.maximum(seen + through + unseen, 1)] = "no overlap"
     status[pairs < _FEW] = "few points"

@@ -94,42 +94,45 @@ def match_scans(
     """Match pairs of scans (reference, second scan) from guesses (x, y, theta).
 
     A guess is the pose of the second scan in the reference's frame. Every ``stride``-th point and every ``skip``-th of
-    the reference take part until capture radius and scale have shrunk, with ``thin`` also afterwards. A result is the
-    pose (3), the score, iterations, whether the last step was below ten tolerances, the information (6), its part that
-    is due to errors of the lines (6), pairs, sum of weights, weighted sum of squared errors, points that the other scan
-    should see, points that contradict it, points that it did not see, and for blocks of 1, 2, 4 to 128 successive
-    points the sum of squares of the blocks' sums of weighted errors (8), 0 with ``thin``.
+    the reference take part until capture radius and scale have shrunk, with ``thin`` also afterwards. With ``one_way``
+    the reference's points do not count in the score. A result is the pose (3), the score, iterations, whether the last
+    step was below ten tolerances, the information (6), its part that is due to errors of the lines (6), pairs, sum of
+    weights, weighted sum of squared errors, points that the other scan should see, points that contradict it, points
+    that it did not see, and for blocks of 1, 2, 4 to 128 successive points the sum of squares of the blocks' sums of
+    weighted errors (8), 0 with ``thin``; the last step (3).
     """
     out = result[: MATCH_RESULT * pairs * starts].reshape(-1, MATCH_RESULT)
     upper = np.triu_indices(3)
     for n in range(pairs * starts):
         first, second = (slice(start[scan], start[scan + 1]) for scan in pair[n // starts])
         one, other, lines = point[first], point[second], line[first]
-        pose, iteration, calm, information, doubt, numbers, squares = _refine(one, other, lines, guess[n, :3], rules)
+        refined = _refine(one, other, lines, guess[n, :3], rules)
+        pose, iteration, calm, information, doubt, numbers, squares, moved = refined
         both = np.zeros(4, point.dtype)
         if len(one) and len(other):
             (x, y), c, s = pose[:2], np.cos(pose[2]), np.sin(pose[2])
             inverse = np.array([-c * x - s * y, s * x - c * y, c, -s])
             step, skip, near, gap = rules.score_stride, rules.skip if rules.thin else 1, rules.near, rules.gap
             both += agreement(one, lines, other, step, skip, np.array([x, y, c, s]), near, gap)
-            both += agreement(other, line[second], one, step, skip, inverse, near, gap)
+            if not rules.one_way:
+                both += agreement(other, line[second], one, step, skip, inverse, near, gap)
         everything = both[1] + both[2] + UNSEEN * both[3]
         out[n, :3] = pose
         out[n, 3] = (both[0] - 0.5 * both[2]) / everything if everything > 0 else 0
         out[n, 4:6] = iteration, calm
         out[n, 6:12], out[n, 12:18] = information[upper], doubt[upper]
-        out[n, 18:] = numbers[2], numbers[0], numbers[1], *both[1:], *squares
+        out[n, 18:] = numbers[2], numbers[0], numbers[1], *both[1:], *squares, *moved
 
 
 def _refine(
     one: np.ndarray, other: np.ndarray, lines: np.ndarray, guess: np.ndarray, rules: structs.MatchRules
-) -> tuple[np.ndarray, int, bool, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return pose, iterations, whether its last step was small, and the sums of the last iteration."""
+) -> tuple[np.ndarray, int, bool, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return pose, iterations, whether its last step was small, the sums of the last iteration, and that step."""
     real, pose = one.dtype.type, guess.copy()
     capture, scale = real(rules.capture), real(rules.scale)
     information = doubt = np.zeros((3, 3), real)
     numbers, iteration, settled, calm = np.zeros(3, real), 0, False, False
-    squares = np.zeros(MATCH_BLOCKS, real)
+    squares, moved = np.zeros(MATCH_BLOCKS, real), np.zeros(3, real)
     while iteration < rules.iterations and not settled and len(one):
         last = bool(capture <= rules.least_capture and scale <= rules.least_scale)
         full = last and not rules.thin
@@ -152,6 +155,7 @@ def _refine(
         if length > most:
             step[:2] *= most / length
         step[2] = np.clip(step[2], real(-0.3), real(0.3))
+        moved = step
         pose = pose + step
         change = max(length, abs(step[2]))
         settled = bool(last and change < rules.tolerance)
@@ -159,4 +163,4 @@ def _refine(
         quiet = length < real(0.1) * scale and abs(step[2]) < real(0.03) * scale
         factor = real(rules.shrink) ** (2 if quiet and not last else 1)
         capture, scale = max(capture * factor, rules.least_capture), max(scale * factor, rules.least_scale)
-    return pose, iteration, calm, information, doubt, numbers, squares
+    return pose, iteration, calm, information, doubt, numbers, squares, moved

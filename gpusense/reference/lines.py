@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+WHOLE_TURN = 6.283185307179586
+
 
 def fit_lines(
     flags: frozenset[str],
@@ -17,12 +19,13 @@ def fit_lines(
     ratio: float,
     slack: float,
     width: float,
+    gap: float,
 ) -> None:
     """Fit a line to each point and ``reach`` neighbours on either side, up to ``most`` within a distance of ``width``.
 
-    None of them is farther from the last one than ``slack`` plus ``ratio`` times its range. A line is a unit normal, an
-    offset, and 1 / (sum of squared distances along the line). A point without neighbours has the line across its beam,
-    -1 in place of that sum, and no pairs.
+    None of them is farther from the last one than ``slack`` plus ``ratio`` times its range, nor than ``gap`` in
+    bearing. A line is a unit normal, an offset, and 1 / (sum of squared distances along the line). A point without
+    neighbours has the line across its beam, -1 in place of that sum, and no pairs.
     """
     for scan in range(scans):
         mine = point[start[scan] : start[scan + 1]]
@@ -36,6 +39,8 @@ def fit_lines(
                 following = mine[(np.arange(count) + direction * j) % count]
                 between = following[:, :2] - last[:, :2]
                 joined = joined & ((between**2).sum(axis=1) <= (slack + ratio * last[:, 3]) ** 2)
+                turn = np.abs(following[:, 2] - last[:, 2])
+                joined = joined & (np.minimum(turn, point.dtype.type(WHOLE_TURN) - turn) <= gap)
                 if j > reach:
                     joined = joined & (((following[:, :2] - mine[:, :2]) ** 2).sum(axis=1) <= width * width)
                 x, y = (np.where(joined, following[:, i] - mine[:, i], 0) for i in (0, 1))

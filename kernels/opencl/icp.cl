@@ -7,8 +7,8 @@
 // Numbers of a result: pose (3), score, iterations, whether the last step was below ten tolerances, information (6),
 // and its part that is due to errors of the lines (6), pairs, sum of weights, weighted sum of squared errors, points
 // that the other scan should see, points that contradict it, points that it did not see, and for blocks of 1, 2, 4 to
-// 128 successive points the sum of squares of the blocks' sums of weighted errors (8), 0 with thin.
-#define MATCH_RESULT 32
+// 128 successive points the sum of squares of the blocks' sums of weighted errors (8), 0 with thin; the last step (3).
+#define MATCH_RESULT 35
 // Rounding errors of bounds are far below this share.
 #define ALMOST ((real)0.999)
 // Weight in the score of a point that the other scan did not see; one that disagrees has 1.
@@ -104,7 +104,7 @@ real4 agreement(global const real4 *point, global const real4 *line, const int c
 
 // Match scans: one work-item takes a pair (reference, second scan) and a guess (x, y, theta), the pose of the second
 // scan in the reference's frame. Every stride-th point and every skip-th of the reference take part until capture
-// radius and scale have shrunk, with thin also afterwards.
+// radius and scale have shrunk, with thin also afterwards. With one_way the reference's points do not count in the score.
 kernel void match_scans(global const real4 *point, global const int *start, global const real4 *line,
                         global const int2 *pair, global const real4 *guess, global real *result, const int scans,
                         const int points, const int pairs, const int starts, const MatchRules rules) {
@@ -116,6 +116,7 @@ kernel void match_scans(global const real4 *point, global const int *start, glob
     real4 pose = guess[n];
     real sums[MATCH_SUMS], squares[MATCH_BLOCKS], open[MATCH_BLOCKS];
     real capture = rules.capture, scale = rules.scale, cosine = cos(pose.z), sine = sin(pose.z);
+    real4 moved = (real4)(0);
     int iteration = 0, settled = 0, calm = 0, ahead = 0;
     for (int i = 0; i < MATCH_SUMS; ++i) sums[i] = 0;
     for (int i = 0; i < MATCH_BLOCKS; ++i) squares[i] = open[i] = 0;
@@ -141,6 +142,7 @@ kernel void match_scans(global const real4 *point, global const int *start, glob
         const real length = sqrt(step.x * step.x + step.y * step.y), most = (real)0.5 * rules.capture;
         if (length > most) step.xy *= most / length;
         step.z = fmax(fmin(step.z, (real)0.3), (real)-0.3);
+        moved = step;
         pose += step;
         cosine = cos(pose.z);
         sine = sin(pose.z);
@@ -159,8 +161,9 @@ kernel void match_scans(global const real4 *point, global const int *start, glob
         const real4 inverse = (real4)(-cosine * pose.x - sine * pose.y, sine * pose.x - cosine * pose.y, cosine, -sine);
         there = agreement(point + first, line + first, count, point + second, others, rules.score_stride, skip,
                           (real4)(pose.x, pose.y, cosine, sine), rules.near, rules.gap);
-        back = agreement(point + second, line + second, others, point + first, count, rules.score_stride, skip, inverse,
-                         rules.near, rules.gap);
+        if (!rules.one_way)
+            back = agreement(point + second, line + second, others, point + first, count, rules.score_stride, skip, inverse,
+                             rules.near, rules.gap);
     }
     const real4 both = there + back;
     const real all = both.y + both.z + UNSEEN * both.w;
@@ -174,4 +177,5 @@ kernel void match_scans(global const real4 *point, global const int *start, glob
     out[18] = sums[17], out[19] = sums[15], out[20] = sums[16];
     out[21] = both.y, out[22] = both.z, out[23] = both.w;
     for (int i = 0; i < MATCH_BLOCKS; ++i) out[24 + i] = squares[i];
+    out[32] = moved.x, out[33] = moved.y, out[34] = moved.z;
 }

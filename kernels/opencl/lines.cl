@@ -1,12 +1,14 @@
 // Lines through the points of a scan and their neighbours, for point-to-line ICP: total least squares.
 
+#define WHOLE_TURN ((real)6.283185307179586)
+
 // Fit a line to each point and reach neighbours on either side, up to most within a distance of width, none of them
-// farther from the last one than slack plus ratio times its range: unit normal, offset, and 1 / (sum of squared
-// distances along the line). A point without neighbours has the line across its beam, -1 in place of that sum, and no
-// pairs. One work-item takes a point of a scan.
+// farther from the last one than slack plus ratio times its range, nor than gap in bearing: unit normal, offset, and
+// 1 / (sum of squared distances along the line). A point without neighbours has the line across its beam, -1 in place
+// of that sum, and no pairs. One work-item takes a point of a scan.
 kernel void fit_lines(global const real4 *point, global const int *start, global real4 *line, const int scans,
                       const int points, const int reach, const int most, const real ratio, const real slack,
-                      const real width) {
+                      const real width, const real gap) {
     const int k = get_global_id(0), scan = get_global_id(1);
     const int first = start[scan], count = start[scan + 1] - first;
     if (k >= count) return;
@@ -21,8 +23,9 @@ kernel void fit_lines(global const real4 *point, global const int *start, global
             i = i >= count ? i - count : i < 0 ? i + count : i;
             const real4 next = point[first + i];
             const real2 between = next.xy - last.xy, d = next.xy - centre.xy;
-            const real farthest = slack + ratio * last.w;
+            const real farthest = slack + ratio * last.w, turn = fabs(next.z - last.z);
             if (between.x * between.x + between.y * between.y > farthest * farthest) break;
+            if (fmin(turn, WHOLE_TURN - turn) > gap) break;
             if (j > reach && d.x * d.x + d.y * d.y > width * width) break;
             sum += d;
             xx += d.x * d.x;

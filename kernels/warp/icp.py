@@ -19,8 +19,8 @@ from .prelude import kernel, precision, work_item
 # Numbers of a result: pose (3), score, iterations, whether the last step was below ten tolerances, information (6),
 # and its part that is due to errors of the lines (6), pairs, sum of weights, weighted sum of squared errors, points
 # that the other scan should see, points that contradict it, points that it did not see, and for blocks of 1, 2, 4 to
-# 128 successive points the sum of squares of the blocks' sums of weighted errors (8), 0 with thin.
-MATCH_RESULT = wp.constant(32)
+# 128 successive points the sum of squares of the blocks' sums of weighted errors (8), 0 with thin; the last step (3).
+MATCH_RESULT = wp.constant(35)
 
 
 @functools.cache
@@ -180,7 +180,7 @@ def make(name, flags):
 
     # Match scans: one work-item takes a pair (reference, second scan) and a guess (x, y, theta), the pose of the second
     # scan in the reference's frame. Every stride-th point takes part until capture radius and scale have shrunk, with
-    # thin also afterwards.
+    # thin also afterwards. With one_way the reference's points do not count in the score.
     @kernel
     def match_scans(
         point: wp.array(dtype=vec4),
@@ -213,6 +213,7 @@ def make(name, flags):
         iteration = int(0)
         settled = int(0)
         calm = int(0)
+        moved = vec4()
         ahead = int(0)
         running = int(1)
         while running == 1 and iteration < rules.iterations and settled == 0 and count > 0:
@@ -253,6 +254,7 @@ def make(name, flags):
                 if length > most:
                     share = most / length
                 turn = wp.max(wp.min(step.z, LARGEST_TURN), -LARGEST_TURN)
+                moved = vec4(share * step.x, share * step.y, turn, ZERO)
                 pose = vec4(pose.x + share * step.x, pose.y + share * step.y, pose.z + turn, ZERO)
                 cosine = wp.cos(pose.z)
                 sine = wp.sin(pose.z)
@@ -273,7 +275,8 @@ def make(name, flags):
             if rules.thin == 1:
                 skip = rules.skip
             both = agreement(point, line, first, count, second, others, stride, skip, forward, rules.near, rules.gap)
-            both += agreement(point, line, second, others, first, count, stride, skip, inverse, rules.near, rules.gap)
+            if rules.one_way == 0:
+                both += agreement(point, line, second, others, first, count, stride, skip, inverse, rules.near, rules.gap)
         everything = both.y + both.z + UNSEEN * both.w
         score = real(0.0)
         if everything > ZERO:
@@ -296,5 +299,8 @@ def make(name, flags):
         result[out + 23] = both.w
         for i in range(MATCH_BLOCKS):
             result[out + 24 + i] = blocks[i]
+        result[out + 32] = moved.x
+        result[out + 33] = moved.y
+        result[out + 34] = moved.z
 
     return {"match_scans": match_scans}[name]

@@ -13,11 +13,12 @@ def make(name, flags):
     types = precision(flags)
     real, vec4 = types.real, types.vec4
     ZERO, ONE, HALF, MISSING = real(0.0), real(1.0), real(0.5), real(-1.0)
+    WHOLE_TURN = real(6.283185307179586)
 
     # Fit a line to each point and reach neighbours on either side, up to most within a distance of width, none of them
-    # farther from the last one than slack plus ratio times its range: unit normal, offset, and 1 / (sum of squared
-    # distances along the line). A point without neighbours has the line across its beam, -1 in place of that sum, and
-    # no pairs. One work-item takes a point of a scan.
+    # farther from the last one than slack plus ratio times its range, nor than gap in bearing: unit normal, offset, and
+    # 1 / (sum of squared distances along the line). A point without neighbours has the line across its beam, -1 in
+    # place of that sum, and no pairs. One work-item takes a point of a scan.
     @kernel
     def fit_lines(
         point: wp.array(dtype=vec4),
@@ -30,6 +31,7 @@ def make(name, flags):
         ratio: real,
         slack: real,
         width: real,
+        gap: real,
     ):
         scan, k = wp.tid()
         if scan >= scans:
@@ -61,7 +63,10 @@ def make(name, flags):
                 farthest = slack + ratio * last.w
                 dx = following.x - centre.x
                 dy = following.y - centre.y
-                if x * x + y * y > farthest * farthest or (j > reach and dx * dx + dy * dy > width * width):
+                turn = wp.abs(following.z - last.z)
+                turn = wp.min(turn, WHOLE_TURN - turn)
+                too_far = x * x + y * y > farthest * farthest or turn > gap
+                if too_far or (j > reach and dx * dx + dy * dy > width * width):
                     j = count
                 else:
                     sum_x += dx

@@ -144,7 +144,8 @@ def test_what_is_not_known_has_an_infinite_covariance(backend, first, second, st
     match = gs.match_scan(*scans, FRONT, backend=backend)
     assert match.status in statuses
     assert np.isinf(match.covariance.diagonal()).any()
-    assert match.converged == (match.status == "unobservable")
+    assert not match.converged
+    assert match.usable == (match.status == "unobservable")
     assert not np.isnan(match.covariance).any()
 
 

@@ -10,7 +10,7 @@ from support.matching_scenes import CORRIDOR, FRONT, RING, ROOM, WALL, segments_
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.matching.alone import own_uncertainty
+from gpusense.matching.alone import own_information
 from gpusense.matching.options import MatchOptions
 
 METHODS = ["auto", "gauss_newton", "correlative"]
@@ -49,7 +49,7 @@ def test_walls_in_a_map_leave_the_position_along_them_open(method, place, segmen
     # Where the expected scan moves along the wall with every pose, the chain does not come to rest.
     assert match.status in {"unobservable", "no convergence"}
     assert np.isinf(match.covariance[0, 0])
-    if match.converged:
+    if match.usable:
         axis = match.directions[0]
         assert abs(axis[0] * math.cos(origin[2]) + axis[1] * math.sin(origin[2])) > 0.99
         assert match.covariance[2, 2] < 1e-3
@@ -84,7 +84,7 @@ def test_what_a_map_does_not_say_is_a_failure(method, case):
     else:
         scan = rng.uniform(0.5, 8.0, 360)
     match = gs.match_scan(grid, scan, scanner, guess, method, backend="opencl")
-    assert match.status in {"few points", "no overlap", "poor"}
+    assert match.status in {"few points", "no overlap", "poor", "doubtful", "outside window"}
     assert not match.converged
     assert np.isinf(match.covariance.diagonal()).all()
 
@@ -94,7 +94,7 @@ def test_lines_of_a_scan_have_the_information_of_their_normals():
     mount, scanner_pose = (0.3, -0.2, 0.0), (0.2, 0.1, 0.0)
     scanner = gs.Scanner(RING.bearings, range_max=30.0, mount=mount)
     scan, pose = segments_scan(ROOM[:4], scanner_pose, scanner), np.array([[5.0, -3.0, 0.7]])
-    found = own_uncertainty(
+    found = own_information(
         scan[None], pose, np.ones(1), scanner, get_backend("numpy"), np.dtype(np.float64), MatchOptions(0.01, 1.0, None)
     )
     place = scan[:, None] * np.stack([np.cos(scanner.bearings), np.sin(scanner.bearings)], axis=1)
@@ -103,7 +103,6 @@ def test_lines_of_a_scan_have_the_information_of_their_normals():
     arm = place + mount[:2]
     turn = np.array([[np.cos(0.7), np.sin(0.7)], [-np.sin(0.7), np.cos(0.7)]])
     jacobian = np.column_stack([normal @ turn, normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]])
-    expected = np.linalg.inv(jacobian.T @ jacobian)
+    expected = jacobian.T @ jacobian
     # Lines through corners have other normals.
-    np.testing.assert_allclose(found.covariance[0], expected, rtol=0.1, atol=0.1 * np.abs(expected).max())
-    assert found.observed.all()
+    np.testing.assert_allclose(found[0], expected, rtol=0.1, atol=0.1 * np.abs(expected).max())

@@ -18,7 +18,7 @@ KERNELS: dict[str, Kernel] = {
     ),
     "fit_lines": kernel(
         "lines", "beam scan", *_POINTS, "out real4 line [points]", "int scans", "int points", "int reach", "int most",
-        "real ratio", "real slack", "real width", wide=True, wide_group=8,
+        "real ratio", "real slack", "real width", "real gap", wide=True, wide_group=8,
     ),
     "match_scans": kernel(
         "icp", "item", *_POINTS, "real4 line [points]", "int2 pair [pairs]", "real4 guess [pairs * starts]",

@@ -4,7 +4,7 @@
 // requires: icp_step lanes/math
 
 // Numbers of a result; see icp.cl.
-#define MATCH_RESULT 32
+#define MATCH_RESULT 35
 // Weight in the score of a point that the other scan did not see; one that disagrees has 1.
 #define UNSEEN ((real)0.13)
 // tan(pi / 8). arcsin s < s + ARCSIN s^3. Errors of bearings are far below BEARING_ERROR.
@@ -233,7 +233,7 @@ void sum_pairs(global const real4 *point, global const real4 *line, const int co
 
 // Match scans: one work-item takes a pair (reference, second scan) and a guess (x, y, theta), the pose of the second
 // scan in the reference's frame. Every stride-th point and every skip-th of the reference take part until capture
-// radius and scale have shrunk, with thin also afterwards.
+// radius and scale have shrunk, with thin also afterwards. With one_way the reference's points do not count in the score.
 kernel void match_scans(global const real4 *point, global const int *start, global const real4 *line,
                         global const int2 *pair, global const real4 *guess, global real *result, const int scans,
                         const int points, const int pairs, const int starts, const MatchRules rules) {
@@ -245,6 +245,7 @@ kernel void match_scans(global const real4 *point, global const int *start, glob
     real4 pose = guess[n];
     real sums[MATCH_SUMS], squares[MATCH_BLOCKS];
     real capture = rules.capture, scale = rules.scale, cosine = cos(pose.z), sine = sin(pose.z);
+    real4 moved = (real4)(0);
     int iteration = 0, settled = 0, calm = 0;
     for (int i = 0; i < MATCH_SUMS; ++i) sums[i] = 0;
     for (int i = 0; i < MATCH_BLOCKS; ++i) squares[i] = 0;
@@ -260,6 +261,7 @@ kernel void match_scans(global const real4 *point, global const int *start, glob
         const real length = sqrt(step.x * step.x + step.y * step.y), most = (real)0.5 * rules.capture;
         if (length > most) step.xy *= most / length;
         step.z = fmax(fmin(step.z, (real)0.3), (real)-0.3);
+        moved = step;
         pose += step;
         cosine = cos(pose.z);
         sine = sin(pose.z);
@@ -278,8 +280,9 @@ kernel void match_scans(global const real4 *point, global const int *start, glob
         const real4 inverse = (real4)(-cosine * pose.x - sine * pose.y, sine * pose.x - cosine * pose.y, cosine, -sine);
         there = agreement(point + first, line + first, count, point + second, others, rules.score_stride, skip,
                           (real4)(pose.x, pose.y, cosine, sine), rules.near, rules.gap);
-        back = agreement(point + second, line + second, others, point + first, count, rules.score_stride, skip, inverse,
-                         rules.near, rules.gap);
+        if (!rules.one_way)
+            back = agreement(point + second, line + second, others, point + first, count, rules.score_stride, skip, inverse,
+                             rules.near, rules.gap);
     }
     const real4 both = there + back;
     const real all = both.y + both.z + UNSEEN * both.w;
@@ -293,4 +296,5 @@ kernel void match_scans(global const real4 *point, global const int *start, glob
     out[18] = sums[17], out[19] = sums[15], out[20] = sums[16];
     out[21] = both.y, out[22] = both.z, out[23] = both.w;
     for (int i = 0; i < MATCH_BLOCKS; ++i) out[24 + i] = squares[i];
+    out[32] = moved.x, out[33] = moved.y, out[34] = moved.z;
 }

@@ -1,33 +1,36 @@
 // Lines through LANES points of a scan at once: fit_lines of lines.cl.
 // requires: lanes/math
 
-// Fit lines to LANES points and their neighbours. Farthest neighbours are MOST points away.
-#define MOST 16
+// Fit lines to LANES points and their neighbours. At most MOST points on either side.
+#define MOST 48
+#define WHOLE_TURN 6.283185307179586f
 kernel void fit_lines(global const real4 *point, global const int *start, global real4 *line, const int scans,
                       const int points, const int reach, const int most, const real ratio, const real slack,
-                      const real width) {
+                      const real width, const real gap) {
     const int begin = LANES * get_global_id(0), scan = get_global_id(1);
     const int first = start[scan], count = start[scan + 1] - first;
     if (begin >= count) return;
     // Points from MOST before the block to MOST behind it.
-    real x[LANES + 2 * MOST], y[LANES + 2 * MOST], range[LANES + 2 * MOST];
+    real x[LANES + 2 * MOST], y[LANES + 2 * MOST], range[LANES + 2 * MOST], angle[LANES + 2 * MOST];
     for (int i = 0, k = begin - most; i < LANES + 2 * most; ++i, ++k) {
         k = k < 0 ? k + count : k >= count ? k - count : k;
         const real4 p = point[first + (k < 0 || k >= count ? 0 : k)];
-        x[i] = p.x, y[i] = p.y, range[i] = p.w;
+        x[i] = p.x, y[i] = p.y, angle[i] = p.z, range[i] = p.w;
     }
     const lanes centre_x = load_lanes(0, x + most), centre_y = load_lanes(0, y + most);
-    const lanes centre_range = load_lanes(0, range + most);
+    const lanes centre_range = load_lanes(0, range + most), centre_angle = load_lanes(0, angle + most);
     lanes sum_x = 0, sum_y = 0, xx = 0, xy = 0, yy = 0, size = 1;
     for (int direction = -1; direction <= 1; direction += 2) {
-        lanes last_x = centre_x, last_y = centre_y, last_range = centre_range;
+        lanes last_x = centre_x, last_y = centre_y, last_range = centre_range, last_angle = centre_angle;
         ilanes joined = -1;
         for (int j = 1; j <= most && 2 * j < count; ++j) {
             const int at = most + direction * j;
             const lanes next_x = load_lanes(0, x + at), next_y = load_lanes(0, y + at);
             const lanes between_x = next_x - last_x, between_y = next_y - last_y;
             const lanes dx = next_x - centre_x, dy = next_y - centre_y, farthest = slack + ratio * last_range;
+            const lanes next_angle = load_lanes(0, angle + at), turn = fabs(next_angle - last_angle);
             joined &= between_x * between_x + between_y * between_y <= farthest * farthest;
+            joined &= fmin(turn, WHOLE_TURN - turn) <= gap;
             if (j > reach) joined &= dx * dx + dy * dy <= width * width;
             if (!any_lane(joined)) break;
             sum_x += joined ? dx : (lanes)0;
@@ -36,7 +39,7 @@ kernel void fit_lines(global const real4 *point, global const int *start, global
             xy += joined ? dx * dy : (lanes)0;
             yy += joined ? dy * dy : (lanes)0;
             size += joined ? (lanes)1 : (lanes)0;
-            last_x = next_x, last_y = next_y, last_range = load_lanes(0, range + at);
+            last_x = next_x, last_y = next_y, last_angle = next_angle, last_range = load_lanes(0, range + at);
         }
     }
     const lanes mean_x = sum_x / size, mean_y = sum_y / size;

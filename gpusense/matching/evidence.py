@@ -1,0 +1,66 @@
+"""Evidence for and against a match, and the probability that its pose is right.
+
+The probability is a logistic function of what the scans say at the pose that was found. Its weights were fitted by
+``bench/derive/match_evidence.py`` to matches of simulated scans and of half of the recorded logs, of neighbouring
+places and of places that have nothing in common; right and wrong poses weigh the same.
+``bench/accuracy/match_verdicts.py`` shows what is said against what happens, for both halves.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+NAMES = ("disagreement", "contradiction", "overlap", "pairs", "roughness", "misfit", "lost", "rival", "distance")
+"""Evidence for and against a match.
+
+``disagreement``: 1 less the score. ``contradiction``: share of the points in common sight that one scan saw through.
+``overlap``: share of all points that are in common sight. ``pairs``: number of pairs of points. ``roughness``: root
+mean square error of pairs over the noise. ``misfit``: 1 less the mean weight of pairs. ``lost``: number of directions
+that are not observed. ``rival``: 1 where another pose agrees about as well. ``distance``: that from the guess, over the
+window's half width.
+"""
+
+# A pose in which every direction is observed is doubtful below the first probability, another one below the second: it
+# is used along what it observes, with its p_right beside it.
+DOUBTED, DOUBTED_PARTLY = 0.6, 0.03
+# Constant, and weights of the logarithms of disagreement, contradiction, overlap, pairs, roughness and misfit, of a
+# lost direction, of a second one, of a rival, and of the logarithm of the distance.
+_CONSTANT = -2.698
+_WEIGHTS = np.array([-1.959, -0.047, 0.510, -0.279, -0.040, -0.386, -1.261, 0.321, -2.035, -1.862])
+# Least values of which logarithms are taken, and what is added to distances.
+_LEAST = np.array([1e-3, 3e-3, 1e-3, 1.0, 0.1, 1e-2])
+_NEAR = 0.04
+
+
+def pair_evidence(result: np.ndarray, lost: np.ndarray, other: np.ndarray, noise: float) -> np.ndarray:
+    """Return the evidence (S, 9) of results of the kernel ``match_scans``, see :data:`NAMES`; the distance is 0.
+
+    Args:
+        result: (S, 35) results.
+        lost: (S,) number of lost directions.
+        other: (S, 3) offsets to poses that agree about as well, NaN without one.
+        noise: Standard deviation of ranges [m].
+    """
+    seen, through, unseen = result[:, 21], result[:, 22], result[:, 23]
+    pairs, weights = np.maximum(result[:, 18], 1), result[:, 19]
+    rough = np.sqrt(result[:, 20] / np.maximum(weights, 1e-30)) / max(noise, 1e-6)
+    common = np.maximum(seen + through, 1)
+    values = (
+        1 - result[:, 3], through / common, seen / np.maximum(common + unseen, 1), pairs, np.minimum(rough, 20.0),
+        1 - weights / pairs, lost, np.isfinite(other).all(axis=1), 0 * lost,
+    )  # fmt: skip
+    return np.stack(values, axis=1)
+
+
+def features_of(evidence: np.ndarray) -> np.ndarray:
+    """Return the numbers (S, 10) that the weights multiply."""
+    logs = np.log(np.maximum(evidence[:, :6], _LEAST))
+    lost = evidence[:, 6]
+    return np.column_stack([logs, lost > 0, lost > 1, evidence[:, 7], np.log(evidence[:, 8] + _NEAR)])
+
+
+def probability_right(evidence: np.ndarray) -> np.ndarray:
+    """Return the probabilities (S,) that poses are right along their observed directions."""
+    with np.errstate(over="ignore"):
+        p: np.ndarray = 1 / (1 + np.exp(-(_CONSTANT + features_of(evidence) @ _WEIGHTS)))
+    return p

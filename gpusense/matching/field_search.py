@@ -1,0 +1,242 @@
+"""Searches for the likeliest poses of a scan by the integer scores of a likelihood field.
+
+A score of a cell is its log density in 255 steps. With the nearest cell's distance the sum of scores differs from the
+log-likelihood by rounding alone. With bilinear distances an end point's density depends on its place within a cell. All
+positions are centres of cells, so this place is the same at all positions with one heading. A cell is divided into
+tiles; each kind of tile has a table of its own with the largest density within the tile, rounded up. A bilinear
+function has its least value over a tile at a corner, so these are bounds, and every pose whose bound reaches the
+log-likelihood of some known pose is evaluated by the model.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import weakref
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import NamedTuple, cast
+
+import numpy as np
+
+from gpusense._util.typing import Space
+from gpusense.backends import get_backend
+from gpusense.interface.terms import log_weight
+from gpusense.matching.pose_grid import Found, PoseGrid
+from gpusense.matching.score_tables import TOP, ScoreTables, quantized
+from gpusense.matching.search import Search
+from gpusense.models.scan.caster import RayCaster
+from gpusense.models.scan.field import LikelihoodFieldModel
+from gpusense.tables.distances import distance_transform
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.scanner import Reading, classes
+
+# Side of the largest block that is bounded as a whole [m], relative to the field's max_distance, and most levels.
+_BLOCK, _MOST_LEVELS = 0.8, 5
+# Tiles along a side of a cell for bilinear fields, if there is room for as many table cells.
+_TILES, _MOST_TABLE_CELLS = (4, 2, 1), 1 << 28
+# Rounding of a log-likelihood, in steps for each hit.
+_ROUNDING = 2e-3
+
+
+class Candidates(NamedTuple):
+    """Poses that a search found, by falling score (M,), and the index of the likeliest.
+
+    Attributes:
+        poses: (M, 3) in the world.
+        score: (M,) from 0 to 1, the mean of the end points.
+        best: Index of the likeliest.
+        evaluated: Poses and blocks of poses that were evaluated.
+    """
+
+    poses: np.ndarray
+    score: np.ndarray
+    best: int
+    evaluated: int
+
+
+class FieldSearch:
+    """The tables of a model for searches.
+
+    Args:
+        model: A likelihood field.
+        stride: Cells between neighbouring positions.
+    """
+
+    def __init__(self, model: LikelihoodFieldModel, stride: int) -> None:
+        self.lock = threading.Lock()
+        self.grid, self.stride = model.grid, stride
+        self._model = weakref.ref(model)
+        backend = get_backend(model.device.selection)
+        p, cell = model.parameters, model.grid.resolution
+        unknown, outside = cast(Space, model.unknown), cast(Space, model.outside)
+        self._walled = outside == "occupied"
+        obstacles = np.pad(model.grid.obstacles(unknown), 1, constant_values=self._walled)
+        distances = distance_transform(obstacles, resolution=cell, backend=backend)
+        distances = np.minimum(distances, p.max_distance)
+        for edge in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
+            distances[edge] = 0.0 if self._walled else p.max_distance
+        self._low, self._high = (float(_log_density(model, np.array([d]))[0]) for d in (p.max_distance, 0.0))
+        self._tiles = 0
+        if p.interpolation == "bilinear":
+            room = _MOST_TABLE_CELLS / distances.size
+            self._tiles = next((n for n in _TILES if n * n <= room), _TILES[-1])
+            scores = self._tile_scores(model, distances)
+        else:
+            scores = quantized(_log_density(model, distances[1:-1, 1:-1]), self._low, self._high)
+        shortest = min(model.grid.shape) / stride
+        levels = min(math.log2(max(_BLOCK * p.max_distance / (cell * stride), 1)), math.log2(max(shortest / 4, 1)))
+        self._search = Search(
+            ScoreTables(
+                backend, scores, levels=min(int(levels), _MOST_LEVELS), stride=stride,
+                beyond=TOP if self._walled else 0,
+            )
+        )  # fmt: skip
+        self.caster = RayCaster(model.grid, model.scanner.range_max, backend=backend, unknown=unknown, outside=outside)
+        self.smooth = LikelihoodFieldModel(
+            model.grid, model.scanner, replace(p, interpolation="bilinear"), backend=backend,
+            precision=model.precision, unknown=unknown, outside=outside, beams=model.beams,
+        )  # fmt: skip
+
+    def _tile_scores(self, model: LikelihoodFieldModel, distances: np.ndarray) -> np.ndarray:
+        """Return the largest scores (n * n, H + 1, W + 1) of the tiles between four centres, rounded up."""
+        n = self._tiles
+        along = np.linspace(0, 1, n + 1)
+        rows = [(1 - f) * distances[:-1] + f * distances[1:] for f in along]
+        scores = np.empty((n * n, distances.shape[0] - 1, distances.shape[1] - 1), np.uint8)
+        corners = [[(1 - f) * row[:, :-1] + f * row[:, 1:] for f in along] for row in rows]
+        for i in range(n):
+            for j in range(n):
+                least = np.min([corners[i][j], corners[i][j + 1], corners[i + 1][j], corners[i + 1][j + 1]], axis=0)
+                values = _log_density(model, least)
+                exact = (np.clip(values, self._low, self._high) - self._low) * (TOP / self._step())
+                scores[i * n + j] = np.minimum(np.ceil(exact + 0.01), TOP)
+        return scores
+
+    def _step(self) -> float:
+        return max(self._high - self._low, 1e-300)
+
+    def find(
+        self, ranges: np.ndarray, points: np.ndarray, searched: PoseGrid, allowed: np.ndarray | None, depth: float
+    ) -> Candidates:
+        """Return the poses whose scores are near the best one, and the likeliest by the model.
+
+        Args:
+            ranges: (K,) readings [m].
+            points: (M, 2) end points of the hits on the robot [m], at least one.
+            searched: The poses.
+            allowed: Positions that may be found; None: all.
+            depth: Largest difference from the best score.
+        """
+        model = self._model()
+        assert model is not None
+        cells = points / self.grid.resolution
+        most = math.ceil(depth * TOP * len(points))
+        if self._tiles:
+            return self._find_between(model, ranges, cells, searched, allowed, most)
+        found = self._search.find([cells], searched, slack=max(len(points), most), allowed=allowed)
+        poses = to_world(self.grid, searched.poses(found, self.stride))
+        # Rounding moves a score by half a step for each hit.
+        near = np.flatnonzero(found.score >= found.score[0] - len(points))
+        best = near[_first_of_largest(model.log_likelihood(poses[near], ranges), found, near)]
+        return Candidates(poses, found.score / (TOP * len(points)), int(best), found.evaluated)
+
+    def _find_between(
+        self, model: LikelihoodFieldModel, ranges: np.ndarray, cells: np.ndarray, searched: PoseGrid,
+        allowed: np.ndarray | None, most: int,
+    ) -> Candidates:  # fmt: skip
+        """Return the likeliest poses of a bilinear field: all whose bounds reach a likelihood that is known."""
+        # A cell of the tables lies between four centres; the ring outside the map has one, too.
+        shifted = PoseGrid(searched.start + 0.5, searched.headings, searched.height, searched.width)
+
+        def run(headings: slice, floor: int) -> Found:
+            part = PoseGrid(shifted.start, shifted.headings[:, headings], shifted.height, shifted.width)
+            images = _tile_numbers(cells, part.headings[0], part.start[0], self._tiles)
+            slack = TOP * len(cells) if floor >= 0 else len(cells)
+            return self._search.find([cells], part, slack=slack, allowed=allowed, images=[images], floor=floor)
+
+        everything = slice(0, searched.headings.shape[1])
+        first = run(everything, -1)
+        poses = to_world(self.grid, searched.poses(first, self.stride))
+        known = self._steps(model, ranges, len(cells), poses).max() - 1 - _ROUNDING * len(cells)
+        # The modes may score less, but only the likeliest pose must not be missed.
+        parts = [(everything, run(everything, max(int(known) - most, 0)))]
+        evaluated = first.evaluated
+        if not parts[0][1].complete[0]:
+            evaluated += parts[0][1].evaluated
+            parts = list(_complete(run, everything, max(int(known), 0)))
+        evaluated += sum(part.evaluated for _, part in parts)
+        found = [np.concatenate(each) for each in zip(*[
+            (part.row, part.col, part.heading + headings.start) for headings, part in parts
+        ], strict=True)]  # fmt: skip
+        row, col, heading = found
+        start, stride = searched.start[0], self.stride
+        local = np.stack([start[0] + stride * col, start[1] + stride * row, searched.headings[0, heading]], axis=1)
+        poses = to_world(self.grid, local)
+        score = self._steps(model, ranges, len(cells), poses)
+        order = np.lexsort((heading, col, row, -score))
+        order = order[score[order] >= score.max() - most]
+        return Candidates(poses[order], score[order] / (TOP * len(cells)), 0, evaluated)
+
+    def _steps(self, model: LikelihoodFieldModel, ranges: np.ndarray, hits: int, poses: np.ndarray) -> np.ndarray:
+        """Return the log-likelihoods of the hits at poses as scores."""
+        log_p = model.log_likelihood(poses, ranges).astype(np.float64)
+        # Readings that are not hits have the same density at all poses.
+        nearest, farthest = model.scanner.range_min, model.scanner.range_max
+        others = np.where(classes(ranges, nearest, farthest) == Reading.HIT, np.nan, ranges)
+        log_p -= float(model.log_likelihood(poses[:1], others)[0])
+        steps: np.ndarray = (log_p / model.temperature - hits * self._low) * (TOP / self._step())
+        return steps
+
+
+def _complete(run: Callable[[slice, int], Found], headings: slice, floor: int) -> Iterator[tuple[slice, Found]]:
+    """Yield searches of parts of the headings, in which every pose that reaches the floor is found."""
+    found = run(headings, floor)
+    if found.complete[0] or headings.stop - headings.start < 2:
+        yield headings, found
+        return
+    middle = (headings.start + headings.stop) // 2
+    for part in (slice(headings.start, middle), slice(middle, headings.stop)):
+        yield from _complete(run, part, floor)
+
+
+_SEARCHES: weakref.WeakKeyDictionary[LikelihoodFieldModel, FieldSearch] = weakref.WeakKeyDictionary()
+
+
+def field_search(model: LikelihoodFieldModel, stride: int) -> FieldSearch:
+    """Return the search of a model; a model whose map has changed has a new one."""
+    search = _SEARCHES.get(model)
+    if search is None or search.grid is not model.grid or search.stride != stride:
+        search = _SEARCHES[model] = FieldSearch(model, stride)
+    return search
+
+
+def _log_density(model: LikelihoodFieldModel, distance: np.ndarray) -> np.ndarray:
+    """Return log densities of distances [m] to the nearest obstacle; see the kernel file ``field``."""
+    p = model.parameters
+    hit = log_weight(p.z_hit) - math.log(p.sigma_hit * math.sqrt(2 * math.pi)) - 0.5 * (distance / p.sigma_hit) ** 2
+    return np.logaddexp(hit, log_weight(p.z_rand) - math.log(model.scanner.range_max))
+
+
+def _first_of_largest(log_p: np.ndarray, found: Found, rows: np.ndarray) -> int:
+    """Return the index of the largest log-likelihood; ties by row, then column, then heading."""
+    likeliest = np.flatnonzero(log_p == log_p.max())
+    chosen = rows[likeliest]
+    return int(likeliest[np.lexsort((found.heading[chosen], found.col[chosen], found.row[chosen]))[0]])
+
+
+def _tile_numbers(points: np.ndarray, headings: np.ndarray, start: np.ndarray, tiles: int) -> np.ndarray:
+    """Return the numbers (A, K) of the tiles in which end points lie at each heading; see ``end_cells``."""
+    cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
+    x, y = points[:, 0], points[:, 1]
+    place = np.stack([start[0] + (cos * x - sin * y), start[1] + (sin * x + cos * y)], axis=-1)
+    tile = np.minimum(np.floor((place - np.floor(place)) * tiles), tiles - 1).astype(np.int32)
+    number: np.ndarray = tile[..., 1] * tiles + tile[..., 0]
+    return number
+
+
+def to_world(grid: OccupancyGrid, cells: np.ndarray) -> np.ndarray:
+    """Convert (M, 3) poses in the grid's frame [cells, cells, rad] to the world, headings from -pi to pi."""
+    xy = grid._to_world(cells[:, :2] * grid.resolution)
+    theta = np.remainder(cells[:, 2] + grid.origin[2] + math.pi, 2 * math.pi) - math.pi
+    return np.column_stack([xy, theta])

@@ -1,0 +1,80 @@
+"""The standard deviation of a scan's ranges, from the scan alone.
+
+On a straight wall the inverse range is ``a cos(bearing) + b sin(bearing)``, so that of a beam follows from those of two
+neighbours, at any incidence. The median deviation from it tells the noise: corners, edges and moving things are fewer
+than half of all places. Ranges that come in steps have at least the deviation of rounding, step / sqrt(12).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.scanner import Reading, Scanner, classes
+
+# Most places of a scan that are looked at, and least places for an estimate.
+_PLACES, _LEAST = 160, 12
+# A normal error's median of absolute values, in deviations.
+_MEDIAN = 0.6745
+# Neighbours whose ranges differ by more than this share do not belong to one surface.
+_STEP = 0.35
+# Noise is at least this [m], and rounded up to the next power of this root, so that scans of a call form groups.
+LEAST_NOISE, LARGEST_NOISE, ROOT = 0.004, 0.08, 2**0.5
+# Noise that is assumed where a scan has too few places [m].
+ASSUMED_NOISE = 0.02
+# Ranges come in steps if all differences are multiples of one of this size [m], up to this share of it.
+_LEAST_STEP, _ODD = 1e-3, 0.02
+
+
+def scan_noise(ranges: np.ndarray, scanner: Scanner) -> np.ndarray:
+    """Return the standard deviations (S,) of the ranges of (S, K) readings [m], NaN where too few places tell it."""
+    bearing = scanner.bearings
+    count = len(bearing)
+    if count < 3 or not len(ranges):
+        return np.full(len(ranges), np.nan)
+    place = np.arange(1, count - 1)
+    place = place[:: -(-len(place) // _PLACES)]
+    z = [ranges[:, place + k].astype(np.float64) for k in (-1, 0, 1)]
+    use = np.ones(z[1].shape, bool)
+    for part in z:
+        use &= classes(part, scanner.range_min, scanner.range_max) == Reading.HIT
+    before, after = bearing[place] - bearing[place - 1], bearing[place + 1] - bearing[place]
+    whole = np.sin(before + after)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        left, right = np.sin(after) / whole, np.sin(before) / whole
+        expected = 1 / (left / z[0] + right / z[2])
+        # The deviation of the difference: errors of the other two ranges, times the derivatives by them.
+        share = np.sqrt(1 + ((expected / z[0]) ** 2 * left) ** 2 + ((expected / z[2]) ** 2 * right) ** 2)
+        use &= (expected > 0) & (np.abs(z[0] - z[1]) < _STEP * z[1]) & (np.abs(z[2] - z[1]) < _STEP * z[1])
+        off = np.where(use, np.abs(z[1] - expected) / share, np.inf)
+    number = use.sum(axis=1)
+    middle = np.sort(off, axis=1)[np.arange(len(off)), np.maximum(number - 1, 0) // 2]
+    rounding = _range_steps(np.where(use, z[1], np.inf)) / np.sqrt(12)
+    return np.where(number >= _LEAST, np.maximum(middle / _MEDIAN, rounding), np.nan)
+
+
+def _range_steps(ranges: np.ndarray) -> np.ndarray:
+    """Return the step (S,) in which ranges (S, K) come [m], 0 without one; infinite ranges do not count."""
+    with np.errstate(invalid="ignore"):
+        gap = np.diff(np.sort(ranges, axis=1), axis=1)
+    gap = np.where(np.isfinite(gap) & (gap > 0.5 * _LEAST_STEP), gap, np.inf)
+    step = gap.min(axis=1, initial=np.inf)
+    with np.errstate(invalid="ignore"):
+        multiple = gap / step[:, None]
+        odd = np.isfinite(gap) & (np.abs(multiple - np.rint(multiple)) > _ODD)
+    known = np.isfinite(gap).sum(axis=1) >= _LEAST
+    return np.where(known & (step > _LEAST_STEP) & ~odd.any(axis=1), step, 0.0)
+
+
+def match_noise(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the noise of matches (S,) from that of both scans: the larger one, on a scale of steps; NaN is unknown."""
+    both = np.fmax(first, second)
+    both = np.clip(np.where(np.isnan(both), ASSUMED_NOISE, both), LEAST_NOISE, LARGEST_NOISE)
+    noise: np.ndarray = LEAST_NOISE * ROOT ** np.ceil(np.log(both / LEAST_NOISE) / np.log(ROOT) - 1e-6)
+    return noise
+
+
+def map_noise(scans: np.ndarray, grid: OccupancyGrid) -> np.ndarray:
+    """Return the noise of matches (S,) of scans in a map, whose surfaces have errors of rounding to cells."""
+    both = np.hypot(np.where(np.isnan(scans), ASSUMED_NOISE, scans), grid.resolution / np.sqrt(12))
+    return match_noise(both, both)

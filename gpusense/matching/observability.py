@@ -1,0 +1,203 @@
+"""Directions of a pose that the pairs of a match observe, tested against what noise makes up.
+
+The information of Gauss-Newton counts errors of the lines as information: in a corridor, noise turns lines, and turned
+lines seem to constrain the position along it. Where a direction v is not observed, all of v' I v is such a sum of
+squares. Its mean is v' S v, where S is what the variance of the points makes up, and it scatters like a chi-squared
+variable with as many degrees of freedom as there are lines without a common point. So the generalised eigenvalues of
+I v = lambda S v decide: lambda is 1 in the mean where nothing is observed, whatever the units of the coordinates, and
+a direction counts as observed above the quantile of lambda with the probability FALSE_ALARM of a false one.
+
+A lost direction is lost in all coordinates: the information of the others is that with the position along it unknown
+(Schur's complement). Where translations alone explain what is lost, as along a corridor, the heading stays observed.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+# Probability that a direction that is not observed counts as observed, and the normal quantile of the rest.
+FALSE_ALARM, _QUANTILE = 1e-4, 3.72
+# Least degrees of freedom, and least ratio of an observed direction.
+_LEAST_LINES, _LEAST_RATIO = 4.0, 2.0
+# An observed direction has this many pairs.
+LEAST_PAIRS = 1.5
+# What lines without errors make up [pairs].
+_SPURIOUS = 1e-3
+# Share of the largest eigenvalue below which a direction of an information is lost.
+_NOTHING = 1e-9
+
+
+class Observed(NamedTuple):
+    """What pairs observe.
+
+    Attributes:
+        information: (S, 3, 3) sums of w J J' without what noise makes up, exactly 0 along lost directions.
+        lost: (S,) number of lost directions.
+    """
+
+    information: np.ndarray
+    lost: np.ndarray
+
+
+def critical_ratio(lines: np.ndarray) -> np.ndarray:
+    """Return the quantile of a chi-squared variable over its degrees of freedom (S,), by Wilson and Hilferty (1931)."""
+    share = 2 / (9 * np.maximum(lines, _LEAST_LINES))
+    ratio: np.ndarray = np.maximum((1 - share + _QUANTILE * np.sqrt(share)) ** 3, _LEAST_RATIO)
+    return ratio
+
+
+def observed_information(
+    information: np.ndarray, spurious: np.ndarray, lever: np.ndarray, lines: np.ndarray, least: np.ndarray
+) -> Observed:
+    """Return the information of pairs along the directions that they observe.
+
+    Args:
+        information: (S, 3, 3) sums of w J J'.
+        spurious: (S, 3, 3) the part of them that the variance of the points makes up, in the mean.
+        lever: (S,) length by which headings are multiplied [m].
+        lines: (S,) lines of the scan without a common point.
+        least: (S,) least pairs of an observed direction.
+    """
+    scale = balance_of(lever)
+    both = scale[:, :, None] * scale[:, None, :]
+    total, made_up = information * both, spurious * both + _SPURIOUS * np.eye(3)
+    critical = critical_ratio(lines)
+    values, vectors = _generalised(total, made_up)
+    lost = _is_lost(values, vectors, critical, least)
+    count = lost.sum(axis=1)
+    some = np.flatnonzero(count)
+    result = np.array(total)
+    if len(some):
+        basis = _lost_basis(total[some], made_up[some], critical[some], least[some], vectors[some], lost[some])
+        result[some] = without(total[some], basis, made_up[some])
+        values, vectors = np.array(values), np.array(vectors)
+        values[some], vectors[some] = _generalised(result[some], made_up[some])
+    # What noise makes up is 1 of each eigenvalue.
+    left = np.where(np.arange(3) < count[:, None], 0.0, np.maximum(values - 1, 1e-3 * values))
+    sides = made_up @ vectors
+    result = np.einsum("sik,sk,sjk->sij", sides, left, sides)
+    if len(some):
+        result[some] = without(result[some], basis, made_up[some])
+    return Observed(result / both, count)
+
+
+def balance_of(lever: np.ndarray) -> np.ndarray:
+    """Return (S, 3) factors that turn x, y and ``lever`` times the heading into x, y and the heading."""
+    return np.stack([np.ones_like(lever), np.ones_like(lever), 1 / lever], axis=1)
+
+
+def without(information: np.ndarray, lost: np.ndarray, made_up: np.ndarray) -> np.ndarray:
+    """Return information (S, 3, 3) with the positions along lost directions (S, 3, L) unknown; columns may be 0.
+
+    The directions have no information at all in the result, up to rounding. What rounding and noise make up (S, 3, 3)
+    is not divided by.
+    """
+    side = information @ lost
+    inner = lost.transpose(0, 2, 1) @ (side + made_up @ lost)
+    left = information - side @ np.linalg.pinv(inner, rcond=1e-12, hermitian=True) @ side.transpose(0, 2, 1)
+    # Rounding leaves traces along lost directions: project them out.
+    q = orthonormal(lost)
+    keep = np.eye(3) - q @ q.transpose(0, 2, 1)
+    result: np.ndarray = keep @ left @ keep
+    return result
+
+
+def _generalised(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return ascending eigenvalues (S, 3) of a v = lambda b v, and eigenvectors in columns with v' b v = 1."""
+    inverse = np.linalg.inv(np.linalg.cholesky(b))
+    values, vectors = np.linalg.eigh(inverse @ a @ inverse.transpose(0, 2, 1))
+    return values, inverse.transpose(0, 2, 1) @ vectors
+
+
+def _is_lost(values: np.ndarray, vectors: np.ndarray, critical: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """Return which directions noise alone explains, or have hardly a pair; all with smaller ratios are lost, too."""
+    pairs = values / np.maximum(np.square(vectors).sum(axis=1), 1e-300)
+    lost = (values < critical[:, None]) | (pairs < least[:, None])
+    result: np.ndarray = np.logical_or.accumulate(lost[:, ::-1], axis=1)[:, ::-1]
+    return result
+
+
+def _lost_basis(
+    total: np.ndarray, made_up: np.ndarray, critical: np.ndarray, least: np.ndarray, vectors: np.ndarray,
+    lost: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Return (S, 3, 3) lost directions in columns, others 0; translations first, where they are lost by themselves."""
+    values, plane = _generalised(total[:, :2, :2], made_up[:, :2, :2])
+    slides = _is_lost(values, plane, critical, least)
+    basis = np.where(lost[:, None, :], vectors, 0.0)
+    basis /= np.maximum(np.linalg.norm(basis, axis=1, keepdims=True), 1e-300)
+    count, sliding = lost.sum(axis=1), slides.sum(axis=1)
+    translation = np.concatenate([plane, np.zeros((len(plane), 1, 2))], axis=1)
+    translation /= np.linalg.norm(translation, axis=1, keepdims=True)
+    one = (count == 1) & (sliding >= 1)
+    basis[one, :, 0] = translation[one, :, 0]
+    two = (count == 2) & (sliding == 2)
+    basis[two, :, :2] = np.eye(3)[:, :2]
+    # One translation and another direction: that of the two which is less like the translation.
+    mixed = np.flatnonzero((count == 2) & (sliding == 1))
+    if len(mixed):
+        along = np.abs(np.einsum("si,sik->sk", translation[mixed, :, 0], basis[mixed, :, :2]))
+        other = basis[mixed, :, np.argmin(along, axis=1)]
+        basis[mixed, :, 0], basis[mixed, :, 1] = translation[mixed, :, 0], other
+    basis[count == 3] = np.eye(3)
+    return basis
+
+
+def orthonormal(vectors: np.ndarray) -> np.ndarray:
+    """Return orthonormal columns that span those of (S, 3, L); columns without a direction are 0."""
+    u, s, _ = np.linalg.svd(vectors, full_matrices=False)
+    kept = s > 1e-9 * np.maximum(s[:, :1], 1e-300)
+    result: np.ndarray = np.where(kept[:, None, :] & (s[:, None, :] > 0), u, 0.0)
+    return result
+
+
+def axes_of(information: np.ndarray, lever: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return ascending eigenvalues (S, 3) of information, exactly 0 where lost, and directions (S, 3, 3) in columns.
+
+    Directions are those of x, y and ``lever`` times the heading.
+    """
+    scale = balance_of(lever)
+    values, vectors = np.linalg.eigh(information * (scale[:, :, None] * scale[:, None, :]))
+    values = np.where(values > _NOTHING * np.maximum(values[:, -1:], 0), values, 0.0)
+    return values, vectors
+
+
+def covariance_of(information: np.ndarray, lever: np.ndarray, reach: tuple[float, float]) -> np.ndarray:
+    """Return the covariance (S, 3, 3) of an information: its inverse, infinite in every coordinate that is lost.
+
+    A coordinate is lost if positions along a lost direction within ``reach`` of each other differ in it by more than
+    its deviation; where they differ less, their difference is part of its variance.
+
+    Args:
+        information: (S, 3, 3), 0 along lost directions.
+        lever: (S,) length by which headings are multiplied [m].
+        reach: Farthest distance [m] and angle [rad] from the guess.
+    """
+    scale = balance_of(lever)
+    values, vectors = axes_of(information, lever)
+    gone = values == 0
+    axes = vectors * scale[:, :, None]
+    inverse = np.where(gone, 0, 1 / np.where(gone, 1, values))
+    covariance = np.einsum("sik,sk,sjk->sij", axes, inverse, axes)
+    lost = np.where(gone[:, None, :], axes, 0.0)
+    if not gone.any():
+        return covariance
+    # How far one may go along each lost direction within reach, and how far each coordinate then moves.
+    limit = np.array([max(reach[0], 1e-3), max(reach[0], 1e-3), max(reach[1], 1e-3)])
+    with np.errstate(divide="ignore"):
+        far = np.min(np.where(np.abs(lost) > 0, limit[:, None] / np.abs(lost), np.inf), axis=1)
+    moved = np.sqrt(np.square(np.where(gone[:, None, :], lost * np.where(gone, far, 0)[:, None, :], 0)).sum(axis=2))
+    variance = np.einsum("sii->si", covariance)
+    infinite = moved**2 > variance
+    covariance[:, range(3), range(3)] += np.where(infinite, 0, moved**2)
+    with np.errstate(invalid="ignore"):
+        product = lost @ lost.transpose(0, 2, 1)
+        size = np.sqrt(np.einsum("sii->si", product))
+        both = infinite[:, :, None] & infinite[:, None, :] & (
+            np.abs(product) > 1e-6 * size[:, :, None] * size[:, None, :]
+        )  # fmt: skip
+    covariance = np.where(both, np.copysign(np.inf, product), covariance)
+    covariance[:, range(3), range(3)] = np.where(infinite, np.inf, np.einsum("sii->si", covariance))
+    return covariance

@@ -1,0 +1,131 @@
+"""What matches say about themselves: information from their pairs, the directions they observe, and their status."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from gpusense.backends import Backend
+from gpusense.matching.evidence import DOUBTED, DOUBTED_PARTLY, probability_right
+from gpusense.matching.icp import LONG_WIDTH, WIDTH, IcpPairs, points_of_line, space_of
+from gpusense.matching.observability import Observed, axes_of, covariance_of
+from gpusense.matching.options import MatchOptions
+from gpusense.matching.points import ScanPoints
+from gpusense.matching.result import USABLE, ScanMatch
+from gpusense.matching.uncertainty import inflation_of, observed_pairs, symmetric, variance_of
+
+# Distances from guesses are relative to windows of at least this [m].
+_LEAST_WINDOW = 0.1
+# Lines turn with noise by this much in the mean square [rad^2] where longer ones tell what is observed.
+_TURNED_LINES = 0.02
+
+
+class PairSums(NamedTuple):
+    """What the pairs of matches observe in the sensors' frames, variances of points and factors of covariances (S,)."""
+
+    found: Observed
+    variance: np.ndarray
+    factor: np.ndarray
+
+
+def tested(
+    device: IcpPairs, result: np.ndarray, points: ScanPoints, pairs: np.ndarray, options: MatchOptions
+) -> PairSums:
+    """Return what pairs observe: by the lines of the matches, and where noise may turn these, by longer ones."""
+    lever = points.rms_range(pairs[:, 1])
+    squared = result[:, 20] / np.maximum(result[:, 19], 1e-30)
+    variance, factor = variance_of(
+        squared, result[:, 19], options.least_scale, options.noise, inflation_of(result[:, 24:32])
+    )
+    noise = np.maximum(variance, options.noise**2)
+    lines = result[:, 19] / points_of_line(points.gap, options.noise, lever)
+
+    def observed(sums: np.ndarray, rows: np.ndarray) -> Observed:
+        information, doubt = symmetric(sums[:, 6:12]), symmetric(sums[:, 12:18])
+        return observed_pairs(information, doubt, noise[rows], lever[rows], lines[rows])
+
+    found = observed(result, np.arange(len(result)))
+    turned = (result[:, 12] + result[:, 15]) * noise > _TURNED_LINES * np.maximum(result[:, 19], 1e-30)
+    rows = np.flatnonzero((found.lost > 0) | turned)
+    if len(rows) and LONG_WIDTH * options.noise > WIDTH:
+        device.fit_lines(LONG_WIDTH * options.noise)
+        longer = device.run(rows, result[rows, None, :3], options.last_rules(points.gap))[:, 0]
+        for values, others in zip(found, observed(longer, rows), strict=True):
+            values[rows] = others
+    return PairSums(found, variance, factor)
+
+
+def concluded(
+    pose: np.ndarray, information: np.ndarray, factor: np.ndarray, score: np.ndarray, iterations: np.ndarray,
+    status: np.ndarray, lever: np.ndarray, other: np.ndarray, evidence: np.ndarray, pairs: np.ndarray,
+    options: MatchOptions,
+) -> ScanMatch:  # fmt: skip
+    """Return matches whose information is 0 where they failed, and spans both poses where there are two.
+
+    Args:
+        pose: (S, 3) poses.
+        information: (S, 3, 3) of them.
+        factor: (S,) by which it is multiplied for a sum over pairs [m^2].
+        score: (S,) scores.
+        iterations: (S,) iterations.
+        status: (S,) statuses so far.
+        lever: (S,) root mean square ranges [m].
+        other: (S, 3) offsets to poses that agree about as well, NaN without one.
+        evidence: (S, E) numbers of ``evidence.NAMES``.
+        pairs: (S,) sums of weights.
+        options: The window and the noise.
+    """
+    usable = np.isin(status, USABLE)
+    two = usable & np.isfinite(other).all(axis=1)
+    offset = np.where(two[:, None], other, 0.0)
+    # The covariance plus a quarter of the offset's square, by Woodbury's identity.
+    side = np.einsum("sij,sj->si", information, offset)
+    information = information - side[:, :, None] * (side / (4 + (side * offset).sum(axis=1))[:, None])[:, None, :]
+    status = np.where(two, "ambiguous", status)
+    values, vectors = axes_of(information, lever)
+    shares = values * (factor / np.maximum(pairs, 1))[:, None]
+    information = np.where(usable[:, None, None], information, 0.0)
+    return ScanMatch(
+        pose, covariance_of(information, lever, options.window), information, np.zeros(len(pose)), score,
+        iterations.astype(np.int64), shares, vectors.transpose(0, 2, 1), lever, np.full(len(pose), options.noise),
+        evidence, status,
+    )  # fmt: skip
+
+
+def judged(match: ScanMatch, guess: np.ndarray, options: MatchOptions) -> ScanMatch:
+    """Return S matches with the probabilities that they are right; doubtful ones and those off the window have failed.
+
+    Args:
+        match: Matches from ``concluded``.
+        guess: (S, 3) guesses of the poses.
+        options: The window.
+    """
+    offset = match.pose - guess
+    evidence = match.evidence.copy()
+    evidence[:, -1] = np.hypot(offset[:, 0], offset[:, 1]) / max(options.window[0], _LEAST_WINDOW)
+    status, outside = np.asarray(match.status), options.is_outside(offset)
+    p_right = np.where(match.usable & ~outside, probability_right(evidence), 0.0)
+    least = np.where(status == "converged", DOUBTED, DOUBTED_PARTLY)
+    status = np.where(match.usable & (p_right < least), "doubtful", status)
+    status = np.where(match.usable & outside, "outside window", status)
+    failed = ~np.isin(status, USABLE)[:, None, None]
+    return replace(
+        match, evidence=evidence, p_right=p_right, status=status, information=np.where(failed, 0.0, match.information),
+        covariance=np.where(failed, np.where(np.eye(3) > 0, np.inf, 0.0), match.covariance),
+    )  # fmt: skip
+
+
+def pair_sums(
+    backend: Backend, real: np.dtype, points: ScanPoints, pairs: np.ndarray, options: MatchOptions
+) -> np.ndarray:
+    """Return results (S, 35) of pairs of scans that stay where they are, but for one last step."""
+    lock, space = space_of(backend)
+    stride = options.rules(int(points.counts[pairs[:, 1]].max(initial=0)), points.gap).score_stride
+    rules = options.last_rules(points.gap)._replace(score_stride=stride)
+    with lock, space:
+        device = IcpPairs(backend, real, points, pairs, options.noise, space)
+        result = device.run(np.arange(len(pairs)), np.zeros((len(pairs), 1, 3)), rules)[:, 0]
+        space.wait()
+    return result

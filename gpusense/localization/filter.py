@@ -80,7 +80,7 @@ class ParticleFilter(Beginnings):
         "_everywhere", "_distinct",
         "_verdict", "_sensors", "_cloud",
     )  # fmt: skip
-    PARTS = ("_trust",)
+    PARTS = ()
 
     def __init__(
         self,
@@ -132,7 +132,8 @@ class ParticleFilter(Beginnings):
         if method == "estimate" and self._pending is None:
             # It runs the pending motion, and judges the pose.
             return (self._verdict,)
-        return self, self._cloud, self._verdict, *self._sensors
+        rival = () if self._rival is None else self._rival.changing()
+        return self, self._cloud, self._verdict, *self._sensors, *rival
 
     def __repr__(self) -> str:
         one = self.options

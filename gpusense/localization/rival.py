@@ -89,6 +89,10 @@ class Rival:
         """Note what the call that begins must leave as it is."""
         self._filter._keep()
 
+    def changing(self) -> tuple[Any, ...]:
+        """Return the objects whose state a correction may change."""
+        return self, *self._filter._changing("correct")
+
     def state(self) -> tuple[dict[str, Any], FilterState]:
         """Return the rival as plain data."""
         return plain_state(self, without=("_filter", "_pool")), self._filter.state()

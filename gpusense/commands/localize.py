@@ -93,9 +93,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--reverse", type=not_negative_number, metavar="P",
         help=f"probability that a translation went the other direction (default: {DEFAULTS.reverse})")  # fmt: skip
     add("--fit-motion", action="store_true", help="learn the motion noise from the reference poses of this log first")
-    add("--recovery", choices=("augmented", "sensor"),
-        help="inject particles when the filter is lost: anywhere, or where the scan is likely (default: only a start "
-        "with --global is repeated)")  # fmt: skip
+    add("--recovery", choices=("sensor", "augmented", "none"),
+        help="where scans contradict the pose: search for a rival that must win by later scans, or inject particles "
+        f"anywhere, or neither (default: {DEFAULTS.recovery})")  # fmt: skip
     add("--beam-skip", type=positive_number, metavar="P",
         help="leave out beams, such as of people, that less than this share of the particles explains")  # fmt: skip
     add("--every", type=whole_number(low=1), default=1, metavar="E", help="every E-th scan, from --offset on")

@@ -107,7 +107,7 @@ def make_filter(args: argparse.Namespace, grid: OccupancyGrid, steps: list[Step]
     models = [kind(grid, scanners[one], parameters, beams=beams, backend=args.backend) for one in sorted(scanners)]
     chosen: dict[str, Any] = dict(
         particles=DEFAULTS.particles_everywhere if args.everywhere else DEFAULTS.particles,
-        recovery=None,
+        recovery=DEFAULTS.recovery,
         beam_skip=None,
     )
     if nav2 is not None:
@@ -117,6 +117,8 @@ def make_filter(args: argparse.Namespace, grid: OccupancyGrid, steps: list[Step]
             recovery="augmented" if all(nav2.recovery) else None,
         )  # fmt: skip
     given = {name: getattr(args, name) for name in chosen if getattr(args, name) is not None}
+    if args.recovery == "none":
+        given["recovery"] = None
     return ParticleFilter(
         models, motion=_motion(args, steps, read), seed=args.seed, temperature=args.temperature, **(chosen | given)
     )

@@ -56,8 +56,7 @@ class Beginnings(Results):
     def initialize_uniform(self, *, bounds: AnyArray | None = None, particles: int | None = None) -> None:
         """Draw particles uniformly over the free cells of the map, with any heading.
 
-        Without bounds and another ``recovery``, half of the particles are placed anew, as by :meth:`reset`, where they
-        have converged to a pose that scans contradict.
+        Without bounds and with ``recovery="sensor"``, the pose to which they converge is compared with other places.
 
         Args:
             bounds: ((x_min, y_min), (x_max, y_max)) [m]: only there. Needed for models without a grid.

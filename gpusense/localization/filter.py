@@ -48,10 +48,9 @@ class ParticleFilter(Beginnings):
         resampling: "systematic", "stratified" or "residual"; sums are exact in each.
         threshold: Resample where the effective sample size is below this share of the particles.
         stages: Most stages of a correction, 1 to 6; 1 is the plain particle filter with tempered weights.
-        recovery: None: only a start anywhere on the map is repeated (sensor resetting) where scans contradict the pose
-            that it has found; "augmented": inject uniform particles where the scans' likelihood drops (*Probabilistic
-            Robotics* table 8.3), or "sensor": inject them where the scan is likely (sensor resetting, Lenser and
-            Veloso 2000) as soon as the filter finds itself lost.
+        recovery: "sensor": where scans contradict the pose, a rival cloud begins where the scan is likely (sensor
+            resetting, Lenser and Veloso 2000) and takes over once later scans prefer it; "augmented": inject uniform
+            particles where the scans' likelihood drops (*Probabilistic Robotics* table 8.3); None: neither.
         beam_skip: None, or a share of the particles in (0, 1): a beam that fewer of them explain is left out, such as
             one of a person. A scan of which most beams would be left out is used as a whole, and so is each scan while
             the particles lie apart. Each correction then asks 100 particles on the host first.

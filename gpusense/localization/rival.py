@@ -183,6 +183,10 @@ class Rival:
         gain = self.log_odds - self._prior
         own = covariance_of(numbers)
         together = deviations(own)[0] < _TOGETHER
+        if not together:
+            # The mean of several places is none of them.
+            poses, weights = self._filter.host_particles(), self._filter.host_weights()
+            self._place, own = poses[int(np.argmax(weights))], np.zeros((3, 3))
         self._compare(own, pose, covariance, dict(readings))
         if together and not self._settled:
             self._settled = True

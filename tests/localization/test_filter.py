@@ -191,7 +191,7 @@ def test_recovery_from_a_kidnapping():
     for recovery in ("augmented", "sensor"):
         pf = gs.ParticleFilter(model, particles=800, seed=4, recovery=recovery)
         pf.initialize(mean=TRUTH, covariance=np.eye(3) * 1e-3)
-        for pose in (*[TRUTH] * 4, *[np.array([6.5, 5.0, -1.0])] * 12):
+        for pose in (*[TRUTH] * 4, *[np.array([6.5, 5.0, -1.0])] * 20):
             pf.correct(walls(pose))
             pf.predict((0, 0, 0), (0, 0, 0))
         found = pf.estimate("cluster").pose

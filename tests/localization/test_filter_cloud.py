@@ -110,7 +110,8 @@ def test_a_correction_has_the_bits_of_the_other_kind(cloud, other, drawn):
     np.testing.assert_allclose(host(cloud.shares(COUNT)), host(other.shares(COUNT)), rtol=1e-14, atol=0)
     assert abs(host(cloud.shares(COUNT)).sum() - 1) < 1e-12
     assert np.array_equal(cloud.estimate(COUNT), other.estimate(COUNT))
-    assert np.array_equal(host(cloud.moments(COUNT)), cloud.estimate(COUNT)[:9])
+    # On a GPU the moments take a second pass.
+    np.testing.assert_allclose(host(cloud.moments(COUNT)), cloud.estimate(COUNT)[:9], rtol=1e-9, atol=1e-15)
     one, two = cloud.summary(), other.summary()
     assert one[:4] == two[:4] and 1 <= one.effective_sample_size <= COUNT and not one.degenerate
     # Weights are those of the scores: the likeliest particle is the heaviest.

@@ -129,7 +129,7 @@ def pairs(backend: str, count: int, seed: int) -> tuple[list[list[str]], list[li
         for k in range(BINS):
             some = number == k
             row.append(
-                ": ".join(f"{np.average(one[some], weights=weight[some]):.2f}" for one in (said, right))
+                ": ".join(f"{np.average(one[some], weights=weight[some]):.2f}" for one in (said, right)) +
                 f" ({some.sum()})" if some.any() else "-"
             )  # fmt: skip
         diagram.append(row)
@@ -281,7 +281,7 @@ def main(argv: list[str] | None = None) -> None:
         texts.append(f"{title}\n\n{table(columns, lines)}")
 
     if "corridors" in parts:
-        add("corridors", "Corridors", ["beams", "noise cm", "matches", "converged %", "others", "error / deviation, 99 %"],
+        add("corridors", "Corridors", ["beams", "noise cm", "matches", "converged %", "others", "99 % of error"],
             corridors(backend, count, seed))  # fmt: skip
     if "pairs" in parts:
         verdicts, diagram = pairs(backend, count, seed)

@@ -10,7 +10,7 @@ import numpy as np
 
 from gpusense.backends import Backend
 from gpusense.matching.evidence import pair_evidence
-from gpusense.matching.icp import IcpPairs, space_of
+from gpusense.matching.icp import STRAIGHT_WIDTH, WIDTH, IcpPairs, space_of
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import ScanPoints
 from gpusense.matching.result import ScanMatch
@@ -28,6 +28,8 @@ _REFINED, _APART, _TURNED = 6, 0.1, 0.05
 _FARTHER, _UNSETTLED = 0.03, 0.05
 # Starts whose score is this far below the best one are not refined.
 _PROMISING = 0.15
+# Lines turn with noise by this in the mean square [rad^2] where longer ones give the pose.
+_TURNED = 0.13
 # Poses farther apart than this whose scores are this close make a match ambiguous.
 _OTHER, _OTHER_TURN, _CLOSE = 0.25, 0.1, 0.012
 
@@ -82,6 +84,7 @@ def match_pairs(
                     which = np.flatnonzero(some)
                     _search(device, which, sensor[which], reach, best, options, (before, most), points.gap)
             _repeat(device, sensor, best, options, most, points.gap)
+        _straighten(device, best.result, points, pairs, options)
         sums = tested(device, best.result, points, pairs, options)
         space.wait()
     return _finished(best, sums, pairs, points, options, mount)
@@ -147,6 +150,21 @@ def _repeat(device: IcpPairs, guess: np.ndarray, best: Best, options: MatchOptio
             again[:, 3] + _UNSETTLED * again[:, 5] > best.result[rows, 3] + _UNSETTLED * best.result[rows, 5] - 1e-3
         )
         best.result[rows[better]] = again[better]
+
+
+def _straighten(
+    device: IcpPairs, result: np.ndarray, points: ScanPoints, pairs: np.ndarray, options: MatchOptions
+) -> None:
+    """Match pairs again by longer lines where noise turns the usual ones, and put the results in place."""
+    turn = (result[:, 12] + result[:, 15]) * options.noise**2 / np.maximum(result[:, 19], 1e-30)
+    rows = np.flatnonzero(turn > _TURNED)
+    if len(rows) and STRAIGHT_WIDTH * options.noise > WIDTH:
+        device.fit_lines(STRAIGHT_WIDTH * options.noise)
+        most = int(points.counts[pairs[:, 1]].max(initial=0))
+        rules = options.final_rules(most, points.gap)
+        rules = rules._replace(capture=rules.least_capture, scale=rules.least_scale)
+        result[rows] = device.run(rows, result[rows, None, :3], rules)[:, 0]
+        device.fit_lines(WIDTH)
 
 
 def nearby(options: MatchOptions) -> np.ndarray:

@@ -19,9 +19,10 @@ from gpusense.matching.points import GAP, ScanPoints
 # Neighbours on either side to which a line is fitted, and how far they may be from one another: a share of the range
 # and a distance [m]. Bodies in vectors have room for 48.
 REACH, _MOST, _FEWER, _RATIO, _SLACK = 2, 48, 16, 0.1, 0.05
-# Half of the least length of a line [m]; and of lines that tell what is observed, in standard deviations of ranges.
-# Lines as long as these do not turn with noise, but round corners, which costs accuracy.
-WIDTH, LONG_WIDTH = 0.04, 8.0
+# Half of the least length of a line [m]; in standard deviations of ranges that of lines for scans of which noise turns
+# such short ones, and that of lines that tell what is observed. Long lines do not turn with noise, but round corners,
+# which costs accuracy.
+WIDTH, STRAIGHT_WIDTH, LONG_WIDTH = 0.04, 3.5, 8.0
 # Neighbours may be this many deviations apart, or this many of the scanner's steps in bearing times the range.
 _SLACK_DEVIATIONS, _STEPS = 6.0, 2.5
 # With farther steps of bearing lines have three points [rad].

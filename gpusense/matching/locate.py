@@ -12,6 +12,7 @@ from gpusense._util import checks, masks
 from gpusense.matching.climb import climb
 from gpusense.matching.field_search import Candidates, FieldSearch, field_search
 from gpusense.matching.location import Location, PoseMode, Status
+from gpusense.matching.location_evidence import NAMES, location_evidence, probability_right
 from gpusense.matching.search import PoseGrid
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
@@ -24,11 +25,6 @@ from gpusense.world.scanner import Reading, classify
 _BLOCK, _MOST_LEVELS = 0.8, 5
 # Poses that score lower than the best one by this share of the largest score are searched for modes.
 _DEPTH = 0.0125
-# A mode with this share of the best score is as good as the best.
-_RIVAL = 0.99
-# A pose explains a scan whose ranges agree this much; with less agreement, down to min_agreement, the score must be
-# this large. Of 400 scans of other buildings, none passes both tests (bench/studies/global_matching.py).
-_CLEAR, _FIT = 0.85, 0.99
 # Poses nearer than this to a better one are part of its mode [m, rad].
 _MODE_RADIUS, _MODE_ANGLE = 0.5, math.radians(15)
 # A range agrees with the map within this many sigma_hit, or cells, of the expected range.
@@ -43,7 +39,7 @@ def locate_scan(
     angle: float = 0.0175,
     positions: Literal["free", "all"] = "free",
     modes: int = 10,
-    min_agreement: float = 0.7,
+    min_probability: float = 0.8,
     refine: bool = True,
 ) -> Location:
     """Find the likeliest pose of a scan on a grid of poses over the whole map, without a guess.
@@ -53,8 +49,9 @@ def locate_scan(
     ``model.log_likelihood``, ties by the lowest row, then column, then heading. Damped Gauss-Newton on the model's
     interpolated field then refines it.
 
-    A pose is only reported as ``"found"`` if no distinct pose is as good, and the expected ranges there agree with at
-    least 85 % of the hits, or with ``min_agreement`` of them where the score is at least 0.99.
+    ``p_right`` is the probability that the pose is right, from the readings that agree with the map there, those that
+    pass through its walls, those that end before them, and the same of other poses that score nearly as well. A pose is
+    ``"found"`` if it is at least ``min_probability``.
 
     Args:
         model: A likelihood field; its beams, parameters and device are used.
@@ -64,7 +61,7 @@ def locate_scan(
             a right angle.
         positions: ``"free"``: the robot's position must lie in a free cell; ``"all"``: anywhere on the map.
         modes: Largest number of modes.
-        min_agreement: Least share of hits that must agree with expected ranges, from 0 to 1.
+        min_probability: Least ``p_right`` of a pose that counts as found, from 0 to 1.
         refine: Whether ``pose`` may lie between the poses of the grid, up to two steps from the likeliest of them.
 
     Raises:
@@ -91,7 +88,7 @@ def locate_scan(
     turns = 4 * math.ceil(math.pi / 2 / checks.real("angle", angle, above=1e-4, high=math.pi / 2) - 1e-9)
     checks.choice("positions", positions, ("free", "all"))
     checks.integer("modes", modes, low=1)
-    checks.real("min_agreement", min_agreement, low=0, high=1)
+    checks.real("min_probability", min_probability, low=0, high=1)
     grid = model.grid
     headings = 2 * math.pi / turns * np.arange(turns)[None]
     allowed = _allowed(grid, stride) if positions == "free" else None
@@ -101,7 +98,8 @@ def locate_scan(
     options = dict(resolution=stride * cell, angle=2 * math.pi / turns, poses=searched.count)
     if not len(points):
         nothing = np.full(3, np.nan)
-        return Location(nothing, 0.0, 0.0, 0.0, (), "no match", evaluated=0, **options)  # type: ignore[arg-type]
+        said = 0.0, np.full(len(NAMES), np.nan), "no match"
+        return Location(nothing, 0.0, 0.0, 0.0, (), *said, evaluated=0, **options)  # type: ignore[arg-type]
     search = field_search(model, stride)
     with search.lock:
         found = search.find(np.asarray(ranges, np.float64), points, searched, allowed, _DEPTH)
@@ -112,7 +110,7 @@ def locate_scan(
         near = _refined(search.smooth, np.asarray(ranges, np.float64), pose, 2 * stride * cell, 4 * math.pi / turns)
         pose = near if positions == "all" or _is_free(grid, near) else pose
     return Location(
-        pose, top.score, top.log_likelihood, top.agreement, chosen, _status(chosen, min_agreement),
+        pose, top.score, top.log_likelihood, top.agreement, chosen, *_said(chosen, min_probability),
         evaluated=found.evaluated, **options,  # type: ignore[arg-type]
     )  # fmt: skip
 
@@ -154,9 +152,10 @@ def _modes(
         left &= (np.hypot(off[:, 0], off[:, 1]) > radius) | (turn > _MODE_ANGLE)
         following = int(np.argmax(left)) if left.any() else None
     log_p = model.log_likelihood(poses[chosen], ranges)
-    agreement = _agreement(model, np.asarray(ranges, np.float64), hits, search.caster, poses[chosen])
+    shares = _shares(model, np.asarray(ranges, np.float64), hits, search.caster, poses[chosen])
     return tuple(
-        PoseMode(poses[i], float(found.score[i]), float(log_p[n]), float(agreement[n])) for n, i in enumerate(chosen)
+        PoseMode(poses[i], float(found.score[i]), float(log_p[n]), *(float(share) for share in shares[n]))
+        for n, i in enumerate(chosen)
     )
 
 
@@ -177,23 +176,26 @@ def _is_free(grid: OccupancyGrid, pose: np.ndarray) -> bool:
     return inside and bool(grid.free[row, col])
 
 
-def _agreement(
+def _shares(
     model: LikelihoodFieldModel, ranges: np.ndarray, hits: np.ndarray, caster: RayCaster, poses: np.ndarray
 ) -> np.ndarray:
-    """Return the share of hits whose expected range at each pose is near the reading."""
+    """Return shares (M, 3) of the hits at poses: as long as expected ranges, longer, and shorter."""
     x, y, yaw = model.scanner.mount
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     sensors = poses + np.stack([cos * x - sin * y, sin * x + cos * y, np.full(len(poses), yaw)], axis=1)
     expected = caster.cast(sensors, model.scanner.bearings[hits])
     tolerance = max(_AGREE_SIGMAS * model.parameters.sigma_hit, _AGREE_CELLS * model.grid.resolution)
-    share: np.ndarray = (np.abs(expected - ranges[hits]) <= tolerance).mean(axis=1)
-    return share
+    off = ranges[hits] - expected
+    longer, shorter = (off > tolerance).mean(axis=1), (off < -tolerance).mean(axis=1)
+    return np.stack([1 - longer - shorter, longer, shorter], axis=1)
 
 
-def _status(modes: tuple[PoseMode, ...], min_agreement: float) -> Status:
-    """Return whether the first mode alone explains the scan."""
-    best = modes[0]
-    if any(mode.agreement >= min_agreement and mode.score >= _RIVAL * best.score for mode in modes[1:]):
-        return "ambiguous"
-    explained = best.agreement >= max(_CLEAR, min_agreement) or (best.agreement >= min_agreement and best.score >= _FIT)
-    return "found" if explained else "no match"
+def _said(modes: tuple[PoseMode, ...], least: float) -> tuple[float, np.ndarray, Status]:
+    """Return the probability that the first mode is right, the evidence, and the status."""
+    evidence = location_evidence(modes, _DEPTH)
+    p_right = probability_right(evidence)
+    if p_right >= least:
+        return p_right, evidence, "found"
+    # Would the pose be found if there were no other?
+    alone = probability_right(location_evidence(modes[:1], _DEPTH))
+    return p_right, evidence, "ambiguous" if alone >= least else "no match"

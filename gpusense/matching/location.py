@@ -21,6 +21,8 @@ class PoseMode:
         score: Mean score of the end points, from 0 (all far from obstacles) to 1 (all on obstacles).
         log_likelihood: log p(z | pose, m) by the model.
         agreement: Share of the hits that agree with the expected ranges at the pose.
+        through: Share of the hits that are longer than the expected ranges: beams that pass through walls of the map.
+        short: Share of the hits that are shorter, as before people.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -32,6 +34,8 @@ class PoseMode:
     score: float
     log_likelihood: float
     agreement: float
+    through: float = 0.0
+    short: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +50,9 @@ class Location:
         agreement: Share of the hits that agree with the expected ranges there.
         modes: The likeliest pose of the grid of poses and distinct other ones that score nearly as well, by falling
             score.
+        p_right: Probability that the pose is right: off by at most 0.5 m and 5 degrees. It holds where as many scans are
+            tried that were taken on the map as scans of other places.
+        evidence: (E,) what ``p_right`` is made of, see :data:`gpusense.matching.location_evidence.NAMES`.
         status: ``"found"``; ``"ambiguous"`` where other modes are as good; ``"no match"`` where no pose explains the
             scan.
         resolution: Distance between neighbouring positions of the grid of poses [m].
@@ -65,6 +72,8 @@ class Location:
     log_likelihood: float
     agreement: float
     modes: tuple[PoseMode, ...] = field(repr=False)
+    p_right: float
+    evidence: Floats = field(repr=False)
     status: Status
     resolution: float
     angle: float

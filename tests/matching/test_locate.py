@@ -60,6 +60,62 @@ def test_the_pose_is_that_of_brute_force(backend, positions, outside, beams):
     assert found.evaluated < 0.5 * found.poses
 
 
+def random_case(seed: int):
+    """Return a random map, scanner and parameters of a bilinear field, and random readings."""
+    rng = np.random.default_rng(seed)
+    rows, cols = rng.integers(10, 26, 2)
+    cells = np.where(rng.random((rows, cols)) < rng.choice([0.02, 0.08, 0.2]), 100, 0)
+    cells[rng.random((rows, cols)) < 0.1 * (seed % 3 == 0)] = -1
+    res = float(rng.choice([0.05, 0.1, 0.25]))
+    grid = gs.OccupancyGrid(cells, res, (1.0, -2.0, rng.uniform(-3, 3)))
+    scanner = gs.Scanner.uniform(
+        angle_min=-2.0, angle_increment=0.2, count=21, range_max=cols * res, mount=(0.1 * res, 0.2 * res, 0.3)
+    )
+    parameters = gs.LikelihoodFieldParameters(
+        sigma_hit=rng.uniform(0.5, 3) * res, max_distance=rng.uniform(2, 10) * res, interpolation="bilinear",
+        z_hit=0.9, z_rand=0.1 if seed % 2 else 0.05, z_max=0.0 if seed % 2 else 0.05,
+    )  # fmt: skip
+    options = dict(
+        outside="occupied" if seed % 5 == 0 else "free", temperature=0.5 if seed % 7 == 0 else 1.0, unknown="free",
+        precision="float64" if seed % 4 < 2 else "float32",
+    )  # fmt: skip
+    return grid, scanner, parameters, options, rng.uniform(0.5 * res, 1.1 * cols * res, 21), int(rng.integers(1, 3))
+
+
+@pytest.mark.parametrize("seeds", [range(20), range(20, 40), range(40, 60)], ids=["first", "second", "third"])
+def test_the_pose_of_a_bilinear_field_is_that_of_brute_force(seeds):
+    for seed in seeds:
+        grid, scanner, parameters, options, ranges, stride = random_case(seed)
+        model = gs.LikelihoodFieldModel(grid, scanner, parameters, backend="opencl", **options)
+        found = gs.locate_scan(
+            model, ranges, resolution=stride * grid.resolution, angle=0.2, positions="all", refine=False
+        )
+        rows, cols = np.mgrid[0 : grid.shape[0] : stride, 0 : grid.shape[1] : stride]
+        centers = grid.cell_centers(rows.ravel(), cols.ravel())
+        headings = 2 * math.pi / 32 * np.arange(32) + grid.origin[2]
+        poses = np.column_stack([np.repeat(centers, 32, axis=0), np.tile(headings, len(centers))])
+        log_p = model.log_likelihood(poses, ranges)
+        assert found.poses == len(poses)
+        assert found.log_likelihood == pytest.approx(float(log_p.max()), rel=1e-5, abs=1e-4), seed
+        (again,) = model.log_likelihood(found.pose[None], ranges)
+        assert again == pytest.approx(float(log_p.max()), rel=1e-5, abs=1e-4), seed
+
+
+def test_cluttered_scans_are_found_where_they_are_unique():
+    """People hide a quarter of the beams: fewer readings agree than any fixed share would ask for, none is too long."""
+    grid, pose = house(), np.array([4.0, 2.6, 1.3])
+    model = gs.LikelihoodFieldModel(grid, SCANNER, PARAMETERS, backend="opencl")
+    ranges = scan_at(grid, pose, 0.01)
+    ranges[10:22] = np.minimum(ranges[10:22], 0.9)
+    ranges[50:60] = np.minimum(ranges[50:60], 0.7)
+    found = gs.locate_scan(model, ranges, resolution=0.1, angle=0.05)
+    assert found.agreement < 0.85 and found.modes[0].through < 0.1 < found.modes[0].short
+    assert np.hypot(*(found.pose - pose)[:2]) < 0.2
+    assert found.p_right > 0.7
+    ragged = np.random.default_rng(1).uniform(0.5, 7.5, SCANNER.count)
+    assert gs.locate_scan(model, ragged, resolution=0.1, angle=0.05).p_right < 0.1
+
+
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (5e6, -4e5, -2.1)])
 def test_a_scan_is_found_wherever_the_map_lies(backend, origin):
     grid = house(origin)
@@ -146,7 +202,7 @@ def test_bad_arguments_are_named():
     model = gs.LikelihoodFieldModel(grid, SCANNER, backend="numpy")
     for options, name in [
         ({"resolution": 0}, "resolution"), ({"angle": 0}, "angle"), ({"positions": "known"}, "positions"),
-        ({"modes": 0}, "modes"), ({"min_agreement": 2}, "min_agreement"),
+        ({"modes": 0}, "modes"), ({"min_probability": 2}, "min_probability"),
     ]:  # fmt: skip
         with pytest.raises(ValueError, match=f"^{name}:"):
             gs.locate_scan(model, ranges, **options)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -110,3 +111,24 @@ def ending(job, store):
     started(job)
     end = job.option(f"end{job.seed}")
     return {"value": ENDS[end]() if end else job.seed / 3}
+
+
+def start_and_end(folder):
+    """Start a process that outlasts the worker, and end the worker."""
+    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+    (Path(folder) / "process").write_text(str(process.pid))
+    os._exit(3)
+
+
+def sent_text(name):
+    """Return the text of a file that was sent."""
+    from gpusense.sweeps.worker import _SENT
+
+    return Path(_SENT[name]).read_text()
+
+
+def await_file(path):
+    """Wait until a file is there."""
+    while not os.path.exists(path):
+        time.sleep(0.02)
+    return "there"

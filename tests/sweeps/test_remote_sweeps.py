@@ -15,7 +15,7 @@ from support.certificates import write_certificates
 from support.command_line import error_of
 from support.dask_cluster import Cluster
 from support.paths import ROOT
-from support.sweep_tasks import starts, written_down
+from support.sweep_tasks import await_file, sent_text, starts, written_down
 
 import gpusense as gs
 from gpusense.commands import cli
@@ -156,12 +156,6 @@ def test_a_job_of_a_client_that_has_gone_does_not_hold_its_worker(cluster, execu
     awaited(lambda: not alive(process))
     assert executor.submit(abs, -4).result(timeout=60) == 4
     other.terminate()
-
-
-def sent_text(name):
-    from gpusense.sweeps.worker import _SENT
-
-    return Path(_SENT[name]).read_text()
 
 
 def test_a_cluster_without_workers_ends_the_sweep(tmp_path, caplog):
@@ -308,9 +302,3 @@ def test_a_worker_that_pauses_ends_its_call_and_begins_none(tmp_path):
         assert not queued.running() and not queued.done()
         pause = False
         assert queued.result(timeout=60) == 1
-
-
-def await_file(path):
-    while not os.path.exists(path):
-        time.sleep(0.02)
-    return "there"

@@ -13,7 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from support.sweep_tasks import starts
+from support.sweep_tasks import start_and_end, starts
 
 import gpusense as gs
 from gpusense.sweep import Job, ProcessExecutor, SweepLost, WorkerDied
@@ -183,12 +183,6 @@ def test_what_a_job_has_started_ends_with_its_worker(tmp_path):
         with pytest.raises(WorkerDied, match="with exit code 3"):
             started.result(timeout=60)
     await_end([int((tmp_path / "process").read_text())])
-
-
-def start_and_end(folder):
-    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
-    (Path(folder) / "process").write_text(str(process.pid))
-    os._exit(3)
 
 
 def test_a_worker_that_ends_between_jobs_is_charged_to_none(tmp_path):

@@ -3,8 +3,8 @@
     GPUSENSE_DATA=DATA python bench/derive/location_evidence.py --backend opencl
 
 Scans of half A of the logs and of generated buildings, some with people, on their own map and on the others of their
-half. Right and wrong poses weigh the same. With ``--half B`` the table of what is said against what happens for the logs
-that took no part.
+half. Right and wrong poses weigh the same. With ``--half B`` the table of what is said against what happens for the
+logs that took no part.
 """
 
 from __future__ import annotations

@@ -50,8 +50,8 @@ class Location:
         agreement: Share of the hits that agree with the expected ranges there.
         modes: The likeliest pose of the grid of poses and distinct other ones that score nearly as well, by falling
             score.
-        p_right: Probability that the pose is right: off by at most 0.5 m and 5 degrees. It holds where as many scans are
-            tried that were taken on the map as scans of other places.
+        p_right: Probability that the pose is right: off by at most 0.5 m and 5 degrees. It holds where as many scans
+            are tried that were taken on the map as scans of other places.
         evidence: (E,) what ``p_right`` is made of, see :data:`gpusense.matching.location_evidence.NAMES`.
         status: ``"found"``; ``"ambiguous"`` where other modes are as good; ``"no match"`` where no pose explains the
             scan.

@@ -276,7 +276,9 @@ def make(name, flags):
                 skip = rules.skip
             both = agreement(point, line, first, count, second, others, stride, skip, forward, rules.near, rules.gap)
             if rules.one_way == 0:
-                both += agreement(point, line, second, others, first, count, stride, skip, inverse, rules.near, rules.gap)
+                both += agreement(
+                    point, line, second, others, first, count, stride, skip, inverse, rules.near, rules.gap
+                )
         everything = both.y + both.z + UNSEEN * both.w
         score = real(0.0)
         if everything > ZERO:

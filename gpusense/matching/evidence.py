@@ -22,7 +22,7 @@ window's half width.
 
 # A pose in which every direction is observed is doubtful below the first probability, another one below the second: it
 # is used along what it observes, with its p_right beside it.
-DOUBTED, DOUBTED_PARTLY = 0.7, 0.03
+DOUBTED, DOUBTED_PARTLY = 0.65, 0.03
 # Constant, and weights of the logarithms of disagreement, contradiction, overlap, pairs, roughness and misfit, of a
 # lost direction, of a second one, of a rival, and of the logarithm of the distance.
 _CONSTANT = -3.123

@@ -28,7 +28,7 @@ _CONSTANT = -6.73
 _WEIGHTS = (-0.04, -4.83, 0.34)
 # Weights of gap and ahead: whether it is the right one of two.
 _RIVAL_WEIGHTS = (1.87, 5.22)
-# What is added before logarithms.
+# Added before logarithms.
 _LEAST = (3e-3, 1e-2, 1e-2)
 
 

@@ -23,14 +23,14 @@ FALSE_ALARM, _QUANTILE = 1e-4, 3.72
 _LEAST_LINES, _LEAST_RATIO = 4.0, 2.0
 # An observed direction has this many pairs.
 LEAST_PAIRS = 1.5
-# What lines without errors make up [pairs].
+# Spurious information of lines without errors [pairs].
 _SPURIOUS = 1e-3
 # Share of the largest eigenvalue below which a direction of an information is lost.
 _NOTHING = 1e-9
 
 
 class Observed(NamedTuple):
-    """What pairs observe.
+    """Directions that pairs observe.
 
     Attributes:
         information: (S, 3, 3) sums of w J J' without what noise makes up, exactly 0 along lost directions.
@@ -74,7 +74,7 @@ def observed_information(
         result[some] = without(total[some], basis, made_up[some])
         values, vectors = np.array(values), np.array(vectors)
         values[some], vectors[some] = _generalised(result[some], made_up[some])
-    # What noise makes up is 1 of each eigenvalue.
+    # Noise makes up 1 of each eigenvalue.
     left = np.where(np.arange(3) < count[:, None], 0.0, np.maximum(values - 1, 1e-3 * values))
     sides = made_up @ vectors
     result = np.einsum("sik,sk,sjk->sij", sides, left, sides)
@@ -91,8 +91,8 @@ def balance_of(lever: np.ndarray) -> np.ndarray:
 def without(information: np.ndarray, lost: np.ndarray, made_up: np.ndarray) -> np.ndarray:
     """Return information (S, 3, 3) with the positions along lost directions (S, 3, L) unknown; columns may be 0.
 
-    The directions have no information at all in the result, up to rounding. What rounding and noise make up (S, 3, 3)
-    is not divided by.
+    The directions have no information at all in the result, up to rounding. ``made_up`` (S, 3, 3) is the information
+    that rounding and noise make up.
     """
     side = information @ lost
     inner = lost.transpose(0, 2, 1) @ (side + made_up @ lost)

@@ -237,7 +237,7 @@ class MapMatcher:
 def _joint(field: np.ndarray, own: np.ndarray, bias: float, lever: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the information (S, 3, 3) whose covariance is the sum of both and of a bias [m], and its lost directions.
 
-    What either of them does not observe is lost.
+    A direction that either of them does not observe is lost.
     """
     scale = balance_of(lever)
     both = scale[:, :, None] * scale[:, None, :]

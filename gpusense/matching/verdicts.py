@@ -1,4 +1,4 @@
-"""What matches say about themselves: information from their pairs, the directions they observe, and their status."""
+"""Verdicts of matches on themselves: information from their pairs, the directions they observe, and their status."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _TURNED_LINES = 0.05
 
 
 class PairSums(NamedTuple):
-    """What the pairs of matches observe in the sensors' frames, variances of points and factors of covariances (S,)."""
+    """Directions that the pairs of matches observe in the sensors' frames, variances of points and factors of covariances (S,)."""
 
     found: Observed
     variance: np.ndarray

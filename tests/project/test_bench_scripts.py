@@ -418,6 +418,14 @@ def test_matching_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     assert all(row["wrong_percent"] == 0 and row["median_mm"] < 20 for row in report["rows"])
 
 
+def test_match_verdicts_are_measured(needs: Callable[[str], str], tmp_path: Path) -> None:
+    """Corridors and scans of few beams, which need no data."""
+    arguments = ["--count", "6", "--backend", needs("opencl"), "--part", "corridors", "--part", "few"]
+    rows = run_script("accuracy/match_verdicts.py", *arguments, output=tmp_path / "verdicts")["rows"]
+    assert all(float(row["converged %"]) <= 10 for row in rows["corridors"])
+    assert len(rows["few"]) == 12
+
+
 def test_field_gradients_are_measured(needs: Callable[[str], str], tmp_path: Path) -> None:
     small = ["--particles", "60", "--beams", "11", "--repeats", "1", "--backend", needs("opencl")]
     report = run_script("speed/field_gradient.py", *small, output=tmp_path / "small")

@@ -1,17 +1,16 @@
 """Measure what scan matches say about themselves against what happens.
 
-    GPUSENSE_DATA=DATA python bench/accuracy/match_verdicts.py --backend opencl \\
-        --output bench/results/match_verdicts_cpu
+    python bench/accuracy/match_verdicts.py --backend opencl --output bench/results/match_verdicts_cpu
 
-``corridors``: endless corridors, noise of 1 to 5 cm, 360 and 1081 beams over 360 and 270 degrees, three headings,
-guesses 0.3 m off along the corridor: matches that say they converged, and the largest error over the deviation of a
-coordinate that is finite. ``pairs``: neighbouring and unrelated places of both halves of the recordings and of
-simulations (see ``bench/verdict_pairs.py``; half B took no part in any fit): probabilities that are said and shares
-that happen, with right and wrong ones weighing the same, the area under the ROC curve, unrelated pairs that
-converged, and right neighbours that are kept. ``nees``: squared errors over predicted ones (NEES / 3, whose median is
-0.79 and mean 1 for right covariances) of simulations, of loops of three scans, and against the reference poses. Each
-scan of a loop is used twice, with other beams each time, so that its three matches are independent: no reference is
-needed. ``few``: scans of 8 to 72 beams, to scans and to maps.
+``GPUSENSE_DATA`` names the folder of recorded data. ``corridors``: endless corridors, noise of 1 to 5 cm, 360 and 1081
+beams over 360 and 270 degrees, three headings, guesses 0.3 m off along the corridor: matches that say they converged,
+and the largest error over the deviation of a coordinate that is finite. ``pairs``: neighbouring and unrelated places of
+both halves of the recordings and of simulations (see ``bench/verdict_pairs.py``; half B took no part in any fit):
+probabilities that are said and shares that happen, with right and wrong ones weighing the same, the area under the ROC
+curve, unrelated pairs that converged, and right neighbours that are kept. ``nees``: squared errors over predicted ones
+(NEES / 3, whose median is 0.79 and mean 1 for right covariances) of simulations, of loops of three scans, and against
+the reference poses. Each scan of a loop is used twice, with other beams each time, so that its three matches are
+independent: no reference is needed. ``few``: scans of 8 to 72 beams, to scans and to maps.
 """
 
 from __future__ import annotations
@@ -128,10 +127,8 @@ def pairs(backend: str, count: int, seed: int) -> tuple[list[list[str]], list[li
         row = [half]
         for k in range(BINS):
             some = number == k
-            row.append(
-                ": ".join(f"{np.average(one[some], weights=weight[some]):.2f}" for one in (said, right)) +
-                f" ({some.sum()})" if some.any() else "-"
-            )  # fmt: skip
+            means = [np.average(part[some], weights=weight[some]) if some.any() else np.nan for part in (said, right)]
+            row.append(f"{means[0]:.2f}: {means[1]:.2f} ({some.sum()})")
         diagram.append(row)
     return verdicts, diagram
 
@@ -234,7 +231,7 @@ def nees_simulated(backend: str, count: int, seed: int) -> list[list[str]]:
 
 
 def few(backend: str, count: int, seed: int) -> list[list[str]]:
-    """Return the rows of scans of few beams over a full turn, 1 cm of noise, guesses off by 15 cm and 5 degrees."""
+    """Return the rows of scans of few beams over a full turn, with 1 cm of noise, guesses off by up to 15 cm."""
     rng, rows = np.random.default_rng(seed), []
     for beams in FEW:
         scanner = gs.Scanner.uniform(angle_min=-np.pi, angle_increment=2 * np.pi / beams, count=beams, range_max=20.0)
@@ -258,12 +255,14 @@ def few(backend: str, count: int, seed: int) -> list[list[str]]:
             squares = np.einsum("si,sij,sj->s", off, match.information, off) / observed
             distance = np.hypot(off[:, 0], off[:, 1])
             names, counts = np.unique(match.status, return_counts=True)
-            rows.append([
-                str(beams), to, ", ".join(f"{n} {name}" for name, n in zip(names, counts, strict=True)),
-                " / ".join(f"{1e3 * np.percentile(distance[seen], q):.0f}" for q in (50, 95)) if seen.any() else "-",
-                f"{np.median(squares[seen]):.2f}" if seen.any() else "-",
-                f"{match.p_right[seen].mean():.2f}" if seen.any() else "-",
-            ])  # fmt: skip
+            if seen.any():
+                middle, most = 1e3 * np.percentile(distance[seen], [50, 95])
+                figures = [f"{middle:.0f} / {most:.0f}", f"{np.median(squares[seen]):.2f}",
+                           f"{match.p_right[seen].mean():.2f}"]  # fmt: skip
+            else:
+                figures = ["-"] * 3
+            statuses = ", ".join(f"{n} {name}" for name, n in zip(names, counts, strict=True))
+            rows.append([str(beams), to, statuses, *figures])
     return rows
 
 
@@ -281,8 +280,8 @@ def main(argv: list[str] | None = None) -> None:
         texts.append(f"{title}\n\n{table(columns, lines)}")
 
     if "corridors" in parts:
-        add("corridors", "Corridors", ["beams", "noise cm", "matches", "converged %", "others", "99 % of error"],
-            corridors(backend, count, seed))  # fmt: skip
+        columns = ["beams", "noise cm", "matches", "converged %", "others", "99 % of error / deviation"]
+        add("corridors", "Corridors", columns, corridors(backend, count, seed))
     if "pairs" in parts:
         verdicts, diagram = pairs(backend, count, seed)
         add("pairs", "Verdicts", ["half", "pairs", "unrelated: converged %", "usable %", "neighbours: converged %",
@@ -291,10 +290,12 @@ def main(argv: list[str] | None = None) -> None:
     if "nees" in parts:
         add("nees", "NEES / 3, simulated", ["beams", "noise cm", "matches", "mean", "median"],
             nees_simulated(backend, count, seed))  # fmt: skip
-        add("loops", "NEES / 3, recorded",
-            ["half", "recording", "loops", "NEES / 3 of loops, median / mean", "loop mm", "NEES / 3, references",
-             "deviation mm", "off the references mm", "of these the references' mm"],
-            [loops(name, backend, count, seed) for name in (*HALF_A, *HALF_B)])  # fmt: skip
+        columns = [
+            "half", "recording", "loops", "NEES / 3 of loops, median / mean", "loop mm",
+            "NEES / 3 against references, median", "deviation mm", "off the references mm",
+            "of these the references' mm",
+        ]  # fmt: skip
+        add("loops", "NEES / 3, recorded", columns, [loops(name, backend, count, seed) for name in (*HALF_A, *HALF_B)])
     if "few" in parts:
         add("few", "Few beams", ["beams", "to", "statuses", "median / p95 mm", "NEES", "mean p_right"],
             few(backend, count // 2, seed))  # fmt: skip

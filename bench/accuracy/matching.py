@@ -61,7 +61,7 @@ def row(kind: str, name: str, guess: str, backend: str, truth: np.ndarray, call:
     squared = np.einsum("si,sij,sj->s", off[sure], np.linalg.inv(match.covariance[sure]), off[sure]) / 3
     # Wrong matches whose covariance denies it.
     deviation = np.sqrt(np.einsum("sii->si", match.covariance)[:, :2].max(axis=1))
-    lies = wrong & match.converged & (distance > 10 * deviation)
+    lies = wrong & match.usable & (distance > 10 * deviation)
     names, counts = np.unique(match.status, return_counts=True)
     thirds = [squared[some] for some in np.array_split(np.argsort(np.abs(truth[sure, 2])), 3)]
     return {
@@ -127,14 +127,9 @@ def simulated(data: Path | None, backend: str, count: int, seed: int) -> list[di
             a, b = (scan + rng.normal(0, noise, scan.shape) * (scan < SCANNER.range_max) for scan in (one, two))
             rows.append(
                 row("simulated", f"{name}, {noise:g} m noise", "perturbed", backend, truth,
-                    lambda a=a, b=b, g=guess, n=noise: match_noisy(a, b, g, n, backend))
+                    lambda a=a, b=b, g=guess: gs.match_scan(a, b, SCANNER, g, backend=backend))
             )  # fmt: skip
     return rows
-
-
-def match_noisy(first: np.ndarray, second: np.ndarray, guess: np.ndarray, noise: float, backend: str) -> ScanMatch:
-    """Match scans whose noise is known; that of exact ones is the default."""
-    return gs.match_scan(first, second, SCANNER, guess, backend=backend, noise=max(noise, 0.01))
 
 
 def in_maps(data: Path, backend: str, limit: int, seed: int) -> list[dict[str, Any]]:

@@ -63,7 +63,7 @@ def confident(match: gs.ScanMatch, truth: np.ndarray) -> int:
     variances = np.einsum("sii->si", match.covariance)
     denied = distance > 10 * np.sqrt(variances[:, :2].max(axis=1))
     denied |= turn > 10 * np.sqrt(variances[:, 2])
-    return int((match.converged & wrong(match.pose, truth) & denied).sum())
+    return int((match.usable & wrong(match.pose, truth) & denied).sum())
 
 
 def recorded(data: Path, log: str) -> tuple[list[gs.Scan], np.ndarray]:
@@ -97,9 +97,9 @@ def scan_to_scan(data: Path, log: str, backend: str, limit: int) -> dict[str, An
     begun = time.perf_counter()
     match = gs.match_scan(ranges[:-1], ranges[1:], scans[0].scanner, guess, backend=backend)
     seconds = time.perf_counter() - begun
-    found = np.where(match.converged[:, None], match.pose, guess)
+    found = np.where(match.usable[:, None], match.pose, guess)
     truth = relative_poses(poses[:-1], poses[1:])
-    result = row("scan to scan", log, found, truth, guess, int((~match.converged).sum()), seconds)
+    result = row("scan to scan", log, found, truth, guess, int((~match.usable).sum()), seconds)
     past = gs.match_scan(
         ranges[:-2], ranges[2:], scans[0].scanner,
         np.array([gs.compose_poses(*guess[k : k + 2]) for k in range(len(guess) - 1)]), backend=backend,
@@ -123,11 +123,11 @@ def scan_to_map(data: Path, log: str, backend: str, limit: int) -> dict[str, Any
         guess = gs.compose_poses(found[-1], step)
         match = gs.match_scan(grid, scan.ranges, scan.scanner, guess, backend=backend)
         matches.append(match)
-        found.append(match.pose if match.converged else guess)
+        found.append(match.pose if match.usable else guess)
     seconds = time.perf_counter() - begun
     poses = np.array(found)
     result = row("scan to map", log, relative_poses(poses[:-1], poses[1:]), relative_poses(truth[:-1], truth[1:]),
-                 steps, sum(not match.converged for match in matches), seconds)  # fmt: skip
+                 steps, sum(not match.usable for match in matches), seconds)  # fmt: skip
     off = differences(poses, truth)[0]
     several = gs.ScanMatch(**{f.name: np.stack([getattr(m, f.name) for m in matches]) for f in fields(gs.ScanMatch)})
     return result | {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ DEEPEST = 100
 """Levels of lists and mappings in each other."""
 MOST_REPEATED = 100_000
 """Values that the aliases of a document may repeat, counted as if each were written out."""
+_TOO_DEEP = f"its parts must be nested at most {DEEPEST} deep, got more"
 
 
 @functools.cache
@@ -64,7 +66,7 @@ def check_yaml(text: str | bytes) -> None:
     nested: list[tuple[str | None, int]] = []
     known: dict[str, int] = {}
     size = repeated = 0
-    for event in yaml.parse(text, _base()):
+    for event in _events(text):
         if isinstance(event, yaml.CollectionEndEvent):
             anchor, before = nested.pop()
             if anchor is not None:
@@ -81,11 +83,23 @@ def check_yaml(text: str | bytes) -> None:
                 raise ValueError(f"its aliases must repeat at most {MOST_REPEATED} values, got more")
         elif isinstance(event, yaml.CollectionStartEvent):
             if len(nested) == DEEPEST:
-                raise ValueError(f"its parts must be nested at most {DEEPEST} deep, got more")
+                raise ValueError(_TOO_DEEP)
             nested.append((event.anchor, size))
             size = 0
         elif isinstance(event, yaml.ScalarEvent) and event.anchor is not None:
             known[event.anchor] = 1
+
+
+def _events(text: str | bytes) -> Iterator[Any]:
+    """Return the events of a document; some versions of the parser have a bound of nesting of their own."""
+    import yaml
+
+    try:
+        yield from yaml.parse(text, _base())
+    except yaml.YAMLError as error:
+        if "nesting depth" in str(getattr(error, "problem", "")):
+            raise ValueError(_TOO_DEEP) from error
+        raise
 
 
 def read_mapping(file: Path) -> dict[Any, Any]:

@@ -29,7 +29,7 @@ _FARTHER, _UNSETTLED = 0.03, 0.05
 # Starts whose score is this far below the best one are not refined.
 _PROMISING = 0.15
 # Lines turn with noise by this in the mean square [rad^2] where longer ones give the pose.
-_TURNED = 0.13
+_TURNED = 0.11
 # Poses farther apart than this whose scores are this close make a match ambiguous.
 _OTHER, _OTHER_TURN, _CLOSE = 0.25, 0.1, 0.012
 
@@ -76,16 +76,13 @@ def match_pairs(
             poor = enough & (result[:, 3] < DOUBTFUL)
             moved = np.abs(result[:, :3] - sensor)
             far = (moved[:, :2].max(axis=1) > _FAR * options.capture) | (moved[:, 2] > _FAR_TURN)
-            for some, reach in (
-                (poor, options.starts()),
-                (enough & far & ~poor & (result[:, 3] < _SURE), nearby(options)),
-            ):
+            for some, window in ((poor, options), (enough & far & ~poor & (result[:, 3] < _SURE), nearby(options))):
                 if some.any():
                     which = np.flatnonzero(some)
-                    _search(device, which, sensor[which], reach, best, options, (before, most), points.gap)
+                    _search(device, which, sensor[which], window.starts(), best, options, (before, most), points.gap)
             _repeat(device, sensor, best, options, most, points.gap)
-        _straighten(device, best.result, points, pairs, options)
-        sums = tested(device, best.result, points, pairs, options)
+        noisy = _straighten(device, best.result, points, pairs, options)
+        sums = tested(device, best.result, points, pairs, options, noisy)
         space.wait()
     return _finished(best, sums, pairs, points, options, mount)
 
@@ -154,22 +151,22 @@ def _repeat(device: IcpPairs, guess: np.ndarray, best: Best, options: MatchOptio
 
 def _straighten(
     device: IcpPairs, result: np.ndarray, points: ScanPoints, pairs: np.ndarray, options: MatchOptions
-) -> None:
-    """Match pairs again by longer lines where noise turns the usual ones, and put the results in place."""
+) -> np.ndarray:
+    """Match pairs again by longer lines where noise turns the usual ones; return the numbers of these pairs."""
     turn = (result[:, 12] + result[:, 15]) * options.noise**2 / np.maximum(result[:, 19], 1e-30)
     rows = np.flatnonzero(turn > _TURNED)
     if len(rows) and STRAIGHT_WIDTH * options.noise > WIDTH:
-        device.fit_lines(STRAIGHT_WIDTH * options.noise)
+        device.fit_lines(STRAIGHT_WIDTH * options.noise, rows)
         most = int(points.counts[pairs[:, 1]].max(initial=0))
         rules = options.final_rules(most, points.gap)
         rules = rules._replace(capture=rules.least_capture, scale=rules.least_scale)
         result[rows] = device.run(rows, result[rows, None, :3], rules)[:, 0]
-        device.fit_lines(WIDTH)
+    return rows
 
 
-def nearby(options: MatchOptions) -> np.ndarray:
-    """Return the offsets of the starts of a search near a guess."""
-    return replace(options, window=(0.6 * options.capture, math.radians(15.0))).starts()
+def nearby(options: MatchOptions) -> MatchOptions:
+    """Return options of a search near a guess."""
+    return replace(options, window=(0.6 * options.capture, math.radians(15.0)))
 
 
 def distinct(poses: np.ndarray, score: np.ndarray, known: np.ndarray, capture: float) -> tuple[np.ndarray, np.ndarray]:

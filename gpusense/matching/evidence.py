@@ -22,11 +22,11 @@ window's half width.
 
 # A pose in which every direction is observed is doubtful below the first probability, another one below the second: it
 # is used along what it observes, with its p_right beside it.
-DOUBTED, DOUBTED_PARTLY = 0.6, 0.03
+DOUBTED, DOUBTED_PARTLY = 0.65, 0.03
 # Constant, and weights of the logarithms of disagreement, contradiction, overlap, pairs, roughness and misfit, of a
 # lost direction, of a second one, of a rival, and of the logarithm of the distance.
-_CONSTANT = -2.698
-_WEIGHTS = np.array([-1.959, -0.047, 0.510, -0.279, -0.040, -0.386, -1.261, 0.321, -2.035, -1.862])
+_CONSTANT = -3.123
+_WEIGHTS = np.array([-1.350, -0.164, 1.574, -0.067, -0.202, -0.692, -1.395, 0.622, -2.158, -1.788])
 # Least values of which logarithms are taken, and what is added to distances.
 _LEAST = np.array([1e-3, 3e-3, 1e-3, 1.0, 0.1, 1e-2])
 _NEAR = 0.04

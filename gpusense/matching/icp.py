@@ -73,13 +73,20 @@ class IcpPairs:
         self._most, self._gap, self._noise = int(points.counts.max(initial=0)), points.gap, noise
         self.fit_lines(WIDTH)
 
-    def fit_lines(self, width: float) -> None:
-        """Fit lines to all points, over at least ``width`` [m] on either side, as far as there are points."""
+    def fit_lines(self, width: float, pairs: np.ndarray | None = None) -> None:
+        """Fit lines to the points of all scans, or of those of some pairs.
+
+        Args:
+            width: Half of their length [m], as far as there are points.
+            pairs: (P,) numbers of pairs; lines of other ones stay.
+        """
         if not self._most:
             return
+        scans = np.arange(self._counts[0], dtype=np.int32) if pairs is None else np.unique(self._pairs[pairs])
         flags = widened(self._backend.info.lanes, "fit_lines", self._flags)
         lines = launch(
-            "fit_lines", flags, (self._most, self._counts[0]), point=self._point, start=self._start, line=self._line,
+            "fit_lines", flags, (self._most, len(scans)), point=self._point, start=self._start,
+            which=self._space.upload("match which", scans), line=self._line, chosen=len(scans),
             scans=self._counts[0], points=self._counts[1], reach=1 if self._gap > GAP * _SPARSE else REACH,
             most=_MOST if width > WIDTH else _FEWER,
             ratio=max(_RATIO, _STEPS * self._gap / GAP), slack=max(_SLACK, _SLACK_DEVIATIONS * self._noise),

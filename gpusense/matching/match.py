@@ -69,7 +69,7 @@ def match_scan(
         precision: ``"float32"`` or ``"float64"``.
         noise: Standard deviation of ranges [m]; errors beyond some three of them lose their weight. ``"auto"``: that of
             each match, from the scans' own deviations from straight walls, at least that of the steps in which ranges
-            come, and 4 mm; see the field ``noise`` of the result.
+            come, and 1 cm; see the field ``noise`` of the result.
         capture: Farthest distance between paired points at the start [m]: the error of a good guess.
         window: Half widths of the search: distance from the guess [m], and turn [rad].
         temperature: In (0, 1]: multiplies the information, for errors that the scans do not show, such as motion during
@@ -156,7 +156,8 @@ def _matches(
 
     noise = np.full(len(second), options.noise)
     if not given:
-        noise = match_noise(np.broadcast_to(scan_noise(first, scanner), len(second)), scan_noise(second, scanner))
+        own = scan_noise(np.concatenate([first, second]), scanner)
+        noise = match_noise(np.broadcast_to(own[: len(first)], len(second)), own[len(first) :])
     return _by_noise(noise, options, to_scan), single
 
 

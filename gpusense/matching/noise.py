@@ -13,13 +13,13 @@ from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Reading, Scanner, classes
 
 # Most places of a scan that are looked at, and least places for an estimate.
-_PLACES, _LEAST = 160, 12
+_PLACES, _LEAST = 120, 12
 # A normal error's median of absolute values, in deviations.
 _MEDIAN = 0.6745
 # Neighbours whose ranges differ by more than this share do not belong to one surface.
 _STEP = 0.35
-# Noise is at least this [m], and rounded up to the next power of this root, so that scans of a call form groups.
-LEAST_NOISE, LARGEST_NOISE, ROOT = 0.004, 0.08, 2**0.5
+# Noise is at least this [m], and rounded up to the next power of this root, so that scans of a call form few groups.
+LEAST_NOISE, LARGEST_NOISE, ROOT = 0.01, 0.08, 2**0.5
 # Noise that is assumed where a scan has too few places [m].
 ASSUMED_NOISE = 0.02
 # Ranges come in steps if all differences are multiples of one of this size [m], up to this share of it.
@@ -70,7 +70,7 @@ def match_noise(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the noise of matches (S,) from that of both scans: the larger one, on a scale of steps; NaN is unknown."""
     both = np.fmax(first, second)
     both = np.clip(np.where(np.isnan(both), ASSUMED_NOISE, both), LEAST_NOISE, LARGEST_NOISE)
-    noise: np.ndarray = LEAST_NOISE * ROOT ** np.ceil(np.log(both / LEAST_NOISE) / np.log(ROOT) - 1e-6)
+    noise: np.ndarray = LEAST_NOISE * ROOT ** np.ceil(np.log(both / LEAST_NOISE) / np.log(ROOT) - 0.1)
     return noise
 
 

@@ -91,8 +91,8 @@ def balance_of(lever: np.ndarray) -> np.ndarray:
 def without(information: np.ndarray, lost: np.ndarray, made_up: np.ndarray) -> np.ndarray:
     """Return information (S, 3, 3) with the positions along lost directions (S, 3, L) unknown; columns may be 0.
 
-    The directions have no information at all in the result, up to rounding. Information (S, 3, 3) that rounding and
-    noise make up is not divided by.
+    The directions have no information at all in the result, up to rounding. ``made_up`` (S, 3, 3) is the information
+    that rounding and noise make up.
     """
     side = information @ lost
     inner = lost.transpose(0, 2, 1) @ (side + made_up @ lost)

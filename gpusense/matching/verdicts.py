@@ -23,7 +23,7 @@ _TURNED_LINES = 0.02
 
 
 class PairSums(NamedTuple):
-    """Information of the pairs of matches in the sensors' frames, variances of points, factors of covariance (S,)."""
+    """Information of the pairs of matches in the sensors' frames, variances of points, factors of covariances (S,)."""
 
     found: Observed
     variance: np.ndarray

@@ -11,9 +11,11 @@ def fit_lines(
     flags: frozenset[str],
     point: np.ndarray,
     start: np.ndarray,
+    which: np.ndarray,
     line: np.ndarray,
     scans: int,
     points: int,
+    chosen: int,
     reach: int,
     most: int,
     ratio: float,
@@ -21,13 +23,14 @@ def fit_lines(
     width: float,
     gap: float,
 ) -> None:
-    """Fit a line to each point and ``reach`` neighbours on either side, up to ``most`` within a distance of ``width``.
+    """Fit a line to each point of the chosen scans and ``reach`` neighbours on either side.
 
-    None of them is farther from the last one than ``slack`` plus ``ratio`` times its range, nor than ``gap`` in
-    bearing. A line is a unit normal, an offset, and 1 / (sum of squared distances along the line). A point without
-    neighbours has the line across its beam, -1 in place of that sum, and no pairs.
+    Up to ``most`` neighbours within a distance of ``width`` take part. None of them is farther from the last one than
+    ``slack`` plus ``ratio`` times its range, nor than ``gap`` in bearing. A line is a unit normal, an offset, and 1 /
+    (sum of squared distances along the line). A point without neighbours has the line across its beam, -1 in place of
+    that sum, and no pairs.
     """
-    for scan in range(scans):
+    for scan in which[:chosen]:
         mine = point[start[scan] : start[scan + 1]]
         count = len(mine)
         sums, size = np.zeros((5, count), point.dtype), np.ones(count, point.dtype)

@@ -18,14 +18,16 @@ def make(name, flags):
     # Fit a line to each point and reach neighbours on either side, up to most within a distance of width, none of them
     # farther from the last one than slack plus ratio times its range, nor than gap in bearing: unit normal, offset, and
     # 1 / (sum of squared distances along the line). A point without neighbours has the line across its beam, -1 in
-    # place of that sum, and no pairs. One work-item takes a point of a scan.
+    # place of that sum, and no pairs. One work-item takes a point of one of the chosen scans.
     @kernel
     def fit_lines(
         point: wp.array(dtype=vec4),
         start: wp.array(dtype=wp.int32),
+        which: wp.array(dtype=wp.int32),
         line: wp.array(dtype=vec4),
         scans: wp.int32,
         points: wp.int32,
+        chosen: wp.int32,
         reach: wp.int32,
         most: wp.int32,
         ratio: real,
@@ -33,9 +35,10 @@ def make(name, flags):
         width: real,
         gap: real,
     ):
-        scan, k = wp.tid()
-        if scan >= scans:
+        row, k = wp.tid()
+        if row >= chosen:
             return
+        scan = which[row]
         first = start[scan]
         count = start[scan + 1] - first
         if k >= count:

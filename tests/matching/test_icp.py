@@ -65,7 +65,8 @@ def test_lines_are_total_least_squares():
     z = 2 + 0.02 * rng.normal(size=(1, 360))
     points = scan_points(z, RING, np.dtype(np.float64))
     line = np.empty((360, 4))
-    fit_lines(frozenset(), points.point, points.start, line, 1, 360, 2, 16, 0.1, 0.05, 0.0, 0.06)
+    which = np.zeros(1, np.int32)
+    fit_lines(frozenset(), points.point, points.start, which, line, 1, 360, 1, 2, 16, 0.1, 0.05, 0.0, 0.06)
     for k in (0, 1, 100, 359):
         near = points.point[(k + np.arange(-2, 3)) % 360, :2]
         centre = near.mean(axis=0)

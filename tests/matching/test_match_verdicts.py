@@ -1,4 +1,4 @@
-"""What matches say about themselves: lost directions, windows, noise, and probabilities."""
+"""Verdicts of matches on themselves: lost directions, windows, noise, and probabilities."""
 
 from __future__ import annotations
 

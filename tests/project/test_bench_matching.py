@@ -33,3 +33,11 @@ def test_matching_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     report = run_script("accuracy/matching.py", *arguments, output=tmp_path / "matching")
     assert len(report["rows"]) == 6
     assert all(row["wrong_percent"] == 0 and row["median_mm"] < 20 for row in report["rows"])
+
+
+def test_match_verdicts_are_measured(needs: Callable[[str], str], tmp_path: Path) -> None:
+    """Corridors and scans of few beams, which need no data."""
+    arguments = ["--count", "6", "--backend", needs("opencl"), "--part", "corridors", "--part", "few"]
+    rows = run_script("accuracy/match_verdicts.py", *arguments, output=tmp_path / "verdicts")["rows"]
+    assert all(float(row["converged %"]) <= 10 for row in rows["corridors"])
+    assert len(rows["few"]) == 12

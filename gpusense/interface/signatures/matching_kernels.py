@@ -17,8 +17,9 @@ KERNELS: dict[str, Kernel] = {
         "Score score", "ScanBatch batch", wide=True,
     ),
     "fit_lines": kernel(
-        "lines", "beam scan", *_POINTS, "out real4 line [points]", "int scans", "int points", "int reach", "int most",
-        "real ratio", "real slack", "real width", "real gap", wide=True, wide_group=8,
+        "lines", "beam scan", *_POINTS, "int which [chosen]", "out real4 line [points]", "int scans", "int points",
+        "int chosen", "int reach", "int most", "real ratio", "real slack", "real width", "real gap", wide=True,
+        wide_group=8,
     ),
     "match_scans": kernel(
         "icp", "item", *_POINTS, "real4 line [points]", "int2 pair [pairs]", "real4 guess [pairs * starts]",

@@ -19,7 +19,7 @@ from gpusense.matching.uncertainty import inflation_of, observed_pairs, symmetri
 # Distances from guesses are relative to windows of at least this [m].
 _LEAST_WINDOW = 0.1
 # Lines turn with noise by this much in the mean square [rad^2] where longer ones tell what is observed.
-_TURNED_LINES = 0.02
+_TURNED_LINES = 0.05
 
 
 class PairSums(NamedTuple):
@@ -31,9 +31,13 @@ class PairSums(NamedTuple):
 
 
 def tested(
-    device: IcpPairs, result: np.ndarray, points: ScanPoints, pairs: np.ndarray, options: MatchOptions
-) -> PairSums:
-    """Return what pairs observe: by the lines of the matches, and where noise may turn these, by longer ones."""
+    device: IcpPairs, result: np.ndarray, points: ScanPoints, pairs: np.ndarray, options: MatchOptions,
+    noisy: np.ndarray,
+) -> PairSums:  # fmt: skip
+    """Return what pairs observe: by the lines of the matches, and where noise may turn these, by longer ones.
+
+    ``noisy`` are numbers of pairs whose lines noise turns.
+    """
     lever = points.rms_range(pairs[:, 1])
     squared = result[:, 20] / np.maximum(result[:, 19], 1e-30)
     variance, factor = variance_of(
@@ -42,17 +46,23 @@ def tested(
     noise = np.maximum(variance, options.noise**2)
     lines = result[:, 19] / points_of_line(points.gap, options.noise, lever)
 
-    def observed(sums: np.ndarray, rows: np.ndarray) -> Observed:
+    def observed(sums: np.ndarray, rows: np.ndarray, independent: np.ndarray) -> Observed:
         information, doubt = symmetric(sums[:, 6:12]), symmetric(sums[:, 12:18])
-        return observed_pairs(information, doubt, noise[rows], lever[rows], lines[rows])
+        return observed_pairs(information, doubt, noise[rows], lever[rows], independent)
 
-    found = observed(result, np.arange(len(result)))
+    # Short lines decide only what is beyond doubt.
+    found = observed(result, np.arange(len(result)), np.zeros(len(result)))
     turned = (result[:, 12] + result[:, 15]) * noise > _TURNED_LINES * np.maximum(result[:, 19], 1e-30)
+    turned[noisy] = True
     rows = np.flatnonzero((found.lost > 0) | turned)
     if len(rows) and LONG_WIDTH * options.noise > WIDTH:
-        device.fit_lines(LONG_WIDTH * options.noise)
-        longer = device.run(rows, result[rows, None, :3], options.last_rules(points.gap))[:, 0]
-        for values, others in zip(found, observed(longer, rows), strict=True):
+        device.fit_lines(LONG_WIDTH * options.noise, rows)
+        rules = options.last_rules(points.gap)
+        stride = options.rules(int(points.counts[pairs[rows, 1]].max(initial=0)), points.gap).stride
+        longer = device.run(rows, result[rows, None, :3], rules._replace(stride=stride, thin=1))[:, 0]
+        # Some of the points stand for all of them.
+        longer[:, 6:18] *= stride
+        for values, others in zip(found, observed(longer, rows, lines[rows]), strict=True):
             values[rows] = others
     return PairSums(found, variance, factor)
 

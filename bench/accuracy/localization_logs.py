@@ -11,6 +11,8 @@ there, starts anywhere on the map are compared with one another and with the ver
 from __future__ import annotations
 
 import argparse
+import functools
+import itertools
 import json
 import sys
 from pathlib import Path
@@ -19,6 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 import recordings
+from parallel import results
 
 import gpusense as gs
 from gpusense.evaluation.machine import machine, machine_line
@@ -53,6 +56,33 @@ def wean(backend, seeds):
     return rows
 
 
+@functools.cache
+def _recording(name):
+    return recordings.load(name)
+
+
+@functools.cache
+def _motion(name):
+    """Return the motion model that is learned from the odometry of a log."""
+    events = _recording(name).events
+    odometry, truth = (np.array([getattr(e, which) for e in events]) for which in ("odometry", "truth"))
+    return gs.fit_odometry_motion(odometry, truth).motion
+
+
+@functools.cache
+def _models(name, kind, backend, beams):
+    return _recording(name).models(recordings.makers(kind, backend, beams))
+
+
+def track(name, kind, particles, seed, backend, beams, limit, fit_motion, recovery):
+    """Return the track of a run."""
+    motion = _motion(name) if fit_motion else None
+    models = _models(name, kind, backend, beams)
+    return recordings.follow(
+        _recording(name), models, limit=limit, particles=particles, seed=seed, motion=motion, **recovery
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--backend", default="opencl")
@@ -63,35 +93,29 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--limit", type=int, help="scans of each log")
     parser.add_argument("--fit-motion", action="store_true", help="learn the noise of the odometry from the log first")
+    parser.add_argument("--recovery", default="default", choices=("default", "none", "augmented", "sensor"))
+    parser.add_argument("--processes", type=int, default=1, help="runs at once, each with one thread")
     parser.add_argument("--out", type=Path, help="a .json file; the table goes to the .md file beside it")
     args = parser.parse_args()
-    results = []
-    for name in args.logs:
-        if name == "wean":
-            results += wean(args.backend, args.seeds)
-            continue
-        recording, motion = recordings.load(name), None
-        if args.fit_motion:
-            odometry, truth = (
-                np.array([getattr(e, which) for e in recording.events]) for which in ("odometry", "truth")
-            )
-            motion = gs.fit_odometry_motion(odometry, truth).motion
-        for kind in args.models:
-            models = recording.models(recordings.makers(kind, args.backend, args.beams))
-            for count in args.particles:
-                runs = [
-                    recordings.follow(recording, models, limit=args.limit, particles=count, seed=seed, motion=motion)
-                    for seed in range(args.seeds)
-                ]
-                noise = "fitted" if args.fit_motion else "default"
-                row = dict(log=name, model=kind, particles=count, beams=args.beams, noise=noise)
-                row |= recordings.figures(runs)
-                print(_line(row), flush=True)
-                results.append(row)
+    rows = wean(args.backend, args.seeds) if "wean" in args.logs else []
+    recovery = {} if args.recovery == "default" else dict(recovery=None if args.recovery == "none" else args.recovery)
+    settings = list(itertools.product([name for name in args.logs if name != "wean"], args.models, args.particles))
+    jobs = [
+        (*setting, seed, args.backend, args.beams, args.limit, args.fit_motion, recovery)
+        for setting in settings
+        for seed in range(args.seeds)
+    ]
+    tracks = results(track, jobs, args.processes)
+    for name, kind, count in settings:
+        noise = "fitted" if args.fit_motion else "default"
+        row = dict(log=name, model=kind, particles=count, beams=args.beams, noise=noise, recovery=args.recovery)
+        row |= recordings.figures(list(itertools.islice(tracks, args.seeds)))
+        print(_line(row), flush=True)
+        rows.append(row)
     if args.out is not None:
         command = " ".join(["bench/accuracy/localization_logs.py", *sys.argv[1:]])
-        args.out.write_text(json.dumps(dict(machine=machine(), command=command, results=results), indent=1))
-        lines = [_line(row) for row in results if "model" in row]
+        args.out.write_text(json.dumps(dict(machine=machine(), command=command, results=rows), indent=1))
+        lines = [_line(row) for row in rows if "model" in row]
         if lines:
             table = "\n".join([*_HEAD, *lines])
             args.out.with_suffix(".md").write_text(f"{machine_line()}\n\n`python {command}`\n\n{table}\n")

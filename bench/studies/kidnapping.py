@@ -9,6 +9,8 @@ stood still. It is found where five scans in a row are within 1 m and 20 degrees
 from __future__ import annotations
 
 import argparse
+import functools
+import itertools
 import json
 import math
 import sys
@@ -18,6 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 import recordings
+from parallel import results
 
 import gpusense as gs
 from gpusense.evaluation.machine import machine, machine_line
@@ -27,8 +30,16 @@ from gpusense.evaluation.tracking import CONVERGED, CONVERGED_SCANS, CONVERGED_T
 BEFORE, AFTER = 20, 80
 
 
-def run(recording, model, seed, recovery, particles):
+@functools.cache
+def _model(backend, beams):
+    """Return the recording and its model."""
+    recording = recordings.load("intel")
+    return recording, *recording.models(recordings.field(backend, beams=beams))
+
+
+def run(seed, recovery, particles, backend, beams):
     """Return the number of scans after the jump until the robot is found, None if never, and those said lost before."""
+    recording, model = _model(backend, beams)
     rng = np.random.default_rng(seed)
     count = len(recording.events)
     first, second = int(rng.integers(count - BEFORE)), int(rng.integers(count - AFTER))
@@ -59,32 +70,37 @@ def main() -> None:
     parser.add_argument("--particles", nargs="+", type=int, default=[2000])
     parser.add_argument("--runs", type=int, default=10)
     parser.add_argument("--beams", type=int, default=60)
+    parser.add_argument("--processes", type=int, default=1, help="runs at once, each with one thread")
     parser.add_argument("--out", type=Path, help="a .json file; the table goes to the .md file beside it")
     args = parser.parse_args()
-    recording = recordings.load("intel")
-    (model,) = recording.models(recordings.field(args.backend, beams=args.beams))
     head = (
         "| recovery | particles | found again | median scans | scans off that say lost [%] |",
         "| --- | --- | --- | --- | --- |",
     )
-    lines, results = list(head), []
-    for particles in args.particles:
-        for recovery in (None, "augmented", "sensor"):
-            runs = [run(recording, model, seed, recovery, particles) for seed in range(args.runs)]
-            scans = [one for one, _ in runs if one is not None]
-            off = sum(AFTER if one is None else one for one, _ in runs)
-            row = dict(recovery=recovery, particles=particles, runs=len(runs), found=len(scans),
-                       median_scans=float(np.median(scans)) if scans else None, scans=[one for one, _ in runs],
-                       said_lost=sum(said for _, said in runs) / max(off, 1))  # fmt: skip
-            results.append(row)
-            median = "-" if not scans else f"{row['median_scans']:.0f}"
-            lines.append(
-                f"| {recovery} | {particles} | {len(scans)} of {len(runs)} | {median} | {100 * row['said_lost']:.0f} |"
-            )
-            print(lines[-1], flush=True)
+    lines, rows = list(head), []
+    settings = list(itertools.product(args.particles, (None, "augmented", "sensor")))
+    jobs = [
+        (seed, recovery, particles, args.backend, args.beams)
+        for particles, recovery in settings
+        for seed in range(args.runs)
+    ]
+    done = results(run, jobs, args.processes)
+    for particles, recovery in settings:
+        runs = list(itertools.islice(done, args.runs))
+        scans = [one for one, _ in runs if one is not None]
+        off = sum(AFTER if one is None else one for one, _ in runs)
+        row = dict(recovery=recovery, particles=particles, runs=len(runs), found=len(scans),
+                   median_scans=float(np.median(scans)) if scans else None, scans=[one for one, _ in runs],
+                   said_lost=sum(said for _, said in runs) / max(off, 1))  # fmt: skip
+        rows.append(row)
+        median = "-" if not scans else f"{row['median_scans']:.0f}"
+        lines.append(
+            f"| {recovery} | {particles} | {len(scans)} of {len(runs)} | {median} | {100 * row['said_lost']:.0f} |"
+        )
+        print(lines[-1], flush=True)
     if args.out is not None:
         command = " ".join(["bench/studies/kidnapping.py", *sys.argv[1:]])
-        args.out.write_text(json.dumps(dict(machine=machine(), command=command, results=results), indent=1))
+        args.out.write_text(json.dumps(dict(machine=machine(), command=command, results=rows), indent=1))
         args.out.with_suffix(".md").write_text("\n".join([f"{machine_line()}\n\n`python {command}`\n", *lines]) + "\n")
 
 

@@ -142,6 +142,8 @@ def run_shard(args):
     kept, rows, begin = [], [], time.time()
     with progress(len(chosen)) as step:
         for job in chosen:
+            if args.seconds is not None and time.time() - begin > args.seconds:
+                break
             step(f"{job[1]} {job[2]}")
             made = prepared(job, args)
             if made is None:
@@ -177,6 +179,7 @@ def main() -> None:
     parser.add_argument("--groups", nargs="+", default=list(GROUPS), choices=GROUPS)
     parser.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N")
     parser.add_argument("--limit", type=int, help="most runs of the shard")
+    parser.add_argument("--seconds", type=float, help="begin no more runs of the shard after this time")
     parser.add_argument("--raw", type=Path, default=Path("verdict_shard.npz"), help="file of the shard's runs")
     parser.add_argument("--join", type=Path, nargs="+", help="files of shards to report on")
     parser.add_argument("--out", type=Path, help="a .json file; the page goes to the .md file beside it")

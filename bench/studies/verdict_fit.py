@@ -27,7 +27,7 @@ from scipy.optimize import minimize
 import gpusense as gs
 from gpusense._util.progress import progress
 from gpusense.evaluation.machine import machine, machine_line
-from gpusense.localization.passages import AGREES, SHORT, THROUGH, passages
+from gpusense.localization.passages import counts_of, passages
 from gpusense.localization.ratio import FEW
 from gpusense.localization.spread import deviations, is_wide
 
@@ -36,7 +36,7 @@ WAYS = (0.0, 0.1, 0.3, 0.6, 1.0, 1.5, 2.5, 4.0)
 
 
 def follow(seed, args):
-    """Return a row for each scan with a narrow estimate: wrong or not, agree, through, short, x, y."""
+    """Return a row for each scan with a narrow estimate: wrong or not, ``Counts``, x, y."""
     rng = np.random.default_rng((5, seed))
     case = ("own", "own", "kidnapped", "wrong")[int(rng.integers(4))]
     people, moved, glass = (
@@ -68,8 +68,8 @@ def follow(seed, args):
         if is_wide(covariance) or (not wrong and (position > 0.5 or heading > 0.25)):
             continue
         found = passages(grid, scanner, pose, event.ranges, deviations(covariance))
-        rows.append((wrong, *(found.count(kind) for kind in (AGREES, THROUGH, SHORT)), *pose[:2]))
-    return np.array(rows, np.float64).reshape(-1, 6)
+        rows.append((wrong, *counts_of([found]), *pose[:2]))
+    return np.array(rows, np.float64).reshape(-1, 8)
 
 
 def regression(design, wrong):
@@ -97,15 +97,19 @@ def main() -> None:
             step(f"run {seed}")
             each.append(follow(seed, args))
     rows = np.concatenate(each)
-    wrong, (agree, through, short) = rows[:, 0] > 0, rows[:, 1:4].T
-    weight = (agree + through + short) / (agree + through + short + FEW)
-    feature = np.log((through + 0.5) / (agree + 0.5))
-    bias, slope = regression(np.column_stack([weight, weight * feature]), wrong)
-    shorts = weight * np.log((short + 0.5) / (agree + 0.5))
-    with_short = regression(np.column_stack([weight, weight * feature, shorts]), wrong)
-    ratio = weight * (bias + slope * feature)
-    three = ", ".join(f"{value:.2f}" for value in with_short)
-    lines = [f"BIAS {bias:.2f}, SLOPE {slope:.2f}; with the short beams {three}", "",
+    wrong, (agree, close, through, short, nothing) = rows[:, 0] > 0, rows[:, 1:6].T
+    telling = agree + through + short
+    features = [
+        np.log((one + 0.5) / (other + 0.5))
+        for one, other in ((through, agree), (agree - close, close), (nothing, telling), (short, agree))
+    ]
+    weight = telling / (telling + FEW)
+    design = weight[:, None] * np.column_stack([np.ones(len(rows)), *features])
+    chosen = regression(design[:, :4], wrong)
+    with_short, through_only = regression(design, wrong), regression(design[:, :2], wrong)
+    ratio = design[:, :4] @ chosen
+    lines = [f"BIAS, SLOPE, BLUNT, NOTHING {_listed(chosen)}; SLOPE alone {_listed(through_only)}; with the short "
+             f"beams {_listed(with_short)}", "",
              f"{len(rows)} scans of {args.runs} runs, {100 * wrong.mean():.0f} % at wrong poses", "",
              "| fitted ratio | right | wrong | ratio of the counts |", "| --- | --- | --- | --- |"]  # fmt: skip
     for low, high in itertools.pairwise(EDGES):
@@ -118,10 +122,14 @@ def main() -> None:
     print("\n".join(lines))
     if args.out is not None:
         command = " ".join(["bench/studies/verdict_fit.py", *sys.argv[1:]])
-        result = dict(bias=float(bias), slope=float(slope), with_short=with_short.tolist(), scans=len(rows))
+        result = dict(coefficients=chosen.tolist(), with_short=with_short.tolist(), scans=len(rows))
         args.out.write_text(json.dumps(dict(machine=machine(), command=command, results=result), indent=1))
         table = "\n".join(lines)
         args.out.with_suffix(".md").write_text(f"{machine_line()}\n\n`python {command}`\n\n{table}\n")
+
+
+def _listed(values):
+    return ", ".join(f"{value:.2f}" for value in values)
 
 
 def correlations(each, ratios):
@@ -129,7 +137,7 @@ def correlations(each, ratios):
     pairs = []
     for rows, ratio in zip(each, ratios, strict=True):
         right = rows[:, 0] == 0
-        place, value = rows[right, 4:6], ratio[right]
+        place, value = rows[right, 6:8], ratio[right]
         for lag in (1, 2, 4, 8, 16):
             if len(value) > lag:
                 way = np.hypot(*(place[lag:] - place[:-lag]).T)

@@ -30,6 +30,8 @@ START = 0.1
 PER_SCAN, PER_METRE, FOUND, WIDE = 1e-3, 2e-3, 0.003, 0.05
 # Correlation of the ratios of two scans at one place, and the way in which it falls to 1 / e [m, rad].
 STAYS, LENGTH, TURN = 0.95, 2.0, 1.0
+# Searches on a right map of which one finds a wrong place; wrong places that count.
+MISSES, MOST_PLACES = 8, 2
 # Longest way from one scan to the next that counts [m]; a longer one is a jump of the localiser.
 _FASTEST = 1.0
 
@@ -57,9 +59,14 @@ class Belief(NamedTuple):
         return 1 / (1 + math.exp(-self.log_odds))
 
     @classmethod
-    def anywhere(cls) -> Belief:
-        """Return the belief at a start anywhere on a map."""
-        return cls(0.0, chosen=True)
+    def anywhere(cls, after: int = 0) -> Belief:
+        """Return the belief at a place that was searched for on a map.
+
+        Args:
+            after: Places that were searched for before and were wrong. On a right map a search misses one in
+                ``MISSES``.
+        """
+        return cls(math.log(MISSES) * min(after, MOST_PLACES), chosen=True)
 
     def counted(self) -> Belief:
         """Return the belief with one scan more."""

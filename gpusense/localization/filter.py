@@ -17,7 +17,8 @@ from gpusense.localization.estimates import covariance_of
 from gpusense.localization.filter_cloud import FilterCloud, Given, Step
 from gpusense.localization.journal import plain_state, set_state, settled, whole
 from gpusense.localization.motion import STILL, MotionModel, OdometryMotion, SampledMotion
-from gpusense.localization.rival import COMPARISONS, PARTICLES, PRIOR, Rival, can_search, evidence_of
+from gpusense.localization.rival import COMPARISONS, PARTICLES, PRIOR, Rival, evidence_of
+from gpusense.localization.rival_search import can_search
 from gpusense.localization.scoring import given_of
 from gpusense.localization.sensors import sensors_of
 from gpusense.localization.state import FilterState, check_state, constructor_options, model_names, readings_on_host

@@ -16,6 +16,7 @@ thousand look-ups for a scan. A diagonal pair of walls stops a ray, as in the ca
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -35,6 +36,8 @@ _BEAMS, _FARTHEST = 32, 20.0
 _BESIDE, _APART, _MOST_BESIDE, _MOST_APART = 0.08, 0.025, 0.3, 0.1
 # Tolerance of a range: a part of it, at least [m] and at least in cells.
 _PART, _LEAST, _LEAST_CELLS = 0.02, 0.2, 2.0
+# Agreeing readings within this of a wall are close [m].
+_CLOSE = 0.1
 # Step of the walk [cells].
 _STEP = 0.5
 
@@ -46,6 +49,7 @@ class Passages(NamedTuple):
         kind: (B,) class of each beam.
         bearing: (B,) bearing from the scanner [rad].
         wall: (B, 2) where the beam meets the first mapped wall, NaN where it meets none before its end [m].
+        close: (B,) whether an agreeing reading ends within 0.1 m of that wall, or within a cell.
         inside: Whether the pose is inside of solid cells.
         off: Whether the pose is in unknown cells or off the map.
     """
@@ -53,12 +57,44 @@ class Passages(NamedTuple):
     kind: NDArray[np.int8]
     bearing: Floats
     wall: Floats
+    close: NDArray[np.bool_]
     inside: bool
     off: bool
 
     def count(self, kind: int) -> int:
         """Return the number of beams of a class."""
         return int(np.count_nonzero(self.kind == kind))
+
+
+class Counts(NamedTuple):
+    """Beams of the scans of one moment, by what they tell.
+
+    Attributes:
+        agree: Agreeing beams.
+        close: Those among them that end close to a wall.
+        through: Beams that pass through walls.
+        short: Short ones.
+        nothing: Beams that tell nothing.
+    """
+
+    agree: int
+    close: int
+    through: int
+    short: int
+    nothing: int
+
+    @property
+    def telling(self) -> int:
+        """Number of beams that agree, pass through, or are short."""
+        return self.agree + self.through + self.short
+
+
+def counts_of(scans: Sequence[Passages]) -> Counts:
+    """Return the counts of several scans."""
+    agree, through, short, nothing = (
+        sum(one.count(kind) for one in scans) for kind in (AGREES, THROUGH, SHORT, NOTHING)
+    )
+    return Counts(agree, sum(int(np.count_nonzero(one.close)) for one in scans), through, short, nothing)
 
 
 def passages(
@@ -103,9 +139,10 @@ def passages(
     direction = heading + bearing
     with np.errstate(invalid="ignore"):
         distance = np.where(wall[0], first[0], np.nan)
+        close = agrees & (np.abs(reading - distance) < max(_CLOSE, grid.resolution))
         met = origin[:2] + distance[:, None] * np.column_stack([np.cos(direction), np.sin(direction)])
     inside, off = _place_of(grid, pose)
-    return Passages(kind.astype(np.int8), bearing, met, inside, off)
+    return Passages(kind.astype(np.int8), bearing, met, close, inside, off)
 
 
 def _origin_of(pose: Floats, mount: tuple[float, float, float]) -> tuple[Floats, float]:

@@ -31,10 +31,9 @@ from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import SampledMotion
 from gpusense.localization.pose_algebra import wrap_angle
 from gpusense.localization.ratio import ratio_of_scan
-from gpusense.localization.sensors import Sensor
+from gpusense.localization.rival_search import RivalSearch, drawn
 from gpusense.localization.spread import FAR, FAR_TURN, deviations
 from gpusense.localization.verdict import sightings
-from gpusense.models.landmark.model import LandmarkModel
 
 if TYPE_CHECKING:
     from gpusense.localization.filter import ParticleFilter
@@ -43,20 +42,20 @@ if TYPE_CHECKING:
 # Logarithm of the Bayes factor that wins, and that ends a rival that falls behind; scans that a rival needs to win if
 # it lies together, and if it has several places; scans after which one that neither wins nor loses is given up.
 WIN, LOSE, SCANS, APART, LONGEST = 7.0, -7.0, 3, 8, 15
+# Scans after which a rival with several places is given up where the beams that meet walls contradict the best one.
+SETTLES = 5
 # Rivals with which a pose is compared that was searched for on the whole map.
 COMPARISONS = 3
 # Prior odds of a rival of a tracked pose: its place was not known before.
 PRIOR = -7.0
-# Particles of a rival; poses that are tried; effective number of these that begin it.
-PARTICLES, TRIES, CHOSEN = 1000, 20_000, 100
-# Deviation of poses that are tried around the estimate, at least [m]; half widths around a chosen pose [m, m, rad].
-_NEARBY, _SPREAD = 2.0, (0.1, 0.1, 0.05)
+# Particles of a rival; half widths around a pose that begins it [m, m, rad].
+PARTICLES, _SPREAD = 1000, (0.1, 0.1, 0.05)
 # A cloud lies together up to this deviation [m]. Two clouds are at one place up to these [m, rad].
 _TOGETHER, _SAME, _SAME_TURN = 0.5, 0.5, 0.3
 # Mean ratio of wrong against right up to which the beams speak for a pose; share of the mean that a scan leaves.
-_RIGHT, _KEPT = -1.0, 0.6
-# Most that a scan counts [nats], and margin around landmarks [m].
-_MOST, _MARGIN = 50.0, 1.0
+_RIGHT, _AGAINST, _KEPT = -1.0, 0.0, 0.6
+# Most that a scan counts [nats].
+_MOST = 50.0
 
 
 def evidence_of(cloud: FilterCloud) -> float:
@@ -83,7 +82,7 @@ class Rival:
         self._prior, self._settled = PRIOR, False
         # Weighted sums of the ratios of wrong against right, of the rival and of the particles, and of the weights.
         self._ratios = np.zeros(3)
-        self._pool: tuple[np.ndarray, starts.Spread] | None = None
+        self._search = RivalSearch(rival._sensors)
 
     def keep(self) -> None:
         """Note what the call that begins must leave as it is."""
@@ -95,7 +94,7 @@ class Rival:
 
     def state(self) -> tuple[dict[str, Any], FilterState]:
         """Return the rival as plain data."""
-        return plain_state(self, without=("_filter", "_pool")), self._filter.state()
+        return plain_state(self, without=("_filter", "_search")), self._filter.state()
 
     def restore(self, state: tuple[dict[str, Any], FilterState]) -> None:
         """Take over a rival."""
@@ -119,36 +118,19 @@ class Rival:
             prior: Prior log odds; at 0 places near the estimate are no rivals.
         """
         self._filter._step = step
-        key = self._filter._key()
-        tries = self._tries(pose, covariance, key, everywhere=prior == 0.0)
-        score = np.zeros(len(tries))
-        for index, reading in readings:
-            sensor = self._filter._sensors[index]
-            score += sensor.temperature(self._filter.options.temperature) * np.asarray(
-                sensor.log_likelihood(tries, reading), np.float64
-            )
-        chosen = drawn(score, self._filter.options.most)
+        key, options = self._filter._key(), self._filter.options
+        tries, score, effective = self._search.found(pose, covariance, readings, key, options.temperature)
+        if prior == 0.0:
+            far = np.hypot(*(tries[:, :2] - pose[:2]).T) > FAR
+            far |= np.abs(wrap_angle(tries[:, 2] - pose[2])) > 2 * FAR_TURN
+            tries, score = tries[far], score[far]
+        chosen = drawn(score, options.most, effective)
         if chosen is None:
             return
         self._filter._pending = None
-        self._filter._place(
-            starts.spread(tries[chosen], _SPREAD, self._filter.options.most, key, each=True), again=True
-        )
+        self._filter._place(starts.spread(tries[chosen], _SPREAD, options.most, key, each=True), again=True)
         self.active, self.log_odds, self._prior, self._scans, self._settled = True, prior, prior, 0, False
         self._ratios = np.zeros(3)
-
-    def _tries(self, pose: np.ndarray, covariance: np.ndarray, key: starts.Key, *, everywhere: bool) -> np.ndarray:
-        """Return poses anywhere, and around the estimate with any heading."""
-        if self._pool is None:
-            self._pool = _anywhere(self._filter._sensors)
-        anywhere = starts.spread(*self._pool, TRIES // 2, key)
-        wide = max(2 * deviations(covariance)[0], _NEARBY)
-        around = starts.normal(pose, np.diag([wide**2, wide**2, math.pi**2]), TRIES // 2, key)
-        tries = np.vstack([anywhere, around])
-        if not everywhere:
-            return tries
-        far = np.hypot(*(tries[:, :2] - pose[:2]).T) > FAR
-        return tries[far | (np.abs(wrap_angle(tries[:, 2] - pose[2])) > 2 * FAR_TURN)]
 
     def predict(self, motion: SampledMotion) -> None:
         """Move the rival."""
@@ -215,8 +197,15 @@ class Rival:
         mine, other, weight = self._ratios
         return bool(not weight or (mine / weight < _RIGHT and (mine < other or not better)))
 
+    def _is_contradicted(self) -> bool:
+        """Tell whether the beams that meet walls speak against the rival."""
+        mine, _, weight = self._ratios
+        return bool(weight and mine / weight > _AGAINST)
+
     def _is_late(self, gain: float) -> bool:
         """Tell whether a rival has fallen behind or had enough scans; equals that lie together may both be right."""
+        if self._scans >= (SCANS if self._settled else SETTLES) and self._is_contradicted():
+            return True
         over = self._scans >= LONGEST
         if self._prior == 0.0 and self._settled:
             return gain < LOSE or (over and not self._is_plausible())
@@ -233,39 +222,3 @@ class Rival:
         if not self.active or not self._scans or self.is_at(pose) or not self._is_plausible():
             return 0.0
         return 1 / (1 + math.exp(-min(max(self.log_odds, -_MOST), _MOST)))
-
-
-def drawn(score: np.ndarray, count: int) -> np.ndarray | None:
-    """Return indices drawn by likelihoods, tempered so that ``CHOSEN`` are effective; None if none is possible."""
-    possible = np.isfinite(score)
-    if not possible.any():
-        return None
-    distance = np.where(possible, score - score[possible].max(), -np.inf)
-    low, high = 0.0, 1.0
-    for _ in range(40):
-        middle = high if low == 0.0 and high == 1.0 else (low + high) / 2
-        weight = np.exp(middle * distance, where=possible, out=np.zeros(len(score)))
-        size = weight.sum() ** 2 / (weight @ weight)
-        if size >= min(CHOSEN, np.count_nonzero(possible)):
-            low = middle
-        else:
-            high = middle
-        if low >= high:
-            break
-    weight = np.exp(low * distance, where=possible, out=np.zeros(len(score)))
-    ends = np.cumsum(weight)
-    return np.minimum(np.searchsorted(ends, (np.arange(count) + 0.5) / count * ends[-1], side="right"), len(score) - 1)
-
-
-def _anywhere(sensors: Sequence[Sensor]) -> tuple[np.ndarray, starts.Spread]:
-    """Return centres and half widths of all places where a robot may be: free cells, or the box of the landmarks."""
-    models = [sensor.model for sensor in sensors]
-    if any(hasattr(model, "grid") for model in models):
-        return starts.free_pool(models, None)
-    xy = np.vstack([model.landmarks.xy for model in models if isinstance(model, LandmarkModel)])
-    return starts.free_pool([], np.array([xy.min(axis=0) - _MARGIN, xy.max(axis=0) + _MARGIN]))
-
-
-def can_search(sensors: Sequence[Sensor]) -> bool:
-    """Tell whether a sensor has a map in which a rival can be searched for."""
-    return any(hasattr(one.model, "grid") or isinstance(one.model, LandmarkModel) for one in sensors)

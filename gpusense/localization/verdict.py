@@ -25,6 +25,7 @@ from gpusense.localization.passages import Passages, passages
 from gpusense.localization.ratio import explained_of_scan, ratio_of_features, ratio_of_scan
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.spread import deviations, is_apart, is_wide
+from gpusense.localization.words import TRACKING
 from gpusense.models.landmark.model import LandmarkModel
 
 # Random poses; corrections between two judgements of a start anywhere.
@@ -43,6 +44,7 @@ class VerdictState(NamedTuple):
         explained: Share of explained beams there; NaN without beams.
         gains: Gains of recent features by the index of their sensor.
         ratios: Ratios of features since the last judgement.
+        places: Places that were searched for since the last one that scans have confirmed.
     """
 
     belief: Belief = Belief()
@@ -51,6 +53,7 @@ class VerdictState(NamedTuple):
     explained: float = math.nan
     gains: tuple[tuple[int, Gains], ...] = ()
     ratios: tuple[float, ...] = ()
+    places: int = 0
 
 
 class Verdict:
@@ -128,7 +131,8 @@ class Verdict:
 
     def doubt(self) -> None:
         """Begin anew with a pose that was just searched for: that scans chose it is no evidence."""
-        self.state = self.state._replace(belief=Belief.anywhere(), judged=-1)
+        places = self.state.places + 1
+        self.state = self.state._replace(belief=Belief.anywhere(after=places - 1), judged=-1, places=places)
 
     @property
     def explains_little(self) -> bool:
@@ -165,7 +169,10 @@ class Verdict:
             ratios = [ratio_of_scan(scans), float(np.mean(state.ratios)) if state.ratios else math.nan]
             known = [ratio for ratio in ratios if not math.isnan(ratio)]
             belief = belief.judged((x, y, theta), sum(known) if known else math.nan)
-        self.state = state._replace(belief=belief, judged=state.corrections, explained=explained, ratios=())
+        places = 0 if belief.wrong < TRACKING else state.places
+        self.state = state._replace(
+            belief=belief, judged=state.corrections, explained=explained, ratios=(), places=places
+        )
         return explained
 
 

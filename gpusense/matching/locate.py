@@ -94,7 +94,7 @@ def locate_scan(
     allowed = _allowed(grid, stride) if positions == "free" else None
     rows, cols = (-(-size // stride) for size in grid.shape)
     searched = PoseGrid(np.array([[0.5, 0.5]]), headings, rows, cols)
-    hits, points = _end_points(model, ranges)
+    hits, points = end_points_of(model, ranges)
     options = dict(resolution=stride * cell, angle=2 * math.pi / turns, poses=searched.count)
     if not len(points):
         nothing = np.full(3, np.nan)
@@ -115,7 +115,7 @@ def locate_scan(
     )  # fmt: skip
 
 
-def _end_points(model: LikelihoodFieldModel, ranges: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def end_points_of(model: LikelihoodFieldModel, ranges: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices of the hits that the model uses, and their (M, 2) end points on the robot [m]."""
     scanner = model.scanner
     z = checks.array("ranges", ranges, (scanner.count,), finite=False)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense.localization.rival import CHOSEN, drawn
+from gpusense.localization.rival_search import drawn
+from gpusense.matching.likely import likely_poses
 
 # A building of four rooms of different sizes along a corridor, with doors.
 CELLS = np.zeros((120, 200), np.int8)
@@ -130,11 +131,40 @@ def test_the_temperature_does_not_learn_from_a_doubtful_pose(model):
 def test_poses_are_drawn_by_their_likelihood():
     rng = np.random.default_rng(0)
     score = -0.5 * rng.normal(size=20_000) ** 2 * 1e4
-    rows = drawn(score, 1000)
-    assert len(rows) == 1000 and score[rows].min() > -40 * (score.max() - np.sort(score)[-2 * CHOSEN])
-    assert len(np.unique(rows)) > CHOSEN / 2
-    assert np.array_equal(np.unique(drawn(np.zeros(50), 100)), np.arange(50))
-    assert drawn(np.full(10, -np.inf), 5) is None
+    rows = drawn(score, 1000, 100)
+    assert len(rows) == 1000 and score[rows].min() > -40 * (score.max() - np.sort(score)[-200])
+    assert len(np.unique(rows)) > 50
+    assert len(np.unique(drawn(score, 1000, 800))) > len(np.unique(rows))
+    assert np.array_equal(np.unique(drawn(np.zeros(50), 100, 100)), np.arange(50))
+    assert drawn(np.full(10, -np.inf), 5, 100) is None
     score = np.full(1000, -np.inf)
     score[3] = -1e6
-    assert set(drawn(score, 20)) == {3}
+    assert set(drawn(score, 20, 100)) == {3}
+
+
+@pytest.mark.parametrize("kind", ["field", "beam"])
+def test_a_carried_robot_is_found_within_a_few_scans(model, kind):
+    """Anywhere in the building, whatever the number of particles: the search is over the whole map."""
+    if kind == "beam":
+        model = gs.BeamModel(GRID, SCANNER, gs.BeamParameters(z_hit=0.8, z_short=0.1, z_max=0.0, z_rand=0.1,
+                             sigma_hit=0.05, lambda_short=0.5), backend="opencl")  # fmt: skip
+    before, after = along((3.0, 9.5, 0.3), 3), along((13.0, 9.5, 0.3), 10)
+    pf = gs.ParticleFilter(model, particles=300, seed=2)
+    pf.initialize(mean=before[0], covariance=np.diag([0.01, 0.01, 0.01]))
+    odometry = np.vstack([before, before[-1] + after - after[0]])
+    found = track(np.vstack([before, after]), scans(np.vstack([before, after])), pf, odometry)
+    assert error(found[-1], after[-1]) < 0.2
+
+
+def test_the_likeliest_poses_of_a_map_hold_the_right_one():
+    field = gs.LikelihoodFieldModel(GRID, SCANNER, gs.LikelihoodFieldParameters(sigma_hit=0.15), backend="opencl")
+    for pose in ((3.0, 9.5, 0.3), (13.0, 2.5, -2.0), (8.0, 6.0, 3.0)):
+        (ranges,) = scans([pose], people=0.3)
+        poses = likely_poses(field, ranges, 20)
+        off = np.abs(poses - pose)
+        near = (off[:, 0] < 0.15) & (off[:, 1] < 0.15) & (np.abs(gs.wrap_angle(poses[:, 2] - pose[2])) < 0.06)
+        assert 1 <= len(poses) <= 20 and near.any()
+        apart = np.hypot(*(poses[:, None, :2] - poses[None, :, :2]).transpose(2, 0, 1))
+        turned = np.abs(gs.wrap_angle(poses[:, None, 2] - poses[None, :, 2]))
+        assert ((apart > 0.5) | (turned > 0.26) | np.eye(len(poses), dtype=bool)).all()
+    assert likely_poses(field, np.full(90, np.inf), 20).shape == (0, 3)

@@ -1,0 +1,151 @@
+"""Poses at which a rival of a filter's particles begins: candidates for the last readings on the whole map.
+
+A scan is searched for by branch and bound on the whole map (:func:`gpusense.matching.likely.likely_poses`), so no place
+is missed for lack of tries: once with all beams, and once with the longer half, since people shorten beams. Among
+people the likelihood prefers places with many walls, so candidates are weighed by the beams that meet walls as well
+(:mod:`gpusense.localization.ratio`). Landmarks are searched for by poses drawn at random, as are scans of maps whose
+search finds nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from gpusense.backends import arrays
+from gpusense.localization import starts
+from gpusense.localization.filter_cloud import Given
+from gpusense.localization.ratio import ratio_of_scan
+from gpusense.localization.sensors import Sensor
+from gpusense.localization.spread import deviations
+from gpusense.localization.verdict import sightings
+from gpusense.matching.likely import likely_poses
+from gpusense.models.landmark.model import LandmarkModel
+from gpusense.models.scan.field import LikelihoodFieldModel
+from gpusense.world.parameters import LikelihoodFieldParameters
+
+# Candidates of each search on a map, and the effective number of them that begin a rival; beams of a scan for it.
+_CANDIDATES, _EFFECTIVE, _BEAMS = 40, 5, 60
+# Covariance of a candidate: half the distances between poses of the search.
+_SPREAD_OF_POSE = np.diag([0.05**2, 0.05**2, 0.025**2])
+# Parameters of the field of a search: wider than those of the filter, since poses of the search lie apart.
+_FIELD = LikelihoodFieldParameters(z_hit=0.7, z_max=0.0, z_rand=0.3, sigma_hit=0.15)
+# Random poses, and the effective number of them that begin a rival.
+_TRIES, _CHOSEN = 20_000, 100
+# Deviation of random poses around the estimate, at least [m], and margin around landmarks [m].
+_NEARBY, _MARGIN = 2.0, 1.0
+
+
+class RivalSearch:
+    """Searches for rivals.
+
+    Args:
+        sensors: The sensors of the rival.
+    """
+
+    def __init__(self, sensors: Sequence[Sensor]) -> None:
+        self._sensors = sensors
+        self._pool: tuple[np.ndarray, starts.Spread] | None = None
+        self._field: LikelihoodFieldModel | None = None
+
+    def found(
+        self,
+        pose: np.ndarray,
+        covariance: np.ndarray,
+        readings: Sequence[Given],
+        key: starts.Key,
+        temperature: float | str,
+    ) -> tuple[np.ndarray, np.ndarray, int]:
+        """Return candidates (M, 3), their log-likelihoods (M,), and the effective number of them that begins a rival.
+
+        Args:
+            pose: (3,) estimated pose of the particles.
+            covariance: (3, 3) their covariance.
+            readings: Indices of sensors with the last readings.
+            key: Seed and step of random poses.
+            temperature: Of the filter.
+        """
+        tries, effective = self._on_map(readings), _EFFECTIVE
+        on_map = len(tries) > 0
+        if not on_map:
+            tries, effective = self._at_random(pose, covariance, key), _CHOSEN
+        score = np.zeros(len(tries))
+        for index, reading in readings:
+            sensor = self._sensors[index]
+            likelihood = np.asarray(sensor.log_likelihood(tries, reading), np.float64)
+            score += sensor.temperature(temperature) * likelihood
+        return tries, score - self._ratios(tries, readings) if on_map else score, effective
+
+    def _ratios(self, poses: np.ndarray, readings: Sequence[Given]) -> np.ndarray:
+        """Return the log-likelihood ratios (M,) of "wrong" against "right" of poses; 0 where scans tell nothing."""
+        known = dict(readings)
+        ratios = [ratio_of_scan(sightings(self._sensors, known, pose, _SPREAD_OF_POSE)) for pose in poses]
+        return np.nan_to_num(np.array(ratios))
+
+    def _on_map(self, readings: Sequence[Given]) -> np.ndarray:
+        """Return candidates for the first scan among readings."""
+        for index, reading in readings:
+            sensor = self._sensors[index]
+            if sensor.calibrates:
+                ranges = np.asarray(arrays.copied_to_host(reading[0], sensor.backend, "ranges"), np.float64)
+                field, returned = self._field_of(sensor), np.isfinite(ranges)
+                longer = np.where(ranges < np.median(ranges[returned]), np.nan, ranges) if returned.any() else ranges
+                return np.vstack([likely_poses(field, each, _CANDIDATES) for each in (ranges, longer)])
+        return np.empty((0, 3))
+
+    def _field_of(self, sensor: Sensor) -> LikelihoodFieldModel:
+        """Return the field of a sensor's map for searches; it is made once."""
+        grid, scanner = sensor.model.grid, sensor.model.scanner
+        if self._field is None or self._field.grid is not grid or self._field.scanner is not scanner:
+            beams = min(_BEAMS, scanner.count)
+            self._field = LikelihoodFieldModel(
+                grid, scanner, _FIELD, backend=sensor.model.device.selection, beams=beams
+            )
+        return self._field
+
+    def _at_random(self, pose: np.ndarray, covariance: np.ndarray, key: starts.Key) -> np.ndarray:
+        """Return poses anywhere, and around the estimate with any heading."""
+        if self._pool is None:
+            self._pool = _anywhere(self._sensors)
+        anywhere = starts.spread(*self._pool, _TRIES // 2, key)
+        wide = max(2 * deviations(covariance)[0], _NEARBY)
+        around = starts.normal(pose, np.diag([wide**2, wide**2, math.pi**2]), _TRIES // 2, key)
+        return np.vstack([anywhere, around])
+
+
+def drawn(score: np.ndarray, count: int, effective: int) -> np.ndarray | None:
+    """Return indices drawn by likelihoods, tempered so that some are effective; None if none is possible."""
+    possible = np.isfinite(score)
+    if not possible.any():
+        return None
+    distance = np.where(possible, score - score[possible].max(), -np.inf)
+    low, high = 0.0, 1.0
+    for _ in range(40):
+        middle = high if low == 0.0 and high == 1.0 else (low + high) / 2
+        weight = np.exp(middle * distance, where=possible, out=np.zeros(len(score)))
+        size = weight.sum() ** 2 / (weight @ weight)
+        if size >= min(effective, np.count_nonzero(possible)):
+            low = middle
+        else:
+            high = middle
+        if low >= high:
+            break
+    weight = np.exp(low * distance, where=possible, out=np.zeros(len(score)))
+    ends = np.cumsum(weight)
+    return np.minimum(np.searchsorted(ends, (np.arange(count) + 0.5) / count * ends[-1], side="right"), len(score) - 1)
+
+
+def can_search(sensors: Sequence[Sensor]) -> bool:
+    """Tell whether a sensor has a map in which a rival can be searched for."""
+    return any(hasattr(one.model, "grid") or isinstance(one.model, LandmarkModel) for one in sensors)
+
+
+def _anywhere(sensors: Sequence[Sensor]) -> tuple[np.ndarray, starts.Spread]:
+    """Return centres and half widths of all places where a robot may be: free cells, or the box of the landmarks."""
+    models = [sensor.model for sensor in sensors]
+    if any(hasattr(model, "grid") for model in models):
+        return starts.free_pool(models, None)
+    xy = np.vstack([model.landmarks.xy for model in models if isinstance(model, LandmarkModel)])
+    return starts.free_pool([], np.array([xy.min(axis=0) - _MARGIN, xy.max(axis=0) + _MARGIN]))

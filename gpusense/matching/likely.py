@@ -1,0 +1,59 @@
+"""The poses on a whole map at which a scan is likeliest: candidates, of which later scans choose."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.matching.field_search import field_search
+from gpusense.matching.locate import end_points_of
+from gpusense.matching.search import PoseGrid
+from gpusense.models.scan.field import LikelihoodFieldModel
+
+# Distance and angle between neighbouring poses [m, rad]; half of them are within the reach of a cloud of particles.
+_RESOLUTION, _ANGLE = 0.1, math.radians(3.0)
+# Poses that score less than the best one by this are not found; poses nearer than this to a better one are not new.
+_DEPTH, _NEAR, _TURNED = 0.06, 0.5, math.radians(15.0)
+
+
+def likely_poses(model: LikelihoodFieldModel, ranges: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Return distinct poses in free cells at which a scan is likeliest, by falling score.
+
+    Branch and bound, as in :func:`gpusense.matching.locate.locate_scan`, on a coarser grid of poses.
+
+    Args:
+        model: A likelihood field.
+        ranges: (K,) readings [m].
+        count: Most poses.
+
+    Returns:
+        (M, 3) poses, 0.5 m or 15 degrees apart; none for a scan without hits, or on a map without free cells.
+    """
+    grid = model.grid
+    stride = max(round(_RESOLUTION / grid.resolution), 1)
+    allowed = grid.free[::stride, ::stride]
+    points = end_points_of(model, ranges)[1]
+    if not len(points) or not allowed.any():
+        return np.empty((0, 3))
+    turns = 4 * math.ceil(math.pi / 2 / _ANGLE)
+    rows, columns = (-(-size // stride) for size in grid.shape)
+    searched = PoseGrid(np.array([[0.5, 0.5]]), 2 * math.pi / turns * np.arange(turns)[None], rows, columns)
+    search = field_search(model, stride)
+    with search.lock:
+        poses = search.find(ranges, points, searched, allowed, _DEPTH).poses
+    return poses[_distinct(poses, count)]
+
+
+def _distinct(poses: NDArray[np.float64], count: int) -> list[int]:
+    """Return the indices of poses that are far from all better ones."""
+    chosen: list[int] = []
+    left = np.ones(len(poses), bool)
+    while len(chosen) < count and left.any():
+        first = int(np.argmax(left))
+        chosen.append(first)
+        off = poses - poses[first]
+        turn = np.abs(np.remainder(off[:, 2] + math.pi, 2 * math.pi) - math.pi)
+        left &= (np.hypot(off[:, 0], off[:, 1]) > _NEAR) | (turn > _TURNED)
+    return chosen

@@ -251,7 +251,7 @@ class ParticleFilter(Beginnings):
             return
         rival = self._rival
         if rival is not None and rival.active:
-            rival.correct(given, evidence_of(self._cloud))
+            rival.correct(given, evidence_of(self._cloud.summary()))
             numbers = self._cloud.estimate(self._shown)
             won = rival.judge(numbers[:3], covariance_of(numbers), given)
             if won is not None:

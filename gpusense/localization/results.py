@@ -15,7 +15,7 @@ from gpusense.localization.estimates import Estimate, clustered, covariance_of
 from gpusense.localization.filter_cloud import FilterCloud
 from gpusense.localization.journal import Whole, settled, whole
 from gpusense.localization.options import Options
-from gpusense.localization.rival import Rival
+from gpusense.localization.rival import Rival, evidence_of
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.spread import is_apart, is_narrow, is_wide, share_off, share_off_of
 from gpusense.localization.verdict import Verdict
@@ -95,7 +95,7 @@ class Results(Whole, ABC):
                 pose = poses[int(np.argmax(self._cloud.host_weights(self._shown)))]
             else:
                 pose, covariance = clustered(poses, self._cloud.host_weights(self._shown))
-        explained = self._verdict.judge(pose, covariance, self._last)
+        explained = self._verdict.judge(pose, covariance, self._last, evidence_of(summary))
         p_lost = self._p_lost(pose, covariance)
         word = word_of(p_lost, self._verdict.wrong, wide=is_wide(covariance), apart=is_apart(covariance))
         size = summary.effective_sample_size

@@ -26,7 +26,7 @@ import numpy as np
 from gpusense.interface.constants import EVIDENCE
 from gpusense.localization import starts
 from gpusense.localization.estimates import covariance_of
-from gpusense.localization.filter_cloud import FilterCloud, Given
+from gpusense.localization.filter_cloud import Given, Summary
 from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import SampledMotion
 from gpusense.localization.pose_algebra import wrap_angle
@@ -58,9 +58,8 @@ _RIGHT, _AGAINST, _KEPT = -1.0, 0.0, 0.6
 _MOST = 50.0
 
 
-def evidence_of(cloud: FilterCloud) -> float:
+def evidence_of(summary: Summary) -> float:
     """Return log p(z | earlier readings) of the last correction; -inf where no particle was possible."""
-    summary = cloud.summary()
     return -math.inf if summary.degenerate else float(summary.numbers[EVIDENCE])
 
 
@@ -145,7 +144,7 @@ class Rival:
             evidence: Evidence of the filter, by :func:`evidence_of`.
         """
         self._filter._weigh(readings)
-        mine = evidence_of(self._filter._cloud)
+        mine = evidence_of(self._filter._cloud.summary())
         if math.isfinite(mine) or math.isfinite(evidence):
             self.log_odds += min(max(mine - evidence, -_MOST), _MOST)
         self._scans += 1

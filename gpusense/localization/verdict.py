@@ -28,8 +28,13 @@ from gpusense.localization.spread import deviations, is_apart, is_wide
 from gpusense.localization.words import TRACKING
 from gpusense.models.landmark.model import LandmarkModel
 
-# Random poses; corrections between two judgements of a start anywhere.
-_RANDOM, _INTERVAL = 64, 5
+# Random poses.
+_RANDOM = 64
+# A pose that is sure, with at most this belief that it is wrong, is judged anew after a way [m] or a turn [rad], which
+# bring new evidence, after some corrections, or where readings are less likely than those before by so much [nats].
+_SURE, _WAY, _TURNED, _SELDOM, _DROP = 0.05, 0.25, 0.25, 10, 3.0
+# Corrections after which a filter judges without being asked, where its pose is not sure.
+_INTERVAL = 5
 # Share of explained beams below which it is worth while to look elsewhere.
 _FEW = 0.4
 
@@ -45,6 +50,7 @@ class VerdictState(NamedTuple):
         gains: Gains of recent features by the index of their sensor.
         ratios: Ratios of features since the last judgement.
         places: Places that were searched for since the last one that scans have confirmed.
+        evidence: Evidence of the readings that were judged last, by the particles.
     """
 
     belief: Belief = Belief()
@@ -54,6 +60,7 @@ class VerdictState(NamedTuple):
     gains: tuple[tuple[int, Gains], ...] = ()
     ratios: tuple[float, ...] = ()
     places: int = 0
+    evidence: float = -math.inf
 
 
 class Verdict:
@@ -126,8 +133,8 @@ class Verdict:
 
     @property
     def due(self) -> bool:
-        """Tell whether enough corrections have passed for a new judgement of a start anywhere."""
-        return self.state.corrections % _INTERVAL == 0
+        """Tell whether a filter that is not asked for its estimate judges now."""
+        return self.state.corrections % (_SELDOM if self.state.belief.wrong <= _SURE else _INTERVAL) == 0
 
     def doubt(self) -> None:
         """Begin anew with a pose that was just searched for: that scans chose it is no evidence."""
@@ -144,19 +151,26 @@ class Verdict:
         """Probability that another place is right, by the scans; 0 for sensors without a map."""
         return self.state.belief.wrong if self.informed else 0.0
 
-    def judge(self, pose: np.ndarray, covariance: np.ndarray, readings: Mapping[int, tuple[Any, ...]]) -> float:
-        """Judge a pose by the last readings, once for each correction.
+    def judge(
+        self,
+        pose: np.ndarray,
+        covariance: np.ndarray,
+        readings: Mapping[int, tuple[Any, ...]],
+        evidence: float = -math.inf,
+    ) -> float:
+        """Judge a pose by the last readings, once for each correction, and less often where the pose is sure.
 
         Args:
             pose: (3,) estimated pose.
             covariance: (3, 3) its covariance.
             readings: Last readings by the index of their sensor.
+            evidence: log p(last readings | earlier ones) of the particles; -inf judges in any case.
 
         Returns:
             Share of the beams that the pose explains; NaN without beams.
         """
         state = self.state
-        if state.judged == state.corrections:
+        if state.judged == state.corrections or self._adds_nothing(pose, covariance, evidence):
             return state.explained
         scans = sightings(self._sensors, readings, pose, covariance)
         explained, belief = explained_of_scan(scans), state.belief
@@ -171,9 +185,26 @@ class Verdict:
             belief = belief.judged((x, y, theta), sum(known) if known else math.nan)
         places = 0 if belief.wrong < TRACKING else state.places
         self.state = state._replace(
-            belief=belief, judged=state.corrections, explained=explained, ratios=(), places=places
+            belief=belief,
+            judged=state.corrections,
+            explained=explained,
+            ratios=(),
+            places=places,
+            evidence=evidence,
         )
         return explained
+
+    def _adds_nothing(self, pose: np.ndarray, covariance: np.ndarray, evidence: float) -> bool:
+        """Tell whether a pose is sure and so near to the one judged last that its scan adds next to no evidence."""
+        state = self.state
+        before = state.belief.pose
+        if before is None or state.judged < 0 or state.belief.wrong > _SURE or state.ratios or is_wide(covariance):
+            return False
+        if not evidence >= state.evidence - _DROP:
+            return False
+        near = math.hypot(pose[0] - before[0], pose[1] - before[1]) < _WAY
+        turn = abs(math.remainder(float(pose[2]) - before[2], math.tau))
+        return near and turn < _TURNED and state.corrections - state.judged < _SELDOM
 
 
 def sightings(

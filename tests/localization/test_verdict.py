@@ -110,7 +110,7 @@ def test_the_ratio_ignores_short_beams_and_has_limits():
     two = ratio_of_scan([passages(GRID, SCANNER, POSE, hidden)])
     assert one == two == LIMITS[0]
     elsewhere = ratio_of_scan([passages(GRID, SCANNER, POSE + np.array([3.5, 0.0, 0.0]), right)])
-    assert 0 < elsewhere <= LIMITS[1]
+    assert one + 3 < elsewhere <= LIMITS[1]
     assert math.isnan(ratio_of_scan([])) and math.isnan(explained_of_scan([]))
     nothing = passages(GRID, SCANNER, POSE, np.full(64, np.nan))
     assert math.isnan(ratio_of_scan([nothing])) and math.isnan(explained_of_scan([nothing]))
@@ -214,7 +214,7 @@ def test_a_carried_robot_is_lost_within_a_few_scans(model):
     scans = [scan_at(pose if k < 10 else pose + np.array([3.5, 2.0, 1.0])) for k, pose in enumerate(poses)]
     pf, found = followed(model, poses, scans, recovery=None)
     assert all(one.verdict == "tracking" and one.p_lost < 0.05 for one in found[:10])
-    assert found[-1].verdict == "lost" and found[-1].lost and found[-1].p_lost > 0.9
+    assert found[-1].verdict == "lost" and found[-1].lost and found[-1].p_lost > 0.8
     # The evidence names the robot's place.
     told = pf.diagnose()
     assert told.cause == "start" and math.dist(told.elsewhere[:2], (poses[-1] + np.array([3.5, 2.0, 0.0]))[:2]) < 0.3

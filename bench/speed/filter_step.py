@@ -3,7 +3,8 @@
 Where a step is one recorded program, starts of it in a row show the time on the device, with and without the estimate.
 
 The scene is a generated building, the cloud that of a tracked robot. One stage is the plain filter; the default is up
-to four stages, of which a step on a processor takes those that the cloud needs.
+to four stages, of which a step on a processor takes those that the cloud needs. Steps of three filters run in turns:
+without recovery and verdict, with the verdict of ``estimate``, and with recovery as well, which is the default.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ SIZES = ((2000, 60), (4000, 60), (100_000, 60))
 
 
 def measure(backend: str, particles: int, beams: int, stages: int, steps: int) -> dict[str, object]:
-    """Return the median and least milliseconds of a step."""
+    """Return the median and least milliseconds of a step, without and with the verdict."""
     grid = building()
     scanner = gs.Scanner.uniform(angle_min=-np.pi / 2, angle_increment=np.pi / (beams - 1), count=beams, range_max=20.0)
     model = gs.LikelihoodFieldModel(grid, scanner, gs.LikelihoodFieldParameters(sigma_hit=0.1), backend=backend)
@@ -36,16 +37,24 @@ def measure(backend: str, particles: int, beams: int, stages: int, steps: int) -
     x0, y0, _ = grid.origin
     pose = np.array([x0 + (column + 0.5) * grid.resolution, y0 + (row + 0.5) * grid.resolution, 0.3])
     ranges = gs.RayCaster(grid, range_max=20.0, backend=backend).cast(pose[None], scanner.bearings)[0]
-    pf = gs.ParticleFilter(model, particles=particles, temperature=0.2, stages=stages)
-    pf.initialize(mean=pose, covariance=np.diag([0.01, 0.01, 0.002]))
-    times = []
+    filters = []
+    for recovery in (None, None, "sensor"):
+        pf = gs.ParticleFilter(model, particles=particles, temperature=0.2, stages=stages, recovery=recovery)
+        pf.initialize(mean=pose, covariance=np.diag([0.01, 0.01, 0.002]))
+        filters.append(pf)
+    times: list[list[float]] = [[], [], []]
     for _ in range(steps + 5):
-        begin = time.perf_counter()
-        pf.predict((0, 0, 0), (0, 0, 0))
-        pf.correct(ranges)
-        pf.mean_and_covariance()
-        times.append((time.perf_counter() - begin) * 1000)
-    late = times[5:]
+        for which, (pf, kept) in enumerate(zip(filters, times, strict=True)):
+            begin = time.perf_counter()
+            pf.predict((0, 0, 0), (0, 0, 0))
+            pf.correct(ranges)
+            if which:
+                pf.estimate()
+            else:
+                pf.mean_and_covariance()
+            kept.append((time.perf_counter() - begin) * 1000)
+    late, verdict, default = (kept[5:] for kept in times)
+    pf = filters[0]
     in_a_row = with_estimate = None
     if pf._cloud._recordings:
         step = next(reversed(pf._cloud._recordings.values()))[0]
@@ -53,7 +62,8 @@ def measure(backend: str, particles: int, beams: int, stages: int, steps: int) -
         in_a_row, with_estimate = _in_a_row(pf, steps, [step]), _in_a_row(pf, steps, [step, estimate])
     return dict(
         backend=backend, particles=particles, beams=beams, stages=stages, median_ms=float(np.median(late)),
-        least_ms=min(late), in_a_row_ms=in_a_row, with_estimate_ms=with_estimate, start=pf.explain(),
+        least_ms=min(late), verdict_ms=float(np.mean(verdict) - np.mean(late)),
+        recovery_ms=float(np.mean(default) - np.mean(late)), in_a_row_ms=in_a_row, with_estimate_ms=with_estimate, start=pf.explain(),
     )  # fmt: skip
 
 
@@ -86,8 +96,9 @@ def main() -> None:
     args = parser.parse_args()
     rows = []
     print(
-        "| particles x beams | stages | median ms | least ms | recorded ones in a row ms | with estimate | start |\n"
-        "| --- | --- | --- | --- | --- | --- | --- |"
+        "| particles x beams | stages | median ms | least ms | verdict, more ms | and recovery, more ms | "
+        "recorded ones in a row ms | with estimate | start |\n"
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
     )
     for particles, beams in args.size or SIZES:
         for stages in (1, 4):
@@ -95,7 +106,7 @@ def main() -> None:
             rows.append(one)
             print(
                 f"| {particles} x {beams} | {stages} | {one['median_ms']:.2f} | {one['least_ms']:.2f} | "
-                f"{_text(one['in_a_row_ms'])} | {_text(one['with_estimate_ms'])} | "
+                f"{one['verdict_ms']:.3f} | {one['recovery_ms']:.3f} | {_text(one['in_a_row_ms'])} | {_text(one['with_estimate_ms'])} | "
                 f"{one['start']} |",
                 flush=True,
             )

@@ -63,7 +63,8 @@ def measure(backend: str, particles: int, beams: int, stages: int, steps: int) -
     return dict(
         backend=backend, particles=particles, beams=beams, stages=stages, median_ms=float(np.median(late)),
         least_ms=min(late), verdict_ms=float(np.mean(verdict) - np.mean(late)),
-        recovery_ms=float(np.mean(default) - np.mean(late)), in_a_row_ms=in_a_row, with_estimate_ms=with_estimate, start=pf.explain(),
+        recovery_ms=float(np.mean(default) - np.mean(late)), in_a_row_ms=in_a_row,
+        with_estimate_ms=with_estimate, start=pf.explain(),
     )  # fmt: skip
 
 
@@ -106,7 +107,8 @@ def main() -> None:
             rows.append(one)
             print(
                 f"| {particles} x {beams} | {stages} | {one['median_ms']:.2f} | {one['least_ms']:.2f} | "
-                f"{one['verdict_ms']:.3f} | {one['recovery_ms']:.3f} | {_text(one['in_a_row_ms'])} | {_text(one['with_estimate_ms'])} | "
+                f"{one['verdict_ms']:.3f} | {one['recovery_ms']:.3f} | "
+                f"{_text(one['in_a_row_ms'])} | {_text(one['with_estimate_ms'])} | "
                 f"{one['start']} |",
                 flush=True,
             )

@@ -31,7 +31,7 @@ PER_SCAN, PER_METRE, FOUND, WIDE = 1e-3, 2e-3, 0.003, 0.05
 # Correlation of the ratios of two scans at one place, and the way in which it falls to 1 / e [m, rad].
 STAYS, LENGTH, TURN = 0.95, 2.0, 1.0
 # Searches on a right map of which one finds a wrong place; wrong places that count.
-MISSES, MOST_PLACES = 4, 2
+MISSES, MOST_PLACES = 8, 2
 # Longest way from one scan to the next that counts [m]; a longer one is a jump of the localiser.
 _FASTEST = 1.0
 

@@ -24,8 +24,8 @@ from collections.abc import Sequence
 
 from gpusense.localization.passages import Passages, counts_of
 
-BIAS, SLOPE, BLUNT, NOTHING, FEW = 3.34, 1.78, 0.48, 0.62, 4.0
-CAUTION, SOLID, UNKNOWN, LIMITS = 1.2, 2.0, 1.0, (-4.0, 5.0)
+BIAS, SLOPE, BLUNT, NOTHING, FEW = 3.34, 1.74, 0.48, 0.58, 4.0
+CAUTION, SOLID, UNKNOWN, LIMITS = 0.9, 2.0, 1.0, (-4.0, 5.0)
 # Share of a feature's gain that counts, since features of a scan and of the next one are dependent; its limit.
 _OF_GAIN, _LIMIT_OF_GAIN = 0.25, 3.0
 

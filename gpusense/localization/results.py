@@ -13,7 +13,7 @@ from gpusense.backends.base import Backend
 from gpusense.localization.diagnosis import Diagnosis, diagnose
 from gpusense.localization.estimates import Estimate, clustered, covariance_of
 from gpusense.localization.filter_cloud import FilterCloud
-from gpusense.localization.journal import Whole, settled, whole
+from gpusense.localization.journal import Whole, settled
 from gpusense.localization.options import Options
 from gpusense.localization.rival import Rival, evidence_of
 from gpusense.localization.sensors import Sensor
@@ -72,7 +72,8 @@ class Results(Whole, ABC):
         """Number of particles of the next step."""
         return self._cloud.count
 
-    @whole
+    # The verdict's state is one assignment.
+    @settled
     def estimate(self, method: str = "mean") -> Estimate:
         """Return the pose of the robot.
 

@@ -39,7 +39,7 @@ def locate_scan(
     angle: float = 0.0175,
     positions: Literal["free", "all"] = "free",
     modes: int = 10,
-    min_probability: float = 0.8,
+    min_probability: float = 0.7,
     refine: bool = True,
 ) -> Location:
     """Find the likeliest pose of a scan on a grid of poses over the whole map, without a guess.

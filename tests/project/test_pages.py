@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from support.pages import commands, is_ours, run_page
+from support.pages import commands, is_ours, parsed, run_page, visible
 from support.paths import ROOT
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -19,6 +19,18 @@ def test_blocks_run(page, tmp_path, needs):
     needs("opencl")
     needs("warp")
     run_page(page, tmp_path)
+
+
+# At most one block in this number may be skipped, under a condition as well.
+SKIPPED = 20
+
+
+def test_few_blocks_are_skipped():
+    examples = [example for page in PAGES for example in parsed(page).examples()]
+    blocks = sum(map(visible, examples))
+    skips = sum(isinstance(example.parsed, tuple) for example in examples)
+    assert blocks > 45
+    assert 0 < skips <= blocks / SKIPPED
 
 
 SHELL = 'gpusense fit --map map.yaml \\\n    --out "a b"  # a comment\n\ngpusense devices\n'

@@ -1,4 +1,4 @@
-r"""
+"""
 The density over the expected range
 ===================================
 

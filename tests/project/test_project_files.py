@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 import tomllib
 
 import pytest
@@ -76,3 +78,21 @@ def test_templates_are_yaml(path):
     if not path.is_file():
         pytest.skip("only the checkout has it")
     assert isinstance(yaml.safe_load(path.read_text(encoding="utf-8")), dict)
+
+
+# Largest sizes [bytes]: twice those of the first release.
+SIZES = {".whl": 2.6e6, ".gz": 10.5e6}
+
+
+@pytest.mark.slow
+def test_what_is_published_is_sound_and_small(tmp_path):
+    pytest.importorskip("twine")
+    build = [sys.executable, "-m", "build", "--no-isolation", "--outdir", tmp_path, ROOT]
+    subprocess.run(build, cwd=tmp_path, check=True, capture_output=True)
+    files = sorted(tmp_path.iterdir())
+    assert {file.suffix for file in files} == set(SIZES)
+    for file in files:
+        assert file.stat().st_size < SIZES[file.suffix], file.name
+    check = [sys.executable, "-m", "twine", "check", "--strict", *files]
+    done = subprocess.run(check, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout

@@ -1,4 +1,4 @@
-"""Destructors work when the interpreter ends, which sets the names of modules to None before it frees the last objects."""
+"""Destructors work when the interpreter ends, which empties modules before it frees the last objects."""
 
 from __future__ import annotations
 

@@ -19,8 +19,9 @@ parameters = gs.BeamParameters(z_hit=0.6, z_short=0.2, z_max=0.1, z_rand=0.1, si
 cells = np.zeros((1, 101), dtype=np.int8)
 cells[0, 100] = 100
 grid = gs.OccupancyGrid(cells, resolution=0.05)
-z = (np.arange(COUNT) + 0.5) * RANGE_MAX / COUNT
-poses = np.column_stack([5.0 - z, np.full(COUNT, 0.025), np.zeros(COUNT)])  # the wall is z away
+expected = (np.arange(COUNT) + 1) * RANGE_MAX / COUNT
+z = expected - RANGE_MAX / COUNT / 2
+poses = np.column_stack([5.0 - expected, np.full(COUNT, 0.025), np.zeros(COUNT)])
 
 model = gs.BeamModel(grid, gs.Scanner(np.zeros(COUNT), RANGE_MAX), parameters, precision="float64", backend="numpy")
 density = np.exp(model.log_likelihood(poses, z, per_beam=True)[1])  # rows: expected, columns: measured

@@ -43,6 +43,7 @@ def things():
     """Return an object of each kind, by name."""
     grid = gs.worlds.building(seed=4, size=(14.0, 12.0))
     run = gs.worlds.simulate_run(grid, SCANNER, scans=3)
+    drive = gs.worlds.simulate_run(grid, gs.Scanner([0.0], 8.0), scans=60)
     beam = gs.BeamModel(grid, SCANNER, backend="numpy")
     field = gs.LikelihoodFieldModel(grid, SCANNER, backend="numpy", beams=20)
     landmarks = gs.LandmarkMap([(5, 0), (0, 5)])
@@ -71,13 +72,16 @@ def things():
         "2 scan matches": gs.match_scan(run.scans[:2], run.scans[1:], SCANNER, backend="numpy"),
         "Location": gs.locate_scan(field, run.scans[0], resolution=0.2, angle=0.1),
         "MapMatch": gs.match_map(grid, grid, (0, 0, 0), (0.2, 0.2, 0.1), backend="numpy"),
+        "DiscreteFit": gs.DiscreteBeamModel.learn(run.scans, expected, range_max=8.0, bins=40).fit,
+        "MotionFit": gs.fit_odometry_motion(drive.odometry, drive.poses),
         "PositionFix": gs.trilaterate([(0.0, 0.0), (4.0, 0.0)], [2.5, 2.5], sigma=0.1),
     }  # fmt: skip
 
 
 NAMES = (
     "OccupancyGrid", "BeamModel", "LikelihoodFieldModel", "LandmarkModel", "HeadingModel", "BeamFit", "IncidenceFit",
-    "PointFit", "LandmarkFit", "Estimate", "ScanMatch", "2 scan matches", "Location", "MapMatch", "PositionFix",
+    "PointFit", "LandmarkFit", "Estimate", "ScanMatch", "2 scan matches", "Location", "MapMatch",
+    "PositionFix", "DiscreteFit", "MotionFit",
 )  # fmt: skip
 
 

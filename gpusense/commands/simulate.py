@@ -43,7 +43,7 @@ example:
   gpusense simulate --world office --map-out office.yaml --log-out run.log
   gpusense localize --map office.yaml --log run.log
   gpusense simulate --map office.yaml --log-out crowded.log.gz --hidden 0.3 --moved 0.1 --seed 7
-  gpusense simulate --map office.yaml --log-out run.bag --format ros1 --mount 0.2 0 0 --tum truth.tum"""
+  gpusense simulate --map office.yaml --log-out run.bag --mount 0.2 0 0 --tum truth.tum"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,9 +55,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     source.add_argument("--world", metavar="NAME", help="a generated map instead: office, corridor, hall or twins, "
                         "or one of these with a seed of its own, as in office:3")  # fmt: skip
     add("--log-out", required=True, type=Path, metavar="FILE", help="the log to write")
-    add("--format", choices=("carmen", "ros1", "ros2"), default="carmen",
+    add("--format", choices=("carmen", "ros1", "ros2"),
         help="a CARMEN log, compressed where the name ends in .gz; a bag of ROS 1 (.bag); a new folder with a bag of "
-        "ROS 2 (default: %(default)s)")  # fmt: skip
+        "ROS 2 (default: by the name, ros1 for .bag and carmen for others)")  # fmt: skip
     add("--map-out", type=output_path(".yaml"), metavar="YAML", help="write the robot's map")
     add("--world-out", type=output_path(".yaml"), metavar="YAML", help="write the world as it is, without people")
     add("--tum", type=output_path(".tum", ".txt"), metavar="FILE", help="write the true poses of the robot")
@@ -122,7 +122,7 @@ def run(args: argparse.Namespace) -> int:
     from gpusense.evaluation.trajectory_files import read_tum, write_tum
     from gpusense.world.map_files import read_map, write_map
 
-    _check_output(args)
+    args.format = _check_output(args)
     grid = read_map(args.map) if args.map else _generated(args.world, args.seed)
     world = None if args.true_map is None else read_map(args.true_map)
     path = None if args.path is None else read_tum(args.path)[1]
@@ -143,22 +143,25 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _check_output(args: argparse.Namespace) -> None:
-    """Check that the log can be written before any work is done.
+def _check_output(args: argparse.Namespace) -> str:
+    """Return the format of the log, and check that it can be written before any work is done.
 
     Raises:
         ValueError, OSError: it cannot.
     """
     from gpusense._util.files import check_writable
+    from gpusense.evaluation.simulation.files import kind_of
     from gpusense.logs.bag_writer import check_bag
 
-    if args.format == "carmen":
+    kind = kind_of(args.log_out) if args.format is None else str(args.format)
+    if kind == "carmen":
         check_writable(args.log_out)
-        return
+        return kind
     try:
-        check_bag(args.log_out, first=args.format == "ros1")
+        check_bag(args.log_out, first=kind == "ros1")
     except ImportError as error:
         raise ValueError(f"--format: {error}") from None
+    return kind
 
 
 def _generated(name: str, seed: int) -> OccupancyGrid:

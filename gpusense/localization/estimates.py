@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gpusense._util.html import card, pose_rows
 from gpusense.localization.pose_algebra import mean_pose, wrap_angle
 from gpusense.localization.words import LOST, Word
 
@@ -56,6 +57,11 @@ class Estimate:
             f"Estimate(x={x:.3f}, y={y:.3f}, theta={theta:.3f}, deviations=({deviations}), "
             f"p_lost={self.p_lost:.2g}, verdict={self.verdict!r})"
         )
+
+    def _repr_html_(self) -> str:
+        rows = [*pose_rows(self.pose, self.covariance), ("p_lost", self.p_lost, ""), ("explained", self.explained, ""),
+                ("effective sample size", self.effective_sample_size, f"of {self.particles}")]  # fmt: skip
+        return card(f"Estimate: {self.verdict}", rows, head=("", "value", "deviation"))
 
     @property
     def lost(self) -> bool:

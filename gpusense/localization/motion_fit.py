@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 
 from gpusense._util import checks
+from gpusense._util.html import card
 from gpusense._util.typing import AnyArray
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.motion import OdometryMotion, odometry_turns
@@ -85,6 +86,16 @@ class MotionFit:
     turned: float = 0.0
     log_errors: tuple[float, ...] = ()
     undetermined: tuple[str, ...] = ()
+
+    def _repr_html_(self) -> str:
+        motion = self.motion
+        values: list[tuple[str, object]] = [(f"alpha{k}", value) for k, value in enumerate(motion.alpha, 1)]
+        values += [(name, getattr(motion, name)) for name in ("reverse", "least", "systematic", "sideways")]
+        rows: list[tuple[object, ...]] = [
+            (name, value, "not determined" if name in self.undetermined else "") for name, value in values
+        ]
+        rows += [("inflation", self.inflation, ""), ("steps", self.steps, f"over {self.travelled:.1f} m")]
+        return card("MotionFit", rows)
 
 
 def fit_odometry_motion(odometry: AnyArray, poses: AnyArray, *, systematic: bool = True) -> MotionFit:

@@ -8,6 +8,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.html import card
+
 Floats = NDArray[np.float64]
 Status = Literal["found", "ambiguous", "no match"]
 
@@ -79,6 +81,12 @@ class Location:
     angle: float
     poses: int
     evaluated: int
+
+    def _repr_html_(self) -> str:
+        rows = [("pose", *self.pose.round(3).tolist(), self.score)]
+        rows += [(f"mode {k}", *mode.pose.round(3).tolist(), mode.score) for k, mode in enumerate(self.modes, 1)]
+        title = f"Location: {self.status}, p_right = {self.p_right:.3g}"
+        return card(title, rows, head=("", "x [m]", "y [m]", "theta [rad]", "score"))
 
     @property
     def found(self) -> bool:

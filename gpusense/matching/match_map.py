@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
+from gpusense._util.html import card
 from gpusense.backends import Selection, get_backend
 from gpusense.matching.align import Alignment
 from gpusense.matching.score_tables import TOP, ScoreTables, field_scores
@@ -69,6 +70,13 @@ class MapMatch:
     status: Literal["found", "ambiguous", "no match"]
     poses: int
     evaluated: int
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (f"mode {k}", *pose.round(3).tolist(), float(correlation))
+            for k, (pose, correlation) in enumerate(zip(self.modes, self.correlations, strict=True), 1)
+        ]
+        return card(f"MapMatch: {self.status}", rows, head=("", "x [m]", "y [m]", "theta [rad]", "correlation"))
 
     @property
     def found(self) -> bool:

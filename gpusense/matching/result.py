@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.html import card, pose_rows
 from gpusense.matching.observability import covariance_of
 
 Floats = NDArray[np.float64]
@@ -141,6 +142,13 @@ class ScanMatch:
             return f"{self.status}: {STATUSES[self.status]}"
         names, counts = np.unique(self.status, return_counts=True)
         return "\n".join(f"{count} {name}: {STATUSES[name]}" for name, count in zip(names, counts, strict=True))
+
+    def _repr_html_(self) -> str:
+        if not isinstance(self.status, str):
+            return card(f"{len(self)} scan matches", [(line,) for line in self.explain().splitlines()])
+        rows = [*pose_rows(self.pose, self.covariance), ("p_right", float(self.p_right), ""),
+                ("score", float(self.score), "")]  # fmt: skip
+        return card(f"ScanMatch: {self.status}", rows, head=("", "value", "deviation"), detail=self.explain())
 
     def __repr__(self) -> str:
         if isinstance(self.status, str):

@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.html import card
+
 Floats = NDArray[np.float64]
 
 STATUSES = {
@@ -93,6 +95,14 @@ class PositionFix:
     def explain(self) -> str:
         """Return the status and its meaning."""
         return f"{self.status}: {STATUSES[self.status]}"
+
+    def _repr_html_(self) -> str:
+        names = ("x [m]", "y [m]", "theta [rad]")[: self.solutions.shape[1]]
+        rows = [
+            (f"solution {k}", *map(float, solution), float(deviation))
+            for k, (solution, deviation) in enumerate(zip(self.solutions, self.deviation, strict=True), 1)
+        ]
+        return card(f"PositionFix: {self.status}", rows, head=("", *names, "deviation [m]"), detail=self.explain())
 
     def __repr__(self) -> str:
         text = f"PositionFix({self.status!r}, {len(self)} solution{'s' * (len(self) != 1)}"

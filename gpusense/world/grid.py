@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
+from gpusense._util.html import card
 from gpusense.world.messages import field, planar_pose, real_field
 from gpusense.world.plausible import look_at_grid
+from gpusense.world.thumbnail import thumbnail
 
 SMALLEST_RESOLUTION, LARGEST_RESOLUTION = 1e-4, 1e3
 """Bounds of the side of a cell [m]."""
@@ -280,6 +282,18 @@ class OccupancyGrid:
             f"OccupancyGrid({rows} x {cols} cells, {100 * share:.3g}% occupied, resolution={self._resolution}, "
             f"origin={self._origin}, occupied_threshold={self._occupied_threshold})"
         )
+
+    def _repr_html_(self) -> str:
+        rows, cols = self.shape
+        shares = ((name, np.count_nonzero(mask) / max(self._cells.size, 1)) for name, mask in
+                  (("occupied", self.occupied), ("unknown", self.unknown)))  # fmt: skip
+        table = [
+            ("cells", f"{rows} x {cols} of {self._resolution:g} m"),
+            ("size [m]", f"{self.width:g} x {self.height:g}"),
+            ("origin", self._origin),
+            *((name, f"{share:.1%}") for name, share in shares),
+        ]
+        return card("OccupancyGrid", table, picture=thumbnail(self))
 
     def __reduce__(self) -> tuple[Callable[..., OccupancyGrid], tuple[Any, ...]]:
         # Copies and pickles call the constructor, so that their cells are read-only too.

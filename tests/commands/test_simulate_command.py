@@ -116,7 +116,15 @@ def test_parameters_of_a_fit_are_those_of_the_readings(office, capsys):
     assert abs(json.loads(capsys.readouterr().out)["fit"]["parameters"]["sigma_hit"] - 0.2) < 0.01
 
 
+def test_a_name_that_ends_in_bag_makes_a_bag(office):
+    pytest.importorskip("rosbags")
+    assert main(["simulate", "--map", "office.yaml", *FEW, "--log-out", "run.bag"]) == 0
+    assert (office / "run.bag").read_bytes().startswith(b"#ROSBAG")
+    assert len(list(gs.read_log("run.bag"))) == 20
+
+
 BAD = {
+    "a file of a bag of ROS 2": (["--world", "office", "--log-out", "run.mcap"], "a bag of ROS 2 is a folder"),
     "a world that there is not": (["--world", "castle"], "--world: must be one of office, corridor, hall, twins"),
     "a seed that is no number": (["--world", "office:x"], "--world: must be one of"),
     "a map that is missing": (["--map", "none.yaml"], "none.yaml: must exist, got no such file"),
@@ -137,5 +145,5 @@ def test_bad_input_is_one_line_and_writes_nothing(name, tmp_path, monkeypatch, c
         assert main(["simulate", "--log-out", "run.log"]) == 2
         assert message in capsys.readouterr().err
     else:
-        assert message in error_of(["simulate", *options, "--log-out", "run.log"], capsys)
+        assert message in error_of(["simulate", "--log-out", "run.log", *options], capsys)
     assert not list(tmp_path.iterdir())

@@ -34,11 +34,12 @@ class SharedBuffer(cl.SVMAllocation):
         self.bytes: np.ndarray = np.ctypeslib.as_array((ctypes.c_uint8 * size).from_address(self.svm_ptr))
         self._settle = settle
 
-    def __del__(self) -> None:
+    def __del__(self, run: Callable[[Callable[[], object]], None] = undisturbed) -> None:
+        # As a default, the function is there when the interpreter ends and has emptied its modules.
         # The driver does not keep it alive for queued commands, as it does a buffer. Freed through the queue, as
         # pyopencl can also do, it ended in a corrupted heap with PoCL 3. Without an allocation there is no attribute.
         if (settle := getattr(self, "_settle", None)) is not None:
-            undisturbed(settle)
+            run(settle)
 
 
 class SharedPart(cl.SVM):  # type: ignore[type-arg]

@@ -50,11 +50,12 @@ class OpenCLRecording(Recording):
             queue.flush()
         self._count(len(self._launches))
 
-    def __del__(self) -> None:
+    def __del__(self, run: Callable[[Callable[[], object]], None] = undisturbed) -> None:
+        # As a default, the function is there when the interpreter ends and has emptied its modules.
         # Memory that is shared with the host must not go while a queue works on it.
         # An interrupt may come before there is one.
         if getattr(self, "_used", None):
-            undisturbed(self._wait_for_all)
+            run(self._wait_for_all)
 
     def wait(self) -> None:
         """See Recording.wait."""

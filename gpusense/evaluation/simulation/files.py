@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from gpusense.world.scanner import Scanner
 FORMATS = ("carmen", "ros1", "ros2")
 
 
-def write_run(run: SimulatedRun, path: str | os.PathLike[str], kind: str = "carmen") -> None:
+def write_run(run: SimulatedRun, path: str | os.PathLike[str], kind: str | None = None) -> None:
     """Write a simulated run as a log that ``read_log`` reads.
 
     Args:
@@ -26,7 +27,8 @@ def write_run(run: SimulatedRun, path: str | os.PathLike[str], kind: str = "carm
         path: The log.
         kind: ``"carmen"``, compressed where the name ends in ``.gz``, whose poses are the true ones; they are those of
             the laser, as the format has no mount. ``"ros1"``, a bag of ROS 1 whose name ends in ``.bag``; ``"ros2"``,
-            the folder of a bag of ROS 2, which must not exist: both have the mount, and no true poses.
+            the folder of a bag of ROS 2, which must not exist: both have the mount, and no true poses. None takes
+            ``"ros1"`` where the name ends in ``.bag``, and else ``"carmen"``.
 
     Raises:
         TypeError, ValueError: an argument is not of the kind described, or the format cannot hold the scans.
@@ -45,10 +47,25 @@ def write_run(run: SimulatedRun, path: str | os.PathLike[str], kind: str = "carm
     if not isinstance(run, SimulatedRun):
         raise TypeError(f"run: must be a SimulatedRun, got {checks.show(run)}")
     file = checks.path("path", path)
-    if checks.choice("kind", kind, FORMATS) == "carmen":
+    kind = kind_of(file) if kind is None else checks.choice("kind", kind, FORMATS)
+    if kind == "carmen":
         write_carmen(file, records_of(run, of_laser=True))
         return
     write_bag(file, records_of(run), first=kind == "ros1")
+
+
+def kind_of(path: Path) -> str:
+    """Return the format of a log by its name.
+
+    Raises:
+        ValueError: the name is that of a file within a bag of ROS 2.
+    """
+    suffix = path.suffix.lower()
+    if suffix in (".db3", ".mcap"):
+        raise ValueError(
+            f"{path}: must not end in .db3 or .mcap; a bag of ROS 2 is a folder, format ros2, got {suffix!r}"
+        )
+    return "ros1" if suffix == ".bag" else "carmen"
 
 
 def records_of(run: SimulatedRun, *, of_laser: bool = False) -> Iterator[Scan]:

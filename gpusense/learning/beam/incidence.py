@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
+from gpusense._util.html import card
 from gpusense._util.typing import FitMethod, Precision
 from gpusense.backends import Selection
 from gpusense.learning.beam.blocks import check_blocks
@@ -94,6 +95,16 @@ class IncidenceFit:
             f"IncidenceFit({len(self.fits)} bins, {sum(self.counts)} readings, "
             f"no_surface_count={self.no_surface_count}, strength={self.strength:g}, converged={self.converged})"
         )
+
+    def _repr_html_(self) -> str:
+        names = list(self.pooled.standard_errors)
+        edges = np.degrees(self.parameters.edges)
+        bins = [f"{low:.0f} to {high:.0f}" for low, high in pairwise(edges)]
+        rows = [
+            (name, count, *(getattr(fit.parameters, each) for each in names))
+            for name, count, fit in zip(bins, self.counts, self.fits, strict=True)
+        ]
+        return card("IncidenceFit", rows, head=("incidence [deg]", "readings", *names), detail=str(self))
 
     def __str__(self) -> str:
         names = [*self.pooled.standard_errors, *(["range_bias"] if self.pooled.bias_fitted else [])]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.html import FIT_HEAD, card
 from gpusense.world.parameters import BeamParameters
 
 _UNITS = {"sigma_hit": "m", "lambda_short": "1/m", "range_bias": "m"}
@@ -101,6 +102,15 @@ class BeamFit:
     def __repr__(self) -> str:
         values = ", ".join(f"{name}={value:.4g}" for name, value in self.parameters.to_dict().items())
         return f"BeamFit({values}, converged={self.converged})"
+
+    def _repr_html_(self) -> str:
+        rows: list[tuple[object, ...]] = [
+            (name, getattr(self.parameters, name), _error(error), self.held.get(name, ""))
+            for name, error in self.standard_errors.items()
+        ]
+        kind = "fitted" if self.bias_fitted else "estimated, not in the parameters"
+        rows.append(("range_bias", self.range_bias, _error(self.range_bias_error), kind))
+        return card(f"BeamFit: {self.status}", rows, head=FIT_HEAD, detail=str(self))
 
     def __str__(self) -> str:
         lines = [

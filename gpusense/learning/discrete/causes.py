@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from gpusense._util.html import card
 from gpusense.world.parameters import _Parameters
 
 
@@ -79,3 +80,7 @@ class DiscreteFit:
             f"DiscreteFit(log_likelihood={self.log_likelihood:.6g}, hits={self.hits}, max={self.max}, "
             f"missing={self.missing}, converged={self.converged})"
         )
+
+    def _repr_html_(self) -> str:
+        rows = list(self.standard_errors.items())
+        return card(f"DiscreteFit: {self.status}", rows, head=("parameter", "standard error"), detail=repr(self))

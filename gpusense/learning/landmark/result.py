@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.html import FIT_HEAD, card
 from gpusense.world.parameters import LandmarkParameters
 
 _UNITS = {"sigma_range": "m", "sigma_bearing": "rad", "range_bias": "m", "bearing_bias": "rad"}
@@ -92,6 +93,14 @@ class LandmarkFit:
         values = [(name, getattr(self.parameters, name)) for name in names]
         text = ", ".join(f"{name}={value:.4g}" for name, value in values if value is not None)
         return f"LandmarkFit({text}, converged={self.converged})"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (name, value, error, self.held.get(name, ""))
+            for name, error in self.standard_errors.items()
+            if (value := getattr(self.parameters, name)) is not None
+        ]
+        return card(f"LandmarkFit: {self.status}", rows, head=FIT_HEAD, detail=str(self))
 
     def __str__(self) -> str:
         rows = [

@@ -9,6 +9,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.html import FIT_HEAD, card
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.sensor_parameters import BeaconParameters, BumperParameters, HeadingParameters, PositionParameters
 
@@ -82,6 +83,12 @@ class PointFit(Generic[P]):
     def __repr__(self) -> str:
         text = ", ".join(f"{name}={value:.4g}" for name, value in self.values.items())
         return f"PointFit({text}, converged={self.converged})"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (name, value, self.standard_errors[name], self.held.get(name, "")) for name, value in self.values.items()
+        ]
+        return card(f"PointFit: {self.status}", rows, head=FIT_HEAD, detail=str(self))
 
     def __str__(self) -> str:
         title = f"{'parameter':16}{'value':>13}{'std. error':>13}"

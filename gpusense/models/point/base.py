@@ -10,6 +10,7 @@ from typing import Any, cast
 import numpy as np
 
 from gpusense._util import checks
+from gpusense._util.html import card, split_options
 from gpusense._util.typing import Precision
 from gpusense.backends import BackendInfo, Selection, get_backend
 from gpusense.backends.base import Backend, Buffer
@@ -68,6 +69,11 @@ class PointModel(Pickled):
     def __repr__(self) -> str:
         parts = (*self._options(), f"precision={self.precision!r}", f"backend={self.device.selection!r}")
         return f"{type(self).__name__}({', '.join(parts)})"
+
+    def _repr_html_(self) -> str:
+        device = f"{self.device.selection} ({self.device.name}), {self.precision}"
+        rows = [*split_options(self._options()), ("device", device)]
+        return card(type(self).__name__, rows, detail=self.explain())
 
     def _arguments(self) -> dict[str, Any]:
         """See Pickled; subclasses add their own."""

@@ -11,6 +11,7 @@ from typing import Any, Literal, cast, overload
 import numpy as np
 
 from gpusense._util import checks
+from gpusense._util.html import card, split_options
 from gpusense._util.typing import AnyArray, Compat, Precision
 from gpusense.backends import Backend, BackendInfo, Selection, get_backend
 from gpusense.backends.workspace import Workspace
@@ -91,6 +92,17 @@ class ScanModel(Pickled):
         parts += [] if self.compat is None else [f"compat={self.compat!r}"]
         parts += [f"precision={self.precision!r}", f"backend={self.device.selection!r}"]
         return f"{type(self).__name__}({', '.join(parts)})"
+
+    def _repr_html_(self) -> str:
+        count, used = self.scanner.count, self._setting.rules.choice.most
+        options = (*self._options(), *(() if self.compat is None else (f"compat={self.compat!r}",)))
+        rows = [
+            ("map", map_words(self.grid)),
+            ("beams", count if used == count else f"{used} of {count}"),
+            *split_options(options),
+            ("device", f"{self.device.selection} ({self.device.name}), {self.precision}"),
+        ]
+        return card(type(self).__name__, rows, detail=self.explain())
 
     def _arguments(self) -> dict[str, Any]:
         """See Pickled; subclasses add their own."""

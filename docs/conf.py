@@ -1,0 +1,72 @@
+"""Settings of the site, whose source is the whole checkout: python -m sphinx -W -c docs . site"""
+
+from __future__ import annotations
+
+import gc
+import sys
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parent))
+from reference_pages import write_pages
+
+import gpusense
+
+ROOT = Path(__file__).parents[1]
+
+project = "gpusense"
+author = "The gpusense developers"
+copyright = author
+version = release = gpusense.__version__
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_gallery.gen_gallery"]
+root_doc = "docs/index"
+include_patterns = [
+    "docs/**.md", "docs/**.rst", "bench/RESULTS.md", "bench/results/*.md", "CHANGELOG.md", "CODE_OF_CONDUCT.md",
+    "CONTRIBUTING.md", "README.md", "SECURITY.md", "examples/ros2/**/README.md",
+]  # fmt: skip
+exclude_patterns = ["**/.*", "site", "docs/tour/GALLERY_HEADER.rst"]
+# Reports begin with the heading that they have in a page.
+suppress_warnings = ["myst.header", "config.cache"]
+
+myst_heading_anchors = 4
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"
+autodoc_inherit_docstrings = True
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+napoleon_attr_annotations = False
+
+sphinx_gallery_conf = {
+    "examples_dirs": [str(ROOT / "docs" / "tour")],
+    "gallery_dirs": ["docs/lectures"],
+    "within_subsection_order": "FileNameSortKey",
+    "filename_pattern": r"/\d\d_",
+    "remove_config_comments": True,
+    "min_reported_time": 3600,
+    "show_memory": False,
+    "show_signature": False,
+    "download_all_examples": False,
+    "abort_on_example_error": True,
+    "write_computation_times": False,
+}
+
+html_theme = "furo"
+html_title = f"gpusense {version}"
+html_extra_path = ["front"]
+html_copy_source = False
+
+
+def mark_reports(app: Any, name: str, source: list[str]) -> None:
+    """Say that a report stands in no table of contents; pages link to it."""
+    if name.startswith("bench/results/"):
+        source[0] = f"---\norphan: true\n---\n{source[0]}"
+
+
+def setup(app: Any) -> None:
+    """Write the pages of the public names before Sphinx looks for pages."""
+    write_pages(ROOT / "docs" / "api")
+    app.connect("source-read", mark_reports)
+    # Devices' memory of the tour's programs is freed before the interpreter ends.
+    app.connect("build-finished", lambda *_: gc.collect())

@@ -1,0 +1,80 @@
+"""Small tables in HTML, as notebooks show objects that have ``_repr_html_``; everything in them is escaped."""
+
+from __future__ import annotations
+
+import base64
+import html
+import struct
+import zlib
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+FIT_HEAD = ("parameter", "value", "standard error", "")
+"""Headings of the table of a fit."""
+LONGEST = 2000
+"""Most characters of a cell or of a detail; the rest is left out."""
+
+
+def card(
+    title: str, rows: Iterable[Sequence[object]], *, head: Sequence[str] = (), detail: str = "", picture: bytes = b""
+) -> str:
+    """Return a table with a title.
+
+    Args:
+        title: The title, usually the name of a class.
+        rows: Cells of each row. The first one is the row's heading; floats have five digits.
+        head: Headings of the columns; none by default.
+        detail: Text below the table that a click opens.
+        picture: A PNG beside the table.
+    """
+    parts = [f"<b>{_text(title)}</b>"]
+    if picture:
+        code = base64.b64encode(picture).decode("ascii")
+        parts.append(f'<br><img alt="{_text(title)}" src="data:image/png;base64,{code}">')
+    lines = [f"<tr>{''.join(f'<th>{_text(name)}</th>' for name in head)}</tr>"] if head else []
+    for first, *others in rows:
+        cells = "".join(f"<td>{_text(cell)}</td>" for cell in others)
+        lines.append(f"<tr><th>{_text(first)}</th>{cells}</tr>")
+    parts.append(f"<table>{''.join(lines)}</table>")
+    if detail:
+        parts.append(f"<details><summary>more</summary><pre>{_text(detail)}</pre></details>")
+    return f"<div>{''.join(parts)}</div>"
+
+
+def split_options(options: Iterable[str]) -> list[tuple[str, str]]:
+    """Return names and values of options as ``repr`` shows them, such as ``caster=Exact()``."""
+    found = []
+    for option in options:
+        name, equals, value = option.partition("=")
+        found.append((name, value) if equals else ("", name))
+    return found
+
+
+def pose_rows(pose: NDArray[np.floating], covariance: NDArray[np.floating]) -> list[tuple[object, ...]]:
+    """Return the rows of a pose with its standard deviations."""
+    deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
+    names = ("x [m]", "y [m]", "theta [rad]")
+    return [(name, float(value), error) for name, value, error in zip(names, pose.tolist(), deviations, strict=True)]
+
+
+def grey_png(pixels: NDArray[np.uint8]) -> bytes:
+    """Return (H, W) grey values as a PNG."""
+    rows, cols = pixels.shape
+    lines = np.zeros((rows, cols + 1), np.uint8)  # each begins with its filter, none
+    lines[:, 1:] = pixels
+    chunks = (
+        (b"IHDR", struct.pack(">IIBBBBB", cols, rows, 8, 0, 0, 0, 0)),
+        (b"IDAT", zlib.compress(lines.tobytes(), 9)),
+        (b"IEND", b""),
+    )
+    packed = [
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    ]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
+
+
+def _text(value: object) -> str:
+    text = f"{value:.5g}" if isinstance(value, float) else str(value)
+    return html.escape(text if len(text) <= LONGEST else f"{text[:LONGEST]} ...")

@@ -63,8 +63,9 @@ def test_blocks_share_names_and_files(tmp_path):
     page = tmp_path / "page.md"
     page.write_text(
         "```yaml\n# a.yaml\nb: 1\n```\n<!-- invisible-code-block: python\ntext = open('a.yaml').read()\n-->\n"
+        "```python\nassert __name__ == '__main__'\n```\n"
         "```python\nassert text == '# a.yaml\\nb: 1\\n'\n```\n```sh\nls none\n```\n"
         '<!-- skip: next "why" -->\n\n```python\n1 / 0\n```\n'
     )
     run = run_page(page, tmp_path)
-    assert (run.ran, run.skipped) == (1, 1)
+    assert (run.ran, run.skipped) == (2, 1)

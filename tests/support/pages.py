@@ -81,8 +81,10 @@ def visible(example: Example) -> bool:
 def run_page(page: Path, folder: Path) -> PageRun:
     """Run a page's blocks in a folder, and count them."""
     run = PageRun()
+    document = parsed(page)
+    document.namespace["__name__"] = "__main__"  # as a program that is started
     with contextlib.chdir(folder), mock.patch.dict(os.environ):
-        for example in parsed(page).examples():
+        for example in document.examples():
             try:
                 example.evaluate()
             except SkipTest:

@@ -1,0 +1,122 @@
+"""Circles through parts of scans: poles, and walls that are round.
+
+The distance of a point from a circle is measured along its radius; errors of ranges enter by the cosine of the angle of
+incidence, which is that of the first guess, at least ``STEEPEST``. The bearings of the edges of a pole, between its last
+beam and the next one, are measurements of ``asin(radius / distance)``. Levenberg's and Marquardt's steps minimise the sum
+of squares over centre and radius.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.interface.constants import CIRCLE_NUMBERS
+
+# Steps of a fit, and the smallest cosine of an angle of incidence.
+CIRCLE_STEPS, STEEPEST = 25, 0.3
+WHOLE_TURN = 6.283185307179586
+
+
+def wrapped(angle: np.ndarray) -> np.ndarray:
+    """Return an angle in -pi to pi."""
+    result: np.ndarray = angle - WHOLE_TURN * np.floor(angle / WHOLE_TURN + 0.5)
+    return result
+
+
+def pole_guess(mine: np.ndarray, edge: np.ndarray) -> np.ndarray:
+    """Return centre and radius of the pole between two bearings that has the mean range of some points."""
+    half = np.sin(min(0.5 * wrapped(edge[1] - edge[0]), 1.2))
+    middle = edge[0] + 0.5 * wrapped(edge[1] - edge[0])
+    distance = mine[:, 3].mean() / (1 - 0.785 * half)
+    return np.array([distance * np.cos(middle), distance * np.sin(middle), distance * half])
+
+
+def arc_guess(mine: np.ndarray) -> np.ndarray:
+    """Return centre and radius by linear least squares (Kasa 1976)."""
+    mean = mine[:, :2].mean(axis=0)
+    x, y = (mine[:, :2] - mean).T
+    square = x * x + y * y
+    xx, xy, yy, xs, ys = x @ x, x @ y, y @ y, x @ square, y @ square
+    whole = xx * yy - xy * xy
+    if whole <= 0:
+        return np.array([0.0, 0.0, 0.0])
+    a, b = 0.5 * (yy * xs - xy * ys) / whole, 0.5 * (xx * ys - xy * xs) / whole
+    return np.array([mean[0] + a, mean[1] + b, np.sqrt(a * a + b * b + square.mean())])
+
+
+def circle_sums(mine: np.ndarray, edge: np.ndarray, guess: np.ndarray, circle: np.ndarray, sigma: float) -> np.ndarray:
+    """Return the cost of a circle, its gradient (3) and its information (6: xx, xy, xr, yy, yr, rr)."""
+    x, y, r = mine[:, 0] - circle[0], mine[:, 1] - circle[1], np.hypot(mine[:, 0] - circle[0], mine[:, 1] - circle[1])
+    first_distance = np.hypot(guess[0], guess[1])
+    sine = first_distance * np.sin(mine[:, 2] - np.arctan2(guess[1], guess[0])) / guess[2]
+    share = np.sqrt(np.maximum(1 - sine * sine, STEEPEST * STEEPEST)) * sigma
+    rows = np.column_stack([-x / r, -y / r, np.full(len(r), -1.0), r - circle[2]]) / share[:, None]
+    if edge[2] > 0:
+        distance = np.hypot(circle[0], circle[1])
+        sine = min(circle[2] / distance, 0.99)
+        slope = 1 / np.sqrt(1 - sine * sine)
+        bearing, both = np.arctan2(circle[1], circle[0]), np.array(circle[:2])
+        for side, place, deviation in ((-1.0, edge[0], edge[2]), (1.0, edge[1], edge[3])):
+            error = wrapped(bearing + side * np.arcsin(sine) - place)
+            across = np.array([-both[1], both[0]]) / distance**2
+            inward = -side * slope * circle[2] / distance**3 * both
+            row = np.array([*(across + inward), side * slope / distance, error]) / deviation
+            rows = np.vstack([rows, row])
+    j, e = rows[:, :3], rows[:, 3]
+    information = j.T @ j
+    return np.array([e @ e, *(j.T @ e), *information[np.triu_indices(3)]])
+
+
+def damped_step(sums: np.ndarray, damping: float) -> np.ndarray:
+    """Return the step of centre and radius with the diagonal of the information raised."""
+    xx, xy, xr, yy, yr, rr = sums[4:10]
+    xx, yy, rr = xx * (1 + damping), yy * (1 + damping), rr * (1 + damping)
+    a, b, c = yy * rr - yr * yr, xr * yr - xy * rr, xy * yr - xr * yy
+    d, e, f = xx * rr - xr * xr, xy * xr - xx * yr, xx * yy - xy * xy
+    whole = xx * a + xy * b + xr * c
+    g = -sums[1:4]
+    if not whole > 0:
+        return np.zeros(3)
+    return np.array([a * g[0] + b * g[1] + c * g[2], b * g[0] + d * g[1] + e * g[2], c * g[0] + e * g[1] + f * g[2]]) / whole
+
+
+def fit_circle(mine: np.ndarray, edge: np.ndarray, sigma: float) -> np.ndarray:
+    """Return centre, radius, cost (-1 where no circle fits) and information of the circle through points."""
+    guess = pole_guess(mine, edge) if edge[2] > 0 else arc_guess(mine)
+    circle, damping = guess, 1e-3
+    if not (guess[2] > 0 and np.isfinite(guess).all()):
+        return np.array([0, 0, 0, -1.0, 0, 0, 0, 0, 0, 0])
+    sums = circle_sums(mine, edge, guess, circle, sigma)
+    for _ in range(CIRCLE_STEPS):
+        following = circle + damped_step(sums, damping)
+        better = circle_sums(mine, edge, guess, following, sigma)
+        if following[2] > 0 and better[0] <= sums[0]:
+            circle, sums, damping = following, better, max(0.1 * damping, 1e-9)
+        else:
+            damping = 10 * damping
+    return np.array([*circle, sums[0], *sums[4:10]])
+
+
+def fit_circles(
+    flags: frozenset[str],
+    point: np.ndarray,
+    start: np.ndarray,
+    noise: np.ndarray,
+    part: np.ndarray,
+    scan: np.ndarray,
+    edge: np.ndarray,
+    circle: np.ndarray,
+    scans: int,
+    points: int,
+    parts: int,
+) -> None:
+    """Fit circles to parts of scans, of a first point and a number of points.
+
+    Edges are the bearings of the right and the left edge and their deviations, which are 0 where edges are not seen.
+    """
+    for k in range(parts):
+        begin, end = start[scan[k]], start[scan[k] + 1]
+        index = begin + (part[k, 0] - begin + np.arange(part[k, 1])) % (end - begin)
+        mine = point[index].astype(np.float64)
+        found = fit_circle(mine, edge[k].astype(np.float64), float(noise[scan[k]]))
+        circle[CIRCLE_NUMBERS * k : CIRCLE_NUMBERS * (k + 1)] = found

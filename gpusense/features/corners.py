@@ -39,7 +39,10 @@ def find_corners(segments: Segments, straight: np.ndarray, mount: tuple[float, f
     spread = np.sqrt(np.einsum("cii->c", covariance[:, :2, :2]))
     space = (_BEAMS + between)[:, None] * np.stack([segments.spacing[one, 1], segments.spacing[two, 0]], axis=1)
     gap = np.stack([along[:, 0] - segments.ends[one, 1], segments.ends[two, 0] - along[:, 1]], axis=1)
-    meets = (np.abs(gap) <= space + _DEVIATIONS * spread[:, None]).all(axis=1)
+    # So near the vertex a point is on both lines, within noise.
+    noise = np.sqrt(np.maximum(segments.variance[one], segments.variance[two]))
+    reach = _DEVIATIONS * (spread + noise / np.abs(np.sin(turn)))
+    meets = (np.abs(gap) <= space + reach[:, None]).all(axis=1)
     pose = np.column_stack([vertex + np.array(mount[:2]), alpha + 0.5 * turn + math.pi])
     observed = np.broadcast_to(np.eye(3), (len(one), 3, 3))
     score = scores_of(segments, one) * scores_of(segments, two)

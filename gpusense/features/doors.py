@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from gpusense.features.beams import Beams
 from gpusense.features.hallways import pairs_of, wrapped
 from gpusense.features.lines import scores_of
 from gpusense.features.result import Found
@@ -17,11 +18,15 @@ _NARROWEST, _WIDEST = 0.5, 2.0
 _ASIDE, _PARALLEL, _DEVIATIONS = 0.03, math.radians(4), 3.0
 # Least length of a wall [m] and of its other side, and most uncertainty of a jamb across and along the wall [m].
 _WALL, _OTHER, _VAGUE, _COARSE = 0.5, 0.1, 0.05, 0.4
+# Uncertainty of a jamb at grazing incidence in deviations of ranges, as a step of beams.
+_REVEAL = 4.0
 # Share of the beams between the jambs that nothing stops before the wall, and that go on by this [m].
 _UNSTOPPED, _THROUGH, _DEEP = 0.6, 0.25, 0.4
 
 
-def find_doors(segments: Segments, straight: np.ndarray, mount: tuple[float, float, float]) -> Found:
+def find_doors(
+    segments: Segments, straight: np.ndarray, beams: Beams, mount: tuple[float, float, float]
+) -> Found:
     """Return the doors of scans: centre of the gap, direction across, and width."""
     sides = np.flatnonzero(np.isfinite(segments.distance) & (segments.count >= 3))
     one, two = pairs_of(segments.scan[sides])
@@ -36,9 +41,24 @@ def find_doors(segments: Segments, straight: np.ndarray, mount: tuple[float, flo
     good &= _on_wall(segments, wall, other)
     before, after, wall, other = before[good], after[good], wall[good], other[good]
     ends = np.stack([left[0][good], right[0][good], left[1][good], right[1][good]], axis=1)
-    open_share, through = _openness(segments, before, after, wall)
+    open_share, through = _openness(segments, beams, before, after, wall)
     good = (open_share >= _UNSTOPPED) & (through >= _THROUGH)
-    return _found(segments, wall[good], other[good], ends[good], through[good], mount)
+    wall, other, ends, through = wall[good], other[good], ends[good], through[good]
+    kept = _one_each(segments, wall, ends, straight[other])
+    return _found(segments, wall[kept], other[kept], ends[kept], through[kept], mount)
+
+
+def _one_each(segments: Segments, wall: np.ndarray, ends: np.ndarray, sure: np.ndarray) -> np.ndarray:
+    """Return the doors of which no other one overlaps, or that have long walls on both sides or are narrower."""
+    order = np.lexsort((ends[:, 1] - ends[:, 0], ~sure, segments.scan[wall]))
+    middle = segments.place(wall, ends[:, :2].mean(axis=1))
+    width = ends[:, 1] - ends[:, 0]
+    kept: list[int] = []
+    for k in order.tolist():
+        taken = [j for j in kept[::-1] if segments.scan[wall[j]] == segments.scan[wall[k]]]
+        if all(np.hypot(*(middle[j] - middle[k])) > 0.5 * (width[j] + width[k]) for j in taken):
+            kept.append(k)
+    return np.array(kept, np.int64)
 
 
 def _ordered(segments: Segments, one: np.ndarray, two: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -60,7 +80,8 @@ def _jambs(
         turn = np.where(np.abs(turn) < 1.55, turn, np.nan)
         step = segments.distance[wall] * segments.step / np.square(np.cos(turn))
         place = segments.distance[wall] * np.tan(turn) + side * 0.5 * step
-        found.append((place, step))
+        # Of the reveal of a jamb, what is not farther from the wall than noise seems to be wall.
+        found.append((place, np.hypot(step, _REVEAL * np.sqrt(segments.variance[wall]) * np.sin(turn))))
     return found[0], found[1]
 
 
@@ -83,15 +104,14 @@ def _on_wall(segments: Segments, wall: np.ndarray, other: np.ndarray) -> np.ndar
 
 
 def _openness(
-    segments: Segments, before: np.ndarray, after: np.ndarray, wall: np.ndarray
+    segments: Segments, beams: Beams, before: np.ndarray, after: np.ndarray, wall: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the share of the beams of a gap that are not stopped before the wall, and that go through."""
     points, scan = segments.points, segments.scan[wall]
     begin, total = points.start[scan], points.counts[scan]
     last, first = segments.last[before], segments.first[after]
     inside = np.mod(first - last - 1, np.maximum(total, 1))
-    bearing = points.point[:, 2].astype(np.float64)
-    beams = np.rint(np.mod(bearing[first] - bearing[last], 2 * math.pi) / segments.step) - 1
+    open_beams = beams.without_return(scan, last, first)
     which = np.repeat(np.arange(len(wall)), inside)
     number = np.arange(len(which)) - np.repeat(np.cumsum(inside) - inside, inside)
     index = begin[which] + (last[which] - begin[which] + 1 + number) % np.maximum(total[which], 1)
@@ -104,8 +124,9 @@ def _openness(
     hidden = np.bincount(which[is_end & (depth < -margin[which])], minlength=len(wall)) > 0
     stopped = np.bincount(which[depth < -margin[which]], minlength=len(wall))
     shallow = np.bincount(which[(depth >= -margin[which]) & (depth < _DEEP)], minlength=len(wall))
-    beams = np.maximum(beams, np.maximum(inside, 1))
-    return np.where(hidden, 0, 1 - stopped / beams), 1 - (stopped + shallow) / beams
+    total = np.maximum(inside + open_beams, 1)
+    through = (total - stopped - shallow) / total
+    return np.where(hidden, 0, 1 - stopped / total), np.where(inside + open_beams > 0, through, 0)
 
 
 def _found(

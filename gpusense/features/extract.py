@@ -11,6 +11,7 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray
 from gpusense.backends import Selection, get_backend
 from gpusense.backends.base import Backend
+from gpusense.features.beams import beams_of
 from gpusense.features.corners import find_corners
 from gpusense.features.device import ScanDevice
 from gpusense.features.doors import find_doors
@@ -60,11 +61,12 @@ def _found(
     device = ScanDevice(backend, real, points, noise)
     segments = find_segments(device, points, noise)
     is_line = straight(device, segments)
+    beams = beams_of(scans, scanner, points)
     finders = {
         "line": lambda: find_lines(segments, np.flatnonzero(is_line), scanner.mount),
         "corner": lambda: find_corners(segments, is_line, scanner.mount),
-        "door": lambda: find_doors(segments, is_line, scanner.mount),
+        "door": lambda: find_doors(segments, is_line, beams, scanner.mount),
         "hallway": lambda: find_hallways(segments, is_line, scanner.mount),
-        "pole": lambda: find_poles(device, segments, noise, scanner.mount),
+        "pole": lambda: find_poles(device, segments, beams, noise, scanner.mount),
     }
     return {kind: finders[kind]() for kind in KINDS if kind in kinds}

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from gpusense.features.beams import Beams
 from gpusense.features.device import ScanDevice
 from gpusense.features.result import Found
 from gpusense.features.segments import Segments
@@ -14,14 +15,17 @@ from gpusense.features.segments import Segments
 _THINNEST, _THICKEST, _LEAST_POINTS = 0.015, 0.5, 4
 # What is behind a pole is farther by this [m], and so many deviations.
 _BEHIND, _DEVIATIONS = 0.08, 6.0
+# The larger a pole, the more must it be rounder than lines: radius for which this is a deviation [m].
+_USUAL = 0.1
 # Squared deviations per reading and edge of a pole, and how much more than its segments' lines it may cost.
 _POOR, _ROUND = 2.5, 4.0
 
 
-def find_poles(device: ScanDevice, segments: Segments, noise: np.ndarray, mount: tuple[float, float, float]) -> Found:
+def find_poles(
+    device: ScanDevice, segments: Segments, beams: Beams, noise: np.ndarray, mount: tuple[float, float, float]
+) -> Found:
     """Return the poles of scans: centre and radius."""
-    points = segments.points
-    first, count, scan, edges = _objects(segments, noise)
+    first, count, scan, edges = _objects(segments, beams, noise)
     part = np.stack([first, count], axis=1)
     step = segments.step
     edge = np.column_stack([edges, np.full((len(first), 2), step / math.sqrt(12))])
@@ -29,7 +33,7 @@ def find_poles(device: ScanDevice, segments: Segments, noise: np.ndarray, mount:
     radius, cost = circle[:, 2], circle[:, 3]
     good = (cost >= 0) & (radius >= _THINNEST) & (radius <= _THICKEST) & np.isfinite(circle).all(axis=1)
     good &= cost <= _POOR * (count - 1) + 4
-    good &= cost <= _cost_of_lines(segments, first, count, scan) + _ROUND
+    good &= cost + np.square(radius / _USUAL) <= _cost_of_lines(segments, first, count, scan) + _ROUND
     circle, scan, count, cost = circle[good], scan[good], count[good], cost[good]
     inverse, radius = _covariance(circle), circle[:, 2]
     distance = np.hypot(circle[:, 0], circle[:, 1])
@@ -39,7 +43,6 @@ def find_poles(device: ScanDevice, segments: Segments, noise: np.ndarray, mount:
     pose = np.column_stack([circle[:, :2] + np.array(mount[:2]), np.zeros(len(scan))])
     fit = np.minimum(1, (count - 1) / np.maximum(cost, 1e-9))
     score = np.clip(fit * (1 - np.sqrt(np.einsum("pii->p", inverse)) / np.maximum(radius, 0.05)), 0, 1)
-    del points
     return Found(scan, pose, observed, inverse, radius, score).only(sure)
 
 
@@ -52,7 +55,9 @@ def _covariance(circle: np.ndarray) -> np.ndarray:
     return inverse
 
 
-def _objects(segments: Segments, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _objects(
+    segments: Segments, beams: Beams, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return first points, numbers of points and scans of objects in front of others, and bearings of their edges."""
     points = segments.points
     total = len(points.point)
@@ -67,8 +72,9 @@ def _objects(segments: Segments, noise: np.ndarray) -> tuple[np.ndarray, np.ndar
     gap = (step > points.gap) | (following == np.arange(total))
     # An object ends where ranges rise or beams have no return, and begins where they fall.
     begins = np.zeros(total, bool)
-    begins[following[falls | gap]] = True
-    ends, broken = rises | gap, falls
+    begins[following[falls & ~gap]] = True
+    begins |= beams.opens_before
+    ends, broken = (rises & ~gap) | beams.opens_after, falls | gap
     starts = np.flatnonzero(begins)
     if not len(starts):
         empty = np.zeros(0, np.int64)
@@ -103,7 +109,7 @@ def _runs(
 
 def _cost_of_lines(segments: Segments, first: np.ndarray, count: np.ndarray, scan: np.ndarray) -> np.ndarray:
     """Return the cost of the lines of the segments that lie in each object, and 2 for every further line."""
-    begin, total = segments.points.start[scan], segments.points.counts[scan]
+    total = segments.points.counts[scan]
     cost = np.zeros(len(first))
     head, tail = np.searchsorted(segments.scan, scan), np.searchsorted(segments.scan, scan, side="right")
     for k in range(len(first)):
@@ -111,5 +117,4 @@ def _cost_of_lines(segments: Segments, first: np.ndarray, count: np.ndarray, sca
         off = (segments.first[rows] - first[k]) % total[k]
         inner = rows[(off + segments.count[rows] <= count[k])]
         cost[k] = np.maximum(segments.cost[inner], 0).sum() + 2 * len(inner)
-    del begin
     return cost

@@ -1,7 +1,7 @@
 """Circles through parts of scans: poles, and walls that are round.
 
-The distance of a point from a circle is measured along its radius; errors of ranges enter by the cosine of the angle of
-incidence, which is that of the first guess, at least ``STEEPEST``. The bearings of the edges of a pole, between its last
+Errors are those of ranges along beams. Their derivatives grow without bound where a beam grazes the circle, so the cosine
+of the angle of incidence is at least ``STEEPEST`` in them. The bearings of the edges of a pole, between its last
 beam and the next one, are measurements of ``asin(radius / distance)``. Levenberg's and Marquardt's steps minimise the sum
 of squares over centre and radius.
 """
@@ -44,27 +44,44 @@ def arc_guess(mine: np.ndarray) -> np.ndarray:
     return np.array([mean[0] + a, mean[1] + b, np.sqrt(a * a + b * b + square.mean())])
 
 
-def circle_sums(mine: np.ndarray, edge: np.ndarray, guess: np.ndarray, circle: np.ndarray, sigma: float) -> np.ndarray:
-    """Return the cost of a circle, its gradient (3) and its information (6: xx, xy, xr, yy, yr, rr)."""
-    x, y, r = mine[:, 0] - circle[0], mine[:, 1] - circle[1], np.hypot(mine[:, 0] - circle[0], mine[:, 1] - circle[1])
-    first_distance = np.hypot(guess[0], guess[1])
-    sine = first_distance * np.sin(mine[:, 2] - np.arctan2(guess[1], guess[0])) / guess[2]
-    share = np.sqrt(np.maximum(1 - sine * sine, STEEPEST * STEEPEST)) * sigma
-    rows = np.column_stack([-x / r, -y / r, np.full(len(r), -1.0), r - circle[2]]) / share[:, None]
+def side_of(mine: np.ndarray, edge: np.ndarray, guess: np.ndarray) -> float:
+    """Return -1 where beams meet the near side of a circle, as that of a pole, and 1 for the far side."""
     if edge[2] > 0:
-        distance = np.hypot(circle[0], circle[1])
-        sine = min(circle[2] / distance, 0.99)
-        slope = 1 / np.sqrt(1 - sine * sine)
-        bearing, both = np.arctan2(circle[1], circle[0]), np.array(circle[:2])
-        for side, place, deviation in ((-1.0, edge[0], edge[2]), (1.0, edge[1], edge[3])):
-            error = wrapped(bearing + side * np.arcsin(sine) - place)
-            across = np.array([-both[1], both[0]]) / distance**2
-            inward = -side * slope * circle[2] / distance**3 * both
-            row = np.array([*(across + inward), side * slope / distance, error]) / deviation
-            rows = np.vstack([rows, row])
+        return -1.0
+    beyond = np.sum((mine[:, 0] * guess[0] + mine[:, 1] * guess[1]) / mine[:, 3] - mine[:, 3])
+    return 1.0 if beyond < 0 else -1.0
+
+
+def circle_sums(mine: np.ndarray, edge: np.ndarray, side: float, circle: np.ndarray, sigma: float) -> np.ndarray:
+    """Return the cost of a circle, its gradient (3) and its information (6: xx, xy, xr, yy, yr, rr).
+
+    Beams meet its near side (-1) or its far side (1); those that pass it by are compared with their nearest place.
+    """
+    x, y, radius = circle
+    r = mine[:, 3]
+    c, s = mine[:, 0] / r, mine[:, 1] / r
+    beside = x * s - y * c
+    square = radius * radius - beside * beside
+    error = x * c + y * s + side * np.sqrt(np.maximum(square, 0)) - r
+    slope = side / np.sqrt(np.maximum(square, (STEEPEST * radius) ** 2))
+    rows = np.column_stack([c - slope * beside * s, s + slope * beside * c, slope * radius, error]) / sigma
+    if edge[2] > 0:
+        rows = np.concatenate([rows, [edge_row(circle, edge[0], edge[2], -1.0), edge_row(circle, edge[1], edge[3], 1.0)]])
     j, e = rows[:, :3], rows[:, 3]
     information = j.T @ j
     return np.array([e @ e, *(j.T @ e), *information[np.triu_indices(3)]])
+
+
+def edge_row(circle: np.ndarray, place: float, deviation: float, side: float) -> np.ndarray:
+    """Return the derivatives and the error of the bearing of an edge, the right one (-1) or the left one (1)."""
+    x, y, radius = circle
+    distance = np.hypot(x, y)
+    sine = min(radius / distance, 0.99)
+    slope = side / np.sqrt(1 - sine * sine)
+    error = wrapped(np.arctan2(y, x) + side * np.arcsin(sine) - place)
+    inward = slope * radius / distance**3
+    row = np.array([-y / distance**2 - inward * x, x / distance**2 - inward * y, slope / distance, error])
+    return row / deviation
 
 
 def damped_step(sums: np.ndarray, damping: float) -> np.ndarray:
@@ -83,13 +100,13 @@ def damped_step(sums: np.ndarray, damping: float) -> np.ndarray:
 def fit_circle(mine: np.ndarray, edge: np.ndarray, sigma: float) -> np.ndarray:
     """Return centre, radius, cost (-1 where no circle fits) and information of the circle through points."""
     guess = pole_guess(mine, edge) if edge[2] > 0 else arc_guess(mine)
-    circle, damping = guess, 1e-3
+    circle, damping, side = guess, 1e-3, side_of(mine, edge, guess)
     if not (guess[2] > 0 and np.isfinite(guess).all()):
         return np.array([0, 0, 0, -1.0, 0, 0, 0, 0, 0, 0])
-    sums = circle_sums(mine, edge, guess, circle, sigma)
+    sums = circle_sums(mine, edge, side, circle, sigma)
     for _ in range(CIRCLE_STEPS):
         following = circle + damped_step(sums, damping)
-        better = circle_sums(mine, edge, guess, following, sigma)
+        better = circle_sums(mine, edge, side, following, sigma)
         if following[2] > 0 and better[0] <= sums[0]:
             circle, sums, damping = following, better, max(0.1 * damping, 1e-9)
         else:

@@ -18,7 +18,9 @@ _BEHIND, _DEVIATIONS = 0.08, 6.0
 # The larger a pole, the more must it be rounder than lines: radius for which this is a deviation [m].
 _USUAL = 0.1
 # Squared deviations per reading and edge of a pole, and how much more than its segments' lines it may cost.
-_POOR, _ROUND = 2.5, 4.0
+_POOR, _ROUND = 2.5, 6.0
+# What each line but the first fits of noise.
+_EACH = 8.0
 
 
 def find_poles(
@@ -108,7 +110,7 @@ def _runs(
 
 
 def _cost_of_lines(segments: Segments, first: np.ndarray, count: np.ndarray, scan: np.ndarray) -> np.ndarray:
-    """Return the cost of the lines of the segments that lie in each object, and 2 for every further line."""
+    """Return the cost of the lines of the segments that lie in each object, 1 for each other point, and what further lines fit of noise."""
     total = segments.points.counts[scan]
     cost = np.zeros(len(first))
     head, tail = np.searchsorted(segments.scan, scan), np.searchsorted(segments.scan, scan, side="right")
@@ -116,5 +118,6 @@ def _cost_of_lines(segments: Segments, first: np.ndarray, count: np.ndarray, sca
         rows = np.arange(head[k], tail[k])
         off = (segments.first[rows] - first[k]) % total[k]
         inner = rows[(off + segments.count[rows] <= count[k])]
-        cost[k] = np.maximum(segments.cost[inner], 0).sum() + 2 * len(inner)
+        cost[k] = np.maximum(segments.cost[inner], 0).sum() + _EACH * max(len(inner) - 1, 0)
+        cost[k] += count[k] - segments.count[inner].sum()
     return cost

@@ -12,8 +12,8 @@ import numpy as np
 
 from gpusense.interface.constants import CIRCLE_NUMBERS
 
-# Steps of a fit, and the smallest cosine of an angle of incidence.
-CIRCLE_STEPS, STEEPEST = 25, 0.3
+# Steps of a fit, the first of them by distances from the circle, and the smallest cosine of an angle of incidence.
+CIRCLE_STEPS, RADIAL_STEPS, STEEPEST = 25, 8, 0.1
 WHOLE_TURN = 6.283185307179586
 
 
@@ -52,10 +52,13 @@ def side_of(mine: np.ndarray, edge: np.ndarray, guess: np.ndarray) -> float:
     return 1.0 if beyond < 0 else -1.0
 
 
-def circle_sums(mine: np.ndarray, edge: np.ndarray, side: float, circle: np.ndarray, sigma: float) -> np.ndarray:
+def circle_sums(
+    mine: np.ndarray, edge: np.ndarray, side: float, circle: np.ndarray, sigma: float, radial: bool
+) -> np.ndarray:
     """Return the cost of a circle, its gradient (3) and its information (6: xx, xy, xr, yy, yr, rr).
 
     Beams meet its near side (-1) or its far side (1); those that pass it by are compared with their nearest place.
+    Radial errors are distances from the circle.
     """
     x, y, radius = circle
     r = mine[:, 3]
@@ -65,6 +68,10 @@ def circle_sums(mine: np.ndarray, edge: np.ndarray, side: float, circle: np.ndar
     error = x * c + y * s + side * np.sqrt(np.maximum(square, 0)) - r
     slope = side / np.sqrt(np.maximum(square, (STEEPEST * radius) ** 2))
     rows = np.column_stack([c - slope * beside * s, s + slope * beside * c, slope * radius, error]) / sigma
+    if radial:
+        across, up = mine[:, 0] - x, mine[:, 1] - y
+        far = np.maximum(np.hypot(across, up), 1e-9)
+        rows = np.column_stack([across / far, up / far, np.ones(len(r)), radius - far]) / sigma
     if edge[2] > 0:
         rows = np.concatenate([rows, [edge_row(circle, edge[0], edge[2], -1.0), edge_row(circle, edge[1], edge[3], 1.0)]])
     j, e = rows[:, :3], rows[:, 3]
@@ -103,10 +110,13 @@ def fit_circle(mine: np.ndarray, edge: np.ndarray, sigma: float) -> np.ndarray:
     circle, damping, side = guess, 1e-3, side_of(mine, edge, guess)
     if not (guess[2] > 0 and np.isfinite(guess).all()):
         return np.array([0, 0, 0, -1.0, 0, 0, 0, 0, 0, 0])
-    sums = circle_sums(mine, edge, side, circle, sigma)
-    for _ in range(CIRCLE_STEPS):
+    sums = circle_sums(mine, edge, side, circle, sigma, True)
+    for step in range(CIRCLE_STEPS):
+        radial = step < RADIAL_STEPS
+        if step == RADIAL_STEPS:
+            sums, damping = circle_sums(mine, edge, side, circle, sigma, False), 1e-3
         following = circle + damped_step(sums, damping)
-        better = circle_sums(mine, edge, side, following, sigma)
+        better = circle_sums(mine, edge, side, following, sigma, radial)
         if following[2] > 0 and better[0] <= sums[0]:
             circle, sums, damping = following, better, max(0.1 * damping, 1e-9)
         else:

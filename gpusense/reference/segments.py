@@ -17,6 +17,10 @@ from gpusense.interface.constants import LINE_NUMBERS
 PASSES, STEPS = 2, 5
 # A segment whose cost per point is larger is split where that is best, even if one split alone does not pay.
 POOR = 3.0
+# Rows are parallel up to this.
+PARALLEL = 1e-6
+# Splits that lower the cost equally but for this share of it are tied: the first of them counts.
+TIED = 1e-9
 
 
 def middle_of_three(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
@@ -39,8 +43,8 @@ def running_costs(rows: np.ndarray) -> np.ndarray:
     aa, ab, bb, av, bv, vv = (np.cumsum(value) for value in (a * a, a * b, b * b, a * v, b * v, v * v))
     inner = bb - ab * ab / aa
     across = bv - ab * av / aa
-    cost = np.maximum(vv - av * av / aa - np.where(inner > 1e-13 * bb, across * across / inner, 0), 0)
-    cost[:2] = 0
+    cost = np.maximum(vv - av * av / aa - np.where(inner > PARALLEL * PARALLEL * bb, across * across / inner, 0), 0)
+    cost[0] = 0
     result: np.ndarray = np.where(np.isfinite(cost), cost, 0)
     return result
 
@@ -69,7 +73,7 @@ def best_split(point: np.ndarray, first: int, last: int, sigma: float, penalty: 
         return -1, 0.0, total
     right = running_costs(rows[::-1])[::-1]
     gain = total - left[:-1] - right[1:]
-    best = int(gain.argmax())
+    best = int((gain >= gain.max() - TIED * (1e5 + total)).argmax())
     return first + best + 1, float(gain[best]), total
 
 

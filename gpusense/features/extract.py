@@ -26,7 +26,7 @@ from gpusense.matching.points import scan_points
 from gpusense.world.scanner import Scanner
 
 # Noise with which scans are split: at least this [m], at most this.
-_LEAST_NOISE, _LARGEST_NOISE = 3e-3, 0.3
+_LEAST_NOISE, _LARGEST_NOISE = 3e-3, 0.1
 
 
 def extract_features(

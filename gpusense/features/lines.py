@@ -12,13 +12,13 @@ from gpusense.features.result import Found
 from gpusense.features.segments import PENALTY, Segments
 
 # Least points and length [m] of a line, and largest deviation of its direction [rad].
-LEAST_POINTS, LEAST_LENGTH, LARGEST_DEVIATION = 5, 0.3, 0.06
+LEAST_POINTS, LEAST_LENGTH, LARGEST_DEVIATION = 6, 0.3, 0.06
 # Most squared deviations per point of a line, and of a circle that takes the place of two lines.
 POOR = 3.0
-# A circle may cost this much more than two lines, which have more parameters.
-_ROUND = 6.0
-# A round wall turns by at least this between the middles of two segments [rad].
-_LEAST_TURN = 0.06
+# A circle may cost this much more than two lines, which have more parameters; beside a part that is round; passes.
+_ROUND, _ROUND_BESIDE, _ROUNDS = 12.0, 35.0, 4
+# A round wall turns by at least and at most this between two segments [rad].
+_LEAST_TURN, _LARGEST_TURN = 0.02, 1.0
 
 
 class Frame(NamedTuple):
@@ -53,10 +53,14 @@ def _is_round(device: ScanDevice, segments: Segments) -> np.ndarray:
     circle = device.circles(part, segments.scan[one], np.zeros((len(one), 4)))
     apart = segments.cost[one] + segments.cost[two]
     turn = np.abs(np.mod(segments.angle[two] - segments.angle[one] + math.pi, 2 * math.pi) - math.pi)
-    arc = (circle[:, 3] >= 0) & (circle[:, 3] <= apart + _ROUND) & (turn > _LEAST_TURN) & (turn < 0.5 * math.pi)
+    arc = (circle[:, 3] >= 0) & (turn > _LEAST_TURN) & (turn < _LARGEST_TURN)
     found = np.zeros(len(number), bool)
-    found[one[arc]] = True
-    found[two[arc]] = True
+    sure = arc & (circle[:, 3] <= apart + _ROUND)
+    for _ in range(_ROUNDS):
+        found[one[sure]] = True
+        found[two[sure]] = True
+        # Beside a part that is round, less is needed.
+        sure = arc & (found[one] | found[two]) & (circle[:, 3] <= apart + _ROUND_BESIDE)
     return found
 
 

@@ -6,6 +6,8 @@ is known. The same seed gives the same floor.
 
 from __future__ import annotations
 
+import functools
+import itertools
 import math
 from dataclasses import dataclass, field
 
@@ -37,6 +39,17 @@ class Floor:
     doors: Floats
     hallways: Floats
     free: Floats
+
+    @functools.cached_property
+    def corners(self) -> Floats:
+        """(N, 4) vertex, bisector and opening angle of both sides of all corners between walls with a common end."""
+        found = []
+        both = [(wall, wall[[2, 3, 0, 1]]) for wall in self.walls]
+        for i, j in itertools.permutations(range(len(both)), 2):
+            for p, q in itertools.product(both[i], both[j]):
+                if np.abs(p[2:] - q[:2]).max() < 1e-6:
+                    found.append(corner_between(p, q))
+        return np.array(found).reshape(-1, 4)
 
     def cast(self, poses: Floats, bearings: Floats) -> tuple[Floats, NDArray[np.int64]]:
         """Return exact ranges (N, K) [m], infinite without a surface, and the surface's index: walls, then circles."""
@@ -90,6 +103,14 @@ class Floor:
         return np.column_stack([xy, rng.uniform(-math.pi, math.pi, count)])
 
 
+def corner_between(p: Floats, q: Floats) -> list[float]:
+    """Return vertex, bisector and opening angle on the left of walls p and q, of which q begins where p ends."""
+    one, two = p[2:] - p[:2], q[2:] - q[:2]
+    before, after = math.atan2(one[1], one[0]), math.atan2(two[1], two[0])
+    opening = math.pi - math.remainder(after - before, 2 * math.pi)
+    return [float(p[2]), float(p[3]), math.remainder(after + opening / 2, 2 * math.pi), opening]
+
+
 @dataclass
 class _Plan:
     """Surfaces that are being put together."""
@@ -101,7 +122,7 @@ class _Plan:
 
     def path(self, *points: tuple[float, float]) -> None:
         """Add walls from point to point."""
-        self.walls += [(*one, *two) for one, two in zip(points[:-1], points[1:], strict=True)]
+        self.walls += [(*one, *two) for one, two in itertools.pairwise(points)]
 
     def box(self, x: float, y: float, width: float, depth: float, turn: float) -> None:
         """Add the four sides of a box about (x, y)."""
@@ -120,7 +141,8 @@ def floor_plan(seed: int, *, rooms: int = 3, clutter: bool = True) -> Floor:
     """
     rng = np.random.default_rng([seed, 0])
     width, plan = rng.uniform(1.6, 2.6), _Plan()
-    length, jambs = 0.0, {}
+    length = 0.0
+    jambs: dict[int, list[float]] = {}
     for side in (1, -1):
         x, jambs[side] = 0.0, []
         for _ in range(rooms):

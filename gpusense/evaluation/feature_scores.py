@@ -66,10 +66,8 @@ def score_scan(features: Features, truth: Truth, scores: dict[str, Score]) -> No
             score.right += 1
             square = float(error @ mine.information[i] @ error) / FREE[kind]
             score.squares.append(square)
-            across = mine.information[i, :2, :2] @ error[:2] if kind in ("line", "hallway") else error[:2]
-            size = math.hypot(*error[:2])
-            score.errors.append(_across(mine, i, error) if kind in ("line", "hallway") else size)
-            del across
+            slides = kind in ("line", "hallway")
+            score.errors.append(_across(mine, i, error) if slides else math.hypot(*error[:2]))
         score.found += sum(_is_found(mine, kind, row) for row in truth.required[kind])
 
 

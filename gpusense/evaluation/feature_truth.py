@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from gpusense.evaluation.feature_scenes import Floor, Floats
+from gpusense.evaluation.feature_scenes import Floats, Floor, corner_between
 
 # A run of beams on a wall is seen well from this number and length on [m].
 WELL_POINTS, WELL_LENGTH = 10, 0.5
@@ -71,7 +72,7 @@ class _Local:
     """A floor in the robot's frame."""
 
     def __init__(self, floor: Floor, pose: Floats) -> None:
-        self._pose = pose
+        self._pose, self._corners = pose, floor.corners
         self.walls = np.concatenate([self._moved(floor.walls[:, :2]), self._moved(floor.walls[:, 2:])], axis=1)
         self.circles = np.column_stack([self._moved(floor.circles[:, :2]), floor.circles[:, 2]])
         self.jambs = np.concatenate([self._moved(floor.doors[:, :2]), self._moved(floor.doors[:, 2:])], axis=1)
@@ -92,16 +93,10 @@ class _Local:
         return moved
 
     def vertices(self) -> Floats:
-        """Return all corners between walls with a common end, both of their sides."""
-        found = []
-        for i, one in enumerate(self.walls):
-            for two in self.walls[i + 1 :]:
-                for a, b in ((one, two), (two, one)):
-                    for p in (a, a[[2, 3, 0, 1]]):
-                        for q in (b, b[[2, 3, 0, 1]]):
-                            if np.abs(p[2:] - q[:2]).max() < 1e-6:
-                                found.append(_corner(p, q))
-        return np.array(found).reshape(-1, 4)
+        """Return all corners of the floor."""
+        rows = self._corners
+        turned = np.mod(rows[:, 2] - self._pose[2] + math.pi, 2 * math.pi) - math.pi
+        return np.column_stack([self._moved(rows[:, :2]), turned, rows[:, 3]])
 
     def doors(self) -> Floats:
         """Return all doors: centre, direction across away from the robot, and width."""
@@ -144,24 +139,15 @@ def _lines(walls: list[_Run], local: _Local) -> Floats:
     return np.array(rows).reshape(-1, 4)
 
 
-def _corner(p: Floats, q: Floats) -> list[float]:
-    """Return the corner on the left of walls p and q, which follow one another."""
-    one, two = p[2:] - p[:2], q[2:] - q[:2]
-    before, after = math.atan2(one[1], one[0]), math.atan2(two[1], two[0])
-    turn = math.remainder(after - before, 2 * math.pi)
-    opening = math.pi - turn
-    return [*p[2:], math.remainder(after + opening / 2, 2 * math.pi), opening]
-
-
 def _corners(runs: list[_Run], local: _Local, closed: bool, walls: int) -> Floats:
     rows = []
-    pairs = list(zip(runs[:-1], runs[1:], strict=True)) + ([(runs[-1], runs[0])] if closed and runs else [])
+    pairs = list(itertools.pairwise(runs)) + ([(runs[-1], runs[0])] if closed and runs else [])
     for one, two in pairs:
         if max(one.surface, two.surface) >= walls or one is two or not (_well(one) and _well(two)):
             continue
         p, q = _oriented(local.walls[one.surface], one), _oriented(local.walls[two.surface], two)
         if np.abs(p[2:] - q[:2]).max() < 1e-6:
-            row = _corner(p, q)
+            row = corner_between(p, q)
             if abs(math.sin(row[3])) > math.sin(_TURN):
                 rows.append(row)
     return np.array(rows).reshape(-1, 4)
@@ -185,7 +171,10 @@ def _doors(walls: list[_Run], local: _Local, bearings: Floats, ranges: Floats, s
         depth = ranges * np.cos(bearings - row[2]) - (row[0] * math.cos(row[2]) + row[1] * math.sin(row[2]))
         if inside.sum() < 6 or (depth[inside] > _DEEP).mean() < _SHARE:
             continue
-        tolerance = [2.5 * math.hypot(*end) * step / max(abs(math.cos(a - row[2])), 0.05) for end, a in zip(ends, angle, strict=True)]
+        tolerance = [
+            2.5 * math.hypot(*end) * step / max(abs(math.cos(a - row[2])), 0.05)
+            for end, a in zip(ends, angle, strict=True)
+        ]
         sides = [
             any(
                 run.count >= WELL_POINTS and run.length >= 0.3

@@ -14,7 +14,7 @@ from gpusense.features.segments import Segments
 
 # Width of a door [m].
 _NARROWEST, _WIDEST = 0.5, 2.0
-# Both sides are of one wall up to this [m] and [rad], and so many deviations.
+# Both sides are of one wall up to this [m] and [rad], and this many deviations.
 _ASIDE, _PARALLEL, _DEVIATIONS = 0.03, math.radians(4), 3.0
 # Least length of a wall [m] and of its other side, and most uncertainty of a jamb across and along the wall [m].
 _WALL, _OTHER, _VAGUE, _COARSE = 0.5, 0.1, 0.05, 0.4
@@ -24,9 +24,7 @@ _REVEAL = 4.0
 _UNSTOPPED, _THROUGH, _DEEP = 0.6, 0.25, 0.4
 
 
-def find_doors(
-    segments: Segments, straight: np.ndarray, beams: Beams, mount: tuple[float, float, float]
-) -> Found:
+def find_doors(segments: Segments, straight: np.ndarray, beams: Beams, mount: tuple[float, float, float]) -> Found:
     """Return the doors of scans: centre of the gap, direction across, and width."""
     sides = np.flatnonzero(np.isfinite(segments.distance) & (segments.count >= 3))
     one, two = pairs_of(segments.scan[sides])

@@ -12,7 +12,7 @@ from gpusense.features.segments import Segments
 
 # Width [m], and least length of the part that both walls have beside each other, in widths.
 _NARROWEST, _WIDEST, _LEAST_LENGTH = 0.6, 3.2, 2.0
-# Walls are parallel up to this angle [rad] and so many deviations; lines of one wall are apart by at most this [m].
+# Walls are parallel up to this angle [rad] and this many deviations; lines of one wall are apart by at most this [m].
 _PARALLEL, _DEVIATIONS, _SAME = math.radians(2), 3.0, 0.06
 # Hallways of a scan whose axes differ by less are one [rad].
 _ONE_AXIS = math.radians(15)

@@ -71,7 +71,9 @@ def in_robot_frame(segments: Segments, mount: tuple[float, float, float]) -> Fra
     jacobian = np.zeros((len(c), 2, 2))
     jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1
     jacobian[:, 1, 0] = aside
-    covariance = jacobian @ np.where(np.isfinite(segments.covariance), segments.covariance, 0) @ jacobian.transpose(0, 2, 1)
+    covariance = (
+        jacobian @ np.where(np.isfinite(segments.covariance), segments.covariance, 0) @ jacobian.transpose(0, 2, 1)
+    )
     return Frame(segments.angle, segments.distance + ahead, covariance)
 
 
@@ -94,6 +96,4 @@ def find_lines(segments: Segments, which: np.ndarray, mount: tuple[float, float,
     jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 1, 0] = -middle, 1, 1
     covariance = jacobian @ segments.covariance[which] @ jacobian.transpose(0, 2, 1)
     pose = np.column_stack([xy, angle + math.pi / 2])
-    return Found(
-        segments.scan[which], pose, observed, covariance, segments.length[which], scores_of(segments, which)
-    )
+    return Found(segments.scan[which], pose, observed, covariance, segments.length[which], scores_of(segments, which))

@@ -13,13 +13,13 @@ from gpusense.features.segments import Segments
 
 # Radius [m], and least points of a pole.
 _THINNEST, _THICKEST, _LEAST_POINTS = 0.015, 0.5, 4
-# What is behind a pole is farther by this [m], and so many deviations.
+# The background of a pole is farther by this [m], and this many deviations.
 _BEHIND, _DEVIATIONS = 0.08, 6.0
 # The larger a pole, the more must it be rounder than lines: radius for which this is a deviation [m].
 _USUAL = 0.1
 # Squared deviations per reading and edge of a pole, and how much more than its segments' lines it may cost.
 _POOR, _ROUND = 2.5, 6.0
-# What each line but the first fits of noise.
+# Cost by which each line but the first fits noise.
 _EACH = 8.0
 
 
@@ -110,7 +110,7 @@ def _runs(
 
 
 def _cost_of_lines(segments: Segments, first: np.ndarray, count: np.ndarray, scan: np.ndarray) -> np.ndarray:
-    """Return the cost of the lines of the segments that lie in each object, 1 for each other point, and what further lines fit of noise."""
+    """Return the cost of the lines in each object, with what further lines fit of noise, and 1 for each other point."""
     total = segments.points.counts[scan]
     cost = np.zeros(len(first))
     head, tail = np.searchsorted(segments.scan, scan), np.searchsorted(segments.scan, scan, side="right")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,14 +69,17 @@ class Features:
 
     def __getitem__(self, index: slice | NDArray[np.bool] | NDArray[np.int64] | str) -> Features:
         """Return some of the features: those of a kind, of a mask, of indices or of a slice."""
+        chosen: slice | NDArray[Any]
         if isinstance(index, str):
-            index = self.kind == checks.choice("kind", index, KINDS)
-        elif not isinstance(index, slice):
-            index = np.asarray(index)
-            if index.ndim != 1 or (index.size and index.dtype.kind not in "biu"):
+            chosen = self.kind == checks.choice("kind", index, KINDS)
+        elif isinstance(index, slice):
+            chosen = index
+        else:
+            chosen = np.asarray(index)
+            if chosen.ndim != 1 or (chosen.size and chosen.dtype.kind not in "biu"):
                 raise TypeError(f"index: must be a kind, a slice, a mask or indices, got {checks.show(index)}")
-            index = index.astype(np.int64) if index.dtype.kind != "b" else index
-        return Features(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
+            chosen = chosen if chosen.dtype.kind == "b" else chosen.astype(np.int64)
+        return Features(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
 
     def of_scan(self, scan: int) -> Features:
         """Return the features of one scan."""
@@ -112,7 +116,7 @@ class Features:
 def signature_of(kind: NDArray[np.str_], size: Floats) -> Floats:
     """Return the signatures (F,) of features: ten times the place of the kind among ``KINDS``, plus the size up to 9.
 
-    Sizes are compared by ``sigma_signature`` of :class:`gpusense.LandmarkParameters`; kinds are then always told apart.
+    Sizes are compared by ``sigma_signature`` of :class:`gpusense.LandmarkParameters`; two kinds are then never confused.
     """
     place = np.zeros(len(kind))
     for number, name in enumerate(KINDS):
@@ -165,16 +169,15 @@ class Found:
 def nothing() -> Found:
     """Return no feature."""
     empty = np.zeros(0)
-    return Found(
-        np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), empty, empty
-    )
+    return Found(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), empty, empty)
 
 
 def features_of(found: dict[str, Found]) -> Features:
     """Return features of several kinds, ordered by scan, then kind."""
-    names, parts = list(found), list(found.values())
-    kind = np.concatenate([np.full(len(part.scan), name, "<U7") for name, part in found.items()] or [np.zeros(0, "<U7")])
-    del names
+    parts = list(found.values())
+    kind = np.concatenate(
+        [np.full(len(part.scan), name, "<U7") for name, part in found.items()] or [np.zeros(0, "<U7")]
+    )
     scan = np.concatenate([part.scan for part in parts] or [np.zeros(0)]).astype(np.int64)
     order = np.argsort(scan, kind="stable")
     pairs = [_covariances(part) for part in parts]

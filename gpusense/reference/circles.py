@@ -1,9 +1,9 @@
 """Circles through parts of scans: poles, and walls that are round.
 
-Errors are those of ranges along beams. Their derivatives grow without bound where a beam grazes the circle, so the cosine
-of the angle of incidence is at least ``STEEPEST`` in them. The bearings of the edges of a pole, between its last
-beam and the next one, are measurements of ``asin(radius / distance)``. Levenberg's and Marquardt's steps minimise the sum
-of squares over centre and radius.
+Errors are those of ranges along beams. Their derivatives grow without bound where a beam grazes the circle, so the
+cosine of the angle of incidence is at least ``STEEPEST`` in them. The bearings of the edges of a pole, between its
+last beam and the next one, are measurements of ``asin(radius / distance)``. Levenberg's and Marquardt's steps
+minimise the sum of squares over centre and radius.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def wrapped(angle: np.ndarray) -> np.ndarray:
 
 def pole_guess(mine: np.ndarray, edge: np.ndarray) -> np.ndarray:
     """Return centre and radius of the pole between two bearings that has the mean range of some points."""
-    half = np.sin(min(0.5 * wrapped(edge[1] - edge[0]), 1.2))
+    half = np.sin(np.minimum(0.5 * wrapped(edge[1] - edge[0]), 1.2))
     middle = edge[0] + 0.5 * wrapped(edge[1] - edge[0])
     distance = mine[:, 3].mean() / (1 - 0.785 * half)
     return np.array([distance * np.cos(middle), distance * np.sin(middle), distance * half])
@@ -52,6 +52,18 @@ def side_of(mine: np.ndarray, edge: np.ndarray, guess: np.ndarray) -> float:
     return 1.0 if beyond < 0 else -1.0
 
 
+def edge_row(circle: np.ndarray, place: float, deviation: float, side: float) -> np.ndarray:
+    """Return the derivatives and the error of the bearing of an edge, the right one (-1) or the left one (1)."""
+    x, y, radius = circle
+    distance = np.hypot(x, y)
+    sine = min(radius / distance, 0.99)
+    slope = side / np.sqrt(1 - sine * sine)
+    error = wrapped(np.arctan2(y, x) + side * np.arcsin(sine) - place)
+    inward = slope * radius / distance**3
+    row = np.array([-y / distance**2 - inward * x, x / distance**2 - inward * y, slope / distance, error])
+    return row / deviation
+
+
 def circle_sums(
     mine: np.ndarray, edge: np.ndarray, side: float, circle: np.ndarray, sigma: float, radial: bool
 ) -> np.ndarray:
@@ -73,22 +85,12 @@ def circle_sums(
         far = np.maximum(np.hypot(across, up), 1e-9)
         rows = np.column_stack([across / far, up / far, np.ones(len(r)), radius - far]) / sigma
     if edge[2] > 0:
-        rows = np.concatenate([rows, [edge_row(circle, edge[0], edge[2], -1.0), edge_row(circle, edge[1], edge[3], 1.0)]])
+        rows = np.concatenate(
+            [rows, [edge_row(circle, edge[0], edge[2], -1.0), edge_row(circle, edge[1], edge[3], 1.0)]]
+        )
     j, e = rows[:, :3], rows[:, 3]
     information = j.T @ j
     return np.array([e @ e, *(j.T @ e), *information[np.triu_indices(3)]])
-
-
-def edge_row(circle: np.ndarray, place: float, deviation: float, side: float) -> np.ndarray:
-    """Return the derivatives and the error of the bearing of an edge, the right one (-1) or the left one (1)."""
-    x, y, radius = circle
-    distance = np.hypot(x, y)
-    sine = min(radius / distance, 0.99)
-    slope = side / np.sqrt(1 - sine * sine)
-    error = wrapped(np.arctan2(y, x) + side * np.arcsin(sine) - place)
-    inward = slope * radius / distance**3
-    row = np.array([-y / distance**2 - inward * x, x / distance**2 - inward * y, slope / distance, error])
-    return row / deviation
 
 
 def damped_step(sums: np.ndarray, damping: float) -> np.ndarray:
@@ -101,7 +103,10 @@ def damped_step(sums: np.ndarray, damping: float) -> np.ndarray:
     g = -sums[1:4]
     if not whole > 0:
         return np.zeros(3)
-    return np.array([a * g[0] + b * g[1] + c * g[2], b * g[0] + d * g[1] + e * g[2], c * g[0] + e * g[1] + f * g[2]]) / whole
+    return (
+        np.array([a * g[0] + b * g[1] + c * g[2], b * g[0] + d * g[1] + e * g[2], c * g[0] + e * g[1] + f * g[2]])
+        / whole
+    )
 
 
 def fit_circle(mine: np.ndarray, edge: np.ndarray, sigma: float) -> np.ndarray:

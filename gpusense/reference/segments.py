@@ -1,10 +1,10 @@
 """Straight segments of scans: pieces of the sequence of points that a line explains up to the noise of ranges.
 
-On a line the inverse range is ``a cos(bearing) + b sin(bearing)``, linear in (a, b). Weighted by range^2 / sigma, squared
-residuals are those of ranges in standard deviations; their sum is the cost. A scan is split where two lines lower the
-cost most, until no split lowers it by ``penalty``; neighbours are merged where a single line costs less than ``penalty``
-more (split and merge, Pavlidis and Horowitz 1974), and ends are moved to where both lines together cost least. Lines are
-then fitted to ranges by Gauss-Newton steps, which is maximum likelihood.
+On a line the inverse range is ``a cos(bearing) + b sin(bearing)``, linear in (a, b). Weighted by range^2 / sigma,
+squared residuals are those of ranges in standard deviations; their sum is the cost. A scan is split where two lines
+lower the cost most, until no split lowers it by ``penalty``; neighbours are merged where a single line costs less
+than ``penalty`` more (split and merge, Pavlidis and Horowitz 1974), and ends are moved to where both lines together
+cost least. Lines are then fitted to ranges by Gauss-Newton steps, which is maximum likelihood.
 """
 
 from __future__ import annotations
@@ -138,32 +138,11 @@ def move_ends(
         i = j
 
 
-def split_scans(
-    flags: frozenset[str],
-    point: np.ndarray,
-    start: np.ndarray,
-    noise: np.ndarray,
-    cost: np.ndarray,
-    stop: np.ndarray,
-    scans: int,
-    points: int,
-    penalty: float,
-    gap: float,
-) -> None:
-    """Split scans into segments: ``stop`` is the end of the segment that begins at a point, -1 at all other points."""
-    for scan in range(scans):
-        first, last, sigma = int(start[scan]), int(start[scan + 1]), float(noise[scan])
-        if last == first:
-            continue
-        split_scan(point, first, last, stop, sigma, penalty, gap)
-        for _ in range(PASSES):
-            merge_segments(point, first, last, stop, sigma, penalty, gap)
-            move_ends(point, first, last, stop, sigma, penalty, gap)
-        merge_segments(point, first, last, stop, sigma, penalty, gap)
-
-
 def fit_line(mine: np.ndarray, sigma: float) -> np.ndarray:
-    """Return a, b, the triangular root of the information about (a, b), and the cost: -1 where no line fits, all 0 for two points."""
+    """Return a, b, the triangular root of the information about (a, b), and the cost of a line.
+
+    The cost is -1 where no line fits, and all are 0 for two points.
+    """
     if len(mine) < 3:
         return np.zeros(LINE_NUMBERS)
     x, y, r = (mine[:, i].astype(np.float64) for i in (0, 1, 3))
@@ -192,6 +171,30 @@ def _solve(rows: np.ndarray) -> np.ndarray:
     z = q.T @ rows[:, 2]
     second = z[1] / r[1, 1] if r[1, 1] != 0 else 0.0
     return np.array([(z[0] - r[0, 1] * second) / r[0, 0], second])
+
+
+def split_scans(
+    flags: frozenset[str],
+    point: np.ndarray,
+    start: np.ndarray,
+    noise: np.ndarray,
+    cost: np.ndarray,
+    stop: np.ndarray,
+    scans: int,
+    points: int,
+    penalty: float,
+    gap: float,
+) -> None:
+    """Split scans into segments: ``stop`` is the end of the segment that begins at a point, -1 at all other points."""
+    for scan in range(scans):
+        first, last, sigma = int(start[scan]), int(start[scan + 1]), float(noise[scan])
+        if last == first:
+            continue
+        split_scan(point, first, last, stop, sigma, penalty, gap)
+        for _ in range(PASSES):
+            merge_segments(point, first, last, stop, sigma, penalty, gap)
+            move_ends(point, first, last, stop, sigma, penalty, gap)
+        merge_segments(point, first, last, stop, sigma, penalty, gap)
 
 
 def fit_segments(

@@ -160,24 +160,6 @@ void move_ends(global const real4 *point, const int first, const int last, globa
     }
 }
 
-// Split scans into segments: stop is the end of the segment that begins at a point, -1 at all other points. One
-// work-item takes a scan.
-kernel void split_scans(global const real4 *point, global const int *start, global const real *noise,
-                        global real *cost, global int *stop, const int scans, const int points, const real penalty,
-                        const real gap) {
-    const int scan = get_global_id(0);
-    if (scan >= scans) return;
-    const int first = start[scan], last = start[scan + 1];
-    const real sigma = noise[scan];
-    if (last == first) return;
-    split_scan(point, first, last, cost, stop, sigma, penalty, gap);
-    for (int pass = 0; pass < PASSES; ++pass) {
-        merge_segments(point, first, last, stop, sigma, penalty, gap);
-        move_ends(point, first, last, cost, stop, sigma, penalty, gap);
-    }
-    merge_segments(point, first, last, stop, sigma, penalty, gap);
-}
-
 // Write a, b, the triangular root of the information about (a, b), and the cost of a line through a part of a scan: -1
 // where no line fits, all 0 for two points.
 void fit_line(global const real4 *point, const int begin, const int size, const int first, const int count,
@@ -222,6 +204,24 @@ void fit_line(global const real4 *point, const int begin, const int size, const 
     }
     line[0] = a;
     line[1] = b;
+}
+
+// Split scans into segments: stop is the end of the segment that begins at a point, -1 at all other points. One
+// work-item takes a scan.
+kernel void split_scans(global const real4 *point, global const int *start, global const real *noise,
+                        global real *cost, global int *stop, const int scans, const int points, const real penalty,
+                        const real gap) {
+    const int scan = get_global_id(0);
+    if (scan >= scans) return;
+    const int first = start[scan], last = start[scan + 1];
+    const real sigma = noise[scan];
+    if (last == first) return;
+    split_scan(point, first, last, cost, stop, sigma, penalty, gap);
+    for (int pass = 0; pass < PASSES; ++pass) {
+        merge_segments(point, first, last, stop, sigma, penalty, gap);
+        move_ends(point, first, last, cost, stop, sigma, penalty, gap);
+    }
+    merge_segments(point, first, last, stop, sigma, penalty, gap);
 }
 
 // Fit lines to parts of scans: first point and number of points, which may go on at the scan's first point. One

@@ -1,9 +1,9 @@
 """Circles through parts of scans: poles, and walls that are round.
 
 Errors are those of ranges along beams. Their derivatives grow without bound where a beam grazes the circle, so the
-cosine of the angle of incidence is at least STEEPEST in them. The bearings of the edges of a pole, between its last beam
-and the next one, are measurements of asin(radius / distance). Levenberg's and Marquardt's steps minimise the sum of
-squares over centre and radius.
+cosine of the angle of incidence is at least STEEPEST in them. The bearings of the edges of a pole, between its last
+beam and the next one, are measurements of asin(radius / distance). Levenberg's and Marquardt's steps minimise the sum
+of squares over centre and radius.
 """
 
 import functools

@@ -3,9 +3,9 @@
 On a line the inverse range is a cos(bearing) + b sin(bearing), linear in (a, b). Weighted by range^2 / sigma, squared
 residuals are those of ranges in standard deviations; their sum is the cost. A scan is split where two lines lower the
 cost most, until no split lowers it by penalty; neighbours are merged where a single line costs less than penalty more
-(split and merge, Pavlidis and Horowitz 1974), and ends are moved to where both lines together cost least. Lines are then
-fitted to ranges by Gauss-Newton steps, which is maximum likelihood. Rows are added by Givens rotations, whose costs have
-no cancellation.
+(split and merge, Pavlidis and Horowitz 1974), and ends are moved to where both lines together cost least. Lines are
+then fitted to ranges by Gauss-Newton steps, which is maximum likelihood. Rows are added by Givens rotations, whose
+costs have no cancellation.
 """
 
 import functools
@@ -80,9 +80,7 @@ def functions(flags):
 
     # Return the rows with that of a point.
     @wp.func
-    def with_point(
-        rows: rows6, point: wp.array(dtype=vec4), i: wp.int32, first: wp.int32, last: wp.int32, sigma: real
-    ):
+    def with_point(rows: rows6, point: wp.array(dtype=vec4), i: wp.int32, first: wp.int32, last: wp.int32, sigma: real):
         weight = weight_at(point, i, first, last, sigma)
         p = point[i]
         return add_row(rows, weight * p[0], weight * p[1], weight)
@@ -165,9 +163,7 @@ def functions(flags):
             end = stop[j]
             whole = penalty
             if not is_apart(point, j, gap):
-                whole = (
-                    cost_of(point, i, end, sigma) - cost_of(point, i, j, sigma) - cost_of(point, j, end, sigma)
-                )
+                whole = cost_of(point, i, end, sigma) - cost_of(point, i, j, sigma) - cost_of(point, j, end, sigma)
             if whole < penalty:
                 stop[i] = end
                 stop[j] = -1
@@ -186,7 +182,7 @@ def functions(flags):
             end = stop[j]
             following = j
             if not is_apart(point, j, gap):
-                k, gain, total = best_split(point, i, end, cost, sigma, penalty)
+                k, _gain, _total = best_split(point, i, end, cost, sigma, penalty)
                 if k >= 0:
                     stop[j] = -1
                     stop[k] = end
@@ -244,9 +240,7 @@ def functions(flags):
         line[place + 4] = rows[3]
         line[place + 5] = cost
 
-    return SimpleNamespace(
-        split_scan=split_scan, merge_segments=merge_segments, move_ends=move_ends, fit_line=fit_line
-    )
+    return SimpleNamespace(split_scan=split_scan, merge_segments=merge_segments, move_ends=move_ends, fit_line=fit_line)
 
 
 @functools.cache

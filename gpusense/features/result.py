@@ -116,7 +116,7 @@ class Features:
 def signature_of(kind: NDArray[np.str_], size: Floats) -> Floats:
     """Return the signatures (F,) of features: ten times the place of the kind among ``KINDS``, plus the size up to 9.
 
-    Sizes are compared by ``sigma_signature`` of :class:`gpusense.LandmarkParameters`; two kinds are then never confused.
+    Sizes are compared by ``sigma_signature`` of :class:`gpusense.LandmarkParameters`; kinds are never confused.
     """
     place = np.zeros(len(kind))
     for number, name in enumerate(KINDS):

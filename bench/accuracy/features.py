@@ -3,7 +3,7 @@
     python bench/accuracy/features.py --backend opencl --output bench/results/features_cpu
 
 ``GPUSENSE_DATA`` names the folder of recorded data. ``simulated``: floors of known geometry (see
-``gpusense/evaluation/feature_scenes.py``: corridors, rooms, open, half open and closed doors, square pillars, poles and
+``gpusense/evaluation/feature_scenes.py``: corridors, rooms, doors open, half open and closed, square pillars, poles,
 boxes): the share of features that are seen well and found, the share of returned ones that exist, median errors, and
 the squared error over the covariance per degree of freedom (NEES; 1 is right), in the mean without errors beyond
 99.9 % of chi squared, and the share of those. ``ransac``: lines by scikit-image's RANSAC, one after another, beside
@@ -109,7 +109,7 @@ def simulated(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
 
 
 def ransac_lines(points: np.ndarray, noise: float, rng: np.random.Generator) -> list[np.ndarray]:
-    """Return lines (x, y, theta, length) by scikit-image's RANSAC: each of the points that are left, longest gap 0.5 m."""
+    """Return lines (x, y, theta, length) by scikit-image's RANSAC, each of the points left, with gaps up to 0.5 m."""
     from skimage.measure import LineModelND, ransac
 
     left, found = points, []

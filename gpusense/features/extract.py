@@ -100,11 +100,11 @@ def _found(
         return {}
     device = ScanDevice(backend, real, points, noise)
     segments = find_segments(device, points, noise)
-    is_line = straight(device, segments)
+    is_line, is_side = straight(device, segments)
     beams = beams_of(scans, scanner, points)
     finders = {
         "line": lambda: find_lines(segments, np.flatnonzero(is_line), scanner.mount),
-        "corner": lambda: find_corners(segments, is_line, scanner.mount),
+        "corner": lambda: find_corners(segments, is_side, scanner.mount),
         "door": lambda: find_doors(segments, is_line, beams, scanner.mount),
         "hallway": lambda: find_hallways(segments, is_line, scanner.mount),
         "pole": lambda: find_poles(device, segments, beams, noise, scanner.mount),

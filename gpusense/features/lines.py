@@ -13,6 +13,8 @@ from gpusense.features.segments import PENALTY, Segments
 
 # Least points and length [m] of a line, and largest deviation of its direction [rad].
 LEAST_POINTS, LEAST_LENGTH, LARGEST_DEVIATION = 6, 0.3, 0.06
+# Those of a side of a corner.
+SIDE_POINTS, SIDE_LENGTH, SIDE_DEVIATION = 4, 0.15, 0.1
 # Most squared deviations per point of a line, and of a circle that takes the place of two lines.
 POOR = 3.0
 # A circle may cost this much more than two lines, which have more parameters; beside a part that is round; passes.
@@ -29,15 +31,14 @@ class Frame(NamedTuple):
     covariance: np.ndarray
 
 
-def straight(device: ScanDevice, segments: Segments) -> np.ndarray:
-    """Return which segments (G,) are lines."""
+def straight(device: ScanDevice, segments: Segments) -> tuple[np.ndarray, np.ndarray]:
+    """Return which segments (G,) are lines, and which are sides of corners, which may be shorter."""
     deviation = np.sqrt(segments.covariance[:, 0, 0])
     free = np.maximum(segments.count - 2, 1)
-    good = segments.count >= LEAST_POINTS
-    good &= np.isfinite(segments.distance) & (segments.length >= LEAST_LENGTH) & (deviation <= LARGEST_DEVIATION)
-    good &= segments.cost <= POOR * free + PENALTY
-    result: np.ndarray = good & ~_is_round(device, segments)
-    return result
+    good = np.isfinite(segments.distance) & (segments.cost <= POOR * free + PENALTY) & ~_is_round(device, segments)
+    line = good & (segments.count >= LEAST_POINTS) & (segments.length >= LEAST_LENGTH)
+    side = good & (segments.count >= SIDE_POINTS) & (segments.length >= SIDE_LENGTH)
+    return line & (deviation <= LARGEST_DEVIATION), side & (deviation <= SIDE_DEVIATION)
 
 
 def _is_round(device: ScanDevice, segments: Segments) -> np.ndarray:

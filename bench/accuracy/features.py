@@ -8,9 +8,9 @@ boxes): the share of features that are seen well and found, the share of returne
 the squared error over the covariance per degree of freedom (NEES; 1 is right), in the mean without errors beyond
 99.9 % of chi squared, and the share of those. ``ransac``: lines by scikit-image's RANSAC, one after another, beside
 ours. ``real``: features of recorded scans that are found again from another place, and how far they are apart in
-deviations; the reference poses, which are not perfect, have deviations of 3 cm and 0.01 rad (jarvis 1 cm and 0.004 rad).
-``localisation``: a filter with features alone in the map that the even scans give, beside the same filter with the
-likelihood field. ``rates``: scans a second of 1080 beams.
+deviations; the reference poses, which are not perfect, have deviations of 3 cm and 0.01 rad (jarvis 1 cm and
+0.004 rad). ``localisation``: a filter with features alone in the map that the other half of the scans gives, beside
+the same filter with the likelihood field. ``rates``: scans a second of 1080 beams.
 """
 
 from __future__ import annotations
@@ -268,17 +268,26 @@ def followed(models: list[Any], events: list[Any], readings: list[Any], seed: in
     }  # fmt: skip
 
 
+def halves(recording: Any) -> tuple[np.ndarray, np.ndarray, list[Any]]:
+    """Return readings and poses of one half of a run's scans, and the events of the other."""
+    if recording.name in recordings.CARMEN:
+        log = recordings.data() / "carmen_logs" / f"{recordings.CARMEN[recording.name]}-corrected.log.gz"
+        even = recordings.read_steps(log, every=2, offset=0)
+        return np.array([s.scan.ranges for s in even]), np.array([s.scan.pose for s in even]), recording.events
+    even = recording.events[::2]
+    return np.array([e.ranges for e in even]), np.array([e.truth for e in even]), recording.events[1::2]
+
+
 def localisation(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     """Return filters with features alone beside those with the field: same odometry, particles and seeds."""
     rows, report = [], {}
-    for name in ("intel", "csail"):
+    for name in ("jarvis-s3000", "jarvis-nav350", "intel", "csail"):
         recording = recordings.load(name)
         grid, scanner = recording.places[0]
-        log = recordings.data() / "carmen_logs" / f"{name}-corrected.log.gz"
-        even = recordings.read_steps(log, every=2, offset=0)
-        surveyed = gs.extract_features(np.array([s.scan.ranges for s in even]), scanner, LANDMARKS, arguments.backend)
-        landmarks = gs.map_features(surveyed, np.array([s.scan.pose for s in even])).landmarks()
-        events = recording.events[: arguments.limit]
+        before, where, events = halves(recording)
+        surveyed = gs.extract_features(before, scanner, LANDMARKS, arguments.backend)
+        landmarks = gs.map_features(surveyed, where).landmarks()
+        events = events[: arguments.limit]
         ranges = np.array([event.ranges for event in events])
         begin = time.perf_counter()
         features = gs.extract_features(ranges, scanner, LANDMARKS, arguments.backend)

@@ -113,6 +113,13 @@ class Features:
         return f"Features({', '.join(words) or 'none'})"
 
 
+def joined(parts: Sequence[Features], scans: int) -> Features:
+    """Return the features of several calls, each of ``scans`` scans but for the last, as those of one."""
+    values = {one.name: np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(Features)}
+    values["scan"] = np.concatenate([part.scan + scans * number for number, part in enumerate(parts)])
+    return Features(**values)
+
+
 def signature_of(kind: NDArray[np.str_], size: Floats) -> Floats:
     """Return the signatures (F,) of features: ten times the place of the kind among ``KINDS``, plus the size up to 9.
 

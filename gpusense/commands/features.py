@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--limit", type=whole_number(low=1), metavar="S", help="largest number of scans (default: all)")
     add("--range-max", type=positive_number, metavar="M",
         help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')")  # fmt: skip
-    add("--least", type=whole_number(low=1), default=3, metavar="N",
+    add("--least", type=whole_number(low=1), default=2, metavar="N",
         help="least scans that show a landmark (default: %(default)s)")  # fmt: skip
     add_backend(parser)
     add_json(parser)
@@ -95,8 +95,10 @@ def _extract(args: argparse.Namespace, scans: list[tuple[int, Scan]]) -> Feature
     from gpusense.features.result import KINDS
 
     ranges = np.array([scan.ranges for _, scan in scans])
-    noise = "auto" if args.noise is None else args.noise
-    return extract_features(ranges, scans[0][1].scanner, args.kinds or KINDS, args.backend, noise=noise)
+    kinds, scanner = args.kinds or KINDS, scans[0][1].scanner
+    if args.noise is None:
+        return extract_features(ranges, scanner, kinds, args.backend)
+    return extract_features(ranges, scanner, kinds, args.backend, noise=args.noise)
 
 
 def _landmark_kinds(args: argparse.Namespace) -> tuple[str, ...]:

@@ -29,8 +29,8 @@ _DEVIATIONS, _FLOOR, _TURN = 4.0, 0.03, 0.4
 _SIZES = {"corner": 0.5, "door": 0.4, "pole": 0.1}
 # Beams, range [m], and distance of the places of scans that are cast in a map [m], their distance from obstacles [m].
 _BEAMS, _RANGE, _SPACING, _CLEARANCE = 720, 12.0, 1.0, 0.3
-# Most scans that are cast in a map.
-_MOST_SCANS = 4000
+# Most scans that are cast in a map, and least of them that show a landmark.
+_MOST_SCANS, _VIEWS = 4000, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ def map_features(
     *,
     kinds: str | Sequence[str] = LANDMARK_KINDS,
     pose_deviation: ArrayLike = (0.03, 0.01),
-    least: int = 3,
+    least: int = 2,
 ) -> FeatureMap:
     """Make landmarks of the features of scans at known poses.
 
@@ -182,7 +182,7 @@ def landmarks_of_map(
     if len(poses):
         ranges = np.asarray(RayCaster(grid, limit, backend=backend).cast(poses, scanner.bearings), np.float64)
     features = extract_features(ranges, scanner, kinds, backend, noise=0.5 * grid.resolution)
-    return map_features(features, poses, kinds=kinds, pose_deviation=(0.5 * grid.resolution, 0.0))
+    return map_features(features, poses, kinds=kinds, pose_deviation=(0.5 * grid.resolution, 0.0), least=_VIEWS)
 
 
 def _free_places(grid: OccupancyGrid, spacing: float) -> Floats:

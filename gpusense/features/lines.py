@@ -20,7 +20,7 @@ POOR = 3.0
 # A circle may cost this much more than two lines, which have more parameters; beside a part that is round; passes.
 _ROUND, _ROUND_BESIDE, _ROUNDS = 12.0, 35.0, 4
 # A round wall turns by at least and at most this between two segments [rad].
-_LEAST_TURN, _LARGEST_TURN = 0.02, 1.0
+_LEAST_TURN, _LARGEST_TURN = 0.02, 1.4
 
 
 class Frame(NamedTuple):

@@ -52,7 +52,7 @@ def test_landmarks_are_where_corners_and_doors_are(surveyed):
     assert apart.min(axis=1).max() < 0.04
     width = np.abs(FLOOR.doors[:, 2] - FLOOR.doors[:, 0])[apart.argmin(axis=1)]
     np.testing.assert_allclose(surveyed.size[surveyed.kind == "door"], width, atol=0.1)
-    assert (surveyed.count >= 3).all()
+    assert (surveyed.count >= 2).all()
     deviation = np.sqrt(np.einsum("mii->mi", surveyed.covariance))
     assert (deviation > 1e-4).all() and (deviation < 0.1).all()
 
@@ -118,7 +118,7 @@ def test_kinds_are_chosen_and_saved(surveyed, tmp_path):
 
 
 def test_features_seen_too_seldom_are_no_landmarks(surveyed):
-    poses = corridor_path(160)[:2]
+    poses = corridor_path(160)[:1]
     features = gs.extract_features(scans_at(poses, 1), SCANNER)
     assert len(gs.map_features(features, poses)) == 0
     assert len(gs.map_features(features, poses, least=1)) > 0

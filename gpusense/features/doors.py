@@ -17,7 +17,7 @@ _NARROWEST, _WIDEST = 0.5, 2.0
 # Both sides are of one wall up to this [m] and [rad], and this many deviations.
 _ASIDE, _PARALLEL, _DEVIATIONS = 0.03, math.radians(4), 3.0
 # Least length of a wall [m] and of its other side, and most uncertainty of a jamb across and along the wall [m].
-_WALL, _OTHER, _VAGUE, _COARSE = 0.5, 0.1, 0.05, 0.4
+_WALL, _OTHER, _VAGUE, _COARSE = 0.5, 0.1, 0.08, 0.4
 # Uncertainty of a jamb at grazing incidence in deviations of ranges, as a step of beams.
 _REVEAL = 4.0
 # Share of the beams between the jambs that nothing stops before the wall, and that go on by this [m].
@@ -135,7 +135,8 @@ def _found(
     angle, middle = segments.angle[wall], ends[:, :2].mean(axis=1)
     c, s = np.cos(angle), np.sin(angle)
     mine = segments.covariance[wall]
-    along = np.square(ends[:, 2:]).sum(axis=1) / 48
+    # Twice the variance of an edge between two beams: beams beside a jamb may be taken for its reveal.
+    along = np.square(ends[:, 2:]).sum(axis=1) / 24
     across = mine[:, 1, 1] - 2 * middle * mine[:, 0, 1] + middle**2 * mine[:, 0, 0]
     mixed = mine[:, 0, 1] - middle * mine[:, 0, 0]
     covariance = np.zeros((len(wall), 3, 3))

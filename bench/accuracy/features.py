@@ -325,6 +325,21 @@ def rates(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     return "## Rates\n\n" + table(names, rows), report
 
 
+def plain(value: Any) -> int | float | None:
+    """Return a number as JSON has it, None for NaN."""
+    number = value.item() if hasattr(value, "item") else value
+    return None if isinstance(number, float) and math.isnan(number) else number
+
+
+def draw(arguments: argparse.Namespace) -> None:
+    """Draw the scan with the most kinds of features."""
+    scanner = scanner_of(720)
+    ranges, _ = scans_of(4, scanner, 0.01, 40)
+    features = gs.extract_features(ranges, scanner, backend=arguments.backend)
+    richest = max(range(len(ranges)), key=lambda k: (len(set(features.of_scan(k).kind)), len(features.of_scan(k))))
+    gs.plots.save(gs.plots.features_figure(features.of_scan(richest), ranges[richest], scanner), arguments.figure)
+
+
 def main(argv: list[str] | None = None) -> None:
     """Run the parts and write the report."""
     parser = make_parser(__doc__, backend="auto", data=True)
@@ -335,13 +350,19 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--every", type=int, default=1, help="step between recorded scans (default: %(default)s)")
     parser.add_argument("--limit", type=int, default=600, help="most recorded scans (default: %(default)s)")
     parser.add_argument("--seeds", type=int, default=3, help="runs of each filter (default: %(default)s)")
+    parser.add_argument(
+        "--figure", type=Path, help="draw a scan of a simulated floor with its features, and nothing else"
+    )
     arguments = parse(parser, argv)
+    if arguments.figure:
+        return draw(arguments)
     functions = dict(zip(PARTS, (simulated, rivals, real, localisation, rates), strict=True))
     texts, report = [], {}
     for part in PARTS:
         if part in arguments.parts:
-            text, report[part] = functions[part](arguments)
+            text, figures = functions[part](arguments)
             texts.append(text)
+            report[part] = {key: {name: plain(value) for name, value in row.items()} for key, row in figures.items()}
     publish(__file__, arguments, "# Features of scans\n\n" + "\n\n".join(texts), report)
 
 

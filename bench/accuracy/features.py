@@ -334,7 +334,7 @@ def plain(value: Any) -> int | float | None:
 def draw(arguments: argparse.Namespace) -> None:
     """Draw the scan with the most kinds of features."""
     scanner = scanner_of(720)
-    ranges, _ = scans_of(4, scanner, 0.01, 40)
+    ranges, _ = scans_of(4, scanner, 0.01, 20)
     features = gs.extract_features(ranges, scanner, backend=arguments.backend)
     richest = max(range(len(ranges)), key=lambda k: (len(set(features.of_scan(k).kind)), len(features.of_scan(k))))
     gs.plots.save(gs.plots.features_figure(features.of_scan(richest), ranges[richest], scanner), arguments.figure)

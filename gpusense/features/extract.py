@@ -18,7 +18,7 @@ from gpusense.features.doors import find_doors
 from gpusense.features.hallways import find_hallways
 from gpusense.features.lines import find_lines, straight
 from gpusense.features.poles import find_poles
-from gpusense.features.result import KINDS, Features, Found, check_kinds, features_of
+from gpusense.features.result import KINDS, Features, Found, check_kinds, features_of, joined
 from gpusense.features.segments import find_segments
 from gpusense.matching.match import readings
 from gpusense.matching.noise import ASSUMED_NOISE, scan_noise
@@ -27,6 +27,8 @@ from gpusense.world.scanner import Scanner
 
 # Noise with which scans are split: at least this [m], at most this.
 _LEAST_NOISE, _LARGEST_NOISE = 3e-3, 0.1
+# Most readings that are in work at once.
+_READINGS = 1 << 22
 
 
 def extract_features(
@@ -88,7 +90,11 @@ def extract_features(
         deviation = np.clip(deviation, _LEAST_NOISE, _LARGEST_NOISE)
     else:
         deviation = np.full(len(scans), max(given, _LEAST_NOISE))
-    return features_of(_found(device, real, scans, scanner, deviation, wanted))
+    step = max(_READINGS // max(scanner.count, 1), 1)
+    parts = [slice(first, first + step) for first in range(0, max(len(scans), 1), step)]
+    return joined(
+        [features_of(_found(device, real, scans[part], scanner, deviation[part], wanted)) for part in parts], step
+    )
 
 
 def _found(

@@ -51,10 +51,14 @@ def _one_each(segments: Segments, wall: np.ndarray, ends: np.ndarray, sure: np.n
     order = np.lexsort((ends[:, 1] - ends[:, 0], ~sure, segments.scan[wall]))
     middle = segments.place(wall, ends[:, :2].mean(axis=1))
     width = ends[:, 1] - ends[:, 0]
+    scan = segments.scan[wall]
     kept: list[int] = []
+    taken: list[int] = []
     for k in order.tolist():
-        taken = [j for j in kept[::-1] if segments.scan[wall[j]] == segments.scan[wall[k]]]
+        if taken and scan[taken[0]] != scan[k]:
+            taken = []
         if all(np.hypot(*(middle[j] - middle[k])) > 0.5 * (width[j] + width[k]) for j in taken):
+            taken.append(k)
             kept.append(k)
     return np.array(kept, np.int64)
 

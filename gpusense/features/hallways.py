@@ -90,9 +90,11 @@ def _one_each(scan: np.ndarray, angle: np.ndarray, length: np.ndarray) -> np.nda
     """Return the pairs with the longest walls, one of each scan and axis."""
     order = np.lexsort((-length, scan))
     kept: list[int] = []
+    taken: list[int] = []
     for k in order.tolist():
-        taken = [j for j in kept[::-1] if scan[j] == scan[k]]
-        turns = [abs(math.remainder(angle[k] - angle[j], math.pi)) for j in taken]
-        if all(turn > _ONE_AXIS for turn in turns):
+        if taken and scan[taken[0]] != scan[k]:
+            taken = []
+        if all(abs(math.remainder(angle[k] - angle[j], math.pi)) > _ONE_AXIS for j in taken):
+            taken.append(k)
             kept.append(k)
     return np.sort(np.array(kept, np.int64))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,7 +22,32 @@ _WALL, _OTHER, _VAGUE, _COARSE = 0.5, 0.1, 0.08, 0.4
 # Uncertainty of a jamb at grazing incidence in deviations of ranges, as a step of beams.
 _REVEAL = 4.0
 # Share of the beams between the jambs that nothing stops before the wall, and that go on by this [m].
-_UNSTOPPED, _THROUGH, _DEEP = 0.6, 0.25, 0.4
+_UNSTOPPED, _UNSTOPPED_BESIDE_LEAF, _THROUGH, _DEEP = 0.6, 0.25, 0.25, 0.4
+# Length of a leaf in widths of its door, its least turn from the wall [rad], and the gap beside its hinge [m].
+_LEAF, _LEAST_TURN, _TOUCHING = (0.6, 1.25), math.radians(15), 0.12
+
+
+@dataclass(frozen=True)
+class _Gaps:
+    """Gaps between two segments of a scan.
+
+    Attributes:
+        before: (D,) segment before the gap.
+        after: (D,) segment after it.
+        wall: (D,) the one of them whose line is that of the wall.
+        other: (D,) the other one: a part of the wall, or the leaf of a door.
+        ends: (D, 4) places of both jambs along the wall, and the steps of beams there [m].
+    """
+
+    before: np.ndarray
+    after: np.ndarray
+    wall: np.ndarray
+    other: np.ndarray
+    ends: np.ndarray
+
+    def only(self, rows: np.ndarray) -> _Gaps:
+        """Return some of the gaps."""
+        return _Gaps(self.before[rows], self.after[rows], self.wall[rows], self.other[rows], self.ends[rows])
 
 
 def find_doors(segments: Segments, straight: np.ndarray, beams: Beams, mount: tuple[float, float, float]) -> Found:
@@ -29,25 +55,64 @@ def find_doors(segments: Segments, straight: np.ndarray, beams: Beams, mount: tu
     sides = np.flatnonzero(np.isfinite(segments.distance) & (segments.count >= 3))
     one, two = pairs_of(segments.scan[sides])
     before, after = _ordered(segments, sides[one], sides[two])
+    kinds = _between_walls(segments, straight, before, after), _beside_leaves(segments, straight, before, after)
+    names = ("before", "after", "wall", "other", "ends")
+    gaps = _Gaps(*(np.concatenate([getattr(each, name) for each in kinds]) for name in names))
+    is_leaf = np.arange(len(gaps.wall)) >= len(kinds[0].wall)
+    good, through = _openness(segments, beams, gaps)
+    gaps, is_leaf, through = gaps.only(good), is_leaf[good], through[good]
+    kept = _one_each(segments, gaps, straight[gaps.other] & ~is_leaf)
+    gaps = gaps.only(kept)
+    return _found(segments, gaps.wall, gaps.other, gaps.ends, through[kept], mount)
+
+
+def _between_walls(segments: Segments, straight: np.ndarray, before: np.ndarray, after: np.ndarray) -> _Gaps:
+    """Return the gaps between two parts of a straight wall."""
     # The better line is the wall; the other one has to lie on it.
     wall = np.where(segments.covariance[before, 0, 0] <= segments.covariance[after, 0, 0], before, after)
     other = np.where(wall == before, after, before)
     left, right = _jambs(segments, before, after, wall)
-    width = right[0] - left[0]
-    good = straight[wall] & (segments.length[wall] >= _WALL) & (segments.length[other] >= _OTHER)
-    good &= (width >= _NARROWEST) & (width <= _WIDEST) & (left[1] <= _COARSE) & (right[1] <= _COARSE)
-    good &= _on_wall(segments, wall, other)
-    before, after, wall, other = before[good], after[good], wall[good], other[good]
-    ends = np.stack([left[0][good], right[0][good], left[1][good], right[1][good]], axis=1)
-    open_share, through = _openness(segments, beams, before, after, wall)
-    good = (open_share >= _UNSTOPPED) & (through >= _THROUGH)
-    wall, other, ends, through = wall[good], other[good], ends[good], through[good]
-    kept = _one_each(segments, wall, ends, straight[other])
-    return _found(segments, wall[kept], other[kept], ends[kept], through[kept], mount)
+    gaps = _Gaps(before, after, wall, other, np.stack([left[0], right[0], left[1], right[1]], axis=1))
+    return gaps.only(_is_wide(segments, straight, gaps) & _on_wall(segments, wall, other))
 
 
-def _one_each(segments: Segments, wall: np.ndarray, ends: np.ndarray, sure: np.ndarray) -> np.ndarray:
+def _beside_leaves(segments: Segments, straight: np.ndarray, before: np.ndarray, after: np.ndarray) -> _Gaps:
+    """Return the gaps between a wall's end and the hinge of a leaf that is open towards the scanner."""
+    wall, leaf = np.concatenate([before, after]), np.concatenate([after, before])
+    before, after = np.concatenate([before, before]), np.concatenate([after, after])
+    near = straight[wall] & straight[leaf]
+    wall, leaf, before, after = wall[near], leaf[near], before[near], after[near]
+    alpha, beta = segments.angle[wall], segments.angle[leaf]
+    sine = np.sin(beta - alpha)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # Where the lines meet, along each of them.
+        hinge = (segments.distance[leaf] - segments.distance[wall] * np.cos(beta - alpha)) / sine
+        reached = (segments.distance[leaf] * np.cos(beta - alpha) - segments.distance[wall]) / sine
+    first = leaf == after
+    end = np.where(first, segments.ends[leaf, 0], segments.ends[leaf, 1])
+    step = np.where(first, segments.spacing[leaf, 0], segments.spacing[leaf, 1])
+    left, right = _jambs(segments, before, after, wall)
+    ends = np.stack([np.where(first, left[0], hinge), np.where(first, hinge, right[0]),
+                     np.where(first, left[1], step), np.where(first, step, right[1])], axis=1)  # fmt: skip
+    gaps = _Gaps(before, after, wall, leaf, ends)
+    noise = np.sqrt(segments.variance[wall])
+    good = (np.abs(sine) > math.sin(_LEAST_TURN)) & (np.abs(reached - end) <= 1.5 * step + 0.05 + _DEVIATIONS * noise)
+    share = segments.length[leaf] / np.maximum(ends[:, 1] - ends[:, 0], 1e-9)
+    good &= (share >= _LEAF[0]) & (share <= _LEAF[1])
+    return gaps.only(good & _is_wide(segments, straight, gaps))
+
+
+def _is_wide(segments: Segments, straight: np.ndarray, gaps: _Gaps) -> np.ndarray:
+    """Return which gaps are as wide as doors, of a wall that is long enough, with jambs that are known."""
+    width = gaps.ends[:, 1] - gaps.ends[:, 0]
+    good = straight[gaps.wall] & (segments.length[gaps.wall] >= _WALL) & (segments.length[gaps.other] >= _OTHER)
+    result: np.ndarray = good & (width >= _NARROWEST) & (width <= _WIDEST) & (gaps.ends[:, 2:] <= _COARSE).all(axis=1)
+    return result
+
+
+def _one_each(segments: Segments, gaps: _Gaps, sure: np.ndarray) -> np.ndarray:
     """Return the doors of which no other one overlaps, or that have long walls on both sides or are narrower."""
+    wall, ends = gaps.wall, gaps.ends
     order = np.lexsort((ends[:, 1] - ends[:, 0], ~sure, segments.scan[wall]))
     middle = segments.place(wall, ends[:, :2].mean(axis=1))
     width = ends[:, 1] - ends[:, 0]
@@ -105,30 +170,37 @@ def _on_wall(segments: Segments, wall: np.ndarray, other: np.ndarray) -> np.ndar
     return good
 
 
-def _openness(
-    segments: Segments, beams: Beams, before: np.ndarray, after: np.ndarray, wall: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the share of the beams of a gap that are not stopped before the wall, and that go through."""
-    points, scan = segments.points, segments.scan[wall]
+def _openness(segments: Segments, beams: Beams, gaps: _Gaps) -> tuple[np.ndarray, np.ndarray]:
+    """Return which gaps are open, and the share of their beams that go through."""
+    points, wall = segments.points, gaps.wall
+    scan = segments.scan[wall]
     begin, total = points.start[scan], points.counts[scan]
-    last, first = segments.last[before], segments.first[after]
+    last, first = segments.last[gaps.before], segments.first[gaps.after]
     inside = np.mod(first - last - 1, np.maximum(total, 1))
     open_beams = beams.without_return(scan, last, first)
     which = np.repeat(np.arange(len(wall)), inside)
     number = np.arange(len(which)) - np.repeat(np.cumsum(inside) - inside, inside)
     index = begin[which] + (last[which] - begin[which] + 1 + number) % np.maximum(total[which], 1)
     angle = segments.angle[wall][which]
-    xy = points.point[index, :2].astype(np.float64)
-    depth = np.cos(angle) * xy[:, 0] + np.sin(angle) * xy[:, 1] - segments.distance[wall][which]
-    margin = 0.05 + 3 * np.sqrt(segments.variance[wall])
-    # Beside a jamb beams go on; where something stands before it, the jamb is none.
-    is_end = (number == 0) | (number == inside[which] - 1)
-    hidden = np.bincount(which[is_end & (depth < -margin[which])], minlength=len(wall)) > 0
-    stopped = np.bincount(which[depth < -margin[which]], minlength=len(wall))
-    shallow = np.bincount(which[(depth >= -margin[which]) & (depth < _DEEP)], minlength=len(wall))
-    total = np.maximum(inside + open_beams, 1)
-    through = (total - stopped - shallow) / total
-    return np.where(hidden, 0, 1 - stopped / total), np.where(inside + open_beams > 0, through, 0)
+    place = points.point[:, :2].astype(np.float64)
+    depth = np.cos(angle) * place[index, 0] + np.sin(angle) * place[index, 1] - segments.distance[wall][which]
+    margin = (0.05 + 3 * np.sqrt(segments.variance[wall]))[which]
+
+    def count(chosen: np.ndarray) -> np.ndarray:
+        return np.bincount(which[chosen], minlength=len(wall))
+
+    # Beside a jamb beams go on. Something before the wall that does not begin there hides the jamb; else it is a leaf.
+    beside = np.stack([last, first], axis=1)[which]
+    at_end = np.stack([number == 0, number == inside[which] - 1], axis=1) & (depth < -margin)[:, None]
+    apart = np.hypot(*np.moveaxis(place[index][:, None] - place[beside], 2, 0))
+    touches = apart <= _TOUCHING + 2 * gaps.ends[which, 2:]
+    hidden, has_leaf = count((at_end & ~touches).any(axis=1)) > 0, count((at_end & touches).any(axis=1)) > 0
+    stopped, shallow = count(depth < -margin), count((depth >= -margin) & (depth < _DEEP))
+    beams_in = inside + open_beams
+    share = np.maximum(beams_in, 1)
+    through = np.where(beams_in > 0, (share - stopped - shallow) / share, 0)
+    least = np.where(has_leaf, _UNSTOPPED_BESIDE_LEAF, _UNSTOPPED)
+    return ~hidden & (1 - stopped / share >= least) & (through >= _THROUGH), through
 
 
 def _found(

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.evaluation.feature_scenes import floor_plan
+from gpusense.evaluation.feature_scenes import Floor, floor_plan
 from gpusense.evaluation.feature_scores import Score, score_scan
 from gpusense.evaluation.feature_truth import truth_of
 
@@ -185,6 +185,30 @@ def test_a_square_room_has_four_walls_and_corners(backend, beams, turn):
     # Bisectors point into the room.
     inward = corners.pose[:, :2] + 0.5 * np.column_stack([np.cos(corners.pose[:, 2]), np.sin(corners.pose[:, 2])])
     assert (np.abs(inward + np.array([0.4, -0.3])) < 2).all()
+
+
+@pytest.mark.parametrize(("swing", "least"), [(-70, 0.97), (-45, 0.97), (60, 0.6), (90, 0.6)])
+def test_doors_have_leaves(swing, least):
+    """A leaf turns out of the room (-) or into it (+), where it hides a jamb or the wall beside it from many places."""
+    near, far, angle = 1.5, 2.4, math.radians(swing)
+    leaf = (0, near, 0.9 * math.sin(angle), near + 0.9 * math.cos(angle))
+    room = [(0, 0, 6, 0), (6, 0, 6, 4), (6, 4, 0, 4), (0, 4, 0, far), (0, near, 0, 0), leaf]
+    outside = [(-4, -3, -4, 8), (-4, 8, 9, 8), (9, 8, 9, -3), (9, -3, -4, -3)]
+    floor = Floor(
+        np.array(room + outside, float), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 5)),
+        np.array([[0.6, 0.6, 5.4, 3.4]]),
+    )  # fmt: skip
+    poses, scanner = floor.poses(60, 1), ring(720, range_max=12.0)
+    exact, _ = floor.cast(poses, scanner.bearings)
+    c, s = np.cos(scanner.bearings), np.sin(scanner.bearings)
+    ends = gs.compose_poses(poses[:, None], np.stack([exact * c, exact * s, 0 * exact], axis=-1))
+    visible = (ends[..., 0] < -1.0).sum(axis=1) > 15
+    ranges = exact + 0.01 * np.random.default_rng(0).standard_normal(exact.shape)
+    doors = gs.extract_features(ranges, scanner, kinds="door")
+    centre = gs.compose_poses(poses[doors.scan], doors.pose)
+    right = np.hypot(centre[:, 0], centre[:, 1] - 0.5 * (near + far)) < 0.2
+    assert right.sum() >= right.size - 1
+    assert visible.sum() > 12 and np.isin(np.flatnonzero(visible), doors.scan[right]).mean() >= least
 
 
 def test_poses_are_in_the_robots_frame():

@@ -15,6 +15,7 @@ TITLES = {
     "tables": "Tables of a map",
     "learning": "Learning",
     "matching": "Matching",
+    "features": "Features of scans",
     "mapping": "Maps from scans",
     "localization": "Localisation",
     "positions": "Positions from beacons",

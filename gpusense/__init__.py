@@ -16,6 +16,9 @@ from gpusense._version import __version__ as __version__
 # run ``PYTHONPATH=tests python -m support.public_names`` after a change.
 _NAMES = {
     "backends": ("Device", "devices"),
+    "features.extract": ("extract_features",),
+    "features.landmarks": ("FeatureMap", "landmarks_of_map", "map_features"),
+    "features.result": ("Features",),
     "learning.beam.fit": ("fit_beam_parameters",),
     "learning.beam.incidence": ("IncidenceFit", "fit_incidence_parameters"),
     "learning.beam.result": ("BeamFit",),

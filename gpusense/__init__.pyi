@@ -8,6 +8,11 @@ from gpusense import worlds as worlds
 from gpusense._version import __version__ as __version__
 from gpusense.backends import Device as Device
 from gpusense.backends import devices as devices
+from gpusense.features.extract import extract_features as extract_features
+from gpusense.features.landmarks import FeatureMap as FeatureMap
+from gpusense.features.landmarks import landmarks_of_map as landmarks_of_map
+from gpusense.features.landmarks import map_features as map_features
+from gpusense.features.result import Features as Features
 from gpusense.learning.beam.fit import fit_beam_parameters as fit_beam_parameters
 from gpusense.learning.beam.incidence import IncidenceFit as IncidenceFit
 from gpusense.learning.beam.incidence import fit_incidence_parameters as fit_incidence_parameters

@@ -19,7 +19,7 @@ from gpusense.commands import signals
 # Modules of gpusense.commands, in the order of the help.
 COMMANDS = (
     "devices", "selftest", "demo", "simulate", "map", "score", "localize", "fit", "match", "likelihood-map",
-    "landmarks", "sweep", "bench",
+    "features", "landmarks", "sweep", "bench",
 )  # fmt: skip
 
 BAD_INPUT = 2

@@ -36,6 +36,8 @@ RAY_BITS = 12
 MATCH_RESULT = 35
 # Kernel file field_gradient: numbers of a particle, log p, its gradient (3) and the information (9).
 GRADIENT_NUMBERS = 13
+# Kernel files segments and circles: numbers of a line and of a circle.
+LINE_NUMBERS, CIRCLE_NUMBERS = 6, 10
 
 
 def strands_in(terms: int) -> int:

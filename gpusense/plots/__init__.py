@@ -8,6 +8,7 @@ from gpusense.plots.drawing import (
     new_figure,
     save,
 )
+from gpusense.plots.features import draw_features, draw_landmarks, features_figure, landmarks_figure
 from gpusense.plots.localization import localization_figure
 from gpusense.plots.matches import match_figure
 from gpusense.plots.pose_densities import draw_particles, draw_pose_density, pose_lattice
@@ -30,7 +31,9 @@ from gpusense.plots.positions import (
 __all__ = [
     "add_colour_bar",
     "draw_beacons",
+    "draw_features",
     "draw_fix",
+    "draw_landmarks",
     "draw_likelihood_field",
     "draw_map",
     "draw_particles",
@@ -40,6 +43,8 @@ __all__ = [
     "draw_position_density",
     "draw_scan",
     "draw_scan_field",
+    "features_figure",
+    "landmarks_figure",
     "draw_solution_set",
     "localization_figure",
     "match_figure",

@@ -40,7 +40,7 @@ def match_figure(
     """
     figure = new_figure(11.0, 5.5)
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
-    points = _points(ranges, scanner)
+    points = points_of(ranges, scanner)
     for ax, title, at in zip(axes, ("before", "after"), (guess, pose), strict=True):
         x, y, theta = np.asarray(at, np.float64)
         c, s = np.cos(theta), np.sin(theta)
@@ -48,7 +48,7 @@ def match_figure(
         if isinstance(reference, OccupancyGrid):
             draw_map(ax, reference)
         else:
-            ax.plot(*_points(reference, scanner).T, ".", color=REFERENCE, ms=3, label="reference")
+            ax.plot(*points_of(reference, scanner).T, ".", color=REFERENCE, ms=3, label="reference")
         ax.plot(*moved.T, ".", color=SECOND, ms=2, label="second scan")
         ax.set(title=title, xlabel="x [m]", ylabel="y [m]", aspect="equal")
     near = np.concatenate([points @ np.array([[c, s], [-s, c]]) + (x, y), [(x, y)]])
@@ -59,7 +59,7 @@ def match_figure(
     return figure
 
 
-def _points(ranges: ArrayLike, scanner: Scanner) -> np.ndarray:
+def points_of(ranges: ArrayLike, scanner: Scanner) -> np.ndarray:
     """Return the end points of the hits of a scan in the robot's frame."""
     z = np.asarray(masks.filled(ranges), np.float64)
     hit = classify(z, scanner) == Reading.HIT

@@ -17,7 +17,7 @@ from gpusense.evaluation.trajectory_files import read_tum, write_tum
 
 BEARINGS = np.radians(np.arange(-90, 91, 3.0))
 MOUNTS = {"front": (0.2, 0.0, 0.0), "rear": (-0.2, 0.0, math.pi)}
-READERS = ("localize", "score", "fit", "map", "match", "likelihood-map")
+READERS = ("localize", "score", "fit", "map", "match", "likelihood-map", "features")
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def command(place, name, log="run", *more):
     """Return a call of a command on a bag."""
     out = {"map": ["--out", str(place / "built.yaml")],
            "likelihood-map": ["--out", str(place / "p.png"), "--headings", "4", "--resolution", "2"]}  # fmt: skip
-    options = [] if name in ("map", "match") else ["--map", str(place / "map.yaml")]
+    options = [] if name in ("map", "match", "features") else ["--map", str(place / "map.yaml")]
     options += ["--reference", str(place / "true.tum")] if name in ("score", "fit", "map", "localize") else []
     options += ["--particles", "300"] if name in ("score", "localize") else []
     return [name, "--log", str(place / log), "--backend", "numpy", *options, *out.get(name, []), *more]

@@ -51,6 +51,7 @@ ON_PURPOSE = [
     Purpose("beam", "readings_of_scan sum_terms", REFERENCE_ONLY, ARRAYS),
     Purpose("bits", "lowest_bit highest_bit", KERNELS_ONLY, "the reference unpacks words to bool"),
     Purpose("bits", "unpacked", REFERENCE_ONLY, "the reference unpacks words to bool"),
+    Purpose("circles", "point_of add_error", KERNELS_ONLY, "points come one after another"),
     Purpose("distance", "_lines _lowest", REFERENCE_ONLY, ARRAYS),
     Purpose("echo", "echoes", REFERENCE_ONLY, ARRAYS),
     Purpose("end_point", "within", (OPENCL,), FLOOR),
@@ -77,6 +78,9 @@ ON_PURPOSE = [
     Purpose("rectangles", "reached _runs longest _quadrants", REFERENCE_ONLY, ARRAYS),
     Purpose("relative", "pair_sum_float64", (OPENCL,), FLOAT64),
     Purpose("rungs", "eight_at sum_eight sum_before", KERNELS_ONLY, EIGHT),
+    Purpose("segments", "add_row", KERNELS_ONLY, "points come one after another, added by rotations"),
+    Purpose("segments", "with_point", (WARP,), "OpenCL's functions take pointers to rows"),
+    Purpose("segments", "running_costs rows_of _solve", REFERENCE_ONLY, ARRAYS),
     Purpose("tiles", "tile_place tile_group tile_ray tile_step", KERNELS_ONLY, TILES),
 ]  # fmt: skip
 

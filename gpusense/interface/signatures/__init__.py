@@ -8,6 +8,7 @@ three to this table. ``real`` stands for the precision of a model, float32 or fl
 from __future__ import annotations
 
 from gpusense.interface.signatures import (
+    feature_kernels,
     learning_kernels,
     map_kernels,
     mapping_kernels,
@@ -30,5 +31,6 @@ KERNELS: dict[str, Kernel] = {
     **learning_kernels.KERNELS,
     **matching_kernels.KERNELS,
     **search_kernels.KERNELS,
+    **feature_kernels.KERNELS,
     **particle_kernels.KERNELS,
 }

@@ -1,0 +1,370 @@
+"""Measure features of scans: recall, precision, covariance, repeatability, localisation by features alone, and rates.
+
+    python bench/accuracy/features.py --backend opencl --output bench/results/features_cpu
+
+``GPUSENSE_DATA`` names the folder of recorded data. ``simulated``: floors of known geometry (see
+``gpusense/evaluation/feature_scenes.py``: corridors, rooms, doors open, half open and closed, square pillars, poles,
+boxes): the share of features that are seen well and found, the share of returned ones that exist, median errors, and
+the squared error over the covariance per degree of freedom (NEES; 1 is right), in the mean without errors beyond
+99.9 % of chi squared, and the share of those. ``ransac``: lines by scikit-image's RANSAC, one after another, beside
+ours. ``real``: features of recorded scans that are found again from another place, and how far they are apart in
+deviations; the reference poses, which are not perfect, have deviations of 3 cm and 0.01 rad (jarvis 1 cm and
+0.004 rad). ``localisation``: a filter with features alone in the map that the other half of the scans gives, beside
+the same filter with the likelihood field. ``rates``: scans a second of 1080 beams.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+import gpusense as gs
+from gpusense.evaluation.feature_scenes import floor_plan
+from gpusense.evaluation.feature_scores import FREE, Score, score_scan
+from gpusense.evaluation.feature_truth import truth_of
+from gpusense.features.result import KINDS, Features
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import recordings
+from common import add_repeats, best, make_parser, parse, publish, table
+
+PARTS = ("simulated", "ransac", "real", "localisation", "rates")
+BEAMS, NOISES = (180, 360, 1081), (0.0, 0.01, 0.03, 0.05)
+# Recordings, deviations of their reference poses, and scans of each that are compared.
+RECORDINGS = {
+    "intel": (0.03, 0.01), "csail": (0.03, 0.01), "olin": (0.03, 0.01), "jarvis-nav350": (0.01, 0.004),
+    "jarvis-s3000": (0.01, 0.004),
+}  # fmt: skip
+# Motions between scans that are compared [m], farthest features [m], and how near another one is the same [m, rad].
+MOVED, FAR, NEAR, TURN = (0.3, 2.0), 8.0, 0.3, 0.35
+# Kinds that a filter uses, and its parameters.
+LANDMARKS = ("corner", "door", "pole")
+PARAMETERS = gs.LandmarkParameters(
+    sigma_range=0.1, sigma_bearing=0.03, sigma_signature=0.3, z_detect=0.7, z_false=0.3, range_max=20.0
+)
+
+
+def scanner_of(beams: int) -> gs.Scanner:
+    """Return a scanner of 270 degrees and 0.25 degrees a beam, or one that looks all around."""
+    if beams == 1081:
+        return gs.Scanner.uniform(
+            angle_min=-0.75 * math.pi, angle_increment=math.radians(0.25), count=1081, range_max=25
+        )
+    return gs.Scanner.uniform(angle_min=-math.pi, angle_increment=2 * math.pi / beams, count=beams, range_max=25)
+
+
+def scans_of(seed: int, scanner: gs.Scanner, noise: float, count: int) -> tuple[np.ndarray, list[Any]]:
+    """Return scans of a floor and their true features."""
+    floor = floor_plan(seed)
+    poses = floor.poses(count, seed)
+    exact, surface = floor.cast(poses, scanner.bearings)
+    truth = [truth_of(floor, p, scanner.bearings, r, s) for p, r, s in zip(poses, exact, surface, strict=True)]
+    return exact + noise * np.random.default_rng([seed, 3]).standard_normal(exact.shape), truth
+
+
+def figures_of(kind: str, score: Score) -> dict[str, float]:
+    """Return the figures of one kind."""
+    squares = np.array(score.squares)
+    limit = chi2.ppf(0.999, FREE[kind]) / FREE[kind]
+    inner = squares[squares <= limit]
+    return {
+        "required": score.required, "recall": score.recall, "features": score.features, "precision": score.precision,
+        "error_m": float(np.median(score.errors)) if score.errors else math.nan,
+        "nees": float(inner.mean()) if len(inner) else math.nan,
+        "nees_all": score.nees, "outliers": float(np.mean(squares > limit)) if len(squares) else math.nan,
+    }  # fmt: skip
+
+
+def simulated(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
+    """Return recall, precision and covariances in floors of known geometry."""
+    rows, report = [], {}
+    for beams in BEAMS:
+        for noise in NOISES:
+            scores: dict[str, Score] = {}
+            scanner = scanner_of(beams)
+            for seed in range(arguments.floors):
+                ranges, truth = scans_of(arguments.seed + seed, scanner, noise, arguments.scans)
+                features = gs.extract_features(ranges, scanner, backend=arguments.backend)
+                for k, one in enumerate(truth):
+                    score_scan(features.of_scan(k), one, scores)
+            for kind in KINDS:
+                f = figures_of(kind, scores[kind])
+                report[f"{beams} {noise} {kind}"] = f
+                nees = "" if noise == 0 else f"{f['nees']:.2f}"
+                outliers = "" if noise == 0 else f"{100 * f['outliers']:.1f}"
+                rows.append([
+                    beams, f"{100 * noise:g}", kind, f"{100 * f['recall']:.1f} of {f['required']}",
+                    f"{100 * f['precision']:.1f} of {f['features']}", f"{1000 * f['error_m']:.1f}", nees, outliers,
+                ])  # fmt: skip
+    names = ["beams", "noise [cm]", "kind", "recall [%]", "precision [%]", "error [mm], median", "NEES", "outliers [%]"]
+    return "## Simulated floors\n\n" + table(names, rows), report
+
+
+def ransac_lines(points: np.ndarray, noise: float, rng: np.random.Generator) -> list[np.ndarray]:
+    """Return lines (x, y, theta, length) by scikit-image's RANSAC, each of the points left, with gaps up to 0.5 m."""
+    from skimage.measure import LineModelND, ransac
+
+    left, found = points, []
+    while len(left) >= 8:
+        model, inliers = ransac(left, LineModelND, 2, 3 * noise, max_trials=200, rng=rng)
+        if model is None or inliers.sum() < 8:
+            break
+        origin, direction = model.origin, model.direction
+        place = (left - origin) @ direction
+        order = np.argsort(np.where(inliers, place, np.inf))[: inliers.sum()]
+        runs = np.split(order, np.flatnonzero(np.diff(place[order]) > 0.5) + 1)
+        longest = max(runs, key=len)
+        ends = place[longest[[0, -1]]]
+        if len(longest) >= 8 and ends[1] - ends[0] >= 0.3:
+            middle = origin + ends.mean() * direction
+            found.append(np.array([*middle, math.atan2(direction[1], direction[0]), ends[1] - ends[0]]))
+        left = np.delete(left, longest, axis=0)
+    return found
+
+
+def as_features(lines: list[np.ndarray]) -> Features:
+    """Return lines as features without covariance."""
+    rows = np.array(lines).reshape(-1, 4)
+    count = len(rows)
+    return Features(
+        np.full(count, "line"), np.zeros(count, np.int64), rows[:, :3], np.zeros((count, 3, 3)),
+        np.zeros((count, 3, 3)), rows[:, 3], np.ones(count),
+    )  # fmt: skip
+
+
+def rivals(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
+    """Return our lines beside those of RANSAC, of the same scans."""
+    try:
+        import skimage
+    except ImportError:
+        return "## RANSAC\n\nscikit-image is absent.", {}
+    rows, report = [], {}
+    for beams, noise in ((360, 0.01), (360, 0.03), (1081, 0.01), (1081, 0.03)):
+        scanner, scores, seconds = scanner_of(beams), {"ours": {}, "ransac": {}}, {"ours": 0.0, "ransac": 0.0}
+        gs.extract_features(np.ones(beams), scanner, "line", arguments.backend)
+        for seed in range(max(arguments.floors // 5, 1)):
+            ranges, truth = scans_of(arguments.seed + seed, scanner, noise, arguments.scans)
+            begin = time.perf_counter()
+            features = gs.extract_features(ranges, scanner, "line", arguments.backend)
+            seconds["ours"] += time.perf_counter() - begin
+            for k, one in enumerate(truth):
+                score_scan(features.of_scan(k), one, scores["ours"])
+                directions = np.column_stack([np.cos(scanner.bearings), np.sin(scanner.bearings)])
+                begin = time.perf_counter()
+                lines = ransac_lines(ranges[k, :, None] * directions, noise, np.random.default_rng(k))
+                seconds["ransac"] += time.perf_counter() - begin
+                score_scan(as_features(lines), one, scores["ransac"])
+        count = max(arguments.floors // 5, 1) * arguments.scans
+        for name, total in scores.items():
+            line = total["line"]
+            ms = 1000 * seconds[name] / count
+            report[f"{name} {beams} {noise}"] = {
+                "recall": line.recall, "precision": line.precision, "error_m": np.median(line.errors), "ms": ms
+            }  # fmt: skip
+            label = f"scikit-image {skimage.__version__}" if name == "ransac" else "extract_features"
+            error = 1000 * np.median(line.errors)
+            rows.append([beams, f"{100 * noise:g}", label, f"{100 * line.recall:.1f}", f"{100 * line.precision:.1f}",
+                         f"{error:.1f}", f"{ms:.3g}"])  # fmt: skip
+    names = ["beams", "noise [cm]", "lines of", "recall [%]", "precision [%]", "error [mm], median", "ms a scan"]
+    return "## Lines beside RANSAC\n\n" + table(names, rows), report
+
+
+def expected_again(features: Features, relative: np.ndarray, ranges: np.ndarray, scanner: gs.Scanner) -> np.ndarray:
+    """Return which features (F,) another scan should show: in its field of view, near, with nothing before them."""
+    c, s = math.cos(relative[2]), math.sin(relative[2])
+    xy = (features.pose[:, :2] - relative[:2]) @ np.array([[c, -s], [s, c]]) - np.array(scanner.mount[:2])
+    far = np.hypot(xy[:, 0], xy[:, 1])
+    bearing = gs.wrap_angle(np.arctan2(xy[:, 1], xy[:, 0]) - scanner.mount[2])
+    off = np.abs(gs.wrap_angle(bearing[:, None] - scanner.bearings))
+    beam = off.argmin(axis=1)
+    near = np.stack([ranges[np.clip(beam + k, 0, scanner.count - 1)] for k in (-2, -1, 0, 1, 2)]).max(axis=0)
+    seen: np.ndarray = (off.min(axis=1) < 0.02) & (far < FAR) & (near > far - 0.3)
+    return seen
+
+
+def compared(one: Features, two: Features, relative: np.ndarray, spread: tuple[float, float]) -> list[float | None]:
+    """Return, for each feature of a scan, its squared distance to the same one of another scan, or None."""
+    c, s = math.cos(relative[2]), math.sin(relative[2])
+    turn = np.array([[c, -s], [s, c]])
+    place, heading = two.pose[:, :2] @ turn.T + relative[:2], two.pose[:, 2] + relative[2]
+    found: list[float | None] = []
+    for i, kind in enumerate(one.kind):
+        off = place - one.pose[i, :2]
+        distance = np.hypot(off[:, 0], off[:, 1])
+        period = 2 * math.pi if kind == "corner" else math.pi
+        angle = np.abs(np.mod(heading - one.pose[i, 2] + period / 2, period) - period / 2)
+        fits = (two.kind == kind) & (distance < NEAR) & ((angle < TURN) | (kind == "pole"))
+        if not fits.any():
+            found.append(None)
+            continue
+        j = int(np.where(fits, distance, np.inf).argmin())
+        lever = np.hypot(*two.pose[j, :2])
+        both = one.covariance[i, :2, :2] + turn @ two.covariance[j, :2, :2] @ turn.T
+        both = both + np.eye(2) * (2 * spread[0] ** 2 + (spread[1] * lever) ** 2)
+        found.append(float(off[j] @ np.linalg.solve(both, off[j])))
+    return found
+
+
+def real(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
+    """Return how often features of recordings are found again from another place."""
+    rows, report = [], {}
+    for name, spread in RECORDINGS.items():
+        recording = recordings.load(name)
+        scanner = recording.places[0][1]
+        events = [event for event in recording.events if np.isfinite(event.truth).all()][:: arguments.every]
+        events = events[: arguments.limit]
+        features = gs.extract_features(np.array([e.ranges for e in events]), scanner, LANDMARKS, arguments.backend)
+        poses = np.array([event.truth for event in events])
+        counts = {kind: [0, 0, 0] for kind in LANDMARKS}
+        for i in range(len(events)):
+            ahead = np.hypot(*(poses[i + 1 :, :2] - poses[i, :2]).T)
+            later = np.flatnonzero((ahead >= MOVED[0]) & (ahead <= MOVED[1]))
+            if not len(later):
+                continue
+            j = i + 1 + int(later[0])
+            relative = gs.pose_difference(poses[i], poses[j])
+            one, two = features.of_scan(i), features.of_scan(j)
+            seen = expected_again(one, relative, events[j].ranges, scanner)
+            for kind, square, again in zip(one.kind, compared(one, two, relative, spread), seen, strict=True):
+                if again:
+                    counts[str(kind)][0] += 1
+                    counts[str(kind)][1] += square is not None
+                    counts[str(kind)][2] += square is not None and square < chi2.ppf(0.9973, 2)
+        for kind, (total, again, close) in counts.items():
+            report[f"{name} {kind}"] = {"expected": total, "again": again, "within_3_sigma": close}
+            share = f"{100 * again / total:.0f}" if total else ""
+            sigma = f"{100 * close / again:.0f}" if again else ""
+            rows.append([name, len(events), kind, total, share, sigma])
+    names = ["recording", "scans", "kind", "should be seen again", "found again [%]", "of these within 3 sigma [%]"]
+    return "## Recorded scans\n\n" + table(names, rows), report
+
+
+def followed(models: list[Any], events: list[Any], readings: list[Any], seed: int) -> dict[str, float]:
+    """Return errors and time of a filter over events with the readings of each."""
+    pf = gs.ParticleFilter(models, particles=1000, seed=seed)
+    pf.initialize(mean=events[0].truth, covariance=np.diag([0.25, 0.25, 0.04]))
+    errors, seconds = [], 0.0
+    for k, event in enumerate(events):
+        begin = time.perf_counter()
+        if k:
+            pf.predict(events[k - 1].odometry, event.odometry)
+        if len(readings[k]):
+            pf.correct(readings[k])
+        pose = pf.estimate().pose
+        seconds += time.perf_counter() - begin
+        errors.append(math.hypot(*(pose[:2] - event.truth[:2])))
+    late = np.array(errors[len(errors) // 20 :])
+    return {
+        "median_m": float(np.median(late)), "p95_m": float(np.quantile(late, 0.95)),
+        "lost": float(np.mean(late > 1.0)), "ms": 1000 * seconds / len(events),
+    }  # fmt: skip
+
+
+def halves(recording: Any) -> tuple[np.ndarray, np.ndarray, list[Any]]:
+    """Return readings and poses of one half of a run's scans, and the events of the other."""
+    if recording.name in recordings.CARMEN:
+        log = recordings.data() / "carmen_logs" / f"{recordings.CARMEN[recording.name]}-corrected.log.gz"
+        even = recordings.read_steps(log, every=2, offset=0)
+        return np.array([s.scan.ranges for s in even]), np.array([s.scan.pose for s in even]), recording.events
+    even = recording.events[::2]
+    return np.array([e.ranges for e in even]), np.array([e.truth for e in even]), recording.events[1::2]
+
+
+def localisation(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
+    """Return filters with features alone beside those with the field: same odometry, particles and seeds."""
+    rows, report = [], {}
+    for name in ("jarvis-s3000", "jarvis-nav350", "intel", "csail"):
+        recording = recordings.load(name)
+        grid, scanner = recording.places[0]
+        before, where, events = halves(recording)
+        surveyed = gs.extract_features(before, scanner, LANDMARKS, arguments.backend)
+        landmarks = gs.map_features(surveyed, where).landmarks()
+        events = events[: arguments.limit]
+        ranges = np.array([event.ranges for event in events])
+        begin = time.perf_counter()
+        features = gs.extract_features(ranges, scanner, LANDMARKS, arguments.backend)
+        extraction = 1000 * (time.perf_counter() - begin) / len(events)
+        rows_of = [features.of_scan(k).range_bearing() for k in range(len(events))]
+        fields = recordings.field(arguments.backend)(grid, scanner)
+        model = gs.LandmarkModel(landmarks, PARAMETERS, backend=arguments.backend)
+        settings = {"field": ([fields], list(ranges)), "features": ([model], rows_of)}
+        settings["odometry alone"] = ([model], [[]] * len(events))
+        for label, (models, readings) in settings.items():
+            runs = [followed(models, events, readings, seed) for seed in range(arguments.seeds)]
+            figures = {key: float(np.mean([run[key] for run in runs])) for key in runs[0]}
+            figures["ms"] += extraction if label == "features" else 0
+            report[f"{name} {label}"] = figures | {"landmarks": len(landmarks), "per_scan": len(features) / len(events)}
+            rows.append([name, len(events), label, f"{figures['median_m']:.3f}", f"{figures['p95_m']:.3f}",
+                         f"{100 * figures['lost']:.1f}", f"{figures['ms']:.2f}"])  # fmt: skip
+        rows[-2][2] += f" ({len(features) / len(events):.1f} a scan, {len(landmarks)} landmarks)"
+    names = ["recording", "scans", "filter with", "error [m], median", "95 %", "beyond 1 m [%]", "ms a scan"]
+    return "## Localisation\n\n" + table(names, rows), report
+
+
+def rates(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
+    """Return scans a second of 1080 beams, in turns."""
+    scanner = scanner_of(1080)
+    ranges = np.concatenate([scans_of(seed, scanner, 0.01, 50)[0] for seed in range(4)])
+    rows, report, limits = [], {}, (arguments.repeats, arguments.seconds)
+    for selection in ("numpy", arguments.backend, "warp:cpu"):
+        part = ranges[:10] if selection == "numpy" else ranges
+        gs.extract_features(part[:1], scanner, backend=selection)
+        seconds = best(lambda part=part, b=selection: gs.extract_features(part, scanner, backend=b), *limits)[0]
+        one = best(lambda b=selection: gs.extract_features(ranges[0], scanner, backend=b), *limits)[0]
+        report[selection] = {"scans_per_s": len(part) / seconds, "one_scan_ms": 1000 * one}
+        rows.append([selection, len(part), f"{len(part) / seconds:.0f}", f"{1000 * one:.2f}"])
+    names = ["backend", "scans in a call", "scans a second", "a single scan [ms]"]
+    return "## Rates\n\n" + table(names, rows), report
+
+
+def plain(value: Any) -> int | float | None:
+    """Return a number as JSON has it, None for NaN."""
+    number = value.item() if hasattr(value, "item") else value
+    return None if isinstance(number, float) and math.isnan(number) else number
+
+
+def draw(arguments: argparse.Namespace) -> None:
+    """Draw the scan with the most kinds of features."""
+    scanner = scanner_of(720)
+    ranges, _ = scans_of(4, scanner, 0.01, 20)
+    features = gs.extract_features(ranges, scanner, backend=arguments.backend)
+    richest = max(range(len(ranges)), key=lambda k: (len(set(features.of_scan(k).kind)), len(features.of_scan(k))))
+    gs.plots.save(gs.plots.features_figure(features.of_scan(richest), ranges[richest], scanner), arguments.figure)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run the parts and write the report."""
+    parser = make_parser(__doc__, backend="auto", data=True)
+    add_repeats(parser, 5, 5.0)
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="default: all")
+    parser.add_argument("--floors", type=int, default=20, help="simulated floors (default: %(default)s)")
+    parser.add_argument("--scans", type=int, default=20, help="scans of each floor (default: %(default)s)")
+    parser.add_argument("--every", type=int, default=1, help="step between recorded scans (default: %(default)s)")
+    parser.add_argument("--limit", type=int, default=600, help="most recorded scans (default: %(default)s)")
+    parser.add_argument("--seeds", type=int, default=3, help="runs of each filter (default: %(default)s)")
+    parser.add_argument(
+        "--figure", type=Path, help="draw a scan of a simulated floor with its features, and nothing else"
+    )
+    arguments = parse(parser, argv)
+    if arguments.figure:
+        return draw(arguments)
+    functions = dict(zip(PARTS, (simulated, rivals, real, localisation, rates), strict=True))
+    texts, report = [], {}
+    for part in PARTS:
+        if part in arguments.parts:
+            text, figures = functions[part](arguments)
+            texts.append(text)
+            report[part] = {key: {name: plain(value) for name, value in row.items()} for key, row in figures.items()}
+    publish(__file__, arguments, "# Features of scans\n\n" + "\n\n".join(texts), report)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,219 @@
+"""Run ``gpusense features``: extract features from the scans of a recorded log, and make landmarks of them."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gpusense._util.progress import progress
+from gpusense.commands.arguments import add_backend, add_json, output_path, positive_number, whole_number
+from gpusense.commands.output import print_json
+from gpusense.commands.scans import add_log, add_reference, read_scans
+from gpusense.evaluation.machine import machine, machine_line
+
+if TYPE_CHECKING:
+    from gpusense.features.landmarks import FeatureMap
+    from gpusense.features.result import Features
+    from gpusense.logs import Scan
+
+NAME = "features"
+HELP = "Extract lines, corners, doors, hallways and poles from the scans of a log."
+
+# Scans of one call: a step of the progress bar.
+_CALL = 256
+
+_EPILOG = """\
+Each scan is split into lines, and corners, doors, hallways and poles are made of them (docs/features.md). With
+--map-out the corners, doors and poles of all scans become landmarks, at the logged poses or those of --reference;
+--map-in makes landmarks of an occupancy grid instead.
+
+Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
+
+example:
+  gpusense features --log run.log.gz --limit 300 --plot scan.png
+  gpusense features --log run.log.gz --map-out landmarks.csv --map-plot landmarks.png
+  gpusense features --map-in map.yaml --map-out landmarks.csv"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    parser.epilog = _EPILOG
+    add = parser.add_argument
+    add_log(parser, "a log with scans", required=False)
+    add_reference(parser)
+    add("--map-in", type=Path, metavar="YAML", help="a map_server map, of which landmarks are made instead of a log")
+    add("--kinds", nargs="+", choices=("line", "corner", "door", "hallway", "pole"), metavar="KIND",
+        help="line, corner, door, hallway, pole (default: all)")  # fmt: skip
+    add("--noise", type=positive_number, metavar="M",
+        help="standard deviation of ranges [m] (default: that of each scan)")  # fmt: skip
+    add("--every", type=whole_number(low=1), default=1, metavar="E", help="every E-th scan (default: 1)")
+    add("--offset", type=whole_number(low=0), default=0, metavar="O", help="index of the first scan (default: 0)")
+    add("--limit", type=whole_number(low=1), metavar="S", help="largest number of scans (default: all)")
+    add("--range-max", type=positive_number, metavar="M",
+        help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')")  # fmt: skip
+    add("--least", type=whole_number(low=1), default=2, metavar="N",
+        help="least scans that show a landmark (default: %(default)s)")  # fmt: skip
+    add_backend(parser)
+    add_json(parser)
+    add("--out", type=output_path(".csv"), metavar="CSV", help="write all features")
+    add("--map-out", type=output_path(".csv"), metavar="CSV", help="write landmarks")
+    picture = output_path(".png", ".pdf", ".svg")
+    add("--plot", type=picture, metavar="FILE", help="draw the scan with the most features")
+    add("--map-plot", type=picture, metavar="FILE", help="draw the landmarks")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Extract the features and print their numbers; after Ctrl-C those so far."""
+    if (args.log is None) == (args.map_in is None):
+        raise ValueError("--log: must be given, or else --map-in, and not both")
+    if args.map_in is not None:
+        return _of_map(args)
+    posed = args.map_out is not None or args.map_plot is not None
+    scans = read_scans(args, posed=posed)
+    parts: list[Features] = []
+    begun = time.perf_counter()
+    try:
+        with progress(len(scans)) as step:
+            for first in range(0, len(scans), _CALL):
+                parts.append(_extract(args, scans[first : first + _CALL]))
+                for index, _ in scans[first : first + _CALL]:
+                    step(f"scan {index}")
+    except KeyboardInterrupt:
+        if parts:
+            _report(args, scans, parts, posed, time.perf_counter() - begun)
+        raise
+    _report(args, scans, parts, posed, time.perf_counter() - begun)
+    return 0
+
+
+def _extract(args: argparse.Namespace, scans: list[tuple[int, Scan]]) -> Features:
+    from gpusense.features.extract import extract_features
+    from gpusense.features.result import KINDS
+
+    ranges = np.array([scan.ranges for _, scan in scans])
+    kinds, scanner = args.kinds or KINDS, scans[0][1].scanner
+    if args.noise is None:
+        return extract_features(ranges, scanner, kinds, args.backend)
+    return extract_features(ranges, scanner, kinds, args.backend, noise=args.noise)
+
+
+def _landmark_kinds(args: argparse.Namespace) -> tuple[str, ...]:
+    from gpusense.features.landmarks import LANDMARK_KINDS
+
+    return tuple(kind for kind in LANDMARK_KINDS if args.kinds is None or kind in args.kinds)
+
+
+def _of_map(args: argparse.Namespace) -> int:
+    """Make landmarks of a map."""
+    from gpusense.features.landmarks import landmarks_of_map
+    from gpusense.world.map_files import read_map
+
+    for option in ("out", "plot", "reference"):
+        if getattr(args, option) is not None:
+            raise ValueError(f"--{option}: must not be given with --map-in, which has no scans")
+    grid = read_map(args.map_in)
+    landmarks = landmarks_of_map(grid, kinds=_landmark_kinds(args), backend=args.backend)
+    _write_landmarks(args, landmarks, grid)
+    if args.json:
+        print_json({"options": _options(args), "landmarks": _landmark_rows(landmarks), "machine": machine()})
+        return 0
+    print(f"{landmarks!r} of {grid!r}")
+    _print_files(args)
+    return 0
+
+
+def _report(
+    args: argparse.Namespace, scans: list[tuple[int, Scan]], parts: list[Features], posed: bool, seconds: float
+) -> None:
+    """Print and write the features of all scans, or of those before an interrupt."""
+    from gpusense.features.landmarks import map_features
+    from gpusense.features.result import joined
+
+    features = joined(parts, _CALL)
+    done = min(_CALL * len(parts), len(scans))
+    landmarks = None
+    if posed:
+        poses = np.array([scan.pose for _, scan in scans[:done]])
+        landmarks = map_features(features, poses, kinds=_landmark_kinds(args), least=args.least)
+        _write_landmarks(args, landmarks, None)
+    if args.out is not None:
+        _write(args.out, features, scans)
+    if args.plot is not None:
+        _draw(args.plot, features, scans[:done])
+    counts = {str(kind): int(count) for kind, count in zip(*np.unique(features.kind, return_counts=True), strict=True)}
+    if args.json:
+        print_json({
+            "options": _options(args), "scans": done, "counts": counts, "milliseconds_each": 1e3 * seconds / done,
+            "landmarks": None if landmarks is None else _landmark_rows(landmarks), "machine": machine(),
+        })  # fmt: skip
+        return
+    print(f"{done} scans, {1e3 * seconds / done:.3g} ms each with the first call's compilation")
+    for kind, count in counts.items():
+        print(f"  {count} {kind}{'s' * (count > 1)}: {count / done:.2f} a scan")
+    if landmarks is not None:
+        print(f"landmarks: {landmarks!r}")
+    if done < len(scans):
+        print(f"interrupted: results of {done} of {len(scans)} scans")
+    _print_files(args)
+
+
+def _print_files(args: argparse.Namespace) -> None:
+    for path, word in (
+        (args.out, "written"),
+        (args.map_out, "written"),
+        (args.plot, "drawn"),
+        (args.map_plot, "drawn"),
+    ):
+        if path is not None:
+            print(f"{word}: {path}")
+    print(f"\n{machine_line()}")
+
+
+def _options(args: argparse.Namespace) -> dict[str, Any]:
+    return {name: value for name, value in vars(args).items() if name not in ("run", "command", "json")}
+
+
+def _landmark_rows(landmarks: FeatureMap) -> list[dict[str, Any]]:
+    return [
+        {"kind": str(kind), "pose": pose, "size": float(size), "count": int(count)}
+        for kind, pose, size, count in zip(landmarks.kind, landmarks.pose, landmarks.size, landmarks.count, strict=True)
+    ]
+
+
+def _write_landmarks(args: argparse.Namespace, landmarks: FeatureMap, grid: Any) -> None:
+    from gpusense.plots.drawing import save
+    from gpusense.plots.features import landmarks_figure
+
+    if args.map_out is not None:
+        landmarks.save(args.map_out)
+    if args.map_plot is not None:
+        save(landmarks_figure(landmarks, grid), args.map_plot)
+
+
+def _write(path: Path, features: Features, scans: list[tuple[int, Scan]]) -> None:
+    """Write a line for each feature: scan, kind, pose, deviations, size and score."""
+    from gpusense._util.files import write_whole
+
+    deviation = np.sqrt(np.einsum("fii->fi", features.covariance))
+    lines = ["scan,kind,x,y,theta,deviation_x,deviation_y,deviation_theta,size,score"]
+    for scan, kind, pose, spread, size, score in zip(
+        features.scan, features.kind, features.pose, deviation, features.size, features.score, strict=True
+    ):
+        numbers = ",".join(repr(float(value)) for value in (*pose, *spread, size, score))
+        lines.append(f"{scans[int(scan)][0]},{kind},{numbers}")
+    text = "\n".join(lines) + "\n"
+    write_whole(path, lambda file: file.write(text.encode()))
+
+
+def _draw(path: Path, features: Features, scans: list[tuple[int, Scan]]) -> None:
+    """Draw the scan with the most features."""
+    from gpusense.plots.drawing import save
+    from gpusense.plots.features import features_figure
+
+    most = int(np.bincount(features.scan, minlength=len(scans)).argmax())
+    scan = scans[most][1]
+    save(features_figure(features.of_scan(most), scan.ranges, scan.scanner), path)

@@ -1,0 +1,1 @@
+"""Features of scans: lines, corners, doors, hallways and poles."""

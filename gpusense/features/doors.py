@@ -1,0 +1,228 @@
+"""Doors: gaps in a straight wall that a person or robot fits through, open at least in part."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpusense.features.beams import Beams
+from gpusense.features.hallways import pairs_of, wrapped
+from gpusense.features.lines import scores_of
+from gpusense.features.result import Found
+from gpusense.features.segments import Segments
+
+# Width of a door [m].
+_NARROWEST, _WIDEST = 0.5, 2.0
+# Both sides are of one wall up to this [m] and [rad], and this many deviations.
+_ASIDE, _PARALLEL, _DEVIATIONS = 0.03, math.radians(4), 3.0
+# Least length of a wall [m] and of its other side, and most uncertainty of a jamb across and along the wall [m].
+_WALL, _OTHER, _VAGUE, _COARSE = 0.5, 0.1, 0.08, 0.4
+# Uncertainty of a jamb at grazing incidence in deviations of ranges, as a step of beams.
+_REVEAL = 4.0
+# Share of the beams between the jambs that nothing stops before the wall, and that go on by this [m].
+_UNSTOPPED, _UNSTOPPED_BESIDE_LEAF, _THROUGH, _DEEP = 0.6, 0.25, 0.25, 0.4
+# Length of a leaf in widths of its door, its least turn from the wall [rad], and the gap beside its hinge [m].
+_LEAF, _LEAST_TURN, _TOUCHING = (0.6, 1.25), math.radians(15), 0.12
+
+
+@dataclass(frozen=True)
+class _Gaps:
+    """Gaps between two segments of a scan.
+
+    Attributes:
+        before: (D,) segment before the gap.
+        after: (D,) segment after it.
+        wall: (D,) the one of them whose line is that of the wall.
+        other: (D,) the other one: a part of the wall, or the leaf of a door.
+        ends: (D, 4) places of both jambs along the wall, and the steps of beams there [m].
+    """
+
+    before: np.ndarray
+    after: np.ndarray
+    wall: np.ndarray
+    other: np.ndarray
+    ends: np.ndarray
+
+    def only(self, rows: np.ndarray) -> _Gaps:
+        """Return some of the gaps."""
+        return _Gaps(self.before[rows], self.after[rows], self.wall[rows], self.other[rows], self.ends[rows])
+
+
+def find_doors(segments: Segments, straight: np.ndarray, beams: Beams, mount: tuple[float, float, float]) -> Found:
+    """Return the doors of scans: centre of the gap, direction across, and width."""
+    sides = np.flatnonzero(np.isfinite(segments.distance) & (segments.count >= 3))
+    one, two = pairs_of(segments.scan[sides])
+    before, after = _ordered(segments, sides[one], sides[two])
+    kinds = _between_walls(segments, straight, before, after), _beside_leaves(segments, straight, before, after)
+    names = ("before", "after", "wall", "other", "ends")
+    gaps = _Gaps(*(np.concatenate([getattr(each, name) for each in kinds]) for name in names))
+    is_leaf = np.arange(len(gaps.wall)) >= len(kinds[0].wall)
+    good, through = _openness(segments, beams, gaps)
+    gaps, is_leaf, through = gaps.only(good), is_leaf[good], through[good]
+    kept = _one_each(segments, gaps, straight[gaps.other] & ~is_leaf)
+    gaps = gaps.only(kept)
+    return _found(segments, gaps.wall, gaps.other, gaps.ends, through[kept], mount)
+
+
+def _between_walls(segments: Segments, straight: np.ndarray, before: np.ndarray, after: np.ndarray) -> _Gaps:
+    """Return the gaps between two parts of a straight wall."""
+    # The better line is the wall; the other one has to lie on it.
+    wall = np.where(segments.covariance[before, 0, 0] <= segments.covariance[after, 0, 0], before, after)
+    other = np.where(wall == before, after, before)
+    left, right = _jambs(segments, before, after, wall)
+    gaps = _Gaps(before, after, wall, other, np.stack([left[0], right[0], left[1], right[1]], axis=1))
+    return gaps.only(_is_wide(segments, straight, gaps) & _on_wall(segments, wall, other))
+
+
+def _beside_leaves(segments: Segments, straight: np.ndarray, before: np.ndarray, after: np.ndarray) -> _Gaps:
+    """Return the gaps between a wall's end and the hinge of a leaf that is open towards the scanner."""
+    wall, leaf = np.concatenate([before, after]), np.concatenate([after, before])
+    before, after = np.concatenate([before, before]), np.concatenate([after, after])
+    near = straight[wall] & straight[leaf]
+    wall, leaf, before, after = wall[near], leaf[near], before[near], after[near]
+    alpha, beta = segments.angle[wall], segments.angle[leaf]
+    sine = np.sin(beta - alpha)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # Where the lines meet, along each of them.
+        hinge = (segments.distance[leaf] - segments.distance[wall] * np.cos(beta - alpha)) / sine
+        reached = (segments.distance[leaf] * np.cos(beta - alpha) - segments.distance[wall]) / sine
+    first = leaf == after
+    end = np.where(first, segments.ends[leaf, 0], segments.ends[leaf, 1])
+    step = np.where(first, segments.spacing[leaf, 0], segments.spacing[leaf, 1])
+    left, right = _jambs(segments, before, after, wall)
+    ends = np.stack([np.where(first, left[0], hinge), np.where(first, hinge, right[0]),
+                     np.where(first, left[1], step), np.where(first, step, right[1])], axis=1)  # fmt: skip
+    gaps = _Gaps(before, after, wall, leaf, ends)
+    noise = np.sqrt(segments.variance[wall])
+    good = (np.abs(sine) > math.sin(_LEAST_TURN)) & (np.abs(reached - end) <= 1.5 * step + 0.05 + _DEVIATIONS * noise)
+    share = segments.length[leaf] / np.maximum(ends[:, 1] - ends[:, 0], 1e-9)
+    good &= (share >= _LEAF[0]) & (share <= _LEAF[1])
+    return gaps.only(good & _is_wide(segments, straight, gaps))
+
+
+def _is_wide(segments: Segments, straight: np.ndarray, gaps: _Gaps) -> np.ndarray:
+    """Return which gaps are as wide as doors, of a wall that is long enough, with jambs that are known."""
+    width = gaps.ends[:, 1] - gaps.ends[:, 0]
+    good = straight[gaps.wall] & (segments.length[gaps.wall] >= _WALL) & (segments.length[gaps.other] >= _OTHER)
+    result: np.ndarray = good & (width >= _NARROWEST) & (width <= _WIDEST) & (gaps.ends[:, 2:] <= _COARSE).all(axis=1)
+    return result
+
+
+def _one_each(segments: Segments, gaps: _Gaps, sure: np.ndarray) -> np.ndarray:
+    """Return the doors of which no other one overlaps, or that have long walls on both sides or are narrower."""
+    wall, ends = gaps.wall, gaps.ends
+    order = np.lexsort((ends[:, 1] - ends[:, 0], ~sure, segments.scan[wall]))
+    middle = segments.place(wall, ends[:, :2].mean(axis=1))
+    width = ends[:, 1] - ends[:, 0]
+    scan = segments.scan[wall]
+    kept: list[int] = []
+    taken: list[int] = []
+    for k in order.tolist():
+        if taken and scan[taken[0]] != scan[k]:
+            taken = []
+        if all(np.hypot(*(middle[j] - middle[k])) > 0.5 * (width[j] + width[k]) for j in taken):
+            taken.append(k)
+            kept.append(k)
+    return np.array(kept, np.int64)
+
+
+def _ordered(segments: Segments, one: np.ndarray, two: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sides of gaps: the segment before and the segment after it, also around the end of a scan."""
+    around = segments.successor[np.searchsorted(segments.scan, segments.scan[one], side="right") - 1] >= 0
+    before = np.concatenate([one, two[around]])
+    after = np.concatenate([two, one[around]])
+    return before, after
+
+
+def _jambs(
+    segments: Segments, before: np.ndarray, after: np.ndarray, wall: np.ndarray
+) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Return places of both jambs along the wall, and the steps of beams there."""
+    found = []
+    bearing = segments.points.point[:, 2].astype(np.float64)
+    for point, side in ((segments.last[before], 1), (segments.first[after], -1)):
+        turn = wrapped(bearing[point] - segments.angle[wall])
+        turn = np.where(np.abs(turn) < 1.55, turn, np.nan)
+        step = segments.distance[wall] * segments.step / np.square(np.cos(turn))
+        place = segments.distance[wall] * np.tan(turn) + side * 0.5 * step
+        # Of the reveal of a jamb, what is not farther from the wall than noise seems to be wall.
+        found.append((place, np.hypot(step, _REVEAL * np.sqrt(segments.variance[wall]) * np.sin(turn))))
+    return found[0], found[1]
+
+
+def _on_wall(segments: Segments, wall: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return whether the other side lies on the wall."""
+    c, s, d = np.cos(segments.angle[wall]), np.sin(segments.angle[wall]), segments.distance[wall]
+    good = np.ones(len(wall), bool)
+    deviation = np.sqrt(segments.covariance[wall, 0, 0] + segments.covariance[other, 0, 0])
+    turn = np.abs(wrapped(segments.angle[wall] - segments.angle[other]))
+    good &= turn <= _PARALLEL + _DEVIATIONS * deviation
+    middle = segments.ends[other].mean(axis=1)
+    xy = segments.place(other, middle)
+    across, along = c * xy[:, 0] + s * xy[:, 1] - d, c * xy[:, 1] - s * xy[:, 0]
+    mine, its = segments.covariance[wall], segments.covariance[other]
+    spread = mine[:, 1, 1] - 2 * along * mine[:, 0, 1] + along**2 * mine[:, 0, 0]
+    spread += its[:, 1, 1] - 2 * middle * its[:, 0, 1] + middle**2 * its[:, 0, 0]
+    spread = np.sqrt(np.maximum(spread, 0))
+    good &= (np.abs(across) <= _ASIDE + _DEVIATIONS * spread) & (spread <= _VAGUE)
+    return good
+
+
+def _openness(segments: Segments, beams: Beams, gaps: _Gaps) -> tuple[np.ndarray, np.ndarray]:
+    """Return which gaps are open, and the share of their beams that go through."""
+    points, wall = segments.points, gaps.wall
+    scan = segments.scan[wall]
+    begin, total = points.start[scan], points.counts[scan]
+    last, first = segments.last[gaps.before], segments.first[gaps.after]
+    inside = np.mod(first - last - 1, np.maximum(total, 1))
+    open_beams = beams.without_return(scan, last, first)
+    which = np.repeat(np.arange(len(wall)), inside)
+    number = np.arange(len(which)) - np.repeat(np.cumsum(inside) - inside, inside)
+    index = begin[which] + (last[which] - begin[which] + 1 + number) % np.maximum(total[which], 1)
+    angle = segments.angle[wall][which]
+    place = points.point[:, :2].astype(np.float64)
+    depth = np.cos(angle) * place[index, 0] + np.sin(angle) * place[index, 1] - segments.distance[wall][which]
+    margin = (0.05 + 3 * np.sqrt(segments.variance[wall]))[which]
+
+    def count(chosen: np.ndarray) -> np.ndarray:
+        return np.bincount(which[chosen], minlength=len(wall))
+
+    # Beside a jamb beams go on. Something before the wall that does not begin there hides the jamb; else it is a leaf.
+    beside = np.stack([last, first], axis=1)[which]
+    at_end = np.stack([number == 0, number == inside[which] - 1], axis=1) & (depth < -margin)[:, None]
+    apart = np.hypot(*np.moveaxis(place[index][:, None] - place[beside], 2, 0))
+    touches = apart <= _TOUCHING + 2 * gaps.ends[which, 2:]
+    hidden, has_leaf = count((at_end & ~touches).any(axis=1)) > 0, count((at_end & touches).any(axis=1)) > 0
+    stopped, shallow = count(depth < -margin), count((depth >= -margin) & (depth < _DEEP))
+    beams_in = inside + open_beams
+    share = np.maximum(beams_in, 1)
+    through = np.where(beams_in > 0, (share - stopped - shallow) / share, 0)
+    least = np.where(has_leaf, _UNSTOPPED_BESIDE_LEAF, _UNSTOPPED)
+    return ~hidden & (1 - stopped / share >= least) & (through >= _THROUGH), through
+
+
+def _found(
+    segments: Segments, wall: np.ndarray, other: np.ndarray, ends: np.ndarray, through: np.ndarray,
+    mount: tuple[float, float, float],
+) -> Found:  # fmt: skip
+    """Return doors by their walls and jambs (D, 4): places along the wall and steps of beams."""
+    angle, middle = segments.angle[wall], ends[:, :2].mean(axis=1)
+    c, s = np.cos(angle), np.sin(angle)
+    mine = segments.covariance[wall]
+    # Twice the variance of an edge between two beams: beams beside a jamb may be taken for its reveal.
+    along = np.square(ends[:, 2:]).sum(axis=1) / 24
+    across = mine[:, 1, 1] - 2 * middle * mine[:, 0, 1] + middle**2 * mine[:, 0, 0]
+    mixed = mine[:, 0, 1] - middle * mine[:, 0, 0]
+    covariance = np.zeros((len(wall), 3, 3))
+    covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 2, 2] = across, along, mine[:, 0, 0]
+    covariance[:, 0, 2] = covariance[:, 2, 0] = mixed
+    observed = np.zeros((len(wall), 3, 3))
+    observed[:, 0, 0], observed[:, 0, 1] = c, s
+    observed[:, 1, 0], observed[:, 1, 1], observed[:, 2, 2] = -s, c, 1
+    xy = segments.place(wall, middle) + np.array(mount[:2])
+    best = np.maximum(scores_of(segments, wall), scores_of(segments, other))
+    found = Found(segments.scan[wall], np.column_stack([xy, angle]), observed, covariance,
+                  ends[:, 1] - ends[:, 0], best * np.minimum(1, 0.5 + through))  # fmt: skip
+    return found.only(np.argsort(found.scan, kind="stable"))

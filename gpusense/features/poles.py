@@ -1,0 +1,123 @@
+"""Poles: round objects in front of what is behind them, such as columns, posts, legs and cylindrical reflectors."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gpusense.features.beams import Beams
+from gpusense.features.device import ScanDevice
+from gpusense.features.result import Found
+from gpusense.features.segments import Segments
+
+# Radius [m], and least points of a pole.
+_THINNEST, _THICKEST, _LEAST_POINTS = 0.015, 0.5, 4
+# The background of a pole is farther by this [m], and this many deviations.
+_BEHIND, _DEVIATIONS = 0.08, 6.0
+# The larger a pole, the more must it be rounder than lines: radius for which this is a deviation [m].
+_USUAL = 0.1
+# Squared deviations per reading and edge of a pole, and how much more than its segments' lines it may cost.
+_POOR, _ROUND = 2.5, 6.0
+# Cost by which each line but the first fits noise.
+_EACH = 8.0
+
+
+def find_poles(
+    device: ScanDevice, segments: Segments, beams: Beams, noise: np.ndarray, mount: tuple[float, float, float]
+) -> Found:
+    """Return the poles of scans: centre and radius."""
+    first, count, scan, edges = _objects(segments, beams, noise)
+    part = np.stack([first, count], axis=1)
+    step = segments.step
+    edge = np.column_stack([edges, np.full((len(first), 2), step / math.sqrt(12))])
+    circle = device.circles(part, scan, edge)
+    radius, cost = circle[:, 2], circle[:, 3]
+    good = (cost >= 0) & (radius >= _THINNEST) & (radius <= _THICKEST) & np.isfinite(circle).all(axis=1)
+    good &= cost <= _POOR * (count - 1) + 4
+    good &= cost + np.square(radius / _USUAL) <= _cost_of_lines(segments, first, count, scan) + _ROUND
+    circle, scan, count, cost = circle[good], scan[good], count[good], cost[good]
+    inverse, radius = _covariance(circle), circle[:, 2]
+    distance = np.hypot(circle[:, 0], circle[:, 1])
+    sure = (np.sqrt(np.einsum("pii->p", inverse)) < 0.5 * np.maximum(radius, 0.05)) & (distance > radius)
+    observed = np.zeros((len(scan), 2, 3))
+    observed[:, 0, 0] = observed[:, 1, 1] = 1
+    pose = np.column_stack([circle[:, :2] + np.array(mount[:2]), np.zeros(len(scan))])
+    fit = np.minimum(1, (count - 1) / np.maximum(cost, 1e-9))
+    score = np.clip(fit * (1 - np.sqrt(np.einsum("pii->p", inverse)) / np.maximum(radius, 0.05)), 0, 1)
+    return Found(scan, pose, observed, inverse, radius, score).only(sure)
+
+
+def _covariance(circle: np.ndarray) -> np.ndarray:
+    """Return the covariances (P, 2, 2) of centres, with the radius unknown."""
+    information = np.zeros((len(circle), 3, 3))
+    rows, cols = np.triu_indices(3)
+    information[:, rows, cols] = information[:, cols, rows] = circle[:, 4:10]
+    inverse: np.ndarray = np.linalg.pinv(information, hermitian=True)[:, :2, :2]
+    return inverse
+
+
+def _objects(
+    segments: Segments, beams: Beams, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return first points, numbers of points and scans of objects in front of others, and bearings of their edges."""
+    points = segments.points
+    total = len(points.point)
+    scan = np.repeat(np.arange(len(noise)), points.counts)
+    begin, counts = points.start[scan], points.counts[scan]
+    following = begin + (np.arange(total) - begin + 1) % np.maximum(counts, 1)
+    point = points.point.astype(np.float64)
+    r, bearing = point[:, 3], point[:, 2]
+    step = np.mod(bearing[following] - bearing, 2 * math.pi)
+    jump = _BEHIND + _DEVIATIONS * noise[scan]
+    rises, falls = r[following] - r > jump, r - r[following] > jump
+    gap = (step > points.gap) | (following == np.arange(total))
+    # An object ends where ranges rise or beams have no return, and begins where they fall.
+    begins = np.zeros(total, bool)
+    begins[following[falls & ~gap]] = True
+    begins |= beams.opens_before
+    ends, broken = (rises & ~gap) | beams.opens_after, falls | gap
+    starts = np.flatnonzero(begins)
+    if not len(starts):
+        empty = np.zeros(0, np.int64)
+        return empty, empty, empty, np.zeros((0, 2))
+    stops = np.flatnonzero(ends | broken)
+    return _runs(points.start, scan, starts, stops, ends, bearing, segments.step, points.counts)
+
+
+def _runs(
+    start: np.ndarray, scan: np.ndarray, starts: np.ndarray, stops: np.ndarray, ends: np.ndarray, bearing: np.ndarray,
+    step: float, counts: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Return the objects from points that begin one to the next stop, if that ends it, and they are narrow enough."""
+    place = np.searchsorted(stops, starts)
+    last = np.where(place < len(stops), stops[np.minimum(place, len(stops) - 1)], -1)
+    # Around the end of a scan.
+    same = (last >= 0) & (scan[np.maximum(last, 0)] == scan[starts])
+    head = np.searchsorted(stops, start[scan[starts]])
+    wrapped = stops[np.minimum(head, len(stops) - 1)]
+    usable = (head < len(stops)) & (scan[wrapped] == scan[starts]) & (wrapped < starts)
+    last = np.where(same, last, np.where(usable, wrapped, -1))
+    kept = (last >= 0) & ends[np.maximum(last, 0)]
+    starts, last = starts[kept], last[kept]
+    of = scan[starts]
+    count = np.mod(last - starts, np.maximum(counts[of], 1)) + 1
+    width = np.mod(bearing[last] - bearing[starts], 2 * math.pi)
+    kept = (count >= _LEAST_POINTS) & (width < 2.0)
+    starts, last, of, count, width = starts[kept], last[kept], of[kept], count[kept], width[kept]
+    edges = np.stack([bearing[starts] - 0.5 * step, bearing[starts] + width + 0.5 * step], axis=1)
+    return starts, count, of, edges
+
+
+def _cost_of_lines(segments: Segments, first: np.ndarray, count: np.ndarray, scan: np.ndarray) -> np.ndarray:
+    """Return the cost of the lines in each object, with what further lines fit of noise, and 1 for each other point."""
+    total = segments.points.counts[scan]
+    cost = np.zeros(len(first))
+    head, tail = np.searchsorted(segments.scan, scan), np.searchsorted(segments.scan, scan, side="right")
+    for k in range(len(first)):
+        rows = np.arange(head[k], tail[k])
+        off = (segments.first[rows] - first[k]) % total[k]
+        inner = rows[(off + segments.count[rows] <= count[k])]
+        cost[k] = np.maximum(segments.cost[inner], 0).sum() + _EACH * max(len(inner) - 1, 0)
+        cost[k] += count[k] - segments.count[inner].sum()
+    return cost

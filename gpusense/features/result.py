@@ -1,0 +1,214 @@
+"""Features of scans: kinds, poses, covariances, sizes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense._util import checks
+
+Floats = NDArray[np.float64]
+
+KINDS = ("line", "corner", "door", "hallway", "pole")
+"""Kinds of features."""
+
+# Signatures of two kinds differ by at least one of these; sizes are below it.
+SIGNATURE_STEP = 10.0
+_LARGEST_SIZE = 9.0
+# A coordinate is lost if a lost direction has more than this of it.
+_PARALLEL = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Features of scans from :func:`gpusense.extract_features`, in the order of scans and, in a scan, of kinds.
+
+    Attributes:
+        kind: (F,) names: "line", "corner", "door", "hallway" or "pole".
+        scan: (F,) index of the scan.
+        pose: (F, 3) x, y [m] and theta [rad, in -pi to pi] in the robot's frame. Line: midpoint and direction, with
+            the scanner on its left. Corner: vertex and bisector into the free space. Door: centre and direction
+            across, away from the scanner. Hallway: point of the axis abreast of the robot and direction of the axis,
+            within pi / 2 of the robot's. Pole: centre and 0.
+        covariance: (F, 3, 3) of the pose; infinite in every coordinate in which a direction lies that is not
+            observed: along a line and the axis of a hallway, and the heading of a pole.
+        information: (F, 3, 3) inverse of the covariance, finite: exactly 0 along directions that are not observed.
+        size: (F,) length of a line [m], opening angle of the free space in a corner [rad], width of a door and of a
+            hallway [m], radius of a pole [m].
+        score: (F,) quality in 0 to 1: agreement of the readings with the shape, times how well they place it.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> scanner = gs.Scanner.uniform(angle_min=-3.1, angle_increment=0.0175, count=356, range_max=9.0)
+        >>> b = scanner.bearings
+        >>> room = np.minimum(3 / np.abs(np.cos(b)), 2 / np.abs(np.sin(b)))
+        >>> corners = gs.extract_features(room, scanner, kinds="corner", backend="numpy")
+        >>> np.unique(np.abs(corners.pose[:, :2]).round(3), axis=0).tolist()
+        [[3.0, 2.0]]
+    """
+
+    kind: NDArray[np.str_]
+    scan: NDArray[np.int64]
+    pose: Floats
+    covariance: Floats
+    information: Floats
+    size: Floats
+    score: Floats
+
+    def __len__(self) -> int:
+        return len(self.scan)
+
+    def __iter__(self) -> Iterator[Features]:
+        """Return the features one by one."""
+        return (self[i : i + 1] for i in range(len(self)))
+
+    def __getitem__(self, index: slice | NDArray[np.bool] | NDArray[np.int64] | str) -> Features:
+        """Return some of the features: those of a kind, of a mask, of indices or of a slice."""
+        chosen: slice | NDArray[Any]
+        if isinstance(index, str):
+            chosen = self.kind == checks.choice("kind", index, KINDS)
+        elif isinstance(index, slice):
+            chosen = index
+        else:
+            chosen = np.asarray(index)
+            if chosen.ndim != 1 or (chosen.size and chosen.dtype.kind not in "biu"):
+                raise TypeError(f"index: must be a kind, a slice, a mask or indices, got {checks.show(index)}")
+            chosen = chosen if chosen.dtype.kind == "b" else chosen.astype(np.int64)
+        return Features(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
+
+    def of_scan(self, scan: int) -> Features:
+        """Return the features of one scan."""
+        return self[self.scan == checks.integer("scan", scan, low=0)]
+
+    def range_bearing(self, kind: str | Sequence[str] | None = None) -> Floats:
+        """Return features as :class:`gpusense.LandmarkModel` takes them.
+
+        Args:
+            kind: A kind or several; None for all. Poses of lines and hallways move with the robot: they are no
+                landmarks.
+
+        Returns:
+            (F, 3) range [m], bearing [rad] and signature, see :func:`signature_of`, in the robot's frame.
+
+        Raises:
+            ValueError: an unknown kind.
+        """
+        chosen = self if kind is None else self[np.isin(self.kind, check_kinds("kind", kind))]
+        x, y = chosen.pose[:, 0], chosen.pose[:, 1]
+        return np.column_stack([np.hypot(x, y), np.arctan2(y, x), chosen.signatures])
+
+    @property
+    def signatures(self) -> Floats:
+        """(F,) signatures, see :func:`signature_of`."""
+        return signature_of(self.kind, self.size)
+
+    def __repr__(self) -> str:
+        counts = [(int(np.count_nonzero(self.kind == name)), name) for name in KINDS]
+        words = [f"{count} {name}{'s' * (count > 1)}" for count, name in counts if count]
+        return f"Features({', '.join(words) or 'none'})"
+
+
+def joined(parts: Sequence[Features], scans: int) -> Features:
+    """Return the features of several calls, each of ``scans`` scans but for the last, as those of one."""
+    values = {one.name: np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(Features)}
+    values["scan"] = np.concatenate([part.scan + scans * number for number, part in enumerate(parts)])
+    return Features(**values)
+
+
+def signature_of(kind: NDArray[np.str_], size: Floats) -> Floats:
+    """Return the signatures (F,) of features: ten times the place of the kind among ``KINDS``, plus the size up to 9.
+
+    Sizes are compared by ``sigma_signature`` of :class:`gpusense.LandmarkParameters`; kinds are never confused.
+    """
+    place = np.zeros(len(kind))
+    for number, name in enumerate(KINDS):
+        place[kind == name] = number
+    signature: Floats = SIGNATURE_STEP * place + np.minimum(size, _LARGEST_SIZE)
+    return signature
+
+
+def check_kinds(name: str, kinds: str | Sequence[str]) -> tuple[str, ...]:
+    """Return kinds as a tuple, checked.
+
+    Raises:
+        TypeError: not a name, nor a sequence of names.
+        ValueError: an unknown kind.
+    """
+    if isinstance(kinds, str):
+        return (checks.choice(name, kinds, KINDS),)
+    try:
+        names = tuple(kinds)
+    except TypeError:
+        raise TypeError(f"{name}: must be kinds of features, got {checks.show(kinds)}") from None
+    return tuple(checks.choice(name, one, KINDS) for one in names)
+
+
+@dataclass
+class Found:
+    """Features of one kind: what is observed of them.
+
+    Attributes:
+        scan: (F,) index of the scan.
+        pose: (F, 3) in the robot's frame.
+        observed: (F, M, 3) rows: directions of x, y and theta that are observed, orthonormal.
+        covariance: (F, M, M) along these.
+        size: (F,) see ``Features``.
+        score: (F,) see ``Features``.
+    """
+
+    scan: np.ndarray
+    pose: np.ndarray
+    observed: np.ndarray
+    covariance: np.ndarray
+    size: np.ndarray
+    score: np.ndarray
+
+    def only(self, rows: np.ndarray) -> Found:
+        """Return some of the features."""
+        return Found(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+
+
+def nothing() -> Found:
+    """Return no feature."""
+    empty = np.zeros(0)
+    return Found(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), empty, empty)
+
+
+def features_of(found: dict[str, Found]) -> Features:
+    """Return features of several kinds, ordered by scan, then kind."""
+    parts = list(found.values())
+    kind = np.concatenate(
+        [np.full(len(part.scan), name, "<U7") for name, part in found.items()] or [np.zeros(0, "<U7")]
+    )
+    scan = np.concatenate([part.scan for part in parts] or [np.zeros(0)]).astype(np.int64)
+    order = np.argsort(scan, kind="stable")
+    pairs = [_covariances(part) for part in parts]
+
+    def joined(values: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
+        return np.concatenate([np.zeros((0, *shape)), *values])[order]
+
+    pose = joined([part.pose for part in parts], (3,))
+    pose[:, 2] = np.mod(pose[:, 2] + math.pi, 2 * math.pi) - math.pi
+    return Features(
+        kind[order], scan[order], pose, joined([one for one, _ in pairs], (3, 3)),
+        joined([two for _, two in pairs], (3, 3)), joined([part.size for part in parts], ()),
+        joined([part.score for part in parts], ()),
+    )  # fmt: skip
+
+
+def _covariances(part: Found) -> tuple[np.ndarray, np.ndarray]:
+    """Return covariance and information (F, 3, 3) of features."""
+    rows = part.observed
+    columns = rows.transpose(0, 2, 1)
+    information = columns @ np.linalg.inv(part.covariance) @ rows
+    covariance = columns @ part.covariance @ rows
+    kept = columns @ rows
+    lost = np.eye(3) - kept
+    gone = np.einsum("fii->fi", lost) > _PARALLEL
+    both = gone[:, :, None] & gone[:, None, :] & (np.abs(lost) > _PARALLEL)
+    return np.where(both, np.copysign(np.inf, lost), covariance), information

@@ -1,0 +1,178 @@
+"""Straight segments of scans, with their lines, neighbours and noise."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpusense.features.device import ScanDevice
+from gpusense.matching.points import GAP, ScanPoints
+
+_FULL_TURN = 2 * math.pi
+# Two lines must lower the cost of one by this to be two [squares of deviations].
+PENALTY = 25.0
+# Degrees of freedom with which the noise of a scan counts in that of its segments.
+_PRIOR = 20.0
+# Least noise of ranges [m]: that of a covariance.
+LEAST_NOISE = 2e-4
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Segments of all scans in their order, each with a line ``x cos(angle) + y sin(angle) = distance``.
+
+    Attributes:
+        points: The points of all scans.
+        scan: (G,) the scan.
+        first: (G,) first point.
+        count: (G,) points.
+        angle: (G,) direction of the line's normal, away from the sensor [rad].
+        distance: (G,) of the line from the sensor [m], NaN without a line.
+        covariance: (G, 2, 2) of angle and distance.
+        cost: (G,) sum of squared deviations of ranges over their variance.
+        variance: (G,) variance of ranges, from the scan and from the segment's residuals [m^2].
+        ends: (G, 2) places of the first and last point along the line, from the foot of the normal [m].
+        spacing: (G, 2) distance of two beams along the line at these [m].
+        successor: (G,) next segment of the scan, after the last one the first if beams go all around, else -1.
+        apart: (G,) whether something may be hidden before the successor.
+    """
+
+    points: ScanPoints
+    scan: np.ndarray
+    first: np.ndarray
+    count: np.ndarray
+    angle: np.ndarray
+    distance: np.ndarray
+    covariance: np.ndarray
+    cost: np.ndarray
+    variance: np.ndarray
+    ends: np.ndarray
+    spacing: np.ndarray
+    successor: np.ndarray
+    apart: np.ndarray
+
+    @property
+    def step(self) -> float:
+        """Usual step between bearings [rad]."""
+        return self.points.gap / GAP
+
+    @property
+    def length(self) -> np.ndarray:
+        """(G,) lengths [m]."""
+        return self.ends[:, 1] - self.ends[:, 0]
+
+    @property
+    def last(self) -> np.ndarray:
+        """(G,) last point of each segment."""
+        begin = self.points.start[self.scan]
+        return begin + (self.first - begin + self.count - 1) % self.points.counts[self.scan]
+
+    def place(self, which: np.ndarray, along: np.ndarray) -> np.ndarray:
+        """Return the points (P, 2) at places along lines."""
+        c, s, d = np.cos(self.angle[which]), np.sin(self.angle[which]), self.distance[which]
+        return np.stack([d * c - along * s, d * s + along * c], axis=1)
+
+
+def find_segments(device: ScanDevice, points: ScanPoints, noise: np.ndarray) -> Segments:
+    """Split scans into segments, and fit lines to them."""
+    stop = device.split(PENALTY)
+    first = np.flatnonzero(stop >= 0)
+    scan = np.searchsorted(points.start, first, side="right") - 1
+    count = stop[first] - first
+    line = device.lines(np.stack([first, count], axis=1), scan)
+    closed = _is_closed(points)
+    first, count, scan, line = _joined_around(device, points, closed, first, count, scan, line)
+    return _described(points, closed, noise, first, count, scan, line)
+
+
+def _is_closed(points: ScanPoints) -> np.ndarray:
+    """Return which scans (S,) have no gap between their last and their first point."""
+    some = points.counts > 0
+    if not len(points.point):
+        return some
+    bearing = points.point[:, 2].astype(np.float64)
+    ends = np.clip(points.start, 0, len(bearing) - 1)
+    around = bearing[ends[:-1]] + _FULL_TURN - bearing[np.maximum(points.start[1:] - 1, 0)]
+    result: np.ndarray = some & (around <= points.gap)
+    return result
+
+
+def _joined_around(
+    device: ScanDevice, points: ScanPoints, closed: np.ndarray, first: np.ndarray, count: np.ndarray,
+    scan: np.ndarray, line: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Join the last segment of a scan with its first one where a single line explains both."""
+    begin = np.searchsorted(scan, np.arange(len(closed)))
+    end = np.searchsorted(scan, np.arange(len(closed)), side="right") - 1
+    rows = np.flatnonzero(closed & (end > begin))
+    head, tail = begin[rows], end[rows]
+    part = np.stack([first[tail], count[tail] + count[head]], axis=1)
+    joint = device.lines(part, rows)
+    apart = line[head, 5] + line[tail, 5]
+    joins = (joint[:, 5] >= 0) & (line[head, 5] >= 0) & (line[tail, 5] >= 0) & (joint[:, 5] - apart < PENALTY)
+    count, line = count.copy(), line.copy()
+    count[tail[joins]], line[tail[joins]] = part[joins, 1], joint[joins]
+    kept = np.ones(len(first), bool)
+    kept[head[joins]] = False
+    return first[kept], count[kept], scan[kept], line[kept]
+
+
+def _described(
+    points: ScanPoints, closed: np.ndarray, noise: np.ndarray, first: np.ndarray, count: np.ndarray,
+    scan: np.ndarray, line: np.ndarray,
+) -> Segments:  # fmt: skip
+    """Return segments with all that follows from their lines."""
+    a, b, r11, r12, r22, cost = line.T
+    size = np.hypot(a, b)
+    valid = (cost >= 0) & (r22 > 0) & (count >= 3) & np.isfinite(line).all(axis=1) & (size > 0)
+    with np.errstate(all="ignore"):
+        angle, distance = np.arctan2(b, a), np.where(valid, 1 / size, np.nan)
+        inverse = np.zeros((len(a), 2, 2))
+        inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1] = 1 / r11, -r12 / (r11 * r22), 1 / r22
+        jacobian = np.stack([-b / size**2, a / size**2, -a / size**3, -b / size**3], axis=1).reshape(-1, 2, 2)
+        root = jacobian @ inverse
+    variance = _variances(noise, scan, count, cost, valid)
+    scaled = variance / noise[scan] ** 2
+    covariance = np.where(valid[:, None, None], root @ root.transpose(0, 2, 1) * scaled[:, None, None], np.inf)
+    begin, total = points.start[scan], points.counts[scan]
+    last = begin + (first - begin + count - 1) % np.maximum(total, 1)
+    bearing = points.point[:, 2].astype(np.float64)
+    step = points.gap / GAP
+    turn = np.stack([bearing[first], bearing[last]], axis=1) - angle[:, None]
+    turn = np.mod(turn + math.pi, _FULL_TURN) - math.pi
+    with np.errstate(all="ignore"):
+        ends = distance[:, None] * np.tan(np.clip(turn, -1.57, 1.57))
+        spacing = distance[:, None] * step / np.square(np.cos(turn))
+    successor, apart = _successors(points, closed, scan, first, last)
+    return Segments(
+        points, scan, first, count, angle, distance, covariance, cost, variance, ends, spacing, successor, apart
+    )
+
+
+def _variances(
+    noise: np.ndarray, scan: np.ndarray, count: np.ndarray, cost: np.ndarray, valid: np.ndarray
+) -> np.ndarray:
+    """Return the variance of ranges (G,): that of all good segments of a scan, and a segment's own residuals."""
+    free = np.maximum(count - 2, 0)
+    squares = noise[scan] ** 2 * np.where(valid, cost, 0)
+    good = valid & (count >= 6)
+    scans = len(noise)
+    sums = np.bincount(scan[good], squares[good], scans) + 4 * noise**2
+    whole = np.maximum(sums / (np.bincount(scan[good], free[good], scans) + 4), LEAST_NOISE**2)
+    own = (_PRIOR * whole[scan] + squares) / (_PRIOR + free)
+    return np.maximum(own, LEAST_NOISE**2)
+
+
+def _successors(
+    points: ScanPoints, closed: np.ndarray, scan: np.ndarray, first: np.ndarray, last: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the next segment of each, or -1, and whether something may be hidden in between."""
+    number = np.arange(len(scan))
+    head = np.searchsorted(scan, scan)
+    is_last = np.append(scan[1:] != scan[:-1], True)[: len(scan)]
+    successor = np.where(is_last, np.where(closed[scan] & (head != number), head, -1), number + 1)
+    bearing = points.point[:, 2].astype(np.float64)
+    step = np.mod(bearing[first[successor]] - bearing[last], _FULL_TURN)
+    return successor, (successor < 0) | (step > points.gap)

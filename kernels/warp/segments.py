@@ -1,0 +1,300 @@
+"""Straight segments of scans: pieces of the sequence of points that a line explains up to the noise of ranges.
+
+On a line the inverse range is a cos(bearing) + b sin(bearing), linear in (a, b). Weighted by range^2 / sigma, squared
+residuals are those of ranges in standard deviations; their sum is the cost. A scan is split where two lines lower the
+cost most, until no split lowers it by penalty; neighbours are merged where a single line costs less than penalty more
+(split and merge, Pavlidis and Horowitz 1974), and ends are moved to where both lines together cost least. Lines are
+then fitted to ranges by Gauss-Newton steps, which is maximum likelihood. Rows are added by Givens rotations, whose
+costs have no cancellation.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from .prelude import kernel, precision
+
+# Passes of merging and of moving ends; Gauss-Newton steps of a line; numbers of a line.
+PASSES, STEPS, LINE_NUMBERS = 2, 5, 6
+
+
+@functools.cache
+def functions(flags):
+    """Make the functions of the file for a set of flags."""
+    types = precision(flags)
+    real, vec4 = types.real, types.vec4
+    # The triangular root of rows that were added (11, 12, right side 1, 22, right side 2), and the cost.
+    rows6 = wp.types.vector(length=6, dtype=real)
+    ZERO, ONE, NOTHING = real(0.0), real(1.0), real(-1.0)
+    # A segment whose cost per point is larger is split where that is best, even if one split alone does not pay.
+    POOR = real(3.0)
+    # Rows are parallel up to this. Splits that lower the cost equally but for a share of it are tied.
+    PARALLEL, TIED, TIED_AT = real(1e-6), real(1e-9), real(1e5)
+    LAST_STEP = STEPS + 1
+
+    # Return the median of three numbers.
+    @wp.func
+    def middle_of_three(a: real, b: real, c: real):
+        return wp.max(wp.min(a, b), wp.min(wp.max(a, b), c))
+
+    # Return the weight of the row (x, y, 1) of point i; its range is the median of three neighbours.
+    @wp.func
+    def weight_at(point: wp.array(dtype=vec4), i: wp.int32, first: wp.int32, last: wp.int32, sigma: real):
+        r = point[i][3]
+        middle = middle_of_three(point[wp.max(i - 1, first)][3], r, point[wp.min(i + 1, last - 1)][3])
+        return middle * middle / (sigma * r)
+
+    # Return the rows with another row (a, b | v).
+    @wp.func
+    def add_row(rows: rows6, first: real, second: real, right: real):
+        a = first
+        b = second
+        v = right
+        r11 = rows[0]
+        r12 = rows[1]
+        z1 = rows[2]
+        r22 = rows[3]
+        z2 = rows[4]
+        size = wp.sqrt(r11 * r11 + a * a)
+        largest = wp.abs(b) + wp.abs(r12)
+        if size > ZERO:
+            c = r11 / size
+            s = a / size
+            upper = r12
+            side = z1
+            r11 = size
+            r12 = c * upper + s * b
+            z1 = c * side + s * v
+            b = c * b - s * upper
+            v = c * v - s * side
+        size = wp.sqrt(r22 * r22 + b * b)
+        if size > PARALLEL * largest:
+            c = r22 / size
+            s = b / size
+            side = z2
+            r22 = size
+            z2 = c * side + s * v
+            v = c * v - s * side
+        return rows6(r11, r12, z1, r22, z2, rows[5] + v * v)
+
+    # Return the rows with that of a point.
+    @wp.func
+    def with_point(rows: rows6, point: wp.array(dtype=vec4), i: wp.int32, first: wp.int32, last: wp.int32, sigma: real):
+        weight = weight_at(point, i, first, last, sigma)
+        p = point[i]
+        return add_row(rows, weight * p[0], weight * p[1], weight)
+
+    # Return the cost of a line through points first to last.
+    @wp.func
+    def cost_of(point: wp.array(dtype=vec4), first: wp.int32, last: wp.int32, sigma: real):
+        rows = rows6()
+        for i in range(first, last):
+            rows = with_point(rows, point, i, first, last, sigma)
+        return rows[5]
+
+    # Return the first point of the second of two lines that lower the cost most, by how much, and the whole cost. The
+    # point is -1 if no split can lower the cost by penalty.
+    @wp.func
+    def best_split(
+        point: wp.array(dtype=vec4), first: wp.int32, last: wp.int32, cost: wp.array(dtype=real), sigma: real,
+        penalty: real,
+    ):  # fmt: skip
+        rows = rows6()
+        for i in range(first, last):
+            rows = with_point(rows, point, i, first, last, sigma)
+            cost[i] = rows[5]
+        total = rows[5]
+        gain = real(0.0)
+        best = int(-1)
+        if total > penalty:
+            rows = rows6()
+            i = last - 1
+            while i > first:
+                rows = with_point(rows, point, i, first, last, sigma)
+                # From here on the cost of this point is that which a split before it saves.
+                lowered = total - cost[i - 1] - rows[5]
+                cost[i] = lowered
+                gain = wp.max(gain, lowered)
+                i -= 1
+            best = first + 1
+            while best < last - 1 and cost[best] < gain - TIED * (TIED_AT + total):
+                best += 1
+            gain = cost[best]
+        return best, gain, total
+
+    # Return whether something may be hidden between point k and the one before.
+    @wp.func
+    def is_apart(point: wp.array(dtype=vec4), k: wp.int32, gap: real):
+        return point[k][2] - point[k - 1][2] > gap
+
+    # Split a scan: each segment's first point gets its end, all other points -1.
+    @wp.func
+    def split_scan(
+        point: wp.array(dtype=vec4), first: wp.int32, last: wp.int32, cost: wp.array(dtype=real),
+        stop: wp.array(dtype=wp.int32), sigma: real, penalty: real, gap: real,
+    ):  # fmt: skip
+        begin = int(first)
+        for k in range(first + 1, last):
+            stop[k] = -1
+            if is_apart(point, k, gap):
+                stop[begin] = k
+                begin = k
+        stop[begin] = last
+        i = int(first)
+        while i < last:
+            end = stop[i]
+            k, gain, total = best_split(point, i, end, cost, sigma, penalty)
+            if k >= 0 and (gain > penalty or total > POOR * real(end - i) + penalty):
+                stop[k] = end
+                stop[i] = k
+            else:
+                i = end
+
+    # Merge neighbours of which a single line costs less than penalty more.
+    @wp.func
+    def merge_segments(
+        point: wp.array(dtype=vec4), first: wp.int32, last: wp.int32, stop: wp.array(dtype=wp.int32), sigma: real,
+        penalty: real, gap: real,
+    ):  # fmt: skip
+        i = int(first)
+        while i < last and stop[i] < last:
+            j = stop[i]
+            end = stop[j]
+            whole = penalty
+            if not is_apart(point, j, gap):
+                whole = cost_of(point, i, end, sigma) - cost_of(point, i, j, sigma) - cost_of(point, j, end, sigma)
+            if whole < penalty:
+                stop[i] = end
+                stop[j] = -1
+            else:
+                i = j
+
+    # Move the ends between neighbours to where both lines cost least.
+    @wp.func
+    def move_ends(
+        point: wp.array(dtype=vec4), first: wp.int32, last: wp.int32, cost: wp.array(dtype=real),
+        stop: wp.array(dtype=wp.int32), sigma: real, penalty: real, gap: real,
+    ):  # fmt: skip
+        i = int(first)
+        while i < last and stop[i] < last:
+            j = stop[i]
+            end = stop[j]
+            following = j
+            if not is_apart(point, j, gap):
+                k, _gain, _total = best_split(point, i, end, cost, sigma, penalty)
+                if k >= 0:
+                    stop[j] = -1
+                    stop[k] = end
+                    stop[i] = k
+                    following = k
+            i = following
+
+    # Write a, b, the triangular root of the information about (a, b), and the cost of a line through a part of a scan:
+    # -1 where no line fits, all 0 for two points.
+    @wp.func
+    def fit_line(
+        point: wp.array(dtype=vec4), begin: wp.int32, size: wp.int32, first: wp.int32, count: wp.int32, sigma: real,
+        line: wp.array(dtype=real), place: wp.int32,
+    ):  # fmt: skip
+        a = real(0.0)
+        b = real(0.0)
+        rows = rows6()
+        cost = real(0.0)
+        step = int(0)
+        if count < 3:
+            step = LAST_STEP + 1
+        while step <= LAST_STEP:
+            rows = rows6()
+            cost = real(0.0)
+            for k in range(count):
+                p = point[begin + (first - begin + k) % size]
+                c = p[0] / p[3]
+                s = p[1] / p[3]
+                if step == 0:
+                    weight = p[3] * p[3] / sigma
+                    rows = add_row(rows, weight * c, weight * s, weight / p[3])
+                else:
+                    expected = ONE / (a * c + b * s)
+                    weight = expected * expected / sigma
+                    error = (p[3] - expected) / sigma
+                    if not (expected > ZERO):
+                        cost = NOTHING
+                    if cost >= ZERO:
+                        cost += error * error
+                    rows = add_row(rows, NOTHING * weight * c, NOTHING * weight * s, error)
+            if cost < ZERO:
+                step = LAST_STEP
+                rows = rows6()
+            if step < LAST_STEP:
+                second = real(0.0)
+                if rows[3] != ZERO:
+                    second = rows[4] / rows[3]
+                a += (rows[2] - rows[1] * second) / rows[0]
+                b += second
+            step += 1
+        line[place] = a
+        line[place + 1] = b
+        line[place + 2] = rows[0]
+        line[place + 3] = rows[1]
+        line[place + 4] = rows[3]
+        line[place + 5] = cost
+
+    return SimpleNamespace(split_scan=split_scan, merge_segments=merge_segments, move_ends=move_ends, fit_line=fit_line)
+
+
+@functools.cache
+def make(name, flags):
+    """Make a kernel of the file for a set of flags."""
+    types, made = precision(flags), functions(flags)
+    real, vec4 = types.real, types.vec4
+
+    # Split scans into segments: stop is the end of the segment that begins at a point, -1 at all other points. One
+    # work-item takes a scan.
+    @kernel
+    def split_scans(
+        point: wp.array(dtype=vec4),
+        start: wp.array(dtype=wp.int32),
+        noise: wp.array(dtype=real),
+        cost: wp.array(dtype=real),
+        stop: wp.array(dtype=wp.int32),
+        scans: wp.int32,
+        points: wp.int32,
+        penalty: real,
+        gap: real,
+    ):
+        scan = wp.tid()
+        if scan >= scans:
+            return
+        first = start[scan]
+        last = start[scan + 1]
+        sigma = noise[scan]
+        if last > first:
+            made.split_scan(point, first, last, cost, stop, sigma, penalty, gap)
+            for _turn in range(PASSES):
+                made.merge_segments(point, first, last, stop, sigma, penalty, gap)
+                made.move_ends(point, first, last, cost, stop, sigma, penalty, gap)
+            made.merge_segments(point, first, last, stop, sigma, penalty, gap)
+
+    # Fit lines to parts of scans: first point and number of points, which may go on at the scan's first point. One
+    # work-item takes a part.
+    @kernel
+    def fit_segments(
+        point: wp.array(dtype=vec4),
+        start: wp.array(dtype=wp.int32),
+        noise: wp.array(dtype=real),
+        part: wp.array(dtype=wp.vec2i),
+        scan: wp.array(dtype=wp.int32),
+        line: wp.array(dtype=real),
+        scans: wp.int32,
+        points: wp.int32,
+        parts: wp.int32,
+    ):
+        k = wp.tid()
+        if k >= parts:
+            return
+        begin = start[scan[k]]
+        size = start[scan[k] + 1] - begin
+        made.fit_line(point, begin, size, part[k][0], part[k][1], noise[scan[k]], line, LINE_NUMBERS * k)
+
+    return {"split_scans": split_scans, "fit_segments": fit_segments}[name]

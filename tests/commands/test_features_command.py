@@ -1,0 +1,116 @@
+"""``gpusense features``: features of a log, landmarks of runs and of maps, files that it writes, and bad input."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+
+import numpy as np
+import pytest
+from support.command_line import error_of
+
+import gpusense as gs
+from gpusense.commands import features as command
+from gpusense.commands.cli import main
+from gpusense.evaluation.feature_scenes import floor_plan
+
+SCANNER = gs.Scanner.uniform(angle_min=-math.pi / 2, angle_increment=math.pi / 360, count=361, range_max=20.0)
+SCANS = 12
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    """Write a CARMEN log of a robot that looks around in a corridor."""
+    path = tmp_path_factory.mktemp("log") / "run.log"
+    floor = floor_plan(2)
+    poses = np.column_stack([2 + 0.3 * np.arange(SCANS), np.zeros(SCANS), 0.3 * np.sin(np.arange(SCANS))])
+    exact, _ = floor.cast(poses, SCANNER.bearings)
+    ranges = exact + 0.01 * np.random.default_rng(0).standard_normal(exact.shape)
+    lines = []
+    for i, (pose, scan) in enumerate(zip(poses, ranges, strict=True)):
+        fields = [*np.minimum(scan, 81.83), *pose, *pose, float(i)]
+        lines.append(f"FLASER 361 {' '.join(f'{value:.4f}' for value in fields)} robot {i}.0")
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def run(capsys, *arguments):
+    code = main(["features", "--backend", "numpy", *map(str, arguments)])
+    captured = capsys.readouterr()
+    assert (code, captured.err) == (0, "")
+    return captured.out
+
+
+def test_features_of_a_log_are_written_and_drawn(capsys, log, tmp_path):
+    out, plot = tmp_path / "features.csv", tmp_path / "scan.png"
+    text = run(capsys, "--log", log, "--out", out, "--plot", plot)
+    assert text.startswith("12 scans") and "lines:" in text and "landmarks" not in text
+    with open(out, encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["kind"] for row in rows} >= {"line", "corner", "door", "hallway"}
+    assert {int(row["scan"]) for row in rows} == set(range(SCANS))
+    assert plot.read_bytes().startswith(b"\x89PNG")
+
+
+def test_landmarks_are_those_of_map_features(capsys, log, tmp_path, monkeypatch):
+    """Also where calls are shorter than the log."""
+    monkeypatch.setattr(command, "_CALL", 5)
+    out, plot = tmp_path / "landmarks.csv", tmp_path / "landmarks.svg"
+    text = run(capsys, "--log", log, "--map-out", out, "--map-plot", plot, "--kinds", "corner", "door")
+    scans = list(gs.read_log(log))
+    found = gs.extract_features(np.array([s.ranges for s in scans]), scans[0].scanner, backend="numpy")
+    expected = gs.map_features(found, np.array([s.pose for s in scans]), kinds=("corner", "door"))
+    assert len(expected) > 0 and f"landmarks: {expected!r}" in text
+    with open(out, encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    np.testing.assert_allclose([[float(row["x"]), float(row["y"])] for row in rows], expected.pose[:, :2])
+    assert "<svg" in plot.read_text()
+
+
+def test_the_document_has_counts_and_landmarks(capsys, log):
+    document = json.loads(run(capsys, "--log", log, "--json", "--every", 2, "--limit", 4))
+    assert document["scans"] == 4 and document["counts"]["line"] > 4 and document["landmarks"] is None
+
+
+def test_landmarks_of_a_map(capsys, tmp_path):
+    cells = np.zeros((80, 120), np.int8)
+    cells[[0, -1]] = cells[:, [0, -1]] = 100
+    gs.write_map(gs.OccupancyGrid(cells, resolution=0.05), tmp_path / "map.yaml")
+    plot = tmp_path / "map.png"
+    text = run(capsys, "--map-in", tmp_path / "map.yaml", "--map-plot", plot)
+    assert text.startswith("FeatureMap(4 corners)") and plot.read_bytes().startswith(b"\x89PNG")
+    document = json.loads(run(capsys, "--map-in", tmp_path / "map.yaml", "--json"))
+    assert [row["kind"] for row in document["landmarks"]] == ["corner"] * 4
+
+
+def test_an_interrupt_keeps_the_results_so_far(capsys, log, monkeypatch):
+    monkeypatch.setattr(command, "_CALL", 5)
+    whole, calls = command._extract, []
+
+    def extract(args, scans):
+        calls.append(len(scans))
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return whole(args, scans)
+
+    monkeypatch.setattr(command, "_extract", extract)
+    assert main(["features", "--backend", "numpy", "--log", str(log)]) == 130
+    captured = capsys.readouterr()
+    assert "interrupted: results of 5 of 12 scans" in captured.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "--log: must be given"),
+        (["--log", "LOG", "--map-in", "map.yaml"], "--log: must be given"),
+        (["--log", "absent.log"], "absent.log: must exist"),
+        (["--log", "LOG", "--kinds", "window"], "invalid choice"),
+        (["--log", "LOG", "--noise", "0"], "--noise"),
+        (["--log", "LOG", "--out", "features.txt"], "--out"),
+        (["--map-in", "map.yaml", "--plot", "scan.png"], "--plot: must not be given"),
+    ],
+)
+def test_bad_input_is_one_line(capsys, log, arguments, message):
+    assert message in error_of(["features", *(str(log) if one == "LOG" else one for one in arguments)], capsys)

@@ -1,0 +1,154 @@
+"""Maps of landmarks from features: their places, their files, and a filter that localises with them alone."""
+
+from __future__ import annotations
+
+import csv
+import math
+
+import numpy as np
+import pytest
+
+import gpusense as gs
+from gpusense.evaluation.feature_scenes import floor_plan
+
+SCANNER = gs.Scanner.uniform(angle_min=-2.35, angle_increment=math.radians(0.5), count=540, range_max=12.0)
+FLOOR = floor_plan(2)
+
+
+def corridor_path(count: int, aside: float = 0.0) -> np.ndarray:
+    """Return poses along the corridor and back."""
+    length, half = FLOOR.hallways[0, 2], count // 2
+    x = np.concatenate([np.linspace(1, length - 1, half), np.linspace(length - 1, 1, count - half)])
+    theta = np.where(np.arange(count) < half, 0, math.pi) + 0.2 * np.sin(np.arange(count) / 9)
+    return np.column_stack([x, aside + 0.25 * np.sin(x), theta])
+
+
+def scans_at(poses: np.ndarray, seed: int, noise: float = 0.02) -> np.ndarray:
+    exact, _ = FLOOR.cast(poses, SCANNER.bearings)
+    ranges = exact + noise * np.random.default_rng(seed).standard_normal(exact.shape)
+    return np.where(ranges < SCANNER.range_max, ranges, np.inf)
+
+
+@pytest.fixture(scope="module")
+def surveyed() -> gs.FeatureMap:
+    """Return the landmarks of a run with small errors of its poses."""
+    poses = corridor_path(160)
+    features = gs.extract_features(scans_at(poses, 1), SCANNER)
+    return gs.map_features(features, poses + np.random.default_rng(9).normal(0, (0.01, 0.01, 0.003), poses.shape))
+
+
+def test_landmarks_are_where_corners_and_doors_are(surveyed):
+    corners, doors = (surveyed.pose[surveyed.kind == kind] for kind in ("corner", "door"))
+    assert len(corners) >= 6 and len(doors) >= 2
+    off = corners[:, None, :2] - FLOOR.corners[:, :2]
+    distance = np.hypot(off[..., 0], off[..., 1])
+    assert distance.min(axis=1).max() < 0.04
+    nearest = FLOOR.corners[distance.argmin(axis=1)]
+    turn = gs.wrap_angle(corners[:, None, 2] - FLOOR.corners[None, :, 2])
+    fits = (distance < 0.04) & (np.abs(turn) < 0.1)
+    assert fits.any(axis=1).all() and len(nearest) == len(corners)
+    middle = 0.5 * (FLOOR.doors[:, :2] + FLOOR.doors[:, 2:])
+    apart = np.hypot(*np.moveaxis(doors[:, None, :2] - middle, 2, 0))
+    assert apart.min(axis=1).max() < 0.04
+    width = np.abs(FLOOR.doors[:, 2] - FLOOR.doors[:, 0])[apart.argmin(axis=1)]
+    np.testing.assert_allclose(surveyed.size[surveyed.kind == "door"], width, atol=0.1)
+    assert (surveyed.count >= 2).all()
+    deviation = np.sqrt(np.einsum("mii->mi", surveyed.covariance))
+    assert (deviation > 1e-4).all() and (deviation < 0.1).all()
+
+
+def test_a_filter_localises_by_features_alone(surveyed):
+    """Odometry alone is off by more in the end than the filter ever is in the median."""
+    poses = corridor_path(120, aside=0.1)
+    features = gs.extract_features(scans_at(poses, 5), SCANNER)
+    parameters = gs.LandmarkParameters(
+        sigma_range=0.1, sigma_bearing=0.03, sigma_signature=0.3, z_detect=0.9, z_false=0.1, range_max=12.0
+    )
+    pf = gs.ParticleFilter(gs.LandmarkModel(surveyed.landmarks(), parameters), particles=1000, seed=0)
+    pf.initialize(mean=poses[0] + (0.3, -0.2, 0.1), covariance=np.diag([0.25, 0.25, 0.04]))
+    motions = gs.compose_poses(gs.invert_poses(poses[:-1]), poses[1:])
+    motions = motions + np.random.default_rng(3).normal(0, (0.02, 0.01, 0.02), motions.shape)
+    odometry, errors = [np.zeros(3)], []
+    for k, pose in enumerate(poses):
+        if k:
+            odometry.append(gs.compose_poses(odometry[-1], motions[k - 1]))
+            pf.predict(odometry[-2], odometry[-1])
+        readings = features.of_scan(k).range_bearing(("corner", "door", "pole"))
+        if len(readings):
+            pf.correct(readings)
+        errors.append(math.hypot(*(pf.estimate().pose[:2] - pose[:2])))
+    alone = gs.compose_poses(poses[0], odometry[-1])
+    assert np.median(errors[20:]) < 0.05 and np.quantile(errors[20:], 0.95) < 0.2 and errors[-1] < 0.1
+    assert math.hypot(*(alone[:2] - poses[-1, :2])) > 4 * np.median(errors[20:])
+
+
+def test_a_map_has_the_corners_that_are_drawn_in_it(backend):
+    cells = np.zeros((100, 160), np.int8)
+    cells[[0, -1]] = cells[:, [0, -1]] = 100
+    cells[40:60, 70:90] = 100
+    grid = gs.OccupancyGrid(cells, resolution=0.05, origin=(10.0, -5.0, math.radians(30)))
+    found = gs.landmarks_of_map(grid, backend=backend)
+    inner = [(x, y) for x in (0.05, 7.95) for y in (0.05, 4.95)]
+    outer = [(x, y) for x in (3.5, 4.5) for y in (2.0, 3.0)]
+    c, s = math.cos(math.radians(30)), math.sin(math.radians(30))
+    expected = np.array(inner + outer) @ np.array([[c, s], [-s, c]]) + (10.0, -5.0)
+    assert found.kind.tolist() == ["corner"] * 8
+    apart = np.hypot(*np.moveaxis(found.pose[:, None, :2] - expected, 2, 0))
+    assert sorted(apart.argmin(axis=1)) == list(range(8)) and apart.min(axis=1).max() < 0.03
+    opening = np.where(apart.argmin(axis=1) < 4, math.pi / 2, 1.5 * math.pi)
+    np.testing.assert_allclose(found.size, opening, atol=0.05)
+
+
+@pytest.mark.parametrize("value", [0, 100, -1])
+def test_maps_without_anything_have_no_landmarks(value):
+    grid = gs.OccupancyGrid(np.full((40, 30), value, np.int8), resolution=0.05)
+    assert len(gs.landmarks_of_map(grid, backend="numpy")) == 0
+
+
+def test_kinds_are_chosen_and_saved(surveyed, tmp_path):
+    doors = surveyed.landmarks("door")
+    assert len(doors) == (surveyed.kind == "door").sum() and (doors.signatures // 10 == 2).all()
+    assert len(surveyed.landmarks()) == len(surveyed)
+    surveyed.save(tmp_path / "landmarks.csv")
+    with open(tmp_path / "landmarks.csv", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["kind"] for row in rows] == surveyed.kind.tolist()
+    np.testing.assert_array_equal([[float(row["x"]), float(row["y"])] for row in rows], surveyed.pose[:, :2])
+    np.testing.assert_array_equal([float(row["signature"]) for row in rows], surveyed.landmarks().signatures)
+
+
+def test_features_seen_too_seldom_are_no_landmarks(surveyed):
+    poses = corridor_path(160)[:1]
+    features = gs.extract_features(scans_at(poses, 1), SCANNER)
+    assert len(gs.map_features(features, poses)) == 0
+    assert len(gs.map_features(features, poses, least=1)) > 0
+    assert len(gs.map_features(features[:0], np.zeros((0, 3)))) == 0
+    assert repr(gs.map_features(features[:0], np.zeros((0, 3)))) == "FeatureMap(none)"
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        ({"features": 3}, TypeError, "features: must be Features"),
+        ({"poses": np.zeros((1, 3))}, ValueError, "poses: must have a pose of each of 2 scans, got 1"),
+        ({"poses": np.zeros(3)}, ValueError, "poses: shape"),
+        ({"kinds": "line"}, ValueError, "kinds: must be"),
+        ({"least": 0}, ValueError, "least: must be"),
+        ({"pose_deviation": (-1.0, 0.0)}, ValueError, "pose_deviation: must be at least 0"),
+    ],
+)
+def test_bad_arguments_are_named(change, error, words):
+    poses = corridor_path(160)[:2]
+    features = gs.extract_features(scans_at(poses, 1), SCANNER, backend="numpy")
+    with pytest.raises(error, match=words):
+        gs.map_features(**({"features": features, "poses": poses} | change))
+
+
+def test_bad_maps_are_named():
+    grid = gs.OccupancyGrid(np.zeros((4, 4), np.int8), resolution=0.05)
+    for change, error, words in (
+        ({"grid": 3}, TypeError, "grid: must be an OccupancyGrid"), ({"spacing": 0}, ValueError, "spacing: must be"),
+        ({"range_max": -1}, ValueError, "range_max: must be"), ({"kinds": "line"}, ValueError, "kinds: must be"),
+    ):  # fmt: skip
+        with pytest.raises(error, match=words):
+            gs.landmarks_of_map(**({"grid": grid, "backend": "numpy"} | change))

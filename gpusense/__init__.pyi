@@ -8,6 +8,8 @@ from gpusense import worlds as worlds
 from gpusense._version import __version__ as __version__
 from gpusense.backends import Device as Device
 from gpusense.backends import devices as devices
+from gpusense.chaining.chain import chain_scans as chain_scans
+from gpusense.chaining.result import ScanChain as ScanChain
 from gpusense.learning.beam.fit import fit_beam_parameters as fit_beam_parameters
 from gpusense.learning.beam.incidence import IncidenceFit as IncidenceFit
 from gpusense.learning.beam.incidence import fit_incidence_parameters as fit_incidence_parameters

@@ -190,21 +190,43 @@ class Chainer:
         )  # fmt: skip
 
     def _all_links(self) -> Links:
-        """Return the links of matches, and of odometry or of constant motion where these leave directions open."""
+        """Return the links of matches, with those of odometry, or of constant motion where these leave it open."""
         front = self._front
-        links = front.links
-        links = replace(links, information=TEMPERATURE * links.information)
+        links = self._weighed(front.links)
         count, keys = front.done, np.array(front.keys)
         if count < 2:
             return links
         nodes = np.arange(1, count)
         before = keys[np.searchsorted(keys, nodes) - 1]
+        total = np.zeros((count, 3, 3))
+        np.add.at(total, links.second, links.information)
+        values = np.linalg.eigvalsh(total[nodes])
+        open_ = values[:, 0] <= _OPEN * np.maximum(values[:, -1], 1e-300)
         if self._odometry is None:
-            return Links.joined([links, self._constant_motion(links, before, nodes)])
+            return Links.joined([links, self._constant_motion(before[open_], nodes[open_])])
         reported = self._odometry[front.nodes[:count]]
         self._motion = self._options.motion or self._fitted(links, reported)
-        pose, information = odometry_links(self._motion, reported[before], reported[nodes])
-        return Links.joined([links, Links.of(ODOMETRY, before, nodes, pose, information)])
+        # From key scan to key scan, and to scans that have no other links in some direction.
+        wanted = open_ | np.isin(nodes, keys)
+        first, second = before[wanted], nodes[wanted]
+        pose, information = odometry_links(self._motion, reported[first], reported[second])
+        return Links.joined([links, Links.of(ODOMETRY, first, second, pose, information)])
+
+    def _weighed(self, links: Links) -> Links:
+        """Return matches with their information times the temperature.
+
+        Scans between two key scans are matched to both, and share the errors of these: together they count as one.
+        """
+        front = self._front
+        keys = np.array(front.keys)
+        is_key = np.zeros(front.done, bool)
+        is_key[keys] = True
+        between = np.append(np.diff(keys), front.done - keys[-1]) - 1
+        share = 1 / np.maximum(between, 1)[np.searchsorted(keys, np.arange(front.done), "right") - 1]
+        other = np.where(is_key[links.first], links.second, links.first)
+        star = is_key[links.first] != is_key[links.second]
+        factor = TEMPERATURE * np.where(star, share[other], 1.0)
+        return replace(links, information=factor[:, None, None] * links.information)
 
     def _fitted(self, links: Links, reported: Floats) -> OdometryMotion:
         """Return the noise of the odometry, fitted to the matches."""
@@ -214,19 +236,13 @@ class Chainer:
         whole = np.append(0, np.cumsum(front.lost > 0))[keys]
         return fitted_motion(reported[keys], poses[keys], np.diff(whole) == 0)
 
-    def _constant_motion(self, links: Links, before: Integers, nodes: Integers) -> Links:
-        """Return links of constant motion to the nodes whose links to earlier ones leave a direction open."""
+    def _constant_motion(self, first: Integers, second: Integers) -> Links:
+        """Return links of constant motion, whose errors add up from scan to scan."""
         front = self._front
-        total = np.zeros((front.done, 3, 3))
-        np.add.at(total, links.second, links.information)
-        values = np.linalg.eigvalsh(total[nodes])
-        open_ = values[:, 0] <= _OPEN * np.maximum(values[:, -1], 1e-300)
         deviation = np.cumsum(np.concatenate([np.zeros((1, 2)), constant_motion_deviation(front.steps)]), axis=0)
-        first, second = before[open_], nodes[open_]
         spread = deviation[second] - deviation[first]
         broken = np.append(0, np.cumsum(self._jumps[front.nodes[1 : front.done]] & (front.p_right < SURE)))
-        unknown = broken[second] != broken[first]
-        spread[unknown] = _UNKNOWN, _UNKNOWN_TURN
+        spread[broken[second] != broken[first]] = _UNKNOWN, _UNKNOWN_TURN
         information = np.zeros((len(first), 3, 3))
         information[:, 0, 0] = information[:, 1, 1] = spread[:, 0] ** -2
         information[:, 2, 2] = spread[:, 1] ** -2
@@ -255,7 +271,7 @@ class Chainer:
         """Return the stretches that are doubtful."""
         front = self._front
         failed = front.p_right < SURE
-        jumped = self._jumps[nodes[1:]]
+        jumped = self._jumps[nodes[1:]] & failed
         open_ = (front.lost > 0) & ~failed if self._odometry is None else np.zeros(len(failed), bool)
         doubts = []
         for reason, flags in (("no match", failed), ("unobserved", open_), ("jump", jumped)):

@@ -31,8 +31,8 @@ Flags = NDArray[np.bool]
 _LEVELS = (
     ((0.6, 0.3), 1.0, 4000),
     ((1.5, 0.6), 1.0, 2000),
-    ((4.0, 1.05), 2.0, 800),
-    ((10.0, 1.6), 4.0, 300),
+    ((4.0, 1.05), 2.0, 600),
+    ((10.0, 1.6), 4.0, 150),
 )
 # Deviations of the drift that a window holds, and the squared distance in deviations of a closure from the drift.
 _DEVIATIONS, _GATE = 3.0, 16.0
@@ -50,8 +50,8 @@ _WEIGHT = 0.25
 _EACH, _NEIGHBOURS = 2, 3
 # Relative gain of the cost that ends a solution between rounds.
 _GAIN = 1e-4
-# Most rounds.
-_ROUNDS = 12
+# Most rounds of a level, and the motion of poses in a round from which another one may find more [m].
+_ROUNDS, _MOVED = 5, 0.3
 
 
 @dataclass(eq=False)
@@ -86,40 +86,38 @@ class Loops:
 
     def steps(self) -> Iterator[str]:
         """Search and close, and yield a word on each round."""
-        for _ in range(_ROUNDS):
-            for level in range(len(_LEVELS)):
-                fresh = self._search(level)
-                if not fresh:
-                    continue
-                before = len(self.closures)
-                self._accept()
-                yield f"window {_LEVELS[level][0][0]:g} m: {len(self.closures)} closures"
-                if len(self.closures) > before:
+        for level in range(len(_LEVELS)):
+            for _ in range(_ROUNDS):
+                before = self.solution.poses
+                if not self._search(level):
                     break
-            else:
-                return
+                self._accept()
+                yield f"{len(self.closures)} closures, of drifts within {_LEVELS[level][0][0]:g} m"
+                moved = np.abs(self.solution.poses - before)[:, :2]
+                if moved.max() < _MOVED:
+                    break
 
     def _search(self, level: int) -> bool:
-        """Match candidates of a level, and return whether there were any."""
-        window, cell, most = _LEVELS[level]
-        poses = self.solution.poses
-        first, second, share = overlaps(self.places, poses, cell, self.apart)
-        new = (second % _EACH == 0) & ~self._is_tried(first, second, level)
-        first, second, share = (values[new] for values in (first, second, share))
-        if not len(first):
-            return False
+        """Match candidates of a level and of those below, and return whether there were any."""
+        _, cell, most = _LEVELS[level]
+        first, second, share = overlaps(self.places, self.solution.poses, cell, self.apart)
         drift = _deviations(self._drift().relative(first, second))
-        fits = _level_of(drift) == level
-        chosen = np.flatnonzero(fits)
-        if len(chosen) > most:
-            chosen = np.sort(chosen[np.argsort(-share[chosen], kind="stable")[:most]])
-        first, second = first[chosen], second[chosen]
-        if not len(first):
-            return False
-        for pair in zip(first.tolist(), second.tolist(), strict=True):
-            self.tried[pair] = level
-        self.matches = Links.joined([self.matches, self._matched(first, second, window)])
-        return True
+        needed = _level_of(drift)
+        # Once more with the next window: deviations are estimates. The last one is for large drifts only.
+        again = (needed == level - 1) & (level < len(_LEVELS) - 1)
+        needed = np.where(again, level, needed)
+        new = (second % _EACH == 0) & (needed <= level)
+        first, second, share, needed = (values[new] for values in (first, second, share, needed))
+        new = ~self._is_tried(first, second, needed)
+        if np.count_nonzero(new) > most:
+            new[np.argsort(np.where(new, -share, np.inf), kind="stable")[most:]] = False
+        first, second, needed = first[new], second[new], needed[new]
+        for k in np.unique(needed):
+            some = needed == k
+            found = self._matched(first[some], second[some], _LEVELS[k][0])
+            self.matches = Links.joined([self.matches, found])
+        self.tried.update(zip(zip(first.tolist(), second.tolist(), strict=True), needed.tolist(), strict=True))
+        return bool(len(first))
 
     def _drift(self) -> Drift:
         """Return the drift of the solution so far."""
@@ -127,12 +125,13 @@ class Loops:
             self.drift = self.solution, Drift(self.solution)
         return self.drift[1]
 
-    def _is_tried(self, first: Integers, second: Integers, level: int) -> Flags:
-        """Return whether pairs, or those with a neighbouring first scan, were matched at a level or a later one."""
+    def _is_tried(self, first: Integers, second: Integers, level: Integers) -> Flags:
+        """Return whether pairs, or those with a neighbouring first scan, were matched at their level or a later one."""
+        shifts = range(-_NEIGHBOURS, _NEIGHBOURS + 1)
         found: Flags = np.array(
             [
-                any(self.tried.get((one + shift, two), -1) >= level for shift in range(-_NEIGHBOURS, _NEIGHBOURS + 1))
-                for one, two in zip(first.tolist(), second.tolist(), strict=True)
+                any(self.tried.get((one + shift, two), -1) >= least for shift in shifts)
+                for one, two, least in zip(first.tolist(), second.tolist(), level.tolist(), strict=True)
             ],
             bool,
         )

@@ -33,6 +33,8 @@ SURE = 0.5
 NEAR = (0.5, 0.3)
 # Readings differ by more than this [m], and this share; scans are unlike where more than a share of them does.
 _DIFFERENCE, _DIFFERENCE_SHARE, _UNLIKE = 0.15, 0.1, 0.3
+# A turn from scan to scan beyond this does not go on [rad].
+_LARGE_TURN = 0.15
 # Half widths of a second search after a failed one [m, rad].
 _WIDE = (2.0, math.pi)
 
@@ -188,7 +190,9 @@ class Front:
             expected = guess[k]
             if self._odometry is None:
                 before = steps[k - 1] if k else (self.steps[-1] if len(self.steps) else np.zeros(3))
-                expected = np.zeros(3) if jumps[k] else before
+                expected = np.zeros(3) if jumps[k] else before.copy()
+                if abs(expected[2]) > _LARGE_TURN:
+                    expected[2] = 0.0
             if not usable[k]:
                 steps[k] = expected
                 continue

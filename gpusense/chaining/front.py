@@ -6,6 +6,7 @@ some key scans before it, and every other scan to the key scans on both sides. T
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any
 
@@ -131,6 +132,15 @@ class Front:
         return chained(np.zeros(3), self.steps)
 
     def advance(self) -> bool:
+        """Match the next group; return whether there was one. An interrupt leaves the groups before it."""
+        trial = copy.copy(self)
+        trial.keys, trial._parts = list(self.keys), list(self._parts)
+        found = trial._match_group()
+        # One call, which no signal divides.
+        self.__dict__.update(trial.__dict__)
+        return found
+
+    def _match_group(self) -> bool:
         """Match the next group; return whether there was one."""
         begin, end = self.done, min(self.done + GROUP, len(self.nodes))
         if begin >= end:

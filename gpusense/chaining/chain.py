@@ -140,7 +140,7 @@ class Chainer:
         self._jumps = jumps_of(self._times, len(read))
         self._front = Front(read, scanner, self._odometry, self._times, self._jumps, self._options)
         self._loops: Loops | None = None
-        self._motion = motion
+        self._motion, self._fitted_to = motion, 0
 
     @property
     def scans(self) -> int:
@@ -205,7 +205,9 @@ class Chainer:
         if self._odometry is None:
             return Links.joined([links, self._constant_motion(before[open_], nodes[open_])])
         reported = self._odometry[front.nodes[:count]]
-        self._motion = self._options.motion or self._fitted(links, reported)
+        if self._options.motion is None and self._fitted_to != count:
+            self._motion, self._fitted_to = self._fitted(links, reported), count
+        assert self._motion is not None
         # From key scan to key scan, and to scans that have no other links in some direction.
         wanted = open_ | np.isin(nodes, keys)
         first, second = before[wanted], nodes[wanted]

@@ -16,7 +16,7 @@ from gpusense.commands.arguments import (
     positive_number,
     whole_number,
 )
-from gpusense.commands.map_chain import add_chain, chain_log, document, is_chained, words, write_chain
+from gpusense.commands.map_chain import add_chain, chain_log, check_chain, document, is_chained, words, write_chain
 from gpusense.commands.output import print_json
 from gpusense.commands.scans import add_log, add_reference, read_scans
 from gpusense.commands.signals import code_of, word_of
@@ -44,8 +44,9 @@ around it, places that are seen again are found and matched, and the poses are t
 and the odometry. The command says what was closed, and what is doubtful. CARMEN logs have poses, which in raw ones are
 copies of the odometry: --chain finds better ones. With --reference the poses are those of a TUM trajectory.
 
-Ctrl-C ends the chain, and the map of the scans so far is written; or it ends the map, which holds the scans so far. A map of more than four million cells is built in bands
-of rows: then it is the map of the bands so far, and of the last one's scans.
+Ctrl-C ends the chain, and the map of the scans so far is written; or it ends the map, which then holds some of the
+scans. A map of more than four million cells is built in bands of rows: then it is the map of the bands so far, and of
+the last one's scans.
 
 Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
@@ -87,6 +88,7 @@ def run(args: argparse.Namespace) -> int:
     from gpusense.evaluation.scoring import with_poses
     from gpusense.mapping.build import MapBuilder
 
+    check_chain(args)
     scans = read_scans(args, posed=False)
     chained, stop, chosen = None, None, len(scans)
     if is_chained(args, scans):

@@ -12,7 +12,7 @@ from gpusense._util import checks
 from gpusense._util.typing import Precision
 from gpusense.backends import Selection, get_backend
 from gpusense.chaining.closing import Loops
-from gpusense.chaining.front import LOCAL, SURE, Front
+from gpusense.chaining.front import LOCAL, SURE, Front, Matcher
 from gpusense.chaining.graph import Solution, solve
 from gpusense.chaining.links import CLOSURE, MOTION, ODOMETRY, Links
 from gpusense.chaining.motion import constant_motion_deviation, fitted_motion, odometry_links, relative
@@ -20,6 +20,7 @@ from gpusense.chaining.options import ChainOptions, check_steps, check_times, ju
 from gpusense.chaining.places import place_points
 from gpusense.chaining.result import Doubt, ScanChain
 from gpusense.chaining.selected import pose_covariances
+from gpusense.chaining.sweep import signed_duration
 from gpusense.localization.motion import OdometryMotion
 from gpusense.localization.pose_algebra import compose_poses, pose_difference
 from gpusense.matching.match import readings
@@ -66,7 +67,8 @@ def chain_scans(
         odometry: (S, 3) poses of the odometer at the scans [m, m, rad]. None: there is none.
         times: (S,) times of the first beams [s]. None: unknown.
         duration: Time from the first beam of a scan to the last one [s], with which scans are freed of the robot's
-            motion; needs ``times``. Beams are measured in their order, evenly in time. 0: at once.
+            motion; needs ``times``. Beams are measured evenly in time, in their order, in reverse or at once: that
+            with which scans agree best. 0: at once.
         motion: Noise of the odometry. None: fitted to the matches.
         step: Motion by odometry below which a scan is not matched [m, rad]: such scans cost nothing.
         key_step: Motion after which a scan becomes a key scan [m, rad].
@@ -138,7 +140,7 @@ class Chainer:
         )  # fmt: skip
         self._readings, self._scanner = read, scanner
         self._jumps = jumps_of(self._times, len(read))
-        self._front = Front(read, scanner, self._odometry, self._times, self._jumps, self._options)
+        self._front = self._new_front()
         self._loops: Loops | None = None
         self._motion, self._fitted_to = motion, 0
 
@@ -150,11 +152,29 @@ class Chainer:
 
     def steps(self) -> Iterator[str]:
         """Match, search and close, a part at a time, and yield a word on each."""
+        if self._options.duration > 0 and self._front.done == 1:
+            yield from self._find_order()
         while self._front.advance():
             yield f"scan {self.scans} of {len(self._readings)}"
         if self._options.close_loops and len(self._front.keys) > LOCAL + 1:
             self._loops = self._make_loops()
             yield from self._loops.steps()
+
+    def _find_order(self) -> Iterator[str]:
+        """Find the order in which beams are measured, and begin with it."""
+        assert self._times is not None
+        found = signed_duration(
+            Matcher(self._readings, self._scanner, replace(self._options, duration=0.0)), self._times,
+            self._options.duration,
+        )  # fmt: skip
+        if found != self._options.duration:
+            self._options = replace(self._options, duration=found)
+            self._front = self._new_front()
+            yield "beams are measured in reverse order" if found < 0 else "beams are measured all at once"
+
+    def _new_front(self) -> Front:
+        """Return the front end before its first scan."""
+        return Front(self._readings, self._scanner, self._odometry, self._times, self._jumps, self._options)
 
     def chain(self) -> ScanChain:
         """Return the trajectory of the scans so far."""
@@ -266,7 +286,7 @@ class Chainer:
         return ScanChain(
             compose_poses(start, poses), turn @ covariance @ turn.T, solution.links.renumbered(nodes),
             nodes[np.array(front.keys)], None if self._odometry is None else self._motion,
-            None if during is None else during[nodes[node]], corrections, self._doubts(nodes), len(nodes),
+            None if during is None else during[nodes[node]], self._options.duration, corrections, self._doubts(nodes), len(nodes),
         )  # fmt: skip
 
     def _doubts(self, nodes: Integers) -> tuple[Doubt, ...]:

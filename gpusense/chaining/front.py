@@ -51,7 +51,7 @@ class Matcher:
 
     def __init__(self, readings: Floats, scanner: Scanner, options: ChainOptions) -> None:
         self._readings, self._scanner, self._options = readings, scanner, options
-        self.motion: Floats | None = np.zeros((len(readings), 3)) if options.duration > 0 else None
+        self.motion: Floats | None = np.zeros((len(readings), 3)) if options.duration else None
 
     def match(
         self, first: Integers, second: Integers, guess: Floats, window: tuple[float, float] | None = None

@@ -41,14 +41,17 @@ class ScanChain:
     """The trajectory of S scans, from :func:`gpusense.chain_scans`.
 
     Attributes:
-        poses: (S, 3) poses of the robot at the first beam of each scan; the first one is that of the odometry, or
-            (0, 0, 0) without one [m, m, rad].
+        poses: (S, 3) poses of the robot at the first listed beam of each scan [m, m, rad]; the first one is that of
+            the odometry, or (0, 0, 0) without one.
         covariance: (S, 3, 3) covariances given the first pose [m^2, m rad, rad^2]; very large along directions that
             nothing tells.
         links: The links of the pose graph between scans, with their weights in the solution; closures are among them.
         keys: (K,) indices of the key scans.
         motion: The noise of the odometry, given or fitted to the matches; None without odometry.
-        motions: (S, 3) motion of the robot during each scan, or None where scans take no time.
+        motions: (S, 3) motion of the robot from the first listed beam of each scan to the last one, or None where
+            scans take no time.
+        duration: Time from the first listed beam to the last one that was used [s]; negative where beams are listed in
+            reverse: the times of poses are then later than those of the scans by as much.
         corrections: (C,) distances [m] by which the closures moved the second scans in the frames of the first ones.
         doubts: Stretches that are doubtful.
         matched: Number of scans that were matched; for the others the robot stood still by its odometry.
@@ -69,6 +72,7 @@ class ScanChain:
     keys: Integers
     motion: OdometryMotion | None
     motions: Floats | None
+    duration: float
     corrections: Floats
     doubts: tuple[Doubt, ...]
     matched: int
@@ -90,6 +94,9 @@ class ScanChain:
         """Return the numbers of scans, key scans, links and closures, and what is doubtful, in words."""
         count = len(self.poses)
         lines = [f"{count} scans, {self.matched} matched, {len(self.keys)} key scans, {len(self.links)} links"]
+        if self.duration:
+            order = "in reverse" if self.duration < 0 else "in their order"
+            lines.append(f"scans of {abs(self.duration):.3g} s, measured {order}, are freed of the robot's motion")
         if len(self.corrections):
             lines.append(
                 f"{len(self.corrections)} closures, which moved scans by {np.median(self.corrections):.2f} m in the "

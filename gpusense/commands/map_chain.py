@@ -131,7 +131,9 @@ def write_chain(args: argparse.Namespace, chained: ChainedScans, grid: Occupancy
     from gpusense.evaluation.trajectory_files import write_tum
 
     if args.tum is not None:
-        times, indices = scan_times([scan.time for _, scan in chained.scans])
+        # Where beams are listed in reverse, poses are those at the end of scans.
+        later = max(-chained.chain.duration, 0.0)
+        times, indices = scan_times([scan.time + later for _, scan in chained.scans])
         write_tum(args.tum, times, chained.chain.poses, indices=indices)
     if args.poses is not None:
         _write_poses(args.poses, chained)
@@ -147,10 +149,11 @@ def _write_poses(path: Path, chained: ChainedScans) -> None:
     from gpusense._util.files import write_whole
 
     lines, chain = [_COLUMNS], chained.chain
+    later = max(-chain.duration, 0.0)
     upper = chain.covariance[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     for (index, scan), pose, spread, doubt in zip(chained.scans, chain.poses, upper, chain.doubtful, strict=True):
         numbers = ",".join(f"{value:.9g}" for value in (*pose, *spread))
-        lines.append(f"{index},{scan.time:.6f},{numbers},{int(doubt)}")
+        lines.append(f"{index},{scan.time + later:.6f},{numbers},{int(doubt)}")
     text = "\n".join(lines) + "\n"
     write_whole(path, lambda file: file.write(text.encode()))
 
@@ -162,7 +165,8 @@ def document(args: argparse.Namespace, chained: ChainedScans) -> dict[str, Any]:
     return {
         "seconds": chained.seconds, "matched": chain.matched, "key_scans": len(chain.keys), "links": len(chain.links),
         "closures": len(corrections), "largest_correction": float(corrections.max()) if len(corrections) else None,
-        "odometry": chain.motion is not None, "doubtful_scans": int(chain.doubtful.sum()),
+        "scan_duration": chain.duration, "odometry": chain.motion is not None,
+        "doubtful_scans": int(chain.doubtful.sum()),
         "doubts": [doubt._asdict() for doubt in chain.doubts],
         "files": {name: str(getattr(args, name)) for name in ("tum", "poses", "plot") if getattr(args, name)},
     }  # fmt: skip

@@ -242,6 +242,15 @@ def test_motion_during_scans_is_taken_out(needs) -> None:
             for pose, b in zip(at, RING.bearings, strict=True)
         ])  # fmt: skip
     moved = gs.chain_scans(scans, RING, times=times, duration=duration, backend=needs("opencl"))
+    assert moved.duration == duration
+    # Beams that are listed from the last one to the first.
+    back = gs.Scanner(RING.bearings[::-1], range_max=30.0)
+    turned = gs.chain_scans(np.array(scans)[:, ::-1], back, times=times, duration=duration, backend=needs("opencl"))
+    assert turned.duration == -duration
+    assert "in reverse" in turned.explain()
+    # These poses are at the end of the scans.
+    later = np.stack([0.8 * np.sin(times + duration), 0.8 * (1 - np.cos(times + duration)), times + duration], axis=1)
+    assert errors(turned, later)[2:-2].max() < 0.06
     skewed = gs.chain_scans(scans, RING, times=times, backend=needs("opencl"))
     assert moved.motions is not None
     assert np.abs(moved.motions[3:-3, 2] - duration).max() < 0.01

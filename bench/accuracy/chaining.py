@@ -4,16 +4,15 @@
 
 Rows of a log: its raw odometry; "scan to scan", successive matches without key scans and loops; "chain" is
 ``gpusense.chain_scans``, with and without odometry, with and without closures; "KISS-ICP" where that library is
-installed, on points with z = 0, with the voxels of 0.1, 0.3 and 1 m, and with or without its correction of motion during
-scans where they have a duration, whatever errs least. Times are wall time without the
-first call's compilation.
+installed, on points with z = 0, with the voxels of 0.1, 0.3 and 1 m, and with or without its correction of motion
+during scans where they have a duration, whatever errs least. Times are wall time without the first call's compilation.
 
 "error" is the root mean square distance from the reference after alignment. "drift" is the mean error of relative
-poses over a path of 5, 20 and 100 m, per length. "contradicted" closures differ from the reference by more than 0.5 m or 0.15
-rad; references have errors, too. That of jarvis is a track by reflectors, whose clock is not the lasers'; that of olin
-is of scans that were taken as instantaneous: both are read where the error of a row is least, within 0.25 s. "held out" is the share of end points up to 20 m of odd
-scans within 5 and 15 cm of an occupied cell of the even scans' map, at the poses of the row with odometry and closures,
-and at those of the reference.
+poses over a path of 5, 20 and 100 m, per length. "contradicted" closures differ from the reference by more than 0.5 m
+or 0.15 rad; references have errors, too. That of jarvis is a track by reflectors, whose clock is not the lasers'; that
+of olin is of scans that were taken as instantaneous: both are read where the error of a row is least, within 0.25 s.
+"held out" is the share of end points up to 20 m of odd scans within 5 and 15 cm of an occupied cell of the even scans'
+map, at the poses of the row with odometry and closures, and at those of the reference.
 """
 
 from __future__ import annotations

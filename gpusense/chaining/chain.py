@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense._util import checks
 from gpusense._util.typing import Precision
 from gpusense.backends import Selection, get_backend
+from gpusense.chaining.assembly import TEMPERATURE, constant_motion_links, fitted_odometry, links_of_odometry, weighed
 from gpusense.chaining.closing import Loops
 from gpusense.chaining.front import LOCAL, SURE, Front, Matcher
 from gpusense.chaining.graph import Solution, solve
-from gpusense.chaining.links import CLOSURE, MOTION, ODOMETRY, Links
-from gpusense.chaining.motion import constant_motion_deviation, fitted_motion, odometry_links, relative
+from gpusense.chaining.links import CLOSURE, Links
+from gpusense.chaining.motion import relative
 from gpusense.chaining.options import ChainOptions, check_steps, check_times, jumps_of
 from gpusense.chaining.places import place_points
 from gpusense.chaining.result import Doubt, ScanChain
@@ -30,13 +31,6 @@ from gpusense.world.scanner import Scanner
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-
-TEMPERATURE = 0.04
-"""Factor of the information of matches: recorded scans have errors that repeat, which no single match shows."""
-# Share of the largest eigenvalue below which the information of a scan's links leaves a direction open.
-_OPEN = 1e-6
-# Deviations of a pose in a direction of which nothing is known [m, rad].
-_UNKNOWN, _UNKNOWN_TURN = 30.0, 3.0
 
 
 def chain_scans(
@@ -210,65 +204,18 @@ class Chainer:
         )  # fmt: skip
 
     def _all_links(self) -> Links:
-        """Return the links of matches, with those of odometry, or of constant motion where these leave it open."""
+        """Return the links of matches and of odometry or constant motion; the odometry's noise is fitted once."""
         front = self._front
-        links = self._weighed(front.links)
-        count, keys = front.done, np.array(front.keys)
-        if count < 2:
+        links = weighed(front)
+        if front.done < 2:
             return links
-        nodes = np.arange(1, count)
-        before = keys[np.searchsorted(keys, nodes) - 1]
-        total = np.zeros((count, 3, 3))
-        np.add.at(total, links.second, links.information)
-        values = np.linalg.eigvalsh(total[nodes])
-        open_ = values[:, 0] <= _OPEN * np.maximum(values[:, -1], 1e-300)
         if self._odometry is None:
-            return Links.joined([links, self._constant_motion(before[open_], nodes[open_])])
-        reported = self._odometry[front.nodes[:count]]
-        if self._options.motion is None and self._fitted_to != count:
-            self._motion, self._fitted_to = self._fitted(links, reported), count
+            return Links.joined([links, constant_motion_links(front, links, self._jumps)])
+        reported = self._odometry[front.nodes[: front.done]]
+        if self._options.motion is None and self._fitted_to != front.done:
+            self._motion, self._fitted_to = fitted_odometry(front, links, reported), front.done
         assert self._motion is not None
-        # From key scan to key scan, and to scans that have no other links in some direction.
-        wanted = open_ | np.isin(nodes, keys)
-        first, second = before[wanted], nodes[wanted]
-        pose, information = odometry_links(self._motion, reported[first], reported[second])
-        return Links.joined([links, Links.of(ODOMETRY, first, second, pose, information)])
-
-    def _weighed(self, links: Links) -> Links:
-        """Return matches with their information times the temperature.
-
-        Scans between two key scans are matched to both, and share the errors of these: together they count as one.
-        """
-        front = self._front
-        keys = np.array(front.keys)
-        is_key = np.zeros(front.done, bool)
-        is_key[keys] = True
-        between = np.append(np.diff(keys), front.done - keys[-1]) - 1
-        share = 1 / np.maximum(between, 1)[np.searchsorted(keys, np.arange(front.done), "right") - 1]
-        other = np.where(is_key[links.first], links.second, links.first)
-        star = is_key[links.first] != is_key[links.second]
-        factor = TEMPERATURE * np.where(star, share[other], 1.0)
-        return replace(links, information=factor[:, None, None] * links.information)
-
-    def _fitted(self, links: Links, reported: Floats) -> OdometryMotion:
-        """Return the noise of the odometry, fitted to the matches."""
-        front = self._front
-        keys = np.array(front.keys)
-        poses = solve(front.poses, links).poses
-        whole = np.append(0, np.cumsum(front.lost > 0))[keys]
-        return fitted_motion(reported[keys], poses[keys], np.diff(whole) == 0)
-
-    def _constant_motion(self, first: Integers, second: Integers) -> Links:
-        """Return links of constant motion, whose errors add up from scan to scan."""
-        front = self._front
-        deviation = np.cumsum(np.concatenate([np.zeros((1, 2)), constant_motion_deviation(front.steps)]), axis=0)
-        spread = deviation[second] - deviation[first]
-        broken = np.append(0, np.cumsum(self._jumps[front.nodes[1 : front.done]] & (front.p_right < SURE)))
-        spread[broken[second] != broken[first]] = _UNKNOWN, _UNKNOWN_TURN
-        information = np.zeros((len(first), 3, 3))
-        information[:, 0, 0] = information[:, 1, 1] = spread[:, 0] ** -2
-        information[:, 2, 2] = spread[:, 1] ** -2
-        return Links.of(MOTION, first, second, relative(front.poses, first, second), information)
+        return Links.joined([links, links_of_odometry(front, links, reported, self._motion)])
 
     def _placed(self, solution: Solution, spread: Floats, nodes: Integers, corrections: Floats) -> ScanChain:
         """Return the result for all scans so far: those that are no nodes stand where the last node does."""
@@ -286,7 +233,8 @@ class Chainer:
         return ScanChain(
             compose_poses(start, poses), turn @ covariance @ turn.T, solution.links.renumbered(nodes),
             nodes[np.array(front.keys)], None if self._odometry is None else self._motion,
-            None if during is None else during[nodes[node]], self._options.duration, corrections, self._doubts(nodes), len(nodes),
+            None if during is None else during[nodes[node]], self._options.duration, corrections,
+            self._doubts(nodes), len(nodes),
         )  # fmt: skip
 
     def _doubts(self, nodes: Integers) -> tuple[Doubt, ...]:

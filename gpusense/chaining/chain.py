@@ -242,9 +242,12 @@ class Chainer:
         front = self._front
         failed = front.p_right < SURE
         jumped = self._jumps[nodes[1:]] & failed
-        open_ = (front.lost > 0) & ~failed if self._odometry is None else np.zeros(len(failed), bool)
+        alone = self._odometry is None
+        open_ = (front.lost > 0) & ~failed & alone
+        single = (front.confirmations() == 0) & ~failed & ~open_ & alone & (len(nodes) > 2)
         doubts = []
-        for reason, flags in (("no match", failed), ("unobserved", open_), ("jump", jumped)):
+        reasons = {"no match": failed, "unobserved": open_, "unconfirmed": single, "jump": jumped}
+        for reason, flags in reasons.items():
             edges = np.diff(np.concatenate([[False], flags, [False]]).astype(int))
             for begin, end in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
                 doubts.append(Doubt(int(nodes[begin]), int(nodes[end]), reason))

@@ -131,6 +131,16 @@ class Front:
         """(M,) poses of the matched nodes, chained from the first one."""
         return chained(np.zeros(3), self.steps)
 
+    def confirmations(self) -> Integers:
+        """Return the number of matches of farther scans that span each step from node to node."""
+        links = self.links
+        far = np.abs(links.second - links.first) > 1
+        ends = np.sort(np.stack([links.first[far], links.second[far]]), axis=0)
+        change = np.zeros(self.done, np.int64)
+        np.add.at(change, ends[0], 1)
+        np.add.at(change, ends[1], -1)
+        return np.cumsum(change)[:-1]
+
     def advance(self) -> bool:
         """Match the next group; return whether there was one. An interrupt leaves the groups before it."""
         trial = copy.copy(self)

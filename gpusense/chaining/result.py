@@ -17,6 +17,7 @@ Integers = NDArray[np.int64]
 REASONS = {
     "no match": "the scan matches neither the one before nor key scans: its motion is that of odometry or a guess",
     "unobserved": "the scans do not observe a direction of the motion, as along a corridor, and there is no odometry",
+    "unconfirmed": "a single match tells the motion, and there is no odometry: no other match agrees with it",
     "jump": "the time jumps, and the robot may be anywhere after it",
 }
 """The meaning of each doubt."""

@@ -200,6 +200,20 @@ def test_a_jump_of_time_is_said(needs) -> None:
     assert np.sqrt(chain.covariance[-1, 0, 0]) > 10
 
 
+@pytest.mark.parametrize("step", [0.8, 1.3])
+def test_wrong_motions_are_doubtful(step: float, needs) -> None:
+    # Without odometry, with large steps and turns of a quarter between scans, some matches are wrong.
+    truth = around(step)
+    short = gs.Scanner(FRONT.bearings, range_max=6.0)
+    chain = gs.chain_scans(scans_of(BLOCK, truth, short), short, close_loops=False, backend=needs("opencl"))
+    off = relative(chain.poses[:-1], chain.poses[1:]) - relative(truth[:-1], truth[1:])
+    off[:, 2] = gs.wrap_angle(off[:, 2])
+    wrong = (np.hypot(off[:, 0], off[:, 1]) > 0.3) | (np.abs(off[:, 2]) > 0.15)
+    assert wrong.any()
+    assert chain.doubtful[1:][wrong].all()
+    assert not chain.doubtful.all()
+
+
 def test_joined_logs_of_two_buildings_are_not_closed(lap: tuple[np.ndarray, ...], needs) -> None:
     truth, scans, _ = lap
     x = np.arange(0, 16, 0.4)

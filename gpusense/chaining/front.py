@@ -34,8 +34,8 @@ SURE = 0.5
 NEAR = (0.5, 0.3)
 # Readings differ by more than this [m], and this share; scans are unlike where more than a share of them does.
 _DIFFERENCE, _DIFFERENCE_SHARE, _UNLIKE = 0.15, 0.1, 0.3
-# A turn from scan to scan beyond this does not go on [rad].
-_LARGE_TURN = 0.15
+# A direction is a turn where this much of its length is.
+_TURNING = 0.5
 # Half widths of a second search after a failed one [m, rad].
 _WIDE = (2.0, math.pi)
 
@@ -210,14 +210,15 @@ class Front:
             expected = guess[k]
             if self._odometry is None:
                 before = steps[k - 1] if k else (self.steps[-1] if len(self.steps) else np.zeros(3))
-                expected = np.zeros(3) if jumps[k] else before.copy()
-                if abs(expected[2]) > _LARGE_TURN:
-                    expected[2] = 0.0
+                expected = np.zeros(3) if jumps[k] else before
             if not usable[k]:
                 steps[k] = expected
                 continue
             scale = np.array([1.0, 1.0, found.lever[k]])
             lost = found.directions[k][found.eigenvalues[k] == 0]
+            if self._odometry is None:
+                # A turn need not go on.
+                lost = lost[np.abs(lost[:, 2]) < _TURNING]
             off = expected - steps[k]
             off[2] = wrap_angle(off[2])
             steps[k] += (lost.T @ (lost @ (scale * off))) / scale

@@ -149,7 +149,8 @@ def figures(log: Log, method: str, poses: np.ndarray, seconds: float) -> dict[st
     found: dict[str, Any] = {"log": log.name, "method": method, "scans": len(poses), "seconds": seconds}
     found |= {"error_m": min(errors), "earlier_s": earlier}
     for length in LENGTHS:
-        found[f"drift_{length}_percent"], found[f"drift_{length}_degrees"] = drifts(poses, truth, length)
+        both = [None if np.isnan(value) else value for value in drifts(poses, truth, length)]
+        found[f"drift_{length}_percent"], found[f"drift_{length}_degrees"] = both
     return found
 
 
@@ -269,7 +270,7 @@ def main(argv: list[str] | None = None) -> None:
         maps.append(made)
 
     def drift(row: dict[str, Any], length: int) -> str:
-        if np.isnan(row[f"drift_{length}_percent"]):
+        if row[f"drift_{length}_percent"] is None:
             return "-"
         return f"{row[f'drift_{length}_percent']:.2f} / {row[f'drift_{length}_degrees']:.3f}"
 

@@ -17,6 +17,7 @@ TITLES = {
     "matching": "Matching",
     "features": "Features of scans",
     "mapping": "Maps from scans",
+    "chaining": "Chains of scans",
     "localization": "Localisation",
     "positions": "Positions from beacons",
     "logs": "Logs",

@@ -16,6 +16,8 @@ from gpusense._version import __version__ as __version__
 # run ``PYTHONPATH=tests python -m support.public_names`` after a change.
 _NAMES = {
     "backends": ("Device", "devices"),
+    "chaining.chain": ("chain_scans",),
+    "chaining.result": ("ScanChain",),
     "features.extract": ("extract_features",),
     "features.landmarks": ("FeatureMap", "landmarks_of_map", "map_features"),
     "features.result": ("Features",),

@@ -8,6 +8,8 @@ from gpusense import worlds as worlds
 from gpusense._version import __version__ as __version__
 from gpusense.backends import Device as Device
 from gpusense.backends import devices as devices
+from gpusense.chaining.chain import chain_scans as chain_scans
+from gpusense.chaining.result import ScanChain as ScanChain
 from gpusense.features.extract import extract_features as extract_features
 from gpusense.features.landmarks import FeatureMap as FeatureMap
 from gpusense.features.landmarks import landmarks_of_map as landmarks_of_map

@@ -1,9 +1,10 @@
-"""Run ``gpusense map``: build an occupancy grid from a log with corrected poses."""
+"""Run ``gpusense map``: build an occupancy grid from a log, with its poses or with those of a chain of matches."""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from gpusense._util.progress import progress
@@ -15,6 +16,7 @@ from gpusense.commands.arguments import (
     positive_number,
     whole_number,
 )
+from gpusense.commands.map_chain import add_chain, chain_log, check_chain, document, is_chained, words, write_chain
 from gpusense.commands.output import print_json
 from gpusense.commands.scans import add_log, add_reference, read_scans
 from gpusense.commands.signals import code_of, word_of
@@ -22,10 +24,12 @@ from gpusense.evaluation.machine import machine
 from gpusense.world.map_greys import MODES
 
 if TYPE_CHECKING:
+    from gpusense.commands.map_chain import ChainedScans
     from gpusense.mapping.build import MapBuilder
+    from gpusense.world.grid import OccupancyGrid
 
 NAME = "map"
-HELP = "Build an occupancy grid from the scans of a log with corrected poses."
+HELP = "Build an occupancy grid from the scans of a log."
 
 # Scans of a step of the progress bar.
 _SCANS = 64
@@ -35,19 +39,21 @@ Each ray makes the cells that it crosses more likely free, and the cell where it
 without a ray stay unknown. The map is written as map_server's YAML file with an image beside it, white where it is
 free, black where occupied, grey where unknown: an image editor removes people and closes gaps.
 
-Scans need the poses of the robot. Some CARMEN logs have them; for bags and raw logs --reference gives a TUM trajectory:
-that of a SLAM program; that of 'gpusense localize --tum' in an older map; or that of 'gpusense match --tum', which
-chains matches from scan to scan, and drifts over long drives.
+Where the log has no corrected poses, as bags, the scans are chained: each is matched to the one before and to key scans
+around it, places that are seen again are found and matched, and the poses are those of least squares over all matches
+and the odometry. The command says what was closed, and what is doubtful. CARMEN logs have poses, which in raw ones are
+copies of the odometry: --chain finds better ones. With --reference the poses are those of a TUM trajectory.
 
-Ctrl-C ends the run; the map of the scans so far is written. A map of more than four million cells is built in bands
-of rows: then it is the map of the bands so far, and of the last one's scans.
+Ctrl-C ends the chain, and the map of the scans so far is written; or it ends the map, which then holds some of the
+scans. A map of more than four million cells is built in bands of rows: then it is the map of the bands so far, and of
+the last one's scans.
 
 Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
 example:
-  gpusense map --log run.log.gz --out map.yaml
+  gpusense map --log run.bag --out map.yaml --tum run.tum --plot map.png
+  gpusense map --log run.log.gz --chain --range-limit 20 --out map.yaml
   gpusense map --log run.log.gz --every 2 --range-limit 20 --resolution 0.1 --out even.yaml
-  gpusense match --log run.bag --tum run.tum
   gpusense map --log run.bag --reference run.tum --out map.yaml"""
 
 
@@ -55,8 +61,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     parser.epilog = _EPILOG
     add = parser.add_argument
-    add_log(parser, "a log with corrected poses, or any with --reference")
+    add_log(parser, "a log with scans")
     add_reference(parser)
+    add_chain(parser)
     add("--out", required=True, type=output_path(".yaml"), metavar="YAML", help="the map; its image lies beside it")
     add("--mode", choices=MODES, default="trinary",
         help="trinary: white, black and grey; scale: shades, a PNG; raw: per cent as greys, almost black "
@@ -78,41 +85,70 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Build and write the map, after Ctrl-C that of the scans so far."""
+    from gpusense.evaluation.scoring import with_poses
     from gpusense.mapping.build import MapBuilder
-    from gpusense.world.map_files import write_map
 
-    scans = read_scans(args)
+    check_chain(args)
+    scans = read_scans(args, posed=False)
+    chained, stop, chosen = None, None, len(scans)
+    if is_chained(args, scans):
+        chained = chain_log(args, scans)
+        scans, stop = chained.scans, chained.stop
+    scans = with_poses(scans, args.log)
+    motions = None if chained is None else chained.chain.motions
     builder = MapBuilder(
         [scan.ranges for _, scan in scans], [scan.pose or (0.0, 0.0, 0.0) for _, scan in scans], scans[0][1].scanner,
         resolution=args.resolution, origin=None, shape=None, range_limit=args.range_limit, clear_max=args.clear_max,
         p_hit=args.p_hit, p_miss=args.p_miss, p_prior=0.5, occupied_threshold=65, backend=args.backend, each=_SCANS,
+        motion=motions,
     )  # fmt: skip
-    done, stop = _build(builder)
+    done, ended = _build(builder)
     grid = builder.grid()
-    transparent = args.mode == "scale" and bool(grid.unknown.any())
-    form: Literal["pgm", "png"] = "png" if transparent else "pgm"
-    write_map(grid, args.out, mode=args.mode, image_format=form)
-    image = args.out.with_suffix(f".{form}")
+    image = _write(args, grid)
+    if chained is not None:
+        write_chain(args, chained, grid)
     counted = round(done * len(scans))
-    rows, cols = grid.shape
-    free, occupied = int(grid.free.sum()), int(grid.occupied.sum())
-    if args.json:
-        print_json({
-            "map": str(args.out), "image": str(image), "mode": args.mode, "scans": counted,
-            "scans_chosen": len(scans), "rays": builder.rays, "rows": rows, "cols": cols,
-            "resolution": grid.resolution, "origin": grid.origin, "free": free, "occupied": occupied,
-            "machine": machine(),
-        })  # fmt: skip
-    else:
-        print(f"{args.out}: {rows} x {cols} cells of {grid.resolution} m, {occupied} occupied, {free} free; "
-              f"{builder.rays} rays of {counted} scans\nimage: {image}")  # fmt: skip
+    _report(args, builder, grid, image, (counted, chosen), chained)
+    stop = stop or ended
     if stop is not None:
-        held = f"{counted} of {len(scans)} scans"
+        held = f"{counted} of {chosen} scans"
         if builder.bands > 1:
             held = f"its lower part, {100 * done:.0f}% of the work; the rest is unknown"
         sys.stderr.write(f"gpusense: {word_of(stop)}: the map holds {held}\n")
         return code_of(stop)
     return 0
+
+
+def _write(args: argparse.Namespace, grid: OccupancyGrid) -> Path:
+    """Write the map, and return the path of its image."""
+    from gpusense.world.map_files import write_map
+
+    transparent = args.mode == "scale" and bool(grid.unknown.any())
+    form: Literal["pgm", "png"] = "png" if transparent else "pgm"
+    write_map(grid, args.out, mode=args.mode, image_format=form)
+    image: Path = args.out.with_suffix(f".{form}")
+    return image
+
+
+def _report(
+    args: argparse.Namespace, builder: MapBuilder, grid: OccupancyGrid, image: Path, scans: tuple[int, int],
+    chained: ChainedScans | None,
+) -> None:  # fmt: skip
+    """Print what was made."""
+    rows, cols = grid.shape
+    free, occupied = int(grid.free.sum()), int(grid.occupied.sum())
+    if args.json:
+        print_json({
+            "map": str(args.out), "image": str(image), "mode": args.mode, "scans": scans[0],
+            "scans_chosen": scans[1], "rays": builder.rays, "rows": rows, "cols": cols,
+            "resolution": grid.resolution, "origin": grid.origin, "free": free, "occupied": occupied,
+            "chain": None if chained is None else document(args, chained), "machine": machine(),
+        })  # fmt: skip
+        return
+    if chained is not None:
+        print(words(args, chained))
+    print(f"{args.out}: {rows} x {cols} cells of {grid.resolution} m, {occupied} occupied, {free} free; "
+          f"{builder.rays} rays of {scans[0]} scans\nimage: {image}")  # fmt: skip
 
 
 def _build(builder: MapBuilder) -> tuple[float, KeyboardInterrupt | None]:

@@ -38,6 +38,8 @@ class Scan:
     pose: Pose | None
     """The robot's corrected pose in the world [m, m, rad]; the laser's in a CARMEN log, which has no mount. None if the
     log has none."""
+    duration: float = 0.0
+    """Time from the first beam to the last one [s]; 0 where the log does not tell."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ranges", masks.filled(self.ranges))

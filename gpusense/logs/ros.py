@@ -53,6 +53,8 @@ from gpusense.world.scanner import Scanner
 _BASES = ("base_footprint", "base_link")
 # Beams of the common scanner of scans whose beams vary.
 _PLACES = 1440
+# Longest time of a scan that is believed [s].
+_LONGEST = 2.0
 # Mounts that are further apart than this contradict each other [m, rad].
 _APART = (0.02, math.radians(2))
 
@@ -119,7 +121,8 @@ def _records(
                 record: Scan | Odometry = Odometry(time, _odometry_pose(message.fields))
             else:
                 ranges = _readings(message.fields, scanner, len(bag.geometries) > 1, upside_down)
-                record = Scan(time, ranges, scanner, _pose_at(time, times, poses), None)
+                lasted = 0.0 if len(bag.geometries) > 1 else _duration(message.fields, scanner.count)
+                record = Scan(time, ranges, scanner, _pose_at(time, times, poses), None, lasted)
         yield record
 
 
@@ -231,6 +234,15 @@ def _readings(message: object, scanner: Scanner, common: bool, upside_down: bool
     ranges[ranges == 0] = math.nan
     ranges.setflags(write=False)
     return ranges
+
+
+def _duration(message: object, beams: int) -> float:
+    """Return the time from the first beam to the last one [s]; 0 where the message does not tell it plausibly."""
+    try:
+        lasted = real_field("message", message, "time_increment") * (beams - 1)
+    except (TypeError, ValueError):
+        return 0.0
+    return lasted if 0 < lasted <= _LONGEST else 0.0
 
 
 def _pose_at(time: float, times: Floats, poses: Floats) -> Pose:

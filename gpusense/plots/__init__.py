@@ -1,5 +1,6 @@
 """Draw maps, scans, particles, fits and positions, each onto a Matplotlib ``Axes``."""
 
+from gpusense.plots.chains import chain_figure
 from gpusense.plots.drawing import (
     add_colour_bar,
     draw_map,
@@ -30,6 +31,7 @@ from gpusense.plots.positions import (
 
 __all__ = [
     "add_colour_bar",
+    "chain_figure",
     "draw_beacons",
     "draw_features",
     "draw_fix",

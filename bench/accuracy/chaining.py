@@ -1,0 +1,295 @@
+"""Chain the scans of recorded logs, and compare trajectories and maps with references.
+
+    python bench/accuracy/chaining.py --backend opencl --output bench/results/chaining
+
+Rows of a log: its raw odometry; "scan to scan", successive matches without key scans and loops; "chain" is
+``gpusense.chain_scans``, with and without odometry, with and without closures; "KISS-ICP" where that library is
+installed, on points with z = 0, with the voxels of 0.1, 0.3 and 1 m, and with or without its correction of motion
+during scans where they have a duration, whatever errs least. Times are wall time without the first call's compilation.
+
+"error" is the root mean square distance from the reference after alignment. "drift" is the mean error of relative
+poses over a path of 5, 20 and 100 m, per length. "contradicted" closures differ from the reference by more than 0.5 m
+or 0.15 rad; references have errors, too. That of jarvis is a track by reflectors, whose clock is not the lasers'; that
+of olin is of scans that were taken as instantaneous: both are read where the error of a row is least, within 0.25 s.
+"held out" is the share of end points up to 20 m of odd scans within 5 and 15 cm of an occupied cell of the even scans'
+map, at the poses of the row with odometry and closures, and at those of the reference.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import itertools
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import gpusense as gs
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from common import make_parser, note, parse, publish, table
+from matching_odometry import recorded
+
+LOGS = ("intel", "fr079", "csail", "aces", "fhw", "seattle", "jarvis-s3000", "jarvis-nav350", "olin")
+LENGTHS = (5, 20, 100)
+LIMIT = 20.0
+VOXELS = (0.1, 0.3, 1.0)
+
+
+@dataclass
+class Log:
+    """Scans with odometry and reference poses, NaN where unknown, or a track of another clock: t, x, y, theta."""
+
+    name: str
+    ranges: np.ndarray
+    scanner: gs.Scanner
+    odometry: np.ndarray
+    truth: np.ndarray
+    times: np.ndarray | None
+    duration: float = 0.0
+    track: np.ndarray | None = None
+
+
+def load(data: Path, name: str) -> Log:
+    """Return a log by its name."""
+    if name.startswith("jarvis"):
+        return jarvis(data / "jarvis_lab", name.removeprefix("jarvis-"))
+    if name == "olin":
+        return olin(data / "olin_mac_bag")
+    if name == "intel":
+        return intel(data / "carmen_logs")
+    scans, motions = recorded(data, {"fr079": "freiburg-079"}.get(name, name))
+    odometry = [np.zeros(3)]
+    for motion in motions:
+        odometry.append(gs.compose_poses(odometry[-1], motion))
+    return from_scans(name, scans, np.array(odometry), np.array([scan.pose for scan in scans]))
+
+
+def from_scans(name: str, scans: list[gs.Scan], odometry: np.ndarray, truth: np.ndarray) -> Log:
+    """Return a log of scans of one scanner; times that decrease are left out."""
+    times = np.array([scan.time for scan in scans])
+    known = times if (np.diff(times) >= 0).all() else None
+    return Log(name, np.stack([scan.ranges for scan in scans]), scans[0].scanner, odometry, truth, known)
+
+
+def intel(folder: Path) -> Log:
+    """Return the log with raw odometry; a few of its scans have corrected poses."""
+    scans = list(gs.read_log(folder / "intel-rawodom-every5.log.gz"))
+    truth = np.full((len(scans), 3), np.nan)
+    with (folder / "intel-rawodom-matches.csv").open() as file:
+        for row in csv.DictReader(file):
+            truth[int(row["raw_index"])] = [float(row[name]) for name in ("x_m", "y_m", "theta_rad")]
+    return from_scans("intel", scans, np.array([scan.odometry for scan in scans]), truth)
+
+
+def olin(folder: Path) -> Log:
+    """Return the bag with the reference that was refined in its own map."""
+    scans = list(gs.read_log(folder / "macfirst_floor_take_2"))
+    rows = np.loadtxt(folder / "derived_reference.csv", delimiter=",", skiprows=1)
+    log = from_scans("olin", scans, np.array([scan.odometry for scan in scans]), np.zeros((len(scans), 3)))
+    return replace(log, duration=float(np.median([scan.duration for scan in scans])), track=rows[:, :4])
+
+
+def jarvis(folder: Path, laser: str) -> Log:
+    """Return a laser of the bag; the scanner for navigation takes an eighth of a second for a turn."""
+    topic = {"s3000": "security", "nav350": "navigation"}[laser]
+    bag = folder / "jarvis_complex_path_fast.bag"
+    scans = list(gs.read_log(bag, topic=f"/driver_laser_{topic}/laser_scan"))
+    track = np.load(folder / "jarvis_complex_path_fast.npz")["gt"]
+    log = from_scans(f"jarvis-{laser}", scans, np.array([s.odometry for s in scans]), np.zeros((len(scans), 3)))
+    return replace(log, duration=float(np.median([scan.duration for scan in scans])), track=track)
+
+
+def references(log: Log, earlier: float) -> np.ndarray:
+    """Return the reference poses of the scans, of a track those some seconds earlier."""
+    if log.track is None:
+        return log.truth
+    at, (t, x, y, theta) = log.times - earlier, log.track.T
+    columns = [np.interp(at, t, values, np.nan, np.nan) for values in (x, y, np.unwrap(theta))]
+    return np.stack(columns, axis=1)
+
+
+def aligned_error(poses: np.ndarray, truth: np.ndarray) -> float:
+    """Return the root mean square distance after the best rigid alignment [m]."""
+    known = np.isfinite(truth).all(axis=1)
+    p, q = poses[known, :2] @ (1, 1j), truth[known, :2] @ (1, 1j)
+    p, q = p - p.mean(), q - q.mean()
+    turn = np.vdot(p, q)
+    return float(np.sqrt(np.mean(np.abs(p * turn / abs(turn) - q) ** 2)))
+
+
+def drifts(poses: np.ndarray, truth: np.ndarray, length: float) -> tuple[float, float]:
+    """Return the mean error of relative poses over paths of a length: per cent, and degrees a metre."""
+    rows = np.flatnonzero(np.isfinite(truth).all(axis=1))
+    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(truth[rows, :2], axis=0).T)))
+    first = np.arange(len(rows))
+    second = np.searchsorted(path, path + length)
+    first, second = first[second < len(rows)], second[second < len(rows)]
+    if not len(first):
+        return np.nan, np.nan
+    moved = [gs.pose_difference(p[rows[first]], p[rows[second]]) for p in (truth, poses)]
+    off, long = gs.pose_difference(*moved), path[second] - path[first]
+    return float(100 * np.mean(np.hypot(off[:, 0], off[:, 1]) / long)), float(
+        np.degrees(np.mean(np.abs(off[:, 2]) / long))
+    )
+
+
+def figures(log: Log, method: str, poses: np.ndarray, seconds: float) -> dict[str, Any]:
+    """Return the figures of a trajectory."""
+    shifts = np.arange(-0.25, 0.26, 0.01) if log.track is not None else [0.0]
+    errors = [aligned_error(poses, references(log, shift)) for shift in shifts]
+    earlier = float(shifts[int(np.argmin(errors))])
+    truth = references(log, earlier)
+    found: dict[str, Any] = {"log": log.name, "method": method, "scans": len(poses), "seconds": seconds}
+    found |= {"error_m": min(errors), "earlier_s": earlier}
+    for length in LENGTHS:
+        both = [None if np.isnan(value) else value for value in drifts(poses, truth, length)]
+        found[f"drift_{length}_percent"], found[f"drift_{length}_degrees"] = both
+    return found
+
+
+def chain_row(log: Log, arguments: argparse.Namespace, with_odometry: bool, loops: bool) -> tuple[dict, gs.ScanChain]:
+    """Chain a log, and return its figures."""
+    begun = time.perf_counter()
+    chain = gs.chain_scans(
+        log.ranges, log.scanner, log.odometry if with_odometry else None, times=log.times,
+        duration=log.duration if log.times is not None else 0.0, close_loops=loops, backend=arguments.backend,
+    )  # fmt: skip
+    seconds = time.perf_counter() - begun
+    name = f"chain, {'with' if with_odometry else 'no'} odometry, {'closures' if loops else 'no closures'}"
+    found = figures(log, name, chain.poses, seconds)
+    truth, closures = references(log, found["earlier_s"]), chain.closures
+    known = closures[np.isfinite(truth[closures.first] + truth[closures.second]).all(axis=1)]
+    off = np.zeros((0, 3))
+    if len(known):
+        off = gs.pose_difference(gs.pose_difference(truth[known.first], truth[known.second]), known.pose)
+    wrong = (np.hypot(off[:, 0], off[:, 1]) > 0.5) | (np.abs(off[:, 2]) > 0.15)
+    found |= {"closures": len(closures), "compared": len(off), "contradicted": int(wrong.sum())}
+    return found | {"doubtful": int(chain.doubtful.sum()), "key_scans": len(chain.keys)}, chain
+
+
+def scan_to_scan(log: Log, backend: str) -> tuple[np.ndarray, float]:
+    """Match each scan to the one before."""
+    begun = time.perf_counter()
+    guess = gs.pose_difference(log.odometry[:-1], log.odometry[1:])
+    poses = [log.odometry[0]]
+    for part in range(0, len(guess), 256):
+        rows = slice(part, part + 256)
+        match = gs.match_scan(log.ranges[:-1][rows], log.ranges[1:][rows], log.scanner, guess[rows], backend=backend)
+        for step in np.where(match.usable[:, None], match.pose, guess[rows]):
+            poses.append(gs.compose_poses(poses[-1], step))
+    return np.array(poses), time.perf_counter() - begun
+
+
+def kiss_icp(log: Log) -> tuple[np.ndarray, float, float] | None:
+    """Return the poses of KISS-ICP, its time, and its voxels; None where it is not installed."""
+    try:
+        from kiss_icp.config import KISSConfig
+        from kiss_icp.kiss_icp import KissICP
+    except ImportError:
+        return None
+    results = []
+    bearings = log.scanner.bearings + log.scanner.mount[2]
+    share = np.linspace(0, 1, log.scanner.count)
+    for voxel, deskew in itertools.product(VOXELS, (True, False) if log.duration else (False,)):
+        config = KISSConfig()
+        config.data.max_range, config.data.min_range = min(log.scanner.range_max, 50.0), 0.1
+        config.data.deskew, config.mapping.voxel_size = deskew, voxel
+        odometry, poses, begun = KissICP(config), [], time.perf_counter()
+        for z in log.ranges:
+            hit = np.isfinite(z) & (z > log.scanner.range_min) & (z < log.scanner.range_max)
+            points = np.stack([z * np.cos(bearings), z * np.sin(bearings), 0 * z], axis=1)[hit]
+            odometry.register_frame(points + np.array([*log.scanner.mount[:2], 0.0]), share[hit])
+            pose = odometry.last_pose
+            poses.append((pose[0, 3], pose[1, 3], np.arctan2(pose[1, 0], pose[0, 0])))
+        seconds = time.perf_counter() - begun
+        results.append((figures(log, "", np.array(poses), 0.0)["error_m"], np.array(poses), seconds, voxel))
+    return min(results, key=lambda found: found[0])[1:]
+
+
+def held_out(log: Log, poses: np.ndarray, motions: np.ndarray | None, backend: str) -> tuple[float, float]:
+    """Return the shares of odd scans' end points within 5 and 15 cm of an occupied cell of the even scans' map."""
+    known = np.flatnonzero(np.isfinite(poses).all(axis=1))
+    even, odd = known[::2], known[1::2]
+    moved = None if motions is None else motions[even]
+    grid = gs.build_map(log.ranges[even], poses[even], log.scanner, range_limit=LIMIT, motion=moved, backend=backend)
+    distance = gs.distance_transform(grid.occupied, resolution=grid.resolution, backend=backend)
+    readings = log.ranges[odd]
+    if motions is not None:
+        readings = gs.deskew_scan(readings, log.scanner, motions[odd])
+    with np.errstate(invalid="ignore"):
+        hit = np.isfinite(readings) & (readings > 0) & (readings < min(LIMIT, log.scanner.range_max))
+    sensor = gs.compose_poses(poses[odd], np.array(log.scanner.mount))
+    angle = sensor[:, 2, None] + log.scanner.bearings
+    z = np.where(hit, readings, 0.0)
+    ends = np.stack([sensor[:, 0, None] + z * np.cos(angle), sensor[:, 1, None] + z * np.sin(angle)], axis=-1)[hit]
+    cells = np.floor((ends - grid.origin[:2]) / grid.resolution).astype(int)
+    inside = ((cells >= 0) & (cells < grid.shape[::-1])).all(axis=1)
+    near = np.full(len(cells), np.inf)
+    near[inside] = distance[cells[inside, 1], cells[inside, 0]]
+    return float(100 * np.mean(near <= 0.0501)), float(100 * np.mean(near <= 0.1501))
+
+
+def measured(log: Log, arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Return the rows of a log, and those of its maps."""
+    gs.chain_scans(log.ranges[:6], log.scanner, log.odometry[:6], backend=arguments.backend)
+    rows = [figures(log, "odometry", log.odometry, 0.0)]
+    rows.append(figures(log, "scan to scan", *scan_to_scan(log, arguments.backend)))
+    peer = kiss_icp(log)
+    if peer is not None:
+        rows.append(figures(log, f"KISS-ICP, voxels of {peer[2]} m", peer[0], peer[1]))
+    best: gs.ScanChain | None = None
+    for with_odometry in (True, False):
+        for loops in (False, True):
+            found, chain = chain_row(log, arguments, with_odometry, loops)
+            rows.append(found)
+            best = chain if best is None or (with_odometry and loops) else best
+            note(f"{log.name}, {found['method']}: {found['error_m']:.3f} m")
+    assert best is not None
+    maps = {"log": log.name, "chain": held_out(log, best.poses, best.motions, arguments.backend)}
+    truth = references(log, min(rows, key=lambda row: row["error_m"])["earlier_s"])
+    maps["reference"] = held_out(log, truth, best.motions, arguments.backend)
+    return rows, maps
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Measure, and publish tables."""
+    parser = make_parser(__doc__, backend="auto", data=True)
+    parser.add_argument("--log", action="append", choices=LOGS, help="default: all")
+    arguments = parse(parser, argv)
+    rows, maps = [], []
+    for name in arguments.log or LOGS:
+        found, made = measured(load(Path(arguments.data), name), arguments)
+        rows += found
+        maps.append(made)
+
+    def drift(row: dict[str, Any], length: int) -> str:
+        if row[f"drift_{length}_percent"] is None:
+            return "-"
+        return f"{row[f'drift_{length}_percent']:.2f} / {row[f'drift_{length}_degrees']:.3f}"
+
+    columns = ["log", "method", "error m", "drift 5 m: % / deg/m", "20 m", "100 m", "closures, contradicted", "s"]
+    lines = [
+        [
+            row["log"], row["method"], f"{row['error_m']:.3f}", *(drift(row, length) for length in LENGTHS),
+            f"{row['closures']}, {row['contradicted']} of {row['compared']}" if row.get("closures") else "-",
+            f"{row['seconds']:.1f}" if row["seconds"] else "-",
+        ]
+        for row in rows
+    ]  # fmt: skip
+    held = [
+        [made["log"], *(f"{made[name][0]:.1f} / {made[name][1]:.1f} %" for name in ("chain", "reference"))]
+        for made in maps
+    ]
+    text = table(columns, lines) + "\n\n" + table(["log", "held out: chain", "held out: reference"], held)
+    publish(__file__, arguments, text, {"rows": rows, "maps": maps})
+
+
+if __name__ == "__main__":
+    main()

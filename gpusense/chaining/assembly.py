@@ -1,0 +1,95 @@
+"""The links of the pose graph of a chain: matches, odometry, and constant motion where both leave directions open."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.chaining.front import SURE, Front
+from gpusense.chaining.graph import solve
+from gpusense.chaining.links import MOTION, ODOMETRY, Links
+from gpusense.chaining.motion import constant_motion_deviation, fitted_motion, odometry_links, relative
+from gpusense.localization.motion import OdometryMotion
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool]
+
+TEMPERATURE = 0.04
+"""Factor of the information of matches: recorded scans have errors that repeat, which no single match shows."""
+# Share of the largest eigenvalue below which the information of a scan's links leaves a direction open.
+_OPEN = 1e-6
+# Deviations of a pose in a direction of which nothing is known [m, rad].
+_UNKNOWN, _UNKNOWN_TURN = 30.0, 3.0
+
+
+def weighed(front: Front) -> Links:
+    """Return the matches so far with their information times the temperature.
+
+    Scans between two key scans are matched to both, and share the errors of these: together they count as one.
+    """
+    links, keys = front.links, np.array(front.keys)
+    is_key = np.zeros(front.done, bool)
+    is_key[keys] = True
+    between = np.append(np.diff(keys), front.done - keys[-1]) - 1
+    share = 1 / np.maximum(between, 1)[np.searchsorted(keys, np.arange(front.done), "right") - 1]
+    other = np.where(is_key[links.first], links.second, links.first)
+    star = is_key[links.first] != is_key[links.second]
+    factor = TEMPERATURE * np.where(star, share[other], 1.0)
+    return replace(links, information=factor[:, None, None] * links.information)
+
+
+def links_of_odometry(front: Front, links: Links, reported: Floats, motion: OdometryMotion) -> Links:
+    """Return links of odometry: from key scan to key scan, and to scans that have no others in some direction.
+
+    Args:
+        front: The matches.
+        links: Their links, as weighed.
+        reported: (M,) poses of the odometer at the nodes.
+        motion: Its noise.
+    """
+    nodes = np.arange(1, front.done)
+    keys = np.array(front.keys)
+    wanted = _is_open(front, links) | np.isin(nodes, keys)
+    second = nodes[wanted]
+    first = keys[np.searchsorted(keys, second) - 1]
+    return Links.of(ODOMETRY, first, second, *odometry_links(motion, reported[first], reported[second]))
+
+
+def fitted_odometry(front: Front, links: Links, reported: Floats) -> OdometryMotion:
+    """Return the noise of the odometry, fitted to the matches."""
+    keys = np.array(front.keys)
+    poses = solve(front.poses, links).poses
+    whole = np.append(0, np.cumsum(front.lost > 0))[keys]
+    return fitted_motion(reported[keys], poses[keys], np.diff(whole) == 0)
+
+
+def constant_motion_links(front: Front, links: Links, jumps: Flags) -> Links:
+    """Return links of constant motion, whose errors add up from scan to scan, where matches leave directions open.
+
+    Args:
+        front: The matches.
+        links: Their links, as weighed.
+        jumps: (S,) whether the time jumps before each scan of the log.
+    """
+    keys = np.array(front.keys)
+    second = np.arange(1, front.done)[_is_open(front, links)]
+    first = keys[np.searchsorted(keys, second) - 1]
+    deviation = np.cumsum(np.concatenate([np.zeros((1, 2)), constant_motion_deviation(front.steps)]), axis=0)
+    spread = deviation[second] - deviation[first]
+    broken = np.append(0, np.cumsum(jumps[front.nodes[1 : front.done]] & (front.p_right < SURE)))
+    spread[broken[second] != broken[first]] = _UNKNOWN, _UNKNOWN_TURN
+    information = np.zeros((len(first), 3, 3))
+    information[:, 0, 0] = information[:, 1, 1] = spread[:, 0] ** -2
+    information[:, 2, 2] = spread[:, 1] ** -2
+    return Links.of(MOTION, first, second, relative(front.poses, first, second), information)
+
+
+def _is_open(front: Front, links: Links) -> Flags:
+    """Return whether the links to earlier scans leave a direction of a node open, but for the first node."""
+    total = np.zeros((front.done, 3, 3))
+    np.add.at(total, links.second, links.information)
+    values = np.linalg.eigvalsh(total[1:])
+    is_open: Flags = values[:, 0] <= _OPEN * np.maximum(values[:, -1], 1e-300)
+    return is_open

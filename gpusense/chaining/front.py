@@ -1,0 +1,287 @@
+"""The front end of a chain: successive scans are matched, and each to a local map of key scans around it.
+
+Scans are taken in groups, each of which is matched in few launches: every scan to the one before, every key scan to
+some key scans before it, and every other scan to the key scans on both sides. Time and memory grow linearly.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.chaining.links import MATCH, Links, chained
+from gpusense.chaining.motion import relative, scan_motions
+from gpusense.chaining.options import ChainOptions
+from gpusense.localization.pose_algebra import pose_difference, wrap_angle
+from gpusense.matching.match import match_scan
+from gpusense.matching.result import ScanMatch
+from gpusense.world.scanner import Scanner
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+GROUP = 256
+"""Scans of a group."""
+# Key scans before it to which a key scan is matched.
+LOCAL = 4
+# A match is used from this p_right on.
+SURE = 0.5
+# Half widths of the search of a match of scans whose relative pose is known from others [m, rad].
+NEAR = (0.5, 0.3)
+# Readings differ by more than this [m], and this share; scans are unlike where more than a share of them does.
+_DIFFERENCE, _DIFFERENCE_SHARE, _UNLIKE = 0.15, 0.1, 0.3
+# A direction is a turn where this much of its length is.
+_TURNING = 0.5
+# Half widths of a second search after a failed one [m, rad].
+_WIDE = (2.0, math.pi)
+
+
+class Matcher:
+    """Matches scans of a log by their indices.
+
+    Args:
+        readings: (S, K) readings [m].
+        scanner: Their scanner.
+        options: Device and precision.
+    """
+
+    def __init__(self, readings: Floats, scanner: Scanner, options: ChainOptions) -> None:
+        self._readings, self._scanner, self._options = readings, scanner, options
+        self.motion: Floats | None = np.zeros((len(readings), 3)) if options.duration else None
+
+    def match(
+        self, first: Integers, second: Integers, guess: Floats, window: tuple[float, float] | None = None
+    ) -> ScanMatch:
+        """Return the poses of second scans in the frames of first ones; at least one pair.
+
+        Args:
+            first: (L,) indices.
+            second: (L,) indices.
+            guess: (L, 3) poses [m, m, rad].
+            window: Half widths of the search [m, rad]; None for the default of ``match_scan``.
+        """
+        options: dict[str, Any] = {} if window is None else {"window": window}
+        if self.motion is not None:
+            options |= {"motion": self.motion[second], "reference_motion": self.motion[first]}
+        return match_scan(
+            self._readings[first], self._readings[second], self._scanner, guess, backend=self._options.backend,
+            precision=self._options.precision, **options,
+        )  # fmt: skip
+
+    def links(self, kind: str, first: Integers, second: Integers, guess: Floats) -> Links:
+        """Return the links of those matches near their guesses that may be used."""
+        parts = []
+        for begin in range(0, len(first), 2 * GROUP):
+            part = slice(begin, begin + 2 * GROUP)
+            match = self.match(first[part], second[part], guess[part], NEAR)
+            links = Links.of(kind, first[part], second[part], match.pose, match.information, match.p_right)
+            parts.append(links[match.usable & (match.p_right >= SURE)])
+        return Links.joined(parts)
+
+
+class Front:
+    """Matches the scans of a log group by group.
+
+    Args:
+        readings: (S, K) readings [m].
+        scanner: Their scanner.
+        odometry: (S, 3) poses of the odometer, or None.
+        times: (S,) times [s], or None.
+        jumps: (S,) whether the time jumps before a scan.
+        options: The options.
+
+    Attributes:
+        nodes: (M,) indices of the scans that are matched, those before which the robot has moved.
+        steps: Motions from each node to the next.
+        keys: Numbers of the nodes that are key scans.
+        doubt: Names of what is doubtful of each step; empty for none.
+        links: The links between nodes.
+    """
+
+    def __init__(
+        self, readings: Floats, scanner: Scanner, odometry: Floats | None, times: Floats | None,
+        jumps: NDArray[np.bool], options: ChainOptions,
+    ) -> None:  # fmt: skip
+        self.matcher = Matcher(readings, scanner, options)
+        self._odometry, self._times, self._jumps, self._options = odometry, times, jumps, options
+        self.nodes = moved_scans(odometry, readings, options.step)
+        self.steps = np.zeros((0, 3))
+        self.p_right = np.zeros(0)
+        self.lost = np.zeros(0, np.int64)
+        self.keys = [0]
+        self._parts: list[Links] = []
+        self._waiting = 0
+
+    @property
+    def done(self) -> int:
+        """Number of nodes that are matched."""
+        return len(self.steps) + 1
+
+    @property
+    def links(self) -> Links:
+        """All links so far."""
+        return Links.joined(self._parts)
+
+    @property
+    def poses(self) -> Floats:
+        """(M,) poses of the matched nodes, chained from the first one."""
+        return chained(np.zeros(3), self.steps)
+
+    def confirmations(self) -> Integers:
+        """Return the number of matches of farther scans that span each step from node to node."""
+        links = self.links
+        far = np.abs(links.second - links.first) > 1
+        ends = np.sort(np.stack([links.first[far], links.second[far]]), axis=0)
+        change = np.zeros(self.done, np.int64)
+        np.add.at(change, ends[0], 1)
+        np.add.at(change, ends[1], -1)
+        return np.cumsum(change)[:-1]
+
+    def advance(self) -> bool:
+        """Match the next group; return whether there was one. An interrupt leaves the groups before it."""
+        trial = copy.copy(self)
+        trial.keys, trial._parts = list(self.keys), list(self._parts)
+        found = trial._match_group()
+        # One call, which no signal divides.
+        self.__dict__.update(trial.__dict__)
+        return found
+
+    def _match_group(self) -> bool:
+        """Match the next group; return whether there was one."""
+        begin, end = self.done, min(self.done + GROUP, len(self.nodes))
+        if begin >= end:
+            return False
+        self._follow(np.arange(begin, end))
+        self._choose_keys(begin, end)
+        self._match_locally(end == len(self.nodes))
+        return True
+
+    def _follow(self, part: Integers) -> None:
+        """Match nodes to those before them."""
+        first, second = self.nodes[part - 1], self.nodes[part]
+        still = np.zeros((len(part), 3))
+        guess = still if self._odometry is None else pose_difference(self._odometry[first], self._odometry[second])
+        found = self.matcher.match(first, second, guess)
+        found = self._tried_again(found, first, second, guess)
+        if self.matcher.motion is not None and self._times is not None:
+            moved = scan_motions(
+                found.pose, self._times[self.nodes[part[0] - 1 : part[-1] + 1]], self._options.duration
+            )
+            new = slice(0 if part[0] == 1 else 1, None)
+            self.matcher.motion[self.nodes[part[0] - 1 : part[-1] + 1][new]] = moved[new]
+            again = self.matcher.match(first, second, found.pose, NEAR)
+            found = found.replaced(np.arange(len(part)), again, again.usable)
+        usable = found.usable & (found.p_right >= SURE)
+        links = Links.of(MATCH, part - 1, part, found.pose, found.information, found.p_right)
+        self._parts.append(links[usable])
+        steps = self._filled(found, usable, guess, self._jumps[second])
+        self.steps = np.concatenate([self.steps, steps])
+        self.p_right = np.concatenate([self.p_right, np.where(usable, found.p_right, 0.0)])
+        self.lost = np.concatenate([self.lost, np.where(usable, (found.eigenvalues == 0).sum(axis=1), 3)])
+
+    def _tried_again(self, found: ScanMatch, first: Integers, second: Integers, guess: Floats) -> ScanMatch:
+        """Match pairs that have failed from the motions before and after them, and by a wide search."""
+        for attempt in ("before", "after", "wide"):
+            good = found.usable & (found.p_right >= SURE)
+            rows = np.flatnonzero(~good)
+            if not len(rows):
+                break
+            others = guess[rows]
+            if attempt != "wide":
+                near = np.flatnonzero(good)
+                if not len(near):
+                    continue
+                place = np.searchsorted(near, rows) - (attempt == "before")
+                others = found.pose[near[np.clip(place, 0, len(near) - 1)]]
+            again = self.matcher.match(first[rows], second[rows], others, _WIDE if attempt == "wide" else None)
+            better = again.usable & (again.p_right > np.where(found.usable[rows], found.p_right[rows], 0.0))
+            found = found.replaced(rows, again, better)
+        return found
+
+    def _filled(self, found: ScanMatch, usable: NDArray[np.bool], guess: Floats, jumps: NDArray[np.bool]) -> Floats:
+        """Return the motions by matches, and along what these do not observe by odometry or constant motion."""
+        steps = np.where(usable[:, None], found.pose, guess)
+        open_ = ~usable | (found.eigenvalues == 0).any(axis=1)
+        for k in np.flatnonzero(open_):
+            expected = guess[k]
+            if self._odometry is None:
+                before = steps[k - 1] if k else (self.steps[-1] if len(self.steps) else np.zeros(3))
+                expected = np.zeros(3) if jumps[k] else before
+            if not usable[k]:
+                steps[k] = expected
+                continue
+            scale = np.array([1.0, 1.0, found.lever[k]])
+            lost = found.directions[k][found.eigenvalues[k] == 0]
+            if self._odometry is None:
+                # A turn need not go on.
+                lost = lost[np.abs(lost[:, 2]) < _TURNING]
+            off = expected - steps[k]
+            off[2] = wrap_angle(off[2])
+            steps[k] += (lost.T @ (lost @ (scale * off))) / scale
+        return steps
+
+    def _choose_keys(self, begin: int, end: int) -> None:
+        """Choose key scans among nodes: after a motion, and on both sides of a match that has failed."""
+        poses = self.poses
+        length, turn = self._options.key_step
+        for k in range(begin, end):
+            off = poses[k] - poses[self.keys[-1]]
+            if self.p_right[k - 1] < SURE:
+                self.keys += [n for n in (k - 1, k) if n > self.keys[-1]]
+            elif np.hypot(off[0], off[1]) >= length or abs(wrap_angle(off[2])) >= turn:
+                self.keys.append(k)
+
+    def _match_locally(self, last: bool) -> None:
+        """Match new key scans to those before them, and the scans between two key scans to both."""
+        first, second = [], []
+        poses, keys = self.poses, np.array(self.keys)
+        end = self.done if last else int(keys[-1]) + 1
+        for k in range(max(self._waiting, 1), end):
+            place = int(np.searchsorted(keys, k))
+            if place < len(keys) and keys[place] == k:
+                others = keys[max(place - LOCAL, 0) : place]
+            else:
+                others = keys[place - 1 : place + 1]
+            for other in others:
+                if abs(other - k) > 1:
+                    first.append(other)
+                    second.append(k)
+        self._waiting = end
+        one, two = np.array(first, np.int64), np.array(second, np.int64)
+        # A failed step between two nodes separates them.
+        broken = np.append(0, np.cumsum(self.p_right < SURE))
+        same = broken[one] == broken[two]
+        one, two = one[same], two[same]
+        found = self.matcher.links(MATCH, self.nodes[one], self.nodes[two], relative(poses, one, two))
+        numbers = np.zeros(int(self.nodes[-1]) + 1, np.int64)
+        numbers[self.nodes] = np.arange(len(self.nodes))
+        self._parts.append(found.renumbered(numbers))
+
+
+def moved_scans(odometry: Floats | None, readings: Floats, step: tuple[float, float]) -> Integers:
+    """Return the indices of scans before which the robot has moved since the last such one.
+
+    It has moved where the odometer has by a step, or where the readings differ though the odometer has not.
+    """
+    if odometry is None or step == (0.0, 0.0):
+        return np.arange(len(readings))
+    chosen, last = [0], odometry[0].tolist()
+    for k, pose in enumerate(odometry.tolist()):
+        turn = abs((pose[2] - last[2] + np.pi) % (2 * np.pi) - np.pi)
+        moved = np.hypot(pose[0] - last[0], pose[1] - last[1]) >= step[0] or turn >= step[1]
+        if k and (moved or _are_unlike(readings[chosen[-1]], readings[k])):
+            chosen.append(k)
+            last = pose
+    return np.array(chosen, np.int64)
+
+
+def _are_unlike(one: Floats, two: Floats) -> bool:
+    """Return whether more readings of two scans differ than those of a robot that stands still."""
+    with np.errstate(invalid="ignore"):
+        both = np.isfinite(one) & np.isfinite(two)
+        differ = np.abs(one - two) > np.maximum(_DIFFERENCE, _DIFFERENCE_SHARE * one)
+    return bool(np.count_nonzero(differ & both) > _UNLIKE * np.count_nonzero(both))

@@ -1,0 +1,109 @@
+"""Links of a pose graph: what is known of the pose of one scan in the frame of another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.localization.pose_algebra import pose_difference, wrap_angle
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+MATCH, ODOMETRY, MOTION, CLOSURE = "match", "odometry", "motion", "closure"
+KINDS = {
+    MATCH: "scans near each other in the log, matched",
+    ODOMETRY: "the robot's odometry",
+    MOTION: "constant motion, where scans and odometry leave a direction open",
+    CLOSURE: "scans of a place that was seen again, matched",
+}
+"""The meaning of each kind of a link."""
+
+
+@dataclass(frozen=True, eq=False)
+class Links:
+    """L links between scans.
+
+    Attributes:
+        first: (L,) indices of the scans in whose frames poses are.
+        second: (L,) indices of the scans whose poses are known.
+        pose: (L, 3) poses of the second scans in the frames of the first ones [m, m, rad].
+        information: (L, 3, 3) inverse covariances, 0 along directions that are not observed.
+        p_right: (L,) probabilities that the poses are right; NaN for odometry and constant motion.
+        kind: (L,) names, see :data:`gpusense.chaining.links.KINDS`.
+        weight: (L,) factors of the information in the solution: near 0 for links that the others contradict.
+
+    Example:
+        >>> import numpy as np
+        >>> from gpusense.chaining.links import Links
+        >>> len(Links.of("odometry", [0], [1], np.zeros((1, 3)), np.eye(3)[None]))
+        1
+    """
+
+    first: Integers
+    second: Integers
+    pose: Floats
+    information: Floats
+    p_right: Floats
+    kind: NDArray[np.str_]
+    weight: Floats
+
+    @classmethod
+    def of(
+        cls, kind: str, first: object, second: object, pose: Floats, information: Floats, p_right: object = np.nan
+    ) -> Links:
+        """Return links of one kind, of weight 1."""
+        count = len(pose)
+        return cls(
+            np.asarray(first, np.int64).reshape(count), np.asarray(second, np.int64).reshape(count),
+            np.asarray(pose, np.float64).reshape(count, 3), np.asarray(information, np.float64).reshape(count, 3, 3),
+            np.array(np.broadcast_to(np.asarray(p_right, np.float64), count)), np.full(count, kind, "<U8"),
+            np.ones(count),
+        )  # fmt: skip
+
+    @classmethod
+    def joined(cls, parts: Sequence[Links]) -> Links:
+        """Return the links of several parts as one, in their order."""
+        if not parts:
+            return cls.of(MATCH, [], [], np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        return cls(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)})
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def __getitem__(self, chosen: NDArray[np.bool] | Integers | slice) -> Links:
+        """Return some of the links."""
+        return Links(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
+
+    def renumbered(self, numbers: Integers) -> Links:
+        """Return the links with the scans' indices looked up in ``numbers``."""
+        return replace(self, first=numbers[self.first], second=numbers[self.second])
+
+    def residuals(self, poses: Floats) -> Floats:
+        """Return (L, 3) differences between the relative poses of (N, 3) poses and those of the links."""
+        off = pose_difference(poses[self.first], poses[self.second]) - self.pose
+        off[:, 2] = wrap_angle(off[:, 2])
+        return off
+
+    def squared_distances(self, poses: Floats) -> Floats:
+        """Return (L,) squared distances of residuals in deviations."""
+        off = self.residuals(poses)
+        squared: Floats = np.maximum(np.einsum("li,lij,lj->l", off, self.information, off), 0.0)
+        return squared
+
+
+def chained(first: Floats, steps: Floats) -> Floats:
+    """Return (S + 1, 3) poses from the first one on, each a step further.
+
+    Args:
+        first: (3,) pose.
+        steps: (S, 3) poses in the frames of those before.
+    """
+    heading = np.cumsum(np.append(first[2], steps[:, 2]))
+    c, s = np.cos(heading[:-1]), np.sin(heading[:-1])
+    x = np.cumsum(np.append(first[0], c * steps[:, 0] - s * steps[:, 1]))
+    y = np.cumsum(np.append(first[1], s * steps[:, 0] + c * steps[:, 1]))
+    return np.stack([x, y, wrap_angle(heading)], axis=1)

@@ -1,0 +1,94 @@
+"""Motion between scans by the odometry, or constant motion in its place, with information."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.localization.motion import OdometryMotion
+from gpusense.localization.motion_fit import fit_odometry_motion
+from gpusense.localization.pose_algebra import pose_difference
+
+Floats = NDArray[np.float64]
+
+# Least deviations of a motion by odometry [m, rad]: a number is needed in each direction.
+_LEAST = (1e-3, 5e-4)
+# Most steps to which the noise of an odometer is fitted.
+_MOST_STEPS = 1000
+# Deviations of constant motion: a share of it, and of a scan's time or a scan [m, rad].
+_SHARE, _RESTLESS, _RESTLESS_TURN = 0.5, 0.02, 0.02
+
+
+def odometry_links(motion: OdometryMotion, before: Floats, after: Floats) -> tuple[Floats, Floats]:
+    """Return the motions (L, 3) between poses of an odometer without its systematic errors, and their information.
+
+    Args:
+        motion: The noise.
+        before: (L, 3) poses of the odometer.
+        after: (L, 3) later poses.
+
+    Returns:
+        (L, 3) poses in the frames of those before, and (L, 3, 3) inverse covariances.
+    """
+    count = len(before)
+    poses, covariances = np.zeros((count, 3)), np.zeros((count, 3, 3))
+    for k in range(count):
+        sampled = motion.sampled(before[k], after[k])
+        first, ahead, left, second = sampled.mean
+        c, s = math.cos(first), math.sin(first)
+        poses[k] = c * ahead - s * left, s * ahead + c * left, first + second
+        jacobian = np.array([[-s * ahead, c, -s, 0.0], [c * ahead, s, c, 0.0], [1.0, 0.0, 0.0, 1.0]])
+        covariances[k] = jacobian * np.square(sampled.deviation) @ jacobian.T
+    covariances += np.diag([_LEAST[0] ** 2, _LEAST[0] ** 2, _LEAST[1] ** 2])
+    information: Floats = np.asarray(np.linalg.inv(covariances), np.float64)
+    return poses, information
+
+
+def fitted_motion(odometry: Floats, poses: Floats, joined: NDArray[np.bool]) -> OdometryMotion:
+    """Return the noise of an odometer against matched poses; the default where too little is known.
+
+    Args:
+        odometry: (M, 3) poses of the odometer at key scans.
+        poses: (M, 3) poses by matches.
+        joined: (M - 1,) whether a match tells the motion between two of them in all directions.
+    """
+    # The longest stretch without a gap.
+    ends = np.flatnonzero(~np.concatenate([[False], joined, [False]]))
+    longest = int(np.argmax(np.diff(ends)))
+    part = slice(ends[longest], min(ends[longest + 1], ends[longest] + _MOST_STEPS))
+    if part.stop - part.start < 3:
+        return OdometryMotion()
+    try:
+        return fit_odometry_motion(odometry[part], poses[part]).motion
+    except ValueError:  # the robot hardly moved
+        return OdometryMotion()
+
+
+def constant_motion_deviation(steps: Floats) -> Floats:
+    """Return the deviations (L, 2) of motions (L, 3) that are those of the step before [m, rad]."""
+    length = np.hypot(steps[:, 0], steps[:, 1])
+    return np.stack([_RESTLESS + _SHARE * length, _RESTLESS_TURN + _SHARE * np.abs(steps[:, 2])], axis=1)
+
+
+def scan_motions(steps: Floats, times: Floats, duration: float) -> Floats:
+    """Return the motions (S, 3) during scans, by the mean velocity before and after each.
+
+    Args:
+        steps: (S - 1, 3) motions from scan to scan.
+        times: (S,) times of the scans [s].
+        duration: Time from the first to the last beam [s].
+    """
+    gaps = np.diff(times)
+    velocity = np.where(gaps[:, None] > 0, steps / np.where(gaps > 0, gaps, 1.0)[:, None], 0.0)
+    if not len(velocity):
+        return np.zeros((len(times), 3))
+    both = np.concatenate([velocity[:1], velocity, velocity[-1:]])
+    return 0.5 * duration * (both[:-1] + both[1:])
+
+
+def relative(poses: Floats, first: NDArray[np.int64], second: NDArray[np.int64]) -> Floats:
+    """Return (L, 3) poses of second scans in the frames of first ones."""
+    found: Floats = pose_difference(poses[first], poses[second])
+    return found

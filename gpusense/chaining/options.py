@@ -1,0 +1,80 @@
+"""Options of a chain of scans, and the checks of its arguments."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense._util import checks
+from gpusense._util.typing import Precision
+from gpusense.backends import Selection
+from gpusense.localization.motion import OdometryMotion
+
+Floats = NDArray[np.float64]
+
+# A gap of the times longer than this many usual steps, and than this [s], is a jump.
+_JUMP_STEPS, _JUMP = 10.0, 2.0
+
+
+@dataclass(frozen=True)
+class ChainOptions:
+    """Options of a chain.
+
+    Attributes:
+        step: Motion by odometry below which a scan is not matched [m, rad].
+        key_step: Motion after which a scan becomes a key scan [m, rad].
+        duration: Time from the first beam of a scan to the last one [s].
+        motion: Noise of the odometry; None to fit it to the matches.
+        close_loops: Whether places that are seen again are searched for.
+        backend: The device.
+        precision: Of the matches.
+    """
+
+    step: tuple[float, float]
+    key_step: tuple[float, float]
+    duration: float
+    motion: OdometryMotion | None
+    close_loops: bool
+    backend: Selection = field(repr=False)
+    precision: Precision
+
+
+def check_steps(name: str, value: object) -> tuple[float, float]:
+    """Return a step in x and y [m], and a turn [rad].
+
+    Raises:
+        TypeError, ValueError: not two finite numbers of at least 0.
+    """
+    values = checks.array(name, value, (2,))
+    length = checks.real(f"{name}[0]", float(values[0]), low=0.0)
+    return length, checks.real(f"{name}[1]", float(values[1]), low=0.0, high=math.pi + 1e-9)
+
+
+def check_times(times: object, scans: int) -> Floats | None:
+    """Return the times of S scans.
+
+    Raises:
+        TypeError, ValueError: not S finite numbers, or they decrease.
+    """
+    if times is None:
+        return None
+    values: Floats = checks.array("times", times, (scans,))
+    falls = np.flatnonzero(np.diff(values) < 0)
+    if len(falls):
+        k = int(falls[0]) + 1
+        raise ValueError(f"times: must not decrease, got {values[k]} after {values[k - 1]} at scan {k}")
+    return values
+
+
+def jumps_of(times: Floats | None, scans: int) -> NDArray[np.bool]:
+    """Return (S,) whether the time from the scan before is much longer than usual; False for the first one."""
+    jumps = np.zeros(scans, bool)
+    if times is None or scans < 3:
+        return jumps
+    gaps = np.diff(times)
+    usual = float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 0.0
+    jumps[1:] = gaps > max(_JUMP_STEPS * usual, _JUMP)
+    return jumps

@@ -1,0 +1,117 @@
+"""The trajectory of a chain of scans, with its links, its closures, and what is doubtful of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.chaining.links import CLOSURE, Links
+from gpusense.localization.motion import OdometryMotion
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+REASONS = {
+    "no match": "the scan matches neither the one before nor key scans: its motion is that of odometry or a guess",
+    "unobserved": "the scans do not observe a direction of the motion, as along a corridor, and there is no odometry",
+    "unconfirmed": "a single match tells the motion, and there is no odometry: no other match agrees with it",
+    "jump": "the time jumps, and the robot may be anywhere after it",
+}
+"""The meaning of each doubt."""
+
+
+class Doubt(NamedTuple):
+    """A stretch of the trajectory that is doubtful.
+
+    Attributes:
+        first: Index of the scan before the first doubtful motion.
+        last: Index of the scan after the last one.
+        reason: One of :data:`gpusense.chaining.result.REASONS`.
+    """
+
+    first: int
+    last: int
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class ScanChain:
+    """The trajectory of S scans, from :func:`gpusense.chain_scans`.
+
+    Attributes:
+        poses: (S, 3) poses of the robot at the first listed beam of each scan [m, m, rad]; the first one is that of
+            the odometry, or (0, 0, 0) without one.
+        covariance: (S, 3, 3) covariances given the first pose [m^2, m rad, rad^2]; very large along directions that
+            nothing tells.
+        links: The links of the pose graph between scans, with their weights in the solution; closures are among them.
+        keys: (K,) indices of the key scans.
+        motion: The noise of the odometry, given or fitted to the matches; None without odometry.
+        motions: (S, 3) motion of the robot from the first listed beam of each scan to the last one, or None where
+            scans take no time.
+        duration: Time from the first listed beam to the last one that was used [s]; negative where beams are listed in
+            reverse: the times of poses are then later than those of the scans by as much.
+        corrections: (C,) distances [m] by which the closures moved the second scans in the frames of the first ones.
+        doubts: Stretches that are doubtful.
+        matched: Number of scans that were matched; for the others the robot stood still by its odometry.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> scanner = gs.Scanner.uniform(angle_min=-3.1, angle_increment=0.0175, count=356, range_max=9.0)
+        >>> c, s = np.cos(scanner.bearings), np.sin(scanner.bearings)
+        >>> room = [np.minimum((3 * np.sign(c) - x) / c, 2 / np.abs(s)) for x in (0.0, 0.1, 0.2)]
+        >>> chain = gs.chain_scans(room, scanner, backend="numpy")
+        >>> len(chain.closures), len(chain.doubts)
+        (0, 0)
+    """
+
+    poses: Floats
+    covariance: Floats
+    links: Links
+    keys: Integers
+    motion: OdometryMotion | None
+    motions: Floats | None
+    duration: float
+    corrections: Floats
+    doubts: tuple[Doubt, ...]
+    matched: int
+
+    @property
+    def closures(self) -> Links:
+        """The links that close loops."""
+        return self.links[self.links.kind == CLOSURE]
+
+    @property
+    def doubtful(self) -> NDArray[np.bool]:
+        """(S,) whether the motion to a scan is part of a doubtful stretch."""
+        result = np.zeros(len(self.poses), bool)
+        for doubt in self.doubts:
+            result[doubt.first + 1 : doubt.last + 1] = True
+        return result
+
+    def explain(self) -> str:
+        """Return the numbers of scans, key scans, links and closures, and what is doubtful, in words."""
+        count = len(self.poses)
+        lines = [f"{count} scans, {self.matched} matched, {len(self.keys)} key scans, {len(self.links)} links"]
+        if self.duration:
+            order = "in reverse" if self.duration < 0 else "in their order"
+            lines.append(f"scans of {abs(self.duration):.3g} s, measured {order}, are freed of the robot's motion")
+        if len(self.corrections):
+            lines.append(
+                f"{len(self.corrections)} closures, which moved scans by {np.median(self.corrections):.2f} m in the "
+                f"median and {self.corrections.max():.2f} m at most"
+            )
+        else:
+            lines.append("no place was seen again, or none for sure: no loop is closed")
+        for reason, meaning in REASONS.items():
+            some = [doubt for doubt in self.doubts if doubt.reason == reason]
+            if some:
+                spans = ", ".join(f"{doubt.first} to {doubt.last}" for doubt in some[:10])
+                more = f" and {len(some) - 10} more" if len(some) > 10 else ""
+                lines.append(f"doubtful, scans {spans}{more}: {meaning}")
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return f"ScanChain({len(self.poses)} scans, {len(self.keys)} key scans, {len(self.corrections)} closures)"

@@ -1,0 +1,56 @@
+"""The order in which beams are measured: as they are listed, in reverse, or all at once.
+
+Drivers of lasers that turn clockwise list their beams in reverse, and some state times that do not hold. Scans between
+which the robot turns tell: freed of its motion by the right order they agree best.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.chaining.front import GROUP, NEAR, Matcher
+from gpusense.chaining.links import chained
+from gpusense.chaining.motion import relative, scan_motions
+
+Floats = NDArray[np.float64]
+
+# Most scans that are looked at, scans between those of a pair, pairs, and the turn during a scan that tells [rad].
+_SCANS, _LAG, _PAIRS, _TURN = 2000, 5, 120, 0.01
+# Another order than the listed one must raise the mean score by this much.
+_CLEAR = 0.003
+
+
+def signed_duration(matcher: Matcher, times: Floats, duration: float) -> float:
+    """Return the time from the first listed beam to the last one: negative in reverse order, 0 for all at once.
+
+    Args:
+        matcher: Matches scans that are not freed of motion.
+        times: (S,) times of the scans [s].
+        duration: The time in the listed order [s], which holds where the scans do not tell.
+    """
+    count = min(len(times), _SCANS)
+    if count <= _LAG + 1:
+        return duration
+    steps = []
+    for begin in range(1, count, GROUP):
+        second = np.arange(begin, min(begin + GROUP, count))
+        match = matcher.match(second - 1, second, np.zeros((len(second), 3)))
+        steps.append(np.where(match.usable[:, None], match.pose, 0.0))
+    moved = np.concatenate(steps)
+    velocity, poses = scan_motions(moved, times[:count], 1.0), chained(np.zeros(3), moved)
+    first = np.arange(count - _LAG)
+    turn = np.abs(velocity[first, 2]) + np.abs(velocity[first + _LAG, 2])
+    first = np.sort(first[np.argsort(-turn, kind="stable")[:_PAIRS]])
+    second = first + _LAG
+    if duration * np.mean(turn[first]) / 2 < _TURN:
+        return duration
+    guess = relative(poses, first, second)
+    scores = {}
+    for value in (duration, 0.0, -duration):
+        matcher.motion = np.zeros((len(times), 3))
+        matcher.motion[:count] = value * velocity
+        scores[value] = float(np.mean(matcher.match(first, second, guess, NEAR).score))
+    matcher.motion = None
+    best = max(scores, key=lambda value: scores[value])
+    return best if scores[best] > scores[duration] + _CLEAR else duration

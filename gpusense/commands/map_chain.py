@@ -1,0 +1,180 @@
+"""Poses of a log's scans by a chain of matches, for ``gpusense map``: options, run, files and words."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gpusense._util.progress import progress
+from gpusense.commands.arguments import output_path
+from gpusense.commands.scans import scan_times
+from gpusense.commands.signals import word_of
+
+if TYPE_CHECKING:
+    from gpusense.chaining.result import ScanChain
+    from gpusense.logs import Scan
+    from gpusense.world.grid import OccupancyGrid
+
+    Scans = list[tuple[int, Scan]]
+
+# Steps of the progress bar for the search for loops.
+_ROUNDS = 20
+# Names of the columns of a file of poses.
+_COLUMNS = "scan,time,x,y,theta,var_x,cov_xy,cov_xtheta,var_y,cov_ytheta,var_theta,doubtful"
+
+
+@dataclass
+class ChainedScans:
+    """Scans with poses of a chain.
+
+    Attributes:
+        scans: The scans that were chained, with their poses.
+        chain: The chain.
+        seconds: Time that it took.
+        stop: The signal that ended it; None at its end.
+    """
+
+    scans: Scans
+    chain: ScanChain
+    seconds: float
+    stop: KeyboardInterrupt | None
+
+
+def add_chain(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a chain."""
+    add = parser.add_argument
+    add("--chain", action="store_true",
+        help="find the poses by matching the scans and closing loops, though the log has some (default: where it has "
+        "none)")  # fmt: skip
+    add("--no-odometry", action="store_true", help="chain the scans without the log's odometry")
+    add("--no-loops", action="store_true", help="do not search for places that are seen again")
+    add("--tum", type=output_path(".tum", ".txt"), metavar="FILE", help="write the poses of a chain, as evo reads them")
+    add("--poses", type=output_path(".csv"), metavar="CSV",
+        help="write the poses of a chain with covariances, and which are doubtful")  # fmt: skip
+    add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
+        help="draw the map with trajectory, closures and doubtful stretches of a chain")  # fmt: skip
+
+
+def check_chain(args: argparse.Namespace) -> None:
+    """Check that a chain and a trajectory are not both asked for.
+
+    Raises:
+        ValueError: they are.
+    """
+    if args.chain and args.reference is not None:
+        raise ValueError("--chain: must not be used with --reference, which has the poses, got both")
+
+
+def is_chained(args: argparse.Namespace, scans: Scans) -> bool:
+    """Return whether the poses are found by a chain, and check the options that need one.
+
+    Raises:
+        ValueError: an option needs a chain.
+    """
+    chained = args.chain or (args.reference is None and any(scan.pose is None for _, scan in scans))
+    for name in ("tum", "poses", "plot", "no_odometry", "no_loops"):
+        if not chained and getattr(args, name):
+            option = name.replace("_", "-")
+            raise ValueError(f"--{option}: must be used with --chain where the scans have poses, got it without")
+    return chained
+
+
+def chain_log(args: argparse.Namespace, scans: Scans) -> ChainedScans:
+    """Chain the scans; after Ctrl-C those so far."""
+    from gpusense.chaining.chain import Chainer
+
+    readings = np.stack([scan.ranges for _, scan in scans])
+    odometry = None if args.no_odometry else _odometry(scans)
+    times = np.array([scan.time for _, scan in scans])
+    known = bool((np.diff(times) >= 0).all())
+    duration = float(np.median([scan.duration for _, scan in scans])) if known else 0.0
+    chainer = Chainer(
+        readings, scans[0][1].scanner, odometry, times=times if known else None, duration=duration,
+        close_loops=not args.no_loops, backend=args.backend,
+    )  # fmt: skip
+    begun, stop = time.perf_counter(), None
+    with progress(len(scans) + _ROUNDS) as step:
+        try:
+            done = 0
+            for word in chainer.steps():
+                for _ in range(max(chainer.scans - done, 1)):
+                    step(word)
+                done = chainer.scans
+        except KeyboardInterrupt as signal:
+            stop = signal
+            sys.stderr.write(f"gpusense: {word_of(stop)}: the map is made of what is chained so far\n")
+    chain = chainer.chain()
+    placed = [
+        (index, replace(scan, pose=tuple(pose)))
+        for (index, scan), pose in zip(scans, chain.poses.tolist(), strict=False)
+    ]
+    return ChainedScans(placed, chain, time.perf_counter() - begun, stop)
+
+
+def _odometry(scans: Scans) -> np.ndarray | None:
+    """Return the odometry of scans; None, with a word, where the log has none or it never changes."""
+    poses = np.array([scan.odometry for _, scan in scans])
+    if len(poses) > 1 and (poses == poses[0]).all():
+        sys.stderr.write("gpusense: the odometry of the log never changes: the scans are chained without it\n")
+        return None
+    return poses
+
+
+def write_chain(args: argparse.Namespace, chained: ChainedScans, grid: OccupancyGrid) -> None:
+    """Write the trajectory, the poses with covariances, and the picture, where asked for."""
+    from gpusense.evaluation.trajectory_files import write_tum
+
+    if args.tum is not None:
+        # Where beams are listed in reverse, poses are those at the end of scans.
+        later = max(-chained.chain.duration, 0.0)
+        times, indices = scan_times([scan.time + later for _, scan in chained.scans])
+        write_tum(args.tum, times, chained.chain.poses, indices=indices)
+    if args.poses is not None:
+        _write_poses(args.poses, chained)
+    if args.plot is not None:
+        from gpusense.plots.chains import chain_figure
+        from gpusense.plots.drawing import save
+
+        save(chain_figure(grid, chained.chain), args.plot)
+
+
+def _write_poses(path: Path, chained: ChainedScans) -> None:
+    """Write a line for each scan: index, time, pose, upper triangle of the covariance, whether it is doubtful."""
+    from gpusense._util.files import write_whole
+
+    lines, chain = [_COLUMNS], chained.chain
+    later = max(-chain.duration, 0.0)
+    upper = chain.covariance[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    for (index, scan), pose, spread, doubt in zip(chained.scans, chain.poses, upper, chain.doubtful, strict=True):
+        numbers = ",".join(f"{value:.9g}" for value in (*pose, *spread))
+        lines.append(f"{index},{scan.time + later:.6f},{numbers},{int(doubt)}")
+    text = "\n".join(lines) + "\n"
+    write_whole(path, lambda file: file.write(text.encode()))
+
+
+def document(args: argparse.Namespace, chained: ChainedScans) -> dict[str, Any]:
+    """Return the facts of a chain for ``--json``."""
+    chain = chained.chain
+    corrections = chain.corrections
+    return {
+        "seconds": chained.seconds, "matched": chain.matched, "key_scans": len(chain.keys), "links": len(chain.links),
+        "closures": len(corrections), "largest_correction": float(corrections.max()) if len(corrections) else None,
+        "scan_duration": chain.duration, "odometry": chain.motion is not None,
+        "doubtful_scans": int(chain.doubtful.sum()),
+        "doubts": [doubt._asdict() for doubt in chain.doubts],
+        "files": {name: str(getattr(args, name)) for name in ("tum", "poses", "plot") if getattr(args, name)},
+    }  # fmt: skip
+
+
+def words(args: argparse.Namespace, chained: ChainedScans) -> str:
+    """Return the facts of a chain in words, and the files that were written."""
+    lines = [f"{chained.chain.explain()}\nchained in {chained.seconds:.1f} s"]
+    lines += [f"written: {getattr(args, name)}" for name in ("tum", "poses") if getattr(args, name)]
+    lines += [f"drawn: {args.plot}"] if args.plot else []
+    return "\n".join(lines)

@@ -1,0 +1,333 @@
+"""Chains of scans: closed forms, loops, degenerate cases and bad input."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.matching_scenes import CORRIDOR, FRONT, RING, ROOM, box, relative, segments_scan
+
+import gpusense as gs
+from gpusense.chaining.chain import Chainer
+
+# A ring of corridors around a block, with niches, so that each place is observed in all directions.
+BLOCK = np.array([
+    *box(0, 0, 24, 18), *box(2.5, 2.5, 21.5, 15.5), *box(7, 0, 7.6, 0.5), *box(16, 2.0, 17, 2.5), *box(23.2, 6, 24, 7),
+    *box(21.5, 11, 22, 12.5), *box(13, 17.4, 14, 18), *box(5, 15.5, 6.5, 16.1), *box(0, 10, 0.6, 10.8),
+    *box(2.5, 5, 3, 6),
+])  # fmt: skip
+OTHER = np.array([*box(-3, -3, 18, 9), *box(0.2, 0.4, 15, 6.1), *box(4, -3, 4.9, -2.3), *box(15.0, 1, 16.1, 2.2)])
+
+
+def around(step: float, laps: float = 1.1) -> np.ndarray:
+    """Return poses along the corridors of BLOCK, with rounded turns."""
+    x1, y1, x2, y2, r = 1.25, 1.25, 22.75, 16.75, 0.6
+    poses = []
+    sides = [(x1 + r, y1, 0.0, x2 - x1 - 2 * r), (x2, y1 + r, np.pi / 2, y2 - y1 - 2 * r),
+             (x2 - r, y2, np.pi, x2 - x1 - 2 * r), (x1, y2 - r, -np.pi / 2, y2 - y1 - 2 * r)]  # fmt: skip
+    for x, y, heading, length in sides:
+        for s in np.arange(0, length, step):
+            poses.append((x + s * np.cos(heading), y + s * np.sin(heading), heading))
+        x, y = x + length * np.cos(heading), y + length * np.sin(heading)
+        for t in np.arange(0, np.pi / 2, step / r):
+            ahead, left = r * np.sin(t), r * (1 - np.cos(t))
+            c, s = np.cos(heading), np.sin(heading)
+            poses.append((x + c * ahead - s * left, y + s * ahead + c * left, heading + t))
+    whole = np.array(poses)
+    return whole[np.arange(int(laps * len(whole))) % len(whole)]
+
+
+def scans_of(
+    walls: np.ndarray, poses: np.ndarray, scanner: gs.Scanner, noise: float = 0.01, seed: int = 0
+) -> np.ndarray:
+    """Return noisy readings at poses."""
+    rng = np.random.default_rng(seed)
+    ranges = np.array([segments_scan(walls, tuple(pose), scanner) for pose in poses])
+    return ranges + rng.normal(0, 0.01, ranges.shape)
+
+
+def drifting(poses: np.ndarray, stretch: float = 1.03, turn: float = 0.01) -> np.ndarray:
+    """Return poses of an odometer that reports too long ways, and turns that are not [rad/m]."""
+    steps = relative(poses[:-1], poses[1:])
+    steps[:, 2] += turn * np.hypot(steps[:, 0], steps[:, 1])
+    steps[:, :2] *= stretch
+    result = [np.array([3.0, -2.0, 1.0])]
+    for step in steps:
+        result.append(gs.compose_poses(result[-1], step))
+    return np.array(result)
+
+
+def errors(chain: gs.ScanChain, truth: np.ndarray) -> np.ndarray:
+    """Return distances of the poses from the true ones, in the frame of the first scan [m]."""
+    found = relative(np.repeat(chain.poses[:1], len(truth), axis=0), chain.poses)
+    wanted = relative(np.repeat(truth[:1], len(truth), axis=0), truth)
+    return np.hypot(*(found - wanted)[:, :2].T)
+
+
+@pytest.fixture(scope="module")
+def lap() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return poses of a lap and some more, scans and odometry."""
+    poses = around(0.4)
+    return poses, scans_of(BLOCK, poses, FRONT), drifting(poses)
+
+
+def test_a_loop_is_closed_and_the_error_falls(lap: tuple[np.ndarray, ...], needs) -> None:
+    truth, scans, odometry = lap
+    chain = gs.chain_scans(scans, FRONT, odometry, backend=needs("opencl"))
+    open_ = gs.chain_scans(scans, FRONT, odometry, close_loops=False, backend=needs("opencl"))
+    assert np.allclose(chain.poses[0], odometry[0])
+    assert len(chain.closures) >= 3
+    assert len(open_.closures) == 0
+    wheels = np.hypot(*(relative(np.repeat(odometry[:1], len(truth), 0), odometry)
+                        - relative(np.repeat(truth[:1], len(truth), 0), truth))[:, :2].T)  # fmt: skip
+    assert wheels.max() > 3.0
+    assert errors(chain, truth).max() < 0.15
+    # Every closure is right.
+    closures = chain.closures
+    off = closures.pose - relative(truth[closures.first], truth[closures.second])
+    assert np.abs(off[:, :2]).max() < 0.1
+    assert (closures.p_right >= 0.9).all()
+    # The end of the lap is known by its closure, the far side is not.
+    deviation = np.sqrt(np.trace(chain.covariance[:, :2, :2], axis1=1, axis2=2))
+    assert deviation[0] == 0
+    assert deviation[int(len(truth) / 1.1) - 1] < 0.7 * deviation.max()
+    assert "closures" in chain.explain()
+
+
+def test_without_odometry_a_lap_is_found_too(lap: tuple[np.ndarray, ...], needs) -> None:
+    truth, scans, _ = lap
+    chain = gs.chain_scans(scans, FRONT, backend=needs("opencl"))
+    assert errors(chain, truth).max() < 0.3
+    assert chain.motion is None
+
+
+def test_errors_are_within_their_deviations(lap: tuple[np.ndarray, ...], needs) -> None:
+    truth, scans, odometry = lap
+    chain = gs.chain_scans(scans, FRONT, odometry, backend=needs("opencl"))
+    found = relative(np.repeat(chain.poses[:1], len(truth), axis=0), chain.poses)
+    off = found - relative(np.repeat(truth[:1], len(truth), axis=0), truth)
+    start = odometry[0, 2]
+    c, s = np.cos(start), np.sin(start)
+    turned = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    off = off @ turned.T
+    nees = np.einsum("si,sij,sj->s", off[1:], np.linalg.inv(chain.covariance[1:]), off[1:]) / 3
+    assert np.median(nees) < 2.0
+
+
+def test_each_backend_finds_the_same(backend: str) -> None:
+    poses = np.array([(0.1 * k, 0.02 * k, 0.05 * k) for k in range(8)])
+    chain = gs.chain_scans(scans_of(ROOM, poses, RING), RING, backend=backend)
+    assert errors(chain, poses).max() < 0.02
+    assert len(chain.doubts) == 0
+
+
+def test_a_corridor_says_that_the_way_along_it_is_unknown(needs) -> None:
+    poses = np.array([(0.3 * k, 0.0, 0.0) for k in range(40)])
+    scans = scans_of(CORRIDOR, poses, RING)
+    chain = gs.chain_scans(scans, RING, backend=needs("opencl"))
+    assert {doubt.reason for doubt in chain.doubts} == {"unobserved"}
+    assert chain.doubtful[1:].all()
+    assert "do not observe" in chain.explain()
+    along, across = chain.covariance[-1, 0, 0], chain.covariance[-1, 1, 1]
+    assert np.sqrt(across) < 0.3
+    # No less than the error.
+    assert np.sqrt(along) > 0.3
+    assert abs(chain.poses[-1, 1]) < 0.1
+    assert np.abs(chain.poses[:, 2]).max() < 0.02
+
+
+def test_odometry_fills_what_a_corridor_leaves_open(needs) -> None:
+    poses = np.array([(0.3 * k, 0.0, 0.0) for k in range(40)])
+    odometry = drifting(poses, 1.0, 0.02)
+    chain = gs.chain_scans(scans_of(CORRIDOR, poses, RING), RING, odometry, backend=needs("opencl"))
+    assert errors(chain, poses).max() < 0.15
+    assert not chain.doubts
+    found = relative(np.repeat(chain.poses[:1], len(poses), axis=0), chain.poses)
+    assert np.abs(found[:, 2]).max() < 0.03
+
+
+@pytest.mark.parametrize("with_odometry", [True, False])
+def test_a_robot_at_rest_stays(with_odometry: bool, needs) -> None:
+    poses = np.zeros((60, 3))
+    odometry = poses if with_odometry else None
+    chain = gs.chain_scans(scans_of(ROOM, poses, FRONT), FRONT, odometry, backend=needs("opencl"))
+    assert np.abs(chain.poses).max() < 0.01
+    assert chain.keys.tolist() == [0]
+    assert chain.matched == (1 if with_odometry else 60)
+
+
+def test_a_turn_that_the_odometer_missed_is_matched(needs) -> None:
+    poses = np.zeros((6, 3))
+    poses[3:, 2] = 1.2
+    chain = gs.chain_scans(scans_of(ROOM, poses, RING), RING, np.zeros((6, 3)), backend=needs("opencl"))
+    assert chain.poses[-1, 2] == pytest.approx(1.2, abs=0.02)
+
+
+@pytest.mark.parametrize("odometry", [None, np.array([[1.0, 2.0, 3.0]])])
+def test_one_scan_is_a_trajectory_of_one_pose(odometry: np.ndarray | None) -> None:
+    chain = gs.chain_scans(scans_of(ROOM, np.zeros((1, 3)), FRONT), FRONT, odometry, backend="numpy")
+    assert chain.poses == pytest.approx(np.zeros((1, 3)) if odometry is None else odometry)
+    assert chain.covariance.tolist() == np.zeros((1, 3, 3)).tolist()
+    assert len(chain.links) == 0
+
+
+@pytest.mark.parametrize("with_odometry", [True, False])
+def test_scans_without_returns_are_bridged(with_odometry: bool, needs) -> None:
+    poses = np.array([(0.1 * k, 0.0, 0.0) for k in range(12)])
+    scans = scans_of(ROOM, poses, RING)
+    scans[5:8] = np.inf
+    chain = gs.chain_scans(scans, RING, poses if with_odometry else None, backend=needs("opencl"))
+    assert ("no match" in [doubt.reason for doubt in chain.doubts]) and chain.doubtful[5:9].all()
+    assert errors(chain, poses)[:5].max() < 0.02
+    assert errors(chain, poses).max() < (0.05 if with_odometry else 0.15)
+    nothing = gs.chain_scans(np.full((5, 360), np.inf), RING, backend=needs("opencl"))
+    assert np.isfinite(nothing.poses).all()
+    assert nothing.covariance[-1, 0, 0] > 0
+
+
+def test_a_jump_of_time_is_said(needs) -> None:
+    poses = np.array([(0.1 * k, 0.0, 0.0) for k in range(12)])
+    times = 0.2 * np.arange(12.0)
+    times[6:] += 100.0
+    chain = gs.chain_scans(scans_of(ROOM, poses, RING), RING, times=times, backend=needs("opencl"))
+    # The place is recognised.
+    assert not chain.doubts
+    assert errors(chain, poses).max() < 0.02
+    scans = np.concatenate([scans_of(ROOM, poses[:6], RING), scans_of(BLOCK, poses[6:] + np.array([5, 1.2, 0]), RING)])
+    chain = gs.chain_scans(scans, RING, times=times, backend=needs("opencl"))
+    assert {"jump", "no match"} <= {d.reason for d in chain.doubts}
+    assert np.sqrt(chain.covariance[-1, 0, 0]) > 10
+
+
+@pytest.mark.parametrize("step", [0.8, 1.3])
+def test_wrong_motions_are_doubtful(step: float, needs) -> None:
+    # Without odometry, with large steps and turns of a quarter between scans, some matches are wrong.
+    truth = around(step)
+    short = gs.Scanner(FRONT.bearings, range_max=6.0)
+    chain = gs.chain_scans(scans_of(BLOCK, truth, short), short, close_loops=False, backend=needs("opencl"))
+    off = relative(chain.poses[:-1], chain.poses[1:]) - relative(truth[:-1], truth[1:])
+    off[:, 2] = gs.wrap_angle(off[:, 2])
+    wrong = (np.hypot(off[:, 0], off[:, 1]) > 0.3) | (np.abs(off[:, 2]) > 0.15)
+    assert wrong.any()
+    assert chain.doubtful[1:][wrong].all()
+    assert not chain.doubtful.all()
+
+
+def test_joined_logs_of_two_buildings_are_not_closed(lap: tuple[np.ndarray, ...], needs) -> None:
+    truth, scans, _ = lap
+    x = np.arange(0, 16, 0.4)
+    ways = np.stack([x - 1.5, np.full(len(x), -1.3), np.zeros(len(x))], axis=1)
+    there = scans_of(OTHER, ways, FRONT, seed=1)
+    whole = np.concatenate([truth[: len(truth) * 3 // 4], ways])
+    joined = np.concatenate([scans[: len(truth) * 3 // 4], there])
+    for odometry in (None, drifting(whole, 1.0, 0.002)):
+        chain = gs.chain_scans(joined, FRONT, odometry, backend=needs("opencl"))
+        border = len(joined) - len(there)
+        links = chain.closures
+        assert not ((links.first < border) & (links.second >= border)).any()
+        assert (border - 1, border, "no match") in [tuple(doubt) for doubt in chain.doubts]
+
+
+def test_two_lasers_of_a_robot_agree(needs) -> None:
+    rear = gs.Scanner(FRONT.bearings, FRONT.range_max, mount=(-0.3, 0.1, np.pi))
+    front = gs.Scanner(FRONT.bearings, FRONT.range_max, mount=(0.25, 0.0, 0.0))
+    poses = np.array([(0.15 * k, 0.03 * k, 0.06 * k) for k in range(12)])
+    chains = []
+    for seed, scanner in enumerate((front, rear)):
+        sensors = gs.compose_poses(poses, np.array(scanner.mount))
+        chains.append(gs.chain_scans(scans_of(ROOM, sensors, FRONT, seed=seed), scanner, backend=needs("opencl")))
+        assert errors(chains[-1], poses).max() < 0.03
+    assert np.abs(chains[0].poses - chains[1].poses).max() < 0.04
+
+
+def test_motion_during_scans_is_taken_out(needs) -> None:
+    # A scan of 0.25 s at 0.8 m/s and 1 rad/s, each beam from where the robot is then.
+    rate, duration = 0.25, 0.249
+    times = rate * np.arange(24)
+    heading = times
+    poses = np.stack([0.8 * np.sin(heading), 0.8 * (1 - np.cos(heading)), heading], axis=1) - (0.5, 0.8, 0)
+    scans = []
+    for t in times:
+        now = t + duration * np.arange(RING.count) / (RING.count - 1)
+        at = np.stack([0.8 * np.sin(now) - 0.5, 0.8 * (1 - np.cos(now)) - 0.8, now], axis=1)
+        scans.append([
+            segments_scan(ROOM, tuple(pose), gs.Scanner([b], range_max=30.0))[0]
+            for pose, b in zip(at, RING.bearings, strict=True)
+        ])  # fmt: skip
+    moved = gs.chain_scans(scans, RING, times=times, duration=duration, backend=needs("opencl"))
+    assert moved.duration == duration
+    # Beams that are listed from the last one to the first.
+    back = gs.Scanner(RING.bearings[::-1], range_max=30.0)
+    turned = gs.chain_scans(np.array(scans)[:, ::-1], back, times=times, duration=duration, backend=needs("opencl"))
+    assert turned.duration == -duration
+    assert "in reverse" in turned.explain()
+    # These poses are at the end of the scans.
+    later = np.stack([0.8 * np.sin(times + duration), 0.8 * (1 - np.cos(times + duration)), times + duration], axis=1)
+    assert errors(turned, later)[2:-2].max() < 0.06
+    skewed = gs.chain_scans(scans, RING, times=times, backend=needs("opencl"))
+    assert moved.motions is not None
+    assert np.abs(moved.motions[3:-3, 2] - duration).max() < 0.01
+    assert errors(moved, poses)[2:-2].max() < 0.03
+    assert errors(moved, poses)[2:-2].max() < 0.6 * errors(skewed, poses)[2:-2].max()
+
+
+def test_a_run_that_is_interrupted_keeps_what_it_has(lap: tuple[np.ndarray, ...], needs, monkeypatch) -> None:
+    truth, scans, odometry = lap
+    monkeypatch.setattr("gpusense.chaining.front.GROUP", 50)
+    chainer = Chainer(scans, FRONT, odometry, backend=needs("opencl"))
+    steps = chainer.steps()
+    assert len(chainer.chain().poses) == 1
+    next(steps)
+    next(steps)
+    assert 90 < chainer.scans < len(scans)
+    part = chainer.chain()
+    assert len(part.poses) == chainer.scans
+    assert errors(part, truth[: chainer.scans]).max() < 0.3
+    for _ in steps:
+        pass
+    assert len(chainer.chain().poses) == len(scans)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"scans": np.ones((0, 181))}, "scans: must hold at least one scan"),
+        ({"scans": np.ones((2, 7))}, "scans"),
+        ({"odometry": np.zeros((3, 3))}, "odometry"),
+        ({"odometry": np.full((2, 3), np.nan)}, "odometry"),
+        ({"times": [1.0, 0.5]}, r"times: must not decrease, got 0.5 after 1.0 at scan 1"),
+        ({"times": [1.0]}, "times"),
+        ({"duration": 0.1}, "duration: must be 0 without times"),
+        ({"duration": -1.0}, "duration"),
+        ({"step": (0.1,)}, "step"),
+        ({"step": (-0.1, 0.0)}, r"step\[0\]"),
+        ({"key_step": (0.5, 9.0)}, r"key_step\[1\]"),
+        ({"precision": "half"}, "precision"),
+        ({"backend": "abacus"}, "backend"),
+    ],
+)
+def test_bad_values(changes: dict, message: str) -> None:
+    arguments = {"scans": np.ones((2, 181)), "scanner": FRONT, "backend": "numpy"} | changes
+    with pytest.raises(ValueError, match=message):
+        gs.chain_scans(arguments.pop("scans"), arguments.pop("scanner"), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [({"scanner": 3}, "scanner"), ({"motion": 0.1}, "motion"), ({"close_loops": "yes"}, "close_loops")],
+)
+def test_bad_types(changes: dict, message: str) -> None:
+    arguments = {"scans": np.ones((2, 181)), "scanner": FRONT, "backend": "numpy"} | changes
+    with pytest.raises(TypeError, match=message):
+        gs.chain_scans(arguments.pop("scans"), arguments.pop("scanner"), **arguments)
+
+
+def test_a_recorded_log_closes_its_loops_rightly(data_dir: Path, needs) -> None:
+    scans = list(gs.read_log(data_dir / "carmen_logs/seattle-corrected.log.gz"))
+    truth = np.array([scan.pose for scan in scans])
+    chain = gs.chain_scans([s.ranges for s in scans], scans[0].scanner, truth, backend=needs("opencl"))
+    closures = chain.closures
+    off = closures.pose - relative(truth[closures.first], truth[closures.second])
+    assert len(closures) > 100
+    assert np.hypot(off[:, 0], off[:, 1]).max() < 0.5

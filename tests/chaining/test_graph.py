@@ -1,0 +1,148 @@
+"""Pose graphs: the sparse solution against SciPy's dense least squares, and covariances against dense inverses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gpusense.chaining.drift import Drift
+from gpusense.chaining.graph import KERNEL, normal_equations, pose_jacobians, solve
+from gpusense.chaining.links import CLOSURE, MATCH, Links, chained
+from gpusense.chaining.selected import inverse_blocks, pose_covariances
+from gpusense.localization.pose_algebra import pose_difference, wrap_angle
+
+
+def scene(seed: int, count: int = 12, outlier: bool = False) -> tuple[np.ndarray, Links]:
+    """Return disturbed poses around a loop, and links of full and of partial information."""
+    rng = np.random.default_rng(seed)
+    angle = 2 * np.pi * np.arange(count) / count
+    truth = np.stack([3 * np.cos(angle), 2 * np.sin(angle), angle + np.pi / 2], axis=1)
+    # Links to the next pose and the one after it, and closures.
+    first = np.concatenate([np.arange(count - 1), np.arange(count - 2), [0, 1, 2]])
+    second = np.concatenate([np.arange(1, count), np.arange(2, count), [count - 1, count - 2, count // 2]])
+    root = rng.normal(0, 3, (len(first), 3, 3)) + 4 * np.eye(3)
+    # Corridors: nothing is known along x.
+    root[3, :, 0] = root[-1, :, 0] = 0.0
+    pose = pose_difference(truth[first], truth[second]) + rng.normal(0, 0.05, (len(first), 3))
+    if outlier:
+        pose[-2] += (2.0, -1.0, 0.7)
+    kind = [MATCH] * (2 * count - 3) + [CLOSURE] * 3
+    links = Links.joined([
+        Links.of(name, [a], [b], p[None], (r.T @ r)[None], 0.9)
+        for name, a, b, p, r in zip(kind, first, second, pose, root, strict=True)
+    ])  # fmt: skip
+    return chained(truth[0], pose[: count - 1]), links
+
+
+def dense(start: np.ndarray, links: Links, kernel: float) -> tuple[np.ndarray, float]:
+    """Return the poses of least cost by SciPy, with numerical derivatives and residuals of its own."""
+    from scipy.optimize import least_squares
+
+    values, axes = np.linalg.eigh(links.information)
+    root = np.sqrt(np.maximum(values, 0))[:, :, None] * axes.transpose(0, 2, 1)
+
+    def errors(free: np.ndarray) -> np.ndarray:
+        z = np.concatenate([start[0], free]).reshape(-1, 3)
+        place, heading = z[:, 0] + 1j * z[:, 1], np.exp(1j * z[:, 2])
+        there = (place[links.second] - place[links.first]) / heading[links.first]
+        turn = np.angle(heading[links.second] / heading[links.first] / np.exp(1j * links.pose[:, 2]))
+        off = np.stack([there.real - links.pose[:, 0], there.imag - links.pose[:, 1], turn], axis=1)
+        scaled = np.einsum("lij,lj->li", root, off)
+        if np.isinf(kernel):
+            return scaled.ravel()
+        return np.sqrt(kernel**2 * np.log1p(np.square(scaled).sum(axis=1) / kernel**2))
+
+    found = least_squares(errors, start[1:].ravel(), xtol=1e-12, ftol=1e-12, gtol=1e-12, max_nfev=500)
+    return np.concatenate([start[0], found.x]).reshape(-1, 3), 2 * found.cost
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_least_squares_are_those_of_scipy(seed: int) -> None:
+    start, links = scene(seed)
+    found = solve(start, links, kernel=np.inf, least=1e-14)
+    truth, cost = dense(start, links, np.inf)
+    assert found.cost == pytest.approx(cost, rel=1e-8)
+    off = found.poses - truth
+    off[:, 2] = wrap_angle(off[:, 2])
+    assert np.abs(off).max() < 1e-5
+    assert (found.links.weight == 1).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_kernel_leaves_an_outlier_out_as_scipy_does(seed: int) -> None:
+    start, links = scene(seed, outlier=True)
+    found = solve(start, links, least=1e-14)
+    truth, cost = dense(found.poses + 0.01 * (np.arange(len(start)) > 0)[:, None], links, KERNEL)
+    assert found.cost == pytest.approx(cost, rel=1e-5)
+    assert np.abs(found.poses - truth)[:, :2].max() < 5e-3
+    assert found.links.weight[-2] < 0.2
+    assert np.delete(found.links.weight, -2).min() > 0.3
+
+
+def test_jacobians_are_those_of_differences() -> None:
+    start, links = scene(1)
+    one, two = pose_jacobians(start, links.first, links.second)
+    for index, analytic in ((links.first, one), (links.second, two)):
+        for k in range(3):
+            residual = []
+            for sign in (1, -1):
+                rows = np.repeat(start[None], len(links), axis=0)
+                rows[np.arange(len(links)), index, k] += sign * 1e-6
+                residual.append(np.array([links[[n]].residuals(rows[n])[0] for n in range(len(links))]))
+            numeric = (residual[0] - residual[1]) / 2e-6
+            assert np.abs(analytic[:, :, k] - numeric).max() < 1e-7
+
+
+def test_a_direction_that_no_link_observes_stays_where_it_was() -> None:
+    information = np.diag([0.0, 100.0, 400.0])
+    links = Links.of(MATCH, [0, 1], [1, 2], np.array([(5.0, 0.1, 0.0), (7.0, -0.1, 0.0)]), np.stack([information] * 2))
+    start = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (2.5, 0.0, 0.0)])
+    found = solve(start, links)
+    assert found.poses[:, 0] == pytest.approx([0.0, 1.0, 2.5], abs=1e-6)
+    assert found.poses[:, 1] == pytest.approx([0.0, 0.1, 0.0], abs=1e-4)
+    spread = pose_covariances(found)
+    assert spread[1, 0, 0] > 1e4
+    assert spread[2, 0, 0] > 1e4
+    assert spread[1, 1, 1] == pytest.approx(1 / 100, rel=1e-2)
+
+
+@pytest.mark.parametrize("poses", [np.zeros((1, 3)), np.zeros((0, 3))])
+def test_a_graph_without_links_stays(poses: np.ndarray) -> None:
+    found = solve(poses, Links.joined([]))
+    assert found.poses.shape == poses.shape
+    assert pose_covariances(found).shape == (*poses.shape, 3)
+
+
+def test_the_cost_never_rises() -> None:
+    for seed in range(5):
+        start, links = scene(seed, outlier=True)
+        squared = links.squared_distances(start)
+        before = float(np.sum(KERNEL**2 * np.log1p(squared / KERNEL**2)))
+        assert solve(start, links).cost <= before
+
+
+@pytest.mark.parametrize("count", [2, 3, 40])
+def test_covariances_are_blocks_of_the_dense_inverse(count: int) -> None:
+    rng = np.random.default_rng(count)
+    first = np.append(np.arange(count - 1), rng.integers(0, count - 1, count))
+    second = np.append(np.arange(1, count), np.minimum(first[count - 1 :] + rng.integers(1, 9, count), count - 1))
+    keep = first != second
+    first, second = first[keep], second[keep]
+    root = rng.normal(0, 1, (len(first), 3, 3)) + 3 * np.eye(3)
+    links = Links.of(MATCH, first, second, rng.normal(0, 1, (len(first), 3)), root.transpose(0, 2, 1) @ root)
+    found = solve(np.cumsum(rng.normal(0, 1, (count, 3)), axis=0), links)
+    matrix, _ = normal_equations(found.poses, found.links, found.links.weight, 0)
+    whole = np.linalg.inv(matrix.toarray() + 1e-6 * np.eye(3 * count - 3))
+    blocks = inverse_blocks(matrix, 1e-6)
+    for k in range(count - 1):
+        part = slice(3 * k, 3 * k + 3)
+        assert np.allclose(blocks[k], whole[part, part], rtol=1e-8, atol=1e-12)
+    # Relative covariances: by the derivatives of the relative pose, from the whole inverse.
+    joint = np.zeros((3 * count, 3 * count))
+    joint[3:, 3:] = whole
+    one, two = pose_jacobians(found.poses, first, second)
+    relative = Drift(found).relative(first, second)
+    for n, (a, b) in enumerate(zip(first, second, strict=True)):
+        wide = np.zeros((3, 3 * count))
+        wide[:, 3 * a : 3 * a + 3], wide[:, 3 * b : 3 * b + 3] = one[n], two[n]
+        assert np.allclose(relative[n], wide @ joint @ wide.T, rtol=1e-6, atol=1e-10)

@@ -27,6 +27,13 @@ SETTINGS = (
 )
 
 
+def wall() -> gs.OccupancyGrid:
+    """Return a map with a wall at x = 5 m."""
+    cells = np.zeros((1, 101), dtype=np.int8)
+    cells[0, 100] = 100
+    return gs.OccupancyGrid(cells, resolution=0.05)
+
+
 def beam_density(parameters: gs.BeamParameters, expected: float, z: np.ndarray) -> np.ndarray:
     """Return p(z | z*) of readings [1/m].
 
@@ -35,11 +42,8 @@ def beam_density(parameters: gs.BeamParameters, expected: float, z: np.ndarray) 
         expected: Range to the wall z* [m].
         z: (N,) readings below ``RANGE_MAX`` [m].
     """
-    cells = np.zeros((1, 101), dtype=np.int8)
-    cells[0, 100] = 100
-    grid = gs.OccupancyGrid(cells, resolution=0.05)
     scanner = gs.Scanner(np.zeros(z.size), range_max=RANGE_MAX)
-    model = gs.BeamModel(grid, scanner, parameters, precision="float64", backend="numpy")
+    model = gs.BeamModel(wall(), scanner, parameters, precision="float64", backend="numpy")
     return np.exp(model.log_likelihood([(5.0 - expected, 0.025, 0.0)], z, per_beam=True)[1][0])
 
 
@@ -90,7 +94,29 @@ def scan_data() -> dict[str, Any]:
     }  # fmt: skip
 
 
-DATA = {"beam": beam_data, "scan": scan_data}
+def em_data() -> dict[str, Any]:
+    """Return readings of a wall, and the parameters after some steps of the book's EM."""
+    expected = 3.0
+    truth = gs.BeamParameters(z_hit=0.5, z_short=0.25, z_max=0.15, z_rand=0.1, sigma_hit=0.12, lambda_short=0.8)
+    model = gs.BeamModel(wall(), gs.Scanner(np.zeros(400), range_max=RANGE_MAX), truth, backend="numpy")
+    ranges = np.round(model.sample([(5.0 - expected, 0.025, 0.0)], seed=1)[0].astype(np.float64), 3)
+    start = gs.BeamParameters(z_hit=0.25, z_short=0.25, z_max=0.25, z_rand=0.25, sigma_hit=1.0, lambda_short=0.1)
+    steps = []
+    for count in (1, 2, 5, 20):
+        fit = gs.fit_beam_parameters(
+            ranges, np.full(ranges.size, expected), RANGE_MAX, method="em-book", initial=start, max_iterations=count,
+            tolerance=1e-300, backend="numpy", precision="float64",
+        )  # fmt: skip
+        values = {"parameters": fit.parameters.to_dict(), "log_likelihood": float(fit.trace[-1])}
+        steps.append({"count": count} | values)
+    kept = [z if z < RANGE_MAX else None for z in ranges.tolist()]
+    return {
+        "range_max": RANGE_MAX, "expected": expected, "ranges": kept, "start": start.to_dict(),
+        "truth": truth.to_dict(), "steps": steps,
+    }  # fmt: skip
+
+
+DATA = {"beam": beam_data, "scan": scan_data, "em": em_data}
 
 
 def page(name: str) -> str:

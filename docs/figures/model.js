@@ -93,6 +93,32 @@ function logField(map, far, pose, scan, p) {
   }, 0);
 }
 
+// The probability of each cause of a reading, z* being the same for all; null is a reading without a return.
+function causes(z, expected, rangeMax, p) {
+  if (z === null) return {hit: 0, short: 0, max: 1, rand: 0, sum: p.z_max};
+  const d = densities(z, expected, rangeMax, p);
+  return {hit: d.hit / d.sum, short: d.short / d.sum, max: 0, rand: d.rand / d.sum, sum: d.sum};
+}
+
+// The log-likelihood of readings.
+function logReadings(ranges, expected, rangeMax, p) {
+  return ranges.reduce((sum, z) => sum + Math.log(causes(z, expected, rangeMax, p).sum), 0);
+}
+
+// One step of EM as the book prints it (table 6.2).
+function emStep(ranges, expected, rangeMax, p) {
+  const total = {hit: 0, short: 0, max: 0, rand: 0};
+  let square = 0, length = 0;
+  for (const z of ranges) {
+    const share = causes(z, expected, rangeMax, p);
+    for (const name in total) total[name] += share[name];
+    if (z !== null) { square += share.hit * (z - expected) ** 2; length += share.short * z; }
+  }
+  const n = ranges.length;
+  return {z_hit: total.hit / n, z_short: total.short / n, z_max: total.max / n, z_rand: total.rand / n,
+    sigma_hit: Math.sqrt(square / total.hit), lambda_short: total.short / length};
+}
+
 // Cells out of a string of 0 and 1.
 function unpacked(map) {
   return {...map, cells: Uint8Array.from(map.cells, Number)};
@@ -110,6 +136,14 @@ function disagreement(data) {
       expectedRanges(map, one.pose, data.scan).forEach((t, k) => compare(t, one.expected[k]));
       compare(logBeam(map, one.pose, data.scan, data.beam), one.log_beam);
       compare(logField(map, far, one.pose, data.scan, data.field), one.log_field);
+    }
+  }
+  if (data.steps) {
+    let p = data.start, done = 0;
+    for (const one of data.steps) {
+      for (; done < one.count; done++) p = emStep(data.ranges, data.expected, data.range_max, p);
+      for (const name in one.parameters) compare(p[name], one.parameters[name]);
+      compare(logReadings(data.ranges, data.expected, data.range_max, p), one.log_likelihood);
     }
   }
   return worst;

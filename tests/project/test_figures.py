@@ -17,7 +17,7 @@ from support.paths import ROOT
 import gpusense as gs
 
 DOCS = ROOT / "docs"
-NAMES = ("beam", "scan")
+NAMES = ("beam", "scan", "em")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 DATA = re.compile(r'(<script type="application/json" id="data">)(.*?)(</script>)', re.DOTALL)
 
@@ -117,6 +117,25 @@ def test_the_script_has_the_likelihoods_of_gpusense(figures: ModuleType) -> None
     np.testing.assert_allclose(found, np.hstack(expected), rtol=1e-9, atol=1e-9)
 
 
+def test_the_script_takes_the_steps_of_the_books_em() -> None:
+    random, expected = np.random.default_rng(5), 2.0
+    ranges = np.concatenate([random.normal(expected, 0.2, 150), random.uniform(0, 5, 40), np.full(10, 5.0)]).round(3)
+    start = gs.BeamParameters(sigma_hit=0.6, lambda_short=0.4)
+    known = {"range_max": 5.0, "expected": expected, "start": start.to_dict()}
+    steps = []
+    for count in (1, 3, 12):
+        fit = gs.fit_beam_parameters(
+            ranges, np.full(ranges.size, expected), 5.0, method="em-book", initial=start, max_iterations=count,
+            tolerance=1e-300, backend="numpy", precision="float64",
+        )  # fmt: skip
+        assert fit.iterations == count
+        steps.append({"count": count, "parameters": fit.parameters.to_dict(), "log_likelihood": float(fit.trace[-1])})
+    data = known | {"ranges": [z if z < 5.0 else None for z in ranges.tolist()], "steps": steps}
+    assert in_node("disagreement(data)", data) < 1e-10
+    steps[2]["parameters"]["sigma_hit"] *= 1.001
+    assert in_node("disagreement(data)", data) == pytest.approx(1e-3, rel=0.01)
+
+
 def test_a_wrong_script_is_found() -> None:
     data = json.loads(DATA.search(committed("beam")).group(2))
     assert in_node("disagreement(data)", data) < 1e-12
@@ -149,6 +168,13 @@ VISITS = {
         drag({offsetX: X(4.0), offsetY: Y(6.0)});
         document.body.dataset.other = said();""",
         None,
+    ),
+    "em": (
+        """document.getElementById("one").click(); document.getElementById("ten").click();
+        document.body.dataset.said = document.getElementById("said").textContent.slice(0, 14);
+        document.getElementById("again").click();
+        document.body.dataset.other = document.getElementById("said").textContent.slice(0, 13);""",
+        ("after 11 steps", "after 0 steps"),
     ),
 }
 

@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
+from docutils import nodes
 from reference_pages import write_pages
+from sphinx import addnodes
 
 import gpusense
 
@@ -64,9 +66,20 @@ def mark_reports(app: Any, name: str, source: list[str]) -> None:
         source[0] = f"---\norphan: true\n---\n{source[0]}"
 
 
+def open_figures(app: Any, doctree: nodes.document) -> None:
+    """Let links to files of ``docs/front`` open them: they lie at the root of the site, and are no downloads."""
+    root = "../" * app.env.docname.count("/")
+    for node in list(doctree.findall(addnodes.download_reference)):
+        _, front, path = node["reftarget"].partition("front/")
+        if front:
+            node.replace_self(nodes.reference("", "", *node.children, refuri=f"{root}{path}"))
+
+
 def setup(app: Any) -> None:
     """Write the pages of the public names before Sphinx looks for pages."""
     write_pages(ROOT / "docs" / "api")
     app.connect("source-read", mark_reports)
+    # Before Sphinx collects the files to be downloaded.
+    app.connect("doctree-read", open_figures, priority=100)
     # Devices' memory of the tour's programs is freed before the interpreter ends.
     app.connect("build-finished", lambda *_: gc.collect())

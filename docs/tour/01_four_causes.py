@@ -8,7 +8,7 @@ nothing at all (*max*) or anything (*rand*). The density of a reading is their m
     p(z | z*) = z_hit p_hit + z_short p_short + z_max p_max + z_rand p_rand
 
 ``gs.BeamParameters`` has the weights, the deviation of hits and the rate of short readings. **Try:**
-``sigma_hit=0.5``, or a wall at 1 m.
+``sigma_hit=0.5``, or a wall at 1 m; `with sliders <../../figures/beam.html>`__ in the browser.
 """
 
 import matplotlib.pyplot as plt

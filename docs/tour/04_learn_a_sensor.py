@@ -5,7 +5,8 @@ Learn a sensor from its readings
 Two sensors look at a wall, once 3 m and once 4 m away: a laser, and a sonar that is often disturbed. Maximum
 likelihood finds the parameters of each (book section 6.3.2); ``gs.fit_beam_parameters`` does it by expectation and
 maximisation with an exact M-step, and Newton's steps at the end. The readings are drawn here, so that the truth is
-known. **Try:** 50 readings in place of 1000, and look at the standard errors.
+known. **Try:** 50 readings in place of 1000, and look at the standard errors; `EM step by step
+<../../figures/em.html>`__ in the browser.
 """
 
 import matplotlib.pyplot as plt

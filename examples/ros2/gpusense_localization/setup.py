@@ -12,6 +12,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/config", ["config/amcl.yaml"]),
+        (f"share/{NAME}/launch", ["launch/localize.launch.py"]),
     ],
     install_requires=["setuptools", "gpusense"],
     license="Apache-2.0",

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,9 +12,12 @@ import numpy as np
 import gpusense as gs
 from gpusense.world.messages import spread_readings
 from gpusense_localization.conversions import Pose, host_array, map_to_odometry, moved_enough
+from gpusense_localization.diagnostics import ERROR, LEVELS, STALE, WARN, status_fields
 
 # Beams of the scanner of scans whose beams vary.
 PLACES = 1440
+# Time without a scan after which diagnostics are stale [s].
+_PATIENCE = 5.0
 
 
 class Localizer:
@@ -22,19 +27,32 @@ class Localizer:
         options: Options of nav2_amcl, see ``gpusense.compat.from_nav2``.
         backend: The device.
         seed: Seed of the filter.
+        clock: Returns the time [s].
 
     Attributes:
+        estimate: Estimate of the last scan that counted; None before one, and after a new start.
         problem: Why the last scan could not be used; None where it could.
+        counted: Number of scans that counted.
     """
 
-    def __init__(self, options: gs.compat.Nav2Options, *, backend: str = "auto", seed: int = 0) -> None:
-        self.options = options
+    def __init__(
+        self,
+        options: gs.compat.Nav2Options,
+        *,
+        backend: str = "auto",
+        seed: int = 0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.options, self._clock = options, clock
         self.backend, self.seed = backend, seed
         self.grid: gs.OccupancyGrid | None = None
         self.filter: Any = None
         self._scanner: gs.Scanner | None = None
         self._spread = False
         self.estimate: Any = None
+        self.counted = 0
+        self._cause = ""
+        self._taken = -math.inf
         self.problem: str | None = None
         self._last: Pose | None = None
         self._start: tuple[np.ndarray, np.ndarray] | None = None
@@ -50,9 +68,15 @@ class Localizer:
 
     def start_at(self, pose: Pose, covariance: np.ndarray) -> None:
         """Begin around a pose."""
-        self._start, self._last = (np.array(pose), np.asarray(covariance)), None
+        self._start, self._last, self.estimate = (np.array(pose), np.asarray(covariance)), None, None
         if self.filter is not None:
             self.filter.initialize(mean=self._start[0], covariance=self._start[1])
+
+    def start_anywhere(self) -> None:
+        """Begin all over the map, as nav2_amcl's ``reinitialize_global_localization`` does."""
+        self._start = self._last = self.estimate = None
+        if self.filter is not None:
+            self.filter.initialize_uniform()
 
     def update(self, message: Any, odometry: Pose, mount: Pose) -> bool:
         """Take a sensor_msgs/LaserScan at an odometry pose; return whether it counted.
@@ -67,6 +91,7 @@ class Localizer:
         except ValueError as error:
             self.problem = str(error)
             return False
+        self._taken = self._clock()
         ranges = self._readings(message, scanner)
         if self._last is not None and not moved_enough(self._last, odometry, self.options.update_min):
             return False
@@ -74,6 +99,7 @@ class Localizer:
             self.filter.predict(np.array(self._last), np.array(odometry))
         self.filter.correct(ranges)
         self._last, self.estimate = odometry, self.filter.estimate()
+        self.counted, self._cause = self.counted + 1, ""
         return True
 
     def map_to_odometry(self) -> Pose:
@@ -84,6 +110,35 @@ class Localizer:
     def cloud(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the (N, 3) particles and their (N,) weights."""
         return host_array(self.filter.particles), host_array(self.filter.weights)
+
+    def status(self, dropped: int = 0, reason: str | None = None) -> dict[str, Any]:
+        """Return the fields of diagnostic_msgs/DiagnosticStatus.
+
+        Args:
+            dropped: Number of scans whose transforms did not come.
+            reason: Why the last of them did not.
+        """
+        values = {"scans that counted": str(self.counted), "scans without transforms": str(dropped)}
+        if self.grid is None:
+            return status_fields("filter", WARN, "no map yet", values)
+        if self.problem is not None:
+            return status_fields("filter", ERROR, f"scans cannot be used: {self.problem}", values)
+        if self._clock() - self._taken > _PATIENCE:
+            why = "" if reason is None else f": {reason}"
+            return status_fields("filter", STALE, f"no scan for {_PATIENCE:g} s{why}", values)
+        found = self.estimate
+        if found is None:
+            return status_fields("filter", WARN, "no estimate since the start", values)
+        values |= {
+            "verdict": found.verdict, "p_lost": f"{found.p_lost:.4f}", "explained": f"{found.explained:.3f}",
+            "particles": str(found.particles), "effective sample size": f"{found.effective_sample_size:.0f}",
+        }  # fmt: skip
+        # The search for a cause takes milliseconds, so it is made once for an estimate.
+        if found.verdict != "tracking" and not self._cause:
+            self._cause = self.filter.diagnose().text
+        return status_fields(
+            "filter", LEVELS[found.verdict], ": ".join(filter(None, (found.verdict, self._cause))), values
+        )
 
     def _readings(self, message: Any, scanner: gs.Scanner) -> np.ndarray:
         """Return the readings for the filter's scanner; make the filter where there is none for it.

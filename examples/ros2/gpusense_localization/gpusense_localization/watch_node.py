@@ -9,17 +9,18 @@ of the scan.
 from __future__ import annotations
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from rclpy.qos import qos_profile_sensor_data
 from rclpy.time import Time
 from sensor_msgs.msg import LaserScan
 from tf2_ros import Buffer, TransformException, TransformListener
 
 from gpusense_localization import conversions
 from gpusense_localization.watcher import Watcher
+from gpusense_localization.wiring import diagnostic_array, latched
 
 
 class WatchingNode(Node):
@@ -37,7 +38,7 @@ class WatchingNode(Node):
         self.buffer = Buffer()
         self.listener = TransformListener(self.buffer, self)
         self.diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        kept = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
+        kept = latched()
         self.create_subscription(OccupancyGrid, "map", self.watcher.set_map, kept)
         self.create_subscription(LaserScan, "scan", self.on_scan, qos_profile_sensor_data)
         self.create_subscription(PoseWithCovarianceStamped, "amcl_pose", self.on_pose, kept)
@@ -65,12 +66,7 @@ class WatchingNode(Node):
     def publish(self) -> None:
         """Publish the diagnostics."""
         now = self.get_clock().now()
-        fields = self.watcher.status(1e-9 * now.nanoseconds)
-        values = [KeyValue(**one) for one in fields.pop("values")]
-        level = bytes([fields.pop("level")])
-        array = DiagnosticArray(status=[DiagnosticStatus(level=level, values=values, **fields)])
-        array.header.stamp = now.to_msg()
-        self.diagnostics.publish(array)
+        self.diagnostics.publish(diagnostic_array(self.watcher.status(1e-9 * now.nanoseconds), now.to_msg()))
 
 
 def main() -> None:

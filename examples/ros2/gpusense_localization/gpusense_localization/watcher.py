@@ -13,10 +13,8 @@ import numpy as np
 
 import gpusense as gs
 from gpusense_localization.conversions import Pose, covariance_of, pose_of
+from gpusense_localization.diagnostics import LEVELS, STALE, status_fields
 
-# diagnostic_msgs/DiagnosticStatus: OK, WARN, ERROR, STALE.
-LEVELS = {"tracking": 0, "uncertain": 1, "lost": 2}
-STALE = 3
 # Scans that wait for their pose.
 _KEPT = 40
 
@@ -90,19 +88,14 @@ class Watcher:
         Args:
             now: Time [s].
         """
-        fields: dict[str, Any] = {"name": "gpusense: localisation", "hardware_id": ""}
         if self._verdict is None or now - self._judged > self.patience:
-            return fields | {"level": STALE, "message": "no pose with a scan of its time", "values": []}
+            return status_fields("localisation", STALE, "no pose with a scan of its time", {})
         found = self._verdict
         evidence = "" if self._diagnosis is None else f": {self._diagnosis.text}"
         values = {"p_lost": f"{found.p_lost:.4f}", "verdict": found.verdict, "explained": f"{found.explained:.3f}"}
         if self._diagnosis is not None:
             values["cause"] = self._diagnosis.cause
-        return fields | {
-            "level": LEVELS[found.verdict],
-            "message": f"{found.verdict}{evidence}",
-            "values": [{"key": key, "value": value} for key, value in values.items()],
-        }
+        return status_fields("localisation", LEVELS[found.verdict], f"{found.verdict}{evidence}", values)
 
     def _monitor_of(self, scanner: gs.Scanner) -> gs.PoseMonitor:
         """Return the monitor of a scanner; what it remembers stays where the scanner changes."""

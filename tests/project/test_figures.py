@@ -1,0 +1,207 @@
+"""The figures that move: their script computes gpusense's numbers; pages are as docs/make_figures.py writes them."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import shutil
+import subprocess
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from support.paths import ROOT
+
+import gpusense as gs
+
+DOCS = ROOT / "docs"
+NAMES = ("beam", "scan", "em")
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+DATA = re.compile(r'(<script type="application/json" id="data">)(.*?)(</script>)', re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def figures() -> ModuleType:
+    """Return the module that writes the pages."""
+    spec = importlib.util.spec_from_file_location("make_figures", DOCS / "make_figures.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def committed(name: str) -> str:
+    return (DOCS / "front" / "figures" / f"{name}.html").read_text(encoding="utf-8")
+
+
+def numbers(value: Any) -> list[float]:
+    """Return the numbers of nested lists and mappings in their order."""
+    if isinstance(value, dict | list):
+        parts = value.values() if isinstance(value, dict) else value
+        return [number for part in parts for number in numbers(part)]
+    return [float(value)] if isinstance(value, int | float) else []
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pages_are_up_to_date(figures: ModuleType, name: str) -> None:
+    made, kept = figures.page(name), committed(name)
+    assert DATA.sub(r"\1\3", made) == DATA.sub(r"\1\3", kept), "run python docs/make_figures.py"
+    new, old = (json.loads(DATA.search(text).group(2)) for text in (made, kept))
+    np.testing.assert_allclose(numbers(old), numbers(new), rtol=1e-9, atol=1e-12)
+    assert json.dumps(old.get("map")) == json.dumps(new.get("map")) and len(numbers(new)) > 50
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pages_fetch_nothing(name: str) -> None:
+    text = committed(name)
+    assert not re.search(
+        r"https?:|\bsrc=|\bhref=|\bimport\b|\bfetch\(|XMLHttp|@import|url\(|\{style\}|\{model\}|\{data\}", text
+    )
+
+
+def in_node(code: str, data: Any) -> Any:
+    """Return the value of a line of JavaScript that may use the figures' functions and ``data``."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("Node is not installed; pages compare themselves with the numbers that are checked above")
+    model = (DOCS / "figures" / "model.js").read_text(encoding="utf-8")
+    source = f"{model}\nconst data = JSON.parse(require('fs').readFileSync(0)); console.log(JSON.stringify({code}));"
+    done = subprocess.run([node, "-e", source], input=json.dumps(data), capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+def test_the_script_has_the_densities_of_gpusense(figures: ModuleType) -> None:
+    random = np.random.default_rng(3)
+    z = np.linspace(0.0, 4.999, 60)
+    rows, expected = [], []
+    for _ in range(40):
+        weights = random.dirichlet(np.full(4, 0.6)).tolist()
+        values = dict(zip(("z_hit", "z_short", "z_max", "z_rand"), weights, strict=True))
+        values |= {"sigma_hit": random.uniform(0.02, 1.0), "lambda_short": random.choice([0.0, random.uniform(0, 4)])}
+        row = {"parameters": values, "expected": float(random.uniform(0.1, 4.9))}
+        rows.append(row | {"z": z.tolist()})
+        expected.append(figures.beam_density(gs.BeamParameters(**values), row["expected"], z))
+    code = "data.map(one => one.z.map(z => densities(z, one.expected, 5, one.parameters).sum))"
+    np.testing.assert_allclose(in_node(code, rows), expected, rtol=1e-10, atol=1e-280)
+
+
+def models_of(data: Any) -> tuple[gs.BeamModel, gs.LikelihoodFieldModel, list[float]]:
+    """Return both models and the readings out of the data of a page."""
+    cells = np.array(list(data["map"]["cells"]), np.int8).reshape(data["map"]["rows"], -1) * 100
+    grid = gs.OccupancyGrid(cells, resolution=data["map"]["resolution"])
+    scanner = gs.Scanner(data["scan"]["bearings"], range_max=data["scan"]["range_max"])
+    options = {"precision": "float64", "backend": "numpy"}
+    field = gs.LikelihoodFieldParameters(**data["field"])
+    return (
+        gs.BeamModel(grid, scanner, gs.BeamParameters(**data["beam"]), **options),
+        gs.LikelihoodFieldModel(grid, scanner, field, **options),
+        [np.inf if z is None else z for z in data["scan"]["ranges"]],
+    )
+
+
+def test_the_script_has_the_likelihoods_of_gpusense(figures: ModuleType) -> None:
+    data = figures.scan_data()
+    beam, field, ranges = models_of(data)
+    assert 0 < np.isinf(ranges).sum() < 20
+    # Poses in walls, at the edge, and with beams along the axes.
+    poses = np.random.default_rng(1).uniform([0, 0, -4], [14, 10, 4], (60, 3)).round(3)
+    poses[:4] = [[5.05, 5.05, 0.0], [0.0, 0.0, np.pi / 2], [13.999, 9.999, -np.pi], [2.0, 1.5, 0.0]]
+    code = """(() => { const map = unpacked(data.map), far = distances(map, data.field.max_distance);
+        return data.at.map(pose => [...expectedRanges(map, pose, data.scan), logBeam(map, pose, data.scan, data.beam),
+        logField(map, far, pose, data.scan, data.field)]); })()"""
+    caster = gs.RayCaster(beam.grid, range_max=8.0, precision="float64", backend="numpy")
+    found = np.array(in_node(code, data | {"at": poses.tolist()}))
+    expected = [caster.cast(poses, beam.scanner.bearings)]
+    expected += [model.log_likelihood(poses, ranges)[:, None] for model in (beam, field)]
+    np.testing.assert_allclose(found, np.hstack(expected), rtol=1e-9, atol=1e-9)
+
+
+def test_the_script_takes_the_steps_of_the_books_em() -> None:
+    random, expected = np.random.default_rng(5), 2.0
+    ranges = np.concatenate([random.normal(expected, 0.2, 150), random.uniform(0, 5, 40), np.full(10, 5.0)]).round(3)
+    start = gs.BeamParameters(sigma_hit=0.6, lambda_short=0.4)
+    known = {"range_max": 5.0, "expected": expected, "start": start.to_dict()}
+    steps = []
+    for count in (1, 3, 12):
+        fit = gs.fit_beam_parameters(
+            ranges, np.full(ranges.size, expected), 5.0, method="em-book", initial=start, max_iterations=count,
+            tolerance=1e-300, backend="numpy", precision="float64",
+        )  # fmt: skip
+        assert fit.iterations == count
+        steps.append({"count": count, "parameters": fit.parameters.to_dict(), "log_likelihood": float(fit.trace[-1])})
+    data = known | {"ranges": [z if z < 5.0 else None for z in ranges.tolist()], "steps": steps}
+    assert in_node("disagreement(data)", data) < 1e-10
+    steps[2]["parameters"]["sigma_hit"] *= 1.001
+    assert in_node("disagreement(data)", data) == pytest.approx(1e-3, rel=0.01)
+
+
+def test_a_wrong_script_is_found() -> None:
+    data = json.loads(DATA.search(committed("beam")).group(2))
+    assert in_node("disagreement(data)", data) < 1e-12
+    data["densities"][1]["p"][3] *= 1.001
+    assert in_node("disagreement(data)", data) == pytest.approx(1e-3, rel=0.01)
+
+
+# What a visitor does, and the text that must follow.
+VISITS = {
+    "beam": (
+        """const set = (name, value) => { const one = document.querySelector(`input[name="${name}"]`);
+        one.value = value; one.dispatchEvent(new Event("input")); };
+        set("z_short", 0); set("z_rand", 0); set("z_max", 0.6);
+        document.body.dataset.said = document.getElementById("reading").textContent;
+        set("z_hit", 0); set("z_max", 0);
+        document.body.dataset.other = document.getElementById("reading").textContent;""",
+        ("No return: probability 0.500", "All weights are 0: one of them must be above 0."),
+    ),
+    "scan": (
+        """const said = () => document.getElementById("said").textContent.replace(/, at the true.*/, "");
+        document.getElementById("truth").click();
+        document.getElementById("map").dispatchEvent(new KeyboardEvent("keydown", {key: "ArrowLeft"}));
+        document.body.dataset.said = said();
+        document.getElementById("model").value = "field";
+        const box = canvas.getBoundingClientRect();
+        dragged = true;
+        const place = {clientX: box.left + X(5), clientY: box.top + Y(5)};
+        canvas.dispatchEvent(new PointerEvent("pointermove", place));
+        document.body.dataset.moved = Math.hypot(pose[0] - 5, pose[1] - 5);
+        drag({offsetX: X(4.0), offsetY: Y(6.0)});
+        document.body.dataset.other = said();""",
+        None,
+    ),
+    "em": (
+        """document.getElementById("one").click(); document.getElementById("ten").click();
+        document.body.dataset.said = document.getElementById("said").textContent.slice(0, 14);
+        document.getElementById("again").click();
+        document.body.dataset.other = document.getElementById("said").textContent.slice(0, 13);""",
+        ("after 11 steps", "after 0 steps"),
+    ),
+}
+
+
+def scan_texts(figures: ModuleType) -> tuple[str, str]:
+    """Return what the page of the scan must say at two poses."""
+    data = figures.scan_data()
+    beam, field, ranges = models_of(data)
+    x, y, theta = data["truth"]
+    places = ((beam, (x - 0.05, y, theta)), (field, (4.0, 6.0, theta)))
+    return tuple(
+        f"x = {at[0]:.2f} m, y = {at[1]:.2f} m: log p(z | x, m) = {model.log_likelihood([at], ranges)[0]:.1f}"
+        for model, at in places
+    )
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+@pytest.mark.parametrize("name", NAMES)
+def test_pages_work_in_a_browser(figures: ModuleType, name: str, tmp_path: Any) -> None:
+    script, texts = VISITS[name]
+    page = tmp_path / f"{name}.html"
+    page.write_text(committed(name).replace("</html>", f"<script>{script}</script></html>"), encoding="utf-8")
+    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
+    done = subprocess.run(
+        [*command, "--dump-dom", page.as_uri()], capture_output=True, text=True, timeout=60, check=True
+    )
+    body = re.search(r"<body ([^>]*)>|data-worst=[^>]*", done.stdout).group()
+    kept = dict(re.findall(r'data-(\w+)="([^"]*)"', body))
+    assert float(kept["worst"]) < 1e-12 and float(kept.get("moved", 0.0)) < 0.05
+    assert (kept["said"], kept["other"]) == (texts or scan_texts(figures))

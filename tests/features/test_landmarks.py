@@ -57,14 +57,21 @@ def test_landmarks_are_where_corners_and_doors_are(surveyed):
     assert (deviation > 1e-4).all() and (deviation < 0.1).all()
 
 
-def test_a_filter_localises_by_features_alone(surveyed):
+@pytest.mark.parametrize("beside", [False, True], ids=["alone", "beside the field"])
+def test_a_filter_localises_by_features(surveyed, beside):
     """Odometry alone is off by more in the end than the filter ever is in the median."""
     poses = corridor_path(120, aside=0.1)
-    features = gs.extract_features(scans_at(poses, 5), SCANNER)
+    ranges = scans_at(poses, 5)
+    features = gs.extract_features(ranges, SCANNER)
     parameters = gs.LandmarkParameters(
         sigma_range=0.1, sigma_bearing=0.03, sigma_signature=0.3, z_detect=0.9, z_false=0.1, range_max=12.0
     )
-    pf = gs.ParticleFilter(gs.LandmarkModel(surveyed.landmarks(), parameters), particles=1000, seed=0)
+    landmarks = gs.LandmarkModel(surveyed.landmarks(), parameters)
+    models = [landmarks]
+    if beside:
+        grid = gs.build_map(scans_at(poses, 6), poses, SCANNER, resolution=0.05)
+        models.append(gs.LikelihoodFieldModel(grid, SCANNER, gs.LikelihoodFieldParameters(sigma_hit=0.07)))
+    pf = gs.ParticleFilter(models, particles=1000, seed=0)
     pf.initialize(mean=poses[0] + (0.3, -0.2, 0.1), covariance=np.diag([0.25, 0.25, 0.04]))
     motions = gs.compose_poses(gs.invert_poses(poses[:-1]), poses[1:])
     motions = motions + np.random.default_rng(3).normal(0, (0.02, 0.01, 0.02), motions.shape)
@@ -74,12 +81,16 @@ def test_a_filter_localises_by_features_alone(surveyed):
             odometry.append(gs.compose_poses(odometry[-1], motions[k - 1]))
             pf.predict(odometry[-2], odometry[-1])
         readings = features.of_scan(k).range_bearing(("corner", "door", "pole"))
-        if len(readings):
-            pf.correct(readings)
+        given = {landmarks: readings} if len(readings) else {}
+        if beside:
+            given[models[1]] = ranges[k]
+        if given:
+            pf.correct(given)
         errors.append(math.hypot(*(pf.estimate().pose[:2] - pose[:2])))
     alone = gs.compose_poses(poses[0], odometry[-1])
     assert np.median(errors[20:]) < 0.05 and np.quantile(errors[20:], 0.95) < 0.2 and errors[-1] < 0.1
     assert math.hypot(*(alone[:2] - poses[-1, :2])) > 4 * np.median(errors[20:])
+    assert pf.estimate().verdict == "tracking"
 
 
 def test_a_map_has_the_corners_that_are_drawn_in_it(backend):

@@ -147,6 +147,7 @@ def test_tiles_of_beams(names: tuple[str, ...], device: Backend) -> None:
 TILED = [("ORDERED",), ("ORDERED", "ALL_READINGS", "SHARED_RAYS")]
 
 
+@pytest.mark.sampled(0.4)
 @pytest.mark.parametrize("names", [(), ("ORDERED", "ALL_READINGS")])
 def test_tiles_that_add_up_strands(names: tuple[str, ...], device: Backend) -> None:
     """The sums of strands, no more and no fewer, are those of the terms of single readings, to the bit."""

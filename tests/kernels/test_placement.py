@@ -195,7 +195,7 @@ def device(request, needs) -> Backend:
     return get_backend(needs(request.param))
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("given_as", PRECISIONS)
 @pytest.mark.parametrize("real", PRECISIONS)
 @pytest.mark.parametrize("name", FRAMES)

@@ -45,7 +45,7 @@ CROPPED = [kind for kind in KINDS if not kind.whole]
 POLICIES = [("free", "free"), ("occupied", "free"), ("free", "occupied"), ("occupied", "occupied")]
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("kind", KINDS, ids=by_name)
 def test_every_backend_has_the_bits_of_numpy(kind, backend):
     for precision, policies in (("float32", POLICIES), ("float64", POLICIES[::3])):

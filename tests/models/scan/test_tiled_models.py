@@ -136,7 +136,7 @@ def test_casters(method, kind, ordered, as_gpu):
         assert differing(*found) == 0
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 257])
 def test_any_number_of_particles(count, ordered, as_gpu):
     grid, scanner, z = world()

@@ -221,7 +221,7 @@ def with_poses(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> l
             rule = "every scan must have a pose, of its own or by --reference"
             raise ValueError(
                 f"log: {rule}, got none at scan {index} of {path}; trajectories for --reference: of a SLAM program, of "
-                "'gpusense localize --tum' in a map, of 'gpusense match --tum' without one"
+                "'gpusense localize --tum' in a map, of 'gpusense map --tum' without one"
             )
     return with_one_scanner(scans, path)
 

@@ -158,7 +158,7 @@ def turned_and_mirrored_scores(after: Scene, before: Scene, parameters: Any, on:
     assert_near(found, expected, 2 * per_beam(expected, expected.dtype))
 
 
-@pytest.mark.sampled(0.3)
+@pytest.mark.sampled(0.2)
 @LAWS
 @given(SEEDS, SMOOTH, st.sampled_from([-1, 1, 2]))
 def test_turn(kind, on, seed, name, quarters):
@@ -187,7 +187,7 @@ def test_mirror(kind, on, seed, name):
     turned_and_mirrored_scores(after, before, PARAMETERS[kind][name], on)
 
 
-@pytest.mark.sampled(0.3)
+@pytest.mark.sampled(0.2)
 @LAWS
 @given(SEEDS, NAMES, st.integers(-10, 10), st.floats(-7, 7), st.integers(0, 40))
 def test_shift(kind, on, seed, name, far, yaw, cells):
@@ -209,7 +209,7 @@ def test_turn_by_the_yaw_of_a_far_origin(on, seed, yaw):
     near_ranges(replace(before, origin=(1e6, -1e6, yaw), poses=moved).cast(**on), before.cast(**on), FAR_FLOAT64)
 
 
-@pytest.mark.sampled(0.3)
+@pytest.mark.sampled(0.2)
 @LAWS
 @given(SEEDS, NAMES, st.sampled_from([-11, -1, 1, 11]))
 def test_all_lengths_times_a_power_of_two(kind, on, seed, name, power):
@@ -275,7 +275,7 @@ def test_cells_cut_in_four_change_distances_by_a_diagonal(interpolation, longer,
     assert (coarse_low <= fine_high + math.sqrt(shorter)).all()
 
 
-@pytest.mark.sampled(0.3)
+@pytest.mark.sampled(0.2)
 @LAWS
 @given(SEEDS, NAMES)
 def test_permuting_beams_and_particles(kind, on, seed, name):
@@ -293,7 +293,7 @@ def test_permuting_beams_and_particles(kind, on, seed, name):
     plain_sum(other, some)
 
 
-@pytest.mark.sampled(0.3)
+@pytest.mark.sampled(0.2)
 @LAWS
 @given(SEEDS, NAMES, st.integers(0, 24))
 def test_splitting_a_scan(kind, on, seed, name, count):

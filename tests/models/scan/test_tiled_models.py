@@ -102,7 +102,7 @@ def test_models(kind, ordered, as_gpu, backend):
             )  # fmt: skip
 
 
-@pytest.mark.sampled(0.4)
+@pytest.mark.sampled(0.25)
 @pytest.mark.parametrize("compat", ["amcl", "beluga"])
 @pytest.mark.parametrize("model", [gs.BeamModel, gs.LikelihoodFieldModel])
 def test_weights_of_other_programs(model, compat, ordered, as_gpu):

@@ -69,7 +69,7 @@ def check_edits(make, result, grid, rng, count=7):
         np.testing.assert_array_equal(result(model), result(make(grid)))
 
 
-@pytest.mark.sampled(0.3)
+@pytest.mark.sampled(0.2)
 @pytest.mark.parametrize(
     ("method", "precision"), [*((method, "float32") for method in each_caster(16)), ("exact", "float64")], ids=by_name
 )

@@ -55,7 +55,9 @@ def follow(seed, args):
     if everywhere:
         pf.initialize_uniform()
     else:
-        pf.initialize(mean=events[0].truth, covariance=np.diag(np.square(runs.START)))
+        # On another map the truth of this one is nowhere.
+        start = gs.worlds.free_pose(grid, rng, 0.2) if case == "wrong" else events[0].truth
+        pf.initialize(mean=start, covariance=np.diag(np.square(runs.START)))
     rows = []
     for before, event in zip([None, *events], events, strict=False):
         if before is not None:

@@ -11,8 +11,8 @@ short, and f(a, b) = log((a + 1/2) / (b + 1/2)),
 within LIMITS: no agreement excludes that another place looks alike. A pose inside of solid cells adds SOLID, one in
 unknown cells UNKNOWN. The coefficients are those of a logistic regression on some 450 simulated runs: people, moved and
 new furniture, glass, wrong maps, 16 to 360 beams and kidnapping, half of the weight for right poses and half for wrong
-ones. 200 other runs (``bench/studies/verdict_fit.py``) give 3.03, 1.42, 0.63 and 0.44. BIAS is lower by CAUTION, since false alarms cost more: it
-was chosen on the tuning half of the recorded logs, as nothing else was.
+ones. 200 other runs (``bench/studies/verdict_fit.py``) give 3.03, 1.42, 0.63 and 0.44. BIAS is lower by CAUTION, since
+false alarms cost more: it was chosen on the tuning half of the recorded logs, as nothing else was.
 
 Among landmarks the ratio is that of the prediction of features (:mod:`gpusense.localization.evidence`).
 """

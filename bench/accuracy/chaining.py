@@ -9,8 +9,9 @@ during scans where they have a duration, whatever errs least. Times are wall tim
 
 "error" is the root mean square distance from the reference after alignment. "drift" is the mean error of relative
 poses over a path of 5, 20 and 100 m, per length. "contradicted" closures differ from the reference by more than 0.5 m
-or 0.15 rad; references have errors, too. That of jarvis is a track by reflectors, whose clock is not the lasers'; that
-of olin is of scans that were taken as instantaneous: both are read where the error of a row is least, within 0.25 s.
+or 0.15 rad; the references themselves have errors. The reference of jarvis is a track by reflectors, whose clock is not
+the lasers'; that of olin is of scans that were taken as instantaneous: both are read where the error of a row is least,
+within 0.25 s.
 "held out" is the share of end points up to 20 m of odd scans within 5 and 15 cm of an occupied cell of the even scans'
 map, at the poses of the row with odometry and closures, and at those of the reference.
 """

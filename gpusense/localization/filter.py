@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.localization import options, resetting, skipping
+from gpusense.localization import options, resetting, skipping, starts
 from gpusense.localization.adaptive import kld_count
 from gpusense.localization.beginnings import Beginnings
 from gpusense.localization.calibration import LOOK, due_of, is_together
@@ -278,10 +278,7 @@ class ParticleFilter(Beginnings):
 
     def _take_over(self, poses: np.ndarray, weights: np.ndarray) -> None:
         """Replace the particles by those of the rival, which the next scans have to confirm."""
-        count = self._cloud.count
-        ends = np.cumsum(weights)
-        rows = np.searchsorted(ends, (np.arange(count) + 0.5) / count * ends[-1], side="right")
-        self._place(poses[np.minimum(rows, len(poses) - 1)], again=True)
+        self._place(poses[starts.rows_by_weight(weights, self._cloud.count)], again=True)
         self._verdict.doubt()
         self._everywhere = COMPARISONS
 

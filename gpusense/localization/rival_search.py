@@ -133,8 +133,7 @@ def drawn(score: np.ndarray, count: int, effective: int) -> np.ndarray | None:
         if low >= high:
             break
     weight = np.exp(low * distance, where=possible, out=np.zeros(len(score)))
-    ends = np.cumsum(weight)
-    return np.minimum(np.searchsorted(ends, (np.arange(count) + 0.5) / count * ends[-1], side="right"), len(score) - 1)
+    return starts.rows_by_weight(weight, count)
 
 
 def can_search(sensors: Sequence[Sensor]) -> bool:

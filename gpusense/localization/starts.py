@@ -94,6 +94,13 @@ def free_pool(models: list[Any], bounds: Any) -> tuple[np.ndarray, Spread]:
     return centres, (half_cell, half_cell, math.pi)
 
 
+def rows_by_weight(weights: np.ndarray, count: int, start: float = 0.5) -> np.ndarray:
+    """Return indices drawn systematically by weights of any positive sum; ``start`` is that of the first mark."""
+    ends = np.cumsum(weights)
+    rows = np.searchsorted(ends, (np.arange(count) + start) / count * ends[-1], side="right")
+    return np.minimum(rows, len(weights) - 1)
+
+
 def likely_pool(likelihood: Any, count: int, key: Key) -> tuple[np.ndarray, Spread]:
     """Return poses drawn by their likelihood, and half widths of a cell of the likelihood's grid.
 
@@ -111,10 +118,7 @@ def likely_pool(likelihood: Any, count: int, key: Key) -> tuple[np.ndarray, Spre
     if not finite.any():
         raise ValueError("likelihood: must have a finite log_p, got none")
     weight = np.where(finite, np.exp(np.where(finite, log_p, -np.inf) - log_p[finite].max()), 0.0)
-    ends = np.cumsum(weight)
-    start = float(uniform_of(_words(1, key, 3)[0])[0])
-    rows = np.searchsorted(ends, (np.arange(count) + start) / count * ends[-1], side="right")
-    rows = np.minimum(rows, log_p.size - 1)
+    rows = rows_by_weight(weight, count, float(uniform_of(_words(1, key, 3)[0])[0]))
     if hasattr(likelihood, "poses"):
         poses = likelihood.poses(*np.unravel_index(rows, shape))
     else:

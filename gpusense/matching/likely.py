@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gpusense.matching.field_search import field_search
 from gpusense.matching.locate import end_points_of
-from gpusense.matching.search import PoseGrid
+from gpusense.matching.pose_grid import PoseGrid, distinct_poses
 from gpusense.models.scan.field import LikelihoodFieldModel
 
 # Distance and angle between neighbouring poses [m, rad]; half of them are within the reach of a cloud of particles.
@@ -43,17 +43,4 @@ def likely_poses(model: LikelihoodFieldModel, ranges: NDArray[np.float64], count
     search = field_search(model, stride)
     with search.lock:
         poses = search.find(ranges, points, searched, allowed, _DEPTH).poses
-    return poses[_distinct(poses, count)]
-
-
-def _distinct(poses: NDArray[np.float64], count: int) -> list[int]:
-    """Return the indices of poses that are far from all better ones."""
-    chosen: list[int] = []
-    left = np.ones(len(poses), bool)
-    while len(chosen) < count and left.any():
-        first = int(np.argmax(left))
-        chosen.append(first)
-        off = poses - poses[first]
-        turn = np.abs(np.remainder(off[:, 2] + math.pi, 2 * math.pi) - math.pi)
-        left &= (np.hypot(off[:, 0], off[:, 1]) > _NEAR) | (turn > _TURNED)
-    return chosen
+    return poses[distinct_poses(poses, count, _NEAR, _TURNED)]

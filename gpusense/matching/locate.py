@@ -13,7 +13,7 @@ from gpusense.matching.climb import climb
 from gpusense.matching.field_search import Candidates, FieldSearch, field_search
 from gpusense.matching.location import Location, PoseMode, Status
 from gpusense.matching.location_evidence import NAMES, location_evidence, probability_right
-from gpusense.matching.search import PoseGrid
+from gpusense.matching.pose_grid import PoseGrid, distinct_poses
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.models.scan.rules import BeamChoice
@@ -141,16 +141,8 @@ def _modes(
     model: LikelihoodFieldModel, ranges: ArrayLike, hits: np.ndarray, search: FieldSearch, found: Candidates, most: int
 ) -> tuple[PoseMode, ...]:
     """Return the best pose and the other local maxima among the poses, by falling score."""
-    poses, left = found.poses, np.ones(len(found.poses), bool)
-    chosen: list[int] = []
-    following: int | None = found.best
-    radius = max(_MODE_RADIUS, 2 * search.stride * search.grid.resolution)
-    while following is not None and len(chosen) < most:
-        chosen.append(following)
-        off = poses - poses[following]
-        turn = np.abs(np.remainder(off[:, 2] + math.pi, 2 * math.pi) - math.pi)
-        left &= (np.hypot(off[:, 0], off[:, 1]) > radius) | (turn > _MODE_ANGLE)
-        following = int(np.argmax(left)) if left.any() else None
+    poses, radius = found.poses, max(_MODE_RADIUS, 2 * search.stride * search.grid.resolution)
+    chosen = distinct_poses(poses, most, radius, _MODE_ANGLE, found.best)
     log_p = model.log_likelihood(poses[chosen], ranges)
     shares = _shares(model, np.asarray(ranges, np.float64), hits, search.caster, poses[chosen])
     return tuple(

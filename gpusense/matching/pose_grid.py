@@ -93,3 +93,24 @@ def end_cells(points: np.ndarray, headings: np.ndarray, start: np.ndarray) -> np
     x, y = points[:, 0], points[:, 1]
     cells = np.stack([start[0] + (cos * x - sin * y), start[1] + (sin * x + cos * y)], axis=-1)
     return np.floor(cells).astype(np.int32)
+
+
+def distinct_poses(poses: np.ndarray, count: int, radius: float, angle: float, first: int = 0) -> list[int]:
+    """Return the indices of poses that are far from all better ones, and of the first.
+
+    Args:
+        poses: (M, 3) poses, by falling score [m, m, rad].
+        count: Most indices.
+        radius: Poses within this distance [m] and ``angle`` of a better one are left out.
+        angle: See ``radius`` [rad].
+        first: Index of the best pose.
+    """
+    chosen: list[int] = []
+    left, following = np.ones(len(poses), bool), first
+    while len(chosen) < count and left.any():
+        chosen.append(following)
+        off = poses - poses[following]
+        turn = np.abs(np.remainder(off[:, 2] + np.pi, 2 * np.pi) - np.pi)
+        left &= (np.hypot(off[:, 0], off[:, 1]) > radius) | (turn > angle)
+        following = int(np.argmax(left))
+    return chosen

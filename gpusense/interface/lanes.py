@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from gpusense.interface import casters
-
-# A kernel has no body in vectors with any of these flags, nor without all flags of one of its sets.
-_NEVER = {"FLOAT64", "ALL_READINGS", "SHARP", "SHARED_RAYS", "ECHO", "SENSOR_TABLE", "CUBES", *casters.FLAGS}
-# Kernels in vectors of float64: the sums of learning.
-_FLOAT64 = {"e_step"}
-_NEVER_OF = {"score_features": {"SIGNATURE", "FIELD", "MARGINAL", "PER_BEAM"}}
+# Flags with which a kernel has no body in vectors, and the sets of flags of which it needs one.
+_SCALAR = frozenset({"FLOAT64", "ALL_READINGS", "SHARP", "CUBES"})
+_NEVER: dict[str, frozenset[str]] = {
+    "cast_ranges": frozenset(),
+    "e_step": _SCALAR - {"FLOAT64"},
+    "score_beams": frozenset(),
+    "score_field": frozenset({"ALL_READINGS"}),
+    "score_features": _SCALAR | {"SIGNATURE", "FIELD", "MARGINAL", "PER_BEAM"},
+}
 _NEEDED: dict[str, tuple[set[str], ...]] = {
     "cast_ranges": (set(),),
     "draw_particles": (set(),),
@@ -18,9 +20,9 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
     "match_scans": (set(),),
     "move_particles": (set(),),
     "place_poses": (set(),),
-    "score_beams": ({"LINEAR"},),
+    "score_beams": (set(),),
     "score_features": ({"RANGE"}, {"BEARING"}),
-    "score_field": ({"LOG_TABLE"}, {"BILINEAR", "LINEAR"}),
+    "score_field": (set(),),
     "set_weights": (set(),),
     "shift_scores": (set(),),
     "sum_poses": (set(),),
@@ -30,7 +32,7 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
 
 def widened(lanes: int, kernel: str, flags: frozenset[str] | set[str]) -> frozenset[str]:
     """Return the flags of a launch, with WIDE where the device asks for lanes and the kernel has a body in vectors."""
-    never = (_NEVER | _NEVER_OF.get(kernel, set())) - ({"FLOAT64"} if kernel in _FLOAT64 else set())
+    never = _NEVER.get(kernel, _SCALAR)
     if lanes == 1 or flags & never or not any(needed <= flags for needed in _NEEDED.get(kernel, ())):
         return frozenset(flags)
     return frozenset(flags) | {"WIDE"}

@@ -39,8 +39,8 @@ def required_files(name: str, flags: frozenset[str] = frozenset()) -> list[str]:
     """List the files of a kernel file's program, the file itself last.
 
     With ``WIDE``, ``lanes/<name>`` takes the place of ``<name>`` where there is such a file. Names in ``// requires:``
-    are taken as they stand, so a file in lanes names files of both folders; ``caster`` stands for the caster of the
-    flags.
+    are taken as they stand, so a file in lanes names files of both folders. ``caster`` stands for the caster of the
+    flags, and ``lanes/caster`` for its body in lanes or, where it has none, for ``lanes/other_caster``.
     """
     return _with_requirements(f"lanes/{name}" if _in_lanes(name, flags) else name, flags)
 
@@ -54,6 +54,9 @@ def _with_requirements(name: str, flags: frozenset[str]) -> list[str]:
     for needed in _requirements(name):
         if needed == "caster":
             needed = casters.caster_file(flags)
+        elif needed == "lanes/caster":
+            needed = f"lanes/{casters.caster_file(flags)}"
+            needed = needed if has_opencl_source(needed) else "lanes/other_caster"
         files += [file for file in _with_requirements(needed, flags) if file not in files]
     return [*files, name]
 
@@ -108,7 +111,7 @@ def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
     text = "".join(opencl_source(needed) for needed in files)
     text += _declarations(text)
     words = set(re.findall(r"\b[A-Z][A-Z0-9_]*\b", text))
-    if any("caster" in _requirements(needed) for needed in files):
+    if any({"caster", "lanes/caster"} & set(_requirements(needed)) for needed in files):
         words |= casters.FLAGS.keys()
     if _in_lanes(file, flags):
         words.add("WIDE")

@@ -96,6 +96,85 @@ def test_lanes_have_the_bits_of_one(particles, beams, outside, device, compiled)
         assert allowed.difference(found[name], one[name]) <= allowed.value, name
 
 
+NARROW = gs.BeamParameters(0.7, 0.1, 0.1, 0.1, 0.004, 0.3)
+MOVED = gs.BeamParameters(0.7, 0.1, 0.1, 0.1, 0.1, 0.3, range_bias=0.03, sigma_growth=0.01)
+ANGLES = gs.IncidenceParameters((0.0, 0.6, 1.1, math.pi / 2), (NARROW, MOVED, gs.BeamParameters()))
+CHANCES = gs.IncidenceParameters(
+    (0.0, 0.6, math.pi / 2), (MOVED, gs.BeamParameters(0.5, 0.1, 0.3, 0.1)), no_surface=gs.BeamParameters(0, 0, 0.9, 0.1)
+)
+BEAM_OPTIONS = {
+    "logarithms": dict(parameters=gs.BeamParameters(0.8, 0.1, 0.1, 0.0)),
+    "logarithms of three": dict(parameters=gs.BeamParameters(0.8 - 1e-35, 0.1, 0.1, 1e-35)),
+    "hit alone": dict(parameters=gs.BeamParameters(1.0, 0.0, 0.0, 0.0, 0.3)),
+    "short alone": dict(parameters=gs.BeamParameters(0.0, 1.0, 0.0, 0.0)),
+    "no rate": dict(parameters=gs.BeamParameters(0.0, 0.9, 0.0, 0.1, lambda_short=0.0)),
+    "narrow": dict(parameters=NARROW),
+    "narrow logarithms": dict(parameters=gs.BeamParameters(0.8, 0.1, 0.1, 0.0, 0.003)),
+    "moved": dict(parameters=MOVED),
+    "narrow, moved": dict(parameters=MOVED.replace(sigma_hit=0.004)),
+    "narrow, moved logarithms": dict(parameters=MOVED.replace(sigma_hit=0.004, z_hit=0.8, z_rand=0.0)),
+    "wide": dict(parameters=gs.BeamParameters(0.7, 0.1, 0.1, 0.1, 30.0)),
+    "a table": dict(sensor_table=0.1),
+    "angles": dict(incidence=ANGLES),
+    "angles, walls outside": dict(incidence=ANGLES, outside="occupied"),
+    "max readings by angle": dict(incidence=CHANCES),
+    "look-up": dict(caster=gs.casters.Lookup(40)),
+    "march": dict(caster="march"),
+    "lines": dict(caster="bresenham"),
+    "everything": dict(specialize=False),
+    "amcl": dict(compat="amcl"),
+    "amcl, exact": dict(compat="amcl", caster="exact"),
+    "beluga, exact": dict(compat="beluga", caster="exact"),
+}
+FIELD_OPTIONS = {
+    "logarithms": dict(parameters=gs.LikelihoodFieldParameters(1.0, 0.0, 0.0)),
+    "smooth logarithms": dict(parameters=gs.LikelihoodFieldParameters(1.0, 0.0, 0.0, interpolation="bilinear")),
+    "smooth, narrow": dict(parameters=gs.LikelihoodFieldParameters(sigma_hit=0.004, interpolation="bilinear")),
+    "smooth, narrow logarithms": dict(
+        parameters=gs.LikelihoodFieldParameters(1.0, 0.0, 0.0, sigma_hit=0.004, interpolation="bilinear")
+    ),
+    "amcl": dict(compat="amcl"),
+    "beluga": dict(compat="beluga"),
+}
+
+
+@pytest.mark.sampled(0.1)
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize(
+    ("kind", "option"),
+    [(gs.BeamModel, name) for name in BEAM_OPTIONS] + [(gs.LikelihoodFieldModel, name) for name in FIELD_OPTIONS],
+)
+@pytest.mark.parametrize("bearings", ["each once", "some often"])
+def test_every_option_has_a_body_in_lanes(kind, option, precision, bearings, device, compiled):
+    """No option leaves the lanes; each has the scalar kernel's values, those of a particle in any lane included."""
+    options = (BEAM_OPTIONS if kind is gs.BeamModel else FIELD_OPTIONS)[option]
+    grid, scanner, poses, z = scene(70, 67)
+    if bearings == "some often":
+        scanner = gs.Scanner(np.repeat(scanner.bearings, np.arange(67) % 20 + 1)[:150], RANGE, mount=scanner.mount)
+        z = np.resize(z, 150)
+    kernel = "score_beams" if kind is gs.BeamModel else "score_field"
+    found = {}
+    for lanes in (1, LANES):
+        model = kind(grid, scanner, **options, precision=precision, backend=device(lanes))
+        compiled.clear()
+        found[lanes] = model.log_likelihood(poses, z)
+        several = model.log_likelihood(np.stack([poses[:33], poses[33:66]]), np.stack([z, z[::-1]]))
+        assert compiled[kernel] == {lanes if option != "everything" or kind is gs.BeamModel else 1}
+        assert differing(several[0], found[lanes][:33]) == 0
+        if "compat" not in options:
+            one, parts = model.log_likelihood(poses, z, per_beam=True)
+            assert differing(one, found[lanes]) == 0
+            found[lanes, "parts"] = parts
+    allowed = beam_tolerance(np.dtype(precision).type).twice()
+    assert np.array_equal(np.isneginf(found[1]), np.isneginf(found[LANES]))
+    possible = np.isfinite(found[1])
+    assert allowed.difference(found[LANES][possible], found[1][possible]) <= allowed.value * len(z)
+    if (1, "parts") in found:
+        possible = np.isfinite(found[1, "parts"])
+        assert np.array_equal(possible, np.isfinite(found[LANES, "parts"]))
+        assert allowed.difference(found[LANES, "parts"][possible], found[1, "parts"][possible]) <= allowed.value
+
+
 def test_a_particle_does_not_depend_on_its_lane(device):
     grid, scanner, poses, z = scene(140, 200)
     smooth = gs.LikelihoodFieldParameters(interpolation="bilinear")
@@ -141,14 +220,16 @@ def test_only_scenes_that_have_such_kernels_get_them():
     wide = dataclasses.replace(info, lanes=LANES)
     assert widened(info.lanes, "cast_ranges", set()) == frozenset()
     assert widened(wide.lanes, "cast_ranges", set()) == {"WIDE"}
-    for flag in ("FLOAT64", "MARCH", "LOOKUP", "SHARED_RAYS", "SHARP"):
-        assert widened(wide.lanes, "cast_ranges", {flag}) == {flag}
-    assert widened(wide.lanes, "score_beams", {"HIT"}) == {"HIT"}
-    assert widened(wide.lanes, "score_beams", {"HIT", "LINEAR"}) == {"HIT", "LINEAR", "WIDE"}
-    assert widened(wide.lanes, "score_field", {"BILINEAR"}) == {"BILINEAR"}
-    assert widened(wide.lanes, "score_field", {"BILINEAR", "LINEAR"}) == {"BILINEAR", "LINEAR", "WIDE"}
-    assert widened(wide.lanes, "score_field", {"BILINEAR", "LINEAR", "SHARP"}) == {"BILINEAR", "LINEAR", "SHARP"}
-    assert widened(wide.lanes, "score_field", {"LOG_TABLE", "CAREFUL"}) == {"LOG_TABLE", "CAREFUL", "WIDE"}
+    for flags in ({"FLOAT64"}, {"LOOKUP"}, {"MARCH", "ORIGINS_OUTSIDE"}):
+        assert widened(wide.lanes, "cast_ranges", flags) == {*flags, "WIDE"}
+    for flags in (set(), {"HIT"}, {"HIT", "LINEAR"}, {"HIT", "SHARP", "ECHO", "INCIDENCE"}, {"CUBES", "ALL_READINGS"}):
+        assert widened(wide.lanes, "score_beams", flags) == {*flags, "WIDE"}
+    for flags in ({"BILINEAR"}, {"BILINEAR", "LINEAR", "SHARP"}, {"LOG_TABLE", "CAREFUL"}, {"LOG_TABLE", "FLOAT64"}):
+        assert widened(wide.lanes, "score_field", flags) == {*flags, "WIDE"}
+    assert widened(wide.lanes, "score_field", {"ALL_READINGS"}) == {"ALL_READINGS"}
+    for flag in ("FLOAT64", "SHARP"):
+        assert widened(wide.lanes, "field_gradient", {"LINEAR", flag}) == {"LINEAR", flag}
+    assert widened(wide.lanes, "beam_tiles", {"LINEAR"}) == {"LINEAR"}
 
 
 def test_programs_in_lanes_begin_in_their_folder():

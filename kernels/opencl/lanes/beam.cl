@@ -1,8 +1,41 @@
-// Beam model of a whole scan, LANES rays at once: score_beams of beam.cl, with sums in the same order. A vector of rays
-// is a block of the sum.
-// requires: error_free lanes/raycast lanes/mixture
+// Beam model of a whole scan, LANES rays at once: score_beams of beam.cl, with sums in the same order.
+// requires: error_free lanes/returns lanes/mixture lanes/sensor_table
 
-// Score scans: one work-item takes a particle, and its rays block by block. Every ray has one reading.
+// Return the terms of readings in the sum.
+lanes reading_term_lanes(const lanes z, const EchoLanes echo, global const real *terms, global const real *edges,
+                         global const real *sensor, const MixtureTables tables, const RangeScale scale) {
+    const lanes expected = range_lanes(echo.t, scale);
+    ilanes bin_at = 0;
+#if INCIDENCE
+    for (int bin = 0; bin + 1 < tables.incidence_bins; ++bin)
+        bin_at += echo.cosine <= edges[bin] ? (ilanes)MIXTURE_TERMS : (ilanes)0;
+#endif
+#if SENSOR_TABLE
+    lanes term = tabulated_density_lanes(z, expected, sensor, tables, scale.range_max);
+#elif CUBES
+    const lanes p = compat_density_lanes(z, expected, terms);
+    lanes term = p * p * p;
+#else
+    lanes term = log_density_lanes(z, expected, terms, bin_at);
+#endif
+#if ALL_READINGS
+#if !SENSOR_TABLE
+    term = z == INFINITY ? TERM(7) : term;
+#endif
+    term = z == z ? term : (lanes)0;
+#endif
+    return term;
+}
+
+#if SHARED_RAYS
+// Vectors of returns, the last two of a scan's rays so far, and the number of rays that were cast.
+typedef struct {
+    real t[2 * LANES], cosine[2 * LANES];
+    int cast;
+} Returns;
+#endif
+
+// Score scans: one work-item takes a particle, and its readings block by block.
 kernel void score_beams(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
                         global const real4 *pose, global const real2 *ray, global const int *first,
                         global const real *reading, global const real *terms, global const real *edges,
@@ -15,37 +48,88 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
 #if SCANS
     const int scan = (n + batch.ahead) / batch.per_scan, size = start[scan + 1] - start[scan];
     const real constant_term = constant_terms[scan];
-    ray += start[scan];
-    reading += start[scan];
+    ray += start[scan] * cone.rays;
+#if SHARED_RAYS
+    first += start[scan];
+    const int begin = first[0];
 #else
-    const int size = readings;
+    const int begin = start[scan];
+#endif
+    reading += begin;
+#else
+    const int size = rays, begin = 0;
     const real constant_term = score.constant_term;
 #endif
-    real2 total = (real2)(constant_term, 0);
-    real values[LANES];
-    for (int k = 0; k < size; k += LANES) {
-        lanes x, y;
-        load_ray_lanes(ray, k, size, &x, &y);
-        const lanes expected = expected_range_lanes(map_table, window, pose_cell[n], pose[n], x, y, scale);
-        const int count = min(size - k, LANES);
-        lanes z;
-        if (count == LANES) {
-            z = load_lanes(0, reading + k);
-        } else {
-            for (int i = 0; i < LANES; ++i) values[i] = reading[k + min(i, count - 1)];
-            z = load_lanes(0, values);
-        }
-        lanes term = log_density_lanes(z, expected, terms);
-#if PER_BEAM
-        store_lanes(term, 0, values);
-        for (int i = 0; i < count; ++i) parts[(long)n * readings + k + i] = values[i];
+#if SHARED_RAYS
+    const int count = first[size] - begin;
+    Returns returns;
+    returns.cast = 0;
+    int r = 0;
+#else
+    const int count = size;
 #endif
-        if (count < LANES) {
+    real2 total = (real2)(constant_term, 0);
+    real4 strands = 0;
+    ilanes impossible = 0;
+    for (int k = 0; k < count; k += LANES) {
+        const int left = count - k;
+#if SHARED_RAYS
+        // Readings of the same ray are neighbours, so those of a vector have rays of two vectors at most.
+        int at[LANES];
+        for (int i = 0; i < LANES; ++i) {
+            while (first[r + 1] - begin <= k + i && k + i < count) ++r;
+            at[i] = r;
+        }
+        for (; returns.cast <= r; returns.cast += LANES) {
+            const EchoLanes new = nearest_echo_lanes(map_table, normals, window, pose_cell[n], pose[n], ray,
+                                                     returns.cast, size, cone, scale.limit, caster);
+            store_lanes(new.t, (returns.cast / LANES) % 2, returns.t);
+            store_lanes(new.cosine, (returns.cast / LANES) % 2, returns.cosine);
+        }
+        real t[LANES], cosine[LANES];
+        for (int i = 0; i < LANES; ++i) {
+            t[i] = returns.t[at[i] % (2 * LANES)];
+            cosine[i] = returns.cosine[at[i] % (2 * LANES)];
+        }
+        const EchoLanes echo = {load_lanes(0, t), load_lanes(0, cosine)};
+#else
+        const EchoLanes echo = nearest_echo_lanes(map_table, normals, window, pose_cell[n], pose[n], ray, k, size,
+                                                  cone, scale.limit, caster);
+#endif
+        lanes term = reading_term_lanes(load_some(reading + k, left), echo, terms, edges, sensor, tables, scale);
+        real values[LANES];
+        if (left < LANES) {
             store_lanes(term, 0, values);
-            for (int i = count; i < LANES; ++i) values[i] = 0;
+            for (int i = left; i < LANES; ++i) values[i] = 0;
             term = load_lanes(0, values);
         }
-        total = add_strands(total, ((term.lo.lo + term.lo.hi) + term.hi.lo) + term.hi.hi);
+#if PER_BEAM
+        store_lanes(term, 0, values);
+        for (int i = 0; i < LANES && i < left; ++i) parts[(long)n * readings + k + i] = values[i];
+#endif
+#if !LINEAR
+        const ilanes never = term == -INFINITY;
+        impossible |= never;
+        term = never ? (lanes)0 : term;
+#endif
+#if FLOAT64
+        strands += term.lo;
+        strands += term.hi;
+        if ((k + LANES) % BLOCK_TERMS == 0 || left <= LANES) {
+            total = add_strands(total, strands);
+            strands = 0;
+        }
+#else
+        strands = ((term.lo.lo + term.lo.hi) + term.hi.lo) + term.hi.hi;
+        total = add_strands(total, strands);
+#endif
     }
-    log_p[n] = score.temperature * (total.x + total.y);
+    const real sum = total.x + total.y;
+#if CUBES
+    log_p[n] = score.temperature * log(sum);
+#elif LINEAR
+    log_p[n] = score.temperature * sum;
+#else
+    log_p[n] = any_lane(impossible) ? -INFINITY : score.temperature * sum;
+#endif
 }

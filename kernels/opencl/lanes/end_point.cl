@@ -3,11 +3,11 @@
 
 // Clamp i to [0, last].
 ilanes within_lanes(const ilanes i, const int last) {
-    const ilanes raised = i > 0 ? i : 0;
-    return raised < last ? raised : last;
+    const ilanes raised = i > 0 ? i : (ilanes)0;
+    return raised < last ? raised : (ilanes)last;
 }
 
-#if BILINEAR
+#if CAREFUL
 // Return frac + a b + sign c d to about twice the working precision; every factor is a sum of two numbers.
 LanePair careful_offset_lanes(const lanes frac, const lanes frac_low, const lanes a, const lanes a_low, const real2 b,
                               const lanes c, const lanes c_low, const real2 d, const real sign) {
@@ -16,16 +16,23 @@ LanePair careful_offset_lanes(const lanes frac, const lanes frac_low, const lane
     const lanes low = (a * b.y + a_low * b.x) + sign * (c * d.y + c_low * d.x);
     return (LanePair){sum.hi, ((ab.lo + sign * cd.lo) + (products.lo + frac_low)) + (low + sum.lo)};
 }
+#endif
 
 // Return the whole cells below an offset, with the remainder in [0, 1) and 1 minus it.
-ilanes whole_cells_lanes(const LanePair offset, lanes *rest, lanes *to_next) {
-    const lanes up = offset.hi + 0.5f;
+ilanes whole_cells_lanes(const LanePair offset, LanePair *rest, LanePair *to_next) {
+    const lanes up = offset.hi + (real)0.5;
     ilanes nearest = to_ilanes(up);
     nearest += to_lanes(nearest) > up;
-    const lanes past = (offset.hi - to_lanes(nearest)) + offset.lo, other = past < 0 ? 1 + past : 1 - past;
-    const ilanes below = past + EDGE < 0;
-    *rest = below ? other : past;
-    *to_next = below ? -past : other;
+#if SHARP
+    const LanePair past = two_sum_lanes(offset.hi - to_lanes(nearest), offset.lo);
+    const LanePair less = {past.hi < 0 ? past.hi : -past.hi, past.hi < 0 ? past.lo : -past.lo};
+    const LanePair other = pair_sum_lanes((LanePair){1, 0}, less);
+#else
+    const lanes left = (offset.hi - to_lanes(nearest)) + offset.lo;
+    const LanePair past = {left, 0}, other = {left < 0 ? 1 + left : 1 - left, 0};
+#endif
+    const ilanes below = past.hi + EDGE < 0;
+    *rest = (LanePair){below ? other.hi : past.hi, below ? other.lo : past.lo};
+    *to_next = (LanePair){below ? -past.hi : other.hi, below ? -past.lo : other.lo};
     return nearest + below;
 }
-#endif

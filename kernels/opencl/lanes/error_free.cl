@@ -20,6 +20,18 @@ LanePair two_product_lanes(const lanes a, const lanes b) {
     return (LanePair){product, ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low};
 }
 
+// Add two numbers of two parts each, to about twice the working precision.
+LanePair pair_sum_lanes(const LanePair a, const LanePair b) {
+    const LanePair sum = two_sum_lanes(a.hi, b.hi);
+    return two_sum_lanes(sum.hi, sum.lo + (a.lo + b.lo));
+}
+
+// Multiply two numbers of two parts each, to about twice the working precision.
+LanePair pair_product_lanes(const LanePair a, const LanePair b) {
+    const LanePair product = two_product_lanes(a.hi, b.hi);
+    return two_sum_lanes(product.hi, product.lo + (a.hi * b.lo + a.lo * b.hi));
+}
+
 // Return a * b = hi + lo by a fused multiply-add.
 LanePair fused_product_lanes(const lanes a, const lanes b) {
     const lanes product = a * b;

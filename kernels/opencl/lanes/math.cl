@@ -1,11 +1,27 @@
 // Exponentials, logarithms, the error function and the arc tangent in lanes. PoCL's own are calls that pass vectors
-// through memory. With |r| <= log(2) / 2 and 1 + f from sqrt(1/2) to sqrt(2):
+// through memory; those of float64 stand for want of better ones. With |r| <= log(2) / 2 and 1 + f from sqrt(1/2) to sqrt(2):
 //     e^a = 2^k e^r,  e^r = 1 + r + r^2 E(r);   log(2^k (1 + f)) = k log 2 + f - f^2 / 2 + f^3 L(f);
 //     erf(x) = 1 - exp(-x W(x));   arctan t = t + t^3 A(t^2).
 // bench/derive/lane_constants.py derives the constants; tests/kernels/test_lane_math.py measures the worst errors that
 // stand below, in ulps of float32.
 // requires: lanes/types
 
+#if FLOAT64
+// From here on the error function is 1 to the last bit.
+#define LANE_ERF_ONE 6.0
+
+// Return e^a for a <= 0.
+lanes exp_lanes(const lanes a) { return exp(a); }
+
+// Return 1 - e^a for a <= 0.
+lanes one_minus_exp_lanes(const lanes a) { return -expm1(a); }
+
+// Return log(p) for p > 0.
+lanes log_lanes(const lanes p) { return log(p); }
+
+// Return erf(x) for x >= 0.
+lanes erf_lanes(const lanes x) { return any_lane(x < LANE_ERF_ONE) ? erf(x) : (lanes)1; }
+#else
 // log 2 in two parts; the first has 16 bits, so that its products with counts are exact.
 #define LOG2_HIGH 0.693145752f
 #define LOG2_LOW 1.42860677e-06f
@@ -93,3 +109,4 @@ lanes erf_lanes(const lanes x) {
     const lanes high = (W4 + W5 * b) + square * ((W6 + W7 * b) + square * W8);
     return one_minus_exp_lanes(-b * (low + (square * square) * high));
 }
+#endif

@@ -1,46 +1,199 @@
-// Beam mixture density of LANES readings at once: mixture.cl in the linear domain, without SHARP.
-// requires: mixture lanes/math
+// Beam mixture density of LANES readings at once: mixture.cl in lanes.
+// requires: error_free mixture lanes/error_free lanes/math
 
-// Up to this 1 - exp(-x) is x within a quarter of the last bit of float32.
+// Up to this 1 - exp(-x) is x within a quarter of the last bit.
+#if FLOAT64
+#define SMALL_DECAY 5.55e-17
+#else
 #define SMALL_DECAY 2.98023224e-08f
+#endif
+// Number i of the terms; bins of angles of incidence have terms of their own, from index bin_at on.
+#if INCIDENCE
+#define TERM(i) GATHER(lanes, (terms + (i)), bin_at)
+#else
+#define TERM(i) terms[i]
+#endif
 
-// Return log p(z | z*). p_rand is at least 1e-30 times the larger of 1 and the peak. So each component may underflow,
-// which begins at 2e-38, and one logarithm is enough.
-lanes log_density_lanes(const lanes z, const lanes expected, global const real *terms) {
-    lanes p = terms[5];
+// Return the larger numbers.
+lanes larger_lanes(const lanes a, const lanes b) { return a > b ? a : b; }
+
 #if HIT
+// Return the means of p_hit; clamped becomes whether a mean is at an end of the range.
+lanes mean_range_lanes(const lanes expected, global const real *terms, const ilanes bin_at, ilanes *clamped) {
 #if BIAS
-    const lanes wanted = expected + terms[10], least = wanted < 0 ? (lanes)0 : wanted;
-    const lanes mean = least > terms[6] ? (lanes)terms[6] : least;
-    // z, z* and the bias nearly cancel, so the rounding error of z - z* is added.
-    const lanes apart = z - expected, shift = apart - z, error = (z - (apart - shift)) - (expected + shift);
-    lanes off = mean == wanted ? (apart - terms[10]) + (error - terms[11]) : z - mean;
+    const lanes wanted = expected + TERM(10), raised = wanted < 0 ? (lanes)0 : wanted;
+    const lanes mean = raised > terms[6] ? (lanes)terms[6] : raised;
+    *clamped = mean != wanted;
+    return mean;
 #else
-    const lanes mean = expected;
-    lanes off = z - expected;
+    *clamped = 0;
+    return expected;
 #endif
+}
+
+// Return sigma_hit / sigma at ranges, as sums of two numbers.
+LanePair hit_scale_lanes(const lanes expected, global const real *terms, const ilanes bin_at) {
 #if GROWTH
-    const lanes scale = 1 / (1 + terms[12] * expected), erf_scale = terms[2] * scale, peak = terms[0] * scale;
-    off *= scale;
+#if SHARP
+    const LanePair growth = pair_product_lanes((LanePair){TERM(12), TERM(13)}, (LanePair){expected, 0});
+    const LanePair x = pair_sum_lanes((LanePair){1, 0}, growth);
+    const lanes y = 1 / x.hi;
+    const LanePair back = two_product_lanes(y, x.hi);
+    return (LanePair){y, (((1 - back.hi) - back.lo) - y * x.lo) * y};
 #else
-    const real erf_scale = terms[2], peak = terms[0];
+    return (LanePair){1 / (1 + TERM(12) * expected), 0};
 #endif
-    const lanes hit = peak * exp_lanes(off * (off * -terms[1]));
-    // The normal has all of its mass within the range unless one end is near.
-    const lanes below = mean * erf_scale, above = (terms[6] - mean) * erf_scale;
+#else
+    return (LanePair){1, 0};
+#endif
+}
+
+// Return (z - mean)^2 / (2 sigma^2) as sums of two numbers.
+LanePair hit_exponent_lanes(const lanes z, const lanes expected, const lanes mean, const ilanes clamped,
+                            const LanePair scale, global const real *terms, const ilanes bin_at) {
+    LanePair off = {z - expected, 0};
+#if BIAS
+    // z, z* and the bias nearly cancel.
+    const LanePair bias = {-TERM(10), -TERM(11)};
+    off = pair_sum_lanes(two_sum_lanes(z, -expected), bias);
+    off.hi = clamped ? z - mean : off.hi;
+    off.lo = clamped ? (lanes)0 : off.lo;
+#endif
+#if SHARP
+    LanePair square = two_product_lanes(off.hi, off.hi);
+#if BIAS
+    square.lo += 2 * off.hi * off.lo;
+#endif
+    const LanePair product = two_product_lanes(square.hi, TERM(1));
+    const LanePair exponent = {product.hi, product.lo + (square.lo * TERM(1) + square.hi * TERM(9))};
+#if GROWTH
+    return pair_product_lanes(exponent, pair_product_lanes(scale, scale));
+#else
+    return exponent;
+#endif
+#else
+#if GROWTH
+    const lanes scaled = off.hi * scale.hi;
+    return (LanePair){scaled * (scaled * TERM(1)), 0};
+#else
+    return (LanePair){off.hi * (off.hi * TERM(1)), 0};
+#endif
+#endif
+}
+
+// Return the normal's mass on [0, range_max]; within becomes whether it is 1 in every lane.
+lanes hit_mass_lanes(const lanes mean, const lanes erf_scale, const real range_max, int *within) {
+    const lanes below = mean * erf_scale, above = (range_max - mean) * erf_scale;
     const lanes nearer = below < above ? below : above;
-    if (any_lane(nearer < ERF_ONE))
-        p += hit / (0.5f * (erf_lanes(nearer) + erf_lanes(below < above ? above : below)));
-    else
-        p += hit;
+    *within = !any_lane(nearer < ERF_ONE);
+    if (*within) return 1;
+    return (real)0.5 * (erf_lanes(nearer) + erf_lanes(below < above ? above : below));
+}
+#endif
+
+#if SHORT
+// Return (1 - exp(-lambda z*)) / lambda, the length that divides p_short: z* to the last bit where lambda z* is small.
+lanes short_length_lanes(const lanes expected, global const real *terms, const ilanes bin_at) {
+    const lanes x = TERM(4) * expected;
+    const lanes length = x > SMALL_DECAY ? one_minus_exp_lanes(-x) * (1 / TERM(4)) : expected;
+    return length > SMALLEST_RANGE ? length : (lanes)SMALLEST_RANGE;
+}
+#endif
+
+#if LINEAR
+// Return log p(z | z*). p_rand > 0 bounds the sum from below, so each component may underflow, and one logarithm is
+// enough.
+lanes log_density_lanes(const lanes z, const lanes expected, global const real *terms, const ilanes bin_at) {
+    lanes p = TERM(5);
+#if HIT
+    ilanes clamped;
+    int within;
+    const lanes mean = mean_range_lanes(expected, terms, bin_at, &clamped);
+    const LanePair scale = hit_scale_lanes(expected, terms, bin_at);
+    const LanePair exponent = hit_exponent_lanes(z, expected, mean, clamped, scale, terms, bin_at);
+    lanes hit = TERM(0) * exp_lanes(-exponent.hi);
+#if GROWTH
+    hit *= scale.hi;
+    const lanes mass = hit_mass_lanes(mean, TERM(2) * scale.hi, terms[6], &within);
+#else
+    const lanes mass = hit_mass_lanes(mean, TERM(2), terms[6], &within);
+#endif
+#if SHARP
+    // Where the density underflows, the second part may be anything.
+    hit = hit > 0 ? hit * (1 - exponent.lo) : hit;
+#endif
+    p += within ? hit : hit / mass;
 #endif
 #if SHORT
-    // short_factor(x) / z* with one division: (1 - exp(-x)) / lambda is z* to the last bit where x is small.
-    const lanes x = terms[4] * expected;
-    const lanes length = x > SMALL_DECAY ? one_minus_exp_lanes(-x) * (1 / terms[4]) : expected;
-    const lanes divisor = length > SMALLEST_RANGE ? length : (lanes)SMALLEST_RANGE;
-    const lanes within = terms[3] * exp_lanes(-terms[4] * z) / divisor;
-    p += ((z <= expected) & (expected > 0)) ? within : (lanes)0;
+    const lanes shorter = TERM(3) * exp_lanes(-TERM(4) * z) / short_length_lanes(expected, terms, bin_at);
+    p += ((z <= expected) & (expected > 0)) ? shorter : (lanes)0;
 #endif
     return log_lanes(p);
 }
+#else
+// Return log p(z | z*). Every component stays a logarithm; -inf only where the mixture is 0.
+lanes log_density_lanes(const lanes z, const lanes expected, global const real *terms, const ilanes bin_at) {
+    lanes largest = -INFINITY;
+#if HIT
+    ilanes clamped;
+    int within;
+    const lanes mean = mean_range_lanes(expected, terms, bin_at, &clamped);
+    const LanePair scale = hit_scale_lanes(expected, terms, bin_at);
+    const LanePair exponent = hit_exponent_lanes(z, expected, mean, clamped, scale, terms, bin_at);
+    lanes hit = (TERM(0) - exponent.hi) + (TERM(8) - exponent.lo);
+#if GROWTH
+    hit += log_lanes(scale.hi);
+    const lanes mass = hit_mass_lanes(mean, TERM(2) * scale.hi, terms[6], &within);
+#else
+    const lanes mass = hit_mass_lanes(mean, TERM(2), terms[6], &within);
+#endif
+    if (!within) hit = mass == 1 ? hit : hit - log_lanes(mass);
+    largest = hit;
+#endif
+#if SHORT
+    const lanes decayed = (TERM(3) - log_lanes(short_length_lanes(expected, terms, bin_at))) - TERM(4) * z;
+    const lanes shorter = ((z <= expected) & (expected > 0)) ? decayed : (lanes)-INFINITY;
+    largest = larger_lanes(shorter, largest);
+#endif
+#if RAND
+    const lanes random = TERM(5);
+    largest = larger_lanes(random, largest);
+#endif
+#if SINGLE
+    return largest;
+#else
+#if RAND
+    lanes p = exp_lanes(random - largest);
+#if HIT
+    p += exp_lanes(hit - largest);
+#endif
+#if SHORT
+    p += exp_lanes(shorter - largest);
+#endif
+#else
+    // Of two components the larger counts as 1.
+    const lanes p = 1 + exp_lanes((hit < shorter ? hit : shorter) - largest);
+#endif
+    const lanes sum = largest + log_lanes(p);
+    return largest == -INFINITY ? largest : sum;
+#endif
+}
+#endif
+
+#if CUBES
+// Return the densities to be cubed: compat_density of compat.cl.
+lanes compat_density_lanes(const lanes z, const lanes expected, global const real *terms) {
+    const lanes off = z - expected;
+    lanes p = terms[0] * exp_lanes(-(off * (off * terms[1])));
+#if AMCL
+    p += z < expected ? terms[3] * terms[4] * exp_lanes(-terms[4] * z) : (lanes)0;
+    return z > terms[6] ? p : p + (z >= terms[6] ? (lanes)terms[7] : (lanes)terms[5]);
+#else
+    int within;
+    const lanes mass = hit_mass_lanes(expected, terms[2], terms[6], &within);
+    p = within ? p : p / mass;
+    p += z < expected ? terms[3] * exp_lanes(-terms[4] * z) / short_length_lanes(expected, terms, 0) : (lanes)0;
+    return p + (z >= terms[6] ? (lanes)terms[7] : (lanes)terms[5]);
+#endif
+}
+#endif

@@ -1,15 +1,36 @@
 // Vector types of the kernels in this folder: one work-item computes LANES particles, beams or pairs at once. They are
 // for processors whose compilers make no vector code of scalar kernels. Where a processor's vectors are shorter than
 // LANES, the loads of several vectors wait for memory side by side. A function in lanes has the name of its scalar one
-// and the ending _lanes. There are 16 lanes of float32; the sums for learning alone have lanes of float64, 8 of them.
+// and the ending _lanes. There are 16 lanes of float32, or 8 of float64.
 // PoCL compiles any, fabs, fmax, min and max as calls, which are too slow for an inner loop: comparisons and masks
 // stand in their place.
 
 #if FLOAT64
 typedef double8 lanes;
 typedef long8 ilanes;
+typedef long lane_int;
 #define LANES 8
+#define as_ilanes as_long8
+#define as_lanes as_double8
 #define load_lanes vload8
+#define store_lanes vstore8
+#define GATHER(type, table, i)                                                                                           \
+    ((type)(table[i.s0], table[i.s1], table[i.s2], table[i.s3], table[i.s4], table[i.s5], table[i.s6], table[i.s7]))
+#define GATHER_AT(type, table, i)                                                                                        \
+    ((type)(table[i[0]], table[i[1]], table[i[2]], table[i[3]], table[i[4]], table[i[5]], table[i[6]], table[i[7]]))
+// 1.5 * 2^52 and its bits: a sum of it and an integer has the integer in its last bits. Not every processor converts
+// vectors of 64 bits.
+#define LANE_INTEGERS 6755399441055744.0
+#define LANE_INTEGER_BITS 0x4338000000000000L
+
+// Convert integers below 2^51.
+lanes to_lanes(const ilanes i) { return as_lanes(i + LANE_INTEGER_BITS) - LANE_INTEGERS; }
+
+// Round down; truncate to an integer numbers that are not negative.
+ilanes to_ilanes(const lanes a) {
+    const lanes shifted = a + LANE_INTEGERS;
+    return as_ilanes(shifted) - LANE_INTEGER_BITS + (shifted - LANE_INTEGERS > a);
+}
 
 // Return whether a comparison holds in any lane.
 int any_lane(const ilanes holds) {
@@ -27,6 +48,7 @@ real sum_lanes(const lanes a) {
 #else
 typedef float16 lanes;
 typedef int16 ilanes;
+typedef int lane_int;
 #define LANES 16
 #define to_lanes convert_float16
 #define to_ilanes convert_int16_rtz
@@ -60,3 +82,11 @@ real sum_lanes(const lanes a) {
 // Return the bits of the absolute values; as integers they have the order of the values.
 ilanes size_bits(const lanes a) { return as_ilanes(a) & 0x7fffffff; }
 #endif
+
+// Return the vector of numbers in memory, the last of count standing in for those beyond it.
+lanes load_some(global const real *numbers, const int count) {
+    if (count >= LANES) return load_lanes(0, numbers);
+    real some[LANES];
+    for (int i = 0; i < LANES; ++i) some[i] = numbers[min(i, count - 1)];
+    return load_lanes(0, some);
+}

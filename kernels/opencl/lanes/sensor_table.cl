@@ -1,0 +1,17 @@
+// Densities of LANES readings from a table: sensor_table.cl in lanes.
+// requires: lanes/types
+
+// Return the bins of ranges; the last one, after the cells, is for range_max and more.
+ilanes range_bin_lanes(const lanes range, const MixtureTables tables, const real range_max) {
+    const ilanes top = range >= range_max, bin = to_ilanes((top ? (lanes)0 : range) * tables.per_metre);
+    const ilanes within = bin < tables.cells ? bin : (ilanes)(tables.cells - 1);
+    return top ? (ilanes)tables.cells : within;
+}
+
+// Return log p of readings for expected ranges.
+lanes tabulated_density_lanes(const lanes z, const lanes expected, global const real *sensor,
+                              const MixtureTables tables, const real range_max) {
+    const ilanes column = range_bin_lanes(expected, tables, range_max);
+    const ilanes at = range_bin_lanes(z, tables, range_max) * (tables.cells + 1) + column;
+    return GATHER(lanes, sensor, at);
+}

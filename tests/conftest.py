@@ -74,15 +74,17 @@ def device(request: pytest.FixtureRequest, needs: Callable[[str], str]) -> Backe
 
 
 @pytest.fixture
-def as_gpu(backend: str) -> Iterator[Callable[[bool], Backend]]:
-    """Return a function that makes each tested backend pretend to be a GPU (True) or a processor (False)."""
+def as_gpu(backend: str) -> Iterator[Callable[..., Backend]]:
+    """Return a function that makes each tested backend pretend to be a GPU (True) or a processor (False).
+
+    With ``scalar`` the processor's kernels compute one particle or beam at once, as those of a GPU do.
+    """
     device = get_backend(backend)
     before = device.info
 
-    def pretend(gpu: bool = True) -> Backend:
-        device.info = (
-            dataclasses.replace(before, kind="gpu", lanes=1) if gpu else dataclasses.replace(before, kind="cpu")
-        )
+    def pretend(gpu: bool = True, *, scalar: bool = False) -> Backend:
+        lanes = 1 if gpu or scalar else before.lanes
+        device.info = dataclasses.replace(before, kind="gpu" if gpu else "cpu", lanes=lanes)
         return device
 
     yield pretend

@@ -71,7 +71,9 @@ def beam_options(scene: Scene, scanner: gs.Scanner) -> Iterator[Option]:
     yield option("sigma_hit = 4 mm", 1.05, gs.BeamParameters(sigma_hit=0.004))
     yield option("fitted: 5 mm, bias, growth", 1.05, FITTED)
     yield option("sensor_table=0.05", 1.05, sensor_table=0.05)
-    yield option("incidence, 3 bins", 1.5, None, incidence=gs.IncidenceParameters((0.0, 0.5, 1.0, math.pi / 2), (BEAM,) * 3))
+    yield option(
+        "incidence, 3 bins", 1.5, None, incidence=gs.IncidenceParameters((0.0, 0.5, 1.0, math.pi / 2), (BEAM,) * 3)
+    )
     yield option("float64", 2.2, precision="float64")
     yield option("60 of the beams", 0.3, beams=60)
     yield option("look-up, 54 bins", 1.05, caster=gs.casters.Lookup(54))
@@ -153,7 +155,9 @@ def main() -> None:
     parser.add_argument("--particles", type=int, default=2000, help="default: %(default)s")
     parser.add_argument("--beams", type=int, default=360, help="default: %(default)s")
     parser.add_argument("--cloud", choices=("tracking", "global"), default="tracking", help="default: %(default)s")
-    parser.add_argument("--rounds", type=int, default=15, help="in which every option has a turn (default: %(default)s)")
+    parser.add_argument(
+        "--rounds", type=int, default=15, help="in which every option has a turn (default: %(default)s)"
+    )
     parser.add_argument("--only", action="append", default=[], help="a row's name, repeatable; default: all")
     arguments = parse(parser)
     scene = Scene(arguments)
@@ -171,7 +175,8 @@ def main() -> None:
             )  # fmt: skip
             note(" ".join(rows[-1]))
     names = ["backend", "model", "option", "ms a call", "times the default", "quartiles", "at most"]
-    title = f"# Options of the scan models\n\n{arguments.particles} particles x {arguments.beams} beams, {arguments.cloud}, {scene.label}.\n\n"
+    sizes = f"{arguments.particles} particles x {arguments.beams} beams, {arguments.cloud}, {scene.label}"
+    title = f"# Options of the scan models\n\n{sizes}.\n\n"
     publish(__file__, arguments, title + table(names, rows), {"rows": report})
 
 

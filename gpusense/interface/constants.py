@@ -20,7 +20,7 @@ FIELD_RING = 2
 # Kernel file relative: coordinates are clamped to this [m]; its square is finite in float32.
 FARTHEST = float(1 << 60)
 # Kernel file mixture: numbers of the mixture for a bin of angles of incidence.
-MIXTURE_TERMS = 14
+MIXTURE_TERMS = 17
 # Kernel file absolute: distributions of a heading (a sum of normals, its Fourier series, von Mises); turns on either
 # side and waves that are summed; exp(-NEGLIGIBLE) is below half an eps.
 NEARBY, SERIES, VON_MISES = 0, 1, 2

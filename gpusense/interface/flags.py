@@ -16,6 +16,7 @@ FLAGS = {
     "SHARP": "the normal density's peak is so high that exponents need more than the working precision",
     "SINGLE": "the mixture has one continuous component",
     "LINEAR": "z_rand is large enough for the mixture to be summed as densities, not as logarithms",
+    "STOPS": "a ray ends behind its reading, where an obstacle no longer changes the density",
     "SECTORS_2": "empty rectangles are made for 2 sectors of each quadrant's directions",
     "SECTORS_4": "empty rectangles are made for 4 of them",
     **casters.FLAGS,

@@ -10,7 +10,7 @@ from gpusense.interface import structs
 from gpusense.reference.compat import compat_density
 from gpusense.reference.echo import echoes, incidence_terms
 from gpusense.reference.error_free import add_term, strand_sums, strands_in
-from gpusense.reference.mixture import log_density
+from gpusense.reference.mixture import last_range, log_density
 from gpusense.reference.ranges import cast_ranges
 from gpusense.reference.ray import expected_range
 from gpusense.reference.scans import particles_of_scans
@@ -108,6 +108,9 @@ def score_beams(
             )  # fmt: skip
         expected = ranges.reshape(end - begin, rays)[:, ray_of]
         z = np.broadcast_to(reading[:readings], expected.shape)
+        if "STOPS" in flags:
+            # Rays need not be cast farther; here they are.
+            expected = np.fmin(expected, last_range(z, terms))
         term = reading_term(flags, z, expected, bin_terms, sensor, tables, scale.range_max)
         if "PER_BEAM" in flags:
             parts[begin * readings : end * readings] = term.ravel()

@@ -1,9 +1,10 @@
 """Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
 
-``terms`` = (hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, the low parts of terms
-0 and 1, range_bias and its low part, sigma_growth / sigma_hit and its low part). In the linear domain hit is z_hit /
-(sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max; in the log domain they are the logarithms of these.
-The mean of p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma is sigma_hit + sigma_growth z* (GROWTH).
+``terms`` = (hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, the low parts of
+terms 0 and 1, range_bias and its low part, sigma_growth / sigma_hit and its low part, three numbers for last_range).
+In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max; in the log
+domain they are the logarithms of these. The mean of p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma
+is sigma_hit + sigma_growth z* (GROWTH).
 """
 
 from __future__ import annotations
@@ -15,6 +16,14 @@ from gpusense.reference.error_free import Pair, pair_product, pair_sum, two_prod
 
 TINY = 1e-30
 SMALLEST_RANGE = 1e-37
+
+
+def last_range(z: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """Return the expected ranges of readings from which on log p does not change by a bit.
+
+    It is that of p_rand, or of p_short far from its end: an obstacle farther away changes nothing.
+    """
+    return np.maximum(terms[14] + terms[15] * z, terms[16])
 
 
 def hit_mass(expected: np.ndarray, erf_scale: float, range_max: np.floating) -> np.ndarray:

@@ -59,6 +59,7 @@ class Caster(ABC):
         backends: Backends that have it.
         whole: Whether the table needs the whole map at once.
         ring: Whether the table has a ring of cells that stands for space outside the grid.
+        stops: Whether a ray may end before the longest range.
     """
 
     name: ClassVar[str]
@@ -70,6 +71,7 @@ class Caster(ABC):
     backends: ClassVar[tuple[str, ...]] = tuple(BY_NAME)
     whole: ClassVar[bool] = False
     ring: ClassVar[bool] = True
+    stops: ClassVar[bool] = True
 
     @property
     def beyond(self) -> int:

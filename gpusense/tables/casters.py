@@ -86,6 +86,7 @@ class Bresenham(Caster):
     lines: str | None = None
 
     name = "bresenham"
+    stops = False
     error = "about a cell, from centre to centre; lines slip between walls that touch at a corner"
     memory = "1 byte per cell of the reachable map"
     precomputation = "none"
@@ -207,6 +208,7 @@ class Lookup(Caster):
     file: str | Path | None = None
 
     name = "lookup"
+    stops = False
     error = "position to half a cell, bearing to pi / bins: as wrong as the ranges differ there"
     memory = "2 bytes per bin and cell of the whole map"
     precomputation = "a ray per bin and cell by the exact caster"

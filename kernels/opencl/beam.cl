@@ -2,6 +2,16 @@
 // Readings whose density does not depend on the pose are not passed in: their sum is the constant term.
 // requires: error_free caster echo tiles mixture sensor_table compat
 
+// Return the distance in cells to which the ray of a reading is cast.
+real ray_limit(const real z, global const real *terms, const RangeScale scale) {
+#if STOPS
+    const real last = last_range(z, terms) / scale.resolution;
+    return last < scale.limit ? last : scale.limit;
+#else
+    return scale.limit;
+#endif
+}
+
 // Return the term of one reading in the sum.
 real reading_term(const real z, const real expected, global const real *terms, global const real *sensor,
                   const MixtureTables tables, const real range_max) {
@@ -66,10 +76,11 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
     for (int r = 0; r < size; ++r) {
 #if ECHO
         const Echo echo = nearest_echo(map_table, normals, window, pose_cell[n], pose[n], ray + r * cone.rays, cone,
-                                       scale.limit, caster);
+                                       ray_limit(reading[r], terms, scale), caster);
         const real t = echo.t;
 #else
-        const real t = cast_ray(map_table, window, pose_cell[n], pose[n], ray[r], scale.limit, caster);
+        const real t = cast_ray(map_table, window, pose_cell[n], pose[n], ray[r],
+                                ray_limit(reading[r], terms, scale), caster);
 #endif
         const real expected = expected_range(t, scale);
 #if INCIDENCE
@@ -152,10 +163,11 @@ kernel void beam_tiles(global const entry *restrict map_table, global const real
 #endif
 #if ECHO
         const Echo echo = nearest_echo(map_table, normals, window, cell, sensor_pose, ray + r * cone.rays, cone,
-                                       scale.limit, caster);
+                                       ray_limit(reading[r], terms, scale), caster);
         const real t = echo.t;
 #else
-        const real t = cast_ray(map_table, window, cell, sensor_pose, ray[r], scale.limit, caster);
+        const real t = cast_ray(map_table, window, cell, sensor_pose, ray[r], ray_limit(reading[r], terms, scale),
+                                caster);
 #endif
         const real expected = expected_range(t, scale);
 #if INCIDENCE

@@ -1,16 +1,26 @@
-// Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom. terms[14]
-// = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, the low parts of terms 0 and
-// 1, range_bias and its low part, sigma_growth / sigma_hit and its low part}. In the linear domain hit is z_hit / (sigma
-// sqrt(2 pi)), short is z_short and rand is z_rand / range_max; in the log domain they are the logarithms of these. The
-// mean of p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma is sigma_hit + sigma_growth z* (GROWTH).
+// Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
+// terms[17] = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, the low parts of
+// terms 0 and 1, range_bias and its low part, sigma_growth / sigma_hit and its low part, three numbers for
+// last_range}. In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is z_rand /
+// range_max; in the log domain they are the logarithms of these. The mean of p_hit is z* + range_bias on [0,
+// range_max] (BIAS), and its sigma is sigma_hit + sigma_growth z* (GROWTH).
 // requires: error_free
 
-#define MIXTURE_TERMS 14
+#define MIXTURE_TERMS 17
 // From here on the error function is 1 to the last bit.
 #define ERF_ONE ((real)(FLOAT64 ? 6 : 4))
 // Keep 2 / x and 1 / z* finite.
 #define TINY_DECAY ((real)1e-30)
 #define SMALLEST_RANGE ((real)1e-37)
+
+#if STOPS
+// Return the expected range of a reading from which on log p is that of p_rand, or of p_short far from its end, to the
+// last bit: an obstacle farther away changes nothing.
+real last_range(const real z, global const real *terms) {
+    const real last = terms[14] + terms[15] * z;
+    return last > terms[16] ? last : terms[16];
+}
+#endif
 
 #if HIT
 // Return the mass of the untruncated normal around z* on [0, range_max], a sum of positive terms, so nothing cancels.

@@ -30,6 +30,8 @@ def make(name, flags):
     SENSOR_TABLE = "SENSOR_TABLE" in flags
     CUBES = "CUBES" in flags
     log_density = mixture.functions(flags).log_density
+    last_range = mixture.functions(flags).last_range
+    STOPS = "STOPS" in flags
     add_strands = error_free.functions(flags).add_strands
     SHARED_RAYS = "SHARED_RAYS" in flags
     ALL_READINGS = "ALL_READINGS" in flags
@@ -46,6 +48,14 @@ def make(name, flags):
     number_at, put = reader(real), writer(real)
     ZERO = real(0.0)
     NEVER = real(-math.inf)
+
+    # Return the distance in cells to which the ray of a reading is cast.
+    @wp.func
+    def ray_limit(z: real, terms: wp.array(dtype=real), scale: types.RangeScale):
+        if STOPS:
+            return wp.min(last_range(z, terms) / scale.resolution, scale.limit)
+        else:
+            return scale.limit
 
     # Return the term of one reading in the sum.
     @wp.func
@@ -131,16 +141,19 @@ def make(name, flags):
         impossible = bool(False)
         for r in range(size):
             bin_terms = terms
+            limit = scale.limit
+            if STOPS:
+                limit = ray_limit(number_at(reading, readings_before + r), terms, scale)
             if ECHO:
                 heard = nearest_echo(
-                    map_table, normals, window, cell, sensor_pose, ray, (before + r) * cone.rays, cone, scale.limit,
+                    map_table, normals, window, cell, sensor_pose, ray, (before + r) * cone.rays, cone, limit,
                     caster,
                 )  # fmt: skip
                 t = heard.t
                 if INCIDENCE:
                     bin_terms = incidence_terms(terms, edges, tables.incidence_bins, heard.cosine)
             else:
-                t = cast_ray(map_table, window, cell, sensor_pose, ray_at(ray, before + r), scale.limit, caster)
+                t = cast_ray(map_table, window, cell, sensor_pose, ray_at(ray, before + r), limit, caster)
             expected = expected_range(t, scale)
             begin = r
             end = r + 1
@@ -222,16 +235,19 @@ def make(name, flags):
             r = tile_ray(item, spread)
         while r < size:
             bin_terms = terms
+            limit = scale.limit
+            if STOPS:
+                limit = ray_limit(number_at(reading, readings_before + r), terms, scale)
             if ECHO:
                 heard = nearest_echo(
-                    map_table, normals, window, cell, sensor_pose, ray, (before + r) * cone.rays, cone, scale.limit,
+                    map_table, normals, window, cell, sensor_pose, ray, (before + r) * cone.rays, cone, limit,
                     caster,
                 )  # fmt: skip
                 t = heard.t
                 if INCIDENCE:
                     bin_terms = incidence_terms(terms, edges, tables.incidence_bins, heard.cosine)
             else:
-                t = cast_ray(map_table, window, cell, sensor_pose, ray_at(ray, before + r), scale.limit, caster)
+                t = cast_ray(map_table, window, cell, sensor_pose, ray_at(ray, before + r), limit, caster)
             expected = expected_range(t, scale)
             k = r
             end = r + 1

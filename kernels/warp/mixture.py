@@ -1,9 +1,10 @@
 """Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
 
-terms[14] = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, the low parts of terms
-0 and 1, range_bias and its low part, sigma_growth / sigma_hit and its low part}. In the linear domain hit is z_hit /
-(sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max; in the log domain they are the logarithms of these.
-The mean of p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma is sigma_hit + sigma_growth z* (GROWTH).
+terms[17] = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, the low parts of
+terms 0 and 1, range_bias and its low part, sigma_growth / sigma_hit and its low part, three numbers for last_range}.
+In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max; in the log
+domain they are the logarithms of these. The mean of p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma
+is sigma_hit + sigma_growth z* (GROWTH).
 """
 
 import functools
@@ -15,7 +16,7 @@ import warp as wp
 from . import error_free
 from .prelude import precision, reader
 
-MIXTURE_TERMS = 14
+MIXTURE_TERMS = 17
 
 
 @functools.cache
@@ -42,6 +43,12 @@ def functions(flags):
     # Keep 2 / x and 1 / z* finite.
     TINY = real(1e-30)
     SMALLEST_RANGE = real(1e-37)
+
+    # Return the expected range of a reading from which on log p is that of p_rand, or of p_short far from its end, to
+    # the last bit: an obstacle farther away changes nothing.
+    @wp.func
+    def last_range(z: real, terms: wp.array(dtype=real)):
+        return wp.max(at(terms, 14) + at(terms, 15) * z, at(terms, 16))
 
     # Return the mass of the untruncated normal around z* on [0, range_max], a sum of positive terms, so nothing
     # cancels. Most ranges are far from both ends and most others far from one of them; rays without an obstacle are at
@@ -208,5 +215,6 @@ def functions(flags):
                 return largest + wp.log(p)
 
     return SimpleNamespace(
-        hit_mass=hit_mass, short_factor=short_factor, log_hit=log_hit, log_short=log_short, log_density=log_density
-    )
+        last_range=last_range, hit_mass=hit_mass, short_factor=short_factor, log_hit=log_hit, log_short=log_short,
+        log_density=log_density,
+    )  # fmt: skip

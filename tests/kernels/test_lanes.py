@@ -100,7 +100,9 @@ NARROW = gs.BeamParameters(0.7, 0.1, 0.1, 0.1, 0.004, 0.3)
 MOVED = gs.BeamParameters(0.7, 0.1, 0.1, 0.1, 0.1, 0.3, range_bias=0.03, sigma_growth=0.01)
 ANGLES = gs.IncidenceParameters((0.0, 0.6, 1.1, math.pi / 2), (NARROW, MOVED, gs.BeamParameters()))
 CHANCES = gs.IncidenceParameters(
-    (0.0, 0.6, math.pi / 2), (MOVED, gs.BeamParameters(0.5, 0.1, 0.3, 0.1)), no_surface=gs.BeamParameters(0, 0, 0.9, 0.1)
+    (0.0, 0.6, math.pi / 2),
+    (MOVED, gs.BeamParameters(0.5, 0.1, 0.3, 0.1)),
+    no_surface=gs.BeamParameters(0, 0, 0.9, 0.1),
 )
 BEAM_OPTIONS = {
     "logarithms": dict(parameters=gs.BeamParameters(0.8, 0.1, 0.1, 0.0)),

@@ -131,6 +131,8 @@ class BeamPipeline(ScanPipeline):
     def flags(self, conditions: frozenset[str], *, tiled: bool, per_beam: bool) -> frozenset[str]:
         """See ScanPipeline.flags."""
         flags = self._fixed_flags | self.cones.flags | conditions
+        if "SHARED_RAYS" in flags or not self.caster.method.stops:
+            flags -= {"STOPS"}
         if tiled:
             return flags
         return widened(self.backend.info.lanes, "score_beams", flags | flags_if(PER_BEAM=per_beam))

@@ -104,12 +104,14 @@ def mixture_of(
         sums_linearly(p.z_rand / range_max, max(peak, p.z_short * p.lambda_short), real)
         for p, peak in zip(kinds, peaks, strict=True)
     )
+    ends = [_last_range(p, range_max, real, linear) for p in kinds]
     flags = flags_if(
         HIT=hit or everything, SHORT=short or everything, RAND=rand or everything,
         BIAS=everything or any(p.range_bias for p in kinds), GROWTH=everything or any(p.sigma_growth for p in kinds),
         SINGLE=specialize and hit + short + rand == 1, SHARP=max(peaks) > HIGH_PEAK or everything, LINEAR=linear,
+        STOPS=specialize and len(ends) == 1 and ends[0] is not None,
     )  # fmt: skip
-    return flags, np.concatenate([_terms(p, range_max, real, linear) for p in kinds])
+    return flags, np.concatenate([_terms(p, range_max, real, linear, end) for p, end in zip(kinds, ends, strict=True)])
 
 
 def peer_mixture(
@@ -156,14 +158,46 @@ def _shape(p: BeamParameters) -> tuple[float, float]:
     return 0.5 / p.sigma_hit / p.sigma_hit, math.sqrt(0.5) / p.sigma_hit
 
 
-def _terms(p: BeamParameters, range_max: float, real: np.dtype, linear: bool) -> np.ndarray:
+def _terms(
+    p: BeamParameters, range_max: float, real: np.dtype, linear: bool, end: tuple[float, float, float] | None
+) -> np.ndarray:
     if linear:
         head = (_peak(p), p.z_short, p.z_rand / range_max)
     else:
         log_scale = log_weight(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi)
         head = (log_scale, log_weight(p.z_short), log_weight(p.z_rand) - math.log(range_max))
     terms = [head[0], *_shape(p), head[1], p.lambda_short, head[2], range_max, log_weight(p.z_max)]
-    return np.append(rounded_terms(terms, real), _moments(p, real))
+    return np.concatenate([rounded_terms(terms, real), _moments(p, real), np.array(end or (0, 0, 0), real)])
+
+
+def _last_range(p: BeamParameters, range_max: float, real: np.dtype, linear: bool) -> tuple[float, float, float] | None:
+    """Return the numbers (offset, slope, least) of an expected range from which on log p is constant to the last bit.
+
+    It is ``max(offset + slope z, least)`` for a reading z. From there on p_hit, divided by its mass, is at most
+    2^-(digits + 3) p_rand: ``z* + bias - z >= u (sigma_hit + sigma_growth z*)`` with u from the peak over p_rand. An
+    offset above 0 only moves the mean farther away. p_short's normaliser is constant where ``exp(-lambda_short z*)`` is
+    below half of the last bit of 1.
+
+    Returns:
+        None where there is no such range below range_max for some reading.
+    """
+    rand, digits = p.z_rand / range_max, np.finfo(real).nmant
+    if not rand or (p.z_short and not (linear and p.lambda_short)):
+        return None
+    least = (digits + 9) * math.log(2) / p.lambda_short if p.z_short else 0.0
+    offset, slope = 0.0, 1.0
+    if p.z_hit:
+        widest = p.sigma_hit + p.sigma_growth * range_max
+        mass = 0.5 * math.erf(range_max * math.sqrt(0.5) / widest)
+        excess = math.log(_peak(p)) - math.log(mass * rand) + (digits + 3) * math.log(2)
+        u = math.sqrt(max(2 * excess, 0.0))
+        if u * p.sigma_growth >= 0.5:
+            return None
+        slope = 1 / (1 - u * p.sigma_growth)
+        offset = (u * p.sigma_hit + max(-p.range_bias, 0.0)) * slope
+    # More than the rounding errors of ranges.
+    slope, offset = slope * 1.0001, offset * 1.0001 + 1e-6 * range_max
+    return (offset, slope, least) if max(offset, least) < range_max else None
 
 
 def _moments(p: BeamParameters, real: np.dtype) -> np.ndarray:

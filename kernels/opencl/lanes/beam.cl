@@ -1,6 +1,16 @@
 // Beam model of a whole scan, LANES rays at once: score_beams of beam.cl, with sums in the same order.
 // requires: error_free lanes/returns lanes/mixture lanes/sensor_table
 
+// Return the distances in cells to which the rays of readings are cast.
+lanes ray_limit_lanes(const lanes z, global const real *terms, const RangeScale scale) {
+#if STOPS
+    const lanes reach = terms[14] + terms[15] * z, last = (reach > terms[16] ? reach : (lanes)terms[16]) / scale.resolution;
+    return last < scale.limit ? last : (lanes)scale.limit;
+#else
+    return scale.limit;
+#endif
+}
+
 // Return the terms of readings in the sum.
 lanes reading_term_lanes(const lanes z, const EchoLanes echo, global const real *terms, global const real *edges,
                          global const real *sensor, const MixtureTables tables, const RangeScale scale) {
@@ -73,6 +83,7 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
     ilanes impossible = 0;
     for (int k = 0; k < count; k += LANES) {
         const int left = count - k;
+        const lanes z = load_some(reading + k, left);
 #if SHARED_RAYS
         // Readings of the same ray are neighbours, so those of a vector have rays of two vectors at most.
         int at[LANES];
@@ -94,9 +105,9 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
         const EchoLanes echo = {load_lanes(0, t), load_lanes(0, cosine)};
 #else
         const EchoLanes echo = nearest_echo_lanes(map_table, normals, window, pose_cell[n], pose[n], ray, k, size,
-                                                  cone, scale.limit, caster);
+                                                  cone, ray_limit_lanes(z, terms, scale), caster);
 #endif
-        lanes term = reading_term_lanes(load_some(reading + k, left), echo, terms, edges, sensor, tables, scale);
+        lanes term = reading_term_lanes(z, echo, terms, edges, sensor, tables, scale);
         real values[LANES];
         if (left < LANES) {
             store_lanes(term, 0, values);

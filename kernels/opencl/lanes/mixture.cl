@@ -171,8 +171,13 @@ lanes log_density_lanes(const lanes z, const lanes expected, global const real *
     p += exp_lanes(shorter - largest);
 #endif
 #else
-    // Of two components the larger counts as 1.
-    const lanes p = 1 + exp_lanes((hit < shorter ? hit : shorter) - largest);
+    // The larger component counts as 1.
+    lanes p = 1;
+#if HIT
+#if SHORT
+    p += exp_lanes((hit < shorter ? hit : shorter) - largest);
+#endif
+#endif
 #endif
     const lanes sum = largest + log_lanes(p);
     return largest == -INFINITY ? largest : sum;

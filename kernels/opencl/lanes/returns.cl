@@ -54,10 +54,10 @@ void hit_normal_lanes(global const real2 *normals, const Window window, const in
 #endif
 
 // Return the nearest returns of the cones from index first on, the last of count cones standing in for those beyond it.
-// Nothing beyond limit counts.
+// Nothing beyond a lane's limit counts.
 EchoLanes nearest_echo_lanes(global const entry *map_table, global const real2 *normals, const Window window,
                              const int2 cell, const real4 pose, global const real2 *ray, const int first,
-                             const int count, const Cone cone, const real limit, const Caster caster) {
+                             const int count, const Cone cone, const lanes limit, const Caster caster) {
     lanes x, y;
 #if ECHO
     EchoLanes echo = {limit, 2};

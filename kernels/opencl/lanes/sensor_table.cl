@@ -3,9 +3,10 @@
 
 // Return the bins of ranges; the last one, after the cells, is for range_max and more.
 ilanes range_bin_lanes(const lanes range, const MixtureTables tables, const real range_max) {
-    const ilanes top = range >= range_max, bin = to_ilanes((top ? (lanes)0 : range) * tables.per_metre);
+    // Missing readings, which are NaN, are in no cell either.
+    const ilanes below = range < range_max, bin = to_ilanes((below ? range : (lanes)0) * tables.per_metre);
     const ilanes within = bin < tables.cells ? bin : (ilanes)(tables.cells - 1);
-    return top ? (ilanes)tables.cells : within;
+    return below ? within : (ilanes)tables.cells;
 }
 
 // Return log p of readings for expected ranges.

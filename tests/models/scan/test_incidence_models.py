@@ -89,7 +89,7 @@ def test_equal_bins_are_the_plain_model(weights, backend):
 
 def test_tiles_and_orders_change_nothing(as_gpu, backend, monkeypatch):
     _, poses, _ = place()
-    model, z = model_of(as_gpu(False)), a_scan()
+    model, z = model_of(as_gpu(False, scalar=True)), a_scan()
     one_by_one, parts = model.log_likelihood(poses, z, per_beam=True)
     assert "WIDE" not in model._last.flags
     for least in (tiles.LEAST_ORDERED, (1, 1)):
@@ -98,7 +98,7 @@ def test_tiles_and_orders_change_nothing(as_gpu, backend, monkeypatch):
         assert differing(tiled.log_likelihood(poses, z), one_by_one) == 0
         assert "INCIDENCE" in tiled._last.flags
     assert differing(tiled.log_likelihood(poses, z, per_beam=True)[1], parts) == 0
-    as_gpu(False)
+    as_gpu(False, scalar=True)
     assert differing(model.log_likelihood(poses[7:9], z), one_by_one[7:9]) == 0
 
 

@@ -123,12 +123,16 @@ def test_tiles_and_shared_cones_change_nothing(as_gpu, backend, monkeypatch):
     grid, poses, _ = place()
     scanner = gs.Scanner(np.append(RING, RING[3]), RANGE, mount=MOUNT, **SONAR)
     z = np.append(a_scan(), 2.0)
-    expected, parts = gs.BeamModel(grid, scanner, backend=as_gpu(False)).log_likelihood(poses, z, per_beam=True)
+    expected, parts = gs.BeamModel(grid, scanner, backend=as_gpu(False, scalar=True)).log_likelihood(
+        poses, z, per_beam=True
+    )
     monkeypatch.setattr(tiles, "LEAST_ORDERED", (1, 1))
     model = gs.BeamModel(grid, scanner, backend=as_gpu())
     assert differing(model.log_likelihood(poses, z), expected) == 0
     assert {"SHARED_RAYS", "ECHO", "INCIDENCE"} <= model._last.flags
-    alone = gs.BeamModel(grid, ring(**SONAR), backend=as_gpu(False)).log_likelihood(poses, a_scan(), per_beam=True)[1]
+    alone = gs.BeamModel(grid, ring(**SONAR), backend=as_gpu(False, scalar=True)).log_likelihood(
+        poses, a_scan(), per_beam=True
+    )[1]
     assert differing(parts[:, :8], alone) == 0
     assert differing(model.expected_ranges(poses)[:, 8], model.expected_ranges(poses)[:, 3]) == 0
 

@@ -100,6 +100,10 @@ class Backend(ABC):
         """Return a kernel by its name, specialised by flags; it is compiled once and kept."""
 
     @abstractmethod
+    def source(self, kernel: str, flags: frozenset[str]) -> str:
+        """Return the text from which ``compile`` makes a kernel."""
+
+    @abstractmethod
     def synchronize(self) -> None:
         """Wait until every launch and copy has ended."""
 

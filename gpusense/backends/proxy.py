@@ -49,6 +49,10 @@ class Proxy(Backend):
         """See Backend.compile."""
         return self._backend.compile(kernel, flags)
 
+    def source(self, kernel: str, flags: frozenset[str]) -> str:
+        """See Backend.source."""
+        return self._backend.source(kernel, flags)
+
     def synchronize(self) -> None:
         """See Backend.synchronize."""
         self._backend.synchronize()

@@ -6,7 +6,7 @@ map, the last scan and cloud. With ``specialize=False`` nothing is left out, and
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 
@@ -18,28 +18,62 @@ class Omission:
         what: The part that a scene does not need.
         why: The reason, with the numbers that decide it.
         saves: The computation, storage or copies that are saved.
+        flags: Flags of the scoring kernel that the part would add.
+        ends: Flags that it would take away.
     """
 
     what: str
     why: str
     saves: str
+    flags: frozenset[str] = frozenset()
+    ends: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class Note:
+    """A part that is kept, or that another choice would leave out."""
+
+    what: str
+    why: str
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The code of a model, and the parts that it leaves out."""
+    """The code of a model, the parts that it leaves out, those that it keeps, and those that could go.
+
+    Attributes:
+        title: The model and its device.
+        code: Flags of the last call.
+        omissions: The parts that are left out.
+        kept: The parts that the scene needs, and why.
+        could_go: Parts that another choice of the user would leave out.
+        measured: Measured savings of omissions [s], by their names.
+    """
 
     title: str
     code: frozenset[str]
     omissions: tuple[Omission, ...]
+    kept: tuple[Note, ...] = ()
+    could_go: tuple[Note, ...] = ()
+    measured: Mapping[str, float] | None = None
 
     def __str__(self) -> str:
         lines = [self.title, f"code: {' '.join(sorted(self.code)) or 'plain'}"]
         if not self.omissions:
             lines.append("nothing is left out")
-        width = max((len(omission.what) for omission in self.omissions), default=0)
-        lines += [f"- {o.what:<{width}}  {o.why}; saves {o.saves}" for o in self.omissions]
+        names = [part.what for part in self.omissions] + [part.what for part in (*self.kept, *self.could_go)]
+        width = max(map(len, names), default=0)
+        lines += [f"- {o.what:<{width}}  {o.why}; saves {o.saves}{self._saving(o)}" for o in self.omissions]
+        for heading, mark, parts in (("kept:", "+", self.kept), ("could go:", "?", self.could_go)):
+            if parts:
+                lines += [heading, *(f"{mark} {note.what:<{width}}  {note.why}" for note in parts)]
         return "\n".join(lines)
+
+    def _saving(self, omission: Omission) -> str:
+        if self.measured is None:
+            return ""
+        seconds = self.measured.get(omission.what)
+        return "; not timed" if seconds is None else f"; measured {1e3 * seconds:+.3f} ms"
 
 
 ORDINARY_HEADINGS = Omission(
@@ -52,47 +86,28 @@ def share(part: float, whole: float) -> str:
     return f"{100 * part / whole:.0f} %" if whole else "0 %"
 
 
-def scene_omissions(
-    *,
-    components: Iterable[tuple[str, float, str]],
-    mount: tuple[float, float, float],
-    unknown: str,
-    outside: str,
-    precision: str,
-    ring: bool = True,
-) -> list[Omission]:
-    """Return the parts that parameters, scanner and map make unnecessary, before any scan.
+def component_notes(components: Iterable[tuple[str, float, str]]) -> tuple[list[Omission], list[Note]]:
+    """Return the components of a mixture whose weight is 0, and the others.
 
     Args:
         components: (parameter, its weight, cost of its component per particle-beam).
-        mount: The scanner's pose on the robot.
-        unknown: Policy for unknown cells.
-        outside: Policy for the space outside the grid.
-        precision: ``"float32"`` or ``"float64"``.
-        ring: Whether a ring of cells around the grid stands for the space outside.
     """
-    omissions = [
-        Omission(f"{name[2:]} component", f"{name} = 0", cost) for name, weight, cost in components if not weight
-    ]
-    if mount[:2] == (0.0, 0.0):
-        omissions.append(Omission("mount", "the scanner sits at the robot's origin", "a rotation per particle"))
-    omissions.append(
-        Omission(
-            "unknown branch",
-            f"unknown cells are {unknown} by one rule, applied once to the map",
-            "a test per cell step",
-        )
-    )
-    if ring:
-        why = f"a sentinel ring stands for what is outside ({outside})"
-        omissions.append(Omission("bounds tests", why, "four comparisons per step"))
+    omissions, kept = [], []
+    for name, weight, cost in components:
+        if weight:
+            kept.append(Note(f"{name[2:]} component", f"{name} = {weight:g}"))
+        else:
+            flags = frozenset({name[2:].upper()}) if name != "z_max" else frozenset[str]()
+            ends = frozenset({"SINGLE"}) if flags else flags
+            omissions.append(Omission(f"{name[2:]} component", f"{name} = 0", cost, flags, ends))
+    return omissions, kept
+
+
+def precision_notes(precision: str) -> tuple[list[Note], list[Note]]:
+    """Return the precision as a part that is kept, and as one that could go."""
     if precision == "float32":
-        omissions.append(
-            Omission(
-                "float64", "positions are split into cell and fraction in float64", "half the bytes and wide units"
-            )
-        )
-    return omissions
+        return [], []
+    return [Note("float64", "precision='float64'")], [Note("float64", "precision='float32' needs half of the bytes")]
 
 
 def launch_omissions(code: frozenset[str], least_ordered: tuple[int, int] | None = None) -> list[Omission]:

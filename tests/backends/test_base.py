@@ -44,6 +44,9 @@ class Plain(Backend):
     def compile(self, kernel, flags):
         return lambda size, *arguments: self.calls.append((kernel, flags, size, arguments))
 
+    def source(self, kernel, flags):
+        raise NotImplementedError
+
     def synchronize(self):
         self.calls.append(("synchronize",))
 

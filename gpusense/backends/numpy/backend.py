@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,10 @@ class NumpyBackend(Backend):
                 body(flags, *bound)
 
         return launch
+
+    def source(self, kernel: str, flags: frozenset[str]) -> str:
+        """See Backend.source; flags are arguments of the reference."""
+        return inspect.getsource(importlib.import_module(f"gpusense.reference.{KERNELS[kernel].file}"))
 
     def synchronize(self) -> None:
         """See Backend.synchronize."""

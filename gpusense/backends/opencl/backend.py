@@ -196,6 +196,11 @@ class OpenCLBackend(ProcessBound, Backend):
             launcher = self._launchers[kernel, flags] = self._launcher(kernel, flags)
         return launcher
 
+    def source(self, kernel: str, flags: frozenset[str]) -> str:
+        """See Backend.source."""
+        file = KERNELS[kernel].file
+        return assemble(file, relevant(file, flags))
+
     def synchronize(self) -> None:
         """See Backend.synchronize."""
         with self._count:

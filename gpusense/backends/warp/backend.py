@@ -6,6 +6,7 @@ kernels unpack ``wp.tid()`` in that order.
 
 from __future__ import annotations
 
+import inspect
 import threading
 from typing import Any
 
@@ -156,6 +157,10 @@ class WarpBackend(ProcessBound, Backend):
                     launcher = self._launchers[key] = self._build(row, *key)
             self._asked[kernel, flags] = launcher
         return launcher
+
+    def source(self, kernel: str, flags: frozenset[str]) -> str:
+        """See Backend.source; flags are constants of the file's factory, which Warp resolves."""
+        return inspect.getsource(warp_module(KERNELS[kernel].file))
 
     def synchronize(self) -> None:
         """See Backend.synchronize."""

@@ -13,8 +13,9 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray, CasterName, Compat, Precision, Space
 from gpusense.backends import Selection
 from gpusense.backends.results import Result
+from gpusense.interface.plan import Note, Omission
 from gpusense.models.arguments import check_absent, check_discrete
-from gpusense.models.scan.beam_explain import title_and_omissions
+from gpusense.models.scan.beam_explain import scene_notes
 from gpusense.models.scan.beam_pipeline import BeamPipeline
 from gpusense.models.scan.cones import bins_of, cones_of, require_exact
 from gpusense.models.scan.map_caster import MapCaster
@@ -270,13 +271,11 @@ class BeamModel(ScanModel):
         self._caster.draw(checked, pipeline.cone_vectors, result.flat, cones, drawing)
         return result.array()
 
-    def explain(self) -> str:
-        """Report what this scene leaves out, why, and the saving; readings and map as of the last call."""
-        title, omissions = title_and_omissions(
+    def _notes(self) -> tuple[str, list[Omission], list[Note], list[Note]]:
+        return scene_notes(
             self._beam_pipeline, self._last, self._mixtures, self.incidence_parameters,
-            discrete=isinstance(self._parameters, SensorTable), unknown=self.unknown, weights_note=self._weights_note(),
+            discrete=isinstance(self._parameters, SensorTable), weights_note=self._weights_note(),
         )  # fmt: skip
-        return str(self._plan(title, omissions))
 
     def _cast(self, poses: AnyArray, out: Any, *, incidence: bool) -> Any:
         pipeline = self._beam_pipeline

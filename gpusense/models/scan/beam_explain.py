@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gpusense.interface.plan import Omission, launch_omissions, scene_omissions, share
+from gpusense.interface.plan import Note, Omission, component_notes, launch_omissions, precision_notes, share
 from gpusense.interface.terms import HIGH_PEAK
 from gpusense.models.scan.beam_pipeline import BeamPipeline
+from gpusense.models.scan.mixture import hit_peak
 from gpusense.models.scan.scoring import LastCall
 from gpusense.models.scan.tiles import LEAST_ORDERED
 from gpusense.world.parameters import BeamParameters, IncidenceParameters
@@ -23,17 +24,16 @@ _MOMENTS = (
 )
 
 
-def title_and_omissions(
+def scene_notes(
     pipeline: BeamPipeline,
     last: LastCall,
     mixtures: Sequence[BeamParameters],
     incidence: IncidenceParameters | None,
     *,
     discrete: bool,
-    unknown: str,
     weights_note: str,
-) -> tuple[str, list[Omission]]:
-    """Return the title of the report, and the omissions; readings and map as of the last call.
+) -> tuple[str, list[Omission], list[Note], list[Note]]:
+    """Return the title of the report, what is left out, kept, and could go; readings and map as of the last call.
 
     Args:
         pipeline: The stages of the model.
@@ -41,16 +41,21 @@ def title_and_omissions(
         mixtures: Parameters of each bin of angles of incidence.
         incidence: The parameters by angle of incidence, or None.
         discrete: Whether the model is the table of a sensor.
-        unknown: The rule for unknown cells.
         weights_note: Words of the title about weights of other programs.
     """
     caster, flags, scan = pipeline.caster, last.flags, last.scan
     scanner, real, weights = pipeline.scanner, pipeline.real.name, pipeline.setting.weights
+    tabulated = pipeline.mixture.table is not None
     components = [(name, max(getattr(p, name) for p in mixtures), cost) for name, cost in _COSTS]
-    omissions = scene_omissions(
-        components=[] if discrete else components, mount=scanner.mount, unknown=unknown, outside=caster.outside,
-        precision=real, ring=caster.method.ring,
-    )  # fmt: skip
+    omissions, kept = component_notes([] if discrete else components)
+    kept_precision, could_go = precision_notes(real)
+    kept += kept_precision
+    if not (discrete or tabulated or weights.is_peer):
+        mixture_kept, mixture_could_go = _kept_of_mixture(pipeline, mixtures)
+        kept += mixture_kept
+        could_go += mixture_could_go
+    if "ORIGINS_OUTSIDE" in flags:
+        kept.append(Note("entry from outside", "a beam starts outside the map, or may do so"))
     if scan is not None and scan.shared:
         spared = len(scan.readings) - len(scan.rays)
         omissions.append(
@@ -61,8 +66,12 @@ def title_and_omissions(
             )
         )
     if flags and "ORIGINS_OUTSIDE" not in flags:
-        omissions.append(Omission("entry from outside", "every beam starts inside the map", "a branch per ray"))
-    if flags and "LINEAR" in flags and not discrete:
+        entry = frozenset({"ORIGINS_OUTSIDE"})
+        omissions.append(Omission("entry from outside", "every beam starts inside the map", "a branch per ray", entry))
+    if "STOPS" in flags:
+        why = "nothing beyond a reading and a few sigma_hit changes its density by a bit"
+        omissions.append(Omission("rays behind readings", why, "the rest of these rays", ends=frozenset({"STOPS"})))
+    if flags and "LINEAR" in flags and not (discrete or tabulated):
         omissions.append(
             Omission("log-domain sum", "z_rand bounds the mixture from below", "2 exp and 3 log per particle-beam")
         )
@@ -80,7 +89,29 @@ def title_and_omissions(
         method += " and for none" if incidence.no_surface is not None else ""
         method += " (max readings depend on it)" if pipeline.rules.max_depends else ""
     name = "beam model" if not discrete else "discrete beam model"
-    return f"{name}{weights_note}{method}, {real}", omissions
+    return f"{name}{weights_note}{method}, {real}", omissions, kept, could_go
+
+
+def _kept_of_mixture(pipeline: BeamPipeline, mixtures: Sequence[BeamParameters]) -> tuple[list[Note], list[Note]]:
+    """Return the parts of the density that its parameters need, and those that other parameters would leave out."""
+    flags, kept, could_go = pipeline.mixture.flags, [], []
+    peak = max(hit_peak(p) for p in mixtures)
+    if "LINEAR" not in flags:
+        kept.append(Note("log-domain sum", "z_rand does not bound the mixture from below"))
+    if "SHARP" in flags:
+        kept.append(Note("exponents in two parts", f"the hit density's peak is {peak:.4g} / m, above {HIGH_PEAK:g}"))
+    for flag, name, _ in _MOMENTS:
+        if flag in flags:
+            values = " or ".join(f"{value:g}" for value in sorted({getattr(p, name) for p in mixtures}))
+            kept.append(Note(name, f"{name} = {values}"))
+    if "INCIDENCE" in pipeline.cones.flags:
+        kept.append(Note("angles of incidence", "they choose the parameters, or whether anything returns"))
+    if "STOPS" not in flags and pipeline.specialize:
+        why = "the density depends on z* however far behind the reading it is"
+        kept.append(Note("rays behind readings", why))
+        if max(p.z_short for p in mixtures) > 0 and len(mixtures) == 1:
+            could_go.append(Note("rays behind readings", "z_short = 0 would end each ray behind its reading"))
+    return kept, could_go
 
 
 def _mixture_omissions(pipeline: BeamPipeline, *, discrete: bool) -> list[Omission]:
@@ -92,8 +123,15 @@ def _mixture_omissions(pipeline: BeamPipeline, *, discrete: bool) -> list[Omissi
     if mixture.table is not None:
         why = f"log p is tabulated over {cells} x {cells + 1} bins of readings and expected ranges"
         return [Omission("mixture", why, "all functions of the components, at the error of the bins")]
-    omissions = [Omission(name, f"{name} = 0", cost) for flag, name, cost in _MOMENTS if flag not in mixture.flags]
+    if "HIT" not in mixture.flags:
+        # These parts go with the component.
+        return []
+    omissions = [
+        Omission(name, f"{name} = 0", cost, frozenset({flag}))
+        for flag, name, cost in _MOMENTS
+        if flag not in mixture.flags
+    ]
     if "SHARP" not in mixture.flags:
         why = f"the hit density's peak is at most {HIGH_PEAK:g} / m"
-        omissions.append(Omission("exponents in two parts", why, "37 operations"))
+        omissions.append(Omission("exponents in two parts", why, "37 operations", frozenset({"SHARP"})))
     return omissions

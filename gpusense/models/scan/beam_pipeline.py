@@ -37,6 +37,7 @@ class BeamPipeline(ScanPipeline):
     """
 
     orders = True
+    kernel_names = ("score_beams",), ("beam_tiles", "sum_parts")
 
     def __init__(
         self, setting: Setting, caster: MapCaster, cones: Cones, mixture: Mixture, *, max_evaluated: bool

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray, Compat, Precision, Space
 from gpusense.backends import Selection
-from gpusense.interface.plan import Omission, launch_omissions, scene_omissions
+from gpusense.interface.plan import Note, Omission, component_notes, launch_omissions, precision_notes
 from gpusense.interface.terms import HIGH_PEAK
 from gpusense.models.run import finish
 from gpusense.models.scan.differentiable import Differentiable
@@ -181,19 +182,28 @@ class LikelihoodFieldModel(ScanModel):
             "beam's readings depends on the pose: draw from a BeamModel of the same map"
         )
 
-    def explain(self) -> str:
-        """Report what this scene leaves out, why, and the saving; readings and map as of the last call."""
+    def _notes(self) -> tuple[str, list[Omission], list[Note], list[Note]]:
         p, pipeline = self.parameters, self._field_pipeline
         bilinear = p.interpolation == "bilinear"
-        components = [
-            ("z_hit", p.z_hit, "1 exp per particle-beam"),
-            ("z_rand", p.z_rand, "1 addition per particle-beam"),
-            ("z_max", p.z_max, "max readings altogether"),
-        ]
-        omissions = scene_omissions(
-            components=components, mount=self.scanner.mount, unknown=self.unknown, outside=self.outside,
-            precision=self.precision,
-        )  # fmt: skip
+        omissions, kept = component_notes(
+            [
+                ("z_hit", p.z_hit, "1 exp per particle-beam"),
+                ("z_rand", p.z_rand, "1 addition per particle-beam"),
+                ("z_max", p.z_max, "max readings altogether"),
+            ]
+        )
+        if not bilinear:
+            # They are in the table, whatever their weights.
+            omissions = [dataclasses.replace(o, flags=frozenset(), ends=frozenset()) for o in omissions]
+        kept_precision, could_go = precision_notes(self.precision)
+        kept += kept_precision
+        if bilinear:
+            kept.append(Note("interpolation", "interpolation='bilinear'"))
+            could_go.append(Note("interpolation", "interpolation='nearest' has one look-up in place of four"))
+            if "SHARP" in pipeline.components:
+                kept.append(Note("exponents in two parts", f"the hit density's peak is above {HIGH_PEAK:g} / m"))
+            if "LINEAR" not in pipeline.components:
+                kept.append(Note("log-domain sum", "z_rand does not bound the mixture from below"))
         if pipeline.log_table:
             omissions.append(
                 Omission("density per beam", "cells hold log densities (nearest)", "1 exp and 1 log per particle-beam")
@@ -201,11 +211,11 @@ class LikelihoodFieldModel(ScanModel):
         if "SHARP" not in pipeline.components:
             low = f"the hit density's peak is at most {HIGH_PEAK:g} / m"
             why = low if bilinear else "no density is evaluated"
-            omissions.append(Omission("exponents in two parts", why, "some 200 operations per particle-beam"))
+            sharp = frozenset({"SHARP"}) if bilinear else frozenset[str]()
+            omissions.append(Omission("exponents in two parts", why, "some 200 operations per particle-beam", sharp))
         if not bilinear:
             omissions.append(Omission("interpolation", "interpolation='nearest'", "3 of 4 look-ups"))
         omissions += launch_omissions(self._last.flags)
         if (far := pipeline.map.omission(pipeline.real.itemsize)) is not None:
             omissions.append(far)
-        title = f"likelihood field{self._weights_note()}, {self.precision}"
-        return str(self._plan(title, omissions))
+        return f"likelihood field{self._weights_note()}, {self.precision}", omissions, kept, could_go

@@ -46,6 +46,7 @@ class FieldPipeline(ScanPipeline):
 
     kept_parts = 1 / BLOCK_TERMS
     end_points = True
+    kernel_names = ("score_field",), ("field_blocks", "sum_parts")
 
     def __init__(
         self,

@@ -99,7 +99,7 @@ def mixture_of(
     hit, short, rand = (max(getattr(p, name) for p in kinds) > 0 for name in ("z_hit", "z_short", "z_rand"))
     # If no range is possible at any angle, a component must evaluate to -inf.
     rand |= max_depends and not (hit or short)
-    peaks, everything = [_peak(p) for p in kinds], not specialize
+    peaks, everything = [hit_peak(p) for p in kinds], not specialize
     linear = all(
         sums_linearly(p.z_rand / range_max, max(peak, p.z_short * p.lambda_short), real)
         for p, peak in zip(kinds, peaks, strict=True)
@@ -125,7 +125,7 @@ def peer_mixture(
     if p.range_bias or p.sigma_growth:
         raise ValueError(f"parameters: range_bias and sigma_growth must be 0 with compat, got {p}")
     flags = frozenset({"HIT", "SHORT", "RAND", "LINEAR", "CUBES"}) | flags_if(AMCL=amcl)
-    hit = p.z_hit if amcl else _peak(p)
+    hit = p.z_hit if amcl else hit_peak(p)
     terms = [hit, *_shape(p), p.z_short, p.lambda_short, p.z_rand / range_max, range_max, p.z_max]
     return flags, rounded_terms(terms, real)
 
@@ -150,7 +150,8 @@ def tabulated(p: BeamParameters, width: float, range_max: float, real: np.dtype)
     return table
 
 
-def _peak(p: BeamParameters) -> float:
+def hit_peak(p: BeamParameters) -> float:
+    """Return the peak of the hit density times its weight [1/m]."""
     return p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
 
 
@@ -162,7 +163,7 @@ def _terms(
     p: BeamParameters, range_max: float, real: np.dtype, linear: bool, end: tuple[float, float, float] | None
 ) -> np.ndarray:
     if linear:
-        head = (_peak(p), p.z_short, p.z_rand / range_max)
+        head = (hit_peak(p), p.z_short, p.z_rand / range_max)
     else:
         log_scale = log_weight(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi)
         head = (log_scale, log_weight(p.z_short), log_weight(p.z_rand) - math.log(range_max))
@@ -189,7 +190,7 @@ def _last_range(p: BeamParameters, range_max: float, real: np.dtype, linear: boo
     if p.z_hit:
         widest = p.sigma_hit + p.sigma_growth * range_max
         mass = 0.5 * math.erf(range_max * math.sqrt(0.5) / widest)
-        excess = math.log(_peak(p)) - math.log(mass * rand) + (digits + 3) * math.log(2)
+        excess = math.log(hit_peak(p)) - math.log(mass * rand) + (digits + 3) * math.log(2)
         u = math.sqrt(max(2 * excess, 0.0))
         if u * p.sigma_growth >= 0.5:
             return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import threading
 from abc import abstractmethod
@@ -15,7 +16,7 @@ from gpusense._util.html import card, split_options
 from gpusense._util.typing import AnyArray, Compat, Precision
 from gpusense.backends import Backend, BackendInfo, Selection, get_backend
 from gpusense.backends.workspace import Workspace
-from gpusense.interface.plan import Omission, Plan, share
+from gpusense.interface.plan import Note, Omission, Plan, share
 from gpusense.models.arguments import check_scene, map_words, real_dtype
 from gpusense.models.pickled import Pickled
 from gpusense.models.poses import Poses
@@ -26,6 +27,7 @@ from gpusense.models.scan.differentiable import Differentiable, is_recorded, log
 from gpusense.models.scan.pipeline import ScanPipeline, Setting
 from gpusense.models.scan.request import Known, Request, make_request
 from gpusense.models.scan.rules import Beams, Rules, check_beams
+from gpusense.models.scan.savings import measured_savings, sources_of
 from gpusense.models.scan.scoring import LastCall, run
 from gpusense.world.compat import Peer, choose
 from gpusense.world.frames import ray_vectors
@@ -263,9 +265,46 @@ class ScanModel(Pickled):
         """
         return bind(self._pipeline, self._lock, self.log_likelihood, poses, ranges, out)
 
+    def explain(self, *, measure: bool = False) -> str:
+        """Report what this scene leaves out, what it keeps, and what could go, each with the reason.
+
+        Readings and map are those of the last call.
+
+        Args:
+            measure: Whether to time the scene with and without each part that flags of the kernel bring back. Each line
+                of a part that is left out then ends with what that saves in a call with the last scan and 2000
+                particles all over the map, ``measured +0.012 ms``, or with ``not timed``. A difference below a few
+                percent of the call is noise.
+
+        Returns:
+            A title, the flags of the code, a line ``- part  reason; saves ...`` for each part that is left out, and
+            lines of the sections ``kept:`` (``+ part  reason``) and ``could go:`` (``? part  reason``).
+
+        Raises:
+            RuntimeError: ``measure`` before any call with a reading that depends on the pose.
+        """
+        title, omissions, kept, could_go = self._notes()
+        plan = self._plan(title, omissions, kept, could_go)
+        if measure:
+            with self._lock:
+                savings = measured_savings(
+                    lambda poses, ranges: self._request(poses, ranges, None), self._pipeline, self._last, plan,
+                    self.scanner.count,
+                )  # fmt: skip
+            plan = dataclasses.replace(plan, measured=savings)
+        return str(plan)
+
+    def sources(self) -> dict[str, str]:
+        """Return the text of the kernels that score a scan, as compiled for the last call.
+
+        Returns:
+            OpenCL C, Warp's Python or NumPy's by the names of the kernels; empty before the first call.
+        """
+        return sources_of(self._setting.backend, self._last)
+
     @abstractmethod
-    def explain(self) -> str:
-        """Report what this scene leaves out, why, and the saving; readings and map as of the last call."""
+    def _notes(self) -> tuple[str, list[Omission], list[Note], list[Note]]:
+        """Return the title of the report, and what is left out, kept, and could go."""
 
     def prepare(self, poses: AnyArray) -> None:
         """Make the map's table for a cloud of (N, 3) poses now; ``log_likelihood`` does it otherwise.
@@ -291,7 +330,7 @@ class ScanModel(Pickled):
     def _weights_note(self) -> str:
         return "" if self.compat is None else f" with the weights of {self._setting.weights.name} (no likelihood)"
 
-    def _plan(self, title: str, omissions: list[Omission]) -> Plan:
+    def _plan(self, title: str, omissions: list[Omission], kept: list[Note], could_go: list[Note]) -> Plan:
         """Return the plan as of the last call."""
         title = f"{title}, {self.device.selection} ({self.device.name})"
         if not self._setting.rules.specialize:
@@ -311,4 +350,4 @@ class ScanModel(Pickled):
                 if left:
                     why = f"{left} of {count} readings {why}"
                     omissions.append(Omission(what, why, f"{share(left, count)} of the beams"))
-        return Plan(title, self._last.flags, tuple(omissions))
+        return Plan(title, self._last.flags, tuple(omissions), tuple(kept), tuple(could_go))

@@ -114,6 +114,8 @@ class ScanPipeline(ABC):
     end_points: bool = False
     careful: bool = False
     orders: bool = False
+    # The kernels that score in one launch, and in tiles.
+    kernel_names: tuple[tuple[str, ...], tuple[str, ...]]
 
     def __init__(self, setting: Setting) -> None:
         self.setting = setting
@@ -122,6 +124,8 @@ class ScanPipeline(ABC):
         self.nothing = self.backend.upload(np.zeros(1, np.int32))
         # Flags by everything on which they depend.
         self._flags: dict[Hashable, frozenset[str]] = {}
+        # Flags to add and to take away while what is left out is measured.
+        self.trial: tuple[frozenset[str], frozenset[str]] | None = None
 
     # ---- stages that depend on the model
 
@@ -238,10 +242,16 @@ class ScanPipeline(ABC):
         if flags is None:
             everything = conditions | readings.flags | placed.headings
             flags = self._flags[key] = self.flags(everything, tiled=tiles is not None, per_beam=per_beam)
+        if self.trial is not None:
+            flags = (flags | self.trial[0]) - self.trial[1]
         count, block = self.layout(readings, flags)
         numbers = placed.count * count if tiles or per_beam else 1
         parts = Parts(count, block, space.empty("parts", numbers, self.real))
         return Scoring(readings, placed, table, parts, log_p, flags, tiles)
+
+    def kernels(self, scoring: Scoring) -> tuple[str, ...]:
+        """Return the names of the kernels that score a piece."""
+        return self.kernel_names[scoring.tiles is not None]
 
     def program(self, scoring: Scoring) -> Program:
         """Return all launches of a piece."""

@@ -27,11 +27,13 @@ class LastCall:
         flags: Flags of its launches.
         scans: The readings of its last scans; None before there is a call.
         together: Scans that shared launches.
+        kernels: The kernels of its last piece, from the poses to log-likelihoods.
     """
 
     flags: frozenset[str] = frozenset()
     scans: ClassedScans | None = None
     together: int = 0
+    kernels: tuple[str, ...] = ()
 
     @property
     def scan(self) -> ClassedScans | None:
@@ -96,6 +98,7 @@ class _Scorer:
                 key, dict(pipeline.numbers(scoring), poses=placed.source, log_p=log_p),
                 lambda: pipeline.program(scoring), version=pipeline.map.version,
             )  # fmt: skip
+        self._last.kernels = pipeline.kernels(scoring)
         # Poses are placed in vectors, whatever scores them.
         self._last.flags = (flags - _WIDE) | (scoring.flags & _WIDE)
         if readings.scans > 1:

@@ -30,17 +30,7 @@ def test_explain_names_what_is_left_out(monkeypatch):
     z[:4] = [NAN, INF, INF, -1.0]
     poses = np.column_stack([grid.cell_centers([200] * 9, range(245, 254)), np.zeros(9)])
     model = make("beam", grid, "numpy", REPEATED, weights=(0.9, 0.0, 0.1, 0.0), mount=(0.0, 0.0, 0.2), beams=12)
-    always = {
-        "short component",
-        "rand component",
-        "mount",
-        "unknown branch",
-        "bounds tests",
-        "float64",
-        "range_bias",
-        "sigma_growth",
-    }
-    always.add("exponents in two parts")
+    always = {"short component", "rand component", "range_bias", "sigma_growth", "exponents in two parts"}
     assert set(left_out(model)) == always
     model.log_likelihood(poses, z)
     assert model.explain().startswith("beam model, float32, ")
@@ -70,14 +60,7 @@ def test_explain_of_a_full_beam_model(backend):
     grid = room()
     model = make("beam", grid, backend, precision="float64")
     model.log_likelihood(cloud(grid, 100), scan())
-    needless = {
-        "unknown branch",
-        "bounds tests",
-        "log-domain sum",
-        "exponents in two parts",
-        "range_bias",
-        "sigma_growth",
-    }
+    needless = {"log-domain sum", "exponents in two parts", "range_bias", "sigma_growth"}
     needless |= {"order of particles"} if model.device.kind == "gpu" else set()
     assert set(left_out(model)) == needless | {"reduction of huge headings"}
 
@@ -91,10 +74,99 @@ def test_explain_of_a_field(kind):
     model.log_likelihood(cloud(grid, 10), z)
     assert model.explain().startswith("likelihood field, float32, ")
     found = left_out(model)
-    assert {"rand component", "max component", "mount", "missing readings", "float64"} <= set(found)
+    assert {"rand component", "max component", "missing readings"} <= set(found)
     assert {"interpolation", "density per beam"} & set(found) == (
         {"interpolation", "density per beam"} if kind == "field" else set()
     )
+
+
+def marked(model: Any, mark: str) -> dict[str, str]:
+    """Return the lines of ``explain`` with a mark, by their names."""
+    lines = [line[2:] for line in model.explain().splitlines() if line.startswith(f"{mark} ")]
+    return {name.strip(): why.strip() for name, why in (line.split("  ", 1) for line in lines)}
+
+
+def test_what_is_kept_and_what_could_go():
+    grid = room()
+    p = gs.BeamParameters(0.8, 0.1, 0.1, 0.0, 0.004, range_bias=0.01)
+    model = gs.BeamModel(grid, gs.Scanner([0.0, 0.5], 9.0), p, backend="numpy", precision="float64")
+    model.log_likelihood(cloud(grid, 5), [1.0, 2.0])
+    kept, could_go = marked(model, "+"), marked(model, "?")
+    assert kept["hit component"] == "z_hit = 0.8" and kept["range_bias"] == "range_bias = 0.01"
+    assert "above 64" in kept["exponents in two parts"] and {"log-domain sum", "float64"} <= set(kept)
+    assert set(could_go) == {"float64", "rays behind readings"} and "z_short = 0" in could_go["rays behind readings"]
+    assert not set(kept) & set(left_out(model))
+    smooth = make("bilinear", grid, "numpy")
+    assert "interpolation" in marked(smooth, "+") and "nearest" in marked(smooth, "?")["interpolation"]
+    plain = make("field", grid, "numpy")
+    assert not marked(plain, "?")
+
+
+def test_parts_of_a_component_that_is_left_out_go_with_it():
+    model = make("beam", room(), "numpy", weights=(0.0, 0.5, 0.1, 0.4))
+    assert "hit component" in left_out(model)
+    assert not {"range_bias", "sigma_growth", "exponents in two parts"} & set(left_out(model))
+
+
+# Words of the kernel's text that a part of the density needs; the parameters of a scene without it, and with it.
+PLAIN = dict(z_hit=0.7, z_short=0.1, z_max=0.1, z_rand=0.1)
+PARTS = {
+    "short component": ("short_length_lanes(expected", dict(PLAIN, z_hit=0.8, z_short=0.0), PLAIN),
+    "hit component": ("hit_exponent_lanes(z", dict(PLAIN, z_hit=0.0, z_rand=0.8), PLAIN),
+    "range_bias": ("TERM(10)", PLAIN, dict(PLAIN, range_bias=0.1)),
+    "sigma_growth": ("TERM(12)", PLAIN, dict(PLAIN, sigma_growth=0.01)),
+    "exponents in two parts": ("two_product_lanes(off", PLAIN, dict(PLAIN, sigma_hit=0.004)),
+}
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_the_text_of_the_kernel_lacks_what_is_left_out(part, needs):
+    """And it has it in a scene that needs it, which says that it is kept."""
+    words, without, with_part = PARTS[part]
+    grid = room()
+    backend = get_backend(needs("opencl"))
+    scalar = {"short_length_lanes(expected": "short_peak(terms", "hit_exponent_lanes(z": "hit_exponent(z, expected, terms)",
+              "TERM(10)": "terms[10]", "TERM(12)": "terms[12]", "two_product_lanes(off": "two_product(off"}  # fmt: skip
+    words = words if backend.info.lanes > 1 else scalar[words]
+    for parameters, listed in ((without, True), (with_part, False)):
+        model = gs.BeamModel(grid, gs.Scanner([0.0, 0.5], 9.0), gs.BeamParameters(**parameters), backend=backend)
+        assert model.sources() == {}
+        model.log_likelihood(cloud(grid, 5), [1.0, 2.0])
+        (text,) = [text for name, text in model.sources().items() if name in ("score_beams", "beam_tiles")]
+        assert (part in left_out(model)) == listed
+        assert (words in text) != listed
+        assert (part in marked(model, "+")) != listed
+
+
+def test_measured_savings(backend):
+    grid = room()
+    model = make("beam", grid, backend)
+    with pytest.raises(RuntimeError, match="measure: must follow a call of log_likelihood"):
+        model.explain(measure=True)
+    poses, z = cloud(grid, 20), scan()
+    before = model.log_likelihood(poses, z)
+    plain, timed = model.explain().splitlines(), model.explain(measure=True).splitlines()
+    assert len(plain) == len(timed)
+    for line, with_time in zip(plain, timed, strict=True):
+        assert with_time.startswith(line)
+        rest = with_time[len(line) :]
+        assert not rest or (
+            line.startswith("- ") and (rest == "; not timed" or ("; measured " in rest and rest.endswith(" ms")))
+        )
+    assert sum("; measured " in line for line in timed) >= 2
+    # The model is as it was.
+    assert "SHARP" not in model.explain().splitlines()[1]
+    np.testing.assert_array_equal(model.log_likelihood(poses, z), before)
+
+
+def test_sources_are_those_of_every_backend(backend):
+    grid = room()
+    for kind, kernels in (("beam", ("score_beams", "beam_tiles")), ("field", ("score_field", "field_blocks"))):
+        model = make(kind, grid, backend)
+        model.log_likelihood(cloud(grid, 20), scan())
+        found = model.sources()
+        assert any(name in kernels for name in found)
+        assert all(name in text for name, text in found.items())
 
 
 # ------------------------------------------------------------------------------------- what the last cloud left out

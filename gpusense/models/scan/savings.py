@@ -1,0 +1,97 @@
+"""Measure what the parts that a scene leaves out would cost, and read the text of the kernels that score it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from gpusense.backends import Backend
+from gpusense.backends.workspace import Workspace
+from gpusense.interface.plan import Plan
+from gpusense.models.run import finish
+from gpusense.models.scan.classed import ClassedScans
+from gpusense.models.scan.pipeline import ScanPipeline
+from gpusense.models.scan.request import Request
+from gpusense.models.scan.scoring import LastCall, run
+from gpusense.world.grid import OccupancyGrid
+
+# Particles, rounds in which the scene with and without a part take turns, and the least time of a turn [s].
+PARTICLES, ROUNDS, TURN = 2000, 7, 0.01
+MakeRequest = Callable[[np.ndarray, np.ndarray], Request]
+
+
+def measured_savings(
+    make_request: MakeRequest, pipeline: ScanPipeline, last: LastCall, plan: Plan, beams: int
+) -> dict[str, float]:
+    """Time a call with and without each part that flags of the scoring kernel bring back.
+
+    Args:
+        make_request: Makes the request of poses and a scan.
+        pipeline: The stages of the model.
+        last: Its last call.
+        plan: The parts that are left out.
+        beams: Beams of the scanner.
+
+    Returns:
+        Median differences [s] of a call with a part and one without it, by the names of the parts.
+
+    Raises:
+        RuntimeError: before any call with a reading that depends on the pose.
+    """
+    scan = last.scan
+    if scan is None or not len(scan.readings) or not last.flags:
+        raise RuntimeError("measure: must follow a call of log_likelihood with a reading that depends on the pose")
+    request = make_request(poses_on(pipeline.grid)[None], ranges_of(scan, beams))
+    savings = {}
+    for omission in plan.omissions:
+        if omission.flags or omission.ends & last.flags:
+            with_part = (omission.flags, omission.ends)
+            savings[omission.what] = _difference(pipeline, request, with_part)
+    return savings
+
+
+def poses_on(grid: OccupancyGrid) -> np.ndarray:
+    """Draw (2000, 3) poses from the free cells of a map, or from all cells where none is free."""
+    rng = np.random.default_rng(0)
+    rows, cols = np.nonzero(grid.free if grid.free.any() else np.ones(grid.shape, bool))
+    chosen = rng.integers(len(rows), size=PARTICLES)
+    headings = rng.uniform(-np.pi, np.pi, PARTICLES)
+    return np.column_stack([grid.cell_centers(rows[chosen], cols[chosen]), headings])
+
+
+def ranges_of(scan: ClassedScans, beams: int) -> np.ndarray:
+    """Return a classed scan as (1, K) ranges; readings that were left out are missing."""
+    ranges = np.full((1, beams), np.nan)
+    ranges[0, scan.columns] = scan.readings
+    ranges[0, scan.left_out.constant_max] = np.inf
+    return ranges
+
+
+def _difference(pipeline: ScanPipeline, request: Request, with_part: tuple[frozenset[str], frozenset[str]]) -> float:
+    """Return how much longer a call takes with other flags of the scoring kernel [s], in turns."""
+    spaces = [(Workspace(pipeline.backend), None), (Workspace(pipeline.backend), with_part)]
+
+    def turn(which: int, calls: int) -> float:
+        space, pipeline.trial = spaces[which]
+        begin = time.perf_counter()
+        try:
+            for _ in range(calls):
+                with space:
+                    run(pipeline, request, space, LastCall())
+                    finish(space, on_device=False)
+        finally:
+            pipeline.trial = None
+        return (time.perf_counter() - begin) / calls
+
+    for which in (0, 1):
+        turn(which, 2)
+    calls = max(1, round(TURN / max(turn(0, 1), 1e-6)))
+    rounds = [turn(1, calls) - turn(0, calls) for _ in range(ROUNDS)]
+    return float(np.median(rounds))
+
+
+def sources_of(backend: Backend, last: LastCall) -> dict[str, str]:
+    """Return the text of the kernels of a last call, by their names."""
+    return {kernel: backend.source(kernel, last.flags) for kernel in last.kernels}

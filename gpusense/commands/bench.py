@@ -86,7 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--beams", type=whole_number(low=1, high=100_000), metavar="K", help="beams of the scanner (default: 360)")
     add("--repeats", type=whole_number(low=1), metavar="R", help="timed calls per point (default: 20)")
     add("--seconds", type=positive_number, default=5.0, metavar="S",
-        help="longest time of a point's timed calls, of which there are at least three [s] (default: %(default)s)")  # fmt: skip
+        help="longest time of a point's timed calls, at least three of them [s] (default: %(default)s)")  # fmt: skip
     add("--build-limit", type=positive_number, metavar="S",
         help="leave out tables that take longer to build [s] (default: 60)")  # fmt: skip
     add("--peers", type=Path, metavar="FILE", help="a Python file with outside candidates; it is executed")
@@ -134,7 +134,7 @@ def run(args: argparse.Namespace) -> int:
             if not outcome.points:
                 raise
             stopped = stop
-        new = document(plan, outcome, _arguments(args, plan), machine(), absent, command_of(sys.argv[1:]))
+        new = document(plan, outcome, arguments_of(args, plan), machine(), absent, command_of(sys.argv[1:]))
         if args.output is not None:
             write_report(args.output, new, to_json(new), args.time)
     comparison = None if old is None or stopped is not None else comparing.compare(old, new, args.slower)
@@ -234,12 +234,13 @@ def _absent_devices(selections: Sequence[str] | None) -> list[str]:
     return [] if selections else [f"{device.name}: {device.reason}" for device in devices() if not device.available]
 
 
-def _arguments(args: argparse.Namespace, plan: Plan) -> dict[str, Any]:
+def arguments_of(args: argparse.Namespace, plan: Plan) -> dict[str, Any]:
     """Return the arguments that affect the measurements; of files only their names."""
     return {
         "quick": plan.deadline < float("inf"), "scenes": [source.name for source in plan.sources],
-        "particles": plan.particles, "checked": plan.checked, "beams": plan.beams, "repeats": plan.repeats, "seconds": plan.seconds,
-        "seed": plan.seed, "precisions": list(plan.precisions), "build_limit": plan.build_limit,
+        "particles": plan.particles, "checked": plan.checked, "beams": plan.beams,
+        "repeats": plan.repeats, "seconds": plan.seconds, "seed": plan.seed,
+        "precisions": list(plan.precisions), "build_limit": plan.build_limit,
         "max_error": [list(one) for one in args.max_error], "max_time": args.max_time,
         "problems": list(args.problem or PROBLEMS), "methods": args.method or [],
         "peers": args.peers.name if args.peers else "",

@@ -125,8 +125,8 @@ def temperature_of(log_p: Floats) -> float:
 def factor_for(log_p: Floats, size: float, most: float = MOST_FACTOR) -> float:
     """Find the largest factor of log-likelihoods at which the effective sample size is at least ``size``.
 
-    The effective sample size falls as the factor rises. Weights that are less sharp than the exact ones, such as sums of
-    cubes, are compared with them at the factor that gives both the same effective sample size.
+    The effective sample size falls as the factor rises. Weights that are less sharp than the exact ones, such as sums
+    of cubes, are compared with them at the factor that gives both the same effective sample size.
 
     Args:
         log_p: (M,) log-likelihoods, finite.

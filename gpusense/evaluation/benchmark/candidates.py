@@ -89,16 +89,16 @@ class Curve:
     knob: str = ""
     values: tuple[float, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
-    quick: tuple[int, ...] = (1,)
+    quick: tuple[int, ...] = (0,)
 
 
 _VARIED = (
-    Curve("march", "safe", "tolerance", (2.0, 1.0, 0.5, 0.1, 0.01), {"rule": "safe"}, (1, 3)),
-    # No tolerance below 1 cell: the distance between the centres of two cells is at least 1.
-    Curve("march", "centre", "tolerance", (4.0, 2.0, 1.0), {"rule": "centre"}, (2,)),
-    Curve("cddt", "", "bins", (54, 108, 216, 720), {"pruned": False}, (1,)),
+    Curve("march", "safe", "tolerance", (1.0, 0.1, 0.01), {"rule": "safe"}, (0, 1)),
+    # The distance between the centres of two cells is at least 1, and a larger tolerance is slower and less exact.
+    Curve("march", "centre", "tolerance", (1.0,), {"rule": "centre"}, (0,)),
+    Curve("cddt", "", "bins", (108, 720), {"pruned": False}, (0,)),
     Curve("cddt", "pruned", "bins", (108,), {"pruned": True}, ()),
-    Curve("lookup", "", "bins", (27, 54, 108), {}, (1,)),
+    Curve("lookup", "", "bins", (54, 108), {}, (0,)),
 )
 CURVES = tuple(
     curve for name in ENTRIES for curve in [each for each in _VARIED if each.method == name] or [Curve(name)]
@@ -107,7 +107,7 @@ CURVES = tuple(
 
 BIN_WIDTHS = (0.5, 0.2, 0.1, 0.05, 0.02)
 """Bin widths [m] of the tabulated beam mixture."""
-SHARES = (8, 4, 2)
+SHARES = (12, 6, 4, 2)
 """Strides of the beams of thinned scans."""
 COMPAT = ("amcl", "beluga")
 """Other packages whose formulas a model can reproduce."""
@@ -142,7 +142,7 @@ def candidates(problems: Sequence[str], *, quick: bool = False) -> list[Candidat
     exact = CASTERS["exact"]()
     beam, field_model = "gs.BeamModel(grid, scanner", "gs.LikelihoodFieldModel(grid, scanner"
     listed.append(Candidate("field", "field", _field(), exact=True, code=f"{field_model})"))
-    for share in SHARES[1:2] if quick else SHARES:
+    for share in SHARES[2:3] if quick else SHARES:
         for problem, method, make, model in (
             ("beam", "exact", _beam(exact, share), beam), ("field", "field", _field(share), field_model),
         ):  # fmt: skip

@@ -1,8 +1,8 @@
 """Choose the method for an error or a time that one can afford: the fastest exact enough, or the most exact in time.
 
-A method is judged over all scenes and clouds of a report at once: by its largest error, and by the geometric mean of its
-times. Methods within ``ALIKE`` of the fastest count as equally fast, so that noise does not decide; of these the most
-exact one is chosen.
+A method is judged over all scenes and clouds of a report at once: by its largest error, and by the geometric mean of
+its times. Methods within ``ALIKE`` of the fastest count as equally fast, so that noise does not decide; of these the
+most exact one is chosen.
 """
 
 from __future__ import annotations

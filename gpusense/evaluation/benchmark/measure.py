@@ -145,7 +145,7 @@ class Cost:
         call_min_s, call_q1_s, call_median_s, call_q3_s: A call with NumPy arrays in and out: least time and quartiles.
         processor_s: Processor time of a call, over all threads of the process: the mean of the timed calls.
         calls: Number of timed calls after a warm-up; 1 where a call takes more than two seconds.
-        launch_min_s, launch_q1_s, launch_median_s, launch_q3_s: Launches of a call alone, with all arrays on the device.
+        launch_min_s, launch_q1_s, launch_median_s, launch_q3_s: Launches of a call alone, arrays on the device.
         launches: Number of timed repetitions of the launches; 0 for a candidate without a backend.
         upload_s, download_s: Transfers of one call.
         table_bytes: Tables of the map on the device.
@@ -214,9 +214,10 @@ def measure(
         built = max(second - min(calls), 0.0) if built is None else built
     elif built is None:
         built = first - min(calls)
+    on_device |= quartiles("call", calls)
     cost = Cost(
-        first_s=first, build_s=built, compile_s=compiling, **quartiles("call", calls),
-        processor_s=statistics.fmean(used), calls=len(calls), table_bytes=table, **on_device,
+        first_s=first, build_s=built, compile_s=compiling, processor_s=statistics.fmean(used), calls=len(calls),
+        table_bytes=table, **on_device,
     )  # fmt: skip
     return cost, runner
 

@@ -22,21 +22,21 @@ _DIGITS = 6
 
 _READING = """\
 Times are nanoseconds per particle-beam: a ray for *ranges*, an evaluated reading for *beam* and *field*. *call* is a
-call with NumPy arrays in and out: minimum and quartiles of the calls after a warm-up. A star marks a single call, of more
-than two seconds. *processor* is the processor's time of a call over all threads. *launch* is the minimum of the launches alone, with all arrays on the device. *build* is the time to
-build the map's tables. *compile* is the additional time of the first call in this process: kernels may come from a
-cache on disk, and later rows reuse compiled kernels; where the first call takes long, *build* includes it. *table* and
-*device* are bytes on the device: of the map's tables, and of all buffers that are alive after a call.
+call with NumPy arrays in and out: minimum and quartiles of the calls after a warm-up. A star marks a single call, of
+more than two seconds. *processor* is the processor's time of a call over all threads. *launch* is the minimum of the
+launches alone, with all arrays on the device. *build* is the time to build the map's tables. *compile* is the
+additional time of the first call in this process: kernels may come from a cache on disk, and later rows reuse compiled
+kernels; where the first call takes long, *build* includes it. *table* and *device* are bytes on the device: of the map's tables, and of all buffers that are alive after a call.
 
 Errors are against the exact caster and the models in float64. For ranges: median, 95th percentile and maximum in cells,
 and the shares wrong by more than one and two cells. For the scan's log-likelihood: root mean square and maximum in
 nats; for *ranges* it follows from the ranges by the float64 mixture. For the posterior, the normalised weights: KL, the
 Kullback-Leibler divergence from the exact weights in nats; TV, the total variation; and the shift of the weighted mean
 pose. *tempered* is the posterior at the temperature where a tenth of the particles share the weight, as in a working
-filter. *comparable* is the posterior at the temperature that gives the method's weights the same effective sample size:
-a filter with ``temperature="auto"`` adapts alike. *fine* compares with the true posterior, untempered, on a fine grid of
-poses around the true one. *fewer beams* counts each of every n-th beam n times, and *compat* computes another model than
-the book's; they are shown for comparison."""
+filter. *comparable* is the posterior at the temperature that gives the method's weights the same effective sample
+size. *fine* compares with the true posterior, untempered, on a fine grid of poses around the true one. *fewer beams*
+counts each of every n-th beam n times, and *compat* computes another model than the book's; they are shown for
+comparison."""
 
 
 def document(

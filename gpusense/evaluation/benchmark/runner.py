@@ -177,9 +177,9 @@ def point_of(plan: Plan, job: Job, truth: Truth, cloud: str, reason: str = "") -
         "device": backend.info.name if backend else candidate.outside,
         "kind": backend.info.kind if backend else "cpu",
         "method": candidate.method, "variant": candidate.variant, "knob": candidate.knob, "value": candidate.value,
-        "code": candidate.code, "precision": job.precision, "exact": candidate.exact, "outside": bool(candidate.outside),
-        "particles": particles, "beams": beams, "work": particles * beams, "checked": len(truth.poses),
-        "status": "left out" if reason else "ok", "reason": reason, "time": None, "memory": None, "errors": None,
+        "code": candidate.code, "precision": job.precision, "exact": candidate.exact,
+        "outside": bool(candidate.outside), "particles": particles, "beams": beams, "work": particles * beams,
+        "checked": len(truth.poses), "status": "left out" if reason else "ok", "reason": reason, "time": None, "memory": None, "errors": None,
     }  # fmt: skip
     if reason:
         return point

@@ -27,6 +27,10 @@ PARTICLES = {"gpu": 4096, "cpu": 1024}
 NUMPY_SHARE = 8
 
 
+class LeftOutError(ValueError):
+    """Raised by a candidate that cannot be measured in a scene, such as for the time that its table would take."""
+
+
 @dataclass(frozen=True)
 class Plan:
     """Plan of a run.
@@ -190,6 +194,8 @@ def point_of(plan: Plan, job: Job, truth: Truth, cloud: str, reason: str = "") -
         )  # fmt: skip
         point |= _split(cost)
         point["errors"] = _errors(truth, candidate, runner, fine=cloud == FINE_CLOUD)
+    except LeftOutError as error:
+        point |= {"status": "left out", "reason": str(error)}
     except UnstableError as error:
         point |= {"status": "unstable", "reason": str(error)}
     except Exception as error:

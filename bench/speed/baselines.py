@@ -32,6 +32,10 @@ from gpusense.evaluation.benchmark.candidates import Candidate
 from gpusense.evaluation.benchmark.scenes import Scene
 from gpusense.world.scanner import Reading, classify
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from speed import range_libc
+
 THETA_BINS = (2000,)
 CDDT_BINS = (108, 720)
 TABLE_BINS = 54
@@ -39,10 +43,6 @@ TABLE_BINS = 54
 NEAR = 1e-4
 # Beams whose densities are multiplied before a logarithm is taken: no product over- or underflows float64.
 BLOCK = 16
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from speed import range_libc
 
 try:
     import numba

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -60,7 +60,7 @@ class Entry:
         setting: Knob and value; empty without one.
         precision: Precision.
         error: Largest error over scenes and clouds, in the unit of its measure (shares as shares, lengths in metres).
-        seconds: Geometric mean of the least times of a call [s].
+        seconds: Geometric mean of the times of a call [s].
         code: How it is called.
         exact: Whether it computes the model itself.
     """
@@ -130,7 +130,18 @@ def _quantity(text: str, units: Sequence[str], name: str) -> tuple[float, str]:
     return value, match[2]
 
 
-def entries(points: Iterable[Mapping[str, Any]], problem: str, measure: Measure, backend: str) -> list[Entry]:
+def call_time(point: Mapping[str, Any]) -> float | None:
+    """Return the least time of a point's calls [s]."""
+    return time_of(point, "call")
+
+
+def entries(
+    points: Iterable[Mapping[str, Any]],
+    problem: str,
+    measure: Measure,
+    backend: str,
+    timing: Callable[[Mapping[str, Any]], float | None] = call_time,
+) -> list[Entry]:
     """Return the methods of a problem on one device, over all scenes and clouds where they were measured.
 
     A method that failed, was left out or is not finite in any of them is not listed.
@@ -140,6 +151,7 @@ def entries(points: Iterable[Mapping[str, Any]], problem: str, measure: Measure,
         problem: The problem.
         measure: The measure of their errors.
         backend: Selection string of the device, or ``"outside"``.
+        timing: Time of a point [s]; None where it was not measured.
     """
     chosen = [point for point in points if point["problem"] == problem and point["backend"] == backend]
     groups: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
@@ -148,7 +160,7 @@ def entries(points: Iterable[Mapping[str, Any]], problem: str, measure: Measure,
     listed = []
     for (method, at, precision), group in groups.items():
         errors = [error_of(point, measure.kind, measure.name) for point in group]
-        times = [time_of(point, "call") for point in group]
+        times = [timing(point) for point in group]
         if any(value is None for value in (*errors, *times)):
             continue
         seconds = math.exp(sum(math.log(time or 1.0) for time in times) / len(times))

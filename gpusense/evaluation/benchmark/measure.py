@@ -15,8 +15,8 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer, Launcher
 from gpusense.backends.proxy import Proxy
 
-LONG = 2.0
-"""Duration of a call above which it is not repeated [s]."""
+LONG = 1.0
+"""Duration of a call above which it is not repeated, nor its launches measured alone [s]."""
 SLOW_TO_MAKE = 2.0
 """Duration of a first call above which no second runner is made, so that building includes compiling [s]."""
 # Time to repeat launches alone for [s]; on a processor they take as long as calls.
@@ -144,7 +144,7 @@ class Cost:
             process compiled before add nothing. None without a second runner.
         call_min_s, call_q1_s, call_median_s, call_q3_s: A call with NumPy arrays in and out: least time and quartiles.
         processor_s: Processor time of a call, over all threads of the process: the mean of the timed calls.
-        calls: Number of timed calls after a warm-up; 1 where a call takes more than two seconds.
+        calls: Number of timed calls after a warm-up; 1 where a call takes more than a second.
         launch_min_s, launch_q1_s, launch_median_s, launch_q3_s: Launches of a call alone, arrays on the device.
         launches: Number of timed repetitions of the launches; 0 for a candidate without a backend.
         upload_s, download_s: Transfers of one call.
@@ -198,12 +198,14 @@ def measure(
     used: list[float] = []
     calls = series(lambda: runner.run(poses), repeats, FEWEST, seconds, used)
     on_device: dict[str, Any] = {}
+    quick = min(calls) <= LONG
     if meter is not None:
-        on_device = {"device_bytes": meter.live, "peak_bytes": meter.peak, **_apart(meter, runner, poses, repeats)}
+        on_device = {"device_bytes": meter.live, "peak_bytes": meter.peak}
+        on_device |= _apart(meter, runner, poses, repeats) if quick else {}
         meter.launches.clear()
     table = getattr(runner, "table_bytes", None)
     compiling = None
-    if first - min(calls) < SLOW_TO_MAKE:
+    if quick and first - min(calls) < SLOW_TO_MAKE:
         # Free the first runner's memory before the second one is made.
         del runner, meter
         begin = time.perf_counter()

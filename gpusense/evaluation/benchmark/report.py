@@ -23,10 +23,11 @@ _DIGITS = 6
 _READING = """\
 Times are nanoseconds per particle-beam: a ray for *ranges*, an evaluated reading for *beam* and *field*. *call* is a
 call with NumPy arrays in and out: minimum and quartiles of the calls after a warm-up. A star marks a single call, of
-more than two seconds. *processor* is the processor's time of a call over all threads. *launch* is the minimum of the
+more than a second. *processor* is the processor's time of a call over all threads. *launch* is the minimum of the
 launches alone, with all arrays on the device. *build* is the time to build the map's tables. *compile* is the
 additional time of the first call in this process: kernels may come from a cache on disk, and later rows reuse compiled
-kernels; where the first call takes long, *build* includes it. *table* and *device* are bytes on the device: of the map's tables, and of all buffers that are alive after a call.
+kernels; where the first call takes long, *build* includes it. *table* and *device* are bytes on the device: of the
+map's tables, and of all buffers that are alive after a call.
 
 Errors are against the exact caster and the models in float64. For ranges: median, 95th percentile and maximum in cells,
 and the shares wrong by more than one and two cells. For the scan's log-likelihood: root mean square and maximum in

@@ -183,7 +183,8 @@ def point_of(plan: Plan, job: Job, truth: Truth, cloud: str, reason: str = "") -
         "method": candidate.method, "variant": candidate.variant, "knob": candidate.knob, "value": candidate.value,
         "code": candidate.code, "precision": job.precision, "exact": candidate.exact,
         "outside": bool(candidate.outside), "particles": particles, "beams": beams, "work": particles * beams,
-        "checked": len(truth.poses), "status": "left out" if reason else "ok", "reason": reason, "time": None, "memory": None, "errors": None,
+        "checked": len(truth.poses), "status": "left out" if reason else "ok", "reason": reason, "time": None,
+        "memory": None, "errors": None,
     }  # fmt: skip
     if reason:
         return point

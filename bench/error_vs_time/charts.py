@@ -10,7 +10,7 @@ from html import escape
 # Okabe and Ito's palette, which remains distinct under colour blindness.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#7f4f24", "#5e3c99", "#7a7a7a")
 WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 480, 330, 62, 14, 34, 48
-STRIP = 46
+STRIP = 62
 """Width of the strip for methods without an error."""
 SMALLEST = 1e-6
 

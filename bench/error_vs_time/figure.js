@@ -1,7 +1,7 @@
 "use strict";
 const rows = JSON.parse(document.getElementById("data").textContent), $ = id => document.getElementById(id);
 const COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#7f4f24", "#5e3c99", "#7a7a7a"];
-const SMALLEST = 1e-6, ALIKE = 1.15, W = 900, H = 460, LEFT = 74, STRIP = 60, RIGHT = 20, TOP = 16, BOTTOM = 44;
+const SMALLEST = 1e-6, ALIKE = 1.15, W = 900, H = 460, LEFT = 74, STRIP = 72, RIGHT = 20, TOP = 16, BOTTOM = 44;
 const unique = list => [...new Set(list)];
 
 function fill(select, options) {

@@ -174,7 +174,7 @@ def methods(rows: Sequence[Row], need: str, devices: Sequence[str], *, fronts: b
               for error, name, there in zip(worst, measures, known, strict=True)),
             f"`{first.code}`",
         ])  # fmt: skip
-    return table(columns, lines, 1)
+    return table(columns, lines, len(columns))
 
 
 def _time(row: Row | None) -> str:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from support.paths import ROOT
@@ -36,6 +38,33 @@ def test_each_report_states_commit_and_command(file: Path) -> None:
     text = file.read_text(encoding="utf-8")
     assert COMMIT.search(text) or "--commit" in text, "no commit"
     assert COMMAND.search(text), "no command"
+
+
+@pytest.fixture
+def stiff_density(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """Import the script that makes the tables of docs/numerics.md."""
+    monkeypatch.syspath_prepend(str(ROOT / "bench"))
+    return importlib.import_module("accuracy.stiff_density")
+
+
+def test_tables_are_written_between_their_marks(stiff_density: ModuleType, tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("a\n<!-- made: one -->\nold\n<!-- end -->\nb\n<!-- made: two -->\nold\n<!-- end -->\nc\n")
+    stiff_density.write_tables(page, {"two": "new", "one": "first"})
+    text = "a\n<!-- made: one -->\nfirst\n<!-- end -->\nb\n<!-- made: two -->\nnew\n<!-- end -->\nc\n"
+    assert page.read_text() == text
+    with pytest.raises(ValueError, match="must have the mark <!-- made: three -->"):
+        stiff_density.write_tables(page, {"three": ""})
+
+
+def test_the_picture_shows_broken_bounds(stiff_density: ModuleType) -> None:
+    """A family within its bound is blue, one beyond it orange, and results that are not finite are named."""
+    rows = [
+        {"backend": "b", "precision": "float32", "family": name, "worst": 1.0, "share": share, "not_finite": lost, "case": "c"}
+        for name, share, lost in (("kept", 0.5, 0), ("broken", 1.5, 0), ("lost", 0.0, 3))
+    ]  # fmt: skip
+    drawn = stiff_density.picture(rows)
+    assert drawn.count("#d55e00") == 2 and ">50 %<" in drawn and ">1.5e+02 %<" in drawn and ">not finite<" in drawn
 
 
 def test_reports_stay_few() -> None:

@@ -59,12 +59,24 @@ def test_tables_are_written_between_their_marks(stiff_density: ModuleType, tmp_p
 
 def test_the_picture_shows_broken_bounds(stiff_density: ModuleType) -> None:
     """A family within its bound is blue, one beyond it orange, and results that are not finite are named."""
+    column = {"backend": "b", "precision": "float32", "worst": 1.0, "case": "c"}
     rows = [
-        {"backend": "b", "precision": "float32", "family": name, "worst": 1.0, "share": share, "not_finite": lost, "case": "c"}
+        column | {"family": name, "share": share, "not_finite": lost}
         for name, share, lost in (("kept", 0.5, 0), ("broken", 1.5, 0), ("lost", 0.0, 3))
-    ]  # fmt: skip
+    ]
     drawn = stiff_density.picture(rows)
     assert drawn.count("#d55e00") == 2 and ">50 %<" in drawn and ">1.5e+02 %<" in drawn and ">not finite<" in drawn
+
+
+def test_families_of_quantities(stiff_density: ModuleType) -> None:
+    """Units differ between precisions, families do not."""
+    names = {
+        "ranges, relative": "ranges", "beam model, 1 + |log p_k|": "beam model, a beam",
+        "field, nearest, eps (1 + |log p_k|)": "field, nearest, a beam",
+        "field, bilinear, scans, share of their bound": "field, bilinear, a scan",
+        "beam model, sum of the weights": "sum of the weights", "textbook formulas, share above 16 eps": "",
+    }  # fmt: skip
+    assert {name: stiff_density.family_of(name) for name in names} == names
 
 
 def test_reports_stay_few() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from support.bench_world import ERRORS, TIMES, made_report
 
+import gpusense as gs
 from gpusense.commands import cli
 from gpusense.evaluation.benchmark import candidates, report, scenes
 from gpusense.interface.casters import ENTRIES
@@ -96,6 +97,16 @@ def test_a_wish_decides_what_is_recommended(capsys):
     ):
         assert cli.main([*own, *wish]) == 0
         assert answer in capsys.readouterr().out
+
+
+def test_a_map_alone_is_the_only_scene(tmp_path, capsys):
+    grid = scenes.clutter(0, (6.0, 5.0), 0.05)
+    gs.write_map(grid, tmp_path / "own.yaml")
+    argv = ["bench", "--problem", "field", "--method", "field", "--map", str(tmp_path / "own.yaml")]
+    assert cli.main([*argv, *SMALL, "--backend", "numpy", "--json"]) == 0
+    made = json.loads(capsys.readouterr().out)
+    assert [scene["name"] for scene in made["scenes"]] == ["own"]
+    assert {point["status"] for point in made["points"]} == {"ok"}
 
 
 @pytest.mark.parametrize(

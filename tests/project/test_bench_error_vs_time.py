@@ -16,7 +16,7 @@ import pytest
 from support.bench_world import made_point
 from support.paths import ROOT
 
-import gpusense as gs
+from gpusense.backends import get_backend
 from gpusense.evaluation.benchmark.runner import Outcome
 
 FOLDER = ROOT / "bench" / "error_vs_time"
@@ -74,20 +74,23 @@ def test_a_report_needs_a_commit(tmp_path: Path) -> None:
     assert done.returncode == 2 and "--commit: the checkout must have no uncommitted changes, got abc+" in done.stderr
 
 
-def test_tasks_are_measured(needs: Callable[[str], str], tmp_path: Path) -> None:
+def test_tasks_are_measured(
+    measure: ModuleType, needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """Landmarks: known correspondences are the truth, the likeliest landmarks are not; and all times are there."""
-    words = ["--backend", needs("opencl"), "--need", "landmarks", "--rounds", "1", "--longest", "99", "--commit", "abc"]
-    command = [sys.executable, str(FOLDER / "needs.py"), *words, "--output", str(tmp_path / "tasks")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    report = json.loads((tmp_path / "tasks.json").read_text())
+    tasks, selection = importlib.import_module("needs"), needs("opencl")
+    monkeypatch.setattr(tasks, "PARTICLES", 300)
+    given = argparse.Namespace(need=["landmarks"], rounds=2, seconds=99.0, longest=99.0, commit="abc")
+    report = tasks.report_of(given, [selection], "python bench/error_vs_time/needs.py")
+    measure.write(tmp_path / "x", "tasks", report)
+    assert json.loads((tmp_path / "x_tasks.json").read_text()) == report
     assert (report["kind"], report["commit"]) == ("needs", "abc")
-    assert report["command"].startswith("python bench/error_vs_time/needs.py --backend")
     rows = {(row["method"], row["precision"]): row for row in report["rows"]}
     assert rows["known", "float64"]["error"]["max"] < 1e-9 < 1e-3 < rows["nearest", "float32"]["error"]["median"]
     for row in rows.values():
-        assert (row["runs"], row["reason"], row["unit"]) == (1, "", "nats")
+        assert (row["runs"], row["reason"], row["unit"]) == (2, "", "nats")
         assert 0 < row["seconds"]["min"] <= row["seconds"]["q1"] <= row["seconds"]["q3"] and row["processor_s"] > 0
+    assert tasks.markdown(report["rows"]).count("landmarks") == len(rows)
 
 
 def test_settings_that_the_time_leaves_no_room_for_are_listed(measure: ModuleType) -> None:
@@ -98,7 +101,7 @@ def test_settings_that_the_time_leaves_no_room_for_are_listed(measure: ModuleTyp
 
     settings = [needs.Setting("matching", name, "", "", "float32", run) for name in "ab"]
     given = argparse.Namespace(rounds=3, seconds=-1.0, longest=0.5)
-    device = gs.RayCaster(gs.OccupancyGrid([[0]], 1.0), 1.0, backend="numpy")._backend
+    device = get_backend("numpy")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(needs.SETTINGS, "matching", lambda _: iter(settings))
         rows = needs.measure("matching", device, given)

@@ -5,8 +5,8 @@
 
 NAME_tasks.json is the report of needs.py, NAME_models.json one of ``gpusense bench`` with 10 000 particles and 360
 beams: all methods in float32, those that compute the model itself in float64, too. Scenes are measured one after the
-other; after --deadline no further one begins, and the report has those before. Both reports are written as soon as they
-are there. A checkout with uncommitted changes is refused; --commit names that of a copy without a repository.
+other; after --deadline no further one begins, and the report has those before. Reports are written as soon as they are
+there, that of the models after each scene. A checkout with uncommitted changes is refused; --commit names that of a copy without a repository.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -53,8 +54,8 @@ def plans_of(arguments: argparse.Namespace) -> tuple[list[Plan], dict[str, Any],
     return plans, bench.arguments_of(given, replace(whole, sources=sources)), absent
 
 
-def models(arguments: argparse.Namespace, stated: str, begin: float) -> dict[str, Any]:
-    """Measure the scenes until the deadline; return the report."""
+def models(arguments: argparse.Namespace, stated: str, begin: float) -> Iterator[dict[str, Any]]:
+    """Measure the scenes until the deadline; yield the report after each one."""
     plans, given, absent = plans_of(arguments)
     outcome, done = Outcome([], []), []
     for plan in plans:
@@ -72,9 +73,9 @@ def models(arguments: argparse.Namespace, stated: str, begin: float) -> dict[str
         outcome.truth = part.truth
         done.append(name)
         note(f"{name}, {plan.precisions[0]}: {time.perf_counter() - begin:.0f} s")
-    given |= {"scenes": list(dict.fromkeys(done)), "precisions": ["float32", "float64"]}
-    report = document(plans[0], outcome, given, machine(), absent, command_line("bench/error_vs_time/measure.py"))
-    return report | {"commit": stated}
+        given |= {"scenes": list(dict.fromkeys(done)), "precisions": ["float32", "float64"]}
+        report = document(plans[0], outcome, given, machine(), absent, command_line("bench/error_vs_time/measure.py"))
+        yield report | {"commit": stated}
 
 
 def main() -> None:
@@ -99,7 +100,8 @@ def main() -> None:
     if not arguments.no_tasks:
         made = needs.report_of(arguments, arguments.backend, command_line("bench/error_vs_time/measure.py"))
         write(arguments.output, "tasks", made)
-    write(arguments.output, "models", models(arguments, stated, begin))
+    for report in models(arguments, stated, begin):
+        write(arguments.output, "models", report)
 
 
 def write(output: Path, kind: str, report: dict[str, Any]) -> None:

@@ -6,8 +6,8 @@
 NAME_tasks.json is the report of needs.py, NAME_models.json one of ``gpusense bench`` with 10 000 particles and 360
 beams: all methods in float32, those that compute the model itself in float64, too. Scenes are measured one after the
 other; after --deadline no further one begins, and the report has those before. Reports are written as soon as they are
-there, that of the models after each scene. A checkout with uncommitted changes is refused; --commit names that of a copy
-without a repository.
+there, that of the models after each scene. A checkout with uncommitted changes is refused; --commit names that of a
+copy without a repository.
 """
 
 from __future__ import annotations

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from html import escape
 
 # Okabe and Ito's palette, which remains distinct under colour blindness.
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#7f4f24", "#5e3c99", "#7a7a7a")
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#7f4f24", "#5e3c99", "#7a7a7a",
+           "#66a61e", "#e7298a", "#8b0000", "#1b7f79")  # fmt: skip
 WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 480, 330, 62, 14, 34, 48
 STRIP = 62
 """Width of the strip for methods without an error."""
@@ -88,7 +89,7 @@ def _panel(chart: Chart, groups: Sequence[str]) -> list[str]:
     parts = [
         f'<text x="{LEFT}" y="18" class="t">{escape(chart.title)}</text>',
         f'<rect x="{LEFT}" y="{top}" width="{STRIP}" height="{bottom - top}" fill="#eef1f5"/>',
-        f'<text x="{LEFT + STRIP / 2:.0f}" y="{bottom + 14}" text-anchor="middle" class="s">exact</text>',
+        f'<text x="{LEFT + STRIP / 2 - 10:.0f}" y="{bottom + 14}" text-anchor="middle" class="s">exact</text>',
         f'<text x="{(begin + end) / 2:.0f}" y="{HEIGHT - 10}" text-anchor="middle">{escape(chart.axis)}</text>',
         f'<text x="14" y="{(top + bottom) / 2:.0f}" text-anchor="middle" '
         f'transform="rotate(-90 14 {(top + bottom) / 2:.0f})">time</text>',

@@ -1,6 +1,6 @@
 "use strict";
 const rows = JSON.parse(document.getElementById("data").textContent), $ = id => document.getElementById(id);
-const COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#7f4f24", "#5e3c99", "#7a7a7a"];
+const COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#7f4f24", "#5e3c99", "#7a7a7a", "#66a61e", "#e7298a", "#8b0000", "#1b7f79"];
 const SMALLEST = 1e-6, ALIKE = 1.15, W = 900, H = 460, LEFT = 74, STRIP = 72, RIGHT = 20, TOP = 16, BOTTOM = 44;
 const unique = list => [...new Set(list)];
 
@@ -79,7 +79,7 @@ function tip(row, event) {
 }
 
 function draw() {
-  const list = chosen(), figure = $("figure"), gpusense = list.filter(row => !row.outside);
+  const list = chosen(), figure = $("figure"), gpusense = list.filter(row => !row.outside && !row.maps);
   figure.replaceChildren();
   $("front").replaceChildren();
   if (!gpusense.length) { $("answer").textContent = "Not measured."; return; }
@@ -94,7 +94,7 @@ function draw() {
   const x = error => error < SMALLEST ? LEFT + STRIP / 2 : begin + (Math.log10(error) - low) / (high - low) * (end - begin);
   const y = time => bottom - (Math.log10(time) - fast) / (slow - fast) * (bottom - TOP);
   figure.append(element("rect", {x: LEFT, y: TOP, width: STRIP, height: bottom - TOP, fill: "#eef1f5"}));
-  figure.append(element("text", {x: LEFT + STRIP / 2, y: bottom + 18, "text-anchor": "middle", fill: "#4a5568"}, "exact"));
+  figure.append(element("text", {x: LEFT + STRIP / 2 - 10, y: bottom + 18, "text-anchor": "middle", fill: "#4a5568"}, "exact"));
   figure.append(element("text", {x: (begin + end) / 2, y: H - 6, "text-anchor": "middle"}, `${$("measure").value} [${list[0].unit}]`));
   for (let d = low; d <= high; d++) {
     const at = x(10 ** d);

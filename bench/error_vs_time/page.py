@@ -31,15 +31,18 @@ WRONG, MEDIAN, TAIL, LARGEST = (
     "rays wrong by more than a cell", "median error of a ray", "95 % error of a ray", "largest error of a ray",
 )  # fmt: skip
 KL, FINE = "KL divergence at a comparable temperature", "KL divergence from the true posterior"
-SHIFT = "shift of the mean position"
+SHIFT, GLOBAL = "shift of the mean position", "the same, all over the map"
 # By need: the measures of its figure and of its table, the first one that of choices.
 SHOWN = {
-    "rays": (WRONG, MEDIAN, TAIL, LARGEST), "beam model": (KL, FINE, SHIFT), "likelihood field": (KL, FINE, SHIFT),
+    "rays": (WRONG, MEDIAN, TAIL, LARGEST), "beam model": (KL, GLOBAL, FINE, SHIFT),
+    "likelihood field": (KL, GLOBAL, FINE, SHIFT),
     "localisation": ("median error", "95 % error"), "matching": ("median error", "95 % error"),
     "in a map": ("median error", "95 % error"), "learning": ("median error", "largest error"),
     "landmarks": ("median error",),
 }  # fmt: skip
 NEEDS = tuple(SHOWN)
+# Methods with a knob that other implementations have, too.
+TABLES = ("cddt", "lookup", "march, centre")
 
 
 @dataclass(frozen=True)
@@ -106,7 +109,8 @@ def own(rows: Iterable[Row], need: str, device: str, scene: str = ALL) -> list[R
 
 def answer(rows: Sequence[Row], wish: Wish, device: str) -> str:
     """Return the method for a wish with its time and error."""
-    able, measure = [row for row in own(rows, wish.need, device) if wish.only(row)], SHOWN[wish.need][0]
+    able = [row for row in own(rows, wish.need, device) if wish.only(row) and not row.maps]
+    measure = SHOWN[wish.need][0]
     entries = [row.entry(measure) for row in able]
     chosen = choose(entries, wish.error, wish.seconds)
     if not able:
@@ -131,7 +135,8 @@ def answers(rows: Sequence[Row], devices: Sequence[str], wishes: Sequence[Wish])
 
 
 def best(rows: Sequence[Row], measure: str) -> list[Row]:
-    """Return the Pareto front."""
+    """Return the Pareto front of the rows of all maps."""
+    rows = [row for row in rows if not row.maps]
     entries = [row.entry(measure) for row in rows]
     return [rows[entries.index(entry)] for entry in front(entries)]
 
@@ -192,7 +197,10 @@ def peers(rows: Sequence[Row]) -> list[str]:
         measure = SHOWN[need][0]
         for device in dict.fromkeys(row.device for row in outside if row.need == need):
             rivals = [row for row in outside if (row.need, row.device) == (need, device)]
-            reference = [row for row in own(rows, need, device) if row.precision == "float32" and not row.setting]
+            reference = [
+                row for row in own(rows, need, device)
+                if row.precision == "float32" and (not row.setting or row.method in TABLES)
+            ]  # fmt: skip
             for row in sorted([*rivals, *reference], key=lambda one: one.seconds):
                 rate = row.work / row.seconds / 1e6
                 error = value(row.errors[measure], row.units[measure]) + " nats" * (need != "rays")
@@ -232,7 +240,7 @@ def interactive(rows: Sequence[Row]) -> str:
     data = [
         {
             "need": row.need, "device": row.device, "map": row.scene, "name": row.text, "method": row.method,
-            "code": row.code, "outside": row.outside, "time": _short(row.seconds),
+            "code": row.code, "outside": row.outside, "maps": row.maps, "time": _short(row.seconds),
             "quartiles": [_short(one) for one in row.quartiles],
             "errors": {name: _short(row.errors[name]) for name in SHOWN[row.need] if name in row.errors},
             "units": [row.units[name] for name in SHOWN[row.need] if name in row.errors],

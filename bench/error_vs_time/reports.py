@@ -6,7 +6,7 @@ import json
 import math
 import subprocess
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,19 +22,20 @@ FOLDERS = ("kernels", "gpusense/models", "gpusense/tables", "gpusense/backends")
 LIMIT = 100
 ALL = "all maps"
 NEEDS = {"ranges": "rays", "beam": "beam model", "field": "likelihood field"}
-# By need: its measures as (place in a point, text, unit); the first one is that of its limit.
+# By need: its measures as (place in a point, cloud or "" for all, text, unit); the first one is that of its limit.
 MODEL_MEASURES = {
     "rays": (
-        (("ranges", "wrong_1"), "rays wrong by more than a cell", "share"),
-        (("ranges", "median"), "median error of a ray", "cells"),
-        (("ranges", "p95"), "95 % error of a ray", "cells"),
-        (("ranges", "max"), "largest error of a ray", "cells"),
+        (("ranges", "wrong_1"), "", "rays wrong by more than a cell", "share"),
+        (("ranges", "median"), "", "median error of a ray", "cells"),
+        (("ranges", "p95"), "", "95 % error of a ray", "cells"),
+        (("ranges", "max"), "", "largest error of a ray", "cells"),
     ),
     "beam model": (
-        (("comparable", "kl"), "KL divergence at a comparable temperature", "nats"),
-        (("fine", "kl"), "KL divergence from the true posterior", "nats"),
-        (("comparable", "shift_m"), "shift of the mean position", "m"),
-        (("log_p", "rms"), "RMS error of log p", "nats"),
+        (("comparable", "kl"), "tracking", "KL divergence at a comparable temperature", "nats"),
+        (("comparable", "kl"), "global", "the same, all over the map", "nats"),
+        (("fine", "kl"), "tracking", "KL divergence from the true posterior", "nats"),
+        (("comparable", "shift_m"), "tracking", "shift of the mean position", "m"),
+        (("log_p", "rms"), "tracking", "RMS error of log p", "nats"),
     ),
 }
 MODEL_MEASURES["likelihood field"] = MODEL_MEASURES["beam model"]
@@ -58,6 +59,7 @@ class Row:
         exact: Whether it computes the model itself.
         outside: Version and threads of another implementation; empty for gpusense.
         work: Rays or readings of a call; 1 for tasks.
+        maps: "8 of 10 clouds" where others were left out, for the time that a table takes; no choice falls on it.
     """
 
     need: str
@@ -74,12 +76,14 @@ class Row:
     exact: bool = False
     outside: str = ""
     work: int = 1
+    maps: str = ""
 
     @property
     def text(self) -> str:
         """Name the method with setting and precision; float32 is not named."""
         precision = self.precision if self.precision != "float32" and self.need != "learning" else ""
-        return ", ".join(word for word in (self.method, self.setting, precision) if word)
+        text = ", ".join(word for word in (self.method, self.setting, precision) if word)
+        return f"{text} ({self.maps})" if self.maps else text
 
     def entry(self, measure: str) -> Entry:
         """Return the row as an entry to choose from, by one of its measures."""
@@ -217,16 +221,18 @@ def model_rows(source: Source) -> list[Row]:
     everywhere = {}
     for (need, backend, *_, precision), group in groups.items():
         seen = everywhere.setdefault((need, backend, precision), set())
-        seen |= {point["scene"] for point in group}
+        seen |= {(point["scene"], point["cloud"]) for point in group}
     rows = []
     for (need, backend, *_, precision), group in groups.items():
         title = source.titles[0] if backend == "outside" else title_of(group[0], machine)
         for scene in [*dict.fromkeys(point["scene"] for point in group), ALL]:
             part = group if scene == ALL else [point for point in group if point["scene"] == scene]
-            # A method that failed in a map is none for all maps.
-            whole = scene != ALL or {point["scene"] for point in part} == everywhere[need, backend, precision]
-            if whole and (made := _model_row(need, title, scene, part)) is not None:
-                rows.append(made)
+            part = [point for point in part if point["status"] != "left out"]
+            there, whole = len(part), len(everywhere[need, backend, precision])
+            made = _model_row(need, title, scene, part) if part else None
+            if made is not None:
+                some = scene == ALL and there < whole
+                rows.append(replace(made, maps=f"{there} of {whole} clouds") if some else made)
     return rows
 
 
@@ -235,8 +241,9 @@ def _model_row(need: str, title: str, scene: str, group: Sequence[Mapping[str, A
     if any(time is None or point["status"] != "ok" for time, point in zip(times, group, strict=True)):
         return None
     errors, units = {}, {}
-    for place, text, unit in MODEL_MEASURES[need]:
-        known = [value for point in group if (value := error_of(point, *place)) is not None]
+    for place, cloud, text, unit in MODEL_MEASURES[need]:
+        part = [point for point in group if cloud in ("", point["cloud"])]
+        known = [value for point in part if (value := error_of(point, *place)) is not None]
         if known:
             errors[text], units[text] = max(known), unit
     first = group[0]

@@ -224,10 +224,10 @@ def listing(found: Sequence[Source]) -> list[str]:
     """Return the table of the reports."""
     lines = [
         (f"[{source.name}](../bench/results/{source.name})", "; ".join(source.titles), str(source.report["date"]),
-         str(source.report["commit"]), f"`{source.report['command']}`")
+         str(source.report["commit"]), source.missing, f"`{source.report['command']}`")
         for source in found
     ]  # fmt: skip
-    return table(("report", "devices", "date", "commit", "command"), lines, 5)
+    return table(("report", "devices", "date", "commit", "not measured", "command"), lines, 6)
 
 
 def picture(name: str) -> Path:

@@ -109,6 +109,13 @@ class Source:
     report: Mapping[str, Any]
     titles: tuple[str, ...]
 
+    @property
+    def missing(self) -> str:
+        """Say how many points or settings were left out or failed, of how many."""
+        points = self.report["points" if self.kind == "models" else "rows"]
+        lost = sum(one["status"] != "ok" if self.kind == "models" else one["seconds"] is None for one in points)
+        return f"{lost} of {len(points)}"
+
 
 # ---- commits
 

@@ -5,7 +5,7 @@ the filter's defaults. A run is lost if the median error of its last tenth is ab
 there, starts anywhere on the map are compared with one another and with the verdict.
 
     python bench/accuracy/localization_logs.py --logs aces olin --models field --particles 500 5000 --seeds 3 \
-        --out bench/results/localization_logs_cpu.json
+        --out localization_logs_cpu.json
 """
 
 from __future__ import annotations

@@ -1,8 +1,12 @@
 """Measure errors of the beam densities against 60 digits, ours beside the textbook's formulas.
 
-    python bench/accuracy/stiff_density.py              # docs/img/stiff_*.png, and the tables of docs/numerics.md
+    python bench/accuracy/stiff_density.py --page docs/numerics.md   # docs/img/stiff_*, and the tables of the page
     python bench/accuracy/stiff_density.py --figures DIRECTORY --backend numpy --backend opencl
     python bench/accuracy/stiff_density.py --figures DIRECTORY --backend numpy --step 4     # a quick look
+
+stiff_worst.svg shows the largest error of each family of quantities on every backend in both precisions, as a share of
+its bound. --page writes the tables between the page's marks, with the command and the commit, and refuses a checkout
+with uncommitted changes.
 
 Truth is mpmath (60 digits) on the same rounded numbers. The unit is eps (1 + |log p|) with the eps of the precision.
 """
@@ -24,13 +28,14 @@ import numpy as np
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.evaluation import stiff
+from gpusense.evaluation.benchmark.report import commit
 from gpusense.evaluation.tolerances import TOLERANCES
 from gpusense.models.scan.densities import naive_log_hit, naive_log_short
 from gpusense.reference.mixture import log_density
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import FIGURES, make_parser, parse, publish, table
+from common import FIGURES, command_line, make_parser, parse, publish, table
 
 mpl.use("Agg")
 mp.mp.dps = 60
@@ -135,12 +140,91 @@ def plot(path: Path, sweeps: dict[str, Sweep], label: str, title: str) -> None:
     figure.savefig(path, dpi=110)
 
 
-def grid_rows(backends: list[str]) -> list[dict[str, Any]]:
-    """Judge the density grid and the catalogue of scenes on every backend."""
+def family_of(quantity: str) -> str:
+    """Return the family of a quantity of ``stiff.run``; empty for the textbook's formulas."""
+    if quantity.startswith("textbook"):
+        return ""
+    if quantity.startswith("ranges"):
+        return "ranges"
+    if quantity.endswith("sum of the weights"):
+        return "sum of the weights"
+    model = "beam model" if quantity.startswith("beam model") else ", ".join(quantity.split(", ")[:2])
+    return f"{model}, a {'scan' if ', scans,' in quantity else 'beam'}"
+
+
+def family_rows(backend: str, precision: str, rows: list[stiff.Row]) -> list[dict[str, Any]]:
+    """Return the row with the largest share of its bound of each family."""
+    found = []
+    for family in sorted(filter(None, {family_of(row.quantity) for row in rows})):
+        own = [row for row in rows if family_of(row.quantity) == family]
+        worst = max(own, key=lambda row: (row.nonfinite, _share(row)))
+        found.append({
+            "backend": backend, "precision": precision, "family": family, "worst": worst.worst,
+            "share": _share(worst), "not_finite": sum(row.nonfinite for row in own), "case": worst.case,
+        })  # fmt: skip
+    return found
+
+
+def _share(row: stiff.Row) -> float:
+    """Return an error as a share of its bound; of a bound of 0, 0 or 2."""
+    return row.worst / row.bound if row.bound else 2.0 * (row.worst > 0)
+
+
+def picture(families: list[dict[str, Any]]) -> str:
+    """Draw the largest error of each family, a column for each backend and precision, darker towards the bound."""
+    columns = list(dict.fromkeys((row["backend"], row["precision"]) for row in families))
+    names = list(dict.fromkeys(row["family"] for row in families))
+    width, height, left, top = 108, 26, 170, 44
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {left + width * len(columns) + 10} '
+        f'{top + height * len(names) + 34}" font-family="sans-serif" font-size="12">',
+        f'<rect width="{left + width * len(columns) + 10}" height="{top + height * len(names) + 34}" fill="white"/>',
+    ]
+    for i, (backend, precision) in enumerate(columns):
+        x = left + width * i + width / 2
+        for line, text in enumerate((backend, precision)):
+            parts.append(f'<text x="{x:.0f}" y="{16 + 16 * line}" text-anchor="middle">{text}</text>')
+    for j, name in enumerate(names):
+        y = top + height * j
+        parts.append(f'<text x="{left - 8}" y="{y + 17}" text-anchor="end">{name}</text>')
+        for i, column in enumerate(columns):
+            row = next((r for r in families if (r["backend"], r["precision"], r["family"]) == (*column, name)), None)
+            if row is None:
+                continue
+            bad, share = row["not_finite"] or row["share"] > 1, min(row["share"], 1.0)
+            fill = "#d55e00" if bad else f"rgb({round(255 - 150 * share)},{round(255 - 90 * share)},255)"
+            x, text = left + width * i, "not finite" if row["not_finite"] else f"{100 * row['share']:.2g} %"
+            parts.append(f'<rect x="{x + 1}" y="{y + 1}" width="{width - 2}" height="{height - 2}" fill="{fill}">'
+                         f'<title>{row["worst"]:.3g}, {row["case"].replace("<", "")}</title></rect>')  # fmt: skip
+            parts.append(f'<text x="{x + width / 2:.0f}" y="{y + 17}" text-anchor="middle">{text}</text>')
+    note = "Largest error as a share of its bound, over all stiff and extreme cases; more than 100 % would be orange."
+    parts.append(f'<text x="10" y="{top + height * len(names) + 22}" fill="#4a5568">{note}</text>')
+    return "\n".join([*parts, "</svg>", ""])
+
+
+def write_tables(page: Path, tables: dict[str, str]) -> None:
+    """Replace what stands between the marks of a page.
+
+    Raises:
+        ValueError: a mark is missing.
+    """
+    text = page.read_text(encoding="utf-8")
+    for name, lines in tables.items():
+        begin, end = f"<!-- made: {name} -->", "<!-- end -->"
+        if begin not in text:
+            raise ValueError(f"{page.name}: must have the mark {begin}, got none")
+        before, _, after = text.partition(begin)
+        text = f"{before}{begin}\n{lines}\n{end}{after.partition(end)[2]}"
+    page.write_text(text, encoding="utf-8")
+
+
+def grid_rows(backends: list[str], families: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Judge the density grid and the catalogue of scenes on every backend; add the worst of each family."""
     found = []
     for backend in backends:
         for precision in PRECISIONS[: 1 + get_backend(backend).info.float64]:
             rows = stiff.run(backend, precision)
+            families += family_rows(backend, precision, rows)
             own, naive, *_ = rows
             found.append({
                 "backend": backend, "precision": precision, "worst": own.worst, "not_finite": own.nonfinite,
@@ -182,8 +266,12 @@ def main() -> int:
     """Draw the plots and write the tables."""
     parser = make_parser(__doc__)
     parser.add_argument("--figures", type=Path, default=FIGURES, help="folder for the drawings (default: docs/img)")
+    parser.add_argument("--page", type=Path, help="page whose tables are written, such as docs/numerics.md")
     parser.add_argument("--step", type=float, default=0.25, help="of the plots [decades of sigma] (default: 0.25)")
     arguments = parse(parser)
+    stated = arguments.commit or commit() or ""
+    if arguments.page and (not stated or stated.endswith("+")):
+        parser.error(f"--page: the checkout must have no uncommitted changes, got {stated or 'no repository'}")
     arguments.figures.mkdir(parents=True, exist_ok=True)
     sigmas, rates = 10.0 ** np.arange(-8, 6.01, arguments.step), 10.0 ** np.arange(-20, 6.01, 2 * arguments.step)
     hits = {precision: sweep(precision, sigmas, (1.0, 0.0, 0.0, 0.0), around) for precision in PRECISIONS}
@@ -198,7 +286,9 @@ def main() -> int:
     cliff = table(
         ("max_distance / sigma", "worst [eps (1 + abs(log p))]"), ([ratio, f"{eps:.1f}"] for ratio, eps in bilinear)
     )
-    rows = grid_rows(arguments.backend)
+    families: list[dict[str, Any]] = []
+    rows = grid_rows(arguments.backend, families)
+    (arguments.figures / "stiff_worst.svg").write_text(picture(families), encoding="utf-8")
     columns = (
         "backend", "precision", "worst", "not finite", "bound", "rows kept", "textbook: above 16 eps", "not finite",
     )  # fmt: skip
@@ -208,7 +298,12 @@ def main() -> int:
          f"{r['naive_not_finite']} of {r['readings']}"]
         for r in rows
     ))  # fmt: skip
-    publish(__file__, arguments, f"{worst}\n\n{cliff}\n\n{grid}", {"bilinear": bilinear, "rows": rows})
+    if arguments.page:
+        made = f"Made by `{command_line('bench/accuracy/stiff_density.py')}` of commit {stated}."
+        write_tables(arguments.page, {"density grid": f"{made}\n\n{grid}", "sweeps": worst, "cliff": cliff})
+    publish(
+        __file__, arguments, f"{worst}\n\n{cliff}\n\n{grid}", {"bilinear": bilinear, "rows": rows, "families": families}
+    )
     return 0
 
 

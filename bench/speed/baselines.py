@@ -10,8 +10,8 @@ numba (``pip install numba``): code of our own from public descriptions, paralle
 - ``numba march``: f1tenth_gym's ray marching: steps of the distance between cell centres through the Euclidean distance
   field, headings rounded to a table of sines.
 
-range_libc and f1tenth_gym themselves appear where they can be imported. Both run one thread. Their maps are the whole
-map in cells, with its yaw taken out.
+range_libc appears where the variable RANGE_LIBC names a copy of its sources, which are compiled then; f1tenth_gym where
+it can be imported. Both run one thread. Their maps are the whole map in cells, with its yaw taken out.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from __future__ import annotations
 import importlib
 import inspect
 import math
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,9 +32,13 @@ from gpusense.evaluation.benchmark.candidates import Candidate
 from gpusense.evaluation.benchmark.scenes import Scene
 from gpusense.world.scanner import Reading, classify
 
-THETA_BINS = (500, 2000, 8000)
-CDDT_BINS = (54, 108, 216, 720)
-TABLE_BINS = (54, 108, 216)
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from speed import range_libc
+
+THETA_BINS = (2000,)
+CDDT_BINS = (108, 720)
+TABLE_BINS = 54
 # f1tenth_gym stops where an obstacle is nearer than this [m].
 NEAR = 1e-4
 # Beams whose densities are multiplied before a logarithm is taken: no product over- or underflows float64.
@@ -189,24 +195,17 @@ def numba_march(bins: int) -> Callable[[Scene, None, str], Runner]:
     return make
 
 
-def range_libc_caster(library: Any, make_caster: Callable[[Any, float], Any]) -> Callable[[Scene, None, str], Runner]:
+def range_libc_caster(library: Any, kind: str, bins: int) -> Callable[[Scene, None, str], Runner]:
     """Make a runner of a range_libc method, in cells and in the frame of the grid."""
 
     def make(scene: Scene, backend: None, precision: str) -> Runner:
-        occupied, limit = scene.grid.occupied, scene.scanner.range_max / scene.grid.resolution
-        # It mixes up the sides of maps that are not square.
-        side = max(occupied.shape)
-        square = np.zeros((side, side), bool)
-        square[: occupied.shape[0], : occupied.shape[1]] = occupied
-        caster = make_caster(library.PyOMap(np.ascontiguousarray(square.T)), limit)
-        angles = scene.scanner.bearings.astype(np.float32)
+        limit = scene.scanner.range_max / scene.grid.resolution
+        caster = range_libc.Caster(library, kind, scene.grid.occupied, limit, bins)
 
         def run(poses: np.ndarray) -> np.ndarray:
-            found = np.empty(len(poses) * len(angles), np.float32)
-            caster.calc_range_repeat_angles(in_cells(scene, poses).astype(np.float32), angles, found)
-            return found.reshape(len(poses), -1) * scene.grid.resolution
+            return caster.cast(in_cells(scene, poses), scene.scanner.bearings) * scene.grid.resolution
 
-        return Runner(run, 0)
+        return Runner(run, caster.table_bytes)
 
     return make
 
@@ -262,18 +261,17 @@ def candidates() -> list[Candidate]:
         Candidate("ranges", "numba march", numba_march(bins), "", "headings", bins, precision="float64", **own)
         for bins in THETA_BINS
     ]
-    library, missing = imported("range_libc")
+    library, missing = range_libc.load()
     own = {"outside": "range_libc, 1 thread", "missing": missing}
-    casters = [
-        ("BL", None, lambda m, r: library.PyBresenhamsLine(m, r)),
-        ("RM", None, lambda m, r: library.PyRayMarching(m, r)),
-        *(("CDDT", bins, lambda m, r, bins=bins: library.PyCDDTCast(m, r, bins)) for bins in CDDT_BINS),
-        *(("GLT", bins, lambda m, r, bins=bins: library.PyGiantLUTCast(m, r, bins)) for bins in TABLE_BINS),
-    ]
+    casters = [("BL", None), ("RM", None), *(("CDDT", bins) for bins in CDDT_BINS), ("PCDDT", CDDT_BINS[0]),
+               ("GLT", TABLE_BINS)]  # fmt: skip
     found += [
-        Candidate("ranges", "range_libc", range_libc_caster(library, make), kind, "bins" if bins else "", bins, **own)
-        for kind, bins, make in casters
-    ]
+        Candidate(
+            "ranges", "range_libc", range_libc_caster(library, kind, bins or 0), kind, "bins" if bins else "", bins,
+            **own,
+        )
+        for kind, bins in casters
+    ]  # fmt: skip
     module, missing = imported("f110_gym.envs.laser_models", "f1tenth_gym.envs.laser_models")
     own = {"outside": "f1tenth_gym, 1 thread", "missing": missing}
     found += [

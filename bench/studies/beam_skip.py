@@ -3,7 +3,7 @@
 People are at 0.4 to 2 m and cover sectors of the scan; sectors and distances follow random walks. A reading is the
 nearer one of wall and person. A run is lost if the median error of its last tenth is above 1 m.
 
-    python bench/studies/beam_skip.py --out bench/results/beam_skip_cpu.json
+    python bench/studies/beam_skip.py --out beam_skip_cpu.json
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ For each log, number of beams (bad readings are dropped first, the others thinne
 of the 50, 80 and 95 % regions, width of the 95 % interval of the position, median NEES (2.37 is right) and the rank
 histogram of the true poses, which is flat where the weights are right.
 
-    python bench/studies/coverage.py --logs intel csail fr079 --beams 10 30 90 180 --out bench/results/coverage_cpu.json
+    python bench/studies/coverage.py --logs intel csail fr079 --beams 10 30 90 180 --out coverage_cpu.json
     python bench/studies/coverage.py --logs intel olin --models beam --beams 60 --weights "plain product" auto
 """
 

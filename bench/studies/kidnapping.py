@@ -3,7 +3,7 @@
 Each run tracks intel for some scans from the logged pose, and goes on at another part of the log as if the robot had
 stood still. It is found where five scans in a row are within 1 m and 20 degrees.
 
-    python bench/studies/kidnapping.py --runs 10 --out bench/results/kidnapping_cpu.json
+    python bench/studies/kidnapping.py --runs 10 --out kidnapping_cpu.json
 """
 
 from __future__ import annotations

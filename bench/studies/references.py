@@ -4,7 +4,7 @@ Errors and coverage are those against reference poses, which are not free of err
 the scan is likelier at the filter's estimate by NATS at least, with all beams and in every run. The reverse, estimates
 that are contradicted by as much, is the control.
 
-    python bench/studies/references.py --seeds 3 --out bench/results/references_cpu.json
+    python bench/studies/references.py --seeds 3 --out references_cpu.json
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ with p_lost of at most 0.5 whose pose has been more than 2 m off, or on a wrong 
 writes its runs to a file; ``--join`` makes the page of all shards.
 
     python bench/studies/verdict.py --shard 1/16 --seeds 4 --maps 10 --simulated 2000 --raw shard_1.npz
-    python bench/studies/verdict.py --join shard_*.npz --out bench/results/verdict_cpu.json
+    python bench/studies/verdict.py --join shard_*.npz --out verdict_cpu.json
 """
 
 from __future__ import annotations

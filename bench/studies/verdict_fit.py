@@ -5,7 +5,7 @@ beams of each scan are judged at the estimate, if it is not wide. A logistic reg
 wrong poses gives the coefficients. The tables compare fitted ratios with those of the counts in bins, and the
 correlation of ratios with the way between their scans. Poses between 0.5 and 1 m off are left out.
 
-    python bench/studies/verdict_fit.py --runs 200 --out bench/results/verdict_fit.json
+    python bench/studies/verdict_fit.py --runs 200 --out verdict_fit.json
 """
 
 from __future__ import annotations

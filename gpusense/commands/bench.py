@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+import shlex
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +13,7 @@ from gpusense._util.files import check_writable, write_whole
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import BACKEND_HELP, add_json, open_backends, positive_number, whole_number
 from gpusense.commands.output import print_json, print_table
+from gpusense.evaluation.benchmark.choice import Wish, answers, parse_error, parse_time
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
@@ -40,6 +43,11 @@ bench/speed/baselines.py of a checkout or from the file that --peers names; the 
 its knob, exact points in the strip on the left, failed points in the strip on the right. Failures are listed with
 their reasons.
 
+At the end stands, for each device and problem, which method to take: the fastest with an error of at most --max-error,
+or the most exact with a call of at most --max-time. Nats are the KL divergence of the posterior, lengths the shift of
+its mean, both at a comparable temperature; percents are rays wrong by more than a cell, cells the range error that 95 %
+of the rays keep. The times are of calls of --particles times --beams.
+
 --compare OLD repeats the measurements of the old report, with its particles, beams and seed unless options change
 them, and lists points that became slower or less exact; --compare OLD NEW compares two reports without measuring.
 
@@ -49,6 +57,7 @@ example:
   gpusense bench --quick
   gpusense bench --output results --backend opencl --backend warp:cpu
   gpusense bench --scene basement --method exact --method lookup --problem ranges
+  gpusense bench --map office.yaml --particles 10000 --beams 60 --max-error "0.01 nats" --max-time "1 ms"
   gpusense bench --compare results/report.json"""
 
 
@@ -76,13 +85,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--checked", type=whole_number(low=2), metavar="M", help="particles whose errors are computed (default: 512)")
     add("--beams", type=whole_number(low=1, high=100_000), metavar="K", help="beams of the scanner (default: 360)")
     add("--repeats", type=whole_number(low=1), metavar="R", help="timed calls per point (default: 20)")
+    add("--seconds", type=positive_number, default=5.0, metavar="S",
+        help="longest time of a point's timed calls, at least three of them [s] (default: %(default)s)")  # fmt: skip
     add("--build-limit", type=positive_number, metavar="S",
         help="leave out tables that take longer to build [s] (default: 60)")  # fmt: skip
     add("--peers", type=Path, metavar="FILE", help="a Python file with outside candidates; it is executed")
     add("--no-peers", action="store_true", help="no outside candidates")
+    add("--max-error", action="append", default=[], type=_limit(parse_error), metavar="E",
+        help="error that one can afford, such as '0.01 nats', '2 cm', '1 %%' or '0.5 cells': choose the fastest method "
+        "(default: 0.01 nats, 1 %%); may be repeated with other units")  # fmt: skip
+    add("--max-time", type=_limit(parse_time), metavar="T",
+        help="time of a call that one can afford, such as '1 ms': choose the most exact method")  # fmt: skip
     add("--time", choices=("call", "launch"), default="call", help="time axis of the diagrams (default: %(default)s)")
     add("--seed", type=whole_number(low=0), metavar="N", help="seed of maps, scans and particles (default: 0)")
     add_json(parser)
+
+
+def _limit(parse: Callable[[str], Any]) -> Callable[[str], Any]:
+    """Make a type for ``add_argument`` of a function that raises ``ValueError`` with the option's name."""
+
+    def convert(text: str) -> Any:
+        try:
+            return parse(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error).partition(": ")[2]) from None
+
+    return convert
 
 
 def run(args: argparse.Namespace) -> int:
@@ -106,7 +134,7 @@ def run(args: argparse.Namespace) -> int:
             if not outcome.points:
                 raise
             stopped = stop
-        new = document(plan, outcome, _arguments(args, plan), machine(), absent)
+        new = document(plan, outcome, arguments_of(args, plan), machine(), absent, command_of(sys.argv[1:]))
         if args.output is not None:
             write_report(args.output, new, to_json(new), args.time)
     comparison = None if old is None or stopped is not None else comparing.compare(old, new, args.slower)
@@ -115,6 +143,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         if measured:
             _print(new, args.output)
+            print("\n".join(["", *answers(new["points"], Wish(dict(args.max_error), args.max_time))]))
         if comparison is not None:
             print("\n".join(["", *comparing.lines_of(comparison, args.slower)]))
     if stopped is not None:
@@ -172,7 +201,7 @@ def make_plan(args: argparse.Namespace, old: Mapping[str, Any] | None) -> tuple[
         sources(args.scene or _names(old, args), args.map, quick=quick), backends, chosen,
         args.precision or (PRECISIONS[:1] if quick else PRECISIONS),
         build_limit=args.build_limit or (_QUICK_BUILD if quick else 60.0),
-        deadline=_QUICK_DEADLINE if quick else float("inf"), **numbers,
+        seconds=args.seconds, deadline=_QUICK_DEADLINE if quick else float("inf"), **numbers,
     )  # fmt: skip
     return plan, [*_absent_devices(args.backend), *failures, *absent]
 
@@ -205,15 +234,22 @@ def _absent_devices(selections: Sequence[str] | None) -> list[str]:
     return [] if selections else [f"{device.name}: {device.reason}" for device in devices() if not device.available]
 
 
-def _arguments(args: argparse.Namespace, plan: Plan) -> dict[str, Any]:
+def arguments_of(args: argparse.Namespace, plan: Plan) -> dict[str, Any]:
     """Return the arguments that affect the measurements; of files only their names."""
     return {
         "quick": plan.deadline < float("inf"), "scenes": [source.name for source in plan.sources],
-        "particles": plan.particles, "checked": plan.checked, "beams": plan.beams, "repeats": plan.repeats,
-        "seed": plan.seed, "precisions": list(plan.precisions), "build_limit": plan.build_limit,
+        "particles": plan.particles, "checked": plan.checked, "beams": plan.beams,
+        "repeats": plan.repeats, "seconds": plan.seconds, "seed": plan.seed,
+        "precisions": list(plan.precisions), "build_limit": plan.build_limit,
+        "max_error": [list(one) for one in args.max_error], "max_time": args.max_time,
         "problems": list(args.problem or PROBLEMS), "methods": args.method or [],
         "peers": args.peers.name if args.peers else "",
     }  # fmt: skip
+
+
+def command_of(words: Sequence[str]) -> str:
+    """Write a command line of this program, absolute paths by their names."""
+    return shlex.join(["gpusense", *(Path(word).name if Path(word).is_absolute() else word for word in words)])
 
 
 def _check_folder(folder: Path) -> None:
@@ -255,12 +291,12 @@ def write_report(folder: Path, report: Mapping[str, Any], text: str, timing: str
 
 
 def _print(report: Mapping[str, Any], folder: Path | None) -> None:
-    from gpusense.evaluation.benchmark.report import COLUMNS, RANGE_COLUMNS, row
+    from gpusense.evaluation.benchmark.report import COLUMNS, RANGE_COLUMNS, TIMES, row
 
-    columns = ("scene", "cloud", "problem", *COLUMNS[:11], *RANGE_COLUMNS, *COLUMNS[11:])
+    columns = ("scene", "cloud", "problem", *COLUMNS[:TIMES], *RANGE_COLUMNS, *COLUMNS[TIMES:])
     kept = [columns.index(name) for name in (
-        "scene", "cloud", "problem", "backend", "method", "knob", "precision", "call ns", "launch ns", "build s", "p99",
-        "> 1 cell", "log p rms", "tempered KL",
+        "scene", "cloud", "problem", "backend", "method", "knob", "precision", "call ns", "launch ns", "build s", "p95",
+        "> 1 cell", "log p rms", "comparable KL",
     )]  # fmt: skip
     rows = [[point["scene"], point["cloud"], point["problem"], *row(point, extra=True)] for point in report["points"]]
     named = [columns[i] for i in kept]

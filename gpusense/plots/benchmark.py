@@ -21,11 +21,11 @@ MEASURES = {
         ("wrong", "ranges", "wrong_1", "share of rays wrong by more than one cell"),
     ),
     "beam": (
-        ("kl", "tempered", "kl", "KL divergence of the tempered posterior [nats]"),
+        ("kl", "comparable", "kl", "KL divergence of the posterior at a comparable temperature [nats]"),
         ("log-p", "log_p", "rms", "RMS error of the scan's log-likelihood [nats]"),
     ),
     "field": (
-        ("kl", "tempered", "kl", "KL divergence of the tempered posterior [nats]"),
+        ("kl", "comparable", "kl", "KL divergence of the posterior at a comparable temperature [nats]"),
         ("log-p", "log_p", "rms", "RMS error of the scan's log-likelihood [nats]"),
     ),
 }

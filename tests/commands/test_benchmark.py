@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from support.bench_world import ERRORS, TIMES, made_report
 
+import gpusense as gs
 from gpusense.commands import cli
 from gpusense.evaluation.benchmark import candidates, report, scenes
 from gpusense.interface.casters import ENTRIES
@@ -18,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("no_data")
 SMALL = ["--quick", "--particles", "8", "--checked", "6", "--beams", "7", "--repeats", "1", "--no-peers"]
 FIELD = ["bench", "--problem", "field", "--method", "field", "--scene", "clutter"]
 POINT_KEYS = {
-    "scene", "cloud", "problem", "backend", "device", "kind", "method", "variant", "knob", "value", "precision",
+    "scene", "cloud", "problem", "backend", "device", "kind", "method", "variant", "knob", "value", "code", "precision",
     "exact", "outside", "particles", "beams", "work", "checked", "status", "reason", "time", "memory", "errors",
 }  # fmt: skip
 
@@ -35,17 +36,20 @@ def test_quick_run_writes_whole_files(needs, tmp_path, capsys):
     written = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     assert written == printed
     assert set(written) == {
-        "schema", "date", "commit", "arguments", "machine", "devices", "absent", "truth", "scenes", "points",
+        "schema", "date", "commit", "command", "arguments", "machine", "devices", "absent", "truth", "scenes", "points",
         "profiles",
     }  # fmt: skip
-    assert written["schema"] == 1
+    assert written["schema"] == 2
     for point in written["points"]:
         assert set(point) == POINT_KEYS
         assert point["status"] == "ok", point["reason"]
         assert set(point["time"]) == TIMES
         assert set(point["memory"]) == {"table_bytes", "device_bytes", "peak_bytes"}
         kinds = set(ERRORS) - ({"ranges"} if point["problem"] == "field" else set())
-        assert {kind: set(values) for kind, values in point["errors"].items()} == {k: ERRORS[k] for k in kinds}
+        known = {k: ERRORS[k] for k in kinds}
+        if point["cloud"] == "tracking" and point["problem"] != "ranges":
+            known["fine"] = ERRORS["comparable"]
+        assert {kind: set(values) for kind, values in point["errors"].items()} == known
         if point["exact"] and "ranges" in kinds:
             assert point["errors"]["ranges"]["median"] < 1e-3
     assert {(p["problem"], p["backend"].split(":")[0]) for p in written["points"]} == {
@@ -80,6 +84,29 @@ def test_table_on_the_terminal(capsys):
     out = capsys.readouterr().out
     assert "clutter  tracking  field    numpy    field, fewer beams" in out
     assert "4 points, 0 left out; truth: " in out
+    assert "field on numpy, 1 x 7, error at most 0.01 nats: field, float32: " in out
+
+
+def test_a_wish_decides_what_is_recommended(capsys):
+    """A time that nothing keeps, one that all keep, and an error that only the model itself keeps."""
+    own = [*FIELD, *SMALL, "--backend", "numpy"]
+    for wish, answer in (
+        (["--max-time", "1 us"], "field on numpy, 1 x 7, at most 1 us: no method"),
+        (["--max-time", "99 s"], "field on numpy, 1 x 7, at most 99 s: field, float32: "),
+        (["--max-error", "0.1 mm"], "field on numpy, 1 x 7, error at most 0.1 mm: field, float32: "),
+    ):
+        assert cli.main([*own, *wish]) == 0
+        assert answer in capsys.readouterr().out
+
+
+def test_a_map_alone_is_the_only_scene(tmp_path, capsys):
+    grid = scenes.clutter(0, (6.0, 5.0), 0.05)
+    gs.write_map(grid, tmp_path / "own.yaml")
+    argv = ["bench", "--problem", "field", "--method", "field", "--map", str(tmp_path / "own.yaml")]
+    assert cli.main([*argv, *SMALL, "--backend", "numpy", "--json"]) == 0
+    made = json.loads(capsys.readouterr().out)
+    assert [scene["name"] for scene in made["scenes"]] == ["own"]
+    assert {point["status"] for point in made["points"]} == {"ok"}
 
 
 @pytest.mark.parametrize(
@@ -95,10 +122,16 @@ def test_table_on_the_terminal(capsys):
         (["--compare", "OLD", "OLD", "OLD"], "--compare: must be one or two reports, got 3"),
         (["--compare", "TEXT"], "TEXT: must be a report of gpusense bench, got no JSON"),
         (["--compare", "OTHER"], "OTHER: must be a report of gpusense bench, got another document"),
-        (["--compare", "LATER"], "LATER: schema must be 1, got 99"),
+        (["--compare", "LATER"], "LATER: schema must be 2, got 99"),
         (["--map", "missing.yaml"], "missing.yaml: must exist"),
         (["--peers", "missing.py"], "missing.py: must exist, got no such file"),
         (["--peers", "TEXT", "--no-peers"], "--no-peers: must not be given together with --peers"),
+        (
+            ["--max-error", "2 furlongs"],
+            "argument --max-error: must be a number > 0 with a unit of nats, cells, %, m, cm",
+        ),
+        (["--max-error", "0 cm"], "argument --max-error: must be a number > 0 with a unit of"),
+        (["--max-time", "5"], "argument --max-time: must be a number > 0 with a unit of s, ms, us, got '5'"),
         (["--output", "TEXT"], "--output: must be a folder, got a file: TEXT"),
         (["--output", "absent/folder"], "absent: No such file or directory"),
     ],

@@ -241,7 +241,9 @@ def test_stiff_density_runs(tmp_path: Path) -> None:
     report = run_script("accuracy/stiff_density.py", *arguments, output=tmp_path / "stiff")
     assert [row["precision"] for row in report["rows"]] == ["float32", "float64"]
     assert all(row["worst"] < row["bound"] and row["kept"] == row["rows"] for row in report["rows"])
-    assert {file.name for file in (tmp_path / "drawn").iterdir()} == {"stiff_hit.png", "stiff_short.png"}
+    names = {"stiff_hit.png", "stiff_short.png", "stiff_worst.svg"}
+    assert {file.name for file in (tmp_path / "drawn").iterdir()} == names
+    assert len(report["families"]) == 16 and max(row["share"] for row in report["families"]) <= 1
 
 
 @pytest.mark.slow

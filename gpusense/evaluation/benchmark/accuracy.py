@@ -9,11 +9,13 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpusense.backends import SPEED_CLASSES, Backend, devices, get_backend
+from gpusense.evaluation.benchmark.fine_posterior import FinePosterior, fine_posterior
 from gpusense.evaluation.benchmark.scenes import Scene
 from gpusense.localization.weights import normalize_weights
 from gpusense.models.scan.beam import BeamModel
@@ -28,6 +30,8 @@ Floats = NDArray[np.float64]
 SHARING = 0.1
 """Effective sample size of the tempered posterior, as a share of the particles."""
 _HALVINGS = 60
+MOST_FACTOR = 1e6
+"""Largest factor of log-likelihoods that makes weights as sharp as the exact ones."""
 
 # Particles per piece when the host scores ranges.
 _PIECE = 256
@@ -70,16 +74,31 @@ class Truth:
     @functools.cached_property
     def beam(self) -> Floats:
         """Compute (M,) log-likelihoods of the beam model."""
-        scene = self.scene
-        model = BeamModel(scene.grid, scene.scanner, scene.beam, backend=self.device, precision="float64")
-        return model.log_likelihood(self.poses, scene.readings)
+        return self._model("beam").log_likelihood(self.poses, self.scene.readings)
 
     @functools.cached_property
     def field(self) -> Floats:
         """Compute (M,) log-likelihoods of the likelihood field."""
+        return self._model("field").log_likelihood(self.poses, self.scene.readings)
+
+    def _model(self, problem: str) -> BeamModel | LikelihoodFieldModel:
         scene = self.scene
-        model = LikelihoodFieldModel(scene.grid, scene.scanner, scene.field, backend=self.device, precision="float64")
-        return model.log_likelihood(self.poses, scene.readings)
+        options: dict[str, Any] = {"backend": self.device, "precision": "float64"}
+        if problem == "field":
+            return LikelihoodFieldModel(scene.grid, scene.scanner, scene.field, **options)
+        return BeamModel(scene.grid, scene.scanner, scene.beam, **options)
+
+    @functools.cached_property
+    def _fine(self) -> dict[str, FinePosterior]:
+        return {}
+
+    def fine(self, problem: str) -> FinePosterior:
+        """Return the posterior of a problem's model on a fine grid of poses around the true one."""
+        name = "field" if problem == "field" else "beam"
+        if name not in self._fine:
+            model, readings = self._model(name), self.scene.readings
+            self._fine[name] = fine_posterior(lambda poses: model.log_likelihood(poses, readings), self.scene.pose)
+        return self._fine[name]
 
     def log_p(self, problem: str) -> Floats:
         """Return (M,) log-likelihoods of a problem's model; the problem ``"ranges"`` has those of the beam model."""
@@ -100,13 +119,29 @@ def temperature_of(log_p: Floats) -> float:
     Args:
         log_p: (M,) log-likelihoods, finite.
     """
+    return factor_for(log_p, SHARING * len(log_p), 1.0)
+
+
+def factor_for(log_p: Floats, size: float, most: float = MOST_FACTOR) -> float:
+    """Find the largest factor of log-likelihoods at which the effective sample size is at least ``size``.
+
+    The effective sample size falls as the factor rises. Weights that are less sharp than the exact ones, such as sums
+    of cubes, are compared with them at the factor that gives both the same effective sample size.
+
+    Args:
+        log_p: (M,) log-likelihoods, finite.
+        size: Effective sample size, in [1, M].
+        most: Largest factor.
+    """
 
     def enough(factor: float) -> bool:
-        return normalize_weights(factor * log_p).effective_sample_size >= SHARING * len(log_p)
+        return normalize_weights(factor * log_p).effective_sample_size >= size
 
-    if enough(1.0):
-        return 1.0
-    low, high = 0.0, 1.0
+    low, high = 0.0, min(1.0, most)
+    while enough(high):
+        if high >= most:
+            return most
+        low, high = high, min(2 * high, most)
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
         low, high = (middle, high) if enough(middle) else (low, middle)
@@ -114,7 +149,12 @@ def temperature_of(log_p: Floats) -> float:
 
 
 def errors(
-    truth: Truth, problem: str, *, ranges: NDArray[np.floating] | None, log_p: NDArray[np.floating] | None
+    truth: Truth,
+    problem: str,
+    *,
+    ranges: NDArray[np.floating] | None,
+    log_p: NDArray[np.floating] | None,
+    temperature: float = 1.0,
 ) -> dict[str, dict[str, float]]:
     """Compute all errors of a point.
 
@@ -123,10 +163,12 @@ def errors(
         problem: ``"ranges"``, ``"beam"`` or ``"field"``.
         ranges: (M, K) the candidate's ranges [m], or None.
         log_p: (M,) the candidate's log-likelihoods; if None, the float64 mixture computes them from the ranges.
+        temperature: Factor that makes the log-likelihoods comparable with those of all beams: n for every n-th beam.
 
     Returns:
-        Errors by kind: ``"ranges"`` if ranges are passed, ``"log_p"``, ``"posterior"`` and ``"tempered"``, the
-        posterior at the temperature of ``Truth.temperatures``.
+        Errors by kind: ``"ranges"`` if ranges are passed, ``"log_p"``, ``"posterior"``, ``"tempered"``, the posterior
+        at the temperature of ``Truth.temperatures``, and ``"comparable"``, the posterior at the temperature that gives
+        the candidate the effective sample size of the exact tempered posterior.
 
     Raises:
         UnstableError: a value is not finite, or an array has the wrong shape.
@@ -139,12 +181,30 @@ def errors(
     if log_p is None:
         raise UnstableError("nothing was computed")
     right = truth.log_p(problem)
-    scores = _checked("log-likelihoods", log_p, right)
+    scores = temperature * _checked("log-likelihoods", log_p, right)
     kinds["log_p"] = log_p_errors(scores, right)
     kinds["posterior"] = posterior_errors(scores, right, truth.poses)
     factor = truth.temperatures[problem]
     kinds["tempered"] = posterior_errors(factor * scores, factor * right, truth.poses)
+    size = normalize_weights(factor * right).effective_sample_size
+    kinds["comparable"] = posterior_errors(factor_for(scores, size) * scores, factor * right, truth.poses)
     return kinds
+
+
+def fine_errors(truth: Truth, problem: str, log_p: NDArray[np.floating], temperature: float = 1.0) -> dict[str, float]:
+    """Compare log-likelihoods on the fine grid of poses with the true posterior there, which is not tempered.
+
+    Args:
+        truth: The exact results.
+        problem: ``"beam"`` or ``"field"``.
+        log_p: The candidate's log-likelihoods of the poses of ``truth.fine(problem)``.
+        temperature: As of :func:`errors`.
+
+    Raises:
+        UnstableError: a value is not finite, or the array has the wrong shape.
+    """
+    fine = truth.fine(problem)
+    return posterior_errors(temperature * _checked("log-likelihoods", log_p, fine.log_p), fine.log_p, fine.poses)
 
 
 def _checked(quantity: str, computed: NDArray[np.floating], right: Floats) -> Floats:
@@ -158,7 +218,7 @@ def _checked(quantity: str, computed: NDArray[np.floating], right: Floats) -> Fl
 
 
 def range_errors(computed: Floats, right: Floats, resolution: float) -> dict[str, float]:
-    """Compute errors of ranges in cells: median, p99, max, mean, and the shares wrong by more than one and two cells.
+    """Compute errors of ranges in cells: median, p95, p99, max, mean, and the shares wrong by more than 1 and 2 cells.
 
     Args:
         computed: The ranges [m].
@@ -167,9 +227,10 @@ def range_errors(computed: Floats, right: Floats, resolution: float) -> dict[str
     """
     apart = np.abs(computed - right) / resolution
     if apart.size == 0:
-        return dict.fromkeys(("median", "p99", "max", "mean", "wrong_1", "wrong_2"), 0.0)
+        return dict.fromkeys(("median", "p95", "p99", "max", "mean", "wrong_1", "wrong_2"), 0.0)
     return {
         "median": float(np.median(apart)),
+        "p95": float(np.quantile(apart, 0.95)),
         "p99": float(np.quantile(apart, 0.99)),
         "max": float(apart.max()),
         "mean": float(apart.mean()),

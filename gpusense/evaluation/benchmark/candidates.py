@@ -45,6 +45,8 @@ class Candidate:
         precision: Precision of an outside candidate, for the report.
         outside: Version and threads of an outside candidate; empty for this package's.
         missing: Reason why it cannot run here; such a candidate is listed and not measured.
+        temperature: Factor that makes its log-likelihoods comparable with those of all beams: n for every n-th beam.
+        code: The Python expression that makes it, for readers of the report.
         table_rays: Number of rays that build the table of a scene's map; None for tables built without rays.
     """
 
@@ -58,6 +60,8 @@ class Candidate:
     precision: str = "float32"
     outside: str = ""
     missing: str = ""
+    temperature: float = 1.0
+    code: str = ""
     table_rays: Callable[[Scene], float] | None = None
 
     @property
@@ -85,16 +89,16 @@ class Curve:
     knob: str = ""
     values: tuple[float, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
-    quick: tuple[int, ...] = (1,)
+    quick: tuple[int, ...] = (0,)
 
 
 _VARIED = (
-    Curve("march", "safe", "tolerance", (2.0, 1.0, 0.5, 0.1, 0.01), {"rule": "safe"}, (1, 3)),
-    # No tolerance below 1 cell: the distance between the centres of two cells is at least 1.
-    Curve("march", "centre", "tolerance", (4.0, 2.0, 1.0), {"rule": "centre"}, (2,)),
-    Curve("cddt", "", "bins", (54, 108, 216, 720), {"pruned": False}, (1,)),
+    Curve("march", "safe", "tolerance", (1.0, 0.1, 0.01), {"rule": "safe"}, (0, 1)),
+    # The distance between the centres of two cells is at least 1, and a larger tolerance is slower and less exact.
+    Curve("march", "centre", "tolerance", (1.0,), {"rule": "centre"}, (0,)),
+    Curve("cddt", "", "bins", (108, 720), {"pruned": False}, (0,)),
     Curve("cddt", "pruned", "bins", (108,), {"pruned": True}, ()),
-    Curve("lookup", "", "bins", (27, 54, 108), {}, (1,)),
+    Curve("lookup", "", "bins", (54, 108), {}, (0,)),
 )
 CURVES = tuple(
     curve for name in ENTRIES for curve in [each for each in _VARIED if each.method == name] or [Curve(name)]
@@ -103,7 +107,7 @@ CURVES = tuple(
 
 BIN_WIDTHS = (0.5, 0.2, 0.1, 0.05, 0.02)
 """Bin widths [m] of the tabulated beam mixture."""
-SHARES = (8, 4, 2)
+SHARES = (12, 6, 4, 2)
 """Strides of the beams of thinned scans."""
 COMPAT = ("amcl", "beluga")
 """Other packages whose formulas a model can reproduce."""
@@ -123,27 +127,38 @@ def candidates(problems: Sequence[str], *, quick: bool = False) -> list[Candidat
         for value in few if quick else values:
             caster = caster_of(curve, value)
             rays = _table_rays(value) if curve.method == "lookup" and value else None
+            code = code_of(curve, value)
             listed += [
                 Candidate(
                     problem, curve.method, make(caster), curve.variant, curve.knob, value, exact=caster.exact,
-                    table_rays=rays,
+                    code=f"gs.{made}, caster={code})", table_rays=rays,
                 )
-                for problem, make in (("ranges", _ranges), ("beam", _beam))
+                for problem, make, made in (
+                    ("ranges", _ranges, "RayCaster(grid, range_max"), ("beam", _beam, "BeamModel(grid, scanner"),
+                )
                 # The problem "ranges" shows a caster's cost and error; the model is measured with a few values only.
                 if problem == "ranges" or value in few
             ]  # fmt: skip
     exact = CASTERS["exact"]()
-    listed.append(Candidate("field", "field", _field(), exact=True))
-    for share in SHARES[1:2] if quick else SHARES:
-        listed.append(Candidate("beam", "exact", _beam(exact, share), "fewer beams", "every", share))
-        listed.append(Candidate("field", "field", _field(share), "fewer beams", "every", share))
+    beam, field_model = "gs.BeamModel(grid, scanner", "gs.LikelihoodFieldModel(grid, scanner"
+    listed.append(Candidate("field", "field", _field(), exact=True, code=f"{field_model})"))
+    for share in SHARES[2:3] if quick else SHARES:
+        for problem, method, make, model in (
+            ("beam", "exact", _beam(exact, share), beam), ("field", "field", _field(share), field_model),
+        ):  # fmt: skip
+            code = f"{model}, beams=range(0, scanner.count, {share})), temperature {share} times"
+            listed.append(Candidate(problem, method, make, "fewer beams", "every", share, temperature=share, code=code))
     for width in BIN_WIDTHS[2:3] if quick else BIN_WIDTHS:
-        listed.append(Candidate("beam", "exact", _beam(exact, sensor_table=width), "sensor table", "bin width", width))
+        made = _beam(exact, sensor_table=width)
+        code = f"{beam}, sensor_table={width})"
+        listed.append(Candidate("beam", "exact", made, "sensor table", "bin width", width, code=code))
     for name in COMPAT:
         if _reproduces(BeamModel, name):
-            listed.append(Candidate("beam", f"compat {name}", _beam(exact, compat=name)))
+            made, code = _beam(exact, compat=name), f'{beam}, compat="{name}")'
+            listed.append(Candidate("beam", f"compat {name}", made, code=code))
         if _reproduces(LikelihoodFieldModel, name):
-            listed.append(Candidate("field", f"compat {name}", _field(compat=name)))
+            made, code = _field(compat=name), f'{field_model}, compat="{name}")'
+            listed.append(Candidate("field", f"compat {name}", made, code=code))
     return [candidate for candidate in listed if candidate.problem in problems]
 
 
@@ -153,6 +168,15 @@ def caster_of(curve: Curve, value: float | None) -> Caster:
     if value is not None:
         options[curve.knob] = int(value) if curve.knob == "bins" else value
     return CASTERS[curve.method](**options)
+
+
+def code_of(curve: Curve, value: float | None) -> str:
+    """Write a curve's caster with its knob at a value as Python code."""
+    options = dict(curve.options) | ({} if value is None else {curve.knob: value})
+    if not options:
+        return f'"{curve.method}"'
+    words = (f"{name}={f'{knob:g}' if isinstance(knob, float) else repr(knob)}" for name, knob in options.items())
+    return f"gs.casters.{CASTERS[curve.method].__name__}({', '.join(words)})".replace("'", '"')
 
 
 class _ModelRunner:

@@ -12,11 +12,12 @@ SLOWER = 1.3
 """A point is slower when both minimum and median of its times grew by more than this factor."""
 _LESS_EXACT = 1.05
 _KINDS = {
-    "ranges": ("median", "p99", "max", "mean", "wrong_1", "wrong_2"), "log_p": ("max", "rms"),
+    "ranges": ("median", "p95", "p99", "max", "mean", "wrong_1", "wrong_2"), "log_p": ("max", "rms"),
     "posterior": ("kl", "tv", "shift_m", "shift_rad"), "tempered": ("kl", "tv", "shift_m", "shift_rad"),
+    "comparable": ("kl", "tv", "shift_m", "shift_rad"), "fine": ("kl", "tv", "shift_m", "shift_rad"),
 }  # fmt: skip
 # Growth below this is rounding, in cells, shares, nats, metres and radians.
-_FLOORS = {"ranges": 1e-4, "log_p": 1e-3, "posterior": 1e-5, "tempered": 1e-5}
+_FLOORS = {"ranges": 1e-4, "log_p": 1e-3, "posterior": 1e-5, "tempered": 1e-5, "comparable": 1e-5, "fine": 1e-5}
 
 _IDENTITY = ("scene", "cloud", "problem", "backend", "method", "variant", "knob", "value", "precision", "checked")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -15,12 +15,12 @@ from gpusense.backends import Backend
 from gpusense.backends.base import Buffer, Launcher
 from gpusense.backends.proxy import Proxy
 
-LONG = 2.0
-"""Duration of a call above which it is not repeated [s]."""
+LONG = 1.0
+"""Duration of a call above which it is not repeated, nor its launches measured alone [s]."""
 SLOW_TO_MAKE = 2.0
 """Duration of a first call above which no second runner is made, so that building includes compiling [s]."""
 # Time to repeat launches alone for [s]; on a processor they take as long as calls.
-_LAUNCH_SECONDS, _FEWEST_LAUNCHES = {"gpu": 1.0, "cpu": 0.1}, 3
+_LAUNCH_SECONDS, FEWEST = {"gpu": 1.0, "cpu": 0.1}, 3
 
 
 class Runner(Protocol):
@@ -142,9 +142,10 @@ class Cost:
             tables. Where the first took more than ``SLOW_TO_MAKE`` there is no second, and compiling is included.
         compile_s: First time minus second time: compiling, or loading kernels from a cache on disk. Kernels that this
             process compiled before add nothing. None without a second runner.
-        call_min_s, call_median_s: A call with NumPy arrays in and out.
-        calls: Number of timed calls after a warm-up; 1 where a call takes more than two seconds.
-        launch_min_s, launch_median_s: Launches of a call alone, with all arrays on the device.
+        call_min_s, call_q1_s, call_median_s, call_q3_s: A call with NumPy arrays in and out: least time and quartiles.
+        processor_s: Processor time of a call, over all threads of the process: the mean of the timed calls.
+        calls: Number of timed calls after a warm-up; 1 where a call takes more than a second.
+        launch_min_s, launch_q1_s, launch_median_s, launch_q3_s: Launches of a call alone, arrays on the device.
         launches: Number of timed repetitions of the launches; 0 for a candidate without a backend.
         upload_s, download_s: Transfers of one call.
         table_bytes: Tables of the map on the device.
@@ -156,10 +157,15 @@ class Cost:
     build_s: float
     compile_s: float | None
     call_min_s: float
+    call_q1_s: float
     call_median_s: float
+    call_q3_s: float
+    processor_s: float
     calls: int
     launch_min_s: float | None = None
+    launch_q1_s: float | None = None
     launch_median_s: float | None = None
+    launch_q3_s: float | None = None
     launches: int = 0
     upload_s: float | None = None
     download_s: float | None = None
@@ -169,7 +175,11 @@ class Cost:
 
 
 def measure(
-    make: Callable[[Any], Runner], backend: Backend | None, poses: np.ndarray, repeats: int
+    make: Callable[[Any], Runner],
+    backend: Backend | None,
+    poses: np.ndarray,
+    repeats: int,
+    seconds: float = float("inf"),
 ) -> tuple[Cost, Runner]:
     """Measure a candidate, and return its runner with built tables.
 
@@ -177,21 +187,25 @@ def measure(
         make: Makes a runner for a backend.
         backend: The device; None for a candidate without a backend.
         poses: (N, 3) particles of a call.
-        repeats: Number of timed calls.
+        repeats: Most timed calls.
+        seconds: Longest time of the timed calls, of which there are at least three [s].
     """
     meter = None if backend is None else Meter(backend)
     begin = time.perf_counter()
     runner, built = _prepared(make, meter, poses)
     runner.run(poses)
     first = time.perf_counter() - begin
-    calls = series(lambda: runner.run(poses), repeats)
+    used: list[float] = []
+    calls = series(lambda: runner.run(poses), repeats, FEWEST, seconds, used)
     on_device: dict[str, Any] = {}
+    quick = min(calls) <= LONG
     if meter is not None:
-        on_device = {"device_bytes": meter.live, "peak_bytes": meter.peak, **_apart(meter, runner, poses, repeats)}
+        on_device = {"device_bytes": meter.live, "peak_bytes": meter.peak}
+        on_device |= _apart(meter, runner, poses, repeats) if quick else {}
         meter.launches.clear()
     table = getattr(runner, "table_bytes", None)
     compiling = None
-    if first - min(calls) < SLOW_TO_MAKE:
+    if quick and first - min(calls) < SLOW_TO_MAKE:
         # Free the first runner's memory before the second one is made.
         del runner, meter
         begin = time.perf_counter()
@@ -202,11 +216,18 @@ def measure(
         built = max(second - min(calls), 0.0) if built is None else built
     elif built is None:
         built = first - min(calls)
+    on_device |= quartiles("call", calls)
     cost = Cost(
-        first_s=first, build_s=built, compile_s=compiling, call_min_s=min(calls),
-        call_median_s=statistics.median(calls), calls=len(calls), table_bytes=table, **on_device,
+        first_s=first, build_s=built, compile_s=compiling, processor_s=statistics.fmean(used), calls=len(calls),
+        table_bytes=table, **on_device,
     )  # fmt: skip
     return cost, runner
+
+
+def quartiles(name: str, seconds: Sequence[float]) -> dict[str, float]:
+    """Return the least of some times and their quartiles, by the names of a :class:`Cost`."""
+    q1, median, q3 = (float(value) for value in np.quantile(seconds, (0.25, 0.5, 0.75)))
+    return {f"{name}_min_s": min(seconds), f"{name}_q1_s": q1, f"{name}_median_s": median, f"{name}_q3_s": q3}
 
 
 def _prepared(make: Callable[[Any], Runner], backend: Any, poses: np.ndarray) -> tuple[Runner, float | None]:
@@ -222,7 +243,13 @@ def _prepared(make: Callable[[Any], Runner], backend: Any, poses: np.ndarray) ->
     return runner, time.perf_counter() - begin
 
 
-def series(run: Callable[[], object], repeats: int, fewest: int = 1, seconds: float = float("inf")) -> list[float]:
+def series(
+    run: Callable[[], object],
+    repeats: int,
+    fewest: int = 1,
+    seconds: float = float("inf"),
+    used: list[float] | None = None,
+) -> list[float]:
     """Time calls after one warm-up; return their seconds, or the warm-up's if it takes more than ``LONG``.
 
     Args:
@@ -230,19 +257,23 @@ def series(run: Callable[[], object], repeats: int, fewest: int = 1, seconds: fl
         repeats: Largest number of timed calls.
         fewest: Least number of timed calls.
         seconds: Total time after which no call beyond ``fewest`` begins.
+        used: Receives the processor's seconds of each call.
     """
-    warm = _seconds(run)
+    used = [] if used is None else used
+    warm = _seconds(run, used)
     if warm > LONG:
         return [warm]
+    used.clear()
     times: list[float] = []
     while len(times) < repeats and (len(times) < fewest or sum(times) < seconds):
-        times.append(_seconds(run))
+        times.append(_seconds(run, used))
     return times
 
 
-def _seconds(run: Callable[[], object]) -> float:
-    begin = time.perf_counter()
+def _seconds(run: Callable[[], object], used: list[float]) -> float:
+    begin, before = time.perf_counter(), time.process_time()
     run()
+    used.append(time.process_time() - before)
     return time.perf_counter() - begin
 
 
@@ -260,6 +291,6 @@ def _apart(meter: Meter, runner: Runner, poses: np.ndarray, repeats: int) -> dic
 
     times: dict[str, Any] = {"upload_s": meter.seconds["upload"], "download_s": meter.seconds["download"]}
     if launches:
-        each = series(launch, repeats, _FEWEST_LAUNCHES, _LAUNCH_SECONDS[backend.info.kind])
-        times |= {"launch_min_s": min(each), "launch_median_s": statistics.median(each), "launches": len(each)}
+        each = series(launch, repeats, FEWEST, _LAUNCH_SECONDS[backend.info.kind])
+        times |= {**quartiles("launch", each), "launches": len(each)}
     return times

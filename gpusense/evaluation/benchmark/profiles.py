@@ -8,12 +8,13 @@ from typing import Any
 
 Key = tuple[str, str, str]
 
-LIMITS = {"ranges": ("ranges", "wrong_1", 0.01), "beam": ("tempered", "kl", 0.01), "field": ("tempered", "kl", 0.01)}
+LIMITS = {"ranges": ("ranges", "wrong_1", 0.01), "beam": ("comparable", "kl", 0.01),
+          "field": ("comparable", "kl", 0.01)}  # fmt: skip
 """By problem: kind and name of the error that decides whether a point solves it, and the largest error allowed."""
 LIMIT_TEXT = {
     "ranges": "at most 1 % of the rays wrong by more than one cell",
-    "beam": "tempered posterior within 0.01 nats (Kullback-Leibler) of the exact one",
-    "field": "tempered posterior within 0.01 nats (Kullback-Leibler) of the exact one",
+    "beam": "posterior at a comparable temperature within 0.01 nats (Kullback-Leibler) of the exact one",
+    "field": "posterior at a comparable temperature within 0.01 nats (Kullback-Leibler) of the exact one",
 }
 
 

@@ -15,29 +15,38 @@ from gpusense.evaluation.benchmark import peers
 from gpusense.evaluation.benchmark.profiles import label, profiles_of, setting
 from gpusense.evaluation.benchmark.runner import Outcome, Plan
 
-SCHEMA = 1
+SCHEMA = 2
 """Version of the report's fields; ``--compare`` accepts reports of this version only."""
 
 _DIGITS = 6
 
 _READING = """\
 Times are nanoseconds per particle-beam: a ray for *ranges*, an evaluated reading for *beam* and *field*. *call* is a
-call with NumPy arrays in and out: minimum and median of the calls after a warm-up. A star marks a single call, of more
-than two seconds. *launch* is the minimum of the launches alone, with all arrays on the device. *build* is the time to
-build the map's tables. *compile* is the additional time of the first call in this process: kernels may come from a
-cache on disk, and later rows reuse compiled kernels; where the first call takes long, *build* includes it. *table* and
-*device* are bytes on the device: of the map's tables, and of all buffers that are alive after a call.
+call with NumPy arrays in and out: minimum and quartiles of the calls after a warm-up. A star marks a single call, of
+more than a second. *processor* is the processor's time of a call over all threads. *launch* is the minimum of the
+launches alone, with all arrays on the device. *build* is the time to build the map's tables. *compile* is the
+additional time of the first call in this process: kernels may come from a cache on disk, and later rows reuse compiled
+kernels; where the first call takes long, *build* includes it. *table* and *device* are bytes on the device: of the
+map's tables, and of all buffers that are alive after a call.
 
-Errors are against the exact caster and the models in float64. For ranges: median, 99th percentile and maximum in cells,
+Errors are against the exact caster and the models in float64. For ranges: median, 95th percentile and maximum in cells,
 and the shares wrong by more than one and two cells. For the scan's log-likelihood: root mean square and maximum in
 nats; for *ranges* it follows from the ranges by the float64 mixture. For the posterior, the normalised weights: KL, the
 Kullback-Leibler divergence from the exact weights in nats; TV, the total variation; and the shift of the weighted mean
 pose. *tempered* is the posterior at the temperature where a tenth of the particles share the weight, as in a working
-filter. *fewer beams* and *compat* compute another model than the book's on all beams; they are shown for comparison."""
+filter. *comparable* is the posterior at the temperature that gives the method's weights the same effective sample
+size. *fine* compares with the true posterior, untempered, on a fine grid of poses around the true one. *fewer beams*
+counts each of every n-th beam n times, and *compat* computes another model than the book's; they are shown for
+comparison."""
 
 
 def document(
-    plan: Plan, outcome: Outcome, arguments: Mapping[str, Any], machine: Mapping[str, Any], absent: Sequence[str]
+    plan: Plan,
+    outcome: Outcome,
+    arguments: Mapping[str, Any],
+    machine: Mapping[str, Any],
+    absent: Sequence[str],
+    command: str = "",
 ) -> dict[str, Any]:
     """Build the report from plain values; non-finite numbers become None.
 
@@ -47,11 +56,13 @@ def document(
         arguments: Arguments of the command.
         machine: Description of the machine.
         absent: Devices and candidates that are absent, with reasons.
+        command: The command line, files by their names.
     """
     value = {
         "schema": SCHEMA,
         "date": time.strftime("%Y-%m-%d"),
         "commit": commit(),
+        "command": command,
         "arguments": dict(arguments),
         "machine": dict(machine),
         "devices": [asdict(backend.info) for backend in plan.backends],
@@ -186,15 +197,17 @@ def _reasons(title: str, points: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 COLUMNS = (
-    "backend", "method", "knob", "precision", "call ns", "median ns", "launch ns", "build s", "compile s", "table MB",
-    "device MB", "log p rms", "max", "KL", "TV", "shift m", "rad", "tempered KL", "TV", "shift m",
+    "backend", "method", "knob", "precision", "call ns", "quartiles ns", "processor ns", "launch ns", "build s",
+    "compile s", "table MB", "device MB", "log p rms", "max", "KL", "shift m", "tempered KL", "comparable KL", "TV",
+    "shift m", "fine KL", "shift m",
 )  # fmt: skip
-RANGE_COLUMNS = ("median", "p99", "max", "> 1 cell", "> 2 cells")
+TIMES = 12  # columns before those of the errors
+RANGE_COLUMNS = ("median", "p95", "max", "> 1 cell", "> 2 cells")
 
 
 def _point_table(points: Sequence[Mapping[str, Any]], problem: str) -> list[str]:
     extra = () if problem == "field" else RANGE_COLUMNS
-    columns = (*COLUMNS[:11], *extra, *COLUMNS[11:])
+    columns = (*COLUMNS[:TIMES], *extra, *COLUMNS[TIMES:])
     return table(columns, [row(point, extra=bool(extra)) for point in points], 4)
 
 
@@ -207,15 +220,16 @@ def row(point: Mapping[str, Any], *, extra: bool) -> list[str]:
     if point["status"] != "ok":
         cells[1] += f" ({point['status']})"
     star = "*" if time_s.get("calls") == 1 else ""
-    cells += [_per_beam(point, f"{which}_s") + star for which in ("call_min", "call_median")]
+    spread = ", ".join(_per_beam(point, f"call_{which}_s") for which in ("q1", "median", "q3"))
+    cells += [_per_beam(point, "call_min_s") + star, spread, _per_beam(point, "processor_s")]
     cells += [_per_beam(point, "launch_min_s"), _text(time_s.get("build_s")), _text(time_s.get("compile_s"))]
     cells += [_text(memory.get(f"{which}_bytes"), 1e-6) for which in ("table", "device")]
     if extra:
         of = errors.get("ranges") or {}
-        cells += [_text(of.get(name)) for name in ("median", "p99", "max")]
+        cells += [_text(of.get(name)) for name in ("median", "p95", "max")]
         cells += [_share(of.get(name)) for name in ("wrong_1", "wrong_2")]
-    for kind, names in (("log_p", ("rms", "max")), ("posterior", ("kl", "tv", "shift_m", "shift_rad")),
-                        ("tempered", ("kl", "tv", "shift_m"))):  # fmt: skip
+    for kind, names in (("log_p", ("rms", "max")), ("posterior", ("kl", "shift_m")), ("tempered", ("kl",)),
+                        ("comparable", ("kl", "tv", "shift_m")), ("fine", ("kl", "shift_m"))):  # fmt: skip
         of = errors.get(kind) or {}
         cells += [_text(of.get(name)) for name in names]
     return cells

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gpusense.backends import Backend
-from gpusense.evaluation.benchmark.accuracy import Truth, UnstableError, errors, truth_device
+from gpusense.evaluation.benchmark.accuracy import Truth, UnstableError, errors, fine_errors, truth_device
 from gpusense.evaluation.benchmark.candidates import Candidate
 from gpusense.evaluation.benchmark.measure import Cost, Runner, measure
 from gpusense.evaluation.benchmark.scenes import CLOUDS, MapSource, Scene, make_scene
@@ -18,10 +18,17 @@ from gpusense.localization.weights import normalize_weights
 
 PRECISIONS = ("float32", "float64")
 
+FINE_CLOUD = "tracking"
+"""The cloud with which the errors on a fine grid of poses around the true pose are reported."""
+
 # Default number of particles of a call: enough to fill the device.
 PARTICLES = {"gpu": 4096, "cpu": 1024}
 # Divisor of that number for the NumPy reference, which is slower.
 NUMPY_SHARE = 8
+
+
+class LeftOutError(ValueError):
+    """Raised by a candidate that cannot be measured in a scene, such as for the time that its table would take."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +43,8 @@ class Plan:
         particles: N of a timed call; None for the device's default.
         checked: Largest number of particles whose results are checked.
         beams: K of the scanner.
-        repeats: Timed calls per point.
+        repeats: Most timed calls per point.
+        seconds: Longest time of a point's timed calls, of which there are at least three [s].
         seed: Seed of all random numbers.
         build_limit: Longest time to build a table [s]; a point above it is left out.
         deadline: Measuring time, without compiling, after which no further point begins [s].
@@ -51,6 +59,7 @@ class Plan:
     beams: int = 360
     repeats: int = 20
     seed: int = 0
+    seconds: float = float("inf")
     build_limit: float = 60.0
     deadline: float = float("inf")
 
@@ -172,19 +181,22 @@ def point_of(plan: Plan, job: Job, truth: Truth, cloud: str, reason: str = "") -
         "device": backend.info.name if backend else candidate.outside,
         "kind": backend.info.kind if backend else "cpu",
         "method": candidate.method, "variant": candidate.variant, "knob": candidate.knob, "value": candidate.value,
-        "precision": job.precision, "exact": candidate.exact, "outside": bool(candidate.outside),
-        "particles": particles, "beams": beams, "work": particles * beams, "checked": len(truth.poses),
-        "status": "left out" if reason else "ok", "reason": reason, "time": None, "memory": None, "errors": None,
+        "code": candidate.code, "precision": job.precision, "exact": candidate.exact,
+        "outside": bool(candidate.outside), "particles": particles, "beams": beams, "work": particles * beams,
+        "checked": len(truth.poses), "status": "left out" if reason else "ok", "reason": reason, "time": None,
+        "memory": None, "errors": None,
     }  # fmt: skip
     if reason:
         return point
     try:
         cost, runner = measure(
             lambda device: candidate.make(scene, device, job.precision), backend, scene.clouds[cloud][:particles],
-            plan.repeats,
+            plan.repeats, plan.seconds,
         )  # fmt: skip
         point |= _split(cost)
-        point["errors"] = _errors(truth, candidate.problem, runner)
+        point["errors"] = _errors(truth, candidate, runner, fine=cloud == FINE_CLOUD)
+    except LeftOutError as error:
+        point |= {"status": "left out", "reason": str(error)}
     except UnstableError as error:
         point |= {"status": "unstable", "reason": str(error)}
     except Exception as error:
@@ -192,12 +204,16 @@ def point_of(plan: Plan, job: Job, truth: Truth, cloud: str, reason: str = "") -
     return point
 
 
-def _errors(truth: Truth, problem: str, runner: Runner) -> dict[str, dict[str, float]]:
-    result = runner.run(truth.poses)
+def _errors(truth: Truth, candidate: Candidate, runner: Runner, *, fine: bool) -> dict[str, dict[str, float]]:
+    result, problem = runner.run(truth.poses), candidate.problem
     if problem == "ranges":
         return errors(truth, problem, ranges=result, log_p=None)
     cast = getattr(runner, "ranges", None) if problem == "beam" else None
-    return errors(truth, problem, ranges=None if cast is None else cast(truth.poses), log_p=result)
+    ranges, factor = None if cast is None else cast(truth.poses), candidate.temperature
+    found = errors(truth, problem, ranges=ranges, log_p=result, temperature=factor)
+    if fine:
+        found["fine"] = fine_errors(truth, problem, runner.run(truth.fine(problem).poses), factor)
+    return found
 
 
 def _split(cost: Cost) -> dict[str, dict[str, Any]]:

@@ -15,8 +15,8 @@ _NONE = type(None)
 _SCENE: dict[str, Any] = {"name": str, "fingerprint": str}
 _POINT: dict[str, Any] = {
     "scene": str, "cloud": str, "problem": str, "backend": str, "device": str, "method": str, "variant": str,
-    "knob": str, "value": (int, float, _NONE), "precision": str, "particles": int, "beams": int, "checked": int,
-    "status": str, "reason": str, "time": (dict, _NONE), "errors": (dict, _NONE),
+    "knob": str, "value": (int, float, _NONE), "precision": str, "code": str, "particles": int,
+    "beams": int, "checked": int, "status": str, "reason": str, "time": (dict, _NONE), "errors": (dict, _NONE),
 }  # fmt: skip
 _ARGUMENTS = ("particles", "checked", "beams", "repeats", "seed")
 _TIMES = ("call_min_s", "call_median_s")

@@ -10,7 +10,7 @@ from support.bench_world import quick_scene
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.evaluation.benchmark import accuracy, scenes
+from gpusense.evaluation.benchmark import accuracy, candidates, fine_posterior, scenes
 from gpusense.evaluation.tolerances import TOLERANCES
 
 pytestmark = pytest.mark.usefixtures("no_data")
@@ -70,7 +70,15 @@ def test_range_errors_by_hand():
     found = np.array([[1.0, 2.05], [3.15, 3.0]])  # 0, 0.5, 1.5 and 10 cells of 0.1 m
     errors = accuracy.range_errors(found, right, 0.1)
     assert errors == pytest.approx(
-        {"median": 1.0, "p99": 1.5 + 0.97 * 8.5, "max": 10.0, "mean": 3.0, "wrong_1": 0.5, "wrong_2": 0.25}
+        {
+            "median": 1.0,
+            "p95": 1.5 + 0.85 * 8.5,
+            "p99": 1.5 + 0.97 * 8.5,
+            "max": 10.0,
+            "mean": 3.0,
+            "wrong_1": 0.5,
+            "wrong_2": 0.25,
+        }
     )
 
 
@@ -100,6 +108,38 @@ def test_temperature_makes_a_tenth_of_the_particles_share():
     factor = accuracy.temperature_of(log_p)
     assert gs.normalize_weights(factor * log_p).effective_sample_size == pytest.approx(20)
     assert accuracy.temperature_of(np.zeros(50)) == 1.0
+
+
+def test_comparable_temperatures_undo_a_factor():
+    """Log-likelihoods that are a third of the exact ones have the exact weights at three times the temperature."""
+    rng = np.random.default_rng(0)
+    right = -50 * rng.random(300)
+    size = gs.normalize_weights(0.2 * right).effective_sample_size
+    assert accuracy.factor_for(right / 3, size) == pytest.approx(0.6)
+    assert accuracy.factor_for(np.zeros(300), size) == accuracy.MOST_FACTOR
+
+
+def test_thinned_beams_count_as_often_as_they_stand_for():
+    """Every fourth beam at four times the temperature comes near the posterior of all, and at its own does not."""
+    scene = quick_scene("building", beams=360, particles=200)
+    truth = accuracy.Truth(scene, scene.clouds["tracking"], get_backend("numpy"))
+    (made,) = [one for one in candidates.candidates(["field"]) if one.variant == "fewer beams" and one.value == 4]
+    log_p = made.make(scene, truth.device, "float64").run(truth.poses)
+    scaled, plain = (
+        accuracy.errors(truth, "field", ranges=None, log_p=log_p, temperature=factor)
+        for factor in (made.temperature, 1.0)
+    )
+    assert scaled["comparable"]["kl"] < 0.15 and scaled["tempered"]["kl"] < 0.15 < 0.4 < plain["tempered"]["kl"]
+    assert scaled["comparable"] == pytest.approx(plain["comparable"], rel=1e-6)
+
+
+def test_fine_posterior_of_a_normal_density():
+    """Its deviations and its mean are those of the density, however narrow that is, up to the grid's spacing."""
+    mean, sigma = np.array([3.01, -2.0, 0.4]), np.array([0.004, 0.03, 0.001])
+    fine = fine_posterior.fine_posterior(lambda x: -0.5 * np.square((x - mean) / sigma).sum(axis=1), (3.0, -2.0, 0.41))
+    np.testing.assert_allclose(fine.deviation, sigma, rtol=0.01)
+    weights = gs.normalize_weights(fine.log_p).weights
+    np.testing.assert_allclose(weights @ fine.poses, mean, atol=1e-4)
 
 
 def test_scored_ranges_are_the_beam_models():

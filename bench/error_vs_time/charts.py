@@ -1,0 +1,143 @@
+"""Draw error against time as SVG, with the same bytes everywhere."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+# Okabe and Ito's palette, which remains distinct under colour blindness.
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#7f4f24", "#5e3c99", "#7a7a7a",
+           "#66a61e", "#e7298a", "#8b0000", "#1b7f79")  # fmt: skip
+WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 480, 330, 62, 14, 34, 48
+STRIP = 62
+"""Width of the strip for methods without an error."""
+SMALLEST = 1e-6
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A point of a chart.
+
+    Attributes:
+        error, seconds: Its place; an error below ``SMALLEST`` is none.
+        name: Name for the tooltip.
+        group: Group that gives its colour.
+        best: Whether it belongs to the Pareto front, and is named.
+    """
+
+    error: float
+    seconds: float
+    name: str
+    group: str
+    best: bool = False
+
+
+@dataclass(frozen=True)
+class Chart:
+    """One panel: a title, the label of the errors, and marks."""
+
+    title: str
+    axis: str
+    marks: Sequence[Mark]
+
+
+def drawing(charts: Sequence[Chart]) -> str:
+    """Draw panels side by side, two in a row, above the legend of their groups."""
+    groups = list(dict.fromkeys(mark.group for chart in charts for mark in chart.marks))
+    rows, columns = -(-len(charts) // 2), min(len(charts), 2)
+    width, legend = WIDTH * columns, -(-len(groups) // (3 * columns))
+    height = HEIGHT * rows + 18 * legend + 8
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" font-family="sans-serif" '
+        f'font-size="11">',
+        "<style>.g{stroke:#e3e7ed}.f{fill:none;stroke:#b8c0cc;stroke-width:4;stroke-opacity:.8}.t{font-weight:bold}"
+        ".s{fill:#4a5568}</style>",
+        f'<rect width="{width}" height="{height}" fill="white"/>',
+    ]
+    for i, chart in enumerate(charts):
+        parts.append(f'<g transform="translate({WIDTH * (i % 2)} {HEIGHT * (i // 2)})">')
+        parts += _panel(chart, groups)
+        parts.append("</g>")
+    for i, group in enumerate(groups):
+        x, y = 20 + 160 * (i % (3 * columns)), HEIGHT * rows + 14 + 18 * (i // (3 * columns))
+        parts.append(f'<circle cx="{x}" cy="{y - 4}" r="4" fill="{_colour(groups, group)}"/>')
+        parts.append(f'<text x="{x + 9}" y="{y}">{escape(group)}</text>')
+    return "\n".join([*parts, "</svg>", ""])
+
+
+def _colour(groups: Sequence[str], group: str) -> str:
+    return COLOURS[groups.index(group) % len(COLOURS)]
+
+
+def _panel(chart: Chart, groups: Sequence[str]) -> list[str]:
+    errors = [mark.error for mark in chart.marks if mark.error >= SMALLEST]
+    times = [mark.seconds for mark in chart.marks]
+    low, high = _decades(errors or [0.1])
+    fast, slow = _decades(times)
+    begin, end, top, bottom = LEFT + STRIP, WIDTH - RIGHT, TOP, HEIGHT - BOTTOM
+
+    def x(error: float) -> float:
+        if error < SMALLEST:
+            return LEFT + STRIP / 2
+        return begin + (math.log10(error) - low) / (high - low) * (end - begin)
+
+    def y(seconds: float) -> float:
+        return bottom - (math.log10(seconds) - fast) / (slow - fast) * (bottom - top)
+
+    parts = [
+        f'<text x="{LEFT}" y="18" class="t">{escape(chart.title)}</text>',
+        f'<rect x="{LEFT}" y="{top}" width="{STRIP}" height="{bottom - top}" fill="#eef1f5"/>',
+        f'<text x="{LEFT + STRIP / 2 - 10:.0f}" y="{bottom + 14}" text-anchor="middle" class="s">exact</text>',
+        f'<text x="{(begin + end) / 2:.0f}" y="{HEIGHT - 10}" text-anchor="middle">{escape(chart.axis)}</text>',
+        f'<text x="14" y="{(top + bottom) / 2:.0f}" text-anchor="middle" '
+        f'transform="rotate(-90 14 {(top + bottom) / 2:.0f})">time</text>',
+    ]
+    for decade in range(low, high + 1):
+        at = x(10.0**decade)
+        parts.append(f'<path class="g" d="M{at:.1f} {top}V{bottom}"/>')
+        parts.append(f'<text x="{at:.1f}" y="{bottom + 14}" text-anchor="middle" class="s">{10.0**decade:g}</text>')
+    for decade in range(fast, slow + 1):
+        at = y(10.0**decade)
+        parts.append(f'<path class="g" d="M{LEFT} {at:.1f}H{end}"/>')
+        parts.append(f'<text x="{LEFT - 5}" y="{at + 4:.1f}" text-anchor="end" class="s">{_time(decade)}</text>')
+    best = sorted((mark for mark in chart.marks if mark.best), key=lambda mark: (x(mark.error), -mark.seconds))
+    if best:
+        steps = "".join(f"H{x(mark.error):.1f}V{y(mark.seconds):.1f}" for mark in best[1:])
+        parts.append(f'<path class="f" d="M{x(best[0].error):.1f} {y(best[0].seconds):.1f}{steps}H{end}"/>')
+    for mark in sorted(chart.marks, key=lambda mark: mark.best):
+        parts.append(
+            f'<circle cx="{x(mark.error):.1f}" cy="{y(mark.seconds):.1f}" r="{4.5 if mark.best else 3}" '
+            f'fill="{_colour(groups, mark.group)}"><title>{escape(mark.name)}</title></circle>'
+        )
+    return parts + _names(best, x, y, end)
+
+
+def _names(best: Sequence[Mark], x, y, end: float) -> list[str]:
+    """Name the marks of the front; one whose name would cover another one stays without."""
+    placed: list[tuple[float, float, float]] = []
+    parts = []
+    for mark in best:
+        width = 5.6 * len(mark.name)
+        left = min(x(mark.error) + 7, end - width)
+        at = y(mark.seconds) - 7
+        if any(abs(at - other) < 12 and left < right and begin < left + width for begin, right, other in placed):
+            continue
+        placed.append((left, left + width, at))
+        parts.append(f'<text x="{left:.1f}" y="{at:.1f}" font-size="10">{escape(mark.name)}</text>')
+    return parts
+
+
+def _decades(numbers: Sequence[float]) -> tuple[int, int]:
+    """Return the decades around some positive numbers."""
+    low, high = math.floor(math.log10(min(numbers))), math.ceil(math.log10(max(numbers)))
+    return low, max(high, low + 1)
+
+
+def _time(decade: int) -> str:
+    value = 10.0**decade
+    for unit, scale in (("ns", 1e9), ("us", 1e6), ("ms", 1e3)):
+        if value * scale < 999:
+            return f"{value * scale:g} {unit}"
+    return f"{value:g} s"

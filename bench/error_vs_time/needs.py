@@ -1,0 +1,413 @@
+"""Measure error against time of whole tasks: localisation, matching, learning, landmarks.
+
+    python bench/error_vs_time/needs.py --backend opencl --output NAME
+    python bench/error_vs_time/needs.py --backend opencl --need localisation --seconds 20 --longest 0.05   # quick
+
+*Localisation*: a robot drives through a generated building, in which people hide a fifth of the beams and 2 % of the
+walls have moved since the map was made, with a laser of 1080 beams over 270 degrees. Each setting of particles, beams,
+model, temperature, stages and precision follows it from a start around the true pose. Errors are those of the position,
+of all scans after the first ten and all seeds; times are those of a step: predict, correct, estimate.
+
+*Matching*: pairs of scans in the same building, 1.4 m and 30 degrees apart at most, with noise of 2 cm, from guesses
+that are off by 0.5 m and 10 degrees at most. All pairs are one call; its time is divided by their number. *In a map*:
+scans on their map, from such guesses.
+
+*Learning*: the parameters of the beam model from readings of known parameters; errors are the root mean square of the
+six relative ones. *Landmarks*: errors are the KL divergence of the posterior of 10 000 particles from that of known
+correspondences in float64, at a comparable temperature.
+
+Settings run in rounds, so that a busy machine slows all alike. A setting that takes longer than --longest a step runs
+once; one that the time of its need leaves no room for is listed as left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import gpusense as gs
+from gpusense.backends import Backend, get_backend
+from gpusense.evaluation.benchmark.accuracy import factor_for, posterior_errors, temperature_of
+from gpusense.evaluation.benchmark.report import commit, plain, to_json
+from gpusense.evaluation.machine import machine
+from gpusense.evaluation.matching import differences, relative_poses
+from gpusense.evaluation.simulation.changes import surface_of
+from gpusense.localization.defaults import DEFAULTS
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import command_line, make_parser, note, parse, table
+from recordings import BEAM
+from speed.learning import TYPICAL, values
+from speed.point_models import landmark_scene
+
+SCHEMA = 1
+NEEDS = ("localisation", "matching", "in a map", "learning", "landmarks")
+UNITS = {"localisation": "m", "matching": "m", "in a map": "m", "learning": "%", "landmarks": "nats"}
+# Scans of the drive, and those at its beginning that do not count.
+SCANS, SETTLING = 60, 10
+SCANNER = gs.Scanner.uniform(angle_min=-2.356, angle_increment=4.712 / 1079, count=1080, range_max=30.0)
+START = (0.5, 0.5, 0.26)
+# Most particles x beams of a setting, by the kind of device.
+MOST = {"cpu": 4_000_000, "gpu": 1_100_000_000}
+PAIRS = 60
+# Most readings of the methods that take some hundred passes over them.
+MOST_SEARCHED = 100_000
+PARTICLES = 10_000
+
+
+@dataclass
+class Setting:
+    """A setting of one need, and what its runs gave.
+
+    Attributes:
+        need: One of ``NEEDS``.
+        method: Name of the method.
+        options: Its setting in words.
+        code: How it is called.
+        precision: The precision.
+        run: Makes a run of a seed; returns errors, and seconds of each step.
+        together: Number of results of a step, by which its seconds are already divided.
+        errors, seconds, processor: Of all runs so far; ``processor`` has the processor's seconds of a step.
+        runs: Number of runs.
+        reason: Why it was left out; empty where it was not.
+    """
+
+    need: str
+    method: str
+    options: str
+    code: str
+    precision: str
+    run: Callable[[int], tuple[np.ndarray, np.ndarray]]
+    together: int = 1
+    errors: list[np.ndarray] = field(default_factory=list)
+    seconds: list[np.ndarray] = field(default_factory=list)
+    processor: list[float] = field(default_factory=list)
+    runs: int = 0
+    reason: str = ""
+
+    def once(self, seed: int) -> None:
+        """Make a run; the first one also runs before it counts, to compile."""
+        if not self.runs:
+            self.run(seed)
+        before = time.process_time()
+        errors, seconds = self.run(seed)
+        self.processor.append((time.process_time() - before) / len(seconds) / self.together)
+        self.errors.append(errors)
+        self.seconds.append(seconds)
+        self.runs += 1
+
+    def row(self, device: Backend) -> dict[str, Any]:
+        """Return the row of the report."""
+        found: dict[str, Any] = {
+            "need": self.need, "backend": device.info.selection, "device": device.info.name,
+            "kind": device.info.kind, "method": self.method, "setting": self.options, "code": self.code,
+            "precision": self.precision, "unit": UNITS[self.need], "runs": self.runs, "reason": self.reason,
+            "seconds": None, "processor_s": None, "error": None,
+        }  # fmt: skip
+        if self.runs:
+            errors, seconds = np.concatenate(self.errors), np.concatenate(self.seconds)
+            found["seconds"] = quantiles(seconds) | {"min": float(seconds.min())}
+            found["processor_s"] = float(np.median(self.processor))
+            found["error"] = quantiles(errors) | {"p95": float(np.quantile(errors, 0.95)), "max": float(errors.max())}
+        return found
+
+
+def quantiles(numbers: np.ndarray) -> dict[str, float]:
+    """Return the quartiles."""
+    return dict(zip(("q1", "median", "q3"), map(float, np.quantile(numbers, (0.25, 0.5, 0.75))), strict=True))
+
+
+# ---- localisation
+
+
+def mapped(world: gs.OccupancyGrid) -> gs.OccupancyGrid:
+    """Return the map that a laser makes of a world: surfaces are occupied, and unknown is all behind them."""
+    cells = np.where(world.occupied & ~surface_of(world), -1, world.cells).astype(np.int8)
+    return gs.OccupancyGrid(cells, world.resolution, world.origin, occupied_threshold=world.occupied_threshold)
+
+
+def scan_model(kind: str, run: Any, beams: int, device: Backend, precision: str) -> tuple[Any, str]:
+    """Make a model of the drive's laser; return it with its code."""
+    made: dict[str, Any] = {"backend": device, "precision": precision, "beams": beams}
+    words = f"beams={beams}" + (', precision="float64"' if precision == "float64" else "")
+    if kind == "field":
+        parameters = gs.LikelihoodFieldParameters(**DEFAULTS.field)
+        return gs.LikelihoodFieldModel(run.grid, run.scanner, parameters, **made), f"gs.LikelihoodFieldModel({words})"
+    chosen: Any = gs.BeamParameters(**BEAM)
+    if kind == "discrete":
+        chosen = gs.DiscreteBeamModel(chosen, range_max=run.scanner.range_max, bins=600)
+    elif kind != "beam":
+        made["caster"] = kind.removeprefix("beam, ")
+        words += f', caster="{made["caster"]}"'
+    name = "DiscreteBeamModel" if kind == "discrete" else "BeamParameters"
+    return gs.BeamModel(run.grid, run.scanner, chosen, **made), f"gs.BeamModel(gs.{name}, {words})"
+
+
+def drive(run: Any, model: Any, seed: int, particles: int, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Follow the robot; return the errors of the position [m] and the seconds of each step."""
+    pf = gs.ParticleFilter(model, particles=particles, seed=seed, **options)
+    pf.initialize(mean=run.poses[0], covariance=np.diag(np.square(START)))
+    errors, seconds = [], []
+    for k, ranges in enumerate(run.scans):
+        begin = time.perf_counter()
+        if k:
+            pf.predict(run.odometry[k - 1], run.odometry[k])
+        pf.correct(ranges)
+        found = pf.estimate()
+        seconds.append(time.perf_counter() - begin)
+        errors.append(np.hypot(*(found.pose[:2] - run.poses[k, :2])))
+    return np.array(errors[SETTLING:]), np.array(seconds[SETTLING:])
+
+
+def localisation(device: Backend) -> Iterator[Setting]:
+    """Yield the settings of localisation: particles and beams of each model, then variants of a middle one."""
+    building = gs.worlds.building(2, (50.0, 50.0))
+    world = gs.worlds.change_world(building, np.random.default_rng(4), moved=0.02)
+    run = gs.worlds.simulate_run(
+        mapped(building), SCANNER, world=world, scans=SCANS, hidden=0.2, seed=3, backend=device
+    )
+    sizes = {
+        "field": ((100, 300, 1000, 3000, 10_000, 100_000, 1_000_000), (8, 30, 60, 180, 1080)),
+        "beam": ((100, 1000, 10_000, 100_000, 1_000_000), (8, 60, 180, 1080)),
+        "discrete": ((1000, 10_000, 100_000), (60, 180)),
+        "beam, march": ((1000, 10_000), (60,)), "beam, cddt": ((1000, 10_000), (60,)),
+    }  # fmt: skip
+    grid = [(kind, n, k, "float32", {}) for kind, (ns, ks) in sizes.items() for n, k in itertools.product(ns, ks)]
+    varied: list[tuple[str, int, int, str, dict[str, Any]]] = [
+        (kind, 1000, 60, precision, options)
+        for kind in ("field", "beam")
+        for precision, options in (
+            ("float32", {"temperature": 1.0}), ("float32", {"stages": 1}),
+            ("float32", {"temperature": 1.0, "stages": 1}), ("float64", {}),
+        )
+    ]  # fmt: skip
+    for kind, n, k, precision, options in varied + sorted(grid, key=lambda one: one[1] * one[2]):
+        if n * k > MOST[device.info.kind] or (precision == "float64" and not device.info.float64):
+            continue
+        model, code = scan_model(kind, run, k, device, precision)
+        words = "".join(f", {name} {value:g}" for name, value in options.items())
+        called = "".join(f", {name}={value!r}" for name, value in options.items())
+        yield Setting(
+            "localisation", kind, f"{n} x {k}{words}", f"gs.ParticleFilter({code}, particles={n}{called})", precision,
+            lambda seed, n=n, model=model, options=options: drive(run, model, seed, n, options),
+        )  # fmt: skip
+
+
+# ---- matching
+
+
+def free_poses(grid: gs.OccupancyGrid, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw poses with room around them."""
+    return np.array([gs.worlds.free_pose(grid, rng, 0.4) for _ in range(count)])
+
+
+def matching(device: Backend) -> Iterator[Setting]:
+    """Yield the settings of matching: methods, numbers of beams, precisions."""
+    rng, grid = np.random.default_rng(5), gs.worlds.building(2, (50.0, 50.0))
+    first = free_poses(grid, PAIRS, rng)
+    second = first + rng.uniform(-1, 1, first.shape) * (1.0, 1.0, np.radians(30))
+    off = rng.uniform(-1, 1, first.shape) * (0.5, 0.5, np.radians(10))
+    for count in (90, 180, 360, 720):
+        scanner = gs.Scanner.uniform(angle_min=-np.pi, angle_increment=2 * np.pi / count, count=count, range_max=20.0)
+        caster = gs.RayCaster(grid, scanner.range_max, backend=device)
+        one, two = (caster.cast(poses, scanner.bearings).astype(np.float64) for poses in (first, second))
+        # A pose in a wall sees nothing.
+        seen = (one.min(axis=1) > 0.1) & (two.min(axis=1) > 0.1)
+        one, two = (scan + rng.normal(0, 0.02, scan.shape) * (scan < scanner.range_max) for scan in (one, two))
+        truth = relative_poses(first, second)
+        for need, reference, right, methods in (
+            ("matching", one[seen], truth[seen], ("auto", "icp", "gauss_newton", "correlative")),
+            ("in a map", grid, second[seen], ("auto", "gauss_newton", "correlative")),
+        ):
+            for method, precision in itertools.product(methods, ("float32", "float64")):
+                if precision == "float64" and (count != 360 or method != "auto" or not device.info.float64):
+                    continue
+                options = "" if precision == "float32" else ', precision="float64"'
+                given = "grid" if need == "in a map" else "reference"
+                yield Setting(
+                    need, method, f"{count} beams",
+                    f'gs.match_scan({given}, ranges, scanner, guess, "{method}"{options})', precision,
+                    matcher(reference, two[seen], scanner, right, off[seen], method, device, precision), len(right),
+                )  # fmt: skip
+
+
+def matcher(
+    reference: Any,
+    ranges: np.ndarray,
+    scanner: gs.Scanner,
+    right: np.ndarray,
+    off: np.ndarray,
+    method: Any,
+    device: Backend,
+    precision: Any,
+) -> Callable[[int], tuple[np.ndarray, np.ndarray]]:
+    """Make the run of a way to match all pairs in one call."""
+
+    def run(seed: int) -> tuple[np.ndarray, np.ndarray]:
+        begin = time.perf_counter()
+        match = gs.match_scan(reference, ranges, scanner, right + off, method, device, precision=precision)
+        each = (time.perf_counter() - begin) / len(right)
+        return differences(match.pose, right)[0], np.array([each])
+
+    return run
+
+
+# ---- learning and landmarks
+
+
+def learning(device: Backend) -> Iterator[Setting]:
+    """Yield the settings of learning: methods and numbers of readings."""
+    for count, method in itertools.product(
+        (100, 1000, 10_000, 100_000, 1_000_000), ("em", "em-book", "gradient", "hill_climb", "genetic")
+    ):
+        if method in ("hill_climb", "genetic") and count > MOST_SEARCHED:
+            continue
+
+        def run(seed: int, count: int = count, method: Any = method) -> tuple[np.ndarray, np.ndarray]:
+            z, expected = TYPICAL.draw(count, np.random.default_rng(seed))
+            begin = time.perf_counter()
+            fit = gs.fit_beam_parameters(z, expected, TYPICAL.range_max, method=method, backend=device)
+            seconds = time.perf_counter() - begin
+            relative = values(fit.parameters) / values(TYPICAL.parameters) - 1
+            return np.array([np.sqrt(np.mean(np.square(relative)))]), np.array([seconds])
+
+        code = f'gs.fit_beam_parameters(ranges, expected, range_max, method="{method}")'
+        precision = "float64" if device.info.float64 else "float32"
+        yield Setting("learning", method, f"{count} readings", code, precision, run)
+
+
+def landmarks(device: Backend) -> Iterator[Setting]:
+    """Yield the settings of landmarks: known and unknown correspondences, precisions."""
+    scene = landmark_scene(100, PARTICLES, 0)
+    features, known, poses = scene.features[:20, :2], scene.seen[:20], scene.clouds["tracking"]
+    right = gs.LandmarkModel(scene.landmarks, backend="numpy", precision="float64").log_likelihood(
+        poses, features, known
+    )
+    factor = temperature_of(right)
+    size = gs.normalize_weights(factor * right).effective_sample_size
+    kinds: dict[str, tuple[dict[str, Any], bool, int]] = {
+        "known": ({}, True, 20), "nearest": ({}, False, 20), "sum": ({"association": "sum"}, False, 20),
+        "negative information": ({"negative": True}, False, 20), "nearest, every other": ({}, False, 2),
+    }  # fmt: skip
+    for (kind, (options, given, used)), precision in itertools.product(kinds.items(), ("float32", "float64")):
+        if precision == "float64" and not device.info.float64:
+            continue
+        chosen = slice(None, None, 2) if used == 2 else slice(None)
+        model = gs.LandmarkModel(scene.landmarks, backend=device, precision=precision, **options)
+
+        def run(
+            seed: int, model: Any = model, chosen: slice = chosen, given: bool = given
+        ) -> tuple[np.ndarray, np.ndarray]:
+            seconds = []
+            for _ in range(5):
+                begin = time.perf_counter()
+                log_p = model.log_likelihood(poses, features[chosen], known[chosen] if given else None)
+                seconds.append(time.perf_counter() - begin)
+            scores = np.asarray(log_p, np.float64)
+            kl = posterior_errors(factor_for(scores, size) * scores, factor * right, poses)["kl"]
+            return np.array([kl]), np.array(seconds)
+
+        words = "".join(f", {name}={value!r}" for name, value in options.items()).replace("'", '"')
+        count = len(features[chosen])
+        yield Setting(
+            "landmarks", kind, f"{PARTICLES} x {count}", f"gs.LandmarkModel(landmarks{words})", precision, run
+        )
+
+
+def in_a_map(device: Backend) -> Iterator[Setting]:
+    """Yield the settings of matching in a map."""
+    return (one for one in matching(device) if one.need == "in a map")
+
+
+def between_scans(device: Backend) -> Iterator[Setting]:
+    """Yield the settings of matching between scans."""
+    return (one for one in matching(device) if one.need == "matching")
+
+
+SETTINGS: dict[str, Callable[[Backend], Iterator[Setting]]] = dict(
+    zip(NEEDS, (localisation, between_scans, in_a_map, learning, landmarks), strict=True)
+)
+
+# ---- all
+
+
+def measure(need: str, device: Backend, arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """Run all settings of a need in rounds; return their rows."""
+    begin, settings = time.perf_counter(), list(SETTINGS[need](device))
+    for number in range(arguments.rounds):
+        for one in settings:
+            if one.reason:
+                continue
+            spent = time.perf_counter() - begin
+            if spent > arguments.seconds:
+                one.reason = one.reason or ("" if one.runs else f"the {arguments.seconds:g} s of this need were over")
+                continue
+            try:
+                one.once(number)
+            except Exception as error:
+                one.reason = " ".join(f"{type(error).__name__}: {error}".split())
+                continue
+            step = float(np.median(one.seconds[-1]))
+            if step > arguments.longest:
+                one.reason = f"a step takes {step:.2g} s, more than {arguments.longest:g} s: measured once"
+        note(f"{device.info.selection}: {need}, round {number + 1}, {time.perf_counter() - begin:.0f} s")
+    return [one.row(device) for one in settings]
+
+
+def markdown(rows: list[dict[str, Any]]) -> str:
+    """Format the rows that ran."""
+    columns = ("need", "device", "method", "setting", "precision", "ms (quartiles)", "processor ms", "error", "95 %")
+    lines = []
+    for row in rows:
+        if row["seconds"] is None:
+            continue
+        times = ", ".join(f"{1e3 * row['seconds'][name]:.3g}" for name in ("q1", "median", "q3"))
+        error, scale = row["error"], {"m": 100, "%": 100}.get(row["unit"], 1)
+        unit = {"m": "cm"}.get(row["unit"], row["unit"])
+        lines.append([
+            row["need"], row["backend"], row["method"], row["setting"], row["precision"], times,
+            f"{1e3 * row['processor_s']:.3g}", f"{scale * error['median']:.3g} {unit}", f"{scale * error['p95']:.3g}",
+        ])  # fmt: skip
+    return table(columns, lines)
+
+
+def add_options(parser: argparse.ArgumentParser, seconds: float = 120.0) -> None:
+    """Add the options of :func:`measure`."""
+    parser.add_argument("--need", action="append", choices=NEEDS, help="repeatable; default: all")
+    parser.add_argument("--seconds", type=float, default=seconds, help="longest time of a need on a device")
+    parser.add_argument("--longest", type=float, default=0.5, help="longest step that is repeated [s]")
+    parser.add_argument("--rounds", type=int, default=3, help="runs of each setting, each with a seed of its own")
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = make_parser(__doc__, backend="kernels")
+    add_options(parser)
+    arguments = parse(parser)
+    report = report_of(arguments, arguments.backend, command_line("bench/error_vs_time/needs.py"))
+    print(markdown(report["rows"]))
+    if arguments.output:
+        arguments.output.with_suffix(".json").write_text(to_json(report), encoding="utf-8")
+
+
+def report_of(arguments: argparse.Namespace, backends: Sequence[str], command: str) -> dict[str, Any]:
+    """Measure, and return the report."""
+    stated, devices = arguments.commit or commit(), [get_backend(name) for name in backends]
+    rows = [row for device in devices for need in arguments.need or NEEDS for row in measure(need, device, arguments)]
+    return plain({
+        "schema": SCHEMA, "kind": "needs", "date": time.strftime("%Y-%m-%d"), "commit": stated, "command": command,
+        "machine": machine(), "rows": rows,
+    })  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

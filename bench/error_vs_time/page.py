@@ -1,0 +1,310 @@
+"""Make docs/error-vs-time.md, its figures and the interactive page from the reports in bench/results.
+
+    python bench/error_vs_time/page.py           # write
+    python bench/error_vs_time/page.py --check   # exit code 1 where a file differs, or a report is of older code
+
+The same reports give the same bytes everywhere.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from error_vs_time.charts import Chart, Mark, drawing
+from error_vs_time.reports import ALL, LIMIT, RESULTS, ROOT, Row, Source, commit_trouble, rows_of, sources
+
+from gpusense._util.files import write_whole
+from gpusense.evaluation.benchmark.choice import choose, error_text, front, time_text
+from gpusense.evaluation.benchmark.report import table
+
+HERE = Path(__file__).parent
+PAGE, FIGURE = Path("docs/error-vs-time.md"), Path("docs/front/figures/error-vs-time.html")
+IMAGES = Path("docs/img")
+WRONG, MEDIAN, TAIL, LARGEST = (
+    "rays wrong by more than a cell", "median error of a ray", "95 % error of a ray", "largest error of a ray",
+)  # fmt: skip
+KL, FINE = "KL divergence at a comparable temperature", "KL divergence from the true posterior"
+SHIFT, GLOBAL = "shift of the mean position", "the same, all over the map"
+# By need: the measures of its figure and of its table, the first one that of choices.
+SHOWN = {
+    "rays": (WRONG, MEDIAN, TAIL, LARGEST), "beam model": (KL, GLOBAL, FINE, SHIFT),
+    "likelihood field": (KL, GLOBAL, FINE, SHIFT),
+    "localisation": ("median error", "95 % error"), "matching": ("median error", "95 % error"),
+    "in a map": ("median error", "95 % error"), "learning": ("median error", "largest error"),
+    "landmarks": ("median error",),
+}  # fmt: skip
+NEEDS = tuple(SHOWN)
+# Methods with a knob that other implementations have, too.
+TABLES = ("cddt", "lookup", "march, centre")
+
+
+@dataclass(frozen=True)
+class Wish:
+    """An error or a time that somebody can afford.
+
+    Attributes:
+        words: In words.
+        need: Its need.
+        error: The largest error of the need's first measure; None without a limit.
+        seconds: The longest time [s]; None without a limit.
+        only: Chooses rows.
+    """
+
+    words: str
+    need: str
+    error: float | None = None
+    seconds: float | None = None
+    only: Callable[[Row], bool] = lambda row: True
+
+
+def _default(row: Row) -> bool:
+    """Return whether a filter has the default temperature and stages."""
+    return "," not in row.setting
+
+
+def _particles(count: int) -> Callable[[Row], bool]:
+    return lambda row: _default(row) and row.setting.startswith(f"{count} x")
+
+
+FIRST = (
+    Wish("10 000 particles at 100 Hz", "localisation", seconds=0.01, only=_particles(10_000)),
+    Wish("1000 particles at 100 Hz", "localisation", seconds=0.01, only=_particles(1000)),
+    Wish("localisation to 2 cm", "localisation", error=0.02, only=_default),
+)
+WISHES = (
+    *FIRST,
+    Wish("beam model, at most 0.01 nats", "beam model", error=0.01),
+    Wish("beam model, at most 10 ms", "beam model", seconds=0.01),
+    Wish("beam model, at most 1 ms", "beam model", seconds=0.001),
+    Wish("likelihood field, at most 0.01 nats", "likelihood field", error=0.01),
+    Wish("likelihood field, at most 1 ms", "likelihood field", seconds=0.001),
+    Wish("rays, at most 1 % wrong", "rays", error=0.01),
+    Wish("match of two scans, at most 1 cm", "matching", error=0.01),
+    Wish("match in a map, at most 1 cm", "in a map", error=0.01),
+    Wish("parameters learned, at most 5 % off", "learning", error=0.05),
+    Wish("unknown landmarks, at most 0.2 nats", "landmarks", error=0.2, only=lambda row: row.method != "known"),
+)
+
+
+def value(number: float, unit: str) -> str:
+    """Format an error; shares and relative errors in percent, lengths in millimetres or centimetres."""
+    if unit in ("share", "relative"):
+        return "0" if number == 0 else error_text(number, "%")
+    if unit == "nats":
+        return "0" if number < 1e-6 else f"{number:.2g}"
+    return f"{number:.3g}" if unit == "cells" else error_text(number, unit)
+
+
+def own(rows: Iterable[Row], need: str, device: str, scene: str = ALL) -> list[Row]:
+    """Return gpusense's rows of a need on a device."""
+    return [row for row in rows if (row.need, row.device, row.scene) == (need, device, scene) and not row.outside]
+
+
+def answer(rows: Sequence[Row], wish: Wish, device: str) -> str:
+    """Return the method for a wish with its time and error."""
+    able = [row for row in own(rows, wish.need, device) if wish.only(row) and not row.maps]
+    measure = SHOWN[wish.need][0]
+    entries = [row.entry(measure) for row in able]
+    chosen = choose(entries, wish.error, wish.seconds)
+    if not able:
+        return "-"
+    if chosen is None:
+        nearest = min(entries, key=lambda entry: entry.seconds if wish.error is None else entry.error)
+        row = able[entries.index(nearest)]
+        return f"none; nearest: {row.text}, {_figures(row, measure)}"
+    row = able[entries.index(chosen)]
+    return f"**{row.text}**: {_figures(row, measure)}"
+
+
+def _figures(row: Row, measure: str) -> str:
+    unit = row.units[measure]
+    return f"{time_text(row.seconds)}, {value(row.errors[measure], unit)}{' nats' * (unit == 'nats')}"
+
+
+def answers(rows: Sequence[Row], devices: Sequence[str], wishes: Sequence[Wish]) -> list[str]:
+    """Return the table of wishes."""
+    lines = [(wish.words, *(answer(rows, wish, device) for device in devices)) for wish in wishes]
+    return table(("to do", *devices), lines, 1 + len(devices))
+
+
+def best(rows: Sequence[Row], measure: str) -> list[Row]:
+    """Return the Pareto front of the rows of all maps."""
+    rows = [row for row in rows if not row.maps]
+    entries = [row.entry(measure) for row in rows]
+    return [rows[entries.index(entry)] for entry in front(entries)]
+
+
+def chart(rows: Sequence[Row], need: str, devices: Sequence[str]) -> str:
+    """Draw a need: a panel for each device, other implementations among its own methods."""
+    measure, charts = SHOWN[need][0], []
+    for device in devices:
+        chosen = [row for row in rows if (row.need, row.device, row.scene) == (need, device, ALL)]
+        if not chosen:
+            continue
+        unit = chosen[0].units[measure]
+        words = {"share": "share", "relative": "relative", "nats": "nats", "m": "m", "cells": "cells"}[unit]
+        kept = best([row for row in chosen if not row.outside], measure)
+        marks = [
+            Mark(row.errors[measure], row.seconds, row.text, row.method, any(row is one for one in kept))
+            for row in chosen
+        ]
+        charts.append(Chart(device, f"{measure} [{words}]", marks))
+    return drawing(charts)
+
+
+def methods(rows: Sequence[Row], need: str, devices: Sequence[str], *, fronts: bool = False) -> list[str]:
+    """Return the table of a need: times on all devices, errors, code; only the fronts where there are many settings."""
+    measures = SHOWN[need]
+    shown: dict[str, dict[str, Row]] = {}
+    for device in devices:
+        chosen = own(rows, need, device)
+        for row in best(chosen, measures[0]) if fronts else chosen:
+            shown.setdefault(row.text, {})[device] = row
+    columns = ["method", *devices, *measures, "code"]
+    lines = []
+    for text, each in shown.items():
+        first = next(iter(each.values()))
+        worst = [max(row.errors.get(name, 0.0) for row in each.values()) for name in measures]
+        known = [name in first.errors for name in measures]
+        lines.append([
+            f"**{text}**" if first.exact else text, *(_time(each.get(device)) for device in devices),
+            *(value(error, first.units[name]) if there else "-"
+              for error, name, there in zip(worst, measures, known, strict=True)),
+            f"`{first.code}`",
+        ])  # fmt: skip
+    return table(columns, lines, len(columns))
+
+
+def _time(row: Row | None) -> str:
+    if row is None:
+        return "-"
+    low, _, high = (time_text(seconds) for seconds in row.quartiles)
+    return f"{time_text(row.seconds)} ({low} to {high})"
+
+
+def peers(rows: Sequence[Row]) -> list[str]:
+    """Return the table of other implementations beside the rows that they stand against."""
+    outside = [row for row in rows if row.outside and row.scene == ALL]
+    lines = []
+    for need in ("rays", "likelihood field"):
+        measure = SHOWN[need][0]
+        for device in dict.fromkeys(row.device for row in outside if row.need == need):
+            rivals = [row for row in outside if (row.need, row.device) == (need, device)]
+            reference = [
+                row for row in own(rows, need, device)
+                if row.precision == "float32" and (not row.setting or row.method in TABLES)
+            ]  # fmt: skip
+            for row in sorted([*rivals, *reference], key=lambda one: one.seconds):
+                rate = row.work / row.seconds / 1e6
+                error = value(row.errors[measure], row.units[measure]) + " nats" * (need != "rays")
+                lines.append((need, row.text, row.outside or "gpusense", f"{rate:.3g}", error, device))
+    return table(("for", "method", "version, threads", "M/s of one core", "error", "processor"), lines, 3)
+
+
+def by_map(rows: Sequence[Row], devices: Sequence[str]) -> list[str]:
+    """Return the rates of the exact caster in each map, and the error of a quarter of the beams."""
+    known = {(row.need, row.text, row.device, row.scene): row for row in rows}
+    lines = []
+    for (need, text, device, scene), row in known.items():
+        if (need, text) == ("rays", "exact") and device in devices:
+            rate, wrong = row.work / row.seconds / 1e6, value(row.errors[WRONG], "share")
+            thin = known.get(("beam model", "exact, fewer beams, every = 4", device, scene))
+            lines.append((device, scene, f"{rate:.4g}", wrong, value(thin.errors[KL], "nats") if thin else "-"))
+    return table(("device", "map", "M rays/s, exact", "wrong", "nats, every 4th beam"), lines, 2)
+
+
+def listing(found: Sequence[Source]) -> list[str]:
+    """Return the table of the reports."""
+    lines = [
+        (f"[{source.name}](../bench/results/{source.name})", "; ".join(source.titles), str(source.report["date"]),
+         str(source.report["commit"]), source.missing, f"`{source.report['command']}`")
+        for source in found
+    ]  # fmt: skip
+    return table(("report", "devices", "date", "commit", "not measured", "command"), lines, 6)
+
+
+def picture(name: str) -> Path:
+    """Return the path of a need's figure."""
+    return IMAGES / f"error-vs-time-{name.replace(' ', '-')}.svg"
+
+
+def interactive(rows: Sequence[Row]) -> str:
+    """Return the interactive page."""
+    data = [
+        {
+            "need": row.need, "device": row.device, "map": row.scene, "name": row.text, "method": row.method,
+            "code": row.code, "outside": row.outside, "maps": row.maps, "time": _short(row.seconds),
+            "quartiles": [_short(one) for one in row.quartiles],
+            "errors": {name: _short(row.errors[name]) for name in SHOWN[row.need] if name in row.errors},
+            "units": [row.units[name] for name in SHOWN[row.need] if name in row.errors],
+        }
+        for row in rows
+    ]  # fmt: skip
+    text = (HERE / "figure.html").read_text(encoding="utf-8")
+    lines = ",\n".join(json.dumps(one, allow_nan=False, separators=(",", ":")) for one in data)
+    style = (ROOT / "docs" / "figures" / "style.css").read_text(encoding="utf-8")
+    script = (HERE / "figure.js").read_text(encoding="utf-8")
+    for mark, part in {"style": style, "script": script, "data": f"[{lines}]"}.items():
+        text = text.replace(f"/*{{{mark}}}*/", part)
+    return text
+
+
+def _short(number: float) -> float:
+    return float(f"{number:.4g}")
+
+
+def files(folder: Path = RESULTS) -> dict[Path, str]:
+    """Return all files of the page by their paths in the checkout.
+
+    Raises:
+        ValueError: a report is damaged or of uncommitted changes, or there is none.
+    """
+    found = sources(folder)
+    rows = rows_of(found)
+    if not rows:
+        raise ValueError(f"reports: {folder.name} must have reports error_vs_time_*.json, got none")
+    devices = list(dict.fromkeys(row.device for row in rows))
+    needs = [need for need in NEEDS if any(row.need == need for row in rows)]
+    made = {picture(need): chart(rows, need, devices) for need in needs}
+    blocks = {
+        "first": answers(rows, devices, FIRST), "answers": answers(rows, devices, WISHES), "peers": peers(rows),
+        "maps": by_map(rows, devices), "reports": listing(found), "limit": [str(LIMIT)],
+    }  # fmt: skip
+    for need in NEEDS:
+        blocks[need] = methods(rows, need, devices, fronts=need == "localisation") if need in needs else ["(none yet)"]
+        words = f"{need}: error against time"
+        blocks[f"figure {need}"] = [f"![{words}](img/{picture(need).name})"] if need in needs else []
+    text = (HERE / "template.txt").read_text(encoding="utf-8")
+    for name, lines in blocks.items():
+        text = text.replace(f"{{{{{name}}}}}", "\n".join(lines))
+    return made | {PAGE: text, FIGURE: interactive(rows)}
+
+
+def main() -> int:
+    """Write the files, or compare them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing, compare")
+    arguments = parser.parse_args()
+    try:
+        made, found = files(), sources()
+    except (OSError, ValueError) as error:
+        parser.error(str(error))
+    troubles = [f"{source.name} {trouble}" for source in found if (trouble := commit_trouble(source.report["commit"]))]
+    for path, text in made.items():
+        if not arguments.check:
+            write_whole(ROOT / path, lambda stream, text=text: stream.write(text.encode()))
+        elif not (ROOT / path).is_file() or (ROOT / path).read_text(encoding="utf-8") != text:
+            troubles.append(f"{path} differs from what the reports give")
+    print("\n".join([f"{len(made)} files of {len(found)} reports", *troubles]))
+    return int(bool(troubles))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,268 @@
+"""Choose the method for an error or a time that one can afford: the fastest exact enough, or the most exact in time.
+
+A method is judged over all scenes and clouds of a report at once: by its largest error, and by the geometric mean of
+its times. Methods within ``ALIKE`` of the fastest count as equally fast, so that noise does not decide; of these the
+most exact one is chosen.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from gpusense.evaluation.benchmark.profiles import error_of, label, pareto_front, setting, time_of
+
+ALIKE = 1.15
+"""Factor of the times below which two methods are equally fast."""
+ROUNDING = 1e-6
+"""Errors below this are equal: rounding of float32."""
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A kind of error that a method is chosen by.
+
+    Attributes:
+        kind, name: Place of the error in a point.
+        unit: Its unit.
+        text: Description.
+    """
+
+    kind: str
+    name: str
+    unit: str
+    text: str
+
+
+KL = Measure("comparable", "kl", "nats", "KL divergence of the posterior at a comparable temperature")
+SHIFT = Measure("comparable", "shift_m", "m", "shift of the weighted mean position at a comparable temperature")
+WRONG = Measure("ranges", "wrong_1", "%", "share of rays wrong by more than one cell")
+CELLS = Measure("ranges", "p95", "cells", "95th percentile of the range error")
+LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+MEASURES = {"ranges": {"%": WRONG, "cells": CELLS}, "beam": {"nats": KL, "m": SHIFT}, "field": {"nats": KL, "m": SHIFT}}
+"""By problem and unit, the measure that a limit is about; the first is the default."""
+DEFAULTS = {"ranges": ("%", 0.01), "beam": ("nats", 0.01), "field": ("nats", 0.01)}
+"""By problem, the unit and the largest error where none is given."""
+_QUANTITY = re.compile(r"\s*([0-9.]+(?:[eE][-+]?[0-9]+)?)\s*([a-z%]+)\s*")
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A method with its setting on one device.
+
+    Attributes:
+        device: Selection string or name of the device.
+        method: Method and variant.
+        setting: Knob and value; empty without one.
+        precision: Precision.
+        error: Largest error over scenes and clouds, in the unit of its measure (shares as shares, lengths in metres).
+        seconds: Geometric mean of the times of a call [s].
+        code: How it is called.
+        exact: Whether it computes the model itself.
+    """
+
+    device: str
+    method: str
+    setting: str
+    precision: str
+    error: float
+    seconds: float
+    code: str = ""
+    exact: bool = False
+
+    @property
+    def text(self) -> str:
+        """Name the method with its setting and precision."""
+        return ", ".join(word for word in (self.method, self.setting, self.precision) if word)
+
+
+@dataclass(frozen=True)
+class Wish:
+    """Limits of a choice.
+
+    Attributes:
+        errors: By unit the largest error: a share for ``"%"``, metres for ``"m"``.
+        seconds: Longest time of a call [s]; None without a limit.
+    """
+
+    errors: Mapping[str, float] = field(default_factory=dict)
+    seconds: float | None = None
+
+
+def parse_error(text: str) -> tuple[str, float]:
+    """Read a limit of the error, such as ``"0.01 nats"``, ``"2 cm"``, ``"1 %"`` or ``"0.5 cells"``.
+
+    Returns:
+        The unit (``"nats"``, ``"m"``, ``"%"`` or ``"cells"``) and the value in it; for ``"%"`` the share.
+
+    Raises:
+        ValueError: the text is no number with one of these units, or the number is not positive and finite.
+    """
+    value, unit = _quantity(text, ("nats", "cells", "%", *LENGTHS), "--max-error")
+    if unit in LENGTHS:
+        return "m", value * LENGTHS[unit]
+    return unit, value / 100 if unit == "%" else value
+
+
+def parse_time(text: str) -> float:
+    """Read a limit of the time of a call, such as ``"1 ms"``; return seconds.
+
+    Raises:
+        ValueError: the text is no number with ``s``, ``ms`` or ``us``, or the number is not positive and finite.
+    """
+    value, unit = _quantity(text, tuple(_SECONDS), "--max-time")
+    return value * _SECONDS[unit]
+
+
+def _quantity(text: str, units: Sequence[str], name: str) -> tuple[float, str]:
+    rule = f"{name}: must be a number > 0 with a unit of {', '.join(units)}"
+    match = _QUANTITY.fullmatch(text)
+    try:
+        value = float(match[1]) if match else math.nan
+    except ValueError:
+        value = math.nan
+    if match is None or match[2] not in units or not 0 < value < math.inf:
+        raise ValueError(f"{rule}, got {text!r}")
+    return value, match[2]
+
+
+def call_time(point: Mapping[str, Any]) -> float | None:
+    """Return the least time of a point's calls [s]."""
+    return time_of(point, "call")
+
+
+def entries(
+    points: Iterable[Mapping[str, Any]],
+    problem: str,
+    measure: Measure,
+    backend: str,
+    timing: Callable[[Mapping[str, Any]], float | None] = call_time,
+) -> list[Entry]:
+    """Return the methods of a problem on one device, over all scenes and clouds where they were measured.
+
+    A method that failed, was left out or is not finite in any of them is not listed.
+
+    Args:
+        points: Points of a report.
+        problem: The problem.
+        measure: The measure of their errors.
+        backend: Selection string of the device, or ``"outside"``.
+        timing: Time of a point [s]; None where it was not measured.
+    """
+    chosen = [point for point in points if point["problem"] == problem and point["backend"] == backend]
+    groups: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
+    for point in chosen:
+        groups.setdefault((label(point), setting(point), point["precision"]), []).append(point)
+    listed = []
+    for (method, at, precision), group in groups.items():
+        errors = [error_of(point, measure.kind, measure.name) for point in group]
+        times = [timing(point) for point in group]
+        if any(value is None for value in (*errors, *times)):
+            continue
+        seconds = math.exp(sum(math.log(time or 1.0) for time in times) / len(times))
+        error = max(error or 0.0 for error in errors)
+        first = group[0]
+        listed.append(Entry(backend, method, at, precision, error, seconds, first["code"], bool(first["exact"])))
+    return listed
+
+
+def front(listed: Sequence[Entry]) -> list[Entry]:
+    """Return the entries that no other one beats in error and time, by rising error; errors of rounding are equal."""
+    places = [(entry.error if entry.error > ROUNDING else 0.0, entry.seconds) for entry in listed]
+    return [listed[i] for i in pareto_front(places)]
+
+
+def choose(listed: Sequence[Entry], error: float | None, seconds: float | None) -> Entry | None:
+    """Choose the entry for a largest error and a longest time.
+
+    With a largest error the fastest of those within both limits is chosen; of equally fast ones the most exact. With a
+    longest time alone the most exact within it is chosen; of equally exact ones the fastest.
+
+    Args:
+        listed: Entries of one device and one measure.
+        error: The largest error; None without a limit.
+        seconds: The longest time [s]; None without a limit.
+
+    Returns:
+        The entry; None where none is within the limits.
+    """
+    able = [
+        entry
+        for entry in listed
+        if (error is None or entry.error <= error) and (seconds is None or entry.seconds <= seconds)
+    ]
+    if not able:
+        return None
+
+    def exactness(entry: Entry) -> tuple[float, bool, float]:
+        return (entry.error if entry.error > ROUNDING else 0.0, not entry.exact, entry.seconds)
+
+    if error is None:
+        return min(able, key=exactness)
+    fastest = min(entry.seconds for entry in able)
+    return min((entry for entry in able if entry.seconds <= ALIKE * fastest), key=exactness)
+
+
+def error_text(value: float, unit: str) -> str:
+    """Format an error in its unit: shares in percent, lengths in millimetres or centimetres."""
+    if unit == "%":
+        return f"{100 * value:.2g} %"
+    if unit == "m":
+        return f"{1e3 * value:.2g} mm" if value < 0.01 else f"{100 * value:.3g} cm"
+    return f"{value if value > ROUNDING else 0:.2g} {unit}"
+
+
+def time_text(seconds: float) -> str:
+    """Format a time: microseconds, milliseconds or seconds."""
+    for unit, scale in (("us", 1e6), ("ms", 1e3)):
+        if seconds * scale < 1000:
+            return f"{seconds * scale:.3g} {unit}"
+    return f"{seconds:.3g} s"
+
+
+def answers(points: Sequence[Mapping[str, Any]], wish: Wish) -> list[str]:
+    """Write the lines that say which method to take, for each problem and device of a report.
+
+    Args:
+        points: Points of a report.
+        wish: The limits; problems without a limit of their unit take that of ``DEFAULTS``, or only the time's.
+    """
+    lines: list[str] = []
+    for problem in dict.fromkeys(point["problem"] for point in points):
+        own = [point for point in points if point["problem"] == problem]
+        measures = MEASURES[problem]
+        unit = next((unit for unit in wish.errors if unit in measures), None)
+        limit = wish.errors[unit] if unit is not None else None
+        if unit is None and wish.seconds is None:
+            unit, limit = DEFAULTS[problem]
+        measure = measures[unit if unit is not None else DEFAULTS[problem][0]]
+        for backend in dict.fromkeys(point["backend"] for point in own):
+            listed = entries(own, problem, measure, backend)
+            lines += _lines_of(listed, own, problem, measure, backend, limit, wish.seconds)
+    return lines
+
+
+def _lines_of(
+    listed: Sequence[Entry],
+    points: Sequence[Mapping[str, Any]],
+    problem: str,
+    measure: Measure,
+    backend: str,
+    limit: float | None,
+    seconds: float | None,
+) -> list[str]:
+    size = next(f"{p['particles']} x {p['beams']}" for p in points if p["backend"] == backend)
+    wanted = [f"error at most {error_text(limit, measure.unit)}"] if limit is not None else []
+    wanted += [f"at most {time_text(seconds)}"] if seconds is not None else []
+    chosen, title = choose(listed, limit, seconds), f"{problem} on {backend}, {size}, {', '.join(wanted)}"
+    if chosen is None:
+        return [f"{title}: no method"]
+    found = f"{chosen.text}: {time_text(chosen.seconds)}, {error_text(chosen.error, measure.unit)}"
+    shown = ", ".join(
+        f"{entry.text} ({time_text(entry.seconds)}, {error_text(entry.error, measure.unit)})" for entry in front(listed)
+    )
+    return [f"{title}: {found}", f"  best for some error or time: {shown}"]

@@ -1,0 +1,82 @@
+"""The choice of a method for an error or a time, by hand."""
+
+from __future__ import annotations
+
+import pytest
+from support.bench_world import made_point
+
+from gpusense.evaluation.benchmark import choice
+
+
+def entry(method: str, error: float, seconds: float, **changes: object) -> choice.Entry:
+    return choice.Entry("d", method, "", "float32", error, seconds, **changes)
+
+
+LISTED = [
+    entry("model itself", 1e-9, 4.0, exact=True), entry("as exact, slower", 0.0, 5.0),
+    entry("a little off", 0.004, 1.1), entry("a little less off", 0.003, 1.2), entry("rough", 0.5, 0.2),
+    entry("beaten", 0.6, 0.9),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("error", "seconds", "chosen"),
+    [
+        (1e-5, None, "model itself"),
+        # Equally fast within 15 %: the more exact one.
+        (0.01, None, "a little less off"),
+        (0.01, 1.15, "a little off"),
+        (1.0, None, "rough"),
+        (None, 4.5, "model itself"),
+        (None, 1.0, "rough"),
+        (None, 0.1, None),
+        (0.001, 3.0, None),
+    ],
+)
+def test_choice_by_hand(error, seconds, chosen):
+    found = choice.choose(LISTED, error, seconds)
+    assert (found and found.method) == chosen
+
+
+def test_front_by_hand():
+    """An error of rounding is none: the slower of two exact methods is beaten."""
+    names = [one.method for one in choice.front(LISTED)]
+    assert names == ["model itself", "a little less off", "a little off", "rough"]
+
+
+def test_noise_of_a_few_percent_changes_no_choice():
+    for factor in (0.95, 1.05):
+        noisy = [entry(e.method, e.error, e.seconds * (factor if i % 2 else 1.0)) for i, e in enumerate(LISTED)]
+        assert choice.choose(noisy, 0.01, None).method == "a little less off"
+
+
+def test_a_method_is_judged_by_its_worst_scene_and_must_work_in_all():
+    kl = {"kl": 0.0}
+    points = [
+        made_point(problem="beam", comparable=kl, call_min_s=1.0),
+        made_point(problem="beam", scene="t", comparable={"kl": 0.3}, call_min_s=4.0),
+        made_point(problem="beam", method="dda", comparable=kl),
+        made_point(problem="beam", method="dda", scene="t", status="failed", errors=None, time=None),
+    ]
+    (only,) = choice.entries(points, "beam", choice.KL, "numpy")
+    assert (only.method, only.error, only.seconds) == ("exact", 0.3, pytest.approx(2.0))
+    lines = choice.answers(points, choice.Wish({"nats": 0.1}))
+    assert lines == ["beam on numpy, 10 x 10, error at most 0.1 nats: no method"]
+    lines = choice.answers(points, choice.Wish({"nats": 0.4}, 3.0))
+    assert lines[0] == "beam on numpy, 10 x 10, error at most 0.4 nats, at most 3 s: exact, float32: 2 s, 0.3 nats"
+
+
+def test_limits_have_units():
+    assert choice.parse_error("0.01 nats") == ("nats", 0.01) and choice.parse_error("1%") == ("%", 0.01)
+    assert choice.parse_error("2 cm") == ("m", 0.02) and choice.parse_time("250 us") == pytest.approx(2.5e-4)
+    for text in ("2", "cm", "-1 cm", "nan m", "1e999 m", "1 ms", "0 %"):
+        with pytest.raises(ValueError, match=r"--max-error: must be a number > 0 with a unit of .*, got"):
+            choice.parse_error(text)
+    with pytest.raises(ValueError, match="--max-time: must be a number > 0 with a unit of s, ms, us, got '1 cm'"):
+        choice.parse_time("1 cm")
+
+
+def test_values_are_read_with_units():
+    values = ((0.0123, "%"), (0.0123, "m"), (0.0042, "m"), (3e-9, "nats"), (0.5, "cells"))
+    assert [choice.error_text(*one) for one in values] == ["1.2 %", "1.23 cm", "4.2 mm", "0 nats", "0.5 cells"]
+    assert [choice.time_text(s) for s in (1.5e-5, 0.0042, 2.0)] == ["15 us", "4.2 ms", "2 s"]

@@ -1,0 +1,112 @@
+"""The scripts that make the reports of docs/error-vs-time.md: whole tasks, and the plan of a device."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from support.bench_world import made_point
+from support.paths import ROOT
+
+from gpusense.backends import get_backend
+from gpusense.evaluation.benchmark.runner import Outcome
+
+FOLDER = ROOT / "bench" / "error_vs_time"
+pytestmark = pytest.mark.usefixtures("no_data")
+
+
+@pytest.fixture
+def measure(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    for folder in (FOLDER, ROOT / "bench"):
+        monkeypatch.syspath_prepend(str(folder))
+    return importlib.import_module("measure")
+
+
+def options(**changes: object) -> argparse.Namespace:
+    given = {
+        "backend": ["numpy"], "scene": None, "no_peers": True, "build_limit": 1.0, "point_seconds": 0.1,
+        "deadline": 1e9, "commit": "abc",
+    }  # fmt: skip
+    return argparse.Namespace(**(given | changes))
+
+
+def test_each_scene_has_all_methods_and_the_exact_ones_in_float64(measure: ModuleType) -> None:
+    plans, given, _ = measure.plans_of(options())
+    assert [(plan.sources[0].name, plan.precisions) for plan in plans] == [
+        ("building", ["float32"]), ("building", ["float64"]), ("clutter", ["float32"]), ("clutter", ["float64"]),
+    ]  # fmt: skip
+    assert {one.method for one in plans[1].candidates} == {"exact", "dda", "field"}
+    assert len(plans[0].candidates) > 20 and (given["particles"], given["beams"]) == (10_000, 360)
+
+
+def test_scenes_after_the_deadline_and_unreadable_ones_are_left_out(
+    measure: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    began = []
+
+    def run(plan):
+        began.append(plan.sources[0].name)
+        if plan.sources[0].name == "building":
+            raise ImportError("no module named yaml")
+        return Outcome([{"name": "clutter"}], [made_point(scene="clutter")], {"device": "d"})
+
+    monkeypatch.setattr(measure, "run", run)
+    *_, report = measure.models(options(), "abc", measure.time.perf_counter())
+    assert began == ["building", "building", "clutter", "clutter"]
+    assert [scene["name"] for scene in report["scenes"]] == ["clutter"] and len(report["points"]) == 2
+    assert (report["commit"], report["arguments"]["scenes"]) == ("abc", ["clutter"])
+    began.clear()
+    assert list(measure.models(options(deadline=0.0), "abc", measure.time.perf_counter() - 1.0)) == began == []
+
+
+def test_a_report_needs_a_commit(tmp_path: Path) -> None:
+    command = [sys.executable, str(FOLDER / "measure.py"), "--backend", "numpy", "--output", str(tmp_path / "x")]
+    done = subprocess.run([*command, "--commit", "abc+"], capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and "--commit: the checkout must have no uncommitted changes, got abc+" in done.stderr
+
+
+def test_tasks_are_measured(
+    measure: ModuleType, needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Landmarks: known correspondences are the truth, the likeliest landmarks are not; and all times are there."""
+    tasks, selection = importlib.import_module("needs"), needs("opencl")
+    monkeypatch.setattr(tasks, "PARTICLES", 300)
+    given = argparse.Namespace(need=["landmarks"], rounds=2, seconds=99.0, longest=99.0, commit="abc")
+    report = tasks.report_of(given, [selection], "python bench/error_vs_time/needs.py")
+    measure.write(tmp_path / "x", "tasks", report)
+    assert json.loads((tmp_path / "x_tasks.json").read_text()) == report
+    assert (report["kind"], report["commit"]) == ("needs", "abc")
+    rows = {(row["method"], row["precision"]): row for row in report["rows"]}
+    assert rows["known", "float64"]["error"]["max"] < 1e-9 < 1e-3 < rows["nearest", "float32"]["error"]["median"]
+    for row in rows.values():
+        assert (row["runs"], row["reason"], row["unit"]) == (2, "", "nats")
+        assert 0 < row["seconds"]["min"] <= row["seconds"]["q1"] <= row["seconds"]["q3"] and row["processor_s"] > 0
+    assert tasks.markdown(report["rows"]).count("landmarks") == len(rows)
+
+
+def test_settings_that_the_time_leaves_no_room_for_are_listed(measure: ModuleType) -> None:
+    needs = importlib.import_module("needs")
+
+    def run(seed: int) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([0.1, 0.3]), np.array([seed + 1.0])
+
+    settings = [needs.Setting("matching", name, "", "", "float32", run) for name in "ab"]
+    given = argparse.Namespace(rounds=3, seconds=-1.0, longest=0.5)
+    device = get_backend("numpy")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(needs.SETTINGS, "matching", lambda _: iter(settings))
+        rows = needs.measure("matching", device, given)
+        assert {row["reason"] for row in rows} == {"the -1 s of this need were over"}
+        assert {row["seconds"] for row in rows} == {None}
+        settings = [needs.Setting("matching", "a", "", "", "float32", run)]
+        (row,) = needs.measure("matching", device, argparse.Namespace(rounds=3, seconds=60.0, longest=0.5))
+    assert (row["runs"], row["error"]["median"], row["seconds"]["median"]) == (1, 0.2, 1.0)
+    assert "measured once" in row["reason"]

@@ -1,0 +1,223 @@
+"""docs/error-vs-time.md: made of committed reports of the code as it is; the interactive page in Node and Chromium."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+from support.paths import ROOT
+
+from gpusense.evaluation.benchmark import choice
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+DEVICE = "2 cores of an X, PoCL"
+
+
+@pytest.fixture(scope="module")
+def page() -> ModuleType:
+    """Import the script that makes the page."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "bench"))
+        return importlib.import_module("error_vs_time.page")
+
+
+@pytest.fixture(scope="module")
+def reports(page: ModuleType) -> ModuleType:
+    """Import the module that reads the reports."""
+    return importlib.import_module("error_vs_time.reports")
+
+
+# ---- the committed page and reports
+
+
+def test_the_page_is_what_the_reports_give(page: ModuleType) -> None:
+    """Byte for byte, figures and the interactive page as well; nothing else of it is committed."""
+    made = page.files()
+    assert {path for path, text in made.items() if (ROOT / path).read_bytes() != text.encode()} == set(), (
+        "run python bench/error_vs_time/page.py"
+    )
+    figures = {path.relative_to(ROOT) for path in (ROOT / "docs" / "img").glob("error-vs-time*")}
+    assert figures == {path for path in made if path.suffix == ".svg"}
+    assert "{{" not in made[page.PAGE] and f"python {Path(page.__file__).relative_to(ROOT)}" in made[page.PAGE]
+
+
+def test_reports_are_of_this_code(reports: ModuleType) -> None:
+    if not reports.has_history():
+        pytest.skip("the checkout has no history, or a part of it only")
+    found = {source.name: reports.commit_trouble(source.report["commit"]) for source in reports.sources()}
+    assert {name: trouble for name, trouble in found.items() if trouble} == {} and found
+
+
+def test_reports_state_command_and_device(reports: ModuleType) -> None:
+    for source in reports.sources():
+        assert source.report["command"].startswith("python bench/error_vs_time/"), source.name
+        assert source.titles and source.report["date"] and "/work" not in source.report["command"]
+
+
+# ---- commits
+
+
+@pytest.fixture
+def history(tmp_path: Path) -> Path:
+    """Make a repository of five commits, of which two change kernels, and a branch aside."""
+
+    def git(*words: str) -> None:
+        own = ["-c", "user.name=a", "-c", "user.email=a@example.org", "-c", "commit.gpgsign=false"]
+        subprocess.run(["git", "-C", str(tmp_path), *own, *words], check=True, capture_output=True)
+
+    git("init", "-b", "main")
+    (tmp_path / "kernels").mkdir()
+    for number, name in enumerate(("README", "kernels/a.cl", "README", "kernels/a.cl", "README")):
+        (tmp_path / name).write_text(str(number))
+        git("add", ".")
+        git("commit", "-m", f"{number}")
+        git("tag", f"c{number}")
+    git("checkout", "-b", "aside", "c0")
+    (tmp_path / "other").write_text("x")
+    git("add", ".")
+    git("commit", "-m", "aside")
+    git("checkout", "main")
+    return tmp_path
+
+
+def test_commits_that_are_old_unknown_or_unclean_are_refused(reports: ModuleType, history: Path) -> None:
+    assert reports.has_history(history) and not reports.has_history(history / "kernels")
+    hashes = {name: reports.git("rev-parse", name, root=history) for name in ("c0", "c2", "c4", "aside")}
+
+    def trouble(commit: str, limit: int) -> str:
+        return reports.commit_trouble(commit, root=history, limit=limit, folders=["kernels"])
+
+    assert trouble(hashes["c4"], 0) == trouble(hashes["c2"], 1) == trouble(hashes["c0"], 2) == ""
+    assert "2 commits to kernels ago, more than 1" in trouble(hashes["c0"], 1)
+    assert "which is no commit of this history" in trouble(hashes["aside"], 9)
+    assert "which is no commit of this history" in trouble("0123456789ab", 9)
+    assert "uncommitted changes" in trouble(hashes["c4"] + "+", 9) and "uncommitted" in trouble("", 9)
+
+
+# ---- reports of two methods
+
+
+def task(method: str, setting: str, seconds: float, error: float, **changes: Any) -> dict[str, Any]:
+    return {
+        "need": "localisation", "backend": "opencl:0:0", "device": "pthread-X", "kind": "cpu", "method": method,
+        "setting": setting, "code": f"make({method})", "precision": "float32", "unit": "m", "runs": 3, "reason": "",
+        "seconds": {"q1": seconds, "median": 2 * seconds, "q3": 3 * seconds, "min": seconds},
+        "processor_s": seconds, "error": {"q1": error, "median": error, "q3": error, "p95": 2 * error, "max": 9.0},
+    } | changes  # fmt: skip
+
+
+def write_tasks(folder: Path, rows: list[dict[str, Any]], commit: str = "abc") -> None:
+    report = {
+        "schema": 1, "kind": "needs", "date": "2026-01-01", "commit": commit, "command": "python x",
+        "machine": {"processors": 2, "processor": "X"}, "rows": rows,
+    }  # fmt: skip
+    (folder / "error_vs_time_x_tasks.json").write_text(json.dumps(report))
+
+
+ROWS = [
+    task("field", "10000 x 60", 0.008, 0.02), task("beam", "10000 x 60", 0.05, 0.005),
+    task("field", "1000 x 60", 0.002, 0.019), task("field", "100 x 60", 0.001, 0.05),
+    task("beam", "1000 x 60", 0.009, 0.006), task("beam", "1000 x 60, temperature 1", 0.001, 0.001),
+]  # fmt: skip
+
+
+def test_the_answers_by_hand(page: ModuleType, tmp_path: Path) -> None:
+    write_tasks(tmp_path, ROWS)
+    text = page.files(tmp_path)[page.PAGE]
+    assert f"| to do | {DEVICE} |" in text
+    assert "| 10 000 particles at 100 Hz | **field, 10000 x 60**: 8 ms, 2 cm |" in text
+    assert "| 1000 particles at 100 Hz | **beam, 1000 x 60**: 9 ms, 6 mm |" in text
+    # A temperature of 1 is no default: it is right in simulations alone.
+    assert "| localisation to 2 cm | **field, 1000 x 60**: 2 ms, 1.9 cm |" in text
+    assert "| beam model, at most 1 ms | - |" in text
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_of_times_gives_the_same_answers(page: ModuleType, tmp_path: Path, seed: int) -> None:
+    """Two runs of other days: all times differ by up to 5 %, and each answer has the same method."""
+    import random
+
+    noise, found = random.Random(seed), []
+    for rows in (ROWS, [one | {"processor_s": one["processor_s"] * noise.uniform(0.95, 1.05)} for one in ROWS]):
+        write_tasks(tmp_path, rows)
+        text = page.files(tmp_path)[page.PAGE]
+        found.append(re.findall(r"^\| (?:10 000|1000|localisation).*?\*\*(.*?)\*\*", text, re.MULTILINE))
+    assert found[0] == found[1] and len(found[0]) == 6
+
+
+def test_reports_of_uncommitted_changes_are_refused(page: ModuleType, tmp_path: Path) -> None:
+    write_tasks(tmp_path, ROWS, commit="abc+")
+    with pytest.raises(ValueError, match="uncommitted changes: abc\\+"):
+        page.files(tmp_path)
+    with pytest.raises(ValueError, match="must have reports"):
+        page.files(tmp_path / "none")
+
+
+def test_two_reports_of_a_device_are_refused(page: ModuleType, tmp_path: Path) -> None:
+    write_tasks(tmp_path, ROWS)
+    shutil.copy(tmp_path / "error_vs_time_x_tasks.json", tmp_path / "error_vs_time_y_tasks.json")
+    with pytest.raises(ValueError, match="each device must have one of a kind"):
+        page.files(tmp_path)
+
+
+# ---- the interactive page
+
+
+def test_the_interactive_page_fetches_nothing(page: ModuleType) -> None:
+    text = (ROOT / page.FIGURE).read_text(encoding="utf-8").replace("http://www.w3.org/2000/svg", "")
+    assert not re.search(
+        r"https?:|\bsrc=|\bhref=|\bimport\b|\bfetch\(|XMLHttp|@import|url\(|\{(style|script|data)\}", text
+    )
+
+
+def test_the_script_chooses_as_python_does(page: ModuleType) -> None:
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("Node is not installed")
+    listed = [("a", 0.0, 5.0), ("b", 1e-9, 4.0), ("c", 0.3, 1.0), ("d", 0.2, 2.0), ("e", 0.9, 3.0), ("f", 0.9, 0.5)]
+    rows = json.dumps([{"name": name, "error": error, "time": time} for name, error, time in listed])
+    script = (Path(page.__file__).parent / "figure.js").read_text(encoding="utf-8")
+    budgets = [0.1, 0.6, 1.5, 2.5, 4.5, 9.0]
+    source = (
+        f'const document = {{getElementById: () => ({{textContent: "[]"}})}};\n{script}\nconst list = {rows};\n'
+        f"console.log(JSON.stringify([paretoFront(list).map(row => row.name), {budgets}.map(s => "
+        "(recommended(list, s) ?? {}).name ?? null)]));"
+    )
+    done = subprocess.run([node, "-"], input=source, capture_output=True, text=True, check=True)
+    front, chosen = json.loads(done.stdout)
+    entries = [choice.Entry("d", name, "", "", error, time) for name, error, time in listed]
+    assert front == [entry.method for entry in choice.front(entries)]
+    found = [choice.choose(entries, None, seconds) for seconds in budgets]
+    assert chosen == [None if entry is None else entry.method for entry in found]
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+def test_the_interactive_page_works_in_a_browser(page: ModuleType, tmp_path: Path) -> None:
+    """Choose a need, move the budget, hover: answer, marked point, front and tooltip follow."""
+    write_tasks(tmp_path, ROWS)
+    script = """<script>
+    const slide = value => { $("budget").value = value; $("budget").dispatchEvent(new Event("input")); };
+    document.body.dataset.most = $("answer").textContent; slide(0);
+    document.body.dataset.least = $("answer").textContent;
+    document.body.dataset.circles = document.querySelectorAll("circle").length;
+    document.querySelector("circle").dispatchEvent(new MouseEvent("mousemove"));
+    document.body.dataset.tip = $("tip").textContent;
+    document.body.dataset.front = [...$("front").rows].map(row => row.cells[0].textContent).join("; ");
+    </script></html>"""
+    text = page.files(tmp_path)[page.FIGURE].replace("</html>", script)
+    (tmp_path / "page.html").write_text(text, encoding="utf-8")
+    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}",
+               "--dump-dom", f"file://{tmp_path / 'page.html'}"]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    body = dict(re.findall(r'data-(\w+)="([^"]*)"', re.search(r"<body[^>]*>", done.stdout)[0]))
+    assert body["most"].startswith("Within 50.5 ms: beam, 1000 x 60, temperature 1, 1 ms, 1 mm. make(beam)")
+    assert body["least"] == "Nothing within 990 us." and body["circles"] == "6"
+    assert "field, 10000 x 60" in body["tip"] and "make(field)" in body["tip"]
+    assert body["front"] == "method; beam, 1000 x 60, temperature 1"

@@ -1,0 +1,80 @@
+"""bench/speed/history.py: rows are appended, and a regression of 10 % on quiet runs is seen."""
+
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from support.paths import ROOT
+
+SCRIPT = ROOT / "bench" / "speed" / "history.py"
+
+
+@pytest.fixture
+def history(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(ROOT / "bench"))
+    return importlib.import_module("speed.history")
+
+
+def row(commit: str, ms: float, *, probe: float = 2.0, error: float = 1e-5, quiet: str = "yes", device: str = "X"):
+    values = ("2026-01-01", commit, device, "rays, 10 x 10", ms, ms, ms, probe, error, "nats", quiet)
+    names = ("date", "commit", "device", "row", "ms", "q1_ms", "q3_ms", "probe_ms", "error", "unit", "quiet")
+    return {name: str(value) for name, value in zip(names, values, strict=True)}
+
+
+BEFORE = [row("a", 10.0), row("b", 10.3), row("c", 9.8)]
+
+
+@pytest.mark.parametrize(
+    ("last", "seen"),
+    [
+        (row("d", 10.9), ""),
+        (row("d", 11.2), "1.12 times the time of 3 quiet runs"),
+        # The processor itself is slower by a fifth today, which the probe shows.
+        (row("d", 12.0, probe=2.4), ""),
+        (row("d", 13.4, probe=2.4), "1.12 times"),
+        # A busy machine says nothing about times, but errors count.
+        (row("d", 30.0, quiet="no"), ""),
+        (row("d", 30.0, quiet="no", error=0.1), "error 0.1 nats, before 1e-05"),
+        (row("d", 10.0, error=9e-4), ""),
+        # The same commit again, and another device, are compared with nothing.
+        (row("c", 99.0), "9.75 times the time of 2 quiet runs"),
+        (row("d", 99.0, device="Y"), ""),
+    ],
+)
+def test_a_regression_of_a_tenth_is_seen(history: ModuleType, last: dict[str, str], seen: str) -> None:
+    found = history.regressions([*BEFORE, last])
+    assert len(found) == bool(seen) and all(seen in line for line in found)
+
+
+def test_the_probe_counts_for_processors_alone(history: ModuleType) -> None:
+    rows = [row(name, 10.0, device="NVIDIA X, warp") for name in "ab"]
+    assert history.regressions([*rows, row("c", 12.0, probe=2.4, device="NVIDIA X, warp")])
+
+
+def test_rows_are_appended_and_compared(needs, tmp_path: Path) -> None:
+    table = tmp_path / "history.csv"
+    words = ["--backend", needs("numpy"), "--size", "40", "8", "--turns", "3", "--file", str(table)]
+
+    def run(*more: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run([sys.executable, str(SCRIPT), *words, *more], capture_output=True, text=True, check=False)
+
+    for commit in ("a", "b"):
+        done = run("--commit", commit, "--limit", "1e9")
+        assert (done.returncode, done.stdout) == (0, "no regression\n"), done.stderr
+    lines = table.read_text().splitlines()
+    assert len(lines) == 7 and lines[0].startswith("date,commit,device,row,ms,")
+    assert [line.split(",")[1] for line in lines[1:]] == ["a"] * 3 + ["b"] * 3
+    table.write_text("x,y\n1,2\n")
+    done = run("--compare")
+    assert done.returncode == 2 and "history.csv: must have the columns date, commit" in done.stderr
+
+
+def test_the_table_of_the_project_is_whole(history: ModuleType) -> None:
+    rows = history.read(history.FILE)
+    assert rows and {row["unit"] for row in rows} <= set(history.FLOORS)
+    assert all(float(row["ms"]) > 0 and row["quiet"] in ("yes", "no") for row in rows)

@@ -1,0 +1,84 @@
+"""Reports in bench/results: each is published by a page, and states its commit and its command."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from support.paths import ROOT
+
+RESULTS = ROOT / "bench" / "results"
+PAGES = [*(ROOT / "docs").glob("*.md"), ROOT / "bench" / "RESULTS.md", ROOT / "README.md"]
+REPORTS = sorted(file for file in RESULTS.iterdir() if file.suffix in (".md", ".json"))
+MOST = 100
+COMMIT = re.compile(
+    r'commit"?:? "?(?:[0-9a-f]{7,12}|main)|published_with": "[0-9a-f]{7}|Published with commit [0-9a-f]{7}'
+)
+COMMAND = re.compile(r"(?:python )?bench/[\w/]+\.py")
+
+
+@pytest.fixture(scope="module")
+def published() -> str:
+    """Return the text of all pages."""
+    return "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+
+
+def test_each_report_is_published(published: str) -> None:
+    """A page links it, or the table of a report links the file beside it."""
+    names = {Path(name).stem for name in re.findall(r"results/([\w.-]+)", published)}
+    names |= {f"extreme-{device}" for device in ("cpu", "h200") if "results/extreme-" in published}
+    assert [file.name for file in REPORTS if file.stem not in names] == []
+
+
+@pytest.mark.parametrize("file", REPORTS, ids=lambda file: file.name)
+def test_each_report_states_commit_and_command(file: Path) -> None:
+    text = file.read_text(encoding="utf-8")
+    assert COMMIT.search(text) or "--commit" in text, "no commit"
+    assert COMMAND.search(text), "no command"
+
+
+@pytest.fixture
+def stiff_density(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """Import the script that makes the tables of docs/numerics.md."""
+    monkeypatch.syspath_prepend(str(ROOT / "bench"))
+    return importlib.import_module("accuracy.stiff_density")
+
+
+def test_tables_are_written_between_their_marks(stiff_density: ModuleType, tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("a\n<!-- made: one -->\nold\n<!-- end -->\nb\n<!-- made: two -->\nold\n<!-- end -->\nc\n")
+    stiff_density.write_tables(page, {"two": "new", "one": "first"})
+    text = "a\n<!-- made: one -->\nfirst\n<!-- end -->\nb\n<!-- made: two -->\nnew\n<!-- end -->\nc\n"
+    assert page.read_text() == text
+    with pytest.raises(ValueError, match="must have the mark <!-- made: three -->"):
+        stiff_density.write_tables(page, {"three": ""})
+
+
+def test_the_picture_shows_broken_bounds(stiff_density: ModuleType) -> None:
+    """A family within its bound is blue, one beyond it orange, and results that are not finite are named."""
+    column = {"backend": "b", "precision": "float32", "worst": 1.0, "case": "c"}
+    rows = [
+        column | {"family": name, "share": share, "not_finite": lost}
+        for name, share, lost in (("kept", 0.5, 0), ("broken", 1.5, 0), ("lost", 0.0, 3))
+    ]
+    drawn = stiff_density.picture(rows)
+    assert drawn.count("#d55e00") == 2 and ">50 %<" in drawn and ">1.5e+02 %<" in drawn and ">not finite<" in drawn
+
+
+def test_families_of_quantities(stiff_density: ModuleType) -> None:
+    """Units differ between precisions, families do not."""
+    names = {
+        "ranges, relative": "ranges", "beam model, 1 + |log p_k|": "beam model, a beam",
+        "field, nearest, eps (1 + |log p_k|)": "field, nearest, a beam",
+        "field, bilinear, scans, share of their bound": "field, bilinear, a scan",
+        "beam model, sum of the weights": "sum of the weights", "textbook formulas, share above 16 eps": "",
+    }  # fmt: skip
+    assert {name: stiff_density.family_of(name) for name in names} == names
+
+
+def test_reports_stay_few() -> None:
+    """Reports that no figure comes from belong to the history."""
+    assert 20 < len(list(RESULTS.iterdir())) <= MOST

@@ -8,7 +8,7 @@ from gpusense.interface import casters
 _NEVER = {"FLOAT64", "ALL_READINGS", "SHARP", "SHARED_RAYS", "ECHO", "SENSOR_TABLE", "CUBES", *casters.FLAGS}
 # Kernels in vectors of float64: the sums of learning.
 _FLOAT64 = {"e_step"}
-_NEVER_OF = {"score_features": {"SIGNATURE", "FIELD", "MARGINAL", "PER_BEAM"}}
+_NEVER_OF = {"score_features": {"SIGNATURE", "FIELD", "MARGINAL", "PER_BEAM", "LINE"}}
 _NEEDED: dict[str, tuple[set[str], ...]] = {
     "cast_ranges": (set(),),
     "draw_particles": (set(),),

@@ -59,8 +59,8 @@ def overlaps(off: Quad, turned: Quad, feature: np.ndarray, normal: Quad, signatu
 def distance_mass(d: Pair, scale: float, signature: np.ndarray, terms: np.ndarray) -> np.ndarray:
     """Return the mass of the normal around lines' distances d on [0, range_max]; d is clamped to it.
 
-    A line that is seen from both sides has two forms, (alpha_j, d) and (alpha_j + pi, -d): the mass of both is that of d
-    on [-range_max, range_max].
+    A line that is seen from both sides has two forms, (alpha_j, d) and (alpha_j + pi, -d): the mass of both is that of
+    d on [-range_max, range_max].
     """
     lower = np.where(signature[:, 1] > 0, -terms[0], 0).astype(terms.dtype)
     width = terms[0] - lower

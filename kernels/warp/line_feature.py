@@ -70,9 +70,9 @@ def functions(flags):
         beside = wp.min(one, other) <= signature[0] and wp.max(one, other) >= -signature[0]
         return cosine >= feature[base + AXIS] and beside
 
-    # Return the mass of the normal around a line's distance d on [0, range_max]; d is clamped to it. A line that is seen
-    # from both sides has two forms, (alpha_j, d) and (alpha_j + pi, -d): the mass of both is that of d on [-range_max,
-    # range_max].
+    # Return the mass of the normal around a line's distance d on [0, range_max]; d is clamped to it. A line that is
+    # seen from both sides has two forms, (alpha_j, d) and (alpha_j + pi, -d): the mass of both is that of d on
+    # [-range_max, range_max].
     @wp.func
     def distance_mass(d: vec2, scale: real, signature: vec4, terms: wp.array(dtype=real)):
         lower = real(0.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense.models.landmark.features import wrapped
 from gpusense.models.point.sampling import LINES, Draws, mounted, normal_within, standard_normal
 from gpusense.reference.relative import wrapped_difference
 from gpusense.world.line_map import LineMap
@@ -39,7 +40,7 @@ def draw_lines(
         if j >= 0:
             true, seen = _seen(place, turned, lines.segments[j], normals[j], bool(lines.two_sided[j]), p)
             true[:, :2] += _errors(u, v, true, p)
-            true[:, 0] = wrapped_difference(true[:, 0], none)[0]
+            true[:, 0] = wrapped(true[:, 0])
             drawn = np.where((kind * (p.z_detect + p.z_false) < p.z_detect)[:, None], true, drawn)
             if not every:
                 drawn[~(seen & (detected < p.p_detect))] = np.nan

@@ -28,11 +28,11 @@ from gpusense.world.sensor_parameters import LineParameters
 class LineModel(FeatureModel):
     """log p(f | x, m) of straight lines that a scan shows, by the walls that they may belong to.
 
-    A line is ``x cos(angle) + y sin(angle) = distance`` in the robot's frame, its angle that of the normal away from
-    the scanner. Each adds ``log(z_detect p(f | j) + z_false / (2 pi range_max))`` with a normal density p(f | j) of angle
-    and distance; docs/features.md defines it. A line may be a wall that it overlaps, when projected on it; where both
-    end makes no difference, since a scan shows a wall only as far as it is in sight. The wall j is known from
-    ``correspondence``, or chosen by ``association``.
+    A line is ``x cos(angle) + y sin(angle) = distance`` in the robot's frame; its angle is that of the normal away from
+    the scanner. Each adds ``log(z_detect p(f | j) + z_false / (2 pi range_max))`` with a normal density p(f | j) of
+    angle and distance; docs/features.md defines it. A line may be a wall that it overlaps, when projected on it. The
+    places of the ends do not matter otherwise: a scan shows a wall only as far as it is in sight. The wall j is known
+    from ``correspondence``, or chosen by ``association``.
 
     Args:
         lines: The map.
@@ -40,8 +40,8 @@ class LineModel(FeatureModel):
         backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
         association: The rule for lines without a known wall. ``"nearest"`` takes the likeliest wall of each;
-            ``"sum"`` sums over all walls, each with the prior 1 / M; ``"joint"`` takes the likeliest assignment in which
-            no two lines that overlap have the same wall, for at most 8 lines and 1024 walls.
+            ``"sum"`` sums over all walls, each with the prior 1 / M; ``"joint"`` takes the likeliest assignment in
+            which no two lines that overlap have the same wall, for at most 8 lines and 1024 walls.
         mount: The frame of the lines (x, y, yaw) on the robot [m, m, rad]; those of ``extract_features`` are in the
             robot's frame.
         temperature: In (0, 1]: multiplies the sum over lines.
@@ -112,8 +112,8 @@ class LineModel(FeatureModel):
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
             features: (F, 2) angle of the normal [rad] and distance [m]; or (F, 4) with the places of both ends along
-                the line, from the foot of the normal, positive to the left of it [m]; or (F, 7) with the variance of the
-                angle, the covariance and the variance of the distance, which are added to the model's:
+                the line, from the foot of the normal, positive to the left of it [m]; or (F, 7) with the variance of
+                the angle, the covariance and the variance of the distance, which are added to the model's:
                 ``extract_features(...).lines()``. Without ends, or where they are NaN, every wall is overlapped.
             correspondence: None, or (F,) indices of the walls, -1 for a false positive.
             out: The array for the result, in the memory of the poses.
@@ -133,9 +133,9 @@ class LineModel(FeatureModel):
     ) -> np.ndarray:
         """Draw lines from p(f | x, m) at each pose, on the host in float64; see ``BeamModel.sample``.
 
-        Without ``correspondence`` every wall that is seen from its side, with a part within range_max, gives a line with
-        probability p_detect. Walls hide nothing. With it, a line of each wall that it names, detected for certain. With
-        probability z_false a line is a false positive, uniform in angle and distance.
+        Without ``correspondence`` every wall that is seen from its side, with a part within range_max, gives a line
+        with probability p_detect. Walls hide nothing. With it, a line of each wall that it names, detected for certain.
+        With probability z_false a line is a false positive, uniform in angle and distance.
 
         Args:
             poses: (N, 3) or (S, N, 3) robot poses in the world [m, m, rad].

@@ -172,7 +172,7 @@ def test_drawn_lines_have_the_covariance_of_the_density():
     p = gs.LineParameters(sigma_angle=0.02, sigma_distance=0.05, z_detect=1.0, z_false=0.0, p_detect=1.0, range_max=10)
     model = gs.LineModel(gs.LineMap([(4, 3, 20, 3), (-2, -1, 2, -1), (2, -2, -2, -2)], False), p, backend="numpy")
     z = model.sample(np.tile([(0, 0, 0.5)], (20000, 1)), seed=3)
-    # The first wall has its free side above; the last one is seen from above, the one in the middle from below.
+    # The free sides of the first two are above them, that of the last one is below: the robot is above two of them.
     assert np.isnan(z[:, 0]).all() and np.isnan(z[:, 2]).all() and np.isfinite(z[:, 1]).all()
     turned = gs.LineModel(gs.LineMap([(20, 3, 4, 3)], False), p, backend="numpy")
     z = turned.sample(np.tile([(0, 0, 0.5)], (20000, 1)), seed=3)[:, 0]

@@ -11,7 +11,7 @@ from gpusense.backends import devices as devices
 from gpusense.chaining.chain import chain_scans as chain_scans
 from gpusense.chaining.result import ScanChain as ScanChain
 from gpusense.features.extract import extract_features as extract_features
-from gpusense.features.landmarks import FeatureMap as FeatureMap
+from gpusense.features.feature_map import FeatureMap as FeatureMap
 from gpusense.features.landmarks import landmarks_of_map as landmarks_of_map
 from gpusense.features.landmarks import map_features as map_features
 from gpusense.features.result import Features as Features

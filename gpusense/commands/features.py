@@ -16,7 +16,7 @@ from gpusense.commands.scans import add_log, add_reference, read_scans
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
-    from gpusense.features.landmarks import FeatureMap
+    from gpusense.features.feature_map import FeatureMap
     from gpusense.features.result import Features
     from gpusense.logs import Scan
 
@@ -102,9 +102,9 @@ def _extract(args: argparse.Namespace, scans: list[tuple[int, Scan]]) -> Feature
 
 
 def _landmark_kinds(args: argparse.Namespace) -> tuple[str, ...]:
-    from gpusense.features.landmarks import LANDMARK_KINDS
+    from gpusense.features.feature_map import MAP_KINDS
 
-    return tuple(kind for kind in LANDMARK_KINDS if args.kinds is None or kind in args.kinds)
+    return tuple(kind for kind in MAP_KINDS if args.kinds is None or kind in args.kinds)
 
 
 def _of_map(args: argparse.Namespace) -> int:

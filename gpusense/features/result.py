@@ -102,6 +102,33 @@ class Features:
         x, y = chosen.pose[:, 0], chosen.pose[:, 1]
         return np.column_stack([np.hypot(x, y), np.arctan2(y, x), chosen.signatures])
 
+    def lines(self) -> Floats:
+        """Return the lines as :class:`gpusense.LineModel` takes them; features of other kinds are left out.
+
+        Returns:
+            (F, 7) angle of the normal away from the scanner [rad] and distance [m], places of both ends along the line
+            from the foot of the normal, positive to the left of it [m], variance of the angle [rad^2], covariance
+            [rad m] and variance of the distance [m^2], in the robot's frame.
+
+        Example:
+            >>> import gpusense as gs, numpy as np
+            >>> scanner = gs.Scanner.uniform(angle_min=-0.9, angle_increment=0.02, count=91, range_max=9.0)
+            >>> wall = gs.extract_features(2 / np.cos(scanner.bearings), scanner, backend="numpy")
+            >>> bool(np.allclose(wall.lines()[:, :2], (0.0, 2.0)))
+            True
+        """
+        chosen = self[self.kind == "line"]
+        angle = chosen.pose[:, 2] - 0.5 * math.pi
+        c, s = np.cos(angle), np.sin(angle)
+        x, y = chosen.pose[:, 0], chosen.pose[:, 1]
+        middle, half = c * y - s * x, 0.5 * chosen.size
+        # At the foot of the normal the distance is that at the middle, and the way there times the angle.
+        across = across_lines(chosen)
+        variance, both = across[:, 1, 1], across[:, 0, 1] + middle * across[:, 1, 1]
+        far = across[:, 0, 0] + 2 * middle * across[:, 0, 1] + middle**2 * variance
+        wrapped = np.mod(angle + math.pi, 2 * math.pi) - math.pi
+        return np.column_stack([wrapped, c * x + s * y, middle - half, middle + half, variance, both, far])
+
     @property
     def signatures(self) -> Floats:
         """(F,) signatures, see :func:`signature_of`."""
@@ -111,6 +138,14 @@ class Features:
         counts = [(int(np.count_nonzero(self.kind == name)), name) for name in KINDS]
         words = [f"{count} {name}{'s' * (count > 1)}" for count, name in counts if count]
         return f"Features({', '.join(words) or 'none'})"
+
+
+def across_lines(lines: Features) -> Floats:
+    """Return the (F, 2, 2) covariance of the offset of lines away from the scanner, at the middle, and of direction."""
+    rows = np.zeros((len(lines), 2, 3))
+    rows[:, 0, 0], rows[:, 0, 1], rows[:, 1, 2] = np.sin(lines.pose[:, 2]), -np.cos(lines.pose[:, 2]), 1
+    result: Floats = np.linalg.inv(rows @ lines.information @ rows.transpose(0, 2, 1))
+    return result
 
 
 def joined(parts: Sequence[Features], scans: int) -> Features:

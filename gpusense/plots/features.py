@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
-from gpusense.features.landmarks import FeatureMap
+from gpusense.features.feature_map import FeatureMap
 from gpusense.features.result import Features
 from gpusense.plots.drawing import draw_map, draw_pose, new_figure
 from gpusense.plots.matches import points_of
@@ -99,6 +99,11 @@ def draw_landmarks(ax: Axes, landmarks: FeatureMap) -> None:
     for kind, colour in COLOURS.items():
         rows = landmarks.kind == kind
         if not rows.any():
+            continue
+        if kind == "line":
+            ends = landmarks.lines().segments.reshape(-1, 2, 2)
+            for number, (x, y) in enumerate(ends.transpose(0, 2, 1)):
+                ax.plot(x, y, color=colour, lw=1.6, zorder=6, label=kind if number == 0 else None)
             continue
         x, y, theta = landmarks.pose[rows].T
         ax.plot(x, y, "o", color=colour, ms=5, zorder=8, label=kind)

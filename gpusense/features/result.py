@@ -144,7 +144,7 @@ def across_lines(lines: Features) -> Floats:
     """Return the (F, 2, 2) covariance of the offset of lines away from the scanner, at the middle, and of direction."""
     rows = np.zeros((len(lines), 2, 3))
     rows[:, 0, 0], rows[:, 0, 1], rows[:, 1, 2] = np.sin(lines.pose[:, 2]), -np.cos(lines.pose[:, 2]), 1
-    result: Floats = np.linalg.inv(rows @ lines.information @ rows.transpose(0, 2, 1))
+    result = np.asarray(np.linalg.inv(rows @ lines.information @ rows.transpose(0, 2, 1)), np.float64)
     return result
 
 

@@ -30,7 +30,7 @@ import gpusense as gs
 from gpusense.evaluation.feature_scenes import floor_plan
 from gpusense.evaluation.feature_scores import FREE, Score, score_scan
 from gpusense.evaluation.feature_truth import truth_of
-from gpusense.features.result import KINDS, Features
+from gpusense.features.result import Features
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -98,7 +98,7 @@ def simulated(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
                 features = gs.extract_features(ranges, scanner, backend=arguments.backend)
                 for k, one in enumerate(truth):
                     score_scan(features.of_scan(k), one, scores)
-            for kind in KINDS:
+            for kind in FREE:
                 f = figures_of(kind, scores[kind])
                 report[f"{beams} {noise} {kind}"] = f
                 nees = "" if noise == 0 else f"{f['nees']:.2f}"

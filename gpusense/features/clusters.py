@@ -8,12 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpusense.features.feature_map import FeatureMap
-from gpusense.features.result import Features, Floats
+from gpusense.features.result import KIND_TYPE, Features, Floats
 
 # Features are of one landmark within this many deviations, with this much added [m], and directions and sizes within
 # these [rad, m or rad].
 _DEVIATIONS, _FLOOR, _TURN = 4.0, 0.03, 0.4
-_SIZES = {"corner": 0.5, "door": 0.4, "pole": 0.1}
+_SIZES = {"corner": 0.5, "door": 0.4, "pole": 0.1, "reflector": 0.1}
+
+# Kinds without a direction.
+ROUND = ("pole", "reflector")
 
 
 @dataclass
@@ -70,7 +73,7 @@ class _Clusters:
         both = self._covariance[near] + world.covariance[i] + np.eye(2) * _FLOOR**2
         distance = np.einsum("mi,mij,mj->m", off[near], np.linalg.inv(both), off[near])
         fits = np.abs(self._size[near] - world.size[i]) < _SIZES[self._kind]
-        if self._kind != "pole":
+        if self._kind not in ROUND:
             period = math.pi if self._kind == "door" else 2 * math.pi
             turn = np.mod(self._pose[near, 2] - world.pose[i, 2] + period / 2, period) - period / 2
             fits &= np.abs(turn) < _TURN
@@ -108,12 +111,12 @@ def _fused(world: InWorld, label: np.ndarray, kind: str, least: int) -> FeatureM
         off = world.pose[rows, :2] - xy
         scatter = np.einsum("fi,fij,fj->", off, information, off) / max(2 * len(rows) - 2, 1)
         factor = 2 if kind == "door" else 1
-        theta = np.angle(np.exp(1j * factor * world.pose[rows, 2]).sum()) / factor if kind != "pole" else 0.0
+        theta = np.angle(np.exp(1j * factor * world.pose[rows, 2]).sum()) / factor if kind not in ROUND else 0.0
         poses.append([*xy, theta])
         covariances.append(covariance * max(scatter, 1.0))
         sizes.append(np.median(world.size[rows]))
         counts.append(len(rows))
     return FeatureMap(
-        np.full(len(counts), kind, "<U7"), np.array(poses).reshape(-1, 3), np.array(covariances).reshape(-1, 2, 2),
+        np.full(len(counts), kind, KIND_TYPE), np.array(poses).reshape(-1, 3), np.array(covariances).reshape(-1, 2, 2),
         np.array(sizes, float), np.array(counts, np.int64),
     )  # fmt: skip

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from gpusense._util import checks
 from gpusense._util.files import write_whole
 from gpusense._util.lines import numbered_lines
-from gpusense.features.result import Floats, signature_of
+from gpusense.features.result import KIND_TYPE, Floats, signature_of
 from gpusense.world.landmarks import LandmarkMap
 from gpusense.world.line_map import LineMap
 
-LANDMARK_KINDS = ("corner", "door", "pole")
+LANDMARK_KINDS = ("corner", "door", "pole", "reflector")
 """Kinds of features whose poses stay where they are while the robot moves."""
 MAP_KINDS = ("line", *LANDMARK_KINDS)
 """Kinds of features of which maps are made."""
@@ -37,7 +37,7 @@ class FeatureMap:
     """Landmarks and lines that were made of features, from :func:`gpusense.map_features`.
 
     Attributes:
-        kind: (M,) "line", "corner", "door" or "pole".
+        kind: (M,) "line", "corner", "door", "pole" or "reflector".
         pose: (M, 3) x, y [m] and theta [rad] in the world, as in :class:`gpusense.Features`: of a line its middle, and
             the direction with the free side on its left.
         covariance: (M, 2, 2) of x and y [m^2]; larger where its features scatter more than their covariances say. Of a
@@ -70,7 +70,7 @@ class FeatureMap:
 
         Raises:
             TypeError: not names of kinds.
-            ValueError: another kind than "corner", "door" and "pole".
+            ValueError: another kind than "corner", "door", "pole" and "reflector".
         """
         chosen = np.isin(self.kind, kinds_of(kinds, LANDMARK_KINDS))
         return LandmarkMap(self.pose[chosen, :2], signature_of(self.kind[chosen], self.size[chosen]))
@@ -119,7 +119,7 @@ class FeatureMap:
         rows = list(_rows(checks.path("path", path)))
         numbers = np.array([row[1] for row in rows]).reshape(-1, 7)
         return cls(
-            np.array([row[0] for row in rows], "<U7"), numbers[:, :3], numbers[:, [4, 5, 5, 6]].reshape(-1, 2, 2),
+            np.array([row[0] for row in rows], KIND_TYPE), numbers[:, :3], numbers[:, [4, 5, 5, 6]].reshape(-1, 2, 2),
             numbers[:, 3], np.array([row[2] for row in rows], np.int64),
         )  # fmt: skip
 
@@ -145,7 +145,9 @@ def kinds_of(kinds: str | Sequence[str], allowed: tuple[str, ...]) -> tuple[str,
 def joined_maps(parts: Sequence[FeatureMap]) -> FeatureMap:
     """Return several maps as one."""
     if not parts:
-        return FeatureMap(np.zeros(0, "<U7"), np.zeros((0, 3)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0, np.int64))
+        return FeatureMap(
+            np.zeros(0, KIND_TYPE), np.zeros((0, 3)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0, np.int64)
+        )
     values = {one.name: np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(FeatureMap)}
     # Rounding leaves matrices a little asymmetric.
     values["covariance"] = 0.5 * (values["covariance"] + values["covariance"].transpose(0, 2, 1))

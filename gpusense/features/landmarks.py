@@ -42,7 +42,7 @@ def map_features(
     Args:
         features: Features of S scans.
         poses: (S, 3) poses of the robot at the scans [m, m, rad].
-        kinds: Kinds out of "line", "corner", "door" and "pole".
+        kinds: Kinds out of "line", "corner", "door", "pole" and "reflector".
         pose_deviation: Standard deviations of the poses: position [m] and heading [rad].
         least: Least number of features of a landmark, in different scans.
 
@@ -91,7 +91,7 @@ def landmarks_of_map(
 
     Args:
         grid: The map.
-        kinds: Kinds out of "line", "corner", "door" and "pole".
+        kinds: Kinds out of "line", "corner", "door", "pole" and "reflector".
         range_max: Range of the scans [m].
         spacing: Distance between neighbouring places [m]; larger where there would be more than 4000.
         backend: The device, see ``gpusense.devices()``.

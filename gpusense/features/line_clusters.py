@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpusense.features.feature_map import FeatureMap
-from gpusense.features.result import Features, Floats, across_lines
+from gpusense.features.result import KIND_TYPE, Features, Floats, across_lines
 
 # Lines are one within this many deviations, with this much added across [m] and in direction [rad]; pieces of one line
 # are at most this far apart [m].
@@ -59,7 +59,7 @@ def lines_of(features: Features, poses: Floats, spread: Floats, least: int) -> F
     normal = np.column_stack([-sine, cosine])
     theta = np.mod(pieces.theta[rows] + math.pi, 2 * math.pi) - math.pi
     return FeatureMap(
-        np.full(len(rows), "line", "<U7"), np.column_stack([pieces.middle[rows], theta]),
+        np.full(len(rows), "line", KIND_TYPE), np.column_stack([pieces.middle[rows], theta]),
         pieces.covariance[rows, 0, 0, None, None] * normal[:, :, None] * normal[:, None, :], 2 * pieces.half[rows],
         np.bincount(label, minlength=len(pieces.theta))[rows],
     )  # fmt: skip

@@ -14,8 +14,11 @@ from gpusense._util import checks
 
 Floats = NDArray[np.float64]
 
-KINDS = ("line", "corner", "door", "hallway", "pole")
-"""Kinds of features."""
+KIND_TYPE = "<U9"
+"""Type of names of kinds."""
+
+KINDS = ("line", "corner", "door", "hallway", "pole", "reflector")
+"""Kinds of features; reflectors need intensities."""
 
 # Signatures of two kinds differ by at least one of these; sizes are below it.
 SIGNATURE_STEP = 10.0
@@ -29,17 +32,17 @@ class Features:
     """Features of scans from :func:`gpusense.extract_features`, in the order of scans and, in a scan, of kinds.
 
     Attributes:
-        kind: (F,) names: "line", "corner", "door", "hallway" or "pole".
+        kind: (F,) names: "line", "corner", "door", "hallway", "pole" or "reflector".
         scan: (F,) index of the scan.
         pose: (F, 3) x, y [m] and theta [rad, in -pi to pi] in the robot's frame. Line: midpoint and direction, with
             the scanner on its left. Corner: vertex and bisector into the free space. Door: centre and direction
             across, away from the scanner. Hallway: point of the axis abreast of the robot and direction of the axis,
-            within pi / 2 of the robot's. Pole: centre and 0.
+            within pi / 2 of the robot's. Pole and reflector: centre and 0.
         covariance: (F, 3, 3) of the pose; infinite in every coordinate in which a direction lies that is not
-            observed: along a line and the axis of a hallway, and the heading of a pole.
+            observed: along a line and the axis of a hallway, and the heading of a pole or reflector.
         information: (F, 3, 3) inverse of the covariance, finite: exactly 0 along directions that are not observed.
         size: (F,) length of a line [m], opening angle of the free space in a corner [rad], width of a door and of a
-            hallway [m], radius of a pole [m].
+            hallway [m], radius of a pole and of a reflector [m].
         score: (F,) quality in 0 to 1: agreement of the readings with the shape, times how well they place it.
 
     Example:
@@ -218,7 +221,7 @@ def features_of(found: dict[str, Found]) -> Features:
     """Return features of several kinds, ordered by scan, then kind."""
     parts = list(found.values())
     kind = np.concatenate(
-        [np.full(len(part.scan), name, "<U7") for name, part in found.items()] or [np.zeros(0, "<U7")]
+        [np.full(len(part.scan), name, KIND_TYPE) for name, part in found.items()] or [np.zeros(0, KIND_TYPE)]
     )
     scan = np.concatenate([part.scan for part in parts] or [np.zeros(0)]).astype(np.int64)
     order = np.argsort(scan, kind="stable")

@@ -68,8 +68,8 @@ COMMANDS: dict[str, tuple[list[str], int, str]] = {
     "demo": (["--particles", "400", "--beams", "20", "--backend", "numpy", "--output", "OUT/made.png"], 3,
              "The best particle by the beam model"),
 }  # fmt: skip
-FILES = {"map": "made.yaml", "likelihood_map": "made.png", "localize": "made.tum", "sweep": "made.csv", "features": "made.csv",
-         "bench": "report.json"}  # fmt: skip
+FILES = {"map": "made.yaml", "likelihood_map": "made.png", "localize": "made.tum", "sweep": "made.csv",
+         "bench": "report.json", "features": "made.csv"}  # fmt: skip
 
 
 def stop_at(monkeypatch: pytest.MonkeyPatch, command: str, number: int, step: int) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import numpy as np
@@ -120,7 +120,7 @@ def _shapes(
     segments = find_segments(device, points, noise)
     is_line, is_side = straight(device, segments)
     beams = beams_of(scans, scanner, points)
-    finders = {
+    finders: dict[str, Callable[[], Found]] = {
         "line": lambda: find_lines(segments, np.flatnonzero(is_line), scanner.mount),
         "corner": lambda: find_corners(segments, is_side, scanner.mount),
         "door": lambda: find_doors(segments, is_line, beams, scanner.mount),

@@ -169,6 +169,19 @@ def test_float32_finds_nearly_the_same(device, monkeypatch):
     assert agree >= len(ranges) - 1
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_ties_are_the_same_in_float32(noise, monkeypatch, needs):
+    """Splits between which readings decide by less than float32 rounds: on these floors some once fell otherwise."""
+    device, scanner = get_backend(needs("opencl")), ring(720)
+    ranges, _ = floor_scans(1, scanner, 0.0, 20)
+    ranges = ranges + noise * np.random.default_rng(1).standard_normal(ranges.shape)
+    expected = gs.extract_features(ranges, scanner, backend=device.info.selection)
+    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, float64=False))
+    found = gs.extract_features(ranges, scanner, backend=device.info.selection)
+    np.testing.assert_array_equal(found.kind, expected.kind)
+    np.testing.assert_array_equal(found.scan, expected.scan)
+
+
 @pytest.mark.parametrize("beams", [0, 1, 2, 3, 10, 180, 1081])
 def test_scans_without_features_have_none(backend, beams):
     scanner, rng = ring(beams) if beams else gs.Scanner([], range_max=25.0), np.random.default_rng(beams)

@@ -47,12 +47,10 @@ class FeatureMap:
 
     Example:
         >>> import gpusense as gs, numpy as np
-        >>> scanner = gs.Scanner.uniform(angle_min=-3.1, angle_increment=0.0175, count=356, range_max=9.0)
-        >>> b = scanner.bearings
-        >>> room = np.minimum(3 / np.abs(np.cos(b)), 2 / np.abs(np.sin(b)))
-        >>> features = gs.extract_features(np.tile(room, (3, 1)), scanner, backend="numpy")
-        >>> found = gs.map_features(features, np.zeros((3, 3)))
-        >>> found.landmarks(), found.lines()
+        >>> cells = np.zeros((80, 120), np.int8)
+        >>> cells[[0, -1]] = cells[:, [0, -1]] = 100
+        >>> made = gs.landmarks_of_map(gs.OccupancyGrid(cells, resolution=0.05), backend="numpy")
+        >>> made.landmarks(), made.lines()
         (LandmarkMap(4 landmarks with signatures), LineMap(4 lines, 0 of them two-sided))
     """
 

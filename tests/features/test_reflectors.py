@@ -77,7 +77,7 @@ def test_reflectors_of_a_recording(data_dir):
     # Medians of the positions that the sensor itself reports in beacons_scan, placed at the same poses.
     reported = [(5.818, 0.779), (-1.464, 4.212), (2.844, 4.328), (0.926, -2.365), (-6.722, -0.485), (-6.806, 3.058)]
     apart = np.hypot(*np.moveaxis(mapped.pose[:, None, :2] - reported, 2, 0))
-    assert len(mapped) == 6 and sorted(apart.argmin(axis=1)) == list(range(6)) and apart.min(axis=1).max() < 0.12
+    assert len(mapped) == 6 and sorted(apart.argmin(axis=1)) == list(range(6)) and apart.min(axis=1).max() < 0.09
     assert mapped.count.sum() > 0.85 * 6 * valid.sum() and mapped.count.sum() > 0.9 * len(found)
     landmarks = mapped.landmarks("reflector")
     assert (landmarks.signatures // 10 == 5).all()

@@ -19,7 +19,8 @@ _NAMES = {
     "chaining.chain": ("chain_scans",),
     "chaining.result": ("ScanChain",),
     "features.extract": ("extract_features",),
-    "features.landmarks": ("FeatureMap", "landmarks_of_map", "map_features"),
+    "features.feature_map": ("FeatureMap",),
+    "features.landmarks": ("landmarks_of_map", "map_features"),
     "features.result": ("Features",),
     "learning.beam.fit": ("fit_beam_parameters",),
     "learning.beam.incidence": ("IncidenceFit", "fit_incidence_parameters"),
@@ -52,6 +53,7 @@ _NAMES = {
     "matching.match_map": ("MapMatch", "match_map"),
     "matching.pose_likelihood": ("PoseLikelihood", "pose_likelihood"),
     "matching.result": ("ScanMatch",),
+    "models.landmark.lines": ("LineModel",),
     "models.landmark.model": ("LandmarkModel",),
     "models.point.absolute": ("HeadingModel", "PositionModel"),
     "models.point.beacons": ("BeaconModel",),
@@ -69,12 +71,19 @@ _NAMES = {
     "tables.normals": ("surface_normals",),
     "world.grid": ("OccupancyGrid",),
     "world.landmarks": ("LandmarkMap",),
+    "world.line_map": ("LineMap",),
     "world.map_files": ("read_map", "write_map"),
     "world.parameters": ("BeamParameters", "IncidenceParameters", "LandmarkParameters", "LikelihoodFieldParameters"),
     "world.plausible": ("PlausibilityWarning",),
     "world.scanner": ("Reading", "Scanner", "classify"),
     "world.sweep": ("deskew_scan",),
-    "world.sensor_parameters": ("BeaconParameters", "BumperParameters", "HeadingParameters", "PositionParameters"),
+    "world.sensor_parameters": (
+        "BeaconParameters",
+        "BumperParameters",
+        "HeadingParameters",
+        "LineParameters",
+        "PositionParameters",
+    ),
 }
 # Public modules.
 _MODULES = ("casters", "compat", "plots", "sweep", "worlds")

@@ -11,7 +11,7 @@ from gpusense.backends import devices as devices
 from gpusense.chaining.chain import chain_scans as chain_scans
 from gpusense.chaining.result import ScanChain as ScanChain
 from gpusense.features.extract import extract_features as extract_features
-from gpusense.features.landmarks import FeatureMap as FeatureMap
+from gpusense.features.feature_map import FeatureMap as FeatureMap
 from gpusense.features.landmarks import landmarks_of_map as landmarks_of_map
 from gpusense.features.landmarks import map_features as map_features
 from gpusense.features.result import Features as Features
@@ -65,6 +65,7 @@ from gpusense.matching.match_map import match_map as match_map
 from gpusense.matching.pose_likelihood import PoseLikelihood as PoseLikelihood
 from gpusense.matching.pose_likelihood import pose_likelihood as pose_likelihood
 from gpusense.matching.result import ScanMatch as ScanMatch
+from gpusense.models.landmark.lines import LineModel as LineModel
 from gpusense.models.landmark.model import LandmarkModel as LandmarkModel
 from gpusense.models.point.absolute import HeadingModel as HeadingModel
 from gpusense.models.point.absolute import PositionModel as PositionModel
@@ -84,6 +85,7 @@ from gpusense.tables.distances import distance_transform as distance_transform
 from gpusense.tables.normals import surface_normals as surface_normals
 from gpusense.world.grid import OccupancyGrid as OccupancyGrid
 from gpusense.world.landmarks import LandmarkMap as LandmarkMap
+from gpusense.world.line_map import LineMap as LineMap
 from gpusense.world.map_files import read_map as read_map
 from gpusense.world.map_files import write_map as write_map
 from gpusense.world.parameters import BeamParameters as BeamParameters
@@ -97,5 +99,6 @@ from gpusense.world.scanner import classify as classify
 from gpusense.world.sensor_parameters import BeaconParameters as BeaconParameters
 from gpusense.world.sensor_parameters import BumperParameters as BumperParameters
 from gpusense.world.sensor_parameters import HeadingParameters as HeadingParameters
+from gpusense.world.sensor_parameters import LineParameters as LineParameters
 from gpusense.world.sensor_parameters import PositionParameters as PositionParameters
 from gpusense.world.sweep import deskew_scan as deskew_scan

@@ -9,7 +9,8 @@ the squared error over the covariance per degree of freedom (NEES; 1 is right), 
 99.9 % of chi squared, and the share of those. ``ransac``: lines by scikit-image's RANSAC, one after another, beside
 ours. ``real``: features of recorded scans that are found again from another place, and how far they are apart in
 deviations; the reference poses, which are not perfect, have deviations of 3 cm and 0.01 rad (jarvis 1 cm and
-0.004 rad). ``localisation``: a filter with features alone in the map that the other half of the scans gives, beside
+0.004 rad). ``localisation``: a filter with points
+(corners, doors and poles), with lines, and with both, in the maps that the other half of the scans gives, beside
 the same filter with the likelihood field. ``rates``: scans a second of 1080 beams.
 """
 
@@ -29,7 +30,7 @@ import gpusense as gs
 from gpusense.evaluation.feature_scenes import floor_plan
 from gpusense.evaluation.feature_scores import FREE, Score, score_scan
 from gpusense.evaluation.feature_truth import truth_of
-from gpusense.features.result import KINDS, Features
+from gpusense.features.result import Features
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -47,9 +48,11 @@ RECORDINGS = {
 MOVED, FAR, NEAR, TURN = (0.3, 2.0), 8.0, 0.3, 0.35
 # Kinds that a filter uses, and its parameters.
 LANDMARKS = ("corner", "door", "pole")
+MAPPED = ("line", *LANDMARKS)
 PARAMETERS = gs.LandmarkParameters(
     sigma_range=0.1, sigma_bearing=0.03, sigma_signature=0.3, z_detect=0.7, z_false=0.3, range_max=20.0
 )
+LINES = gs.LineParameters(sigma_angle=0.03, sigma_distance=0.1, z_detect=0.7, z_false=0.3, range_max=20.0)
 
 
 def scanner_of(beams: int) -> gs.Scanner:
@@ -95,7 +98,7 @@ def simulated(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
                 features = gs.extract_features(ranges, scanner, backend=arguments.backend)
                 for k, one in enumerate(truth):
                     score_scan(features.of_scan(k), one, scores)
-            for kind in KINDS:
+            for kind in FREE:
                 f = figures_of(kind, scores[kind])
                 report[f"{beams} {noise} {kind}"] = f
                 nees = "" if noise == 0 else f"{f['nees']:.2f}"
@@ -247,8 +250,8 @@ def real(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     return "## Recorded scans\n\n" + table(names, rows), report
 
 
-def followed(models: list[Any], events: list[Any], readings: list[Any], seed: int) -> dict[str, float]:
-    """Return errors and time of a filter over events with the readings of each."""
+def followed(models: list[Any], events: list[Any], readings: list[list[Any]], seed: int) -> dict[str, float]:
+    """Return errors and time of a filter over events, with the readings of each for each of its models."""
     pf = gs.ParticleFilter(models, particles=1000, seed=seed)
     pf.initialize(mean=events[0].truth, covariance=np.diag([0.25, 0.25, 0.04]))
     errors, seconds = [], 0.0
@@ -256,8 +259,9 @@ def followed(models: list[Any], events: list[Any], readings: list[Any], seed: in
         begin = time.perf_counter()
         if k:
             pf.predict(events[k - 1].odometry, event.odometry)
-        if len(readings[k]):
-            pf.correct(readings[k])
+        given = {model: one[k] for model, one in zip(models, readings, strict=True) if len(one[k])}
+        if given:
+            pf.correct(given)
         pose = pf.estimate().pose
         seconds += time.perf_counter() - begin
         errors.append(math.hypot(*(pose[:2] - event.truth[:2])))
@@ -279,33 +283,38 @@ def halves(recording: Any) -> tuple[np.ndarray, np.ndarray, list[Any]]:
 
 
 def localisation(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
-    """Return filters with features alone beside those with the field: same odometry, particles and seeds."""
+    """Return filters with points and lines beside those with the field: same odometry, particles and seeds."""
     rows, report = [], {}
     for name in ("jarvis-s3000", "jarvis-nav350", "intel", "csail"):
         recording = recordings.load(name)
         grid, scanner = recording.places[0]
         before, where, events = halves(recording)
-        surveyed = gs.extract_features(before, scanner, LANDMARKS, arguments.backend)
-        landmarks = gs.map_features(surveyed, where).landmarks()
+        surveyed = gs.map_features(gs.extract_features(before, scanner, MAPPED, arguments.backend), where)
         events = events[: arguments.limit]
         ranges = np.array([event.ranges for event in events])
         begin = time.perf_counter()
-        features = gs.extract_features(ranges, scanner, LANDMARKS, arguments.backend)
+        features = gs.extract_features(ranges, scanner, MAPPED, arguments.backend)
         extraction = 1000 * (time.perf_counter() - begin) / len(events)
-        rows_of = [features.of_scan(k).range_bearing() for k in range(len(events))]
-        fields = recordings.field(arguments.backend)(grid, scanner)
-        model = gs.LandmarkModel(landmarks, PARAMETERS, backend=arguments.backend)
-        settings = {"field": ([fields], list(ranges)), "features": ([model], rows_of)}
-        settings["odometry alone"] = ([model], [[]] * len(events))
-        for label, (models, readings) in settings.items():
+        scans = [features.of_scan(k) for k in range(len(events))]
+        points = gs.LandmarkModel(surveyed.landmarks(), PARAMETERS, backend=arguments.backend), [
+            scan.range_bearing(LANDMARKS) for scan in scans
+        ]  # fmt: skip
+        lines = gs.LineModel(surveyed.lines(), LINES, backend=arguments.backend), [scan.lines() for scan in scans]
+        field = recordings.field(arguments.backend)(grid, scanner), list(ranges)
+        settings = {"field": [field], "points": [points], "lines": [lines], "points and lines": [points, lines],
+                    "odometry alone": [(points[0], [[]] * len(events))]}  # fmt: skip
+        for label, sensors in settings.items():
+            models, readings = ([sensor[side] for sensor in sensors] for side in (0, 1))
             runs = [followed(models, events, readings, seed) for seed in range(arguments.seeds)]
             figures = {key: float(np.mean([run[key] for run in runs])) for key in runs[0]}
-            figures["ms"] += extraction if label == "features" else 0
-            report[f"{name} {label}"] = figures | {"landmarks": len(landmarks), "per_scan": len(features) / len(events)}
-            rows.append([name, len(events), label, f"{figures['median_m']:.3f}", f"{figures['p95_m']:.3f}",
+            is_features = label not in ("field", "odometry alone")
+            figures["ms"] += extraction if is_features else 0
+            figures["per_scan"] = sum(len(one) for each in readings for one in each) / len(events) if is_features else 0
+            report[f"{name} {label}"] = figures | {"points": len(surveyed.landmarks()), "lines": len(surveyed.lines())}
+            each = f"{figures['per_scan']:.1f}" if is_features else ""
+            rows.append([name, len(events), label, each, f"{figures['median_m']:.3f}", f"{figures['p95_m']:.3f}",
                          f"{100 * figures['lost']:.1f}", f"{figures['ms']:.2f}"])  # fmt: skip
-        rows[-2][2] += f" ({len(features) / len(events):.1f} a scan, {len(landmarks)} landmarks)"
-    names = ["recording", "scans", "filter with", "error [m], median", "95 %", "beyond 1 m [%]", "ms a scan"]
+    names = ["recording", "scans", "filter with", "a scan", "error [m], median", "95 %", "beyond 1 m [%]", "ms a scan"]
     return "## Localisation\n\n" + table(names, rows), report
 
 

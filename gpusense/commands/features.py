@@ -16,20 +16,20 @@ from gpusense.commands.scans import add_log, add_reference, read_scans
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
-    from gpusense.features.landmarks import FeatureMap
+    from gpusense.features.feature_map import FeatureMap
     from gpusense.features.result import Features
     from gpusense.logs import Scan
 
 NAME = "features"
-HELP = "Extract lines, corners, doors, hallways and poles from the scans of a log."
+HELP = "Extract lines, corners, doors, hallways, poles and reflectors from the scans of a log."
 
 # Scans of one call: a step of the progress bar.
 _CALL = 256
 
 _EPILOG = """\
 Each scan is split into lines, and corners, doors, hallways and poles are made of them (docs/features.md). With
---map-out the corners, doors and poles of all scans become landmarks, at the logged poses or those of --reference;
---map-in makes landmarks of an occupancy grid instead.
+--map-out the lines, corners, doors, poles and reflectors of all scans become a map, at the logged poses or those of
+--reference; --map-in makes a map of an occupancy grid instead. Reflectors need a log with intensities.
 
 Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
@@ -46,8 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_log(parser, "a log with scans", required=False)
     add_reference(parser)
     add("--map-in", type=Path, metavar="YAML", help="a map_server map, of which landmarks are made instead of a log")
-    add("--kinds", nargs="+", choices=("line", "corner", "door", "hallway", "pole"), metavar="KIND",
-        help="line, corner, door, hallway, pole (default: all)")  # fmt: skip
+    add("--kinds", nargs="+", choices=("line", "corner", "door", "hallway", "pole", "reflector"),
+        metavar="KIND", help="line, corner, door, hallway, pole, reflector (default: all)")  # fmt: skip
     add("--noise", type=positive_number, metavar="M",
         help="standard deviation of ranges [m] (default: that of each scan)")  # fmt: skip
     add("--every", type=whole_number(low=1), default=1, metavar="E", help="every E-th scan (default: 1)")
@@ -96,15 +96,15 @@ def _extract(args: argparse.Namespace, scans: list[tuple[int, Scan]]) -> Feature
 
     ranges = np.array([scan.ranges for _, scan in scans])
     kinds, scanner = args.kinds or KINDS, scans[0][1].scanner
-    if args.noise is None:
-        return extract_features(ranges, scanner, kinds, args.backend)
-    return extract_features(ranges, scanner, kinds, args.backend, noise=args.noise)
+    light = [np.full(ranges.shape[1], np.nan) if scan.intensities is None else scan.intensities for _, scan in scans]
+    noise: Any = "auto" if args.noise is None else args.noise
+    return extract_features(ranges, scanner, kinds, args.backend, noise=noise, intensities=np.array(light))
 
 
 def _landmark_kinds(args: argparse.Namespace) -> tuple[str, ...]:
-    from gpusense.features.landmarks import LANDMARK_KINDS
+    from gpusense.features.feature_map import MAP_KINDS
 
-    return tuple(kind for kind in LANDMARK_KINDS if args.kinds is None or kind in args.kinds)
+    return tuple(kind for kind in MAP_KINDS if args.kinds is None or kind in args.kinds)
 
 
 def _of_map(args: argparse.Namespace) -> int:

@@ -15,6 +15,7 @@ from gpusense.evaluation.calibration import Draw, Score
 from gpusense.evaluation.worlds import cloud_uniform
 from gpusense.learning.discrete.causes import DiscreteCauses
 from gpusense.learning.discrete.table import DiscreteBeamModel
+from gpusense.models.landmark.lines import LineModel
 from gpusense.models.landmark.model import LandmarkModel
 from gpusense.models.point.absolute import HeadingModel, PositionModel
 from gpusense.models.point.beacons import BeaconModel
@@ -22,9 +23,16 @@ from gpusense.models.point.bumper import BumperModel
 from gpusense.models.scan.beam import BeamModel
 from gpusense.tables.casters import Lookup
 from gpusense.world.landmarks import LandmarkMap
+from gpusense.world.line_map import LineMap
 from gpusense.world.parameters import BeamParameters, IncidenceParameters, LandmarkParameters
 from gpusense.world.scanner import Scanner
-from gpusense.world.sensor_parameters import BeaconParameters, BumperParameters, HeadingParameters, PositionParameters
+from gpusense.world.sensor_parameters import (
+    BeaconParameters,
+    BumperParameters,
+    HeadingParameters,
+    LineParameters,
+    PositionParameters,
+)
 
 Floats = NDArray[np.float64]
 
@@ -105,6 +113,22 @@ def _landmarks(narrow: bool, options: dict[str, Any]) -> Scene:
     return Scene(poses, draw, score)
 
 
+def _lines(options: dict[str, Any]) -> Scene:
+    # So long that the middle of the part in view is the foot of the normal: the ends say nothing.
+    lines = LineMap([(99.0, 7.0, -99.0, 7.0), (7.0, -99.0, 7.0, 99.0), (-99.0, -30.0, 99.0, 30.0)], [False, True, True])
+    p = LineParameters(sigma_angle=0.3, sigma_distance=0.8, z_detect=0.7, z_false=0.3, range_max=12.0)
+    model = LineModel(lines, p, mount=(0.2, 0.1, 0.3), **options)
+    partners = (0, 1, 2, -1)
+
+    def draw(at: Floats, seed: int) -> np.ndarray:
+        return model.sample(at, seed, correspondence=partners)
+
+    def score(at: Floats, features: np.ndarray) -> np.ndarray:
+        return model.log_likelihood(at, features, correspondence=partners)
+
+    return Scene(_points((-1.0, 0.0, -3.1), (5.0, 5.0, 3.1)), draw, score)
+
+
 def _beacons(kind: Any, options: dict[str, Any]) -> Scene:
     p = BeaconParameters(
         kind=kind, sigma_range=0.7, bias=(0.3, -0.2, 0.1), nu=3, range_max=9.0, mount=(0.2, 0.0)
@@ -132,6 +156,7 @@ def _makers() -> Iterator[tuple[str, Callable[[dict[str, Any]], Scene]]]:
     yield "bumper", lambda options: _point(BumperModel(_GRID, 0.3, bumper, segments=segments, **options))
     yield "landmarks", lambda options: _landmarks(False, options)
     yield "landmarks, narrow view", lambda options: _landmarks(True, options)
+    yield "lines", _lines
 
 
 MAKERS = dict(_makers())

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gpusense.evaluation.feature_truth import Truth
-from gpusense.features.result import KINDS, Features
+from gpusense.features.result import Features
 
 # A feature is found within this distance [m] and angle [rad], and its size within this [m or rad].
 NEAR, TURN = 0.2, math.radians(10)
@@ -55,7 +55,7 @@ class Score:
 
 def score_scan(features: Features, truth: Truth, scores: dict[str, Score]) -> None:
     """Add the features of one scan to the scores of their kinds."""
-    for kind in KINDS:
+    for kind in FREE:
         mine, score = features[kind], scores.setdefault(kind, Score())
         score.features += len(mine)
         score.required += len(truth.required[kind])

@@ -1,11 +1,12 @@
-"""Extract features from scans: lines, corners, doors, hallways and poles."""
+"""Extract features from scans: lines, corners, doors, hallways, poles and reflectors."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray
@@ -18,6 +19,7 @@ from gpusense.features.doors import find_doors
 from gpusense.features.hallways import find_hallways
 from gpusense.features.lines import find_lines, straight
 from gpusense.features.poles import find_poles
+from gpusense.features.reflectors import find_reflectors
 from gpusense.features.result import KINDS, Features, Found, check_kinds, features_of, joined
 from gpusense.features.segments import find_segments
 from gpusense.matching.match import readings
@@ -38,15 +40,17 @@ def extract_features(
     backend: Selection = "auto",
     *,
     noise: float | Literal["auto"] = "auto",
+    intensities: ArrayLike | None = None,
 ) -> Features:
-    """Extract lines, corners, doors, hallways and poles from scans.
+    """Extract lines, corners, doors, hallways and poles from scans, and reflectors where intensities are known.
 
     A scan is split into straight pieces where two lines explain its readings better than one, by more than noise does
     (split and merge, Pavlidis and Horowitz 1974), and a line is fitted to the ranges of each by maximum likelihood.
     Pieces that a circle explains as well are round walls, and no lines. Corners are vertices of neighbouring lines.
     Doors are gaps of 0.5 to 2 m in a wall, between two jambs, through which beams go on; hallways are parallel walls
     0.6 to 3.2 m apart on both sides of the scanner, beside each other for twice their distance; poles are
-    circles with radii of 1.5 to 50 cm in front of all that is beside them.
+    circles with radii of 1.5 to 50 cm in front of all that is beside them. Reflectors are short runs of beams that are
+    at least three times as bright as is usual in their scan; they count as cylinders.
 
     Covariances follow from the deviation of ranges, which the readings of each scan tell, from the residuals of each
     line, and from the distance of beams at edges. The device computes in float64 where it can, and in float32
@@ -57,10 +61,11 @@ def extract_features(
             :func:`gpusense.classify`. A reading of "no return" says that a beam goes on.
         scanner: The scanner; its mount is the sensor's pose on the robot. The robot is at rest during a scan:
             :func:`gpusense.deskew_scan` makes such a scan of one in motion.
-        kinds: Kinds to extract: one, or several of "line", "corner", "door", "hallway" and "pole".
+        kinds: Kinds to extract: one, or several of "line", "corner", "door", "hallway", "pole" and "reflector".
         backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         noise: Standard deviation of ranges [m]. ``"auto"``: that of each scan, from its deviations from straight
             walls; readings of more than 10 cm of noise have no lines.
+        intensities: Intensities of the readings, of their shape, in any unit; NaN where unknown. None: no reflectors.
 
     Returns:
         The features of all scans, by scan and kind; see :class:`gpusense.Features`.
@@ -91,28 +96,35 @@ def extract_features(
     else:
         deviation = np.full(len(scans), max(given, _LEAST_NOISE))
     step = max(_READINGS // max(scanner.count, 1), 1)
+    light = None if intensities is None else np.atleast_2d(checks.array("intensities", intensities, finite=False))
+    if light is not None and light.shape != scans.shape:
+        raise ValueError(f"intensities: shape must be that of the readings, {scans.shape}, got {light.shape}")
     parts = [slice(first, first + step) for first in range(0, max(len(scans), 1), step)]
-    return joined(
-        [features_of(_found(device, real, scans[part], scanner, deviation[part], wanted)) for part in parts], step
-    )
+    found = []
+    for part in parts:
+        shapes = _shapes(device, real, scans[part], scanner, deviation[part], wanted)
+        if light is not None and "reflector" in wanted:
+            shapes["reflector"] = find_reflectors(scans[part], light[part], scanner, deviation[part])
+        found.append(features_of(shapes))
+    return joined(found, step)
 
 
-def _found(
+def _shapes(
     backend: Backend, real: np.dtype, scans: np.ndarray, scanner: Scanner, noise: np.ndarray, kinds: tuple[str, ...]
 ) -> dict[str, Found]:
-    """Return the features of (S, K) readings by kind."""
+    """Return the features of (S, K) readings by kind, but for reflectors."""
     points = scan_points(scans, scanner, np.dtype(np.float64))
-    if not len(points.point):
+    if not len(points.point) or set(kinds) <= {"reflector"}:
         return {}
     device = ScanDevice(backend, real, points, noise)
     segments = find_segments(device, points, noise)
     is_line, is_side = straight(device, segments)
     beams = beams_of(scans, scanner, points)
-    finders = {
+    finders: dict[str, Callable[[], Found]] = {
         "line": lambda: find_lines(segments, np.flatnonzero(is_line), scanner.mount),
         "corner": lambda: find_corners(segments, is_side, scanner.mount),
         "door": lambda: find_doors(segments, is_line, beams, scanner.mount),
         "hallway": lambda: find_hallways(segments, is_line, scanner.mount),
         "pole": lambda: find_poles(device, segments, beams, noise, scanner.mount),
     }
-    return {kind: finders[kind]() for kind in KINDS if kind in kinds}
+    return {kind: finder() for kind, finder in finders.items() if kind in kinds}

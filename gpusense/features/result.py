@@ -14,8 +14,11 @@ from gpusense._util import checks
 
 Floats = NDArray[np.float64]
 
-KINDS = ("line", "corner", "door", "hallway", "pole")
-"""Kinds of features."""
+KIND_TYPE = "<U9"
+"""Type of names of kinds."""
+
+KINDS = ("line", "corner", "door", "hallway", "pole", "reflector")
+"""Kinds of features; reflectors need intensities."""
 
 # Signatures of two kinds differ by at least one of these; sizes are below it.
 SIGNATURE_STEP = 10.0
@@ -29,17 +32,17 @@ class Features:
     """Features of scans from :func:`gpusense.extract_features`, in the order of scans and, in a scan, of kinds.
 
     Attributes:
-        kind: (F,) names: "line", "corner", "door", "hallway" or "pole".
+        kind: (F,) names: "line", "corner", "door", "hallway", "pole" or "reflector".
         scan: (F,) index of the scan.
         pose: (F, 3) x, y [m] and theta [rad, in -pi to pi] in the robot's frame. Line: midpoint and direction, with
             the scanner on its left. Corner: vertex and bisector into the free space. Door: centre and direction
             across, away from the scanner. Hallway: point of the axis abreast of the robot and direction of the axis,
-            within pi / 2 of the robot's. Pole: centre and 0.
+            within pi / 2 of the robot's. Pole and reflector: centre and 0.
         covariance: (F, 3, 3) of the pose; infinite in every coordinate in which a direction lies that is not
-            observed: along a line and the axis of a hallway, and the heading of a pole.
+            observed: along a line and the axis of a hallway, and the heading of a pole or reflector.
         information: (F, 3, 3) inverse of the covariance, finite: exactly 0 along directions that are not observed.
         size: (F,) length of a line [m], opening angle of the free space in a corner [rad], width of a door and of a
-            hallway [m], radius of a pole [m].
+            hallway [m], radius of a pole and of a reflector [m].
         score: (F,) quality in 0 to 1: agreement of the readings with the shape, times how well they place it.
 
     Example:
@@ -102,6 +105,33 @@ class Features:
         x, y = chosen.pose[:, 0], chosen.pose[:, 1]
         return np.column_stack([np.hypot(x, y), np.arctan2(y, x), chosen.signatures])
 
+    def lines(self) -> Floats:
+        """Return the lines as :class:`gpusense.LineModel` takes them; features of other kinds are left out.
+
+        Returns:
+            (F, 7) angle of the normal away from the scanner [rad] and distance [m], places of both ends along the line
+            from the foot of the normal, positive to the left of it [m], variance of the angle [rad^2], covariance
+            [rad m] and variance of the distance [m^2], in the robot's frame.
+
+        Example:
+            >>> import gpusense as gs, numpy as np
+            >>> scanner = gs.Scanner.uniform(angle_min=-0.9, angle_increment=0.02, count=91, range_max=9.0)
+            >>> wall = gs.extract_features(2 / np.cos(scanner.bearings), scanner, backend="numpy")
+            >>> bool(np.allclose(wall.lines()[:, :2], (0.0, 2.0)))
+            True
+        """
+        chosen = self[self.kind == "line"]
+        angle = chosen.pose[:, 2] - 0.5 * math.pi
+        c, s = np.cos(angle), np.sin(angle)
+        x, y = chosen.pose[:, 0], chosen.pose[:, 1]
+        middle, half = c * y - s * x, 0.5 * chosen.size
+        # At the foot of the normal the distance is that at the middle, and the way there times the angle.
+        across = across_lines(chosen)
+        variance, both = across[:, 1, 1], across[:, 0, 1] + middle * across[:, 1, 1]
+        far = across[:, 0, 0] + 2 * middle * across[:, 0, 1] + middle**2 * variance
+        wrapped = np.mod(angle + math.pi, 2 * math.pi) - math.pi
+        return np.column_stack([wrapped, c * x + s * y, middle - half, middle + half, variance, both, far])
+
     @property
     def signatures(self) -> Floats:
         """(F,) signatures, see :func:`signature_of`."""
@@ -111,6 +141,14 @@ class Features:
         counts = [(int(np.count_nonzero(self.kind == name)), name) for name in KINDS]
         words = [f"{count} {name}{'s' * (count > 1)}" for count, name in counts if count]
         return f"Features({', '.join(words) or 'none'})"
+
+
+def across_lines(lines: Features) -> Floats:
+    """Return the (F, 2, 2) covariance of the offset of lines away from the scanner, at the middle, and of direction."""
+    rows = np.zeros((len(lines), 2, 3))
+    rows[:, 0, 0], rows[:, 0, 1], rows[:, 1, 2] = np.sin(lines.pose[:, 2]), -np.cos(lines.pose[:, 2]), 1
+    result = np.asarray(np.linalg.inv(rows @ lines.information @ rows.transpose(0, 2, 1)), np.float64)
+    return result
 
 
 def joined(parts: Sequence[Features], scans: int) -> Features:
@@ -183,7 +221,7 @@ def features_of(found: dict[str, Found]) -> Features:
     """Return features of several kinds, ordered by scan, then kind."""
     parts = list(found.values())
     kind = np.concatenate(
-        [np.full(len(part.scan), name, "<U7") for name, part in found.items()] or [np.zeros(0, "<U7")]
+        [np.full(len(part.scan), name, KIND_TYPE) for name, part in found.items()] or [np.zeros(0, KIND_TYPE)]
     )
     scan = np.concatenate([part.scan for part in parts] or [np.zeros(0)]).astype(np.int64)
     order = np.argsort(scan, kind="stable")

@@ -1,4 +1,4 @@
-"""Layout of a feature of the landmark model: FEATURE numbers, in the same order on the host and in all kernels."""
+"""Layout of a feature of landmark and line models: FEATURE numbers, in the same order on the host and in kernels."""
 
 from __future__ import annotations
 
@@ -18,7 +18,13 @@ FARTHEST, AXIS = 22, 23
 # sigma sqrt 2 of range and bearing, infinite for components that were not measured; the log of the largest possible
 # density; and the largest error of squared distances.
 RANGE_SPREAD, BEARING_SPREAD, MOST, SLACK = 24, 25, 26, 27
-FEATURE = 28
+# Features of one group have different landmarks in a joint association; features of two groups may share one.
+GROUP = 28
+FEATURE = 29
+
+# A line has its distance and the direction of its normal in place of range and bearing, and in other places: the
+# factor of the angle in the second exponent, and the places of its ends along it, from the foot of the normal [m].
+MIXED_SCALE, MIXED_SCALE_LOW, FIRST_END, LAST_END = SIGNATURE_SCALE, SIGNATURE_SCALE_LOW, UPPER, UPPER_LOW
 
 # Arcs of i / 8, of a quarter and of half a turn, as sums of two float64 numbers.
 ARC_STEPS = 8

@@ -48,6 +48,7 @@ FLAGS = {
     "BEARING": "some feature has a bearing",
     "SIGNATURE": "some feature has a signature",
     "FIELD": "the field of view is less than a full circle",
+    "LINE": "features are lines",
     "KNOWN": "it is known which landmark each feature is",
     "MARGINAL": "each feature's densities at all landmarks are summed",
     "INFORMATION": "the sums of the log-likelihood's second derivatives are wanted",

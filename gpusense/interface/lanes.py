@@ -9,7 +9,7 @@ _NEVER: dict[str, frozenset[str]] = {
     "e_step": _SCALAR - {"FLOAT64"},
     "score_beams": frozenset(),
     "score_field": frozenset({"ALL_READINGS"}),
-    "score_features": _SCALAR | {"SIGNATURE", "FIELD", "MARGINAL", "PER_BEAM"},
+    "score_features": _SCALAR | {"SIGNATURE", "FIELD", "MARGINAL", "PER_BEAM", "LINE"},
 }
 _NEEDED: dict[str, tuple[set[str], ...]] = {
     "cast_ranges": (set(),),

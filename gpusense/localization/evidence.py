@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense.models.landmark.model import LandmarkModel
+from gpusense.models.landmark.base import FeatureModel
 
 Floats = NDArray[np.float64]
 
@@ -27,13 +27,13 @@ class Evidence:
     """Gain of the predictions of features.
 
     Args:
-        model: The model of the landmarks.
+        model: The model of the landmarks or lines.
         seed: Seed of the poses anywhere.
     """
 
-    def __init__(self, model: LandmarkModel, *, seed: int = 0) -> None:
+    def __init__(self, model: FeatureModel, *, seed: int = 0) -> None:
         self._model = model
-        xy, rng = model.landmarks.xy, np.random.default_rng(seed)
+        xy, rng = model.corners, np.random.default_rng(seed)
         low, high = xy.min(axis=0) - _MARGIN, xy.max(axis=0) + _MARGIN
         self._poses = np.column_stack(
             [rng.uniform(low, high, (_ANYWHERE, 2)), rng.uniform(-math.pi, math.pi, _ANYWHERE)]
@@ -47,7 +47,7 @@ class Evidence:
         Args:
             poses: (N, 3) predicted particles.
             weights: (N,) their weights.
-            features: (F, 2 or 3) features of the scan, F > 0.
+            features: (F, ...) features of the scan, F > 0.
 
         Returns:
             The gain of all features; NaN where neither particles nor chance can have given them.

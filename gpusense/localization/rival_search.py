@@ -22,7 +22,7 @@ from gpusense.localization.sensors import Sensor
 from gpusense.localization.spread import deviations
 from gpusense.localization.verdict import sightings
 from gpusense.matching.likely import likely_poses
-from gpusense.models.landmark.model import LandmarkModel
+from gpusense.models.landmark.base import FeatureModel
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.world.parameters import LikelihoodFieldParameters
 
@@ -138,7 +138,7 @@ def drawn(score: np.ndarray, count: int, effective: int) -> np.ndarray | None:
 
 def can_search(sensors: Sequence[Sensor]) -> bool:
     """Tell whether a sensor has a map in which a rival can be searched for."""
-    return any(hasattr(one.model, "grid") or isinstance(one.model, LandmarkModel) for one in sensors)
+    return any(hasattr(one.model, "grid") or isinstance(one.model, FeatureModel) for one in sensors)
 
 
 def _anywhere(sensors: Sequence[Sensor]) -> tuple[np.ndarray, starts.Spread]:
@@ -146,5 +146,5 @@ def _anywhere(sensors: Sequence[Sensor]) -> tuple[np.ndarray, starts.Spread]:
     models = [sensor.model for sensor in sensors]
     if any(hasattr(model, "grid") for model in models):
         return starts.free_pool(models, None)
-    xy = np.vstack([model.landmarks.xy for model in models if isinstance(model, LandmarkModel)])
+    xy = np.vstack([model.corners for model in models if isinstance(model, FeatureModel)])
     return starts.free_pool([], np.array([xy.min(axis=0) - _MARGIN, xy.max(axis=0) + _MARGIN]))

@@ -16,7 +16,7 @@ from gpusense.interface.constants import DEPTH, TEMPERATURE
 from gpusense.interface.launches import Program
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.temperature import BeamCorrelation, axes_of, poses_around
-from gpusense.models.landmark.model import LandmarkModel
+from gpusense.models.landmark.base import FeatureModel
 from gpusense.models.point.base import PointModel
 from gpusense.models.scan.bound import DeviceCall
 from gpusense.models.scan.model import ScanModel
@@ -51,12 +51,12 @@ class Sensor:
     MEMORY, PARTS = ("_correlation", "_seen", "_learned"), ()
 
     def __init__(self, model: Any) -> None:
-        if not isinstance(model, (ScanModel, PointModel, LandmarkModel)):
+        if not isinstance(model, (ScanModel, PointModel)):
             raise TypeError(f"models: must be measurement models, got {checks.show(model)}")
         if isinstance(model, ScanModel) and model.temperature != 1:
             raise ValueError(f"models: must have temperature 1, the filter has its own, got {model.temperature}")
         self.model: Any = model
-        self.calibrates, self.ambiguous = isinstance(model, ScanModel), isinstance(model, LandmarkModel)
+        self.calibrates, self.ambiguous = isinstance(model, ScanModel), isinstance(model, FeatureModel)
         self.backend: Backend = model.backend
         self.precision = np.dtype(model.precision)
         self.beams = model.used_beams if isinstance(model, ScanModel) else 0

@@ -26,7 +26,7 @@ from gpusense.localization.ratio import explained_of_scan, ratio_of_features, ra
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.spread import deviations, is_apart, is_wide
 from gpusense.localization.words import TRACKING
-from gpusense.models.landmark.model import LandmarkModel
+from gpusense.models.landmark.base import FeatureModel
 
 # Random poses.
 _RANDOM = 64
@@ -84,7 +84,7 @@ class Verdict:
         self._evidence = {
             index: Evidence(sensor.model, seed=seed)
             for index, sensor in enumerate(sensors)
-            if isinstance(sensor.model, LandmarkModel)
+            if isinstance(sensor.model, FeatureModel)
         }
         self.informed = bool(self._evidence) or any(sensor.calibrates for sensor in sensors)
         self.state = VerdictState()

@@ -41,6 +41,9 @@ class Scan:
     duration: float = 0.0
     """Time from the first beam to the last one [s]; 0 where the log does not tell."""
 
+    intensities: NDArray[np.float32] | None = None
+    """(K,) intensities of the readings in the scanner's unit, read-only; None where the log has none."""
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "ranges", masks.filled(self.ranges))
 

@@ -33,6 +33,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpusense._util.notices import warn_user
 from gpusense.logs.bags import ODOMETRY, SCAN, TRANSFORMS, errors_at, messages, topics_of
@@ -122,7 +123,8 @@ def _records(
             else:
                 ranges = _readings(message.fields, scanner, len(bag.geometries) > 1, upside_down)
                 lasted = 0.0 if len(bag.geometries) > 1 else _duration(message.fields, scanner.count)
-                record = Scan(time, ranges, scanner, _pose_at(time, times, poses), None, lasted)
+                light = None if len(bag.geometries) > 1 else _intensities(message.fields, scanner.count)
+                record = Scan(time, ranges, scanner, _pose_at(time, times, poses), None, lasted, light)
         yield record
 
 
@@ -234,6 +236,19 @@ def _readings(message: object, scanner: Scanner, common: bool, upside_down: bool
     ranges[ranges == 0] = math.nan
     ranges.setflags(write=False)
     return ranges
+
+
+def _intensities(message: object, beams: int) -> NDArray[np.float32] | None:
+    """Return the intensities of a scan, read-only; None where it has none, or all are the same."""
+    try:
+        light = np.array(field_of("message", message, "intensities"), np.float32)
+    except (TypeError, ValueError):
+        return None
+    if light.ndim != 1 or not 0 < beams <= len(light) or not (light != light[0]).any():
+        return None
+    light = light[:beams]
+    light.setflags(write=False)
+    return light
 
 
 def _duration(message: object, beams: int) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
-from gpusense.features.landmarks import FeatureMap
+from gpusense.features.feature_map import FeatureMap
 from gpusense.features.result import Features
 from gpusense.plots.drawing import draw_map, draw_pose, new_figure
 from gpusense.plots.matches import points_of
@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 POINTS = "#9aa5b1"
-COLOURS = {"line": "#1d3557", "corner": "#d7263d", "door": "#b5179e", "hallway": "#2a9d8f", "pole": "#f3722c"}
+COLOURS = {"line": "#1d3557", "corner": "#d7263d", "door": "#b5179e", "hallway": "#2a9d8f", "pole": "#f3722c",
+           "reflector": "#ffbe0b"}  # fmt: skip
 # Length of arrows of directions [m].
 _ARROW = 0.5
 
@@ -67,7 +68,7 @@ def _draw_one(ax: Axes, kind: str, pose: tuple[float, float, float], size: float
     x, y, theta = pose
     colour = COLOURS[kind]
     c, s = math.cos(theta), math.sin(theta)
-    if kind == "pole":
+    if kind in ("pole", "reflector"):
         ax.add_patch(Circle((x, y), max(size, 0.03), fill=False, color=colour, linewidth=2.0, zorder=5, label=label))
     elif kind in ("line", "door"):
         # A door's theta is the direction across.
@@ -100,9 +101,14 @@ def draw_landmarks(ax: Axes, landmarks: FeatureMap) -> None:
         rows = landmarks.kind == kind
         if not rows.any():
             continue
+        if kind == "line":
+            ends = landmarks.lines().segments.reshape(-1, 2, 2)
+            for number, (x, y) in enumerate(ends.transpose(0, 2, 1)):
+                ax.plot(x, y, color=colour, lw=1.6, zorder=6, label=kind if number == 0 else None)
+            continue
         x, y, theta = landmarks.pose[rows].T
         ax.plot(x, y, "o", color=colour, ms=5, zorder=8, label=kind)
-        if kind != "pole":
+        if kind not in ("pole", "reflector"):
             for a, b, t in zip(x, y, theta, strict=True):
                 ax.plot([a, a + _ARROW * math.cos(t)], [b, b + _ARROW * math.sin(t)], color=colour, lw=1, zorder=7)
 

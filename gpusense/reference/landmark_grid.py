@@ -12,6 +12,7 @@ import numpy as np
 from gpusense.interface import structs
 from gpusense.interface.feature_layout import AXIS, FARTHEST, HOLE, RADIUS, REACH
 from gpusense.reference.landmarks import at_places, log_detection
+from gpusense.reference.line_feature import facing, log_line, overlaps
 from gpusense.reference.offsets import Quad, offset
 
 # Pairs of a particle and a landmark that are evaluated at once.
@@ -52,9 +53,30 @@ def near(off: Quad, turned: Quad, feature: np.ndarray) -> np.ndarray:
     return seen & (d <= feature[FARTHEST]) & (turned[0] * off[0] + turned[2] * off[2] >= feature[AXIS] * d)
 
 
+def may_match(
+    flags: frozenset[str], off: Quad, turned: Quad, feature: np.ndarray, normal: np.ndarray, signature: np.ndarray,
+    j: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Return whether features may be landmarks j: near their end points, or for lines turned alike and overlapping."""
+    if "LINE" in flags:
+        return overlaps(off, turned, feature, facing(normal[j], signature[j], turned), signature[j])
+    return near(off, turned, feature)
+
+
+def log_match(
+    flags: frozenset[str], off: Quad, turned: Quad, feature: np.ndarray, normal: np.ndarray, signature: np.ndarray,
+    j: np.ndarray, terms: np.ndarray, arcs: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Return ``log(z_detect p(f | j))`` of one feature at the offsets of landmarks j."""
+    if "LINE" in flags:
+        return log_line(off, turned, feature, facing(normal[j], signature[j], turned), signature[j], terms, arcs)
+    return log_detection(flags, off, turned, feature, signature[j], terms, arcs)
+
+
 def search(
     flags: frozenset[str],
     landmark: np.ndarray,
+    normal: np.ndarray,
     signature: np.ndarray,
     start: np.ndarray,
     place: Quad,
@@ -86,11 +108,11 @@ def search(
         j = np.arange(runs.sum()) + np.repeat(runs_first - (np.cumsum(runs) - runs), runs)
         placed, rotated = at_places(place, n), at_places(turned, n)
         off = offset(landmark[j], placed)
-        kept = near(off, rotated, feature)
+        kept = may_match(flags, off, rotated, feature, normal, signature, j)
         n, j = n[kept], j[kept]
         if len(n):
             off, rotated = at_places(off, kept), at_places(rotated, kept)
-            value = log_detection(flags, off, rotated, feature, signature[j], terms, arcs)
+            value = log_match(flags, off, rotated, feature, normal, signature, j, terms, arcs)
             heads = np.flatnonzero(np.append(True, n[1:] != n[:-1]))
             holder, sizes = n[heads], np.diff(np.append(heads, len(n)))
             most = np.maximum.reduceat(value, heads)

@@ -1,25 +1,33 @@
-"""The likeliest joint association of a few features, in which no two features have the same landmark.
+"""The likeliest joint association of a few features, in which no two features of one group have the same landmark.
 
-Features without a landmark are false positives. Landmarks are processed one after the other. A set s of features is a
-bit mask; ``best[s]`` is the largest sum of log p over the features of s when all of them have landmarks that were
-processed. A landmark can add one feature to a set: 2^features * features steps per landmark, and the maximum is exact.
+Features without a landmark are false positives. Points are all of one group; lines that do not overlap are of
+different groups, since one wall may be seen in pieces. Landmarks are processed one after the other. A set s of
+features is a bit mask; ``best[s]`` is the largest sum of log p over the features of s when all of them have landmarks
+that were processed. A landmark can add one feature of each group to a set: 2^features * features steps per landmark
+and group, and the maximum is exact.
 """
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from gpusense.interface import structs
-from gpusense.interface.feature_layout import FALSE_POSITIVE, FEATURE, RADIUS
-from gpusense.reference.landmark_grid import near
-from gpusense.reference.landmarks import direction, log_detection, sensor_place
+from gpusense.interface.feature_layout import FALSE_POSITIVE, FEATURE, GROUP, RADIUS
+from gpusense.reference.landmark_grid import log_match, may_match
+from gpusense.reference.landmarks import direction, sensor_place
 from gpusense.reference.log_terms import either
 from gpusense.reference.offsets import offset
+
+# A landmark's part of a density is larger than the false positive's from twice the latter on.
+LOG_2 = 0.69314718055994531
 
 
 def joint_features(
     flags: frozenset[str],
     landmark: np.ndarray,
+    normal: np.ndarray,
     signature: np.ndarray,
     pose_cell: np.ndarray,
     pose: np.ndarray,
@@ -53,19 +61,21 @@ def joint_features(
     each = value[: particles * sets * features].reshape(particles, sets, features)
     sums[:], partners[:], each[:] = -np.inf, -1, -np.inf
     sums[:, 0] = 0
+    groups = int(numbers[:features, GROUP].max(initial=0)) + 1
     for j in range(landmarks):
         off = offset(landmark[j : j + 1], place)
-        signatures = signature[np.full(particles, j)]
+        same = np.full(particles, j)
         log_each = np.full((features, particles), -np.inf, real)
         for k in range(features):
             if numbers[k, RADIUS] >= 0:
-                detected = log_detection(flags, off, turned[k], numbers[k], signatures, terms, arcs)
+                detected = log_match(flags, off, turned[k], numbers[k], normal, signature, same, terms, arcs)
                 detected = either(detected, numbers[k, FALSE_POSITIVE])
-                log_each[k] = np.where(near(off, turned[k], numbers[k]), detected, -np.inf)
-        # From the full set down, since smaller sets must not yet contain this landmark.
-        for s in range(sets - 1, 0, -1):
+                may = may_match(flags, off, turned[k], numbers[k], normal, signature, same)
+                log_each[k] = np.where(may, detected, -np.inf)
+        # From the full set down, since smaller sets must not yet contain this landmark for the group.
+        for group, s in itertools.product(range(groups), range(sets - 1, 0, -1)):
             for k in range(features):
-                if s >> k & 1:
+                if s >> k & 1 and numbers[k, GROUP] == group:
                     less = s ^ 1 << k
                     joined = sums[:, less] + log_each[k]
                     better = joined > sums[:, s]
@@ -84,6 +94,6 @@ def joint_features(
     if "PER_BEAM" in flags:
         n = np.arange(particles)
         detected, values = partners[n, chosen], each[n, chosen]
-        which[: particles * features] = detected.ravel()
         false = numbers[:features, FALSE_POSITIVE]
+        which[: particles * features] = np.where(values - false >= real.type(LOG_2), detected, -1).ravel()
         parts[: particles * features] = np.where(detected >= 0, values, false).ravel()

@@ -8,8 +8,8 @@ from gpusense.interface import structs
 from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.interface.feature_layout import FALSE_POSITIVE, FEATURE
 from gpusense.reference.error_free import add_term
-from gpusense.reference.landmark_grid import search
-from gpusense.reference.landmarks import direction, log_detection, sensor_place
+from gpusense.reference.landmark_grid import log_match, search
+from gpusense.reference.landmarks import direction, sensor_place
 from gpusense.reference.log_terms import either
 from gpusense.reference.offsets import offset
 
@@ -20,6 +20,7 @@ BLOCK = 1 << 14
 def score_features(
     flags: frozenset[str],
     landmark: np.ndarray,
+    normal: np.ndarray,
     signature: np.ndarray,
     start: np.ndarray,
     pose_cell: np.ndarray,
@@ -50,18 +51,19 @@ def score_features(
         place = sensor_place(pose_cell[part], pose[part], pose_low[part], buckets.size)
         count = len(place[0])
         total = (np.full(count, score.constant_term, pose.dtype), np.zeros(count, pose.dtype))
-        impossible = np.zeros(count, bool)
+        impossible = np.full(count, np.isneginf(score.constant_term))
         for k in range(0, features, BLOCK_TERMS):
             block = np.zeros(count, pose.dtype)
             for i in range(k, min(k + BLOCK_TERMS, features)):
                 one, turned = numbers[i], direction(pose[part], pose_low[part], numbers[i])
                 if "KNOWN" in flags:
                     j = np.full(count, partner[i])
-                    detected = log_detection(flags, offset(landmark[j], place), turned, one, signature[j], terms, arcs)
+                    off = offset(landmark[j], place)
+                    detected = log_match(flags, off, turned, one, normal, signature, j, terms, arcs)
                     best, chosen = detected, j
                 else:
                     detected, best, chosen = search(
-                        flags, landmark, signature, start, place, turned, one, terms, arcs, buckets
+                        flags, landmark, normal, signature, start, place, turned, one, terms, arcs, buckets
                     )
                 value = either(detected + share, one[FALSE_POSITIVE])
                 impossible |= np.isneginf(value)

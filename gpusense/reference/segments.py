@@ -19,8 +19,8 @@ PASSES, STEPS = 2, 5
 POOR = 3.0
 # Rows are parallel up to this.
 PARALLEL = 1e-6
-# Splits that lower the cost equally but for this share of it are tied: the first of them counts.
-TIED = 1e-9
+# Splits that lower the cost equally but for this share of it, more than float32 rounds, are tied: the first counts.
+TIED = 3e-7
 
 
 def middle_of_three(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:

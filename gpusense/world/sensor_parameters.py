@@ -1,4 +1,4 @@
-"""Intrinsic parameters of position, heading, beacon and bumper models: frozen, validated dataclasses."""
+"""Intrinsic parameters of position, heading, beacon, bumper and line models: frozen, validated dataclasses."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from gpusense.world.parameters import _Parameters
 
 # Limit of degrees of freedom: up to it the mass of Student's t is a short sum; beyond it the t is nearly normal.
 MOST_DEGREES = 100
+# Largest standard deviation of the angle of a line [rad]: half a turn is 9 of them.
+LARGEST_ANGLE_DEVIATION = 0.349
 
 
 def check_covariance(name: str, value: object) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -194,3 +196,38 @@ class BumperParameters(_Parameters):
         self._check("p_contact", low=0, high=1)
         self._check("p_false", low=0, high=1)
         self._check("sigma", above=0)
+
+
+@dataclass(frozen=True)
+class LineParameters(_Parameters):
+    """Parameters of the line model. Deviations are those of the map and of the model; features may bring their own.
+
+    Raises:
+        TypeError: A value is not a real number.
+        ValueError: A value breaks its field's rule, or the two weights do not sum to 1 within 1e-6.
+
+    Example:
+        >>> import gpusense as gs
+        >>> gs.LineParameters(sigma_distance=0.1).sigma_angle
+        0.02
+    """
+
+    sigma_angle: float = 0.02
+    """The standard deviation of a line's angle, in (0, 0.349] [rad]."""
+    sigma_distance: float = 0.05
+    """The standard deviation across the line, at the middle of the part that is seen, > 0 [m]."""
+    z_detect: float = 0.9
+    """The weight of a feature that is a line of the map, >= 0 [1]."""
+    z_false: float = 0.1
+    """The weight of a false positive, a feature that is no line of the map, >= 0 [1]."""
+    range_max: float = 20.0
+    """The largest distance of a line from the sensor, > 0 [m]."""
+    p_detect: float = 0.9
+    """The probability that a line in view is detected, in [0, 1] [1]; used for drawn features only."""
+
+    def __post_init__(self) -> None:
+        self._check("sigma_angle", above=0, high=LARGEST_ANGLE_DEVIATION)
+        self._check("sigma_distance", above=0)
+        self._check_weights("z_detect", "z_false")
+        self._check("range_max", above=0)
+        self._check("p_detect", low=0, high=1)

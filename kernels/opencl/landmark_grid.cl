@@ -1,7 +1,7 @@
 // Search for the landmarks near the end point of a feature, book table 6.5. Landmarks lie in square buckets, row by
 // row; start[i] is the first landmark of bucket i. A search visits the buckets that a disc around the feature's end
 // point touches, and evaluates the landmarks within the disc; others have a negligible density.
-// requires: error_free landmarks
+// requires: error_free landmarks line_feature
 
 // A sum of densities is relative to one of them, until another is larger by a factor of e^RELATIVE.
 #define RELATIVE 4
@@ -41,6 +41,26 @@ real squared_reach(const real exponent, global const real *feature) {
     return (real)1.01 * (r * r + z * (z + r) * (b * b)) + feature[SLACK];
 }
 
+// Return whether a feature may be landmark j: near its end point, or for lines turned alike and overlapping.
+int may_match(const real4 off, const real4 turned, global const real *feature, global const real4 *normal,
+              global const real4 *signature, const int j, const real most) {
+#if LINE
+    return overlaps(off, turned, feature, facing(normal[j], signature[j], turned), signature[j]);
+#else
+    return near(off, turned, feature, most);
+#endif
+}
+
+// Return log(z_detect p(f | j)) of one feature at the offset of landmark j.
+real log_match(const real4 off, const real4 turned, global const real *feature, global const real4 *normal,
+               global const real4 *signature, const int j, global const real *terms, global const real2 *arcs) {
+#if LINE
+    return log_line(off, turned, feature, facing(normal[j], signature[j], turned), signature[j], terms, arcs);
+#else
+    return log_detection(off, turned, feature, signature[j], terms, arcs);
+#endif
+}
+
 // Update a match by one more landmark; sum is the sum of densities relative to match.log_p.
 Match with_landmark(Match match, real2 *sum, const real log_p, const int j) {
 #if MARGINAL
@@ -62,9 +82,9 @@ Match with_landmark(Match match, real2 *sum, const real log_p, const int j) {
 }
 
 // Return the match of a feature among the landmarks within its disc.
-Match search(global const real4 *landmark, global const real4 *signature, global const int *start, const real4 place,
-             const real4 turned, global const real *feature, global const real *terms, global const real2 *arcs,
-             const Buckets buckets) {
+Match search(global const real4 *landmark, global const real4 *normal, global const real4 *signature,
+             global const int *start, const real4 place, const real4 turned, global const real *feature,
+             global const real *terms, global const real2 *arcs, const Buckets buckets) {
     Match match = {-INFINITY, -INFINITY, -1};
     real2 sum = 0;
     const real reach = feature[REACH], radius = feature[RADIUS];
@@ -79,10 +99,13 @@ Match search(global const real4 *landmark, global const real4 *signature, global
         const int last = start[row * buckets.cols + right + 1];
         for (int j = start[row * buckets.cols + left]; j < last; ++j) {
             const real4 off = offset(landmark[j], place);
-            if (!near(off, turned, feature, most)) continue;
-            match = with_landmark(match, &sum, log_detection(off, turned, feature, signature[j], terms, arcs), j);
+            if (!may_match(off, turned, feature, normal, signature, j, most)) continue;
+            const real log_p = log_match(off, turned, feature, normal, signature, j, terms, arcs);
+            match = with_landmark(match, &sum, log_p, j);
 #if !MARGINAL
+#if !LINE
             most = squared_reach(feature[MOST] - match.best, feature);
+#endif
 #endif
         }
     }

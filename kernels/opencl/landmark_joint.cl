@@ -1,20 +1,24 @@
-// The likeliest joint association of a few features, in which no two features have the same landmark. Features without
-// a landmark are false positives. Landmarks are processed one after the other. A set s of features is a bit mask;
-// best[s] is the largest sum of log p over the features of s when all of them have landmarks that were processed. A
-// landmark can add one feature to a set: 2^features * features steps per landmark, and the maximum is exact.
+// The likeliest joint association of a few features, in which no two features of one group have the same landmark.
+// Features without a landmark are false positives. Points are all of one group; lines that do not overlap are of
+// different groups, since one wall may be seen in pieces. Landmarks are processed one after the other. A set s of
+// features is a bit mask; best[s] is the largest sum of log p over the features of s when all of them have landmarks
+// that were processed. A landmark can add one feature of each group to a set: 2^features * features steps per landmark
+// and group, and the maximum is exact.
 // requires: error_free landmarks landmark_grid
 
 // Largest number of features.
 #define MOST_FEATURES 8
+// A landmark's part of a density is larger than the false positive's from twice the latter on.
+#define LOG_2 ((real)0.69314718055994531)
 
 // Find the best joint association: one work-item takes a particle. choice[s] has the landmark of each feature of set s,
 // and value[s] its log p; sets is 2^features.
-kernel void joint_features(global const real4 *landmark, global const real4 *signature, global const int2 *pose_cell,
-                           global const real4 *pose, global const real4 *pose_low, global const real *feature,
-                           global const real *terms, global const real2 *arcs, global real *best, global int *choice,
-                           global real *value, global real *log_p, global real *parts, global int *which,
-                           const int landmarks, const int particles, const int features, const int sets,
-                           const Buckets buckets, const Score score) {
+kernel void joint_features(global const real4 *landmark, global const real4 *normal, global const real4 *signature,
+                           global const int2 *pose_cell, global const real4 *pose, global const real4 *pose_low,
+                           global const real *feature, global const real *terms, global const real2 *arcs,
+                           global real *best, global int *choice, global real *value, global real *log_p,
+                           global real *parts, global int *which, const int landmarks, const int particles,
+                           const int features, const int sets, const Buckets buckets, const Score score) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const real4 high = pose[n], low = pose_low[n], place = sensor_place(pose_cell[n], high, low, buckets.size);
@@ -22,6 +26,8 @@ kernel void joint_features(global const real4 *landmark, global const real4 *sig
     global int *who = choice + (long)n * sets * features;
     for (int s = 0; s < sets; ++s) sums[s] = s == 0 ? (real)0 : -INFINITY;
     for (int i = 0; i < sets * features; ++i) who[i] = -1, each[i] = -INFINITY;
+    int groups = 1;
+    for (int k = 0; k < features; ++k) groups = max(groups, (int)feature[FEATURE * k + GROUP] + 1);
     for (int j = 0; j < landmarks; ++j) {
         const real4 off = offset(landmark[j], place);
         real log_each[MOST_FEATURES];
@@ -29,14 +35,15 @@ kernel void joint_features(global const real4 *landmark, global const real4 *sig
             global const real *numbers = feature + FEATURE * k;
             const real4 turned = direction(high, low, numbers);
             log_each[k] = -INFINITY;
-            if (numbers[RADIUS] >= 0 && near(off, turned, numbers, INFINITY))
-                log_each[k] = either(log_detection(off, turned, numbers, signature[j], terms, arcs),
+            if (numbers[RADIUS] >= 0 && may_match(off, turned, numbers, normal, signature, j, INFINITY))
+                log_each[k] = either(log_match(off, turned, numbers, normal, signature, j, terms, arcs),
                                      numbers[FALSE_POSITIVE]);
         }
-        // From the full set down, since smaller sets must not yet contain this landmark.
-        for (int s = sets - 1; s > 0; --s) {
+        // From the full set down, since smaller sets must not yet contain this landmark for the group.
+        for (int step = 0; step < groups * (sets - 1); ++step) {
+            const int group = step / (sets - 1), s = sets - 1 - step % (sets - 1);
             for (int k = 0; k < features; ++k) {
-                if (!(s >> k & 1)) continue;
+                if (!(s >> k & 1) || feature[FEATURE * k + GROUP] != group) continue;
                 const int less = s ^ 1 << k;
                 const real joined = sums[less] + log_each[k];
                 if (!(joined > sums[s])) continue;
@@ -59,10 +66,10 @@ kernel void joint_features(global const real4 *landmark, global const real4 *sig
     log_p[n] = isinf(most) ? most : score.temperature * (score.constant_term + most);
 #if PER_BEAM
     for (int k = 0; k < features; ++k) {
+        const real false_positive = feature[FEATURE * k + FALSE_POSITIVE], log_each = each[chosen * features + k];
         const int j = who[chosen * features + k];
-        which[(long)n * features + k] = j;
-        parts[(long)n * features + k] =
-            j >= 0 ? each[chosen * features + k] : feature[FEATURE * k + FALSE_POSITIVE];
+        which[(long)n * features + k] = log_each - false_positive >= LOG_2 ? j : -1;
+        parts[(long)n * features + k] = j >= 0 ? log_each : false_positive;
     }
 #endif
 }

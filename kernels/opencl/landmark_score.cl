@@ -4,17 +4,17 @@
 // Sum log p over features: with the KNOWN partner, all landmarks (MARGINAL) or the likeliest one. One work-item takes a
 // particle. With PER_BEAM, parts has the term of each feature, and which the index of its likeliest landmark, -1 where
 // a false positive is likelier. With MARGINAL share is log(1 / landmarks), the prior of a landmark, else 0.
-kernel void score_features(global const real4 *landmark, global const real4 *signature, global const int *start,
-                           global const int2 *pose_cell, global const real4 *pose, global const real4 *pose_low,
-                           global const real *feature, global const int *partner, global const real *terms,
-                           global const real2 *arcs, global real *log_p, global real *parts, global int *which,
-                           const Buckets buckets, const int landmarks, const int particles, const int features,
-                           const real share, const Score score) {
+kernel void score_features(global const real4 *landmark, global const real4 *normal, global const real4 *signature,
+                           global const int *start, global const int2 *pose_cell, global const real4 *pose,
+                           global const real4 *pose_low, global const real *feature, global const int *partner,
+                           global const real *terms, global const real2 *arcs, global real *log_p, global real *parts,
+                           global int *which, const Buckets buckets, const int landmarks, const int particles,
+                           const int features, const real share, const Score score) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const real4 high = pose[n], low = pose_low[n], place = sensor_place(pose_cell[n], high, low, buckets.size);
     real2 total = (real2)(score.constant_term, 0);
-    int impossible = 0;
+    int impossible = isinf(score.constant_term);
     for (int first = 0; first < features; first += BLOCK_TERMS) {
         const int last = min(first + BLOCK_TERMS, features);
         real block = 0;
@@ -23,10 +23,12 @@ kernel void score_features(global const real4 *landmark, global const real4 *sig
             const real4 turned = direction(high, low, numbers);
 #if KNOWN
             const int j = partner[k];
-            const real detected = log_detection(offset(landmark[j], place), turned, numbers, signature[j], terms, arcs);
+            const real4 off = offset(landmark[j], place);
+            const real detected = log_match(off, turned, numbers, normal, signature, j, terms, arcs);
             const Match match = {detected, detected, j};
 #else
-            const Match match = search(landmark, signature, start, place, turned, numbers, terms, arcs, buckets);
+            const Match match =
+                search(landmark, normal, signature, start, place, turned, numbers, terms, arcs, buckets);
 #endif
             const real value = either(match.log_p + share, numbers[FALSE_POSITIVE]);
             impossible |= isinf(value);

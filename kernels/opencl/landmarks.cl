@@ -47,7 +47,9 @@
 #define BEARING_SPREAD 25
 #define MOST 26
 #define SLACK 27
-#define FEATURE 28
+// Features of one group have different landmarks in a joint association; features of two groups may share one.
+#define GROUP 28
+#define FEATURE 29
 // Arcs of i / 8, of a quarter and of half a turn, as sums of two numbers, are arcs[0] to arcs[10].
 #define ARC_STEPS 8
 // Below this distance [m] all bearings are equally likely.

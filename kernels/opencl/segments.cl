@@ -14,8 +14,8 @@
 #define POOR ((real)3)
 // Rows are parallel up to this.
 #define PARALLEL ((real)1e-6)
-// Splits that lower the cost equally but for this share of it are tied: the first of them counts.
-#define TIED ((real)1e-9)
+// Splits that lower the cost equally but for this share of it, more than float32 rounds, are tied: the first counts.
+#define TIED ((real)3e-7)
 #define LINE_NUMBERS 6
 
 // The triangular root of rows that were added, the right-hand side, and the cost.

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import error_free, landmarks
+from . import error_free, landmarks, line_feature
 from .landmarks import (
     AXIS,
     BEARING_SPREAD,
@@ -35,7 +35,10 @@ def functions(flags):
     add_term = error_free.functions(flags & {"FLOAT64"}).add_term
     density = landmarks.functions(flags & {"FLOAT64", "RANGE", "BEARING", "SIGNATURE", "FIELD"})
     offset, log_detection = density.offset, density.log_detection
+    lines = line_feature.functions(flags & {"FLOAT64"})
+    facing, overlaps, log_line = lines.facing, lines.overlaps, lines.log_line
     MARGINAL = "MARGINAL" in flags
+    LINE = "LINE" in flags
     ZERO, ONE = real(0.0), real(1.0)
     NEVER = real(-math.inf)
     # A sum of densities is relative to one of them, until another is larger by a factor of e^RELATIVE.
@@ -88,6 +91,46 @@ def functions(flags):
             squared = WIDER * (r * r + z * (z + r) * (b * b)) + feature[base + SLACK]
         return squared
 
+    # Return whether a feature may be landmark j: near its end point, or for lines turned alike and overlapping.
+    @wp.func
+    def may_match(
+        off: vec4,
+        turned: vec4,
+        feature: wp.array(dtype=real),
+        base: wp.int32,
+        normal: wp.array(dtype=vec4),
+        signature: wp.array(dtype=vec4),
+        j: wp.int32,
+        most: real,
+    ):
+        may = bool(False)
+        if LINE:
+            may = overlaps(off, turned, feature, base, facing(normal[j], signature[j], turned), signature[j])
+        else:
+            may = near(off, turned, feature, base, most)
+        return may
+
+    # Return log(z_detect p(f | j)) of one feature at the offset of landmark j.
+    @wp.func
+    def log_match(
+        off: vec4,
+        turned: vec4,
+        feature: wp.array(dtype=real),
+        base: wp.int32,
+        normal: wp.array(dtype=vec4),
+        signature: wp.array(dtype=vec4),
+        j: wp.int32,
+        terms: wp.array(dtype=real),
+        arcs: wp.array(dtype=vec2),
+    ):
+        log_p = real(0.0)
+        if LINE:
+            seen = facing(normal[j], signature[j], turned)
+            log_p = log_line(off, turned, feature, base, seen, signature[j], terms, arcs)
+        else:
+            log_p = log_detection(off, turned, feature, base, signature[j], terms, arcs)
+        return log_p
+
     # Update a match by one more landmark.
     @wp.func
     def with_landmark(match: Match, log_p: real, j: wp.int32):
@@ -109,6 +152,7 @@ def functions(flags):
     @wp.func
     def search(
         landmark: wp.array(dtype=vec4),
+        normal: wp.array(dtype=vec4),
         signature: wp.array(dtype=vec4),
         start: wp.array(dtype=wp.int32),
         place: vec4,
@@ -141,11 +185,10 @@ def functions(flags):
             last = start[row * buckets.cols + right + 1]
             while j < last:
                 off = offset(landmark[j], place)
-                if near(off, turned, feature, base, most):
-                    match = with_landmark(
-                        match, log_detection(off, turned, feature, base, signature[j], terms, arcs), j
-                    )
-                    if not MARGINAL:
+                if may_match(off, turned, feature, base, normal, signature, j, most):
+                    log_p = log_match(off, turned, feature, base, normal, signature, j, terms, arcs)
+                    match = with_landmark(match, log_p, j)
+                    if not MARGINAL and not LINE:
                         most = squared_reach(feature[base + MOST] - match.best, feature, base)
                 j += 1
             row += 1
@@ -156,4 +199,4 @@ def functions(flags):
             match.log_p = match.best
         return match
 
-    return SimpleNamespace(bucket_at=bucket_at, near=near, search=search)
+    return SimpleNamespace(bucket_at=bucket_at, may_match=may_match, log_match=log_match, search=search)

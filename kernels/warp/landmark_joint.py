@@ -1,8 +1,10 @@
-"""The likeliest joint association of a few features, in which no two features have the same landmark.
+"""The likeliest joint association of a few features, in which no two features of one group have the same landmark.
 
-Features without a landmark are false positives. Landmarks are processed one after the other. A set s of features is a
-bit mask; best[s] is the largest sum of log p over the features of s when all of them have landmarks that were
-processed. A landmark can add one feature to a set: 2^features * features steps per landmark, and the maximum is exact.
+Features without a landmark are false positives. Points are all of one group; lines that do not overlap are of
+different groups, since one wall may be seen in pieces. Landmarks are processed one after the other. A set s of
+features is a bit mask; best[s] is the largest sum of log p over the features of s when all of them have landmarks that
+were processed. A landmark can add one feature of each group to a set: 2^features * features steps per landmark and
+group, and the maximum is exact.
 """
 
 import functools
@@ -11,7 +13,7 @@ import math
 import warp as wp
 
 from . import landmark_grid, landmarks
-from .landmarks import FALSE_POSITIVE, FEATURE, RADIUS
+from .landmarks import FALSE_POSITIVE, FEATURE, GROUP, RADIUS
 from .prelude import kernel, precision
 
 
@@ -23,10 +25,13 @@ def make(name, flags):
     shape = flags & {"FLOAT64", "RANGE", "BEARING", "SIGNATURE", "FIELD"}
     density = landmarks.functions(shape)
     sensor_place, direction, offset = density.sensor_place, density.direction, density.offset
-    log_detection, either = density.log_detection, density.either
-    near = landmark_grid.functions(shape).near
+    either = density.either
+    matches = landmark_grid.functions(flags & (shape | {"LINE"}))
+    may_match, log_match = matches.may_match, matches.log_match
     PER_BEAM = "PER_BEAM" in flags
     ZERO, NEVER, EVERYWHERE = real(0.0), real(-math.inf), real(math.inf)
+    # A landmark's part of a density is larger than the false positive's from twice the latter on.
+    LOG_2 = real(0.69314718055994531)
     # Largest number of features.
     LogEach = wp.types.vector(length=8, dtype=real)
 
@@ -35,6 +40,7 @@ def make(name, flags):
     @kernel
     def joint_features(
         landmark: wp.array(dtype=vec4),
+        normal: wp.array(dtype=vec4),
         signature: wp.array(dtype=vec4),
         pose_cell: wp.array(dtype=wp.vec2i),
         pose: wp.array(dtype=vec4),
@@ -72,6 +78,11 @@ def make(name, flags):
             choice[begin + i] = -1
             value[begin + i] = NEVER
             i += 1
+        groups = int(1)
+        k = int(0)
+        while k < features:
+            groups = wp.max(groups, int(feature[FEATURE * k + GROUP]) + 1)
+            k += 1
         log_each = LogEach()
         j = int(0)
         while j < landmarks:
@@ -82,16 +93,18 @@ def make(name, flags):
                 turned = direction(high, low, feature, base)
                 log_each[k] = NEVER
                 if feature[base + RADIUS] >= ZERO:
-                    if near(off, turned, feature, base, EVERYWHERE):
-                        detected = log_detection(off, turned, feature, base, signature[j], terms, arcs)
+                    if may_match(off, turned, feature, base, normal, signature, j, EVERYWHERE):
+                        detected = log_match(off, turned, feature, base, normal, signature, j, terms, arcs)
                         log_each[k] = either(detected, feature[base + FALSE_POSITIVE])
                 k += 1
-            # From the full set down, since smaller sets must not yet contain this landmark.
-            s = sets - 1
-            while s > 0:
+            # From the full set down, since smaller sets must not yet contain this landmark for the group.
+            step = int(0)
+            while step < groups * (sets - 1):
+                group = step // (sets - 1)
+                s = sets - 1 - step % (sets - 1)
                 k = int(0)
                 while k < features:
-                    if ((s >> k) & 1) != 0:
+                    if ((s >> k) & 1) != 0 and int(feature[FEATURE * k + GROUP]) == group:
                         less = s ^ (1 << k)
                         joined = best[sums + less] + log_each[k]
                         if joined > best[sums + s]:
@@ -106,7 +119,7 @@ def make(name, flags):
                                     value[begin + s * features + i] = value[begin + less * features + i]
                                 i += 1
                     k += 1
-                s -= 1
+                step += 1
             j += 1
         most = real(-math.inf)
         chosen = int(0)
@@ -126,11 +139,11 @@ def make(name, flags):
         if PER_BEAM:
             k = int(0)
             while k < features:
+                false_positive = feature[FEATURE * k + FALSE_POSITIVE]
+                each = value[begin + chosen * features + k]
                 j = choice[begin + chosen * features + k]
-                which[n * features + k] = j
-                parts[n * features + k] = wp.where(
-                    j >= 0, value[begin + chosen * features + k], feature[FEATURE * k + FALSE_POSITIVE]
-                )
+                which[n * features + k] = wp.where(each - false_positive >= LOG_2, j, -1)
+                parts[n * features + k] = wp.where(j >= 0, each, false_positive)
                 k += 1
 
     return {"joint_features": joint_features}[name]

@@ -18,8 +18,9 @@ def make(name, flags):
     add_term = error_free.functions(flags & {"FLOAT64"}).add_term
     density = landmarks.functions(flags & {"FLOAT64", "RANGE", "BEARING", "SIGNATURE", "FIELD"})
     sensor_place, direction, offset = density.sensor_place, density.direction, density.offset
-    log_detection, either = density.log_detection, density.either
-    search = landmark_grid.functions(flags - {"KNOWN", "PER_BEAM"}).search
+    either = density.either
+    matches = landmark_grid.functions(flags - {"KNOWN", "PER_BEAM"})
+    search, log_match = matches.search, matches.log_match
     KNOWN = "KNOWN" in flags
     PER_BEAM = "PER_BEAM" in flags
     ZERO, NEVER = real(0.0), real(-math.inf)
@@ -31,6 +32,7 @@ def make(name, flags):
     @kernel
     def score_features(
         landmark: wp.array(dtype=vec4),
+        normal: wp.array(dtype=vec4),
         signature: wp.array(dtype=vec4),
         start: wp.array(dtype=wp.int32),
         pose_cell: wp.array(dtype=wp.vec2i),
@@ -57,7 +59,7 @@ def make(name, flags):
         low = pose_low[n]
         place = sensor_place(pose_cell[n], high, low, buckets.size)
         total = vec2(score.constant_term, ZERO)
-        impossible = bool(False)
+        impossible = bool(wp.isinf(score.constant_term))
         first = int(0)
         while first < features:
             last = wp.min(first + error_free.BLOCK_TERMS, features)
@@ -71,11 +73,12 @@ def make(name, flags):
                 chosen = int(0)
                 if KNOWN:
                     chosen = partner[k]
-                    detected = log_detection(
-                        offset(landmark[chosen], place), turned, feature, base, signature[chosen], terms, arcs
-                    )
+                    off = offset(landmark[chosen], place)
+                    detected = log_match(off, turned, feature, base, normal, signature, chosen, terms, arcs)
                 else:
-                    match = search(landmark, signature, start, place, turned, feature, base, terms, arcs, buckets)
+                    match = search(
+                        landmark, normal, signature, start, place, turned, feature, base, terms, arcs, buckets
+                    )
                     detected = match.log_p
                     best = match.best
                     chosen = match.chosen

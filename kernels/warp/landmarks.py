@@ -40,7 +40,9 @@ FARTHEST, AXIS = wp.constant(22), wp.constant(23)
 # sigma sqrt 2 of range and bearing, infinite for components that were not measured; the log of the largest possible
 # density; and the largest error of squared distances.
 RANGE_SPREAD, BEARING_SPREAD, MOST, SLACK = wp.constant(24), wp.constant(25), wp.constant(26), wp.constant(27)
-FEATURE = wp.constant(28)
+# Features of one group have different landmarks in a joint association; features of two groups may share one.
+GROUP = wp.constant(28)
+FEATURE = wp.constant(29)
 # Arcs of i / 8, of a quarter and of half a turn, as sums of two numbers, are arcs[0] to arcs[10].
 ARC_STEPS = wp.constant(8)
 QUARTER_TURN, HALF_TURN = wp.constant(9), wp.constant(10)
@@ -251,7 +253,10 @@ def functions(flags):
         direction=direction,
         offset=between.offset,
         distance_pair=distance_pair,
+        across=across,
+        along=along,
         angle_pair=angle_pair,
+        add_square=add_square,
         log_detection=log_detection,
         either=log_terms.functions(flags & {"FLOAT64"}).either,
     )

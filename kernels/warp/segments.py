@@ -30,7 +30,7 @@ def functions(flags):
     # A segment whose cost per point is larger is split where that is best, even if one split alone does not pay.
     POOR = real(3.0)
     # Rows are parallel up to this. Splits that lower the cost equally but for a share of it are tied.
-    PARALLEL, TIED, TIED_AT = real(1e-6), real(1e-9), real(1e5)
+    PARALLEL, TIED, TIED_AT = real(1e-6), real(3e-7), real(1e5)
     LAST_STEP = STEPS + 1
 
     # Return the median of three numbers.

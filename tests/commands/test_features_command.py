@@ -79,9 +79,9 @@ def test_landmarks_of_a_map(capsys, tmp_path):
     gs.write_map(gs.OccupancyGrid(cells, resolution=0.05), tmp_path / "map.yaml")
     plot = tmp_path / "map.png"
     text = run(capsys, "--map-in", tmp_path / "map.yaml", "--map-plot", plot)
-    assert text.startswith("FeatureMap(4 corners)") and plot.read_bytes().startswith(b"\x89PNG")
+    assert text.startswith("FeatureMap(4 lines, 4 corners)") and plot.read_bytes().startswith(b"\x89PNG")
     document = json.loads(run(capsys, "--map-in", tmp_path / "map.yaml", "--json"))
-    assert [row["kind"] for row in document["landmarks"]] == ["corner"] * 4
+    assert [row["kind"] for row in document["landmarks"]] == ["line"] * 4 + ["corner"] * 4
 
 
 def test_an_interrupt_keeps_the_results_so_far(capsys, log, monkeypatch):

@@ -58,6 +58,7 @@ COMMANDS: dict[str, tuple[list[str], int, str]] = {
     "likelihood_map": ([*MAP, *LOG, "--out", "OUT/made.png", "--headings", "4"], 2, "of the positions are done"),
     "score": ([*MAP, *LOG, "--particles", "50"], 3, "results of 2 of 6 scans"),
     "match": (LOG, 2, "results of "),
+    "features": ([*LOG, "--map-out", "OUT/made.csv"], 4, "results of 4 of 6 scans"),
     "localize": ([*MAP, *LOG, "--particles", "100", "--tum", "OUT/made.tum"], 4, "results of 3 of 6 scans"),
     "sweep": (["plan.yaml", "--table", "OUT/made.csv", "--device", "numpy"], 4, "made.csv has the finished jobs"),
     "landmarks": (["--folder", ".", "--robot", "1", "--backend", "numpy"], 1, "while localising; the noise of"),
@@ -68,7 +69,7 @@ COMMANDS: dict[str, tuple[list[str], int, str]] = {
              "The best particle by the beam model"),
 }  # fmt: skip
 FILES = {"map": "made.yaml", "likelihood_map": "made.png", "localize": "made.tum", "sweep": "made.csv",
-         "bench": "report.json"}  # fmt: skip
+         "bench": "report.json", "features": "made.csv"}  # fmt: skip
 
 
 def stop_at(monkeypatch: pytest.MonkeyPatch, command: str, number: int, step: int) -> None:
@@ -98,6 +99,7 @@ def test_a_command_that_is_stopped_keeps_its_results(command, number, place, tmp
     arguments, step, kept = COMMANDS[command]
     monkeypatch.chdir(place)
     monkeypatch.setattr("gpusense.commands.map._SCANS", 2)
+    monkeypatch.setattr("gpusense.commands.features._CALL", 2)
     monkeypatch.setattr("gpusense.matching.pose_likelihood._TILE", 3000)
     monkeypatch.setattr("gpusense.evaluation.matching._BATCH", 2)
     stop_at(monkeypatch, command, number, step)

@@ -22,9 +22,10 @@ def test_readings_are_calibrated(name):
 def test_every_model_of_a_density_has_a_scene():
     models = {name for name in dir(gs) if name.endswith("Model") and hasattr(getattr(gs, name), "sample")}
     assert models - {"LikelihoodFieldModel"} == {
-        "BeaconModel", "BeamModel", "BumperModel", "HeadingModel", "LandmarkModel", "PositionModel",
+        "BeaconModel", "BeamModel", "BumperModel", "HeadingModel", "LandmarkModel", "LineModel",
+        "PositionModel",
     }  # fmt: skip
-    assert len(MAKERS) == 17
+    assert len(MAKERS) == 18
 
 
 def test_poses_of_a_narrow_view_see_all_landmarks():

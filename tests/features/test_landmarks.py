@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import gzip
 import math
 
 import numpy as np
@@ -29,6 +30,12 @@ def scans_at(poses: np.ndarray, seed: int, noise: float = 0.02) -> np.ndarray:
     return np.where(ranges < SCANNER.range_max, ranges, np.inf)
 
 
+def feature_map_of(found: gs.FeatureMap, kind: str) -> gs.FeatureMap:
+    """Return the landmarks of one kind."""
+    rows = found.kind == kind
+    return gs.FeatureMap(*(getattr(found, name)[rows] for name in ("kind", "pose", "covariance", "size", "count")))
+
+
 @pytest.fixture(scope="module")
 def surveyed() -> gs.FeatureMap:
     """Return the landmarks of a run with small errors of its poses."""
@@ -53,11 +60,11 @@ def test_landmarks_are_where_corners_and_doors_are(surveyed):
     width = np.abs(FLOOR.doors[:, 2] - FLOOR.doors[:, 0])[apart.argmin(axis=1)]
     np.testing.assert_allclose(surveyed.size[surveyed.kind == "door"], width, atol=0.1)
     assert (surveyed.count >= 2).all()
-    deviation = np.sqrt(np.einsum("mii->mi", surveyed.covariance))
+    deviation = np.sqrt(np.einsum("mii->mi", surveyed.covariance[surveyed.kind != "line"]))
     assert (deviation > 1e-4).all() and (deviation < 0.1).all()
 
 
-@pytest.mark.parametrize("beside", [False, True], ids=["alone", "beside the field"])
+@pytest.mark.parametrize("beside", ["alone", "lines", "field"])
 def test_a_filter_localises_by_features(surveyed, beside):
     """Odometry alone is off by more in the end than the filter ever is in the median."""
     poses = corridor_path(120, aside=0.1)
@@ -68,7 +75,9 @@ def test_a_filter_localises_by_features(surveyed, beside):
     )
     landmarks = gs.LandmarkModel(surveyed.landmarks(), parameters)
     models = [landmarks]
-    if beside:
+    if beside == "lines":
+        models.append(gs.LineModel(surveyed.lines(), gs.LineParameters(range_max=12.0)))
+    if beside == "field":
         grid = gs.build_map(scans_at(poses, 6), poses, SCANNER, resolution=0.05)
         models.append(gs.LikelihoodFieldModel(grid, SCANNER, gs.LikelihoodFieldParameters(sigma_hit=0.07)))
     pf = gs.ParticleFilter(models, particles=1000, seed=0)
@@ -82,13 +91,17 @@ def test_a_filter_localises_by_features(surveyed, beside):
             pf.predict(odometry[-2], odometry[-1])
         readings = features.of_scan(k).range_bearing(("corner", "door", "pole"))
         given = {landmarks: readings} if len(readings) else {}
-        if beside:
-            given[models[1]] = ranges[k]
+        if beside != "alone":
+            given[models[1]] = ranges[k] if beside == "field" else features.of_scan(k).lines()
         if given:
             pf.correct(given)
         errors.append(math.hypot(*(pf.estimate().pose[:2] - pose[:2])))
     alone = gs.compose_poses(poses[0], odometry[-1])
-    assert np.median(errors[20:]) < 0.05 and np.quantile(errors[20:], 0.95) < 0.2 and errors[-1] < 0.1
+    assert (
+        np.median(errors[20:]) < (0.03 if beside == "lines" else 0.05)
+        and np.quantile(errors[20:], 0.95) < 0.2
+        and errors[-1] < 0.1
+    )
     assert math.hypot(*(alone[:2] - poses[-1, :2])) > 4 * np.median(errors[20:])
     assert pf.estimate().verdict == "tracking"
 
@@ -103,11 +116,23 @@ def test_a_map_has_the_corners_that_are_drawn_in_it(backend):
     outer = [(x, y) for x in (3.5, 4.5) for y in (2.0, 3.0)]
     c, s = math.cos(math.radians(30)), math.sin(math.radians(30))
     expected = np.array(inner + outer) @ np.array([[c, s], [-s, c]]) + (10.0, -5.0)
-    assert found.kind.tolist() == ["corner"] * 8
+    assert found.kind.tolist() == ["line"] * 8 + ["corner"] * 8
+    walls = found.lines()
+    found = feature_map_of(found, "corner")
     apart = np.hypot(*np.moveaxis(found.pose[:, None, :2] - expected, 2, 0))
     assert sorted(apart.argmin(axis=1)) == list(range(8)) and apart.min(axis=1).max() < 0.03
     opening = np.where(apart.argmin(axis=1) < 4, math.pi / 2, 1.5 * math.pi)
     np.testing.assert_allclose(found.size, opening, atol=0.05)
+    # Each wall is as long as the room or the block, with its free side on the left.
+    back, turn = (
+        (walls.middles - (10.0, -5.0)) @ np.array([[c, -s], [s, c]]),
+        walls.normals @ np.array([[c, -s], [s, c]]),
+    )
+    rows = [(4, 0.05, 7.9, 0, -1), (4, 4.95, 7.9, 0, 1), (0.05, 2.5, 4.9, -1, 0), (7.95, 2.5, 4.9, 1, 0),
+            (4, 2, 1, 0, 1), (4, 3, 1, 0, -1), (3.5, 2.5, 1, 1, 0), (4.5, 2.5, 1, -1, 0)]  # fmt: skip
+    table = np.column_stack([back, walls.lengths, turn])
+    off = np.abs(table[:, None] - rows).max(axis=2)
+    assert sorted(off.argmin(axis=1)) == list(range(8)) and off.min(axis=1).max() < 0.1
 
 
 @pytest.mark.parametrize("value", [0, 100, -1])
@@ -119,13 +144,68 @@ def test_maps_without_anything_have_no_landmarks(value):
 def test_kinds_are_chosen_and_saved(surveyed, tmp_path):
     doors = surveyed.landmarks("door")
     assert len(doors) == (surveyed.kind == "door").sum() and (doors.signatures // 10 == 2).all()
-    assert len(surveyed.landmarks()) == len(surveyed)
+    points = surveyed.kind != "line"
+    assert len(surveyed.landmarks()) == points.sum() and len(surveyed.lines()) == (~points).sum()
     surveyed.save(tmp_path / "landmarks.csv")
     with open(tmp_path / "landmarks.csv", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [row["kind"] for row in rows] == surveyed.kind.tolist()
     np.testing.assert_array_equal([[float(row["x"]), float(row["y"])] for row in rows], surveyed.pose[:, :2])
-    np.testing.assert_array_equal([float(row["signature"]) for row in rows], surveyed.landmarks().signatures)
+    np.testing.assert_array_equal(
+        [float(row["signature"]) for row in rows if row["kind"] != "line"], surveyed.landmarks().signatures
+    )
+
+
+def test_files_come_back_with_their_bits(surveyed, tmp_path):
+    path = tmp_path / "landmarks.csv"
+    surveyed.save(path)
+    packed = tmp_path / "landmarks.csv.gz"
+    packed.write_bytes(gzip.compress(path.read_bytes()))
+    for file in (path, str(path), packed):
+        again = gs.FeatureMap.load(file)
+        for name in ("kind", "pose", "covariance", "size", "count"):
+            found, expected = getattr(again, name), getattr(surveyed, name)
+            assert found.dtype == expected.dtype
+            np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(again.lines().segments, surveyed.lines().segments)
+    surveyed.save(path)
+    gs.map_features(gs.extract_features(np.ones((0, 540)), SCANNER), np.zeros((0, 3))).save(path)
+    assert len(gs.FeatureMap.load(path)) == 0
+
+
+GOOD = "1.0,2.0,11.5,corner,0.5,1.5,0.01,0.0,0.01,3"
+BAD_FILES = {
+    "empty": ("", 1, "got an empty file"),
+    "another file": ("time,x,y\n1,2,3\n", 1, "must be x,y,signature,kind"),
+    "a short line": ("HEADER\n" + GOOD + "\n1,2,3\n", 3, "must have 10 columns"),
+    "a kind": ("HEADER\n" + GOOD.replace("corner", "hallway"), 2, "kind must be one of line, corner, door, pole"),
+    "words": ("HEADER\n" + GOOD.replace("2.0", "two"), 2, "columns other than kind must be numbers"),
+    "half a count": ("HEADER\n" + GOOD[:-1] + "3.5", 2, "and count a whole number"),
+    "nan": ("HEADER\n" + GOOD.replace("2.0", "nan"), 2, "numbers must be finite"),
+    "far": ("HEADER\n" + GOOD.replace("2.0", "1e10"), 2, "coordinates at most 1e\\+09 m"),
+    "no size": ("HEADER\n" + GOOD.replace("0.5,1.5", "0.5,0.0"), 2, "size must be above 0"),
+    "count": ("HEADER\n" + GOOD[:-1] + "9" * 30, 2, "and count at least 1"),
+    "covariance": ("HEADER\n" + GOOD.replace("0.01,0.0,", "0.01,0.02,"), 2, "covariance must be positive semidefinite"),
+    "bytes": (b"\xff\xfe\x00", 1, "must be x,y,signature,kind"),
+    "a long line": (b"x" * (1 << 24), 1, "must have lines of less than"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_broken_files_are_named(name, surveyed, tmp_path):
+    text, line, words = BAD_FILES[name]
+    surveyed.save(tmp_path / "good.csv")
+    header = (tmp_path / "good.csv").read_text(encoding="utf-8").split("\n")[0]
+    path = tmp_path / "bad.csv"
+    path.write_bytes(text if isinstance(text, bytes) else text.replace("HEADER", header).encode())
+    with pytest.raises(ValueError, match=words) as caught:
+        gs.FeatureMap.load(path)
+    assert str(caught.value).startswith(f"{path}:{line}: ")
+
+
+def test_missing_files_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        gs.FeatureMap.load(tmp_path / "none.csv")
 
 
 def test_features_seen_too_seldom_are_no_landmarks(surveyed):
@@ -143,7 +223,7 @@ def test_features_seen_too_seldom_are_no_landmarks(surveyed):
         ({"features": 3}, TypeError, "features: must be Features"),
         ({"poses": np.zeros((1, 3))}, ValueError, "poses: must have a pose of each of 2 scans, got 1"),
         ({"poses": np.zeros(3)}, ValueError, "poses: shape"),
-        ({"kinds": "line"}, ValueError, "kinds: must be"),
+        ({"kinds": "hallway"}, ValueError, "kinds: must be"),
         ({"least": 0}, ValueError, "least: must be"),
         ({"pose_deviation": (-1.0, 0.0)}, ValueError, "pose_deviation: must be at least 0"),
     ],
@@ -159,7 +239,7 @@ def test_bad_maps_are_named():
     grid = gs.OccupancyGrid(np.zeros((4, 4), np.int8), resolution=0.05)
     for change, error, words in (
         ({"grid": 3}, TypeError, "grid: must be an OccupancyGrid"), ({"spacing": 0}, ValueError, "spacing: must be"),
-        ({"range_max": -1}, ValueError, "range_max: must be"), ({"kinds": "line"}, ValueError, "kinds: must be"),
+        ({"range_max": -1}, ValueError, "range_max: must be"), ({"kinds": "hallway"}, ValueError, "kinds: must be"),
     ):  # fmt: skip
         with pytest.raises(error, match=words):
             gs.landmarks_of_map(**({"grid": grid, "backend": "numpy"} | change))

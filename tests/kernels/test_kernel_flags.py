@@ -80,6 +80,8 @@ TRACES = [
     ("score_features", "BEARING", (), r"\bangle_pair\(", r"angle_pair_\d+\("),
     ("score_features", "SIGNATURE", (), r"\bSIGNATURE_AT\]", r"pair_product_\d+\("),
     ("score_features", "FIELD", ("BEARING",), r"\bfield_mass\(", r"field_mass_\d+\("),
+    ("score_features", "LINE", ("RANGE", "BEARING"), r"\boverlaps\(", r"overlaps_\d+\("),
+    ("joint_features", "LINE", ("RANGE", "BEARING"), r"\blog_line\(", r"log_line_\d+\("),
     ("score_features", "KNOWN", ("RANGE",), r"= partner\[k\]", r"address\(var_partner\b"),
     ("score_features", "MARGINAL", ("RANGE",), r"\badd_term\(\*sum", r"(?:\bwp::exp\([\s\S]*){2}"),
     ("score_features", "PER_BEAM", ("RANGE",), r"\bparts\[", r"array_store\(var_parts\b"),

@@ -50,6 +50,16 @@ compare(lambda b, p: gs.LandmarkModel(landmarks, every, backend=b, precision=p),
         lambda model: model.log_likelihood(poses, features, known))
 compare(lambda b, p: gs.LandmarkModel(gs.LandmarkMap([], []), every, backend=b, precision=p),
         lambda model: model.log_likelihood(poses, features))
+walls = gs.LineMap(np.hstack([xy, xy + rng.uniform(0.5, 3, (40, 2))]), rng.random(40) < 0.5)
+seen = np.column_stack([rng.uniform(-3, 3, 4), rng.uniform(0, 8, 4), [-1, -2, 0, 1], [1, 2, 3, 2]])
+for options, precision in (({}, "float32"), (dict(association="sum"), "float64"),
+                           (dict(association="joint"), "float32")):
+    def make(b, p, options=options):
+        return gs.LineModel(walls, backend=b, precision=p, **options)
+    compare(make, lambda model: model.associate(poses, seen)[1], precision)
+    compare(make, lambda model: model.log_likelihood(poses, seen, known), precision)
+compare(lambda b, p: gs.LineModel(gs.LineMap([]), backend=b, precision=p),
+        lambda model: model.log_likelihood(poses, seen))
 if BACKEND.startswith("opencl"):
     # Vector bodies, which only processors ask for: full and partial groups of lanes.
     device = get_backend(BACKEND)

@@ -148,21 +148,25 @@ def test_a_bag_without_transforms_names_the_mount_that_is_assumed(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    "name, options, count, beams, mount",
+    "name, options, count, beams, mount, light",
     [
-        ("olin_mac_bag/macfirst_floor_take_2", {}, 357, 720, (0.00393584, 0, math.pi / 2)),
-        ("neato_ros1_bag/middle.bag", {}, 185, 360, (-0.1016, 0, -3.14159)),
+        ("olin_mac_bag/macfirst_floor_take_2", {}, 357, 720, (0.00393584, 0, math.pi / 2), True),
+        ("neato_ros1_bag/middle.bag", {}, 185, 360, (-0.1016, 0, -3.14159), False),
         ("jarvis_lab/jarvis_complex_path_fast.bag", {"topic": "/driver_laser_security/laser_scan"}, 619, 761,
-         (0.895, 0, 0)),
-        ("lidar_wall/g2_0.5m.mcap", {"mount": (0, 0, 0)}, 289, 1440, (0, 0, 0)),
+         (0.895, 0, 0), False),
+        ("lidar_wall/g2_0.5m.mcap", {"mount": (0, 0, 0)}, 289, 1440, (0, 0, 0), False),
     ],
 )  # fmt: skip
-def test_recorded_bags(data_dir: Path, name: str, options: Any, count: int, beams: int, mount: Any) -> None:
+def test_recorded_bags(
+    data_dir: Path, name: str, options: Any, count: int, beams: int, mount: Any, light: bool
+) -> None:
     scans = list(gs.read_log(data_dir / name, **options))
     assert len(scans) == count and {scan.scanner.count for scan in scans} == {beams}
     assert len({id(scan.scanner) for scan in scans}) == 1
     np.testing.assert_allclose(scans[0].scanner.mount, mount, atol=1e-6)
     assert gs.check_mount(scans) is None
+    # Intensities that are all 0 are none.
+    assert (scans[0].intensities is not None) == light
 
 
 def test_a_wrong_mount_contradicts_the_data(data_dir: Path) -> None:

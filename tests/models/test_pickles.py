@@ -47,6 +47,14 @@ def landmarks(backend: str) -> gs.LandmarkModel:
     )  # fmt: skip
 
 
+def lines(backend: str) -> gs.LineModel:
+    walls = gs.LineMap([(0, 3, 3, 3), (3, 0, 3, 3), (0, 3.1, 1, 3.1)], [True, False, False])
+    return gs.LineModel(
+        walls, gs.LineParameters(z_false=0.2, z_detect=0.8), backend=backend, association="joint",
+        mount=(0.1, 0.2, 0.3), temperature=0.5, specialize=False,
+    )  # fmt: skip
+
+
 def caster(backend: str) -> gs.RayCaster:
     return gs.RayCaster(GRID, 4.0, caster="dda", backend=backend, outside="occupied", unknown="occupied")
 
@@ -54,6 +62,7 @@ def caster(backend: str) -> gs.RayCaster:
 CASES: dict[str, tuple[Any, Any]] = {
     **{name: (make, lambda model: model.log_likelihood(POSES, RANGES)) for name, make in SCANS.items()},
     "landmarks": (landmarks, lambda model: model.log_likelihood(POSES, [(1.0, 0.2), (2.0, -0.4)])),
+    "lines": (lines, lambda model: model.log_likelihood(POSES, [(1.2, 1.5, -1, 1), (0.1, 2.0, 0, 1)])),
     "caster": (caster, lambda model: model.cast(POSES, SCANNER.bearings)),
 }
 for _name in absolute_models("numpy"):

@@ -29,6 +29,7 @@ CASES = [
         gs.LandmarkModel(gs.LandmarkMap([(0, 0), (1, 1)]), association="sum", backend="numpy"),
         f"LandmarkModel(landmarks=2, association='sum', {END}",
     ),
+    (gs.LineModel(gs.LineMap([(0, 0, 1, 1)]), backend="numpy"), f"LineModel(lines=1, association='nearest', {END}"),
     (gs.PositionModel(gs.PositionParameters(sigma=2.0), backend="numpy"), f"PositionModel({END}"),
     (gs.HeadingModel(backend="numpy"), f"HeadingModel(kind='wrapped_normal', {END}"),
     (gs.BeaconModel([(0, 0), (1, 1), (2, 0)], backend="numpy"), f"BeaconModel(beacons=3, kind='normal', {END}"),

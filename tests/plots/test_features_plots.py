@@ -33,4 +33,7 @@ def test_landmarks_are_drawn_where_they_are():
     landmarks = gs.landmarks_of_map(grid, backend="numpy")
     (ax,) = gs.plots.landmarks_figure(landmarks, grid).axes
     (dots,) = [line for line in ax.lines if line.get_label() == "corner"]
-    np.testing.assert_allclose(np.column_stack(dots.get_data()), landmarks.pose[:, :2])
+    np.testing.assert_allclose(np.column_stack(dots.get_data()), landmarks.landmarks("corner").xy)
+    drawn = [np.column_stack(line.get_data()).ravel() for line in ax.lines if len(line.get_xdata()) == 2]
+    for wall in landmarks.lines().segments:
+        assert any(np.array_equal(wall, one) for one in drawn)

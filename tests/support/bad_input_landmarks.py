@@ -37,7 +37,96 @@ ABOVE = "{}: must be finite and > 0, got {}".format
 ASSOCIATION = "association: must be one of 'nearest', 'sum', 'joint', got {}".format
 INDICES = "correspondence: indices must be in [-1, 2), got {} at index {}".format
 
+LINES = gs.LineMap([(0, 0, 1, 0), (0, 1, 1, 1)])
+LINE_MODEL = gs.LineModel(LINES, backend="numpy")
+
+
+def line_map(segments: object, two_sided: object = True) -> Callable[[], object]:
+    return lambda: gs.LineMap(segments, two_sided)  # type: ignore[arg-type]
+
+
+def line_score(features: object, **known: object) -> Callable[[], object]:
+    return lambda: LINE_MODEL.log_likelihood([(0, 0, 0)], features, **known)  # type: ignore[arg-type]
+
+
+LINE_SHAPE = "features: shape must be (F, 2), (F, 4) or (F, 7), got {}".format
+LINE_CASES: list[tuple[str, Callable[[], object], type[Exception], str]] = [
+    ("lines-flat", line_map([0, 0, 1, 0]), ValueError, "segments: shape must be (M, 4), got (4,)"),
+    (
+        "lines-nan",
+        line_map([[0, 0, 1, NAN]]),
+        ValueError,
+        "segments: every value must be finite, got nan at index (0, 3)",
+    ),
+    (
+        "lines-point",
+        line_map([[0, 0, 1, 0], [1, 2, 1, 2]]),
+        ValueError,
+        "segments: length must be above 0 and finite, got [1.0, 2.0, 1.0, 2.0] at index 1",
+    ),
+    (
+        "lines-endless",
+        line_map([[-1e308, 0, 1e308, 0]]),
+        ValueError,
+        "segments: length must be above 0 and finite, got [-1e+308, 0.0, 1e+308, 0.0] at index 0",
+    ),
+    ("lines-sides", line_map([[0, 0, 1, 0]], 1), TypeError, "two_sided: must hold bools, got 1"),
+    (
+        "lines-many-sides",
+        line_map([[0, 0, 1, 0]], [True, False]),
+        ValueError,
+        "two_sided: shape must be () or (1,), got (2,)",
+    ),
+    (
+        "line-angle",
+        lambda: gs.LineParameters(sigma_angle=0.4),
+        ValueError,
+        "sigma_angle: must be finite and > 0 and <= 0.349, got 0.4",
+    ),
+    (
+        "line-weights",
+        lambda: gs.LineParameters(z_false=0.2),
+        ValueError,
+        "z_detect + z_false: must be 1 within 1e-06, got 1.1",
+    ),
+    (
+        "line-model-map",
+        lambda: gs.LineModel([[0, 0, 1, 0]], backend="numpy"),
+        TypeError,  # type: ignore[arg-type]
+        "lines: must be a LineMap, got [[0, 0, 1, 0]]",
+    ),
+    (
+        "line-model-parameters",
+        lambda: gs.LineModel(LINES, {"z_detect": 1}, backend="numpy"),
+        TypeError,  # type: ignore[arg-type]
+        "parameters: must be LineParameters, got {'z_detect': 1}",
+    ),
+    (
+        "line-model-scale",
+        lambda: gs.LineModel(LINES, gs.LineParameters(sigma_distance=1e13), backend="numpy"),
+        ValueError,
+        "sigma_distance: must be >= 1e-12 and <= 1e12 in float32, got 10000000000000.0",
+    ),
+    (
+        "line-model-many",
+        lambda: gs.LineModel(gs.LineMap(np.tile([0, 0, 1, 0], (1025, 1))), backend="numpy", association="joint"),
+        ValueError,
+        "lines: must be at most 1024 with association='joint', got 1025",
+    ),
+    ("line-features-flat", line_score([0.0, 1.0]), ValueError, LINE_SHAPE("(2,)")),
+    ("line-features-three", line_score([[0.0, 1.0, 0.0]]), ValueError, LINE_SHAPE("(1, 3)")),
+    ("line-features-words", line_score([["a", "b"]]), TypeError, "features: must hold real numbers, got dtype <U1"),
+    (
+        "line-covariance",
+        line_score([[0, 1, 0, 1, 0.1, 0.2, 0.1]]),
+        ValueError,
+        "features: covariance must be positive semidefinite, got [0.1, 0.2, 0.1] at index 0",
+    ),
+    ("line-known", line_score([[0, 1]], correspondence=[2]), ValueError, INDICES(2, 0)),
+]
+
 CASES: list[tuple[str, Callable[[], object], type[Exception], str]] = [
+    *LINE_CASES,
     ("map-flat", lambda: gs.LandmarkMap([1.0, 2.0]), ValueError, "xy: shape must be (M, 2), got (2,)"),
     ("map-3d", lambda: gs.LandmarkMap([[1, 2, 3]]), ValueError, "xy: shape must be (M, 2), got (1, 3)"),
     ("map-none", lambda: gs.LandmarkMap(None), TypeError, "xy: must hold real numbers, got dtype object"),

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from gpusense.interface.signatures.rows import PLACED, WINDOW, Kernel, kernel
 
-_LANDMARKS = ("real4 landmark [landmarks]", "real4 signature [landmarks]")
+_LANDMARKS = ("real4 landmark [landmarks]", "real4 normal [landmarks]", "real4 signature [landmarks]")
 _BUCKETS = "int start [buckets.rows * buckets.cols + 1]"
-_FEATURES = ("real feature [28 * features]",)
+_FEATURES = ("real feature [29 * features]",)
 _MIXTURE = ("real terms [4]", "real2 arcs [11]")
 _FEATURE_RESULT = (
     "out real log_p [particles]", "out real parts [particles * features]", "out int which [particles * features]",

@@ -35,12 +35,12 @@ def _read(features: object, p: LandmarkParameters) -> np.ndarray:
     return full
 
 
-def look_at_feature_bearings(features: object) -> bool:
-    """Warn of bearings of (F, 2) or (F, 3) features that cannot be meant; return whether there were any."""
+def look_at_feature_angles(features: object, column: int, name: str) -> bool:
+    """Warn of angles in a column of features that cannot be meant; return whether there were any."""
     values = np.asarray(features, np.float64)
-    bearings = values[:, 1][np.isfinite(values[:, 1])] if values.ndim == 2 else np.zeros(0)
-    look_at_bearings("features: bearings", bearings)
-    return bool(bearings.size)
+    angles = values[:, column][np.isfinite(values[:, column])] if values.ndim == 2 else np.zeros(0)
+    look_at_bearings(name, angles)
+    return bool(angles.size)
 
 
 def _impossible(full: np.ndarray, p: LandmarkParameters, span: tuple[float, float]) -> np.ndarray:

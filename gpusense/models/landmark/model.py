@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import Any, cast
 
@@ -11,42 +10,32 @@ from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray, Association, Precision
-from gpusense.backends import Selection, arrays
+from gpusense.backends import Selection
 from gpusense.backends.base import Buffer
 from gpusense.interface.flags import flags_if
-from gpusense.interface.lanes import widened
-from gpusense.interface.launches import Launch, Program, launch
+from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission
-from gpusense.interface.structs import Buckets, Score, SensorView
+from gpusense.interface.structs import Buckets, SensorView
 from gpusense.interface.terms import log_weight
-from gpusense.models.landmark.call import Call, known_features
+from gpusense.models.landmark.base import FeatureModel
 from gpusense.models.landmark.features import (
     PreparedFeatures,
     check_correspondence,
-    look_at_feature_bearings,
+    look_at_feature_angles,
     possible_features,
     prepare_features,
 )
-from gpusense.models.landmark.plan import feature_omissions, looked_at, parameter_omissions
+from gpusense.models.landmark.plan import parameter_omissions
 from gpusense.models.landmark.sampling import draw_features
 from gpusense.models.landmark.sensor import describe, full_circle
 from gpusense.models.landmark.tables import upload_tables
-from gpusense.models.point.base import PointModel
 from gpusense.models.point.sampling import draws_at
-from gpusense.models.poses import Frame, Part, PlacedPoses, Poses, place
+from gpusense.models.poses import PlacedPoses
 from gpusense.world.landmarks import LandmarkMap, make_buckets
 from gpusense.world.parameters import LandmarkParameters
-from gpusense.world.windows import Window
-
-# Limits of the joint association: 2^features sets, and every landmark is tried with each of them.
-JOINT_FEATURES = 8
-JOINT_LANDMARKS = 1024
-_INT = np.dtype(np.int32)
-# Landmarks of a launch that cost what a reading of a scan does.
-_PER_READING = 8
 
 
-class LandmarkModel(PointModel):
+class LandmarkModel(FeatureModel):
     """log p(f | x, m) of the features that a sensor detects, by the landmarks that they may belong to.
 
     Each feature adds ``log(z_detect p(f | j) + z_false p_uniform(f))``; docs/landmarks.md defines both
@@ -102,22 +91,24 @@ class LandmarkModel(PointModel):
         p = self.parameters
         if p.sigma_signature is not None and landmarks.signatures is None:
             raise ValueError(f"sigma_signature: must be None for a map without signatures, got {p.sigma_signature}")
-        self.association = checks.choice("association", association, ("nearest", "sum", "joint"))
-        self.negative, self._specialize = checks.boolean("negative", negative), checks.boolean("specialize", specialize)
-        if negative and self.association == "sum":
+        self.negative = checks.boolean("negative", negative)
+        if negative and checks.choice("association", association, ("nearest", "sum", "joint")) == "sum":
             raise ValueError("association: must be 'nearest' or 'joint' with negative=True, got 'sum'")
-        if self.association == "joint" and len(landmarks) > JOINT_LANDMARKS:
-            got = len(landmarks)
-            raise ValueError(f"landmarks: must be at most {JOINT_LANDMARKS} with association='joint', got {got}")
-        x, y, yaw = (float(value) for value in checks.array("mount", mount, (3,)))
-        self.mount = (x, y, yaw)
-        super().__init__(backend, precision, temperature)
+        super().__init__(
+            "landmarks", len(landmarks), backend, precision, association=association, mount=mount,
+            temperature=temperature, specialize=specialize,
+        )  # fmt: skip
         self._sensor, self._seen = describe(p, landmarks), False
         tiny, most = np.finfo(self._real).tiny, np.finfo(self._real).max
         if any(scale and not tiny <= scale <= most for scale in self._sensor.scales):
             raise ValueError(f"parameters: deviations must fit {self._real.name}, got {p}")
         self._buckets = make_buckets(landmarks)
         self._tables = upload_tables(self._backend, self._real, landmarks, self._buckets, p, self._sensor)
+
+    @property
+    def corners(self) -> np.ndarray:
+        """(M, 2) positions of the landmarks [m], whose box holds the map."""
+        return self.landmarks.xy
 
     def log_likelihood(
         self, poses: AnyArray, features: ArrayLike, correspondence: ArrayLike | None = None, *, out: Any = None
@@ -143,25 +134,6 @@ class LandmarkModel(PointModel):
                 features for a joint association.
         """
         return cast(np.ndarray, self._evaluate(poses, features, correspondence, out=out)[0])
-
-    def associate(self, poses: AnyArray, features: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Return the landmark of each feature, for each particle.
-
-        With ``association="sum"`` this is the landmark with the largest part of the sum.
-
-        Args:
-            poses: (N, 3) robot poses in the world [m, m, rad], as in ``log_likelihood``.
-            features: (F, 2) or (F, 3), as in ``log_likelihood``.
-
-        Returns:
-            (N, F) int32 indices in the map, -1 where a false positive is likelier or a feature is left out, and (N, F)
-            terms of the features in the log-likelihood, before the temperature; always NumPy arrays.
-
-        Raises:
-            TypeError, ValueError: as ``log_likelihood``.
-        """
-        _, which, parts = self._evaluate(poses, features, None, each=True)
-        return which, parts
 
     def _arguments(self) -> dict[str, Any]:
         own = dict(landmarks=self.landmarks, association=self.association, negative=self.negative, mount=self.mount)
@@ -215,132 +187,35 @@ class LandmarkModel(PointModel):
         omissions = parameter_omissions(self.parameters, self.negative, self.mount, self.precision)
         return f"landmark model, {self.association}", omissions
 
+    def _read(self, features: object) -> tuple[np.ndarray, np.ndarray]:
+        full, impossible = possible_features(features, self.parameters, self._sensor.span)
+        if not self._seen:
+            self._seen = look_at_feature_angles(features, 1, "features: bearings")
+        return full, impossible
+
+    def _numbers(self, full: np.ndarray, known: bool) -> PreparedFeatures:
+        return prepare_features(
+            full, self.parameters, self._sensor, self.mount, self._real,
+            extent=max(self._buckets.shape) * self._buckets.resolution, norm=self._tables.norm,
+            gated=self._specialize and not known,
+        )  # fmt: skip
+
     def _code(self, prepared: PreparedFeatures, known: bool, each: bool) -> frozenset[str]:
-        """Return the flags of the kernels."""
         with_range, with_bearing, with_signature = np.any(prepared.measured, axis=0) | (not self._specialize)
         return self._flags | flags_if(
             RANGE=with_range, BEARING=with_bearing, SIGNATURE=with_signature, FIELD=not full_circle(self.parameters),
             KNOWN=known, MARGINAL=not known and self.association == "sum", PER_BEAM=each,
         )  # fmt: skip
 
-    def _prepare(self, full: np.ndarray, correspondence: object, each: bool) -> Call:
-        """Return the values of (F, 3) possible features that all particles share."""
-        known = correspondence is not None
-        prepared = prepare_features(
-            full, self.parameters, self._sensor, self.mount, self._real,
-            extent=max(self._buckets.shape) * self._buckets.resolution, norm=self._tables.norm,
-            gated=self._specialize and not known,
-        )  # fmt: skip
-        fixed, places = 0.0, np.zeros(0, _INT)
-        joint = not known and self.association == "joint"
-        if known:
-            partner = check_correspondence(correspondence, len(full), len(self.landmarks))[prepared.columns]
-            prepared, places, fixed = known_features(prepared, partner, self._buckets)
-        elif joint and len(prepared.columns) > JOINT_FEATURES:
-            got = len(prepared.columns)
-            raise ValueError(f"features: must be at most {JOINT_FEATURES} with association='joint', got {got}")
-        return Call(prepared, places, fixed, self._code(prepared, known, each or self.negative), joint)
+    def _needs_partners(self) -> bool:
+        return self.negative
 
-    def _evaluate(
-        self, poses: object, features: object, correspondence: object, *, each: bool = False, out: Any = None
-    ) -> tuple[Any, np.ndarray, np.ndarray]:
-        """Return log p of each particle, and with ``each`` the (N, F) landmarks and terms of the features."""
-        host = arrays.copied_to_host(features, self._backend, "features")
-        full, impossible = possible_features(host, self.parameters, self._sensor.span)
-        if not self._seen:
-            self._seen = look_at_feature_bearings(host)
-        call = self._prepare(full, correspondence, each)
-        known = correspondence is not None
-        left_out = feature_omissions(
-            call.prepared, self._buckets, total=len(full), impossible=int(impossible.sum()), known=known
-        )
-        # Keyed by the first particle of a piece, since a piece that does not fit into memory is tried again in halves.
-        empty = np.empty((0, len(full)))
-        pieces = {-1: (empty.astype(_INT), empty.astype(self._real))}
-
-        def after(part: Part) -> None:
-            if each:
-                pieces[part[0]] = self._download(call, part[1] - part[0], len(full))
-
-        items, itemsize = self._cost(call, known)
-        log_p = self._score(
-            poses, out, functools.partial(self._program, call), left_out, items=items, itemsize=itemsize, after=after
-        )
-        which, added = zip(*(pieces[first] for first in sorted(pieces)), strict=True)
-        return log_p, np.concatenate(which), np.concatenate(added)
-
-    def _cost(self, call: Call, known: bool) -> tuple[int, float]:
-        """Return the cost of a particle, in readings of a scan, and the bytes that it keeps for each."""
-        looked = 1.0 if known else len(self.landmarks) if call.joint else looked_at(call.prepared, self._buckets)
-        work, kept = max(call.count, 1) * (1 + looked / _PER_READING), 0.0
-        if call.joint:
-            work, kept = work * (1 << call.count), (1 << call.count) * (1 + 2.0 * call.count)
-        elif "PER_BEAM" in call.flags:
-            kept = 2.0 * call.count
-        work = min(work, 1e9)
-        return math.ceil(work), self._real.itemsize * kept / work
-
-    def _program(self, call: Call, poses: Poses, part: Part, log_p: Buffer) -> Program:
-        """Return the launches that score some poses into a buffer."""
-        space, real, features = self._workspace, self._real, call.count
-        frame = Frame(Window(0, 0, *self._buckets.shape), self._buckets, self.mount)
-        placed = place(poses, part, frame, self._backend, space, real, careful=True)
-        numbers, count = call.prepared.numbers, placed.count
-        result = self._results(call, count)
-        common = dict(
-            landmark=self._tables.landmark, signature=self._tables.signature, pose_cell=placed.cell, pose=placed.pose,
-            pose_low=placed.low, terms=self._tables.terms, arcs=self._tables.arcs, log_p=log_p, **result,
-            feature=space.upload("feature", np.resize(numbers, (max(features, 1), numbers.shape[1]))),
-            landmarks=len(self.landmarks), particles=count, features=features,
-            buckets=Buckets(*self._buckets.shape, self._buckets.resolution),
-            score=Score(call.fixed, self.temperature),
-        )  # fmt: skip
-        score = (self._joint_launch if call.joint else self._each_launch)(call, common)
-        unseen = (self._unseen_launch(placed, result["which"], log_p, features),) if self.negative else ()
-        return (*placed.launches(), score, *unseen)
-
-    def _results(self, call: Call, count: int) -> dict[str, Buffer]:
-        """Return the buffers of the log-likelihoods of features, and of their landmarks."""
-        size = count * call.count if "PER_BEAM" in call.flags else 1
-        space = self._workspace
-        return dict(parts=space.empty("parts", size, self._real), which=space.empty("which", size, _INT))
-
-    def _download(self, call: Call, count: int, features: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return (n, F) landmarks in the map and log-likelihoods; -1 and 0 for features that are not evaluated."""
-        which, added = np.full((count, features), -1, _INT), np.zeros((count, features), self._real)
-        if call.count:
-            result = self._results(call, count)
-            place = self._backend.download(result["which"], np.empty((count, call.count), _INT))
-            index = self._buckets.index[place] if len(self.landmarks) else -1
-            which[:, call.prepared.columns] = np.where(place >= 0, index, -1)
-            parts = self._backend.download(result["parts"], np.empty((count, call.count), self._real))
-            added[:, call.prepared.columns] = parts
-        return which, added
-
-    def _each_launch(self, call: Call, common: dict[str, Any]) -> Launch:
-        """Return the launch in which each feature chooses its landmark, or sums over them, independently."""
-        landmarks = len(self.landmarks)
-        prior = -math.log(landmarks) if "MARGINAL" in call.flags and landmarks else 0.0
-        partner = self._workspace.upload("partner", np.append(call.places, np.int32(0)).astype(_INT))
-        flags = widened(self._backend.info.lanes, "score_features", call.flags)
-        return launch(
-            "score_features", flags, (common["particles"],), **common, start=self._tables.start, partner=partner,
-            share=prior,
-        )  # fmt: skip
-
-    def _joint_launch(self, call: Call, common: dict[str, Any]) -> Launch:
-        """Return the launch that finds the likeliest joint assignment."""
-        space, sets, count = self._workspace, 1 << call.count, common["particles"]
-        return launch(
-            "joint_features", call.flags, (count,), **common, best=space.empty("best", count * sets, self._real),
-            choice=space.empty("choice", count * sets * call.count, _INT),
-            value=space.empty("value", count * sets * call.count, self._real), sets=sets,
-        )  # fmt: skip
-
-    def _unseen_launch(self, placed: PlacedPoses, which: Buffer, log_p: Buffer, features: int) -> Launch:
+    def _after(self, placed: PlacedPoses, which: Buffer, log_p: Buffer, features: int) -> Program:
         """Return the launch that adds the landmarks in view without a feature."""
+        if not self.negative:
+            return ()
         p = self.parameters
-        return launch(
+        return (launch(
             "count_unseen", self._flags, (placed.count,), landmark=self._tables.landmark, start=self._tables.start,
             pose_cell=placed.cell, pose=placed.pose, pose_low=placed.low, which=which, log_p=log_p,
             buckets=Buckets(*self._buckets.shape, self._buckets.resolution), particles=placed.count, features=features,
@@ -349,4 +224,4 @@ class LandmarkModel(PointModel):
                 -2.0 if full_circle(p) else math.cos(p.field_of_view / 2),
                 self.temperature * log_weight(1 - p.p_detect),
             ),
-        )  # fmt: skip
+        ),)  # fmt: skip

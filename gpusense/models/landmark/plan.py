@@ -35,6 +35,12 @@ def parameter_omissions(p: LandmarkParameters, negative: bool, mount: Mount, pre
         omissions.append(Omission("mass in the field of view", "it is a full circle", "2 erf or more per landmark"))
     if not negative:
         omissions.append(Omission("negative information", "negative=False", "a look at all landmarks in view"))
+    return omissions + common_omissions(mount, precision)
+
+
+def common_omissions(mount: Mount, precision: str) -> list[Omission]:
+    """Return the omissions of every call, of landmarks and of lines."""
+    omissions = []
     if mount[:2] == (0.0, 0.0):
         omissions.append(Omission("mount", "the sensor sits at the robot's origin", "a rotation per particle"))
     if precision == "float32":
@@ -44,13 +50,14 @@ def parameter_omissions(p: LandmarkParameters, negative: bool, mount: Mount, pre
 
 
 def feature_omissions(
-    prepared: PreparedFeatures, buckets: Buckets, *, total: int, impossible: int, known: bool
+    prepared: PreparedFeatures, buckets: Buckets, *, name: str, total: int, impossible: int, known: bool
 ) -> list[Omission]:
     """Return the omissions by the features of a call.
 
     Args:
         prepared: Features that are evaluated.
         buckets: The map.
+        name: "landmarks" or "lines".
         total: Number of features of the call.
         impossible: Number of features that the sensor cannot have measured.
         known: Whether the correspondences are known.
@@ -64,10 +71,10 @@ def feature_omissions(
         if number:
             omissions.append(Omission(what, f"{number} of {total} features {why}", f"{share(number, total)} of them"))
     if known:
-        omissions.append(Omission("search", "correspondences are known", f"{count - 1} of {count} landmarks"))
+        omissions.append(Omission("search", "correspondences are known", f"{count - 1} of {count} {name}"))
     elif len(prepared.columns) and np.isfinite(prepared.radius).any():
         spared = count - looked_at(prepared, buckets)
         if spared >= 0.5:
             why = f"beyond {prepared.radius.max():.3g} m of where features point densities are below eps of the rest"
-            omissions.append(Omission("far landmarks", why, f"about {share(spared, count)} of {count} landmarks"))
+            omissions.append(Omission(f"far {name}", why, f"about {share(spared, count)} of {count} {name}"))
     return omissions

@@ -22,7 +22,9 @@ class LandmarkTables:
 
     Attributes:
         landmark: (M,) real4 positions in the buckets' frame, by place, and their rounding errors (low parts).
-        signature: (M,) real4 signatures, their rounding errors (low parts), and -log of their mass on the span.
+        normal: (M,) real4 normals of lines, x and y, each with its rounding error; one number for landmarks.
+        signature: (M,) real4 signatures, their rounding errors (low parts), and -log of their mass on the span; of
+            lines half their length, and 1 where they are seen from both sides.
         start: (rows * columns + 1,) place of the first landmark of each bucket.
         terms: The sensor's numbers.
         arcs: Arcs of the slopes i / 8.
@@ -30,6 +32,7 @@ class LandmarkTables:
     """
 
     landmark: Buffer
+    normal: Buffer
     signature: Buffer
     start: Buffer
     terms: Buffer
@@ -53,6 +56,15 @@ def upload_tables(
     flat = p.field_of_view / math.sqrt(math.pi)
     flat /= math.erf(math.pi * scale) if full_circle(p) and scale else 1.0
     terms = np.array([high[0], low[0], high[1], flat], real)
+    norm = float(signature[:, 2].max(initial=0.0))
+    return uploaded(backend, real, buckets, np.zeros((1, 4)), signature, terms, norm)
+
+
+def uploaded(
+    backend: Backend, real: np.dtype, buckets: Buckets, normal: np.ndarray, signature: np.ndarray, terms: np.ndarray,
+    norm: float = 0.0,
+) -> LandmarkTables:  # fmt: skip
+    """Upload tables, with the arcs of slopes."""
     arcs = np.empty((len(ARCS), 2), real)
     exact = np.array(ARCS)
     arcs[:, 0] = exact[:, 0]
@@ -62,6 +74,6 @@ def upload_tables(
         return backend.upload(np.ascontiguousarray(table))
 
     return LandmarkTables(
-        upload(buckets.table(real)), upload(signature.astype(real)), upload(buckets.start), upload(terms), upload(arcs),
-        float(signature[:, 2].max(initial=0.0)),
+        upload(buckets.table(real)), upload(normal.astype(real)), upload(signature.astype(real)), upload(buckets.start),
+        upload(terms), upload(arcs), norm,
     )  # fmt: skip

@@ -27,7 +27,7 @@ Distribution = Callable[[Floats], Floats]
 # Seeds are keys of Philox: two words of 32 bits.
 MOST_SEED, MOST_STEP = (1 << 64) - 1, (1 << 31) - 1
 # Streams of the models, each followed by those of its readings; scan models have 1 << 30.
-POSITION, HEADING, BEACONS, BUMPER, LANDMARKS = (n << 26 for n in range(1, 6))
+POSITION, HEADING, BEACONS, BUMPER, LANDMARKS, LINES = (n << 26 for n in range(1, 7))
 # Half widths [deviations] below which a density is uniform to rounding.
 _FLAT = 1e-7
 
@@ -91,7 +91,7 @@ def mounted(poses: Floats, mount: Sequence[float]) -> Floats:
 
 
 def within(
-    u: Floats, mean: Floats, scale: float, low: float, high: float, cdf: Distribution, quantile: Distribution
+    u: Floats, mean: Floats, scale: float | Floats, low: float, high: float, cdf: Distribution, quantile: Distribution
 ) -> Floats:
     """Return draws of a symmetric distribution on an interval.
 
@@ -101,7 +101,7 @@ def within(
     Args:
         u: (N,) numbers in (0, 1).
         mean: (N,) means.
-        scale: Scale of the distribution.
+        scale: Scale of the distribution, one or (N,).
         low: Lower end.
         high: Upper end.
         cdf: Distribution function of scale 1 around 0.
@@ -115,13 +115,12 @@ def within(
     mass = np.where(near == centre, top - bottom, cdf((high - near) / scale) - cdf((low - near) / scale))
     mark = u * mass
     drawn = np.clip(centre + scale * quantile(np.minimum(bottom + mark, top)), low, high)
-    if (high - low) < _FLAT * scale:
-        drawn = np.where(near == centre, low + u * (high - low), drawn)
+    drawn = np.where((near == centre) & (high - low < _FLAT * scale), low + u * (high - low), drawn)
     drawn = np.where((near != centre) & (mark > top - bottom), np.nan, drawn)
     return np.where(flip, low + high - drawn, drawn)
 
 
-def normal_within(u: Floats, mean: Floats, sigma: float, low: float, high: float) -> Floats:
+def normal_within(u: Floats, mean: Floats, sigma: float | Floats, low: float, high: float) -> Floats:
     """Return draws of a normal on an interval; see :func:`within`."""
     from scipy.special import ndtr, ndtri
 

@@ -3,12 +3,12 @@
 // requires: lanes/landmark_grid
 
 // Sum log p over features: one work-item takes LANES particles. The last particle of all stands in for missing ones.
-kernel void score_features(global const real4 *landmark, global const real4 *signature, global const int *start,
-                           global const int2 *pose_cell, global const real4 *pose, global const real4 *pose_low,
-                           global const real *feature, global const int *partner, global const real *terms,
-                           global const real2 *arcs, global real *log_p, global real *parts, global int *which,
-                           const Buckets buckets, const int landmarks, const int particles, const int features,
-                           const real share, const Score score) {
+kernel void score_features(global const real4 *landmark, global const real4 *normal, global const real4 *signature,
+                           global const int *start, global const int2 *pose_cell, global const real4 *pose,
+                           global const real4 *pose_low, global const real *feature, global const int *partner,
+                           global const real *terms, global const real2 *arcs, global real *log_p, global real *parts,
+                           global int *which, const Buckets buckets, const int landmarks, const int particles,
+                           const int features, const real share, const Score score) {
     const int first_particle = LANES * get_global_id(0);
     if (first_particle >= particles) return;
     real p[8][LANES];
@@ -21,7 +21,7 @@ kernel void score_features(global const real4 *landmark, global const real4 *sig
     const LanePlace place = {{load_lanes(0, p[0]), load_lanes(0, p[1])}, {load_lanes(0, p[2]), load_lanes(0, p[3])}};
     const LanePlace heading = {{load_lanes(0, p[4]), load_lanes(0, p[5])}, {load_lanes(0, p[6]), load_lanes(0, p[7])}};
     LanePair total = {(lanes)score.constant_term, (lanes)0};
-    ilanes impossible = 0;
+    ilanes impossible = isinf(score.constant_term) ? -1 : 0;
     for (int first = 0; first < features; first += BLOCK_TERMS) {
         const int last = min(first + BLOCK_TERMS, features);
         lanes block = 0;

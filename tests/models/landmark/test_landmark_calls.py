@@ -63,6 +63,8 @@ def calls(backend: Any) -> dict[str, Any]:
     found["nearest"] = gs.LandmarkModel(landmarks, backend=backend), (FEATURES,)
     found["known"] = gs.LandmarkModel(landmarks, backend=backend), (FEATURES, [0, -1, 2])
     found["joint"] = gs.LandmarkModel(landmarks, backend=backend, association="joint", negative=True), (FEATURES,)
+    walls = gs.LineMap([(5e6, -3, 5e6 + 8, 4), (5e6 - 4, 0, 5e6, 5)])
+    found["lines"] = gs.LineModel(walls, backend=backend), ([(0.5, 1.0), (-2.0, 3.0)],)
     found["no feature"] = gs.LandmarkModel(landmarks, backend=backend), ([],)
     found["missing"] = models(backend)["heading"][0], (np.nan,)
     return {
@@ -71,7 +73,7 @@ def calls(backend: Any) -> dict[str, Any]:
     }
 
 
-SENSORS = ("position", "heading", "beacons", "bumper", "nearest", "known", "joint", "no feature", "missing")
+SENSORS = ("position", "heading", "beacons", "bumper", "nearest", "known", "joint", "lines", "no feature", "missing")
 
 
 @pytest.mark.sampled(0.5)

@@ -71,6 +71,7 @@ def test_features_against_mpmath(backend, name, precision, how):
     # The sum's terms may cancel: its bound is that of the terms.
     eps = np.finfo(precision).eps
     possible = np.isfinite(expected).all(axis=1)
+    assert not np.isnan(log_p).any()
     np.testing.assert_array_equal(np.isfinite(log_p), possible)
     total, size = expected[possible].sum(axis=1), (1 + np.abs(expected[possible])).sum(axis=1)
     assert (np.abs(log_p[possible].astype(np.float64) - total) <= TOLERANCES["landmark"].value * eps * size).all()

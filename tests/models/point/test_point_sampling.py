@@ -26,10 +26,19 @@ def models(backend="numpy", precision="float32"):
         "bumper": gs.BumperModel(GRID, [(-0.3, -0.2), (0.3, -0.2), (0.3, 0.2), (-0.3, 0.2)],
                                  segments=[0, 1, 0, -1], **options),
         "landmarks": gs.LandmarkModel(MAP, gs.LandmarkParameters(sigma_signature=0.3), **options),
+        "lines": gs.LineModel(gs.LineMap([(0, 5, 6, 5), (7, 0, 7, 5)]), **options),
     }  # fmt: skip
 
 
-SHAPES = {"fix": (2,), "heading": (), "von Mises": (), "beacons": (2,), "bumper": (2,), "landmarks": (3, 3)}
+SHAPES = {
+    "fix": (2,),
+    "heading": (),
+    "von Mises": (),
+    "beacons": (2,),
+    "bumper": (2,),
+    "landmarks": (3, 3),
+    "lines": (2, 4),
+}
 
 
 @pytest.mark.parametrize("name", SHAPES)

@@ -1,0 +1,196 @@
+"""Landmarks and lines that were made of features, and their files."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense._util import checks
+from gpusense._util.files import write_whole
+from gpusense._util.lines import numbered_lines
+from gpusense.features.result import KIND_TYPE, Floats, signature_of
+from gpusense.world.landmarks import LandmarkMap
+from gpusense.world.line_map import LineMap
+
+LANDMARK_KINDS = ("corner", "door", "pole", "reflector")
+"""Kinds of features whose poses stay where they are while the robot moves."""
+MAP_KINDS = ("line", *LANDMARK_KINDS)
+"""Kinds of features of which maps are made."""
+
+_COLUMNS = (
+    "x", "y", "signature", "kind", "theta", "size", "covariance_xx", "covariance_xy", "covariance_yy", "count",
+)  # fmt: skip
+# Largest coordinate [m]; those of UTM reach 1e7.
+_LARGEST = 1e9
+# Largest size of a landmark: a line of 100 km.
+_LARGEST_SIZE = 1e5
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureMap:
+    """Landmarks and lines that were made of features, from :func:`gpusense.map_features`.
+
+    Attributes:
+        kind: (M,) "line", "corner", "door", "pole" or "reflector".
+        pose: (M, 3) x, y [m] and theta [rad] in the world, as in :class:`gpusense.Features`: of a line its middle, and
+            the direction with the free side on its left.
+        covariance: (M, 2, 2) of x and y [m^2]; larger where its features scatter more than their covariances say. Of a
+            line only that across it: its ends are free.
+        size: (M,) length [m], opening angle [rad], width or radius [m].
+        count: (M,) number of features.
+
+    Example:
+        >>> import gpusense as gs, numpy as np
+        >>> cells = np.zeros((80, 120), np.int8)
+        >>> cells[[0, -1]] = cells[:, [0, -1]] = 100
+        >>> made = gs.landmarks_of_map(gs.OccupancyGrid(cells, resolution=0.05), backend="numpy")
+        >>> made.landmarks(), made.lines()
+        (LandmarkMap(4 landmarks with signatures), LineMap(4 lines, 0 of them two-sided))
+    """
+
+    kind: NDArray[np.str_]
+    pose: Floats
+    covariance: Floats
+    size: Floats
+    count: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.count)
+
+    def landmarks(self, kinds: str | Sequence[str] = LANDMARK_KINDS) -> LandmarkMap:
+        """Return a map of the landmarks of some kinds, with the signatures of :attr:`gpusense.Features.signatures`.
+
+        Raises:
+            TypeError: not names of kinds.
+            ValueError: another kind than "corner", "door", "pole" and "reflector".
+        """
+        chosen = np.isin(self.kind, kinds_of(kinds, LANDMARK_KINDS))
+        return LandmarkMap(self.pose[chosen, :2], signature_of(self.kind[chosen], self.size[chosen]))
+
+    def lines(self) -> LineMap:
+        """Return a map of the lines, each seen from the side of its features."""
+        rows = self.kind == "line"
+        half = 0.5 * self.size[rows, None] * np.column_stack([np.cos(self.pose[rows, 2]), np.sin(self.pose[rows, 2])])
+        middle = self.pose[rows, :2]
+        return LineMap(np.hstack([middle - half, middle + half]), two_sided=False)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a CSV file with a line for each landmark: x, y, signature, kind, theta, size, covariance, count.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        lines = [",".join(_COLUMNS)]
+        signature = signature_of(self.kind, self.size)
+        for i, kind in enumerate(self.kind):
+            (xx, xy), (_, yy) = self.covariance[i]
+            numbers = [repr(float(value)) for value in (*self.pose[i], self.size[i], xx, xy, yy, signature[i])]
+            lines.append(",".join([*numbers[:2], numbers[7], str(kind), *numbers[2:7], str(self.count[i])]))
+        text = "\n".join(lines) + "\n"
+        write_whole(checks.path("path", path), lambda file: file.write(text.encode()))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> FeatureMap:
+        """Return the landmarks of a file that :meth:`save` or ``gpusense features --map-out`` wrote.
+
+        The file may be compressed by gzip.
+
+        Raises:
+            FileNotFoundError: the file is missing.
+            ValueError: the file is not of this format; the message begins with file and line.
+
+        Example:
+            >>> import gpusense as gs, numpy as np
+            >>> cells = np.zeros((80, 120), np.int8)
+            >>> cells[[0, -1]] = cells[:, [0, -1]] = 100
+            >>> grid = gs.OccupancyGrid(cells, resolution=0.05)
+            >>> gs.landmarks_of_map(grid, kinds="corner", backend="numpy").save("corners.csv")
+            >>> gs.FeatureMap.load("corners.csv")
+            FeatureMap(4 corners)
+        """
+        rows = list(_rows(checks.path("path", path)))
+        numbers = np.array([row[1] for row in rows]).reshape(-1, 7)
+        return cls(
+            np.array([row[0] for row in rows], KIND_TYPE), numbers[:, :3], numbers[:, [4, 5, 5, 6]].reshape(-1, 2, 2),
+            numbers[:, 3], np.array([row[2] for row in rows], np.int64),
+        )  # fmt: skip
+
+    def __repr__(self) -> str:
+        counts = [f"{np.count_nonzero(self.kind == name)} {name}s" for name in MAP_KINDS if name in self.kind]
+        return f"FeatureMap({', '.join(counts) or 'none'})"
+
+
+def kinds_of(kinds: str | Sequence[str], allowed: tuple[str, ...]) -> tuple[str, ...]:
+    """Return kinds as a tuple, checked.
+
+    Raises:
+        TypeError: not a name, nor a sequence of names.
+        ValueError: another kind.
+    """
+    try:
+        names = (kinds,) if isinstance(kinds, str) else tuple(kinds)
+    except TypeError:
+        raise TypeError(f"kinds: must be kinds of features, got {checks.show(kinds)}") from None
+    return tuple(checks.choice("kinds", name, allowed) for name in names)
+
+
+def joined_maps(parts: Sequence[FeatureMap]) -> FeatureMap:
+    """Return several maps as one."""
+    if not parts:
+        return FeatureMap(
+            np.zeros(0, KIND_TYPE), np.zeros((0, 3)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0, np.int64)
+        )
+    values = {one.name: np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(FeatureMap)}
+    # Rounding leaves matrices a little asymmetric.
+    values["covariance"] = 0.5 * (values["covariance"] + values["covariance"].transpose(0, 2, 1))
+    return FeatureMap(**values)
+
+
+def _rows(path: Path) -> Iterator[tuple[str, list[float], int]]:
+    """Yield kind, numbers (pose, size, covariance) and count of the lines of a file."""
+    header = ",".join(_COLUMNS)
+    number = 0
+    for number, data in numbered_lines(path):
+        text = data.decode(errors="backslashreplace").strip()
+        if number == 1:
+            if text != header:
+                raise ValueError(f"{path}:1: must be {header}, got {checks.show(text)}")
+        elif text:
+            try:
+                yield _row(text.split(","))
+            except ValueError as error:
+                raise ValueError(f"{path}:{number}: {error}, got {checks.show(text)}") from None
+    if not number:
+        raise ValueError(f"{path}:1: must be {header}, got an empty file")
+
+
+def _row(words: list[str]) -> tuple[str, list[float], int]:
+    """Return kind, numbers and count of a line.
+
+    Raises:
+        ValueError: it breaks a rule, which the message names.
+    """
+    if len(words) != len(_COLUMNS):
+        raise ValueError(f"must have {len(_COLUMNS)} columns")
+    x, y, signature, kind, theta, size, xx, xy, yy, count = words
+    if kind not in MAP_KINDS:
+        raise ValueError(f"kind must be one of {', '.join(MAP_KINDS)}")
+    try:
+        numbers = [float(word) for word in (x, y, theta, size, xx, xy, yy)]
+        whole = int(count)
+        float(signature)
+    except ValueError:
+        raise ValueError("columns other than kind must be numbers, and count a whole number") from None
+    if not all(map(math.isfinite, numbers)) or max(map(abs, numbers[:3])) > _LARGEST:
+        raise ValueError(f"numbers must be finite, and coordinates at most {_LARGEST:g} m")
+    if not 0 < numbers[3] <= _LARGEST_SIZE or not 1 <= whole < 1 << 62:
+        raise ValueError(f"size must be above 0 and at most {_LARGEST_SIZE:g}, and count at least 1")
+    if numbers[4] < 0 or numbers[6] < 0 or numbers[5] ** 2 > numbers[4] * numbers[6] * (1 + 1e-9):
+        raise ValueError("covariance must be positive semidefinite")
+    return kind, numbers, whole

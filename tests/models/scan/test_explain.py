@@ -125,8 +125,13 @@ def test_the_text_of_the_kernel_lacks_what_is_left_out(part, needs):
     words, without, with_part = PARTS[part]
     grid = room()
     backend = get_backend(needs("opencl"))
-    scalar = {"short_length_lanes(expected": "short_peak(terms", "hit_exponent_lanes(z": "hit_exponent(z, expected, terms)",
-              "TERM(10)": "terms[10]", "TERM(12)": "terms[12]", "two_product_lanes(off": "two_product(off"}  # fmt: skip
+    scalar = {
+        "short_length_lanes(expected": "short_peak(terms",
+        "hit_exponent_lanes(z": "hit_exponent(z, expected, terms)",
+        "TERM(10)": "terms[10]",
+        "TERM(12)": "terms[12]",
+        "two_product_lanes(off": "two_product(off",
+    }
     words = words if backend.info.lanes > 1 else scalar[words]
     for parameters, listed in ((without, True), (with_part, False)):
         model = gs.BeamModel(grid, gs.Scanner([0.0, 0.5], 9.0), gs.BeamParameters(**parameters), backend=backend)

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense.chaining.front import SURE, Front
+from gpusense.chaining.front import Front
 from gpusense.chaining.graph import solve
 from gpusense.chaining.links import MOTION, ODOMETRY, Links
+from gpusense.chaining.matcher import SURE
 from gpusense.chaining.motion import constant_motion_deviation, fitted_motion, odometry_links, relative
 from gpusense.localization.motion import OdometryMotion
 
@@ -54,7 +55,14 @@ def links_of_odometry(front: Front, links: Links, reported: Floats, motion: Odom
     wanted = _is_open(front, links) | np.isin(nodes, keys)
     second = nodes[wanted]
     first = keys[np.searchsorted(keys, second) - 1]
-    return Links.of(ODOMETRY, first, second, *odometry_links(motion, reported[first], reported[second]))
+    return shared_odometry(ODOMETRY, first, second, reported, motion)
+
+
+def shared_odometry(
+    kind: str, first: NDArray[np.int64], second: NDArray[np.int64], reported: Floats, motion: OdometryMotion
+) -> Links:
+    """Return links by the poses (M, 3) of an odometer at nodes."""
+    return Links.of(kind, first, second, *odometry_links(motion, reported[first], reported[second]))
 
 
 def fitted_odometry(front: Front, links: Links, reported: Floats) -> OdometryMotion:
@@ -65,20 +73,19 @@ def fitted_odometry(front: Front, links: Links, reported: Floats) -> OdometryMot
     return fitted_motion(reported[keys], poses[keys], np.diff(whole) == 0)
 
 
-def constant_motion_links(front: Front, links: Links, jumps: Flags) -> Links:
+def constant_motion_links(front: Front, links: Links) -> Links:
     """Return links of constant motion, whose errors add up from scan to scan, where matches leave directions open.
 
     Args:
         front: The matches.
         links: Their links, as weighed.
-        jumps: (S,) whether the time jumps before each scan of the log.
     """
     keys = np.array(front.keys)
     second = np.arange(1, front.done)[_is_open(front, links)]
     first = keys[np.searchsorted(keys, second) - 1]
     deviation = np.cumsum(np.concatenate([np.zeros((1, 2)), constant_motion_deviation(front.steps)]), axis=0)
     spread = deviation[second] - deviation[first]
-    broken = np.append(0, np.cumsum(jumps[front.nodes[1 : front.done]] & (front.p_right < SURE)))
+    broken = np.append(0, np.cumsum(front.jumps[front.nodes[1 : front.done]] & (front.p_right < SURE)))
     spread[broken[second] != broken[first]] = _UNKNOWN, _UNKNOWN_TURN
     information = np.zeros((len(first), 3, 3))
     information[:, 0, 0] = information[:, 1, 1] = spread[:, 0] ** -2

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense.chaining.drift import Drift
-from gpusense.chaining.front import Matcher
 from gpusense.chaining.graph import Solution, solve
 from gpusense.chaining.links import CLOSURE, Links
+from gpusense.chaining.matcher import TeamMatcher
 from gpusense.chaining.motion import relative
 from gpusense.chaining.places import overlaps
 from gpusense.localization.pose_algebra import compose_poses, invert_poses, wrap_angle
@@ -61,18 +61,23 @@ class Loops:
     Attributes:
         matcher: Matches scans.
         nodes: (K,) indices of the key scans.
+        ranks: (K,) numbers of the key scans among those of their scanner.
+        scanners: Number of scanners.
         places: End points of the key scans.
         broken: (K,) number of breaks of the chain before each key scan.
         links: Links between key scans, without closures.
         solution: The solution so far.
         closures: Closures so far.
         temperature: Factor of the information of matches.
+        apart: Key scans of a pair are at least this many apart.
         tried: Pairs that were matched, with the level of the search.
         rejected: Number of matches that were sure but contradicted others, or stood alone.
     """
 
-    matcher: Matcher
+    matcher: TeamMatcher
     nodes: Integers
+    ranks: Integers
+    scanners: int
     places: list[Floats]
     broken: Integers
     links: Links
@@ -106,7 +111,8 @@ class Loops:
         # Once more with the next window: deviations are estimates. The last one is for large drifts only.
         again = (needed == level - 1) & (level < len(_LEVELS) - 1)
         needed = np.where(again, level, needed)
-        new = (second % _EACH == 0) & (needed <= level)
+        new = (self.ranks[second] % _EACH == 0) & (needed <= level)
+        new &= self.matcher.can_match(self.nodes[first], self.nodes[second])
         first, second, share, needed = (values[new] for values in (first, second, share, needed))
         new = ~self._is_tried(first, second, needed)
         if np.count_nonzero(new) > most:
@@ -127,7 +133,7 @@ class Loops:
 
     def _is_tried(self, first: Integers, second: Integers, level: Integers) -> Flags:
         """Return whether pairs, or those with a neighbouring first scan, were matched at their level or a later one."""
-        shifts = range(-_NEIGHBOURS, _NEIGHBOURS + 1)
+        shifts = range(-_NEIGHBOURS * self.scanners, _NEIGHBOURS * self.scanners + 1, self.scanners)
         found: Flags = np.array(
             [
                 any(self.tried.get((one + shift, two), -1) >= least for shift in shifts)

@@ -8,79 +8,29 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpusense.chaining.links import MATCH, Links, chained
+from gpusense.chaining.matcher import GROUP, NEAR, SURE, Matcher
 from gpusense.chaining.motion import relative, scan_motions
-from gpusense.chaining.options import ChainOptions
+from gpusense.chaining.options import ChainOptions, jumps_of
 from gpusense.localization.pose_algebra import pose_difference, wrap_angle
-from gpusense.matching.match import match_scan
 from gpusense.matching.result import ScanMatch
 from gpusense.world.scanner import Scanner
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-GROUP = 256
-"""Scans of a group."""
 # Key scans before it to which a key scan is matched.
 LOCAL = 4
-# A match is used from this p_right on.
-SURE = 0.5
-# Half widths of the search of a match of scans whose relative pose is known from others [m, rad].
-NEAR = (0.5, 0.3)
 # Readings differ by more than this [m], and this share; scans are unlike where more than a share of them does.
 _DIFFERENCE, _DIFFERENCE_SHARE, _UNLIKE = 0.15, 0.1, 0.3
 # A direction is a turn where this much of its length is.
 _TURNING = 0.5
 # Half widths of a second search after a failed one [m, rad].
 _WIDE = (2.0, math.pi)
-
-
-class Matcher:
-    """Matches scans of a log by their indices.
-
-    Args:
-        readings: (S, K) readings [m].
-        scanner: Their scanner.
-        options: Device and precision.
-    """
-
-    def __init__(self, readings: Floats, scanner: Scanner, options: ChainOptions) -> None:
-        self._readings, self._scanner, self._options = readings, scanner, options
-        self.motion: Floats | None = np.zeros((len(readings), 3)) if options.duration else None
-
-    def match(
-        self, first: Integers, second: Integers, guess: Floats, window: tuple[float, float] | None = None
-    ) -> ScanMatch:
-        """Return the poses of second scans in the frames of first ones; at least one pair.
-
-        Args:
-            first: (L,) indices.
-            second: (L,) indices.
-            guess: (L, 3) poses [m, m, rad].
-            window: Half widths of the search [m, rad]; None for the default of ``match_scan``.
-        """
-        options: dict[str, Any] = {} if window is None else {"window": window}
-        if self.motion is not None:
-            options |= {"motion": self.motion[second], "reference_motion": self.motion[first]}
-        return match_scan(
-            self._readings[first], self._readings[second], self._scanner, guess, backend=self._options.backend,
-            precision=self._options.precision, **options,
-        )  # fmt: skip
-
-    def links(self, kind: str, first: Integers, second: Integers, guess: Floats) -> Links:
-        """Return the links of those matches near their guesses that may be used."""
-        parts = []
-        for begin in range(0, len(first), 2 * GROUP):
-            part = slice(begin, begin + 2 * GROUP)
-            match = self.match(first[part], second[part], guess[part], NEAR)
-            links = Links.of(kind, first[part], second[part], match.pose, match.information, match.p_right)
-            parts.append(links[match.usable & (match.p_right >= SURE)])
-        return Links.joined(parts)
 
 
 class Front:
@@ -91,23 +41,24 @@ class Front:
         scanner: Their scanner.
         odometry: (S, 3) poses of the odometer, or None.
         times: (S,) times [s], or None.
-        jumps: (S,) whether the time jumps before a scan.
         options: The options.
 
     Attributes:
+        jumps: (S,) whether the time jumps before a scan.
         nodes: (M,) indices of the scans that are matched, those before which the robot has moved.
         steps: Motions from each node to the next.
         keys: Numbers of the nodes that are key scans.
-        doubt: Names of what is doubtful of each step; empty for none.
+        p_right: Probabilities of the matches of steps; 0 where none is usable.
+        lost: Numbers of directions that these leave open.
         links: The links between nodes.
     """
 
     def __init__(
-        self, readings: Floats, scanner: Scanner, odometry: Floats | None, times: Floats | None,
-        jumps: NDArray[np.bool], options: ChainOptions,
-    ) -> None:  # fmt: skip
+        self, readings: Floats, scanner: Scanner, odometry: Floats | None, times: Floats | None, options: ChainOptions
+    ) -> None:
         self.matcher = Matcher(readings, scanner, options)
-        self._odometry, self._times, self._jumps, self._options = odometry, times, jumps, options
+        self.jumps = jumps_of(times, len(readings))
+        self._odometry, self._times, self._options = odometry, times, options
         self.nodes = moved_scans(odometry, readings, options.step)
         self.steps = np.zeros((0, 3))
         self.p_right = np.zeros(0)
@@ -178,7 +129,7 @@ class Front:
         usable = found.usable & (found.p_right >= SURE)
         links = Links.of(MATCH, part - 1, part, found.pose, found.information, found.p_right)
         self._parts.append(links[usable])
-        steps = self._filled(found, usable, guess, self._jumps[second])
+        steps = self._filled(found, usable, guess, self.jumps[second])
         self.steps = np.concatenate([self.steps, steps])
         self.p_right = np.concatenate([self.p_right, np.where(usable, found.p_right, 0.0)])
         self.lost = np.concatenate([self.lost, np.where(usable, (found.eigenvalues == 0).sum(axis=1), 3)])

@@ -92,3 +92,13 @@ def relative(poses: Floats, first: NDArray[np.int64], second: NDArray[np.int64])
     """Return (L, 3) poses of second scans in the frames of first ones."""
     found: Floats = pose_difference(poses[first], poses[second])
     return found
+
+
+def partial_motion(motion: Floats, share: Floats) -> Floats:
+    """Return the motions (L, 3) after a share (L,) of others, which are arcs (see ``gpusense.world.sweep``)."""
+    half = motion[:, 2] / 2
+    length = share * np.sinc(share * half / math.pi) / np.sinc(half / math.pi)
+    turn = (share - 1) * half
+    c, s = length * np.cos(turn), length * np.sin(turn)
+    x, y = motion[:, 0], motion[:, 1]
+    return np.stack([c * x - s * y, s * x + c * y, 2 * share * half], axis=1)

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense.localization.pose_algebra import compose_poses
-from gpusense.matching.points import ScanPoints
+from gpusense.matching.points import ScanPoints, scan_points
+from gpusense.world.sensor_scans import SensorScans
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -19,7 +20,18 @@ _ROWS = 512
 _FAR = 2.0
 
 
-def place_points(points: ScanPoints, mount: tuple[float, float], scan: int) -> Floats:
+def place_points_of(data: SensorScans, scans: Integers) -> list[Floats]:
+    """Return the end points of scans in the robot's frame, without the farthest ones of each."""
+    result, sensor, place = [np.zeros((0, 2))] * len(scans), data.sensor[scans], data.places()[scans]
+    for one, scanner in enumerate(data.scanners):
+        some = np.flatnonzero(sensor == one)
+        points = scan_points(data.readings[one][place[some]], scanner, np.dtype(np.float32))
+        for k, scan in enumerate(some.tolist()):
+            result[scan] = _place_points(points, scanner.mount[:2], k)
+    return result
+
+
+def _place_points(points: ScanPoints, mount: tuple[float, float], scan: int) -> Floats:
     """Return (P, 2) end points of a scan in the robot's frame, without the farthest ones."""
     part = points.point[points.start[scan] : points.start[scan + 1]].astype(np.float64)
     near = part[:, 3] <= _FAR * max(float(points.rms_range(np.array([scan]))[0]), 1e-3)

@@ -223,29 +223,28 @@ class Chainer:
         matcher = TeamMatcher([front.matcher for front in joint.fronts], data.sensor, places)
         nodes = joint.nodes[keys]
         return Loops(
-            matcher, nodes, joint.ranks(), len(joint.fronts), place_points_of(data, nodes), joint.broken[keys], links,
+            matcher, nodes, (joint.owner[keys], joint.ranks()), place_points_of(data, nodes), joint.broken[keys], links,
             solve(poses[keys], links), TEMPERATURE, (LOCAL + 1) * len(joint.fronts),
         )  # fmt: skip
 
     def _all_links(self, joint: Joint) -> Links:
         """Return the links of matches and of odometry or constant motion; the odometry's noise is fitted once."""
-        parts, share = [], 1 / len(joint.fronts)
-        reported = None if self._odometry is None else self._odometry[joint.nodes]
+        parts = [joint.renumbered(weighed(front), one) for one, front in enumerate(joint.fronts)]
+        if self._odometry is None:
+            links = Links.joined([*parts, joint.couplings(None, None)])
+            jumped = joint.jumped() & joint.failed
+            return Links.joined([links, constant_motion_links(joint.poses, joint.keys, jumped, links)])
         for one, front in enumerate(joint.fronts):
-            links = weighed(front)
-            parts.append(joint.renumbered(links, one))
+            links, wheels = weighed(front), self._odometry[self._data.rows[one][front.nodes[: front.done]]]
             if front.done < 2:
                 continue
-            if self._odometry is None:
-                others = constant_motion_links(front, links)
-            else:
-                wheels = self._odometry[self._data.rows[one][front.nodes[: front.done]]]
-                if self._options.motion is None and self._fitted_to != front.done and one == 0:
-                    self._motion, self._fitted_to = fitted_odometry(front, links, wheels), front.done
-                others = links_of_odometry(front, links, wheels, self._motion or OdometryMotion())
+            if self._options.motion is None and self._fitted_to != front.done and one == 0:
+                self._motion, self._fitted_to = fitted_odometry(front, links, wheels), front.done
+            others = links_of_odometry(front, links, wheels, self._motion or OdometryMotion())
             # All scanners have the same odometer.
-            parts.append(joint.renumbered(replace(others, information=share * others.information), one))
-        return Links.joined([*parts, joint.couplings(reported, self._motion)])
+            others = replace(others, information=others.information / len(joint.fronts))
+            parts.append(joint.renumbered(others, one))
+        return Links.joined([*parts, joint.couplings(self._odometry[joint.nodes], self._motion)])
 
     def _placed(self, joint: Joint, solution: Solution, spread: Floats, corrections: Floats) -> ScanChain:
         """Return the result for all scans so far: those that are no nodes stand where the last node does."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gpusense.chaining.links import MATCH, Links, chained
 from gpusense.chaining.matcher import GROUP, NEAR, SURE, Matcher
-from gpusense.chaining.motion import relative, scan_motions
+from gpusense.chaining.motion import filled_motion, relative, scan_motions
 from gpusense.chaining.options import ChainOptions, jumps_of
 from gpusense.localization.pose_algebra import pose_difference, wrap_angle
 from gpusense.matching.result import ScanMatch
@@ -50,6 +50,7 @@ class Front:
         keys: Numbers of the nodes that are key scans.
         p_right: Probabilities of the matches of steps; 0 where none is usable.
         lost: Numbers of directions that these leave open.
+        unseen: (L, 3, 3) projections of steps onto these.
         links: The links between nodes.
     """
 
@@ -63,6 +64,7 @@ class Front:
         self.steps = np.zeros((0, 3))
         self.p_right = np.zeros(0)
         self.lost = np.zeros(0, np.int64)
+        self.unseen = np.zeros((0, 3, 3))
         self.keys = [0]
         self._parts: list[Links] = []
         self._waiting = 0
@@ -71,6 +73,11 @@ class Front:
     def done(self) -> int:
         """Number of nodes that are matched."""
         return len(self.steps) + 1
+
+    @property
+    def has_odometry(self) -> bool:
+        """Whether there is odometry."""
+        return self._odometry is not None
 
     @property
     def links(self) -> Links:
@@ -156,24 +163,26 @@ class Front:
     def _filled(self, found: ScanMatch, usable: NDArray[np.bool], guess: Floats, jumps: NDArray[np.bool]) -> Floats:
         """Return the motions by matches, and along what these do not observe by odometry or constant motion."""
         steps = np.where(usable[:, None], found.pose, guess)
-        open_ = ~usable | (found.eigenvalues == 0).any(axis=1)
-        for k in np.flatnonzero(open_):
+        unseen = self._unseen_of(found, usable)
+        for k in np.flatnonzero(unseen.any(axis=(1, 2))):
             expected = guess[k]
             if self._odometry is None:
                 before = steps[k - 1] if k else (self.steps[-1] if len(self.steps) else np.zeros(3))
                 expected = np.zeros(3) if jumps[k] else before
-            if not usable[k]:
-                steps[k] = expected
-                continue
-            scale = np.array([1.0, 1.0, found.lever[k]])
-            lost = found.directions[k][found.eigenvalues[k] == 0]
-            if self._odometry is None:
-                # A turn need not go on.
-                lost = lost[np.abs(lost[:, 2]) < _TURNING]
-            off = expected - steps[k]
-            off[2] = wrap_angle(off[2])
-            steps[k] += (lost.T @ (lost @ (scale * off))) / scale
+            steps[k] = filled_motion(steps[k], expected, unseen[k])
+        self.unseen = np.concatenate([self.unseen, unseen])
         return steps
+
+    def _unseen_of(self, found: ScanMatch, usable: NDArray[np.bool]) -> Floats:
+        """Return projections (L, 3, 3) of motions onto the directions that matches do not observe."""
+        lost = found.eigenvalues == 0
+        if self._odometry is None:
+            # A turn need not go on.
+            lost &= np.abs(found.directions[:, :, 2]) < _TURNING
+        directions = found.directions * lost[:, :, None]
+        scale = np.stack([np.ones(len(lost)), np.ones(len(lost)), found.lever], axis=1)
+        unseen = np.einsum("lki,lkj->lij", directions, directions) * scale[:, None, :] / scale[:, :, None]
+        return np.where(usable[:, None, None], unseen, np.eye(3))
 
     def _choose_keys(self, begin: int, end: int) -> None:
         """Choose key scans among nodes: after a motion, and on both sides of a match that has failed."""

@@ -16,7 +16,7 @@ from gpusense.chaining.assembly import shared_odometry
 from gpusense.chaining.front import Front
 from gpusense.chaining.links import COUPLING, Links, chained
 from gpusense.chaining.matcher import SURE
-from gpusense.chaining.motion import constant_motion_deviation, partial_motion, relative
+from gpusense.chaining.motion import constant_motion_deviation, filled_motion, partial_motion, relative
 from gpusense.localization.motion import OdometryMotion
 from gpusense.localization.pose_algebra import pose_difference
 
@@ -26,6 +26,8 @@ Flags = NDArray[np.bool]
 
 # Deviations of a pose between scans of two scanners: of mounts and clocks [m, rad], and a share of the motion.
 _MOUNTS, _MOUNTS_TURN, _SHARE = 0.01, 0.01, 0.1
+# Constant motion goes on over intervals at most this many times as long.
+_LONGER = 3.0
 # The share between key scans.
 _KEY_SHARE = 0.02
 # Share of the largest eigenvalue below which a direction of the information of all scanners is open.
@@ -134,6 +136,7 @@ class Joint:
         """Return poses by the motions of those front ends that tell most."""
         t = self.nodes.astype(np.float64) if times is None else times[self.nodes]
         moved = np.zeros((len(self.nodes) - 1, 3))
+        unseen = np.zeros((len(moved), 3, 3))
         best = np.argmax(self._trust, axis=0)
         for index, (front, of) in enumerate(self._each()):
             step, _ = _steps_of(of, len(self.nodes))
@@ -146,10 +149,20 @@ class Joint:
                 shares.append(np.where(whole > 0, (t[node] - t[begin]) / np.where(whole > 0, whole, 1.0), even))
             steps = front.steps[step[chosen]]
             moved[chosen] = pose_difference(*(partial_motion(steps, share) for share in shares))
+            unseen[chosen] = front.unseen[step[chosen]]
+        if not self.fronts[0].has_odometry:
+            jumped, gaps = self.jumped(), np.diff(t)
+            for k in np.flatnonzero(unseen.any(axis=(1, 2))):
+                ratio = gaps[k] / gaps[k - 1] if k and gaps[k - 1] > 0 else 0.0
+                before = moved[k - 1] * min(ratio, _LONGER) if k and not jumped[k] else np.zeros(3)
+                moved[k] = filled_motion(moved[k], before, unseen[k])
         return chained(np.zeros(3), moved)
 
     def pairs(self) -> tuple[Integers, Integers]:
-        """Return key scans with the scans of other scanners before and after them: earlier and later nodes (L,)."""
+        """Return nodes with those of other scanners before and after them: earlier and later ones (L,).
+
+        These are key scans, and scans of which the matches to the one before do not tell all.
+        """
         count, pairs = len(self.nodes), []
         before, after = np.full((len(self.fronts), count), -1), np.full((len(self.fronts), count), -1)
         for index, of in enumerate(self.of):
@@ -157,9 +170,12 @@ class Joint:
                 place = np.searchsorted(of, np.arange(count))
                 before[index] = np.where(place > 0, of[np.maximum(place - 1, 0)], -1)
                 after[index] = np.where(place < len(of), of[np.minimum(place, len(of) - 1)], -1)
-        keys = np.arange(count)[self.keys]
+        chosen = np.zeros(count, bool)
+        chosen[self.keys] = True
+        for front, of in self._each():
+            chosen[of[1:][front.lost[: max(len(of) - 1, 0)] > 0]] = True
         for index in range(len(self.fronts)):
-            others = keys[self.owner[keys] != index]
+            others = np.flatnonzero(chosen & (self.owner != index))
             pairs += [np.stack([before[index, others], others]), np.stack([others, after[index, others]])]
         both = np.concatenate(pairs, axis=1)
         both = np.unique(both[:, (both >= 0).all(axis=0)], axis=1)

@@ -39,16 +39,19 @@ def _place_points(points: ScanPoints, mount: tuple[float, float], scan: int) -> 
     return result
 
 
-def overlaps(places: list[Floats], poses: Floats, cell: float, apart: int) -> tuple[Integers, Integers, Floats]:
+def overlaps(
+    places: list[Floats], poses: Floats, cell: float, apart: int, sequence: tuple[Integers, Integers]
+) -> tuple[Integers, Integers, Floats]:
     """Return pairs of key scans that share many cells, the best of each passage.
 
-    Of the key scans in a row that share cells with another one, that with the most is taken.
+    Of the key scans of a scanner in a row that share cells with another one, that with the most is taken.
 
     Args:
         places: End points of each key scan in the robot's frame.
         poses: (K, 3) poses of the key scans.
         cell: Side of a cell [m].
         apart: Key scans of a pair are at least this many apart.
+        sequence: (K,) scanners of the key scans, and (K,) their numbers among those of their scanner.
 
     Returns:
         (L,) first ones, (L,) second ones, and (L,) shares of common cells.
@@ -74,19 +77,23 @@ def overlaps(places: list[Floats], poses: Floats, cell: float, apart: int) -> tu
         second, first = common.row + begin, common.col
         share = common.data / np.maximum(np.minimum(sizes[first], sizes[second]), 1)
         good = (second - first >= apart) & (share >= _SHARE)
-        found.append(_best_of_passages(first[good], second[good], share[good]))
+        found.append(_best_of_passages(first[good], second[good], share[good], sequence))
     one, two, shares = (np.concatenate(part) for part in zip(*found, strict=True))
     return one.astype(np.int64), two.astype(np.int64), shares
 
 
-def _best_of_passages(first: Integers, second: Integers, share: Floats) -> tuple[Integers, Integers, Floats]:
-    """Return the best pair of each run of successive first scans with the same second one."""
+def _best_of_passages(
+    first: Integers, second: Integers, share: Floats, sequence: tuple[Integers, Integers]
+) -> tuple[Integers, Integers, Floats]:
+    """Return the best pair of each run of successive first scans of a scanner with the same second one."""
     if not len(first):
         return first, second, share
-    order = np.lexsort((first, second))
-    first, second, share = first[order], second[order], share[order]
+    scanner, rank = (values[first] for values in sequence)
+    order = np.lexsort((rank, scanner, second))
+    first, second, scanner, rank = (values[order] for values in (first, second, scanner, rank))
+    share = share[order]
     # A run ends where a first scan or more is left out.
-    begins = np.append(True, (np.diff(second) != 0) | (np.diff(first) > 1))
+    begins = np.append(True, (np.diff(second) != 0) | (np.diff(scanner) != 0) | (np.diff(rank) > 1))
     run = np.cumsum(begins)
     best = np.lexsort((-share, run))
     keep = best[np.append(True, np.diff(run[best]) != 0)]

@@ -7,16 +7,16 @@ some key scans before it, and every other scan to the key scans on both sides. T
 from __future__ import annotations
 
 import copy
-import math
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense.chaining.following import matched_again, matched_by_motion, motions_around, weakened
 from gpusense.chaining.links import MATCH, Links, chained
 from gpusense.chaining.matcher import GROUP, NEAR, SURE, Matcher
 from gpusense.chaining.motion import filled_motion, relative, scan_motions
 from gpusense.chaining.options import ChainOptions, jumps_of
-from gpusense.localization.pose_algebra import pose_difference, wrap_angle
+from gpusense.localization.pose_algebra import compose_poses, invert_poses, pose_difference, wrap_angle
 from gpusense.matching.result import ScanMatch
 from gpusense.world.scanner import Scanner
 
@@ -25,12 +25,14 @@ Integers = NDArray[np.int64]
 
 # Key scans before it to which a key scan is matched.
 LOCAL = 4
+# Least p_right of a match that has failed but is a better guess than constant motion.
+_LIKELY = 0.1
+# Least p_right of a match over a failed one.
+_BRIDGE = 0.8
 # Readings differ by more than this [m], and this share; scans are unlike where more than a share of them does.
 _DIFFERENCE, _DIFFERENCE_SHARE, _UNLIKE = 0.15, 0.1, 0.3
 # A direction is a turn where this much of its length is.
 _TURNING = 0.5
-# Half widths of a second search after a failed one [m, rad].
-_WIDE = (2.0, math.pi)
 
 
 class Front:
@@ -50,6 +52,8 @@ class Front:
         keys: Numbers of the nodes that are key scans.
         p_right: Probabilities of the matches of steps; 0 where none is usable.
         lost: Numbers of directions that these leave open.
+        rivalled: Whether other motions explain the scans of a step about as well.
+        bridged: Whether a step that no match tells is that of a match over it.
         unseen: (L, 3, 3) projections of steps onto these.
         links: The links between nodes.
     """
@@ -65,8 +69,11 @@ class Front:
         self.p_right = np.zeros(0)
         self.lost = np.zeros(0, np.int64)
         self.unseen = np.zeros((0, 3, 3))
+        self.rivalled = np.zeros(0, bool)
+        self.bridged = np.zeros(0, bool)
         self.keys = [0]
         self._parts: list[Links] = []
+        self._last: Floats | None = None
         self._waiting = 0
 
     @property
@@ -90,14 +97,15 @@ class Front:
         return chained(np.zeros(3), self.steps)
 
     def confirmations(self) -> Integers:
-        """Return the number of matches of farther scans that span each step from node to node."""
+        """Return the number of matches of farther scans that span each step from node to node, beside a first one."""
         links = self.links
         far = np.abs(links.second - links.first) > 1
         ends = np.sort(np.stack([links.first[far], links.second[far]]), axis=0)
         change = np.zeros(self.done, np.int64)
         np.add.at(change, ends[0], 1)
         np.add.at(change, ends[1], -1)
-        return np.cumsum(change)[:-1]
+        spanning: Integers = np.cumsum(change)[:-1] - self.bridged
+        return spanning
 
     def advance(self) -> bool:
         """Match the next group; return whether there was one. An interrupt leaves the groups before it."""
@@ -114,6 +122,7 @@ class Front:
         if begin >= end:
             return False
         self._follow(np.arange(begin, end))
+        self._bridge(begin - 1, end - 1)
         self._choose_keys(begin, end)
         self._match_locally(end == len(self.nodes))
         return True
@@ -124,7 +133,10 @@ class Front:
         still = np.zeros((len(part), 3))
         guess = still if self._odometry is None else pose_difference(self._odometry[first], self._odometry[second])
         found = self.matcher.match(first, second, guess)
-        found = self._tried_again(found, first, second, guess)
+        rival = np.full((len(part), 3), np.nan)
+        if self._odometry is None:
+            found, rival = matched_by_motion(self.matcher, found, first, second, self._last)
+        found = matched_again(self.matcher, found, first, second, guess)
         if self.matcher.motion is not None and self._times is not None:
             moved = scan_motions(
                 found.pose, self._times[self.nodes[part[0] - 1 : part[-1] + 1]], self._options.duration
@@ -134,42 +146,58 @@ class Front:
             again = self.matcher.match(first, second, found.pose, NEAR)
             found = found.replaced(np.arange(len(part)), again, again.usable)
         usable = found.usable & (found.p_right >= SURE)
-        links = Links.of(MATCH, part - 1, part, found.pose, found.information, found.p_right)
+        information = weakened(found.information, rival)
+        links = Links.of(MATCH, part - 1, part, found.pose, information, found.p_right)
         self._parts.append(links[usable])
-        steps = self._filled(found, usable, guess, self.jumps[second])
+        if self._odometry is None:
+            good = usable & (found.eigenvalues > 0).all(axis=1)
+            guess = motions_around(found.pose, good, self._last)[2]
+            guess[self.jumps[second]] = 0.0
+            likely = ~usable & (found.p_right >= _LIKELY)
+            guess[likely] = found.pose[likely]
+            if usable[-1]:
+                self._last = found.pose[-1]
+        steps = self._filled(found, usable, guess)
+        self.rivalled = np.concatenate([self.rivalled, usable & np.isfinite(rival).all(axis=1)])
         self.steps = np.concatenate([self.steps, steps])
         self.p_right = np.concatenate([self.p_right, np.where(usable, found.p_right, 0.0)])
         self.lost = np.concatenate([self.lost, np.where(usable, (found.eigenvalues == 0).sum(axis=1), 3)])
 
-    def _tried_again(self, found: ScanMatch, first: Integers, second: Integers, guess: Floats) -> ScanMatch:
-        """Match pairs that have failed from the motions before and after them, and by a wide search."""
-        for attempt in ("before", "after", "wide"):
-            good = found.usable & (found.p_right >= SURE)
-            rows = np.flatnonzero(~good)
+    def _bridge(self, begin: int, end: int) -> None:
+        """Match the scans around failed steps, of those from ``begin`` to ``end``, and take these from the matches."""
+        self.bridged = np.concatenate([self.bridged, np.zeros(end - begin, bool)])
+        failed = begin + np.flatnonzero(self.p_right[begin:end] < SURE)
+        steps, sure = self.steps, (self.p_right >= SURE) & (self.lost == 0)
+        for before, after in ((1, 0), (0, 1)):
+            # From one scan more on one side, over a step that is known.
+            known = failed - before + after
+            rows = failed[(known >= 0) & (known < end)]
+            rows = rows[sure[rows - before + after] & ~self.bridged[rows]]
             if not len(rows):
-                break
-            others = guess[rows]
-            if attempt != "wide":
-                near = np.flatnonzero(good)
-                if not len(near):
-                    continue
-                place = np.searchsorted(near, rows) - (attempt == "before")
-                others = found.pose[near[np.clip(place, 0, len(near) - 1)]]
-            again = self.matcher.match(first[rows], second[rows], others, _WIDE if attempt == "wide" else None)
-            better = again.usable & (again.p_right > np.where(found.usable[rows], found.p_right[rows], 0.0))
-            found = found.replaced(rows, again, better)
-        return found
+                continue
+            first, second = rows - before, rows + 1 + after
+            match = self.matcher.match(
+                self.nodes[first], self.nodes[second], compose_poses(steps[first], steps[second - 1])
+            )
+            good = match.usable & (match.p_right >= _BRIDGE) & (match.eigenvalues > 0).all(axis=1)
+            self._parts.append(Links.of(MATCH, first, second, match.pose, match.information, match.p_right)[good])
+            rows, pose = rows[good], match.pose[good]
+            steps[rows] = (
+                pose_difference(steps[rows - 1], pose) if before else compose_poses(pose, invert_poses(steps[rows + 1]))
+            )
+            self.p_right[rows], self.lost[rows], self.unseen[rows], self.bridged[rows] = (
+                match.p_right[good],
+                0,
+                0.0,
+                True,
+            )
 
-    def _filled(self, found: ScanMatch, usable: NDArray[np.bool], guess: Floats, jumps: NDArray[np.bool]) -> Floats:
+    def _filled(self, found: ScanMatch, usable: NDArray[np.bool], guess: Floats) -> Floats:
         """Return the motions by matches, and along what these do not observe by odometry or constant motion."""
         steps = np.where(usable[:, None], found.pose, guess)
         unseen = self._unseen_of(found, usable)
         for k in np.flatnonzero(unseen.any(axis=(1, 2))):
-            expected = guess[k]
-            if self._odometry is None:
-                before = steps[k - 1] if k else (self.steps[-1] if len(self.steps) else np.zeros(3))
-                expected = np.zeros(3) if jumps[k] else before
-            steps[k] = filled_motion(steps[k], expected, unseen[k])
+            steps[k] = filled_motion(steps[k], guess[k], unseen[k])
         self.unseen = np.concatenate([self.unseen, unseen])
         return steps
 
@@ -212,8 +240,8 @@ class Front:
                     second.append(k)
         self._waiting = end
         one, two = np.array(first, np.int64), np.array(second, np.int64)
-        # A failed step between two nodes separates them.
-        broken = np.append(0, np.cumsum(self.p_right < SURE))
+        # A failed step between two nodes separates them, as does one that may be another.
+        broken = np.append(0, np.cumsum((self.p_right < SURE) | self.rivalled))
         same = broken[one] == broken[two]
         one, two = one[same], two[same]
         found = self.matcher.links(MATCH, self.nodes[one], self.nodes[two], relative(poses, one, two))

@@ -50,6 +50,7 @@ class Joint:
         keys: (K,) numbers of nodes that are key scans.
         failed: (M - 1,) whether no scanner tells the motion from a node to the next.
         open: (M - 1,) whether the scanners that tell it leave a direction open.
+        contested: (M - 1,) whether the scanners that tell it may tell another one as well.
         poses: (M, 3) poses by the matches that tell most of each motion, chained from the first one.
     """
 
@@ -65,6 +66,7 @@ class Joint:
         self._trust = np.stack([self._trust_of(front, of) for front, of in self._each()])
         self.failed: Flags = self._trust.max(axis=0) <= 0
         self.open = ~self.failed & self._open()
+        self.contested = ~self.failed & self._contested()
         self.poses = fronts[0].poses if len(fronts) == 1 else self._chained(times)
 
     def _each(self) -> list[tuple[Front, Integers]]:
@@ -131,6 +133,15 @@ class Joint:
         values = np.linalg.eigvalsh(total)
         found: Flags = values[:, 0] <= _OPEN * np.maximum(values[:, -1], 1e-300)
         return found & (self._trust.max(axis=0) < 2)
+
+    def _contested(self) -> Flags:
+        """Return whether another motion explains the scans of every front end that tells each motion."""
+        contested = np.ones(len(self.nodes) - 1, bool)
+        for index, (front, of) in enumerate(self._each()):
+            told = self._trust[index] > 0
+            step, _ = _steps_of(of, len(self.nodes))
+            contested[told] &= front.rivalled[step[told]]
+        return contested
 
     def _chained(self, times: Floats | None) -> Floats:
         """Return poses by the motions of those front ends that tell most."""

@@ -18,6 +18,7 @@ Integers = NDArray[np.int64]
 REASONS = {
     "no match": "the scan matches neither the one before nor key scans: its motion is that of odometry or a guess",
     "unobserved": "the scans do not observe a direction of the motion, as along a corridor, and there is no odometry",
+    "contested": "the scans agree about as well after another motion, and there is no odometry to tell which it was",
     "unconfirmed": "a single match tells the motion, and there is no odometry: no other match agrees with it",
     "jump": "the time jumps, and the robot may be anywhere after it",
 }
@@ -137,8 +138,12 @@ def doubts_of(joint: Joint, alone: bool) -> tuple[Doubt, ...]:
         alone: Whether there is no odometry.
     """
     failed, open_, nodes = joint.failed, joint.open & alone, joint.nodes
-    single = (joint.confirmations() == 0) & ~failed & ~open_ & alone & (len(nodes) > 2)
-    reasons = {"no match": failed, "unobserved": open_, "unconfirmed": single, "jump": joint.jumped() & failed}
+    contested = joint.contested & ~failed & ~open_
+    single = (joint.confirmations() == 0) & ~failed & ~open_ & ~contested & alone & (len(nodes) > 2)
+    reasons = {
+        "no match": failed, "unobserved": open_, "contested": contested, "unconfirmed": single,
+        "jump": joint.jumped() & failed,
+    }  # fmt: skip
     doubts = []
     for reason, flags in reasons.items():
         edges = np.diff(np.concatenate([[False], flags, [False]]).astype(int))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gpusense.chaining.following import matched_again, matched_by_motion, motions_around, weakened
 from gpusense.chaining.links import MATCH, Links, chained
 from gpusense.chaining.matcher import GROUP, NEAR, SURE, Matcher
-from gpusense.chaining.motion import filled_motion, relative, scan_motions
+from gpusense.chaining.motion import filled_motion, partial_motion, relative, scan_motions
 from gpusense.chaining.options import ChainOptions, jumps_of
 from gpusense.localization.pose_algebra import compose_poses, invert_poses, pose_difference, wrap_angle
 from gpusense.matching.result import ScanMatch
@@ -27,8 +27,8 @@ Integers = NDArray[np.int64]
 LOCAL = 4
 # Least p_right of a match that has failed but is a better guess than constant motion.
 _LIKELY = 0.1
-# Least p_right of a match over a failed one.
-_BRIDGE = 0.8
+# Least p_right of a match over failed ones, and most of these in a row.
+_BRIDGE, _GAP = 0.8, 5
 # Readings differ by more than this [m], and this share; scans are unlike where more than a share of them does.
 _DIFFERENCE, _DIFFERENCE_SHARE, _UNLIKE = 0.15, 0.1, 0.3
 # A direction is a turn where this much of its length is.
@@ -54,6 +54,7 @@ class Front:
         lost: Numbers of directions that these leave open.
         rivalled: Whether other motions explain the scans of a step about as well.
         bridged: Whether a step that no match tells is that of a match over it.
+        spanned: Whether a match leads over a step that no match tells, and over its neighbours.
         unseen: (L, 3, 3) projections of steps onto these.
         links: The links between nodes.
     """
@@ -71,9 +72,11 @@ class Front:
         self.unseen = np.zeros((0, 3, 3))
         self.rivalled = np.zeros(0, bool)
         self.bridged = np.zeros(0, bool)
+        self.spanned = np.zeros(0, bool)
         self.keys = [0]
         self._parts: list[Links] = []
         self._last: Floats | None = None
+        self._expected = np.zeros((0, 3))
         self._waiting = 0
 
     @property
@@ -153,6 +156,7 @@ class Front:
             good = usable & (found.eigenvalues > 0).all(axis=1)
             guess = motions_around(found.pose, good, self._last)[2]
             guess[self.jumps[second]] = 0.0
+            self._expected = np.concatenate([self._expected, guess])
             likely = ~usable & (found.p_right >= _LIKELY)
             guess[likely] = found.pose[likely]
             if usable[-1]:
@@ -164,33 +168,48 @@ class Front:
         self.lost = np.concatenate([self.lost, np.where(usable, (found.eigenvalues == 0).sum(axis=1), 3)])
 
     def _bridge(self, begin: int, end: int) -> None:
-        """Match the scans around failed steps, of those from ``begin`` to ``end``, and take these from the matches."""
-        self.bridged = np.concatenate([self.bridged, np.zeros(end - begin, bool)])
-        failed = begin + np.flatnonzero(self.p_right[begin:end] < SURE)
-        steps, sure = self.steps, (self.p_right >= SURE) & (self.lost == 0)
+        """Match over failed steps, of those from ``begin`` to ``end``, and take these from the matches."""
+        none = np.zeros(end - begin, bool)
+        self.bridged, self.spanned = np.append(self.bridged, none), np.append(self.spanned, none)
         for before, after in ((1, 0), (0, 1)):
             # From one scan more on one side, over a step that is known.
-            known = failed - before + after
-            rows = failed[(known >= 0) & (known < end)]
-            rows = rows[sure[rows - before + after] & ~self.bridged[rows]]
-            if not len(rows):
-                continue
-            first, second = rows - before, rows + 1 + after
-            match = self.matcher.match(
-                self.nodes[first], self.nodes[second], compose_poses(steps[first], steps[second - 1])
+            rows = begin + np.flatnonzero(self.p_right[begin:end] < SURE)
+            known = rows - before + after
+            inside = (known >= begin) & (known < end)
+            known, rows = known[inside], rows[inside]
+            rows = rows[(self.p_right[known] >= SURE) & (self.lost[known] == 0) & ~self.bridged[known]]
+            rows, pose, p_right = self._matched_over(rows - before, rows + 1 + after, rows)
+            others = self.steps[rows - before + after]
+            self.steps[rows] = (
+                compose_poses(invert_poses(others), pose) if before else compose_poses(pose, invert_poses(others))
             )
-            good = match.usable & (match.p_right >= _BRIDGE) & (match.eigenvalues > 0).all(axis=1)
-            self._parts.append(Links.of(MATCH, first, second, match.pose, match.information, match.p_right)[good])
-            rows, pose = rows[good], match.pose[good]
-            steps[rows] = (
-                pose_difference(steps[rows - 1], pose) if before else compose_poses(pose, invert_poses(steps[rows + 1]))
-            )
-            self.p_right[rows], self.lost[rows], self.unseen[rows], self.bridged[rows] = (
-                match.p_right[good],
-                0,
-                0.0,
-                True,
-            )
+            self.p_right[rows], self.lost[rows], self.unseen[rows], self.bridged[rows] = p_right, 0, 0.0, True
+        edges = np.diff(np.concatenate([[False], self.p_right[begin:end] < SURE, [False]]).astype(int))
+        first, last = begin + np.flatnonzero(edges > 0), begin + np.flatnonzero(edges < 0)
+        short = (last - first >= 2) & (last - first <= _GAP)
+        runs, pose, _ = self._matched_over(first[short], last[short], np.flatnonzero(short))
+        for run, moved in zip(runs, pose, strict=True):
+            steps = np.arange(first[run], last[run])
+            shares = np.linspace(0, 1, len(steps) + 1)
+            places = partial_motion(np.repeat(moved[None], len(shares), axis=0), shares)
+            self.steps[steps] = relative(places, np.arange(len(steps)), np.arange(1, len(steps) + 1))
+            self.spanned[steps] = True
+
+    def _matched_over(self, first: Integers, second: Integers, rows: Integers) -> tuple[Integers, Floats, Floats]:
+        """Add links of good matches over failed ones, and return their rows, poses and p_right."""
+        if not len(rows):
+            return rows, np.zeros((0, 3)), np.zeros(0)
+        nodes = self.nodes[first], self.nodes[second]
+        match = self.matcher.match(*nodes, relative(self.poses, first, second))
+        if self._odometry is None:
+            # Failed steps may be worse guesses than constant motion is.
+            steps = np.where((self.p_right < SURE)[:, None], self._expected, self.steps)
+            guess = relative(chained(np.zeros(3), steps), first, second)
+            again = self.matcher.match(*nodes, guess)
+            match = match.replaced(np.arange(len(rows)), again, again.usable & (again.p_right > match.p_right))
+        good = match.usable & (match.p_right >= _BRIDGE) & (match.eigenvalues > 0).all(axis=1)
+        self._parts.append(Links.of(MATCH, first, second, match.pose, match.information, match.p_right)[good])
+        return rows[good], match.pose[good], match.p_right[good]
 
     def _filled(self, found: ScanMatch, usable: NDArray[np.bool], guess: Floats) -> Floats:
         """Return the motions by matches, and along what these do not observe by odometry or constant motion."""
@@ -241,7 +260,7 @@ class Front:
         self._waiting = end
         one, two = np.array(first, np.int64), np.array(second, np.int64)
         # A failed step between two nodes separates them, as does one that may be another.
-        broken = np.append(0, np.cumsum((self.p_right < SURE) | self.rivalled))
+        broken = np.append(0, np.cumsum(((self.p_right < SURE) & ~self.spanned) | self.rivalled))
         same = broken[one] == broken[two]
         one, two = one[same], two[same]
         found = self.matcher.links(MATCH, self.nodes[one], self.nodes[two], relative(poses, one, two))

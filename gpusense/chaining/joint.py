@@ -79,8 +79,12 @@ class Joint:
 
     @property
     def broken(self) -> Integers:
-        """(M,) number of motions before each node that no scanner tells."""
-        result: Integers = np.append(0, np.cumsum(self.failed))
+        """(M,) number of motions before each node that no scanner tells, and over which no match leads."""
+        spanned = np.zeros(len(self.failed), bool)
+        for front, of in self._each():
+            step, inside = _steps_of(of, len(self.nodes))
+            spanned[inside] |= front.spanned[step[inside]]
+        result: Integers = np.append(0, np.cumsum(self.failed & ~spanned))
         return result
 
     def jumped(self) -> Flags:

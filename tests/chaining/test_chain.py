@@ -162,6 +162,35 @@ def test_wrong_motions_are_doubtful(step: float, needs) -> None:
     assert not chain.doubtful.all()
 
 
+@pytest.mark.parametrize(("step", "range_max", "most"), [(1.0, 30.0, 0.3), (0.7, 10.0, 2.0), (1.0, 10.0, 5.0)])
+def test_large_motions_without_odometry_are_found_or_said(step: float, range_max: float, most: float, needs) -> None:
+    # From rest, scans of a corridor agree best where the robot has not moved.
+    truth = around(step)
+    short = gs.Scanner(FRONT.bearings, range_max=range_max)
+    chain = gs.chain_scans(scans_of(BLOCK, truth, short), short, close_loops=False, backend=needs("opencl"))
+    assert errors(chain, truth).max() < most
+    off = relative(chain.poses[:-1], chain.poses[1:]) - relative(truth[:-1], truth[1:])
+    off[:, 2] = gs.wrap_angle(off[:, 2])
+    wrong = (np.hypot(off[:, 0], off[:, 1]) > 0.3) | (np.abs(off[:, 2]) > 0.15)
+    assert chain.doubtful[1:][wrong].all()
+    assert "contested" in {doubt.reason for doubt in chain.doubts}
+    assert "after another motion" in chain.explain()
+
+
+def test_a_failed_match_is_bridged_over(needs) -> None:
+    # People stand in front of the scanner at one scan.
+    truth = np.array([(0.25 * k - 1.2, 0.1 * k - 0.6, 0.12 * k) for k in range(10)])
+    scans = scans_of(ROOM, truth, RING)
+    rng = np.random.default_rng(3)
+    scans[5] = np.where(rng.random(RING.count) < 0.75, rng.uniform(0.3, 1.2, RING.count), scans[5])
+    chain = gs.chain_scans(scans, RING, backend=needs("opencl"))
+    good = np.arange(10) != 5
+    assert errors(chain, truth)[good].max() < 0.05
+    assert chain.doubtful[5:7].all() and not chain.doubtful[:5].any() and not chain.doubtful[7:9].any()
+    # The scans beside it are linked.
+    assert ((chain.links.first <= 4) & (chain.links.second >= 6)).any()
+
+
 def test_joined_logs_of_two_buildings_are_not_closed(lap: tuple[np.ndarray, ...], needs) -> None:
     truth, scans, _ = lap
     x = np.arange(0, 16, 0.4)

@@ -16,7 +16,7 @@ from gpusense.localization.motion import OdometryMotion
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool]
 
-TEMPERATURE = 0.04
+TEMPERATURE = 0.02
 """Factor of the information of matches: recorded scans have errors that repeat, which no single match shows."""
 # Share of the largest eigenvalue below which the information of a scan's links leaves a direction open.
 _OPEN = 1e-6

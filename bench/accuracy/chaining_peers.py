@@ -1,15 +1,23 @@
-"""CSM (Censi 2008) as compiled from a copy of its sources, which the user gives; for ``chaining.py``."""
+"""Other programs that follow a robot by its scans, for ``chaining.py``: KISS-ICP where it is installed, and CSM.
+
+CSM (Censi 2008) is compiled from a copy of its sources, which the user gives.
+"""
 
 from __future__ import annotations
 
+import itertools
 import subprocess
+import tempfile
+import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import gpusense as gs
 
 CODE = Path(__file__).resolve().parent / "peer_code" / "csm.c"
+VOXELS = (0.1, 0.3, 1.0)
 # Parts that draw, that need other libraries, or that are programs.
 _LEFT_OUT = ("test", "cairo", "drawing", "mbicp", "_load")
 _CONFIGURATION = "#define STDC_HEADERS 1\n" + "\n".join(
@@ -65,3 +73,40 @@ def steps(program: Path, ranges: np.ndarray, scanner: gs.Scanner, guess: np.ndar
         mount, gs.compose_poses(np.where(usable[:, None], found[:, 1:], 0), gs.invert_poses(mount))
     )
     return np.where(usable[:, None], moved, guess)
+
+
+def csm_steps(
+    source: Path, gsl: Path | None, ranges: np.ndarray, scanner: gs.Scanner, guess: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Compile CSM, and return the motions (S - 1, 3) from scan to scan, and the time."""
+    with tempfile.TemporaryDirectory() as name:
+        program = build(source, gsl, Path(name))
+        begun = time.perf_counter()
+        moved = steps(program, ranges, scanner, guess, Path(name))
+        return moved, time.perf_counter() - begun
+
+
+def kiss_icp(log: Any) -> list[tuple[np.ndarray, float, float]]:
+    """Return poses of KISS-ICP, times, and voxels, with several options; nothing where it is not installed."""
+    try:
+        from kiss_icp.config import KISSConfig
+        from kiss_icp.kiss_icp import KissICP
+    except ImportError:
+        return []
+    results = []
+    bearings = log.scanner.bearings + log.scanner.mount[2]
+    share = np.linspace(0, 1, log.scanner.count)
+    for voxel, deskew in itertools.product(VOXELS, (True, False) if log.duration else (False,)):
+        config = KISSConfig()
+        config.data.max_range, config.data.min_range = min(log.scanner.range_max, 50.0), 0.1
+        config.data.deskew, config.mapping.voxel_size = deskew, voxel
+        odometry, poses, begun = KissICP(config), [], time.perf_counter()
+        for z in log.ranges:
+            hit = np.isfinite(z) & (z > log.scanner.range_min) & (z < log.scanner.range_max)
+            points = np.stack([z * np.cos(bearings), z * np.sin(bearings), 0 * z], axis=1)[hit]
+            odometry.register_frame(points + np.array([*log.scanner.mount[:2], 0.0]), share[hit])
+            pose = odometry.last_pose
+            poses.append((pose[0, 3], pose[1, 3], np.arctan2(pose[1, 0], pose[0, 0])))
+        seconds = time.perf_counter() - begun
+        results.append((np.array(poses), seconds, voxel))
+    return results

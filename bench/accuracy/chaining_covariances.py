@@ -25,7 +25,8 @@ import gpusense as gs
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from chaining import Log, figures, load, references
+from chaining import figures
+from chaining_logs import Log, load, references
 from common import make_parser, note, parse, publish, table
 
 from gpusense.chaining.assembly import TEMPERATURE

@@ -22,7 +22,7 @@ import gpusense as gs
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from chaining import Log, from_scans
+from chaining_logs import Log, from_scans
 from common import make_parser, note, parse, publish, table
 
 NAMES = ("acapulco", "aces", "belgioioso", "csail", "fhw", "freiburg-079", "infinite-corridor", "intel", "seattle")

@@ -1,14 +1,13 @@
-"""Choose the factor of the information of matches on some logs, and look at covariances on others.
+"""Choose the inflation of covariances of chains on some logs, and look at covariances on others.
 
     python bench/accuracy/chaining_covariances.py --backend opencl --output bench/results/chaining_covariances
 
 Chains are made without closures, from odometry. Errors are those of relative poses between scans that are 2 to 20 m of
-the way apart, with covariances of relative poses of the pose graph. The normalised squared error (NEES) is divided by
-3, so that 1 is right; "within" are the shares of errors in the ellipsoids of 50, 80 and 95 %. The information of
-matches has the factor of ``gpusense.chaining``; with another factor of all matches, covariances change by about its
-ratio, so the factor that would make the mean NEES of a log 1 is the present one over that NEES, with the largest tenth
-left out, where references are wrong. The factor of a half of the logs is the median of theirs; it is judged on the
-other half. References of recorded logs have errors of their own, but for jarvis; simulated runs have none.
+the way apart, with covariances of relative poses of the pose graph times an inflation. The normalised squared error
+(NEES) is divided by 3, so that 1 is right; "within" are the shares of errors in the ellipsoids of 50, 80 and 95 %.
+The inflation of a log is the mean NEES without one, with the largest tenth left out, where references are wrong. That
+of a half of the logs is the median of theirs; it is judged on the other half. References of recorded logs have errors
+of their own, but for jarvis; simulated runs have none.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from chaining import figures
 from chaining_logs import Log, load, references
 from common import make_parser, note, parse, publish, table
 
-from gpusense.chaining.assembly import TEMPERATURE
+from gpusense.chaining.assembly import INFLATION
 from gpusense.chaining.chain import Chainer
 from gpusense.chaining.drift import Drift
 from gpusense.chaining.graph import solve
@@ -100,7 +99,7 @@ def squared_errors(log: Log, backend: str) -> np.ndarray:
 
 
 def row(name: str, squared: np.ndarray, ratio: float) -> dict[str, Any]:
-    """Return the figures of a log for the present factor times a ratio."""
+    """Return the figures of a log for the squared errors times a ratio."""
     scaled = squared * ratio
     kept = np.sort(scaled)[: max(int(KEPT * len(scaled)), 1)]
     within = [float(np.mean(3 * scaled <= chi2.ppf(level, 3))) for level in LEVELS]
@@ -123,13 +122,11 @@ def main(argv: list[str] | None = None) -> None:
         note(f"{log.name}: NEES {errors[log.name].mean():.2f}")
     rows = []
     for one, two in (HALVES, HALVES[::-1]):
-        factor = TEMPERATURE * float(np.median([1 / row("", errors[name], 1.0)["kept"] for name in one]))
+        factor = float(np.median([row("", errors[name], 1.0)["kept"] for name in one]))
         for name in (*two, *(log.name for log in made)):
-            rows.append(
-                {"chosen_on": ", ".join(one), "factor": factor, **row(name, errors[name], factor / TEMPERATURE)}
-            )
+            rows.append({"chosen_on": ", ".join(one), "factor": factor, **row(name, errors[name], 1 / factor)})
     for name in errors:
-        rows.append({"chosen_on": "as it is", "factor": TEMPERATURE, **row(name, errors[name], 1.0)})
+        rows.append({"chosen_on": "as it is", "factor": INFLATION, **row(name, errors[name], 1 / INFLATION)})
     lines = [
         [r["chosen_on"], f"{r['factor']:.3f}", r["log"], r["poses"], f"{r['nees']:.2f}", f"{r['kept']:.2f}",
          f"{r['median']:.2f}", " / ".join(f"{100 * share:.0f}" for share in r["within"])]

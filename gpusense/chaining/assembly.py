@@ -16,8 +16,10 @@ from gpusense.localization.motion import OdometryMotion
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool]
 
-TEMPERATURE = 0.02
+TEMPERATURE = 0.04
 """Factor of the information of matches: recorded scans have errors that repeat, which no single match shows."""
+INFLATION = 2.0
+"""Factor of the covariances of poses: half of the recorded logs give it, and the other half, too."""
 # Share of the largest eigenvalue below which the information of a scan's links leaves a direction open.
 _OPEN = 1e-6
 # Deviations of a pose in a direction of which nothing is known [m, rad].

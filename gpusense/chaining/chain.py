@@ -12,7 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense._util import checks
 from gpusense._util.typing import Precision
 from gpusense.backends import Selection, get_backend
-from gpusense.chaining.assembly import TEMPERATURE, constant_motion_links, fitted_odometry, links_of_odometry, weighed
+from gpusense.chaining.assembly import (
+    INFLATION,
+    TEMPERATURE,
+    constant_motion_links,
+    fitted_odometry,
+    links_of_odometry,
+    weighed,
+)
 from gpusense.chaining.closing import Loops
 from gpusense.chaining.front import LOCAL, Front
 from gpusense.chaining.graph import Solution, solve
@@ -203,7 +210,7 @@ class Chainer:
             closures = loops.closures.renumbered(joint.keys)
             poses = _carried(poses, joint.keys, loops.solution.poses)
         solution = solve(poses, Links.joined([links, closures]))
-        spread = pose_covariances(solution)
+        spread = INFLATION * pose_covariances(solution)
         found = solution.links.kind == CLOSURE
         moved = relative(joint.poses, solution.links.first[found], solution.links.second[found])
         corrections = np.hypot(*(solution.links.pose[found] - moved)[:, :2].T)

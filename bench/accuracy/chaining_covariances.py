@@ -133,7 +133,7 @@ def main(argv: list[str] | None = None) -> None:
         for r in rows
     ]  # fmt: skip
     columns = [
-        "factor chosen on",
+        "inflation chosen on",
         "factor",
         "log",
         "pairs of poses",

@@ -134,7 +134,7 @@ def main(argv: list[str] | None = None) -> None:
     ]  # fmt: skip
     columns = [
         "inflation chosen on",
-        "factor",
+        "inflation",
         "log",
         "pairs of poses",
         "NEES",

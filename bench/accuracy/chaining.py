@@ -5,11 +5,13 @@
 Rows of a log: its raw odometry; "scan to scan", successive matches without key scans and loops; "chain" is
 ``gpusense.chain_scans``, with and without odometry, with and without closures; "KISS-ICP" where that library is
 installed, on points with z = 0, with the voxels of 0.1, 0.3 and 1 m, and with or without its correction of motion
-during scans where they have a duration, whatever errs least. Times are wall time without the first call's compilation.
+during scans where they have a duration, whatever errs least; "CSM", from scan to scan, where a copy of it is given.
+"jarvis-both" has the scans of both lasers. Times are wall time without the first call's compilation.
 
 "error" is the root mean square distance from the reference after alignment. "drift" is the mean error of relative
 poses over a path of 5, 20 and 100 m, per length. "contradicted" closures differ from the reference by more than 0.5 m
-or 0.15 rad; the references themselves have errors. The reference of jarvis is a track by reflectors, whose clock is not
+or 0.15 rad; "wrong motions" from scan to scan by more than 0.3 m or 0.1 rad, of which "said" ones are in doubtful
+stretches; the references themselves have errors. The reference of jarvis is a track by reflectors, whose clock is not
 the lasers'; that of olin is of scans that were taken as instantaneous: both are read where the error of a row is least,
 within 0.25 s.
 "held out" is the share of end points up to 20 m of odd scans within 5 and 15 cm of an occupied cell of the even scans'
@@ -19,11 +21,8 @@ map, at the poses of the row with odometry and closures, and at those of the ref
 from __future__ import annotations
 
 import argparse
-import csv
-import itertools
 import sys
 import time
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,86 +33,13 @@ import gpusense as gs
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+from chaining_logs import BOTH, Log, load, references
+from chaining_peers import csm_steps, kiss_icp
 from common import make_parser, note, parse, publish, table
-from matching_odometry import recorded
 
-LOGS = ("intel", "fr079", "csail", "aces", "fhw", "seattle", "jarvis-s3000", "jarvis-nav350", "olin")
+LOGS = ("intel", "fr079", "csail", "aces", "fhw", "seattle", "jarvis-s3000", "jarvis-nav350", BOTH, "olin")
 LENGTHS = (5, 20, 100)
 LIMIT = 20.0
-VOXELS = (0.1, 0.3, 1.0)
-
-
-@dataclass
-class Log:
-    """Scans with odometry and reference poses, NaN where unknown, or a track of another clock: t, x, y, theta."""
-
-    name: str
-    ranges: np.ndarray
-    scanner: gs.Scanner
-    odometry: np.ndarray
-    truth: np.ndarray
-    times: np.ndarray | None
-    duration: float = 0.0
-    track: np.ndarray | None = None
-
-
-def load(data: Path, name: str) -> Log:
-    """Return a log by its name."""
-    if name.startswith("jarvis"):
-        return jarvis(data / "jarvis_lab", name.removeprefix("jarvis-"))
-    if name == "olin":
-        return olin(data / "olin_mac_bag")
-    if name == "intel":
-        return intel(data / "carmen_logs")
-    scans, motions = recorded(data, {"fr079": "freiburg-079"}.get(name, name))
-    odometry = [np.zeros(3)]
-    for motion in motions:
-        odometry.append(gs.compose_poses(odometry[-1], motion))
-    return from_scans(name, scans, np.array(odometry), np.array([scan.pose for scan in scans]))
-
-
-def from_scans(name: str, scans: list[gs.Scan], odometry: np.ndarray, truth: np.ndarray) -> Log:
-    """Return a log of scans of one scanner; times that decrease are left out."""
-    times = np.array([scan.time for scan in scans])
-    known = times if (np.diff(times) >= 0).all() else None
-    return Log(name, np.stack([scan.ranges for scan in scans]), scans[0].scanner, odometry, truth, known)
-
-
-def intel(folder: Path) -> Log:
-    """Return the log with raw odometry; a few of its scans have corrected poses."""
-    scans = list(gs.read_log(folder / "intel-rawodom-every5.log.gz"))
-    truth = np.full((len(scans), 3), np.nan)
-    with (folder / "intel-rawodom-matches.csv").open() as file:
-        for row in csv.DictReader(file):
-            truth[int(row["raw_index"])] = [float(row[name]) for name in ("x_m", "y_m", "theta_rad")]
-    return from_scans("intel", scans, np.array([scan.odometry for scan in scans]), truth)
-
-
-def olin(folder: Path) -> Log:
-    """Return the bag with the reference that was refined in its own map."""
-    scans = list(gs.read_log(folder / "macfirst_floor_take_2"))
-    rows = np.loadtxt(folder / "derived_reference.csv", delimiter=",", skiprows=1)
-    log = from_scans("olin", scans, np.array([scan.odometry for scan in scans]), np.zeros((len(scans), 3)))
-    return replace(log, duration=float(np.median([scan.duration for scan in scans])), track=rows[:, :4])
-
-
-def jarvis(folder: Path, laser: str) -> Log:
-    """Return a laser of the bag; the scanner for navigation takes an eighth of a second for a turn."""
-    topic = {"s3000": "security", "nav350": "navigation"}[laser]
-    bag = folder / "jarvis_complex_path_fast.bag"
-    scans = list(gs.read_log(bag, topic=f"/driver_laser_{topic}/laser_scan"))
-    track = np.load(folder / "jarvis_complex_path_fast.npz")["gt"]
-    log = from_scans(f"jarvis-{laser}", scans, np.array([s.odometry for s in scans]), np.zeros((len(scans), 3)))
-    return replace(log, duration=float(np.median([scan.duration for scan in scans])), track=track)
-
-
-def references(log: Log, earlier: float) -> np.ndarray:
-    """Return the reference poses of the scans, of a track those some seconds earlier."""
-    if log.track is None:
-        return log.truth
-    at, (t, x, y, theta) = log.times - earlier, log.track.T
-    columns = [np.interp(at, t, values, np.nan, np.nan) for values in (x, y, np.unwrap(theta))]
-    return np.stack(columns, axis=1)
 
 
 def aligned_error(poses: np.ndarray, truth: np.ndarray) -> float:
@@ -159,8 +85,8 @@ def chain_row(log: Log, arguments: argparse.Namespace, with_odometry: bool, loop
     """Chain a log, and return its figures."""
     begun = time.perf_counter()
     chain = gs.chain_scans(
-        log.ranges, log.scanner, log.odometry if with_odometry else None, times=log.times,
-        duration=log.duration if log.times is not None else 0.0, close_loops=loops, backend=arguments.backend,
+        log.ranges, odometry=log.odometry if with_odometry else None, times=log.times, close_loops=loops,
+        backend=arguments.backend, **log.arguments,
     )  # fmt: skip
     seconds = time.perf_counter() - begun
     name = f"chain, {'with' if with_odometry else 'no'} odometry, {'closures' if loops else 'no closures'}"
@@ -171,8 +97,17 @@ def chain_row(log: Log, arguments: argparse.Namespace, with_odometry: bool, loop
     if len(known):
         off = gs.pose_difference(gs.pose_difference(truth[known.first], truth[known.second]), known.pose)
     wrong = (np.hypot(off[:, 0], off[:, 1]) > 0.5) | (np.abs(off[:, 2]) > 0.15)
+    found |= wrong_motions(chain, truth)
     found |= {"closures": len(closures), "compared": len(off), "contradicted": int(wrong.sum())}
     return found | {"doubtful": int(chain.doubtful.sum()), "key_scans": len(chain.keys)}, chain
+
+
+def wrong_motions(chain: gs.ScanChain, truth: np.ndarray) -> dict[str, int]:
+    """Return how many motions from scan to scan are off by more than 0.3 m or 0.1 rad, and how many are said."""
+    known = np.flatnonzero(np.isfinite(truth[:-1] + truth[1:]).all(axis=1))
+    off = gs.pose_difference(*(gs.pose_difference(p[known], p[known + 1]) for p in (truth, chain.poses)))
+    wrong = (np.hypot(off[:, 0], off[:, 1]) > 0.3) | (np.abs(off[:, 2]) > 0.1)
+    return {"wrong_motions": int(wrong.sum()), "said": int(chain.doubtful[known + 1][wrong].sum())}
 
 
 def scan_to_scan(log: Log, backend: str) -> tuple[np.ndarray, float]:
@@ -186,32 +121,6 @@ def scan_to_scan(log: Log, backend: str) -> tuple[np.ndarray, float]:
         for step in np.where(match.usable[:, None], match.pose, guess[rows]):
             poses.append(gs.compose_poses(poses[-1], step))
     return np.array(poses), time.perf_counter() - begun
-
-
-def kiss_icp(log: Log) -> tuple[np.ndarray, float, float] | None:
-    """Return the poses of KISS-ICP, its time, and its voxels; None where it is not installed."""
-    try:
-        from kiss_icp.config import KISSConfig
-        from kiss_icp.kiss_icp import KissICP
-    except ImportError:
-        return None
-    results = []
-    bearings = log.scanner.bearings + log.scanner.mount[2]
-    share = np.linspace(0, 1, log.scanner.count)
-    for voxel, deskew in itertools.product(VOXELS, (True, False) if log.duration else (False,)):
-        config = KISSConfig()
-        config.data.max_range, config.data.min_range = min(log.scanner.range_max, 50.0), 0.1
-        config.data.deskew, config.mapping.voxel_size = deskew, voxel
-        odometry, poses, begun = KissICP(config), [], time.perf_counter()
-        for z in log.ranges:
-            hit = np.isfinite(z) & (z > log.scanner.range_min) & (z < log.scanner.range_max)
-            points = np.stack([z * np.cos(bearings), z * np.sin(bearings), 0 * z], axis=1)[hit]
-            odometry.register_frame(points + np.array([*log.scanner.mount[:2], 0.0]), share[hit])
-            pose = odometry.last_pose
-            poses.append((pose[0, 3], pose[1, 3], np.arctan2(pose[1, 0], pose[0, 0])))
-        seconds = time.perf_counter() - begun
-        results.append((figures(log, "", np.array(poses), 0.0)["error_m"], np.array(poses), seconds, voxel))
-    return min(results, key=lambda found: found[0])[1:]
 
 
 def held_out(log: Log, poses: np.ndarray, motions: np.ndarray | None, backend: str) -> tuple[float, float]:
@@ -237,14 +146,30 @@ def held_out(log: Log, poses: np.ndarray, motions: np.ndarray | None, backend: s
     return float(100 * np.mean(near <= 0.0501)), float(100 * np.mean(near <= 0.1501))
 
 
-def measured(log: Log, arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Return the rows of a log, and those of its maps."""
-    gs.chain_scans(log.ranges[:6], log.scanner, log.odometry[:6], backend=arguments.backend)
+def peers(log: Log, arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """Return the rows of other programs that are there: KISS-ICP, whatever errs least, and CSM from scan to scan."""
+    rows = []
+    found = kiss_icp(log)
+    if found:
+        figured = [figures(log, f"KISS-ICP, voxels of {voxel} m", poses, time) for poses, time, voxel in found]
+        rows.append(min(figured, key=lambda row: row["error_m"]))
+    if arguments.csm is not None:
+        guess = gs.pose_difference(log.odometry[:-1], log.odometry[1:])
+        moved, seconds = csm_steps(arguments.csm, arguments.gsl, log.ranges, log.scanner, guess)
+        poses = [log.odometry[0]]
+        for step in moved:
+            poses.append(gs.compose_poses(poses[-1], step))
+        rows.append(figures(log, "CSM, scan to scan", np.array(poses), seconds))
+    return rows
+
+
+def measured(log: Log, arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any] | None]:
+    """Return the rows of a log, and that of its maps, which is None for several lasers."""
     rows = [figures(log, "odometry", log.odometry, 0.0)]
-    rows.append(figures(log, "scan to scan", *scan_to_scan(log, arguments.backend)))
-    peer = kiss_icp(log)
-    if peer is not None:
-        rows.append(figures(log, f"KISS-ICP, voxels of {peer[2]} m", peer[0], peer[1]))
+    if log.lasers is None:
+        gs.chain_scans(log.ranges[:6], log.scanner, log.odometry[:6], backend=arguments.backend)
+        rows.append(figures(log, "scan to scan", *scan_to_scan(log, arguments.backend)))
+        rows += peers(log, arguments)
     best: gs.ScanChain | None = None
     for with_odometry in (True, False):
         for loops in (False, True):
@@ -253,6 +178,8 @@ def measured(log: Log, arguments: argparse.Namespace) -> tuple[list[dict[str, An
             best = chain if best is None or (with_odometry and loops) else best
             note(f"{log.name}, {found['method']}: {found['error_m']:.3f} m")
     assert best is not None
+    if log.lasers is not None:
+        return rows, None
     maps = {"log": log.name, "chain": held_out(log, best.poses, best.motions, arguments.backend)}
     truth = references(log, min(rows, key=lambda row: row["error_m"])["earlier_s"])
     maps["reference"] = held_out(log, truth, best.motions, arguments.backend)
@@ -263,23 +190,36 @@ def main(argv: list[str] | None = None) -> None:
     """Measure, and publish tables."""
     parser = make_parser(__doc__, backend="auto", data=True)
     parser.add_argument("--log", action="append", choices=LOGS, help="default: all")
+    parser.add_argument("--csm", type=Path, help="a copy of CSM's repository, which is compiled")
+    parser.add_argument("--gsl", type=Path, help="where GSL's include and lib are, if the compiler does not find it")
     arguments = parse(parser, argv)
     rows, maps = [], []
     for name in arguments.log or LOGS:
         found, made = measured(load(Path(arguments.data), name), arguments)
         rows += found
-        maps.append(made)
+        maps += [made] if made is not None else []
 
     def drift(row: dict[str, Any], length: int) -> str:
         if row[f"drift_{length}_percent"] is None:
             return "-"
         return f"{row[f'drift_{length}_percent']:.2f} / {row[f'drift_{length}_degrees']:.3f}"
 
-    columns = ["log", "method", "error m", "drift 5 m: % / deg/m", "20 m", "100 m", "closures, contradicted", "s"]
+    columns = [
+        "log",
+        "method",
+        "error m",
+        "drift 5 m: % / deg/m",
+        "20 m",
+        "100 m",
+        "closures, contradicted",
+        "wrong motions, said",
+        "s",
+    ]
     lines = [
         [
             row["log"], row["method"], f"{row['error_m']:.3f}", *(drift(row, length) for length in LENGTHS),
             f"{row['closures']}, {row['contradicted']} of {row['compared']}" if row.get("closures") else "-",
+            f"{row['wrong_motions']}, {row['said']}" if "said" in row else "-",
             f"{row['seconds']:.1f}" if row["seconds"] else "-",
         ]
         for row in rows

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense.chaining.front import SURE, Front
+from gpusense.chaining.front import Front
 from gpusense.chaining.graph import solve
 from gpusense.chaining.links import MOTION, ODOMETRY, Links
 from gpusense.chaining.motion import constant_motion_deviation, fitted_motion, odometry_links, relative
@@ -18,6 +18,8 @@ Flags = NDArray[np.bool]
 
 TEMPERATURE = 0.04
 """Factor of the information of matches: recorded scans have errors that repeat, which no single match shows."""
+INFLATION = 2.0
+"""Factor of the covariances of poses: halves of the recorded logs ask for 2.2 and 2.4 (docs/chaining.md)."""
 # Share of the largest eigenvalue below which the information of a scan's links leaves a direction open.
 _OPEN = 1e-6
 # Deviations of a pose in a direction of which nothing is known [m, rad].
@@ -51,10 +53,17 @@ def links_of_odometry(front: Front, links: Links, reported: Floats, motion: Odom
     """
     nodes = np.arange(1, front.done)
     keys = np.array(front.keys)
-    wanted = _is_open(front, links) | np.isin(nodes, keys)
+    wanted = _is_open(front.done, links) | np.isin(nodes, keys)
     second = nodes[wanted]
     first = keys[np.searchsorted(keys, second) - 1]
-    return Links.of(ODOMETRY, first, second, *odometry_links(motion, reported[first], reported[second]))
+    return shared_odometry(ODOMETRY, first, second, reported, motion)
+
+
+def shared_odometry(
+    kind: str, first: NDArray[np.int64], second: NDArray[np.int64], reported: Floats, motion: OdometryMotion
+) -> Links:
+    """Return links by the poses (M, 3) of an odometer at nodes."""
+    return Links.of(kind, first, second, *odometry_links(motion, reported[first], reported[second]))
 
 
 def fitted_odometry(front: Front, links: Links, reported: Floats) -> OdometryMotion:
@@ -65,30 +74,31 @@ def fitted_odometry(front: Front, links: Links, reported: Floats) -> OdometryMot
     return fitted_motion(reported[keys], poses[keys], np.diff(whole) == 0)
 
 
-def constant_motion_links(front: Front, links: Links, jumps: Flags) -> Links:
-    """Return links of constant motion, whose errors add up from scan to scan, where matches leave directions open.
+def constant_motion_links(poses: Floats, keys: NDArray[np.int64], jumped: Flags, links: Links) -> Links:
+    """Return links of constant motion, whose errors add up from scan to scan, where others leave directions open.
 
     Args:
-        front: The matches.
-        links: Their links, as weighed.
-        jumps: (S,) whether the time jumps before each scan of the log.
+        poses: (M, 3) poses of the nodes.
+        keys: (K,) numbers of the key scans.
+        jumped: (M - 1,) whether the time jumps from a node to the next, and no match tells the motion.
+        links: The others.
     """
-    keys = np.array(front.keys)
-    second = np.arange(1, front.done)[_is_open(front, links)]
+    second = np.arange(1, len(poses))[_is_open(len(poses), links)]
     first = keys[np.searchsorted(keys, second) - 1]
-    deviation = np.cumsum(np.concatenate([np.zeros((1, 2)), constant_motion_deviation(front.steps)]), axis=0)
+    steps = relative(poses, np.arange(len(poses) - 1), np.arange(1, len(poses)))
+    deviation = np.cumsum(np.concatenate([np.zeros((1, 2)), constant_motion_deviation(steps)]), axis=0)
     spread = deviation[second] - deviation[first]
-    broken = np.append(0, np.cumsum(jumps[front.nodes[1 : front.done]] & (front.p_right < SURE)))
+    broken = np.append(0, np.cumsum(jumped))
     spread[broken[second] != broken[first]] = _UNKNOWN, _UNKNOWN_TURN
     information = np.zeros((len(first), 3, 3))
     information[:, 0, 0] = information[:, 1, 1] = spread[:, 0] ** -2
     information[:, 2, 2] = spread[:, 1] ** -2
-    return Links.of(MOTION, first, second, relative(front.poses, first, second), information)
+    return Links.of(MOTION, first, second, relative(poses, first, second), information)
 
 
-def _is_open(front: Front, links: Links) -> Flags:
-    """Return whether the links to earlier scans leave a direction of a node open, but for the first node."""
-    total = np.zeros((front.done, 3, 3))
+def _is_open(count: int, links: Links) -> Flags:
+    """Return whether the links to earlier scans leave a direction of a node open, but for the first of all nodes."""
+    total = np.zeros((count, 3, 3))
     np.add.at(total, links.second, links.information)
     values = np.linalg.eigvalsh(total[1:])
     is_open: Flags = values[:, 0] <= _OPEN * np.maximum(values[:, -1], 1e-300)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,23 +12,32 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense._util import checks
 from gpusense._util.typing import Precision
 from gpusense.backends import Selection, get_backend
-from gpusense.chaining.assembly import TEMPERATURE, constant_motion_links, fitted_odometry, links_of_odometry, weighed
+from gpusense.chaining.assembly import (
+    INFLATION,
+    TEMPERATURE,
+    constant_motion_links,
+    fitted_odometry,
+    links_of_odometry,
+    weighed,
+)
 from gpusense.chaining.closing import Loops
-from gpusense.chaining.front import LOCAL, SURE, Front, Matcher
+from gpusense.chaining.front import LOCAL, Front
 from gpusense.chaining.graph import Solution, solve
+from gpusense.chaining.joint import Joint
 from gpusense.chaining.links import CLOSURE, Links
+from gpusense.chaining.matcher import Matcher, TeamMatcher
 from gpusense.chaining.motion import relative
-from gpusense.chaining.options import ChainOptions, check_steps, check_times, jumps_of
-from gpusense.chaining.places import place_points
-from gpusense.chaining.result import Doubt, ScanChain
+from gpusense.chaining.options import ChainOptions, check_durations, check_steps, check_times
+from gpusense.chaining.places import place_points_of
+from gpusense.chaining.result import ScanChain, doubts_of
 from gpusense.chaining.selected import pose_covariances
 from gpusense.chaining.sweep import signed_duration
 from gpusense.localization.motion import OdometryMotion
 from gpusense.localization.pose_algebra import compose_poses, pose_difference
 from gpusense.matching.match import readings
-from gpusense.matching.points import scan_points
 from gpusense.models.arguments import real_dtype
 from gpusense.world.scanner import Scanner
+from gpusense.world.sensor_scans import check_scans
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -35,11 +45,12 @@ Integers = NDArray[np.int64]
 
 def chain_scans(
     scans: ArrayLike,
-    scanner: Scanner,
+    scanner: Scanner | Sequence[Scanner],
     odometry: ArrayLike | None = None,
     *,
+    sensor: ArrayLike | None = None,
     times: ArrayLike | None = None,
-    duration: float = 0.0,
+    duration: float | Sequence[float] = 0.0,
     motion: OdometryMotion | None = None,
     step: ArrayLike = (0.02, 0.01),
     key_step: ArrayLike = (0.5, 0.35),
@@ -55,14 +66,19 @@ def chain_scans(
     least squares with a robust kernel over all links; the odometry, with noise fitted to the matches, fills the
     directions that scans do not observe, and constant motion does so without one.
 
+    Of a robot with several scanners, each is matched with itself, and loops also between those of equal bearings, as of
+    one in front and one in the rear. A key scan is coupled with the scans of the others before and after it.
+
     Args:
-        scans: (S, K) readings in the order of time [m], at least one.
-        scanner: Their scanner; its mount is the sensor's pose on the robot.
+        scans: (S, K) readings in the order of time [m], at least one; with several scanners S readings, each of its
+            scanner's length.
+        scanner: Their scanner, or several; its mount is the sensor's pose on the robot.
         odometry: (S, 3) poses of the odometer at the scans [m, m, rad]. None: there is none.
+        sensor: (S,) index of the scanner of each scan; with several scanners only.
         times: (S,) times of the first beams [s]. None: unknown.
         duration: Time from the first beam of a scan to the last one [s], with which scans are freed of the robot's
             motion; needs ``times``. Beams are measured evenly in time, in their order, in reverse or at once: that
-            with which scans agree best. 0: at once.
+            with which scans agree best. 0: at once. With several scanners also one number for each.
         motion: Noise of the odometry. None: fitted to the matches.
         step: Motion by odometry below which a scan is not matched [m, rad]: such scans cost nothing.
         key_step: Motion after which a scan becomes a key scan [m, rad].
@@ -85,8 +101,8 @@ def chain_scans(
         [0.0, 0.1, 0.2]
     """
     chainer = Chainer(
-        scans, scanner, odometry, times=times, duration=duration, motion=motion, step=step, key_step=key_step,
-        close_loops=close_loops, precision=precision, backend=backend,
+        scans, scanner, odometry, sensor=sensor, times=times, duration=duration, motion=motion, step=step,
+        key_step=key_step, close_loops=close_loops, precision=precision, backend=backend,
     )  # fmt: skip
     for _ in chainer.steps():
         pass
@@ -99,11 +115,12 @@ class Chainer:
     def __init__(
         self,
         scans: ArrayLike,
-        scanner: Scanner,
+        scanner: Scanner | Sequence[Scanner],
         odometry: ArrayLike | None,
         *,
+        sensor: ArrayLike | None = None,
         times: ArrayLike | None = None,
-        duration: float = 0.0,
+        duration: float | Sequence[float] = 0.0,
         motion: OdometryMotion | None = None,
         step: ArrayLike = (0.02, 0.01),
         key_step: ArrayLike = (0.5, 0.35),
@@ -111,115 +128,134 @@ class Chainer:
         precision: Precision = "float32",
         backend: Selection = "auto",
     ) -> None:
-        if not isinstance(scanner, Scanner):
-            raise TypeError(f"scanner: must be a Scanner, got {checks.show(scanner)}")
         device = get_backend(backend)
         real_dtype(precision, device)
-        read = np.atleast_2d(
-            readings("scans", np.asarray(scans) if isinstance(scans, list) else scans, scanner, device)
-        )
-        if not len(read):
+        self._data = data = check_scans(scans, scanner, sensor, partial(readings, backend=device))
+        if not len(data):
             raise ValueError("scans: must hold at least one scan, got none")
-        self._odometry = None if odometry is None else checks.array("odometry", odometry, (len(read), 3))
-        self._times = check_times(times, len(read))
-        checks.real("duration", duration, low=0.0)
-        if duration > 0 and self._times is None:
-            raise ValueError(f"duration: must be 0 without times, got {duration}")
+        self._odometry = None if odometry is None else checks.array("odometry", odometry, (len(data), 3))
+        self._times = check_times(times, len(data))
+        self._durations = list(check_durations(duration, len(data.scanners), self._times is not None))
         if motion is not None and not isinstance(motion, OdometryMotion):
             raise TypeError(f"motion: must be an OdometryMotion, got {checks.show(motion)}")
         checks.boolean("close_loops", close_loops)
         self._options = ChainOptions(
-            check_steps("step", step), check_steps("key_step", key_step), float(duration), motion, close_loops,
-            backend, precision,
+            check_steps("step", step), check_steps("key_step", key_step), 0.0, motion, close_loops, backend, precision,
         )  # fmt: skip
-        self._readings, self._scanner = read, scanner
-        self._jumps = jumps_of(self._times, len(read))
-        self._front = self._new_front()
-        self._loops: Loops | None = None
+        self._fronts = [self._new_front(one) for one in range(len(data.scanners))]
+        self._loops: tuple[Joint, Loops] | None = None
         self._motion, self._fitted_to = motion, 0
 
     @property
     def scans(self) -> int:
         """Number of scans that are chained so far."""
-        done, nodes = self._front.done, self._front.nodes
-        return len(self._readings) if done == len(nodes) else int(nodes[done - 1]) + 1
+        ends = [
+            int(rows[front.nodes[front.done - 1]]) + 1
+            for front, rows in zip(self._fronts, self._data.rows, strict=True)
+            if front.done < len(front.nodes)
+        ]
+        return min(ends, default=len(self._data))
 
     def steps(self) -> Iterator[str]:
         """Match, search and close, a part at a time, and yield a word on each."""
-        if self._options.duration > 0 and self._front.done == 1:
-            yield from self._find_order()
-        while self._front.advance():
-            yield f"scan {self.scans} of {len(self._readings)}"
-        if self._options.close_loops and len(self._front.keys) > LOCAL + 1:
-            self._loops = self._make_loops()
-            yield from self._loops.steps()
+        for one, duration in enumerate(self._durations):
+            if duration > 0 and self._fronts[one].done == 1:
+                yield from self._find_order(one)
+        # The front end that is behind the others is next.
+        while waiting := [
+            (int(rows[front.nodes[front.done]]), one)
+            for one, (front, rows) in enumerate(zip(self._fronts, self._data.rows, strict=True))
+            if front.done < len(front.nodes)
+        ]:
+            self._fronts[min(waiting)[1]].advance()
+            yield f"scan {self.scans} of {len(self._data)}"
+        if self._options.close_loops and any(len(front.keys) > LOCAL + 1 for front in self._fronts):
+            joint = self._joint()
+            self._loops = joint, self._make_loops(joint)
+            yield from self._loops[1].steps()
 
-    def _find_order(self) -> Iterator[str]:
-        """Find the order in which beams are measured, and begin with it."""
+    def _find_order(self, one: int) -> Iterator[str]:
+        """Find the order in which a scanner's beams are measured, and begin with it."""
         assert self._times is not None
-        found = signed_duration(
-            Matcher(self._readings, self._scanner, replace(self._options, duration=0.0)), self._times,
-            self._options.duration,
-        )  # fmt: skip
-        if found != self._options.duration:
-            self._options = replace(self._options, duration=found)
-            self._front = self._new_front()
-            yield "beams are measured in reverse order" if found < 0 else "beams are measured all at once"
+        data, duration = self._data, self._durations[one]
+        matcher = Matcher(data.readings[one], data.scanners[one], self._options)
+        found = signed_duration(matcher, self._times[data.rows[one]], duration)
+        if found != duration:
+            self._durations[one] = found
+            self._fronts[one] = self._new_front(one)
+            of = f" of scanner {one}" if len(data.scanners) > 1 else ""
+            yield f"beams{of} are measured in reverse order" if found < 0 else f"beams{of} are measured all at once"
 
-    def _new_front(self) -> Front:
-        """Return the front end before its first scan."""
-        return Front(self._readings, self._scanner, self._odometry, self._times, self._jumps, self._options)
+    def _new_front(self, one: int) -> Front:
+        """Return the front end of a scanner before its first scan."""
+        rows = self._data.rows[one]
+        odometry, times = (None if values is None else values[rows] for values in (self._odometry, self._times))
+        options = replace(self._options, duration=self._durations[one])
+        return Front(self._data.readings[one], self._data.scanners[one], odometry, times, options)
+
+    def _joint(self) -> Joint:
+        """Return the matched scans so far as one trajectory."""
+        times = self._times
+        if times is not None:
+            times = times + np.maximum(-np.array(self._durations), 0.0)[self._data.sensor]
+        return Joint(self._fronts, self._data.rows, times, self.scans)
 
     def chain(self) -> ScanChain:
         """Return the trajectory of the scans so far."""
-        front = self._front
-        nodes = front.nodes[: front.done]
-        links, poses = self._all_links(), front.poses
+        joint = self._joint() if self._loops is None else self._loops[0]
+        links, poses = self._all_links(joint), joint.poses
         closures = Links.joined([])
         if self._loops is not None:
-            keys = np.array(front.keys)
-            closures = self._loops.closures.renumbered(keys)
-            poses = _carried(poses, keys, self._loops.solution.poses)
+            loops = self._loops[1]
+            closures = loops.closures.renumbered(joint.keys)
+            poses = _carried(poses, joint.keys, loops.solution.poses)
         solution = solve(poses, Links.joined([links, closures]))
-        spread = pose_covariances(solution)
+        spread = INFLATION * pose_covariances(solution)
         found = solution.links.kind == CLOSURE
-        moved = relative(front.poses, solution.links.first[found], solution.links.second[found])
+        moved = relative(joint.poses, solution.links.first[found], solution.links.second[found])
         corrections = np.hypot(*(solution.links.pose[found] - moved)[:, :2].T)
-        return self._placed(solution, spread, nodes, corrections)
+        return self._placed(joint, solution, spread, corrections)
 
-    def _make_loops(self) -> Loops:
+    def _make_loops(self, joint: Joint) -> Loops:
         """Return the search for loops in the graph of the key scans."""
-        front = self._front
-        keys = np.array(front.keys)
-        number = np.full(front.done, -1)
+        keys, data = joint.keys, self._data
+        number = np.full(len(joint.nodes), -1)
         number[keys] = np.arange(len(keys))
-        links = self._all_links()
+        links, poses = self._all_links(joint), joint.poses
+        if len(joint.fronts) > 1:
+            poses = solve(poses, links).poses
         links = links[(number[links.first] >= 0) & (number[links.second] >= 0)].renumbered(number)
-        points = scan_points(self._readings[front.nodes[keys]], self._scanner, np.dtype(np.float32))
-        places = [place_points(points, self._scanner.mount[:2], k) for k in range(len(keys))]
-        broken = np.append(0, np.cumsum(front.p_right < SURE))[keys]
+        links = Links.joined([links, joint.couplings_of_keys(poses)])
+        places = data.places()
+        matcher = TeamMatcher([front.matcher for front in joint.fronts], data.sensor, places)
+        nodes = joint.nodes[keys]
         return Loops(
-            front.matcher, front.nodes[keys], places, broken, links, solve(front.poses[keys], links), TEMPERATURE,
-            LOCAL + 1,
+            matcher, nodes, (joint.owner[keys], joint.ranks()), place_points_of(data, nodes), joint.broken[keys], links,
+            solve(poses[keys], links), TEMPERATURE, (LOCAL + 1) * len(joint.fronts),
         )  # fmt: skip
 
-    def _all_links(self) -> Links:
+    def _all_links(self, joint: Joint) -> Links:
         """Return the links of matches and of odometry or constant motion; the odometry's noise is fitted once."""
-        front = self._front
-        links = weighed(front)
-        if front.done < 2:
-            return links
+        parts = [joint.renumbered(weighed(front), one) for one, front in enumerate(joint.fronts)]
         if self._odometry is None:
-            return Links.joined([links, constant_motion_links(front, links, self._jumps)])
-        reported = self._odometry[front.nodes[: front.done]]
-        if self._options.motion is None and self._fitted_to != front.done:
-            self._motion, self._fitted_to = fitted_odometry(front, links, reported), front.done
-        assert self._motion is not None
-        return Links.joined([links, links_of_odometry(front, links, reported, self._motion)])
+            links = Links.joined([*parts, joint.couplings(None, None)])
+            jumped = joint.jumped() & joint.failed
+            return Links.joined([links, constant_motion_links(joint.poses, joint.keys, jumped, links)])
+        for one, front in enumerate(joint.fronts):
+            links, wheels = weighed(front), self._odometry[self._data.rows[one][front.nodes[: front.done]]]
+            if front.done < 2:
+                continue
+            if self._options.motion is None and self._fitted_to != front.done and one == 0:
+                self._motion, self._fitted_to = fitted_odometry(front, links, wheels), front.done
+            others = links_of_odometry(front, links, wheels, self._motion or OdometryMotion())
+            # All scanners have the same odometer.
+            others = replace(others, information=others.information / len(joint.fronts))
+            parts.append(joint.renumbered(others, one))
+        return Links.joined([*parts, joint.couplings(self._odometry[joint.nodes], self._motion)])
 
-    def _placed(self, solution: Solution, spread: Floats, nodes: Integers, corrections: Floats) -> ScanChain:
+    def _placed(self, joint: Joint, solution: Solution, spread: Floats, corrections: Floats) -> ScanChain:
         """Return the result for all scans so far: those that are no nodes stand where the last node does."""
-        front, count = self._front, self.scans
+        count, nodes = self.scans, joint.nodes
         node = np.searchsorted(nodes, np.arange(count), "right") - 1
         poses, covariance = solution.poses[node], spread[node]
         start = np.zeros(3)
@@ -229,29 +265,24 @@ class Chainer:
             poses = compose_poses(poses, moved)
         c, s = np.cos(start[2]), np.sin(start[2])
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        during = front.matcher.motion
+        durations = tuple(self._durations)
         return ScanChain(
             compose_poses(start, poses), turn @ covariance @ turn.T, solution.links.renumbered(nodes),
-            nodes[np.array(front.keys)], None if self._odometry is None else self._motion,
-            None if during is None else during[nodes[node]], self._options.duration, corrections,
-            self._doubts(nodes), len(nodes),
+            nodes[joint.keys], None if self._odometry is None else self._motion, self._motions(count),
+            durations[0] if len(durations) == 1 else durations, self._data.sensor[:count], corrections,
+            doubts_of(joint, self._odometry is None), len(nodes),
         )  # fmt: skip
 
-    def _doubts(self, nodes: Integers) -> tuple[Doubt, ...]:
-        """Return the stretches that are doubtful."""
-        front = self._front
-        failed = front.p_right < SURE
-        jumped = self._jumps[nodes[1:]] & failed
-        alone = self._odometry is None
-        open_ = (front.lost > 0) & ~failed & alone
-        single = (front.confirmations() == 0) & ~failed & ~open_ & alone & (len(nodes) > 2)
-        doubts = []
-        reasons = {"no match": failed, "unobserved": open_, "unconfirmed": single, "jump": jumped}
-        for reason, flags in reasons.items():
-            edges = np.diff(np.concatenate([[False], flags, [False]]).astype(int))
-            for begin, end in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
-                doubts.append(Doubt(int(nodes[begin]), int(nodes[end]), reason))
-        return tuple(sorted(doubts))
+    def _motions(self, count: int) -> Floats | None:
+        """Return the motions during the scans so far; None where scans take no time."""
+        if all(front.matcher.motion is None for front in self._fronts):
+            return None
+        motions = np.zeros((len(self._data), 3))
+        for front, rows in zip(self._fronts, self._data.rows, strict=True):
+            if front.matcher.motion is not None:
+                last = np.searchsorted(front.nodes[: front.done], np.arange(len(rows)), "right") - 1
+                motions[rows] = front.matcher.motion[front.nodes[last]]
+        return motions[:count]
 
 
 def _carried(poses: Floats, keys: Integers, placed: Floats) -> Floats:

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense.chaining.drift import Drift
-from gpusense.chaining.front import Matcher
 from gpusense.chaining.graph import Solution, solve
 from gpusense.chaining.links import CLOSURE, Links
+from gpusense.chaining.matcher import TeamMatcher
 from gpusense.chaining.motion import relative
 from gpusense.chaining.places import overlaps
 from gpusense.localization.pose_algebra import compose_poses, invert_poses, wrap_angle
@@ -61,18 +61,22 @@ class Loops:
     Attributes:
         matcher: Matches scans.
         nodes: (K,) indices of the key scans.
+        sequence: (K,) scanners of the key scans, and (K,) their numbers among those of their scanner.
         places: End points of the key scans.
         broken: (K,) number of breaks of the chain before each key scan.
         links: Links between key scans, without closures.
         solution: The solution so far.
         closures: Closures so far.
         temperature: Factor of the information of matches.
-        tried: Pairs that were matched, with the level of the search.
+        apart: Key scans of a pair are at least this many apart.
+        tried: Scanner and number of the first scan and second scan of pairs that were matched, with the level of the
+            search.
         rejected: Number of matches that were sure but contradicted others, or stood alone.
     """
 
-    matcher: Matcher
+    matcher: TeamMatcher
     nodes: Integers
+    sequence: tuple[Integers, Integers]
     places: list[Floats]
     broken: Integers
     links: Links
@@ -81,7 +85,7 @@ class Loops:
     apart: int
     closures: Links = field(default_factory=lambda: Links.joined([]))
     matches: Links = field(default_factory=lambda: Links.joined([]))
-    tried: dict[tuple[int, int], int] = field(default_factory=dict)
+    tried: dict[tuple[int, int, int], int] = field(default_factory=dict)
     drift: tuple[Solution, Drift] | None = None
 
     def steps(self) -> Iterator[str]:
@@ -100,13 +104,14 @@ class Loops:
     def _search(self, level: int) -> bool:
         """Match candidates of a level and of those below, and return whether there were any."""
         _, cell, most = _LEVELS[level]
-        first, second, share = overlaps(self.places, self.solution.poses, cell, self.apart)
+        first, second, share = overlaps(self.places, self.solution.poses, cell, self.apart, self.sequence)
         drift = _deviations(self._drift().relative(first, second))
         needed = _level_of(drift)
         # Once more with the next window: deviations are estimates. The last one is for large drifts only.
         again = (needed == level - 1) & (level < len(_LEVELS) - 1)
         needed = np.where(again, level, needed)
-        new = (second % _EACH == 0) & (needed <= level)
+        new = (self.sequence[1][second] % _EACH == 0) & (needed <= level)
+        new &= self.matcher.can_match(self.nodes[first], self.nodes[second])
         first, second, share, needed = (values[new] for values in (first, second, share, needed))
         new = ~self._is_tried(first, second, needed)
         if np.count_nonzero(new) > most:
@@ -116,7 +121,8 @@ class Loops:
             some = needed == k
             found = self._matched(first[some], second[some], _LEVELS[k][0])
             self.matches = Links.joined([self.matches, found])
-        self.tried.update(zip(zip(first.tolist(), second.tolist(), strict=True), needed.tolist(), strict=True))
+        pairs = zip(*(values[first].tolist() for values in self.sequence), second.tolist(), strict=True)
+        self.tried.update(zip(pairs, needed.tolist(), strict=True))
         return bool(len(first))
 
     def _drift(self) -> Drift:
@@ -128,10 +134,11 @@ class Loops:
     def _is_tried(self, first: Integers, second: Integers, level: Integers) -> Flags:
         """Return whether pairs, or those with a neighbouring first scan, were matched at their level or a later one."""
         shifts = range(-_NEIGHBOURS, _NEIGHBOURS + 1)
+        rows = zip(*(values[first].tolist() for values in self.sequence), second.tolist(), level.tolist(), strict=True)
         found: Flags = np.array(
             [
-                any(self.tried.get((one + shift, two), -1) >= least for shift in shifts)
-                for one, two, least in zip(first.tolist(), second.tolist(), level.tolist(), strict=True)
+                any(self.tried.get((scanner, one + shift, two), -1) >= least for shift in shifts)
+                for scanner, one, two, least in rows
             ],
             bool,
         )

@@ -7,80 +7,32 @@ some key scans before it, and every other scan to the key scans on both sides. T
 from __future__ import annotations
 
 import copy
-import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense.chaining.following import matched_again, matched_by_motion, motions_around, weakened
 from gpusense.chaining.links import MATCH, Links, chained
-from gpusense.chaining.motion import relative, scan_motions
-from gpusense.chaining.options import ChainOptions
-from gpusense.localization.pose_algebra import pose_difference, wrap_angle
-from gpusense.matching.match import match_scan
+from gpusense.chaining.matcher import GROUP, NEAR, SURE, Matcher
+from gpusense.chaining.motion import filled_motion, partial_motion, relative, scan_motions
+from gpusense.chaining.options import ChainOptions, jumps_of
+from gpusense.localization.pose_algebra import compose_poses, invert_poses, pose_difference, wrap_angle
 from gpusense.matching.result import ScanMatch
 from gpusense.world.scanner import Scanner
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-GROUP = 256
-"""Scans of a group."""
 # Key scans before it to which a key scan is matched.
 LOCAL = 4
-# A match is used from this p_right on.
-SURE = 0.5
-# Half widths of the search of a match of scans whose relative pose is known from others [m, rad].
-NEAR = (0.5, 0.3)
+# Least p_right of a match that has failed but is a better guess than constant motion.
+_LIKELY = 0.1
+# Least p_right of a match over failed ones, and most of these in a row.
+_BRIDGE, _GAP = 0.8, 5
 # Readings differ by more than this [m], and this share; scans are unlike where more than a share of them does.
 _DIFFERENCE, _DIFFERENCE_SHARE, _UNLIKE = 0.15, 0.1, 0.3
 # A direction is a turn where this much of its length is.
 _TURNING = 0.5
-# Half widths of a second search after a failed one [m, rad].
-_WIDE = (2.0, math.pi)
-
-
-class Matcher:
-    """Matches scans of a log by their indices.
-
-    Args:
-        readings: (S, K) readings [m].
-        scanner: Their scanner.
-        options: Device and precision.
-    """
-
-    def __init__(self, readings: Floats, scanner: Scanner, options: ChainOptions) -> None:
-        self._readings, self._scanner, self._options = readings, scanner, options
-        self.motion: Floats | None = np.zeros((len(readings), 3)) if options.duration else None
-
-    def match(
-        self, first: Integers, second: Integers, guess: Floats, window: tuple[float, float] | None = None
-    ) -> ScanMatch:
-        """Return the poses of second scans in the frames of first ones; at least one pair.
-
-        Args:
-            first: (L,) indices.
-            second: (L,) indices.
-            guess: (L, 3) poses [m, m, rad].
-            window: Half widths of the search [m, rad]; None for the default of ``match_scan``.
-        """
-        options: dict[str, Any] = {} if window is None else {"window": window}
-        if self.motion is not None:
-            options |= {"motion": self.motion[second], "reference_motion": self.motion[first]}
-        return match_scan(
-            self._readings[first], self._readings[second], self._scanner, guess, backend=self._options.backend,
-            precision=self._options.precision, **options,
-        )  # fmt: skip
-
-    def links(self, kind: str, first: Integers, second: Integers, guess: Floats) -> Links:
-        """Return the links of those matches near their guesses that may be used."""
-        parts = []
-        for begin in range(0, len(first), 2 * GROUP):
-            part = slice(begin, begin + 2 * GROUP)
-            match = self.match(first[part], second[part], guess[part], NEAR)
-            links = Links.of(kind, first[part], second[part], match.pose, match.information, match.p_right)
-            parts.append(links[match.usable & (match.p_right >= SURE)])
-        return Links.joined(parts)
 
 
 class Front:
@@ -91,35 +43,51 @@ class Front:
         scanner: Their scanner.
         odometry: (S, 3) poses of the odometer, or None.
         times: (S,) times [s], or None.
-        jumps: (S,) whether the time jumps before a scan.
         options: The options.
 
     Attributes:
+        jumps: (S,) whether the time jumps before a scan.
         nodes: (M,) indices of the scans that are matched, those before which the robot has moved.
         steps: Motions from each node to the next.
         keys: Numbers of the nodes that are key scans.
-        doubt: Names of what is doubtful of each step; empty for none.
+        p_right: Probabilities of the matches of steps; 0 where none is usable.
+        lost: Numbers of directions that these leave open.
+        rivalled: Whether other motions explain the scans of a step about as well.
+        bridged: Whether a step that no match tells is that of a match over it.
+        spanned: Whether a match leads over a step that no match tells, and over its neighbours.
+        unseen: (L, 3, 3) projections of steps onto these.
         links: The links between nodes.
     """
 
     def __init__(
-        self, readings: Floats, scanner: Scanner, odometry: Floats | None, times: Floats | None,
-        jumps: NDArray[np.bool], options: ChainOptions,
-    ) -> None:  # fmt: skip
+        self, readings: Floats, scanner: Scanner, odometry: Floats | None, times: Floats | None, options: ChainOptions
+    ) -> None:
         self.matcher = Matcher(readings, scanner, options)
-        self._odometry, self._times, self._jumps, self._options = odometry, times, jumps, options
+        self.jumps = jumps_of(times, len(readings))
+        self._odometry, self._times, self._options = odometry, times, options
         self.nodes = moved_scans(odometry, readings, options.step)
         self.steps = np.zeros((0, 3))
         self.p_right = np.zeros(0)
         self.lost = np.zeros(0, np.int64)
+        self.unseen = np.zeros((0, 3, 3))
+        self.rivalled = np.zeros(0, bool)
+        self.bridged = np.zeros(0, bool)
+        self.spanned = np.zeros(0, bool)
         self.keys = [0]
         self._parts: list[Links] = []
+        self._last: Floats | None = None
+        self._expected = np.zeros((0, 3))
         self._waiting = 0
 
     @property
     def done(self) -> int:
         """Number of nodes that are matched."""
         return len(self.steps) + 1
+
+    @property
+    def has_odometry(self) -> bool:
+        """Whether there is odometry."""
+        return self._odometry is not None
 
     @property
     def links(self) -> Links:
@@ -132,14 +100,15 @@ class Front:
         return chained(np.zeros(3), self.steps)
 
     def confirmations(self) -> Integers:
-        """Return the number of matches of farther scans that span each step from node to node."""
+        """Return the number of matches of farther scans that span each step from node to node, beside a first one."""
         links = self.links
         far = np.abs(links.second - links.first) > 1
         ends = np.sort(np.stack([links.first[far], links.second[far]]), axis=0)
         change = np.zeros(self.done, np.int64)
         np.add.at(change, ends[0], 1)
         np.add.at(change, ends[1], -1)
-        return np.cumsum(change)[:-1]
+        spanning: Integers = np.cumsum(change)[:-1] - self.bridged
+        return spanning
 
     def advance(self) -> bool:
         """Match the next group; return whether there was one. An interrupt leaves the groups before it."""
@@ -156,6 +125,7 @@ class Front:
         if begin >= end:
             return False
         self._follow(np.arange(begin, end))
+        self._bridge(begin - 1, end - 1)
         self._choose_keys(begin, end)
         self._match_locally(end == len(self.nodes))
         return True
@@ -166,7 +136,10 @@ class Front:
         still = np.zeros((len(part), 3))
         guess = still if self._odometry is None else pose_difference(self._odometry[first], self._odometry[second])
         found = self.matcher.match(first, second, guess)
-        found = self._tried_again(found, first, second, guess)
+        rival = np.full((len(part), 3), np.nan)
+        if self._odometry is None:
+            found, rival = matched_by_motion(self.matcher, found, first, second, self._last)
+        found = matched_again(self.matcher, found, first, second, guess)
         if self.matcher.motion is not None and self._times is not None:
             moved = scan_motions(
                 found.pose, self._times[self.nodes[part[0] - 1 : part[-1] + 1]], self._options.duration
@@ -176,53 +149,87 @@ class Front:
             again = self.matcher.match(first, second, found.pose, NEAR)
             found = found.replaced(np.arange(len(part)), again, again.usable)
         usable = found.usable & (found.p_right >= SURE)
-        links = Links.of(MATCH, part - 1, part, found.pose, found.information, found.p_right)
+        information = weakened(found.information, rival)
+        links = Links.of(MATCH, part - 1, part, found.pose, information, found.p_right)
         self._parts.append(links[usable])
-        steps = self._filled(found, usable, guess, self._jumps[second])
+        if self._odometry is None:
+            good = usable & (found.eigenvalues > 0).all(axis=1)
+            guess = motions_around(found.pose, good, self._last)[2]
+            guess[self.jumps[second]] = 0.0
+            self._expected = np.concatenate([self._expected, guess])
+            likely = ~usable & (found.p_right >= _LIKELY)
+            guess[likely] = found.pose[likely]
+            if usable[-1]:
+                self._last = found.pose[-1]
+        steps = self._filled(found, usable, guess)
+        self.rivalled = np.concatenate([self.rivalled, usable & np.isfinite(rival).all(axis=1)])
         self.steps = np.concatenate([self.steps, steps])
         self.p_right = np.concatenate([self.p_right, np.where(usable, found.p_right, 0.0)])
         self.lost = np.concatenate([self.lost, np.where(usable, (found.eigenvalues == 0).sum(axis=1), 3)])
 
-    def _tried_again(self, found: ScanMatch, first: Integers, second: Integers, guess: Floats) -> ScanMatch:
-        """Match pairs that have failed from the motions before and after them, and by a wide search."""
-        for attempt in ("before", "after", "wide"):
-            good = found.usable & (found.p_right >= SURE)
-            rows = np.flatnonzero(~good)
-            if not len(rows):
-                break
-            others = guess[rows]
-            if attempt != "wide":
-                near = np.flatnonzero(good)
-                if not len(near):
-                    continue
-                place = np.searchsorted(near, rows) - (attempt == "before")
-                others = found.pose[near[np.clip(place, 0, len(near) - 1)]]
-            again = self.matcher.match(first[rows], second[rows], others, _WIDE if attempt == "wide" else None)
-            better = again.usable & (again.p_right > np.where(found.usable[rows], found.p_right[rows], 0.0))
-            found = found.replaced(rows, again, better)
-        return found
+    def _bridge(self, begin: int, end: int) -> None:
+        """Match over failed steps, of those from ``begin`` to ``end``, and take these from the matches."""
+        none = np.zeros(end - begin, bool)
+        self.bridged, self.spanned = np.append(self.bridged, none), np.append(self.spanned, none)
+        for before, after in ((1, 0), (0, 1)):
+            # From one scan more on one side, over a step that is known.
+            rows = begin + np.flatnonzero(self.p_right[begin:end] < SURE)
+            known = rows - before + after
+            inside = (known >= begin) & (known < end)
+            known, rows = known[inside], rows[inside]
+            rows = rows[(self.p_right[known] >= SURE) & (self.lost[known] == 0) & ~self.bridged[known]]
+            rows, pose, p_right = self._matched_over(rows - before, rows + 1 + after, rows)
+            others = self.steps[rows - before + after]
+            self.steps[rows] = (
+                compose_poses(invert_poses(others), pose) if before else compose_poses(pose, invert_poses(others))
+            )
+            self.p_right[rows], self.lost[rows], self.unseen[rows], self.bridged[rows] = p_right, 0, 0.0, True
+        edges = np.diff(np.concatenate([[False], self.p_right[begin:end] < SURE, [False]]).astype(int))
+        first, last = begin + np.flatnonzero(edges > 0), begin + np.flatnonzero(edges < 0)
+        short = (last - first >= 2) & (last - first <= _GAP)
+        runs, pose, _ = self._matched_over(first[short], last[short], np.flatnonzero(short))
+        for run, moved in zip(runs, pose, strict=True):
+            steps = np.arange(first[run], last[run])
+            shares = np.linspace(0, 1, len(steps) + 1)
+            places = partial_motion(np.repeat(moved[None], len(shares), axis=0), shares)
+            self.steps[steps] = relative(places, np.arange(len(steps)), np.arange(1, len(steps) + 1))
+            self.spanned[steps] = True
 
-    def _filled(self, found: ScanMatch, usable: NDArray[np.bool], guess: Floats, jumps: NDArray[np.bool]) -> Floats:
+    def _matched_over(self, first: Integers, second: Integers, rows: Integers) -> tuple[Integers, Floats, Floats]:
+        """Add links of good matches over failed ones, and return their rows, poses and p_right."""
+        if not len(rows):
+            return rows, np.zeros((0, 3)), np.zeros(0)
+        nodes = self.nodes[first], self.nodes[second]
+        match = self.matcher.match(*nodes, relative(self.poses, first, second))
+        if self._odometry is None:
+            # Failed steps may be worse guesses than constant motion is.
+            steps = np.where((self.p_right < SURE)[:, None], self._expected, self.steps)
+            guess = relative(chained(np.zeros(3), steps), first, second)
+            again = self.matcher.match(*nodes, guess)
+            match = match.replaced(np.arange(len(rows)), again, again.usable & (again.p_right > match.p_right))
+        good = match.usable & (match.p_right >= _BRIDGE) & (match.eigenvalues > 0).all(axis=1)
+        self._parts.append(Links.of(MATCH, first, second, match.pose, match.information, match.p_right)[good])
+        return rows[good], match.pose[good], match.p_right[good]
+
+    def _filled(self, found: ScanMatch, usable: NDArray[np.bool], guess: Floats) -> Floats:
         """Return the motions by matches, and along what these do not observe by odometry or constant motion."""
         steps = np.where(usable[:, None], found.pose, guess)
-        open_ = ~usable | (found.eigenvalues == 0).any(axis=1)
-        for k in np.flatnonzero(open_):
-            expected = guess[k]
-            if self._odometry is None:
-                before = steps[k - 1] if k else (self.steps[-1] if len(self.steps) else np.zeros(3))
-                expected = np.zeros(3) if jumps[k] else before
-            if not usable[k]:
-                steps[k] = expected
-                continue
-            scale = np.array([1.0, 1.0, found.lever[k]])
-            lost = found.directions[k][found.eigenvalues[k] == 0]
-            if self._odometry is None:
-                # A turn need not go on.
-                lost = lost[np.abs(lost[:, 2]) < _TURNING]
-            off = expected - steps[k]
-            off[2] = wrap_angle(off[2])
-            steps[k] += (lost.T @ (lost @ (scale * off))) / scale
+        unseen = self._unseen_of(found, usable)
+        for k in np.flatnonzero(unseen.any(axis=(1, 2))):
+            steps[k] = filled_motion(steps[k], guess[k], unseen[k])
+        self.unseen = np.concatenate([self.unseen, unseen])
         return steps
+
+    def _unseen_of(self, found: ScanMatch, usable: NDArray[np.bool]) -> Floats:
+        """Return projections (L, 3, 3) of motions onto the directions that matches do not observe."""
+        lost = found.eigenvalues == 0
+        if self._odometry is None:
+            # A turn need not go on.
+            lost &= np.abs(found.directions[:, :, 2]) < _TURNING
+        directions = found.directions * lost[:, :, None]
+        scale = np.stack([np.ones(len(lost)), np.ones(len(lost)), found.lever], axis=1)
+        unseen = np.einsum("lki,lkj->lij", directions, directions) * scale[:, None, :] / scale[:, :, None]
+        return np.where(usable[:, None, None], unseen, np.eye(3))
 
     def _choose_keys(self, begin: int, end: int) -> None:
         """Choose key scans among nodes: after a motion, and on both sides of a match that has failed."""
@@ -252,8 +259,8 @@ class Front:
                     second.append(k)
         self._waiting = end
         one, two = np.array(first, np.int64), np.array(second, np.int64)
-        # A failed step between two nodes separates them.
-        broken = np.append(0, np.cumsum(self.p_right < SURE))
+        # A failed step between two nodes separates them, as does one that may be another.
+        broken = np.append(0, np.cumsum(((self.p_right < SURE) & ~self.spanned) | self.rivalled))
         same = broken[one] == broken[two]
         one, two = one[same], two[same]
         found = self.matcher.links(MATCH, self.nodes[one], self.nodes[two], relative(poses, one, two))

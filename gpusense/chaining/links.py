@@ -13,11 +13,12 @@ from gpusense.localization.pose_algebra import pose_difference, wrap_angle
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-MATCH, ODOMETRY, MOTION, CLOSURE = "match", "odometry", "motion", "closure"
+MATCH, ODOMETRY, MOTION, COUPLING, CLOSURE = "match", "odometry", "motion", "coupling", "closure"
 KINDS = {
     MATCH: "scans near each other in the log, matched",
     ODOMETRY: "the robot's odometry",
     MOTION: "constant motion, where scans and odometry leave a direction open",
+    COUPLING: "scans of two scanners of the robot, by the motion between them",
     CLOSURE: "scans of a place that was seen again, matched",
 }
 """The meaning of each kind of a link."""

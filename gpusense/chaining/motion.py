@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gpusense.localization.motion import OdometryMotion
 from gpusense.localization.motion_fit import fit_odometry_motion
-from gpusense.localization.pose_algebra import pose_difference
+from gpusense.localization.pose_algebra import pose_difference, wrap_angle
 
 Floats = NDArray[np.float64]
 
@@ -92,3 +92,21 @@ def relative(poses: Floats, first: NDArray[np.int64], second: NDArray[np.int64])
     """Return (L, 3) poses of second scans in the frames of first ones."""
     found: Floats = pose_difference(poses[first], poses[second])
     return found
+
+
+def partial_motion(motion: Floats, share: Floats) -> Floats:
+    """Return the motions (L, 3) after a share (L,) of others, which are arcs (see ``gpusense.world.sweep``)."""
+    half = motion[:, 2] / 2
+    length = share * np.sinc(share * half / math.pi) / np.sinc(half / math.pi)
+    turn = (share - 1) * half
+    c, s = length * np.cos(turn), length * np.sin(turn)
+    x, y = motion[:, 0], motion[:, 1]
+    return np.stack([c * x - s * y, s * x + c * y, 2 * share * half], axis=1)
+
+
+def filled_motion(motion: Floats, expected: Floats, unseen: Floats) -> Floats:
+    """Return a motion (3,) that is the expected one along what a projection (3, 3) has of their difference."""
+    off = expected - motion
+    off[2] = wrap_angle(off[2])
+    result: Floats = motion + unseen @ off
+    return result

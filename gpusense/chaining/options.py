@@ -69,6 +69,25 @@ def check_times(times: object, scans: int) -> Floats | None:
     return values
 
 
+def check_durations(duration: object, scanners: int, timed: bool) -> tuple[float, ...]:
+    """Return the times of scans of L scanners from the first beam to the last one [s].
+
+    Args:
+        duration: A number for all, or L numbers.
+        scanners: L.
+        timed: Whether the times of the scans are known.
+
+    Raises:
+        TypeError, ValueError: another kind, negative numbers, or numbers without times of the scans.
+    """
+    several = scanners > 1 and np.ndim(duration) == 1  # type: ignore[arg-type]
+    given = checks.array("duration", duration, (scanners,)).tolist() if several else [duration] * scanners
+    values = tuple(float(checks.real("duration", value, low=0.0)) for value in given)
+    if max(values) > 0 and not timed:
+        raise ValueError(f"duration: must be 0 without times, got {duration}")
+    return values
+
+
 def jumps_of(times: Floats | None, scans: int) -> NDArray[np.bool]:
     """Return (S,) whether the time from the scan before is much longer than usual; False for the first one."""
     jumps = np.zeros(scans, bool)

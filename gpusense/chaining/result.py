@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense.chaining.joint import Joint
 from gpusense.chaining.links import CLOSURE, Links
 from gpusense.localization.motion import OdometryMotion
 
@@ -17,6 +18,7 @@ Integers = NDArray[np.int64]
 REASONS = {
     "no match": "the scan matches neither the one before nor key scans: its motion is that of odometry or a guess",
     "unobserved": "the scans do not observe a direction of the motion, as along a corridor, and there is no odometry",
+    "contested": "the scans agree about as well after another motion, and there is no odometry to tell which it was",
     "unconfirmed": "a single match tells the motion, and there is no odometry: no other match agrees with it",
     "jump": "the time jumps, and the robot may be anywhere after it",
 }
@@ -52,7 +54,8 @@ class ScanChain:
         motions: (S, 3) motion of the robot from the first listed beam of each scan to the last one, or None where
             scans take no time.
         duration: Time from the first listed beam to the last one that was used [s]; negative where beams are listed in
-            reverse: the times of poses are then later than those of the scans by as much.
+            reverse: see :attr:`later`. With several scanners a tuple.
+        sensor: (S,) index of the scanner of each scan.
         corrections: (C,) distances [m] by which the closures moved the second scans in the frames of the first ones.
         doubts: Stretches that are doubtful.
         matched: Number of scans that were matched; for the others the robot stood still by its odometry.
@@ -73,7 +76,8 @@ class ScanChain:
     keys: Integers
     motion: OdometryMotion | None
     motions: Floats | None
-    duration: float
+    duration: float | tuple[float, ...]
+    sensor: Integers
     corrections: Floats
     doubts: tuple[Doubt, ...]
     matched: int
@@ -91,13 +95,22 @@ class ScanChain:
             result[doubt.first + 1 : doubt.last + 1] = True
         return result
 
+    @property
+    def later(self) -> Floats:
+        """(S,) time [s] from a scan to its pose: that of the scan where beams are listed in reverse, else 0."""
+        result: Floats = np.maximum(-np.atleast_1d(np.array(self.duration, np.float64)), 0.0)[self.sensor]
+        return result
+
     def explain(self) -> str:
         """Return the numbers of scans, key scans, links and closures, and what is doubtful, in words."""
         count = len(self.poses)
         lines = [f"{count} scans, {self.matched} matched, {len(self.keys)} key scans, {len(self.links)} links"]
-        if self.duration:
-            order = "in reverse" if self.duration < 0 else "in their order"
-            lines.append(f"scans of {abs(self.duration):.3g} s, measured {order}, are freed of the robot's motion")
+        durations = self.duration if isinstance(self.duration, tuple) else (self.duration,)
+        for k, duration in enumerate(durations):
+            order = "in reverse" if duration < 0 else "in their order"
+            of = f"scanner {k}: " if len(durations) > 1 else ""
+            if duration:
+                lines.append(f"{of}scans of {abs(duration):.3g} s, measured {order}, are freed of the robot's motion")
         if len(self.corrections):
             lines.append(
                 f"{len(self.corrections)} closures, which moved scans by {np.median(self.corrections):.2f} m in the "
@@ -115,3 +128,25 @@ class ScanChain:
 
     def __repr__(self) -> str:
         return f"ScanChain({len(self.poses)} scans, {len(self.keys)} key scans, {len(self.corrections)} closures)"
+
+
+def doubts_of(joint: Joint, alone: bool) -> tuple[Doubt, ...]:
+    """Return the stretches that are doubtful.
+
+    Args:
+        joint: The matched scans.
+        alone: Whether there is no odometry.
+    """
+    failed, open_, nodes = joint.failed, joint.open & alone, joint.nodes
+    contested = joint.contested & ~failed & ~open_
+    single = (joint.confirmations() == 0) & ~failed & ~open_ & ~contested & alone & (len(nodes) > 2)
+    reasons = {
+        "no match": failed, "unobserved": open_, "contested": contested, "unconfirmed": single,
+        "jump": joint.jumped() & failed,
+    }  # fmt: skip
+    doubts = []
+    for reason, flags in reasons.items():
+        edges = np.diff(np.concatenate([[False], flags, [False]]).astype(int))
+        for begin, end in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
+            doubts.append(Doubt(int(nodes[begin]), int(nodes[end]), reason))
+    return tuple(sorted(doubts))

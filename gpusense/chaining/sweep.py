@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense.chaining.front import GROUP, NEAR, Matcher
 from gpusense.chaining.links import chained
+from gpusense.chaining.matcher import GROUP, NEAR, Matcher
 from gpusense.chaining.motion import relative, scan_motions
 
 Floats = NDArray[np.float64]

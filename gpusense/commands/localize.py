@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     add = parser.add_argument
     add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
-    add_log(parser, "a log with laser scans and odometry", several=True)
+    add_log(parser, "a log with laser scans and odometry", several="lasers that correct the filter")
     add("--particles", type=whole_number(low=1), metavar="N",
         help=f"particles (default: {DEFAULTS.particles}, with --global {DEFAULTS.particles_everywhere})")  # fmt: skip
     begin = parser.add_mutually_exclusive_group()

@@ -18,7 +18,7 @@ from gpusense.commands.arguments import (
 )
 from gpusense.commands.map_chain import add_chain, chain_log, check_chain, document, is_chained, words, write_chain
 from gpusense.commands.output import print_json
-from gpusense.commands.scans import add_log, add_reference, read_scans
+from gpusense.commands.scans import add_log, add_reference, read_scans_of_lasers, scanners_of
 from gpusense.commands.signals import code_of, word_of
 from gpusense.evaluation.machine import machine
 from gpusense.world.map_greys import MODES
@@ -43,6 +43,7 @@ Where the log has no corrected poses, as bags, the scans are chained: each is ma
 around it, places that are seen again are found and matched, and the poses are those of least squares over all matches
 and the odometry. The command says what was closed, and what is doubtful. CARMEN logs have poses, which in raw ones are
 copies of the odometry: --chain finds better ones. With --reference the poses are those of a TUM trajectory.
+Several lasers of a bag, whose transforms have their mounts, make one trajectory and one map.
 
 Ctrl-C ends the chain, and the map of the scans so far is written; or it ends the map, which then holds some of the
 scans. A map of more than four million cells is built in bands of rows: then it is the map of the bands so far, and of
@@ -52,6 +53,7 @@ Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
 example:
   gpusense map --log run.bag --out map.yaml --tum run.tum --plot map.png
+  gpusense map --log run.bag --topic /front /rear --out map.yaml
   gpusense map --log run.log.gz --chain --range-limit 20 --out map.yaml
   gpusense map --log run.log.gz --every 2 --range-limit 20 --resolution 0.1 --out even.yaml
   gpusense map --log run.bag --reference run.tum --out map.yaml"""
@@ -61,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     parser.epilog = _EPILOG
     add = parser.add_argument
-    add_log(parser, "a log with scans")
+    add_log(parser, "a log with scans", several="lasers of the map")
     add_reference(parser)
     add_chain(parser)
     add("--out", required=True, type=output_path(".yaml"), metavar="YAML", help="the map; its image lies beside it")
@@ -85,22 +87,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Build and write the map, after Ctrl-C that of the scans so far."""
-    from gpusense.evaluation.scoring import with_poses
+    from gpusense.evaluation.scoring import check_poses
     from gpusense.mapping.build import MapBuilder
 
     check_chain(args)
-    scans = read_scans(args, posed=False)
+    scans, sensor = read_scans_of_lasers(args)
     chained, stop, chosen = None, None, len(scans)
     if is_chained(args, scans):
-        chained = chain_log(args, scans)
+        chained = chain_log(args, scans, sensor)
         scans, stop = chained.scans, chained.stop
-    scans = with_poses(scans, args.log)
+        sensor = sensor[: len(scans)]
+    check_poses(scans, args.log)
     motions = None if chained is None else chained.chain.motions
     builder = MapBuilder(
-        [scan.ranges for _, scan in scans], [scan.pose or (0.0, 0.0, 0.0) for _, scan in scans], scans[0][1].scanner,
+        [scan.ranges for _, scan in scans], [scan.pose or (0.0, 0.0, 0.0) for _, scan in scans],
         resolution=args.resolution, origin=None, shape=None, range_limit=args.range_limit, clear_max=args.clear_max,
         p_hit=args.p_hit, p_miss=args.p_miss, p_prior=0.5, occupied_threshold=65, backend=args.backend, each=_SCANS,
-        motion=motions,
+        motion=motions, **scanners_of(scans, sensor),
     )  # fmt: skip
     done, ended = _build(builder)
     grid = builder.grid()

@@ -13,7 +13,7 @@ import numpy as np
 
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import output_path
-from gpusense.commands.scans import scan_times
+from gpusense.commands.scans import scan_times, scanners_of
 from gpusense.commands.signals import word_of
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 # Steps of the progress bar for the search for loops.
 _ROUNDS = 20
 # Names of the columns of a file of poses.
-_COLUMNS = "scan,time,x,y,theta,var_x,cov_xy,cov_xtheta,var_y,cov_ytheta,var_theta,doubtful"
+_COLUMNS = "scan,time,x,y,theta,var_x,cov_xy,cov_xtheta,var_y,cov_ytheta,var_theta,doubtful,laser"
 
 
 @dataclass
@@ -85,18 +85,21 @@ def is_chained(args: argparse.Namespace, scans: Scans) -> bool:
     return chained
 
 
-def chain_log(args: argparse.Namespace, scans: Scans) -> ChainedScans:
-    """Chain the scans; after Ctrl-C those so far."""
+def chain_log(args: argparse.Namespace, scans: Scans, sensor: list[int]) -> ChainedScans:
+    """Chain the scans of lasers; after Ctrl-C those so far."""
     from gpusense.chaining.chain import Chainer
 
-    readings = np.stack([scan.ranges for _, scan in scans])
+    readings = [scan.ranges for _, scan in scans]
     odometry = None if args.no_odometry else _odometry(scans)
     times = np.array([scan.time for _, scan in scans])
     known = bool((np.diff(times) >= 0).all())
-    duration = float(np.median([scan.duration for _, scan in scans])) if known else 0.0
+    each = [
+        [scan.duration for (_, scan), k in zip(scans, sensor, strict=True) if k == one] for one in sorted(set(sensor))
+    ]
+    durations = [float(np.median(some)) if known else 0.0 for some in each]
     chainer = Chainer(
-        readings, scans[0][1].scanner, odometry, times=times if known else None, duration=duration,
-        close_loops=not args.no_loops, backend=args.backend,
+        readings, odometry=odometry, times=times if known else None, close_loops=not args.no_loops,
+        duration=durations if len(durations) > 1 else durations[0], backend=args.backend, **scanners_of(scans, sensor),
     )  # fmt: skip
     begun, stop = time.perf_counter(), None
     with progress(len(scans) + _ROUNDS) as step:
@@ -132,9 +135,13 @@ def write_chain(args: argparse.Namespace, chained: ChainedScans, grid: Occupancy
 
     if args.tum is not None:
         # Where beams are listed in reverse, poses are those at the end of scans.
-        later = max(-chained.chain.duration, 0.0)
-        times, indices = scan_times([scan.time + later for _, scan in chained.scans])
-        write_tum(args.tum, times, chained.chain.poses, indices=indices)
+        at = np.array([scan.time for _, scan in chained.scans]) + chained.chain.later
+        rows = np.arange(len(at))
+        if len(np.unique(chained.chain.sensor)) > 1:
+            # One pose of each time of several lasers.
+            rows = np.unique(at, return_index=True)[1]
+        times, indices = scan_times(at[rows].tolist())
+        write_tum(args.tum, times, chained.chain.poses[rows], indices=indices)
     if args.poses is not None:
         _write_poses(args.poses, chained)
     if args.plot is not None:
@@ -145,15 +152,15 @@ def write_chain(args: argparse.Namespace, chained: ChainedScans, grid: Occupancy
 
 
 def _write_poses(path: Path, chained: ChainedScans) -> None:
-    """Write a line for each scan: index, time, pose, upper triangle of the covariance, whether it is doubtful."""
+    """Write a line for each scan: index, time, pose, upper triangle of the covariance, whether doubtful, laser."""
     from gpusense._util.files import write_whole
 
     lines, chain = [_COLUMNS], chained.chain
-    later = max(-chain.duration, 0.0)
     upper = chain.covariance[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-    for (index, scan), pose, spread, doubt in zip(chained.scans, chain.poses, upper, chain.doubtful, strict=True):
+    rows = zip(chained.scans, chain.poses, upper, chain.doubtful, chain.later, chain.sensor, strict=True)
+    for (index, scan), pose, spread, doubt, later, laser in rows:
         numbers = ",".join(f"{value:.9g}" for value in (*pose, *spread))
-        lines.append(f"{index},{scan.time + later:.6f},{numbers},{int(doubt)}")
+        lines.append(f"{index},{scan.time + later:.6f},{numbers},{int(doubt)},{laser}")
     text = "\n".join(lines) + "\n"
     write_whole(path, lambda file: file.write(text.encode()))
 

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gpusense.commands.arguments import finite_number
 
@@ -22,21 +22,21 @@ FORMATS = "CARMEN or Wean Hall, plain or .gz; a bag of ROS 1 (.bag) or of ROS 2 
 _OPTIONS = {"topic": "topic", "sensors": "topic", "mount": "mount", "node": "node"}
 
 
-def add_log(parser: argparse.ArgumentParser, what: str, *, required: bool = True, several: bool = False) -> None:
+def add_log(parser: argparse.ArgumentParser, what: str, *, required: bool = True, several: str | None = None) -> None:
     """Add ``--log``, and its laser: ``--topic`` and ``--mount``.
 
     Args:
         parser: The parser of a command.
         what: The log and its contents in words, with an article.
         required: Whether it must be given.
-        several: Whether the command takes several lasers.
+        several: The use of lasers in words, where the command takes several.
     """
     add = parser.add_argument
     add("--log", required=required, type=Path, metavar="FILE", help=f"{what}: {FORMATS}")
     names = "topic of a bag (default: /scan, or the only one); front or rear of a CARMEN log (default: front)"
     if several:
         add("--topic", "--sensors", dest="topic", nargs="+", default=[], metavar="NAME",
-            help=f"lasers that correct the filter, one or more: {names}")  # fmt: skip
+            help=f"{several}, one or more: {names}")  # fmt: skip
     else:
         add("--topic", metavar="NAME", help=f"laser: {names}")
     add("--mount", type=finite_number, nargs=3, metavar=("X", "Y", "THETA"),
@@ -80,22 +80,63 @@ def read_scans(args: argparse.Namespace, *, posed: bool = True) -> list[tuple[in
         FileNotFoundError: a file is missing.
     """
     from gpusense.evaluation.scoring import chosen_scans, with_one_scanner, with_poses
-    from gpusense.evaluation.trajectory_files import poses_at, read_tum
 
-    trajectory = None if args.reference is None else read_tum(args.reference)
     with options_named():
         scans = chosen_scans(
             args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit,
             topic=args.topic, mount=args.mount,
         )  # fmt: skip
-    if trajectory is not None:
-        chosen, poses = len(scans), poses_at([scan.time for _, scan in scans], *trajectory)
-        scans = [
-            (k, replace(scan, pose=pose)) for (k, scan), pose in zip(scans, poses, strict=True) if pose is not None
-        ]
-        if len(scans) < chosen:
-            sys.stderr.write(f"gpusense: --reference: has poses of {len(scans)} of {chosen} chosen scans\n")
+    if args.reference is not None:
+        scans = [(scans[k][0], scan) for k, scan in _referenced(args, [scan for _, scan in scans])]
     return (with_poses if posed else with_one_scanner)(scans, args.log)
+
+
+def read_scans_of_lasers(args: argparse.Namespace) -> tuple[list[tuple[int, Scan]], list[int]]:
+    """Read the chosen scans of the lasers of ``--topic`` in the order of their times, and the laser of each.
+
+    Raises:
+        ValueError: a file breaks its format, a laser has no chosen scan, or changes its scanner.
+        FileNotFoundError: a file is missing.
+    """
+    from gpusense.evaluation.steps import read_steps
+
+    with options_named():
+        steps = read_steps(
+            args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit,
+            sensors=args.topic, mount=args.mount,
+        )  # fmt: skip
+    chosen = list(enumerate(step.scan for step in steps))
+    if args.reference is not None:
+        chosen = _referenced(args, [scan for _, scan in chosen])
+    sensor = [steps[k].sensor for k, _ in chosen]
+    for index, name in enumerate(args.topic):
+        if index not in sensor:
+            raise ValueError(f"--topic: must have scans that are chosen, got none of {name}")
+    return [(steps[k].index, scan) for k, scan in chosen], sensor
+
+
+def scanners_of(scans: list[tuple[int, Scan]], sensor: list[int]) -> dict[str, Any]:
+    """Return the arguments ``scanner`` and ``sensor`` of the library for scans of one laser or of several."""
+    scanners = {one: scan.scanner for one, (_, scan) in zip(sensor, scans, strict=True)}
+    if len(scanners) == 1:
+        return {"scanner": scans[0][1].scanner}
+    numbers = {one: k for k, one in enumerate(sorted(scanners))}
+    return {"scanner": [scanners[one] for one in numbers], "sensor": [numbers[one] for one in sensor]}
+
+
+def _referenced(args: argparse.Namespace, scans: list[Scan]) -> list[tuple[int, Scan]]:
+    """Return those scans of which the trajectory of ``--reference`` has the pose, with their numbers."""
+    from gpusense.evaluation.trajectory_files import poses_at, read_tum
+
+    poses = poses_at([scan.time for scan in scans], *read_tum(args.reference))
+    known = [
+        (k, replace(scan, pose=pose))
+        for k, (scan, pose) in enumerate(zip(scans, poses, strict=True))
+        if pose is not None
+    ]
+    if len(known) < len(scans):
+        sys.stderr.write(f"gpusense: --reference: has poses of {len(known)} of {len(scans)} chosen scans\n")
+    return known
 
 
 def scan_times(times: list[float]) -> tuple[list[float], bool]:

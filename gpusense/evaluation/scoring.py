@@ -216,6 +216,16 @@ def with_poses(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> l
     Raises:
         ValueError: a scan has no pose, or another scanner.
     """
+    check_poses(scans, path)
+    return with_one_scanner(scans, path)
+
+
+def check_poses(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> None:
+    """Check that numbered scans of a log have poses.
+
+    Raises:
+        ValueError: a scan has none.
+    """
     for index, scan in scans:
         if scan.pose is None:
             rule = "every scan must have a pose, of its own or by --reference"
@@ -223,7 +233,6 @@ def with_poses(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> l
                 f"log: {rule}, got none at scan {index} of {path}; trajectories for --reference: of a SLAM program, of "
                 "'gpusense localize --tum' in a map, of 'gpusense map --tum' without one"
             )
-    return with_one_scanner(scans, path)
 
 
 def with_one_scanner(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]) -> list[tuple[int, Scan]]:

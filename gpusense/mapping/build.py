@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +15,7 @@ from gpusense.mapping.counts import BandCounts, bands
 from gpusense.mapping.rays import SCANS, RayEnds, Survey, batches, check_lengths, extent
 from gpusense.world.grid import OccupancyGrid, check_origin, check_resolution, grid_of_checked
 from gpusense.world.scanner import Scanner
+from gpusense.world.sensor_scans import check_scans
 from gpusense.world.sweep import check_motion
 from gpusense.world.windows import LONGEST_SIDE, Window
 
@@ -26,8 +28,9 @@ _KEPT_RAYS = 1 << 20
 def build_map(
     scans: ArrayLike,
     poses: ArrayLike,
-    scanner: Scanner,
+    scanner: Scanner | Sequence[Scanner],
     *,
+    sensor: ArrayLike | None = None,
     resolution: float = 0.05,
     origin: ArrayLike | None = None,
     shape: tuple[int, int] | None = None,
@@ -49,9 +52,11 @@ def build_map(
     A large map is built in bands of rows, so that it takes little more memory than its result, a byte a cell.
 
     Args:
-        scans: (S, K) readings [m]; missing readings say nothing. A ray may span 524 288 cells along an axis.
+        scans: (S, K) readings [m]; missing readings say nothing. A ray may span 524 288 cells along an axis. With
+            several scanners S readings, each of its scanner's length.
         poses: (S, 3) poses of the robot in the world [m, m, rad].
-        scanner: The scanner's geometry.
+        scanner: The scanner's geometry, or several scanners.
+        sensor: (S,) index of the scanner of each scan; with several scanners only.
         resolution: Side of a cell [m], 1e-4 to 1e3.
         origin: Pose (x, y, yaw) of the map's first corner [m, m, rad]; requires ``shape``. None: the map holds all
             rays, and its origin is a multiple of the resolution.
@@ -85,7 +90,7 @@ def build_map(
     builder = MapBuilder(
         scans, poses, scanner, resolution=resolution, origin=origin, shape=shape, range_limit=range_limit,
         clear_max=clear_max, p_hit=p_hit, p_miss=p_miss, p_prior=p_prior, occupied_threshold=occupied_threshold,
-        motion=motion, backend=backend,
+        motion=motion, sensor=sensor, backend=backend,
     )  # fmt: skip
     for _ in builder.steps():
         pass
@@ -103,7 +108,7 @@ class MapBuilder:
         self,
         scans: ArrayLike,
         poses: ArrayLike,
-        scanner: Scanner,
+        scanner: Scanner | Sequence[Scanner],
         *,
         resolution: float,
         origin: ArrayLike | None,
@@ -116,21 +121,21 @@ class MapBuilder:
         occupied_threshold: int,
         backend: Selection,
         motion: ArrayLike | None = None,
+        sensor: ArrayLike | None = None,
         each: int = SCANS,
         most: int = BAND_CELLS,
     ) -> None:
-        if not isinstance(scanner, Scanner):
-            raise TypeError(f"scanner: must be a Scanner, got {checks.show(scanner)}")
         placed = checks.array("poses", poses, ("S", 3))
-        readings = checks.array("scans", scans, (len(placed), scanner.count), finite=False)
-        scanner._first_scans.look_at("scans", readings)
+        data = check_scans(scans, scanner, sensor, _readings)
+        if len(data) != len(placed):
+            raise ValueError(f"scans: must be as many as poses, {len(placed)}, got {len(data)}")
         cell = check_resolution(resolution)
-        limit = scanner.range_max if range_limit is None else checks.real("range_limit", range_limit, above=0)
+        limit = np.inf if range_limit is None else checks.real("range_limit", range_limit, above=0)
         checks.boolean("clear_max", clear_max)
         self._occupancy = _occupancy(p_hit, p_miss, p_prior)
         self._threshold = checks.integer("occupied_threshold", occupied_threshold, low=1, high=100)
         moved = check_motion("motion", motion, len(placed))
-        self._survey = Survey(readings, placed, scanner, min(limit, scanner.range_max), clear_max, moved)
+        self._survey = Survey(data, placed, limit, clear_max, moved)
         self._each, self._backend = each, get_backend(backend)
         self._place(cell, origin, shape)
         self._bands = bands(self._shape, most)
@@ -150,7 +155,7 @@ class MapBuilder:
             ends = self._survey.rays(part)
             check_lengths(ends, resolution, int(part[0]))
             boxes[part] = ends.boxes(len(part), frame)
-            if len(boxes) * self._survey.scanner.count <= _KEPT_RAYS:
+            if self._survey.readings <= _KEPT_RAYS:
                 self._kept[part.tobytes()] = ends
         if placed is None:
             placed = extent(boxes, resolution)
@@ -210,6 +215,13 @@ class MapBuilder:
             if self._counts is not None:
                 self._write(self._counts, cells)
         return grid_of_checked(cells, self._frame.resolution, self._frame.origin, occupied_threshold=self._threshold)
+
+
+def _readings(name: str, value: Any, scanner: Scanner) -> np.ndarray:
+    """Return the readings (S, K) of a scanner."""
+    read = checks.array(name, value, ("S", scanner.count), finite=False)
+    scanner._first_scans.look_at(name, read)
+    return read
 
 
 def _occupancy(p_hit: float, p_miss: float, p_prior: float) -> tuple[float, float, float]:

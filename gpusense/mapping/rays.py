@@ -10,6 +10,7 @@ from gpusense.interface.constants import RAY_BITS
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import FARTHEST_ORIGIN, OccupancyGrid
 from gpusense.world.scanner import Reading, Scanner, classify
+from gpusense.world.sensor_scans import SensorScans
 from gpusense.world.sweep import beam_poses
 from gpusense.world.windows import LONGEST_SIDE, Window
 
@@ -24,28 +25,38 @@ class Survey:
     """Scans at known poses, and the rule by which readings become rays.
 
     Attributes:
-        scans: (S, K) readings [m].
+        data: The scans and their scanners.
         poses: (S, 3) poses of the robot [m, m, rad].
-        scanner: The scanner's geometry.
-        range_limit: Readings beyond it clear cells up to it and mark no obstacle [m].
+        range_limit: Readings beyond it clear cells up to it and mark no obstacle [m]; at most that of each scanner.
         clear_max: Whether max readings clear cells up to ``range_limit``; otherwise they are left out.
         motion: (S, 3) motions of the robot during the scans, see ``gpusense.world.sweep``; None: it is at rest.
     """
 
-    scans: np.ndarray
+    data: SensorScans
     poses: np.ndarray
-    scanner: Scanner
     range_limit: float
     clear_max: bool
     motion: np.ndarray | None = None
 
+    @property
+    def readings(self) -> int:
+        """Number of readings of all scans."""
+        return sum(readings.size for readings in self.data.readings)
+
     def rays(self, chosen: np.ndarray) -> RayEnds:
         """Return the rays of some scans by their indices."""
-        motion = None if self.motion is None else self.motion[chosen]
-        return RayEnds(
-            self.scans[chosen], self.poses[chosen], self.scanner, self.range_limit, clear_max=self.clear_max,
-            motion=motion,
-        )  # fmt: skip
+        parts, sensor, place = [], self.data.sensor[chosen], self.data.places()[chosen]
+        for one in np.unique(sensor):
+            some = np.flatnonzero(sensor == one)
+            scanner, rows = self.data.scanners[one], chosen[some]
+            ends = RayEnds(
+                self.data.readings[one][place[some]], self.poses[rows], scanner,
+                min(self.range_limit, scanner.range_max), clear_max=self.clear_max,
+                motion=None if self.motion is None else self.motion[rows],
+            )  # fmt: skip
+            ends.scan = some[ends.scan]
+            parts.append(ends)
+        return parts[0] if len(parts) == 1 else RayEnds.joined(parts)
 
 
 class RayEnds:
@@ -84,6 +95,15 @@ class RayEnds:
             self.start = poses[:, :2] + np.stack([cos * x - sin * y, sin * x + cos * y], axis=1)
             self.end = self.start + length[:, None] * turned
         self.hit, self.scan = hit[used], scan
+
+    @classmethod
+    def joined(cls, parts: list[RayEnds]) -> RayEnds:
+        """Return the rays of several parts in the order of their scans."""
+        result = cls.__new__(cls)
+        order = np.argsort(np.concatenate([part.scan for part in parts]), kind="stable")
+        for name in ("start", "end", "hit", "scan"):
+            setattr(result, name, np.concatenate([getattr(part, name) for part in parts])[order])
+        return result
 
     def boxes(self, count: int, frame: OccupancyGrid) -> np.ndarray:
         """Return the (S, 4) least column and row and largest column and row of the rays of each scan [cells].

@@ -6,63 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.matching_scenes import CORRIDOR, FRONT, RING, ROOM, box, relative, segments_scan
+from support.chain_scenes import BLOCK, OTHER, around, drifting, errors, scans_of
+from support.matching_scenes import CORRIDOR, FRONT, RING, ROOM, relative, segments_scan
 
 import gpusense as gs
 from gpusense.chaining.chain import Chainer
-
-# A ring of corridors around a block, with niches, so that each place is observed in all directions.
-BLOCK = np.array([
-    *box(0, 0, 24, 18), *box(2.5, 2.5, 21.5, 15.5), *box(7, 0, 7.6, 0.5), *box(16, 2.0, 17, 2.5), *box(23.2, 6, 24, 7),
-    *box(21.5, 11, 22, 12.5), *box(13, 17.4, 14, 18), *box(5, 15.5, 6.5, 16.1), *box(0, 10, 0.6, 10.8),
-    *box(2.5, 5, 3, 6),
-])  # fmt: skip
-OTHER = np.array([*box(-3, -3, 18, 9), *box(0.2, 0.4, 15, 6.1), *box(4, -3, 4.9, -2.3), *box(15.0, 1, 16.1, 2.2)])
-
-
-def around(step: float, laps: float = 1.1) -> np.ndarray:
-    """Return poses along the corridors of BLOCK, with rounded turns."""
-    x1, y1, x2, y2, r = 1.25, 1.25, 22.75, 16.75, 0.6
-    poses = []
-    sides = [(x1 + r, y1, 0.0, x2 - x1 - 2 * r), (x2, y1 + r, np.pi / 2, y2 - y1 - 2 * r),
-             (x2 - r, y2, np.pi, x2 - x1 - 2 * r), (x1, y2 - r, -np.pi / 2, y2 - y1 - 2 * r)]  # fmt: skip
-    for x, y, heading, length in sides:
-        for s in np.arange(0, length, step):
-            poses.append((x + s * np.cos(heading), y + s * np.sin(heading), heading))
-        x, y = x + length * np.cos(heading), y + length * np.sin(heading)
-        for t in np.arange(0, np.pi / 2, step / r):
-            ahead, left = r * np.sin(t), r * (1 - np.cos(t))
-            c, s = np.cos(heading), np.sin(heading)
-            poses.append((x + c * ahead - s * left, y + s * ahead + c * left, heading + t))
-    whole = np.array(poses)
-    return whole[np.arange(int(laps * len(whole))) % len(whole)]
-
-
-def scans_of(
-    walls: np.ndarray, poses: np.ndarray, scanner: gs.Scanner, noise: float = 0.01, seed: int = 0
-) -> np.ndarray:
-    """Return noisy readings at poses."""
-    rng = np.random.default_rng(seed)
-    ranges = np.array([segments_scan(walls, tuple(pose), scanner) for pose in poses])
-    return ranges + rng.normal(0, 0.01, ranges.shape)
-
-
-def drifting(poses: np.ndarray, stretch: float = 1.03, turn: float = 0.01) -> np.ndarray:
-    """Return poses of an odometer that reports too long ways, and turns that are not [rad/m]."""
-    steps = relative(poses[:-1], poses[1:])
-    steps[:, 2] += turn * np.hypot(steps[:, 0], steps[:, 1])
-    steps[:, :2] *= stretch
-    result = [np.array([3.0, -2.0, 1.0])]
-    for step in steps:
-        result.append(gs.compose_poses(result[-1], step))
-    return np.array(result)
-
-
-def errors(chain: gs.ScanChain, truth: np.ndarray) -> np.ndarray:
-    """Return distances of the poses from the true ones, in the frame of the first scan [m]."""
-    found = relative(np.repeat(chain.poses[:1], len(truth), axis=0), chain.poses)
-    wanted = relative(np.repeat(truth[:1], len(truth), axis=0), truth)
-    return np.hypot(*(found - wanted)[:, :2].T)
 
 
 @pytest.fixture(scope="module")
@@ -212,6 +160,35 @@ def test_wrong_motions_are_doubtful(step: float, needs) -> None:
     assert wrong.any()
     assert chain.doubtful[1:][wrong].all()
     assert not chain.doubtful.all()
+
+
+@pytest.mark.parametrize(("step", "range_max", "most"), [(1.0, 30.0, 0.3), (0.7, 10.0, 2.0), (1.0, 10.0, 5.0)])
+def test_large_motions_without_odometry_are_found_or_said(step: float, range_max: float, most: float, needs) -> None:
+    # From rest, scans of a corridor agree best where the robot has not moved.
+    truth = around(step)
+    short = gs.Scanner(FRONT.bearings, range_max=range_max)
+    chain = gs.chain_scans(scans_of(BLOCK, truth, short), short, close_loops=False, backend=needs("opencl"))
+    assert errors(chain, truth).max() < most
+    off = relative(chain.poses[:-1], chain.poses[1:]) - relative(truth[:-1], truth[1:])
+    off[:, 2] = gs.wrap_angle(off[:, 2])
+    wrong = (np.hypot(off[:, 0], off[:, 1]) > 0.3) | (np.abs(off[:, 2]) > 0.15)
+    assert chain.doubtful[1:][wrong].all()
+    assert "contested" in {doubt.reason for doubt in chain.doubts}
+    assert "after another motion" in chain.explain()
+
+
+def test_a_failed_match_is_bridged_over(needs) -> None:
+    # People stand in front of the scanner at one scan.
+    truth = np.array([(0.25 * k - 1.2, 0.1 * k - 0.6, 0.12 * k) for k in range(10)])
+    scans = scans_of(ROOM, truth, RING)
+    rng = np.random.default_rng(3)
+    scans[5] = np.where(rng.random(RING.count) < 0.75, rng.uniform(0.3, 1.2, RING.count), scans[5])
+    chain = gs.chain_scans(scans, RING, backend=needs("opencl"))
+    good = np.arange(10) != 5
+    assert errors(chain, truth)[good].max() < 0.05
+    assert chain.doubtful[5:7].all() and not chain.doubtful[:5].any() and not chain.doubtful[7:9].any()
+    # The scans beside it are linked.
+    assert ((chain.links.first <= 4) & (chain.links.second >= 6)).any()
 
 
 def test_joined_logs_of_two_buildings_are_not_closed(lap: tuple[np.ndarray, ...], needs) -> None:

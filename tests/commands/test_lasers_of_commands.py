@@ -134,6 +134,35 @@ def test_scans_without_poses_are_chained_to_a_map(place, capsys, tmp_path):
     assert gs.read_map(out).occupied.any()
 
 
+def test_two_lasers_make_one_trajectory_and_one_map(place, capsys, tmp_path):
+    out, tum, csv = tmp_path / "new.yaml", tmp_path / "run.tum", tmp_path / "run.csv"
+    argv = command(place, "map", "run", "--topic", "/front", "/rear", "--out", str(out), "--tum", str(tum))
+    del argv[argv.index("--reference") : argv.index("--reference") + 2]
+    assert cli.main([*argv, "--poses", str(csv), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["scans"] == 16 and report["chain"]["matched"] == 16 and report["chain"]["doubts"] == []
+    # Scans of both at the same times: a pose of each time.
+    times, poses = read_tum(tum)
+    truth = read_tum(place / "true.tum")[1]
+    assert times.tolist() == list(range(8))
+    here, there = (gs.pose_difference(np.repeat(p[:1], len(p), axis=0), p) for p in (poses, truth))
+    np.testing.assert_allclose(here, there, atol=0.03)
+    lasers = [line.rsplit(",", 1)[1] for line in csv.read_text().splitlines()]
+    assert lasers == ["laser", *["0", "1"] * 8]
+    # The rear laser sees what the front one does not.
+    occupied = {}
+    for topics in (["/front"], ["/front", "/rear"]):
+        argv = command(place, "map", "run", "--topic", *topics)
+        assert cli.main(argv) == 0
+        occupied[len(topics)] = gs.read_map(place / "built.yaml").occupied.sum()
+        capsys.readouterr()
+    assert occupied[2] > 1.3 * occupied[1]
+    message = error_of(command(place, "map", "run", "--topic", "/front", "/top"), capsys)
+    assert message.startswith("--topic: must be one of /front, /rear")
+    message = error_of(command(place, "map", "run", "--topic", "/front", "/rear", "--limit", "1"), capsys)
+    assert message.startswith("--topic: must have scans that are chosen, got none of /rear")
+
+
 def test_a_trajectory_of_matches_makes_a_map(place, capsys, tmp_path):
     tum, out = tmp_path / "run.tum", tmp_path / "new.yaml"
     assert cli.main(command(place, "match", "run", "--topic", "/front", "--tum", str(tum), "--noise", "0.02")) == 0

@@ -296,3 +296,51 @@ def test_a_map_beyond_the_memory_or_the_earth_is_refused(monkeypatch):
     monkeypatch.setattr(memory, "available", lambda: 1 << 20)
     with pytest.raises(MemoryError, match=r"^shape: 20000 x 20000 cells must fit into the available memory"):
         gs.build_map([[1.0]], [(0, 0, 0)], scanner, origin=(0, 0, 0), shape=(20000, 20000), backend="numpy")
+
+
+def test_scans_of_several_scanners_make_the_map_of_one_with_all_beams(backend: str) -> None:
+    rng = np.random.default_rng(4)
+    bearings = rng.uniform(-3, 3, 60)
+    poses, ranges = rng.uniform(-2, 2, (9, 3)), rng.uniform(0.1, 9.5, (9, 60))
+    ranges[:, ::7] = np.inf
+    whole = gs.Scanner(bearings, range_max=9.0)
+    # The beams of two others, one of which is mounted elsewhere, so that its beams have other bearings.
+    turned = (0.4, -0.3, 0.6)
+    parts = [gs.Scanner(bearings[:25], 9.0), gs.Scanner(bearings[25:] - turned[2], 7.0, mount=(0.0, 0.0, turned[2]))]
+    scans = [z for row in ranges for z in (row[:25], row[25:])]
+    options = {"resolution": 0.1, "clear_max": True, "backend": backend}
+    limited = np.where(ranges >= 7.0, np.inf, ranges)
+    one = gs.build_map(
+        np.concatenate([ranges[:, :25], limited[:, 25:]], axis=1), poses, whole, **options, range_limit=6
+    )
+    two = gs.build_map(scans, np.repeat(poses, 2, axis=0), parts, sensor=[0, 1] * 9, **options, range_limit=6)
+    np.testing.assert_array_equal(one.cells, two.cells)
+    assert one.origin == two.origin
+    # The mount moves the rays.
+    moved = [parts[0], gs.Scanner(parts[1].bearings, 7.0, mount=turned)]
+    other = gs.build_map(scans, np.repeat(poses, 2, axis=0), moved, sensor=[0, 1] * 9, **options)
+    assert other.cells.shape != one.cells.shape or (other.cells != one.cells).any()
+
+
+def test_motion_of_scans_of_several_scanners() -> None:
+    rng = np.random.default_rng(5)
+    scanners = [gs.Scanner(np.linspace(-2, 2, count), 9.0) for count in (40, 25)]
+    scans = [rng.uniform(1, 8, scanners[k % 2].count) for k in range(6)]
+    poses, motion = rng.uniform(-1, 1, (6, 3)), rng.uniform(-0.3, 0.3, (6, 3))
+    options = {"origin": (-12.0, -12.0, 0.0), "shape": (240, 240), "resolution": 0.1, "backend": "numpy"}
+    both = gs.build_map(scans, poses, scanners, sensor=[0, 1] * 3, motion=motion, **options)
+    each = [gs.build_map(scans[k::2], poses[k::2], scanners[k], motion=motion[k::2], **options) for k in (0, 1)]
+    known = (each[0].cells >= 0) | (each[1].cells >= 0)
+    np.testing.assert_array_equal(both.cells >= 0, known)
+    alone = (each[0].cells >= 0) & (each[1].cells < 0)
+    np.testing.assert_array_equal(both.cells[alone], each[0].cells[alone])
+
+
+def test_several_scanners_with_bad_values() -> None:
+    scanners, poses = [gs.Scanner([0.0, 1.0], 9.0), gs.Scanner([0.0], 9.0)], np.zeros((2, 3))
+    with pytest.raises(ValueError, match="sensor: must say which of the 2 scanners"):
+        gs.build_map([[1.0, 2.0], [1.0]], poses, scanners, backend="numpy")
+    with pytest.raises(ValueError, match=r"scans: scan 1 must have the 1 readings of scanner 1, got shape \(2,\)"):
+        gs.build_map([[1.0, 2.0], [1.0, 2.0]], poses, scanners, sensor=[0, 1], backend="numpy")
+    with pytest.raises(ValueError, match="scans: must be as many as poses, 3, got 2"):
+        gs.build_map([[1.0, 2.0], [1.0]], np.zeros((3, 3)), scanners, sensor=[0, 1], backend="numpy")

@@ -1,0 +1,149 @@
+"""Choose the inflation of covariances of chains on some logs, and look at covariances on others.
+
+    python bench/accuracy/chaining_covariances.py --backend opencl --output bench/results/chaining_covariances
+
+Chains are made without closures, from odometry. Errors are those of relative poses between scans that are 2 to 20 m of
+the way apart, with covariances of relative poses of the pose graph times an inflation. The normalised squared error
+(NEES) is divided by 3, so that 1 is right; "within" are the shares of errors in the ellipsoids of 50, 80 and 95 %.
+The inflation of a log is the mean NEES without one, with the largest tenth left out, where references are wrong. That
+of a half of the logs is the median of theirs; it is judged on the other half. References of recorded logs have errors
+of their own, but for jarvis; simulated runs have none.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+import gpusense as gs
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from chaining import figures
+from chaining_logs import Log, load, references
+from common import make_parser, note, parse, publish, table
+
+from gpusense.chaining.assembly import INFLATION
+from gpusense.chaining.chain import Chainer
+from gpusense.chaining.drift import Drift
+from gpusense.chaining.graph import solve
+
+HALVES = (("fr079", "aces", "jarvis-s3000", "olin"), ("csail", "fhw", "seattle", "jarvis-nav350"))
+SIMULATED = ("office", "corridor")
+LENGTHS = (2.0, 5.0, 10.0, 20.0)
+KEPT = 0.9
+LEVELS = (0.5, 0.8, 0.95)
+
+
+def simulated(name: str, seed: int) -> Log:
+    """Return a simulated run through rooms or corridors with exact poses."""
+    rng = np.random.default_rng(seed)
+    cells = np.zeros((400, 600), int)
+    cells[[0, -1]] = cells[:, [0, -1]] = 100
+    if name == "office":
+        for _ in range(60):
+            row, col = rng.integers(10, 380), rng.integers(10, 580)
+            if not (abs(row - 200) < 40 or abs(col - 300) < 40):
+                cells[row : row + rng.integers(4, 16), col : col + rng.integers(4, 16)] = 100
+    else:
+        cells[160:170], cells[230:240] = 100, 100
+        for col in range(20, 580, 45):
+            cells[160 : 160 + rng.integers(12, 18), col : col + 6] = 100
+    grid = gs.OccupancyGrid(cells, resolution=0.05)
+    scanner = gs.Scanner.uniform(angle_min=-np.pi / 2, angle_increment=np.pi / 180, count=181, range_max=25.0)
+    x = np.arange(3.0, 26.0, 0.12)
+    poses = np.stack([x, 10 + 0.3 * np.sin(x), np.arctan(0.3 * np.cos(x))], axis=1)
+    ranges = gs.RayCaster(grid, range_max=25.0, backend="numpy").cast(poses, scanner.bearings)
+    ranges = ranges + rng.normal(0, 0.015, ranges.shape)
+    steps = gs.pose_difference(poses[:-1], poses[1:])
+    odometry = [poses[0]]
+    for step in steps * 1.02 + rng.normal(0, (0.004, 0.002, 0.004), steps.shape):
+        odometry.append(gs.compose_poses(odometry[-1], step))
+    return Log(f"simulated {name} {seed}", ranges, scanner, np.array(odometry), poses, None)
+
+
+def squared_errors(log: Log, backend: str) -> np.ndarray:
+    """Return squared errors of relative poses in deviations, divided by 3."""
+    timed = log.times is not None
+    chainer = Chainer(
+        log.ranges, log.scanner, log.odometry, times=log.times, duration=log.duration if timed else 0.0,
+        close_loops=False, backend=backend,
+    )  # fmt: skip
+    for _ in chainer.steps():
+        pass
+    poses = chainer.chain().poses
+    truth = references(log, figures(log, "", poses, 0.0)["earlier_s"])
+    joint = chainer._joint()
+    solution = solve(joint.poses, chainer._all_links(joint))
+    known = np.flatnonzero(np.isfinite(truth[joint.nodes]).all(axis=1))
+    chosen = known[:: max(len(known) // 280, 1)]
+    true, found = truth[joint.nodes[chosen]], poses[joint.nodes[chosen]]
+    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(true[:, :2], axis=0).T)))
+    drift, result = Drift(solution, most=len(joint.nodes)), []
+    for length in LENGTHS:
+        first, second = np.arange(len(chosen)), np.searchsorted(path, path + length)
+        first, second = first[second < len(chosen)], second[second < len(chosen)]
+        if not len(first):
+            continue
+        moved = [gs.pose_difference(p[first], p[second]) for p in (true, found)]
+        off = moved[1] - moved[0]
+        off[:, 2] = gs.wrap_angle(off[:, 2])
+        spread = drift.relative(chosen[first], chosen[second])
+        result.append(np.einsum("li,lij,lj->l", off, np.linalg.inv(spread), off) / 3)
+    return np.concatenate(result)
+
+
+def row(name: str, squared: np.ndarray, ratio: float) -> dict[str, Any]:
+    """Return the figures of a log for the squared errors times a ratio."""
+    scaled = squared * ratio
+    kept = np.sort(scaled)[: max(int(KEPT * len(scaled)), 1)]
+    within = [float(np.mean(3 * scaled <= chi2.ppf(level, 3))) for level in LEVELS]
+    return {"log": name, "poses": len(scaled), "nees": float(np.mean(scaled)), "median": float(np.median(scaled)),
+            "kept": float(kept.mean()), "within": within}  # fmt: skip
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Measure, and publish tables."""
+    parser = make_parser(__doc__, backend="auto", data=True)
+    parser.add_argument("--seeds", type=int, default=2, help="runs of each simulated building")
+    arguments = parse(parser, argv)
+    errors = {}
+    for name in [log for half in HALVES for log in half]:
+        errors[name] = squared_errors(load(Path(arguments.data), name), arguments.backend)
+        note(f"{name}: NEES {errors[name].mean():.2f}")
+    made = [simulated(name, seed) for name in SIMULATED for seed in range(arguments.seeds)]
+    for log in made:
+        errors[log.name] = squared_errors(log, arguments.backend)
+        note(f"{log.name}: NEES {errors[log.name].mean():.2f}")
+    rows = []
+    for one, two in (HALVES, HALVES[::-1]):
+        factor = float(np.median([row("", errors[name], 1.0)["kept"] for name in one]))
+        for name in (*two, *(log.name for log in made)):
+            rows.append({"chosen_on": ", ".join(one), "factor": factor, **row(name, errors[name], 1 / factor)})
+    for name in errors:
+        rows.append({"chosen_on": "as it is", "factor": INFLATION, **row(name, errors[name], 1 / INFLATION)})
+    lines = [
+        [r["chosen_on"], f"{r['factor']:.3f}", r["log"], r["poses"], f"{r['nees']:.2f}", f"{r['kept']:.2f}",
+         f"{r['median']:.2f}", " / ".join(f"{100 * share:.0f}" for share in r["within"])]
+        for r in rows
+    ]  # fmt: skip
+    columns = [
+        "inflation chosen on",
+        "inflation",
+        "log",
+        "pairs of poses",
+        "NEES",
+        "of 90 %",
+        "median",
+        "within 50 / 80 / 95 %",
+    ]
+    publish(__file__, arguments, table(columns, lines), {"rows": rows})
+
+
+if __name__ == "__main__":
+    main()

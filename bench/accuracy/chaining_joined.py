@@ -1,0 +1,87 @@
+"""Join the logs of two buildings, and count the closures between them: there must be none.
+
+    python bench/accuracy/chaining_joined.py --backend opencl --output bench/results/chaining_joined
+
+The scans of the second log follow those of the first one, with odometry that goes on from where the first one ends, and
+without odometry. Logs are cut to their first scans. Scans of both must have equal beams to be those of one scanner: all
+are thinned to the beams at whole degrees, and their odometry is that of the corrected poses, which makes drifts small.
+"within" are the closures in the logs themselves.
+"""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import gpusense as gs
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from chaining_logs import Log, from_scans
+from common import make_parser, note, parse, publish, table
+
+NAMES = ("acapulco", "aces", "belgioioso", "csail", "fhw", "freiburg-079", "infinite-corridor", "intel", "seattle")
+LIMIT = 50.0
+
+
+def load(folder: Path, name: str, scans: int) -> Log:
+    """Return the first scans of a log with its corrected poses as odometry, thinned to one-degree beams."""
+    read = list(gs.read_log(folder / f"{name}-corrected.log.gz"))[:scans]
+    degrees = np.round(np.degrees(read[0].scanner.bearings), 3)
+    whole = np.flatnonzero(np.isclose(degrees, np.round(degrees)) & (degrees < 89.5))
+    scanner = gs.Scanner(np.radians(np.round(degrees[whole])), LIMIT)
+    thinned = [gs.Scan(s.time, s.ranges[whole], scanner, s.pose, s.pose) for s in read]
+    poses = np.array([s.pose for s in read])
+    return from_scans(name, thinned, poses, poses)
+
+
+def joined(one: Log, two: Log, with_odometry: bool, backend: str) -> dict[str, Any]:
+    """Chain two logs as one, and count closures."""
+    border = len(one.ranges)
+    moved = gs.pose_difference(np.repeat(two.odometry[:1], len(two.odometry), axis=0), two.odometry)
+    odometry = np.concatenate([one.odometry, gs.compose_poses(one.odometry[-1], moved)])
+    chain = gs.chain_scans(
+        np.concatenate([one.ranges, two.ranges]), one.scanner, odometry if with_odometry else None, backend=backend
+    )
+    closures = chain.closures
+    across = (closures.first < border) != (closures.second < border)
+    return {
+        "first": one.name, "second": two.name, "odometry": with_odometry, "scans": len(odometry),
+        "within": int((~across).sum()), "across": int(across.sum()),
+        "said": bool(chain.doubtful[border]),
+    }  # fmt: skip
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Measure, and publish a table."""
+    parser = make_parser(__doc__, backend="auto", data=True)
+    parser.add_argument("--scans", type=int, default=250, help="scans of each log (default: %(default)s)")
+    parser.add_argument("--log", action="append", choices=NAMES, help="default: all")
+    arguments = parse(parser, argv)
+    folder = Path(arguments.data) / "carmen_logs"
+    logs = [load(folder, name, arguments.scans) for name in arguments.log or NAMES]
+    rows = []
+    for one, two in itertools.combinations(logs, 2):
+        if one.scanner.count != two.scanner.count:
+            note(f"{one.name} and {two.name} have other beams")
+            continue
+        for with_odometry in (True, False):
+            rows.append(joined(one, two, with_odometry, arguments.backend))
+            note(f"{one.name} and {two.name}: {rows[-1]['across']} of {rows[-1]['within']} closures across")
+    lines = [
+        [row["first"], row["second"], "with" if row["odometry"] else "no", row["scans"], row["within"], row["across"],
+         "yes" if row["said"] else "no"]
+        for row in rows
+    ]  # fmt: skip
+    columns = ["first", "second", "odometry", "scans", "closures within", "across", "border is doubtful"]
+    total = f"{len(rows)} chains of {len(rows) // 2} pairs: {sum(row['across'] for row in rows)} closures across."
+    publish(__file__, arguments, table(columns, lines) + "\n\n" + total, {"rows": rows})
+
+
+if __name__ == "__main__":
+    main()

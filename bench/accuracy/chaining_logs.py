@@ -1,0 +1,115 @@
+"""Recorded logs with references for the benchmarks of chains."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import gpusense as gs
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from matching_odometry import recorded
+
+BOTH = "jarvis-both"
+
+
+@dataclass
+class Log:
+    """Scans with odometry and reference poses, NaN where unknown, or a track of another clock: t, x, y, theta."""
+
+    name: str
+    ranges: np.ndarray
+    scanner: gs.Scanner
+    odometry: np.ndarray
+    truth: np.ndarray
+    times: np.ndarray | None
+    duration: float = 0.0
+    track: np.ndarray | None = None
+    lasers: tuple[tuple[gs.Scanner, ...], np.ndarray, tuple[float, ...]] | None = None
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of ``chain_scans`` for its scanners."""
+        duration = self.duration if self.times is not None else 0.0
+        if self.lasers is None:
+            return {"scanner": self.scanner, "duration": duration}
+        return {"scanner": self.lasers[0], "sensor": self.lasers[1], "duration": self.lasers[2]}
+
+
+def load(data: Path, name: str) -> Log:
+    """Return a log by its name."""
+    if name == BOTH:
+        return both(*(load(data, f"jarvis-{laser}") for laser in ("s3000", "nav350")))
+    if name.startswith("jarvis"):
+        return jarvis(data / "jarvis_lab", name.removeprefix("jarvis-"))
+    if name == "olin":
+        return olin(data / "olin_mac_bag")
+    if name == "intel":
+        return intel(data / "carmen_logs")
+    scans, motions = recorded(data, {"fr079": "freiburg-079"}.get(name, name))
+    odometry = [np.zeros(3)]
+    for motion in motions:
+        odometry.append(gs.compose_poses(odometry[-1], motion))
+    return from_scans(name, scans, np.array(odometry), np.array([scan.pose for scan in scans]))
+
+
+def from_scans(name: str, scans: list[gs.Scan], odometry: np.ndarray, truth: np.ndarray) -> Log:
+    """Return a log of scans of one scanner; times that decrease are left out."""
+    times = np.array([scan.time for scan in scans])
+    known = times if (np.diff(times) >= 0).all() else None
+    return Log(name, np.stack([scan.ranges for scan in scans]), scans[0].scanner, odometry, truth, known)
+
+
+def intel(folder: Path) -> Log:
+    """Return the log with raw odometry; a few of its scans have corrected poses."""
+    scans = list(gs.read_log(folder / "intel-rawodom-every5.log.gz"))
+    truth = np.full((len(scans), 3), np.nan)
+    with (folder / "intel-rawodom-matches.csv").open() as file:
+        for row in csv.DictReader(file):
+            truth[int(row["raw_index"])] = [float(row[name]) for name in ("x_m", "y_m", "theta_rad")]
+    return from_scans("intel", scans, np.array([scan.odometry for scan in scans]), truth)
+
+
+def olin(folder: Path) -> Log:
+    """Return the bag with the reference that was refined in its own map."""
+    scans = list(gs.read_log(folder / "macfirst_floor_take_2"))
+    rows = np.loadtxt(folder / "derived_reference.csv", delimiter=",", skiprows=1)
+    log = from_scans("olin", scans, np.array([scan.odometry for scan in scans]), np.zeros((len(scans), 3)))
+    return replace(log, duration=float(np.median([scan.duration for scan in scans])), track=rows[:, :4])
+
+
+def jarvis(folder: Path, laser: str) -> Log:
+    """Return a laser of the bag; the scanner for navigation takes an eighth of a second for a turn."""
+    topic = {"s3000": "security", "nav350": "navigation"}[laser]
+    bag = folder / "jarvis_complex_path_fast.bag"
+    scans = list(gs.read_log(bag, topic=f"/driver_laser_{topic}/laser_scan"))
+    track = np.load(folder / "jarvis_complex_path_fast.npz")["gt"]
+    log = from_scans(f"jarvis-{laser}", scans, np.array([s.odometry for s in scans]), np.zeros((len(scans), 3)))
+    return replace(log, duration=float(np.median([scan.duration for scan in scans])), track=track)
+
+
+def both(one: Log, two: Log) -> Log:
+    """Return the scans of two lasers as one log."""
+    times = np.concatenate([one.times, two.times])
+    order = np.argsort(times, kind="stable")
+    ranges = [*one.ranges, *two.ranges]
+    lasers = (one.scanner, two.scanner), (order >= len(one.times)).astype(int), (one.duration, two.duration)
+    odometry = np.concatenate([one.odometry, two.odometry])[order]
+    return Log(BOTH, [ranges[k] for k in order], one.scanner, odometry, np.zeros((len(order), 3)), times[order],
+               track=one.track, lasers=lasers)  # fmt: skip
+
+
+def references(log: Log, earlier: float) -> np.ndarray:
+    """Return the reference poses of the scans, of a track those some seconds earlier."""
+    if log.track is None:
+        return log.truth
+    at, (t, x, y, theta) = log.times - earlier, log.track.T
+    columns = [np.interp(at, t, values, np.nan, np.nan) for values in (x, y, np.unwrap(theta))]
+    return np.stack(columns, axis=1)

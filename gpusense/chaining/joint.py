@@ -1,0 +1,248 @@
+"""One trajectory of a robot with several scanners: the scans of all front ends in the order of the log.
+
+Scans of each scanner are matched among themselves. Between two scans of one scanner lie scans of the others, at which
+the robot's pose follows by a share of the motion, by time. So key scans are coupled with the scans of other scanners
+before and after them: by odometry, or by this share.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.chaining.assembly import shared_odometry
+from gpusense.chaining.front import Front
+from gpusense.chaining.links import COUPLING, Links, chained
+from gpusense.chaining.matcher import SURE
+from gpusense.chaining.motion import constant_motion_deviation, filled_motion, partial_motion, relative
+from gpusense.localization.motion import OdometryMotion
+from gpusense.localization.pose_algebra import pose_difference
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool]
+
+# Deviations of a pose between scans of two scanners: of mounts and clocks [m, rad], and a share of the motion.
+_MOUNTS, _MOUNTS_TURN, _SHARE = 0.01, 0.01, 0.1
+# Constant motion goes on over intervals at most this many times as long.
+_LONGER = 3.0
+# The share between key scans.
+_KEY_SHARE = 0.02
+# Share of the largest eigenvalue below which a direction of the information of all scanners is open.
+_OPEN = 1e-6
+
+
+class Joint:
+    """The matched scans of several front ends.
+
+    Args:
+        fronts: The front ends.
+        rows: Of each, the indices of its scans in the log.
+        times: (S,) times of the poses at the scans of the log [s]; None: evenly.
+        scans: Scans of the log that are taken.
+
+    Attributes:
+        nodes: (M,) indices of the matched scans in the log, ascending.
+        of: Of each front end, the numbers of its nodes among these.
+        owner: (M,) index of the front end of each node.
+        keys: (K,) numbers of nodes that are key scans.
+        failed: (M - 1,) whether no scanner tells the motion from a node to the next.
+        open: (M - 1,) whether the scanners that tell it leave a direction open.
+        contested: (M - 1,) whether the scanners that tell it may tell another one as well.
+        poses: (M, 3) poses by the matches that tell most of each motion, chained from the first one.
+    """
+
+    def __init__(self, fronts: Sequence[Front], rows: Sequence[Integers], times: Floats | None, scans: int) -> None:
+        self.fronts = fronts
+        own = [row[front.nodes[: front.done]] for front, row in zip(fronts, rows, strict=True)]
+        own = [nodes[nodes < scans] for nodes in own]
+        whole, owner = np.concatenate(own), np.repeat(np.arange(len(own)), [len(nodes) for nodes in own])
+        order = np.argsort(whole, kind="stable")
+        self.nodes, self.owner = whole[order], owner[order]
+        self.of = [np.searchsorted(self.nodes, nodes) for nodes in own]
+        self.keys = np.sort(np.concatenate([of[_below(front.keys, len(of))] for front, of in self._each()]))
+        self._trust = np.stack([self._trust_of(front, of) for front, of in self._each()])
+        self.failed: Flags = self._trust.max(axis=0) <= 0
+        self.open = ~self.failed & self._open()
+        self.contested = ~self.failed & self._contested()
+        self.poses = fronts[0].poses if len(fronts) == 1 else self._chained(times)
+
+    def _each(self) -> list[tuple[Front, Integers]]:
+        return list(zip(self.fronts, self.of, strict=True))
+
+    def renumbered(self, links: Links, index: int) -> Links:
+        """Return links between nodes of a front end as links between nodes of all, without those beyond the last."""
+        count = len(self.of[index])
+        return links[(links.first < count) & (links.second < count)].renumbered(self.of[index])
+
+    @property
+    def broken(self) -> Integers:
+        """(M,) number of motions before each node that no scanner tells, and over which no match leads."""
+        spanned = np.zeros(len(self.failed), bool)
+        for front, of in self._each():
+            step, inside = _steps_of(of, len(self.nodes))
+            spanned[inside] |= front.spanned[step[inside]]
+        result: Integers = np.append(0, np.cumsum(self.failed & ~spanned))
+        return result
+
+    def jumped(self) -> Flags:
+        """Return whether the time jumps from a node to the next, for all scanners that are there."""
+        jumped = np.ones(len(self.nodes) - 1, bool)
+        for front, of in self._each():
+            step, inside = _steps_of(of, len(self.nodes))
+            jumped[inside] &= front.jumps[front.nodes[step[inside] + 1]]
+        return jumped
+
+    def ranks(self) -> Integers:
+        """Return the number (K,) of each key scan among those of its scanner."""
+        ranks = np.zeros(len(self.keys), np.int64)
+        for one in range(len(self.fronts)):
+            some = self.owner[self.keys] == one
+            ranks[some] = np.arange(np.count_nonzero(some))
+        return ranks
+
+    def confirmations(self) -> Integers:
+        """Return the number (M - 1,) of matches that tell the motion from a node to the next, beside a first one."""
+        total = np.count_nonzero(self._trust > 0, axis=0) - 1
+        for front, of in self._each():
+            step, inside = _steps_of(of, len(self.nodes))
+            if inside.any():
+                total = total + np.where(inside, front.confirmations()[np.where(inside, step, 0)], 0)
+        result: Integers = np.maximum(total, 0)
+        return result
+
+    def _trust_of(self, front: Front, of: Integers) -> Integers:
+        """Return what a front end tells of each motion: -1 nothing, 0 no match, 1 with open directions, 2 all."""
+        step, inside = _steps_of(of, len(self.nodes))
+        trust = np.full(len(step), -1)
+        if inside.any():
+            step = step[inside]
+            trust[inside] = np.where(front.p_right[step] < SURE, 0, np.where(front.lost[step] > 0, 1, 2))
+        return trust
+
+    def _open(self) -> Flags:
+        """Return whether matches leave a direction of the motion from each node to the next open."""
+        if len(self.fronts) == 1:
+            return self._trust[0] < 2
+        total = np.zeros((len(self.nodes) - 1, 3, 3))
+        for index, (front, of) in enumerate(self._each()):
+            links, (step, _) = front.links, _steps_of(of, len(self.nodes))
+            follow = np.flatnonzero(links.second - links.first == 1)
+            information = np.zeros((max(front.done - 1, 1), 3, 3))
+            information[links.first[follow]] = links.information[follow]
+            told = self._trust[index] > 0
+            total[told] += information[step[told]]
+        values = np.linalg.eigvalsh(total)
+        found: Flags = values[:, 0] <= _OPEN * np.maximum(values[:, -1], 1e-300)
+        return found & (self._trust.max(axis=0) < 2)
+
+    def _contested(self) -> Flags:
+        """Return whether another motion explains the scans of every front end that tells each motion."""
+        contested = np.ones(len(self.nodes) - 1, bool)
+        for index, (front, of) in enumerate(self._each()):
+            told = self._trust[index] > 0
+            step, _ = _steps_of(of, len(self.nodes))
+            contested[told] &= front.rivalled[step[told]]
+        return contested
+
+    def _chained(self, times: Floats | None) -> Floats:
+        """Return poses by the motions of those front ends that tell most."""
+        t = self.nodes.astype(np.float64) if times is None else times[self.nodes]
+        moved = np.zeros((len(self.nodes) - 1, 3))
+        unseen = np.zeros((len(moved), 3, 3))
+        best = np.argmax(self._trust, axis=0)
+        for index, (front, of) in enumerate(self._each()):
+            step, _ = _steps_of(of, len(self.nodes))
+            chosen = np.flatnonzero((best == index) & (self._trust[index] >= 0))
+            begin, end = of[step[chosen]], of[step[chosen] + 1]
+            shares = []
+            for node in (chosen, chosen + 1):
+                whole = t[end] - t[begin]
+                even = (node - begin) / (end - begin)
+                shares.append(np.where(whole > 0, (t[node] - t[begin]) / np.where(whole > 0, whole, 1.0), even))
+            steps = front.steps[step[chosen]]
+            moved[chosen] = pose_difference(*(partial_motion(steps, share) for share in shares))
+            unseen[chosen] = front.unseen[step[chosen]]
+        if not self.fronts[0].has_odometry:
+            jumped, gaps = self.jumped(), np.diff(t)
+            for k in np.flatnonzero(unseen.any(axis=(1, 2))):
+                ratio = gaps[k] / gaps[k - 1] if k and gaps[k - 1] > 0 else 0.0
+                before = moved[k - 1] * min(ratio, _LONGER) if k and not jumped[k] else np.zeros(3)
+                moved[k] = filled_motion(moved[k], before, unseen[k])
+        return chained(np.zeros(3), moved)
+
+    def pairs(self) -> tuple[Integers, Integers]:
+        """Return nodes with those of other scanners before and after them: earlier and later ones (L,).
+
+        These are key scans, and scans of which the matches to the one before do not tell all.
+        """
+        count, pairs = len(self.nodes), []
+        before, after = np.full((len(self.fronts), count), -1), np.full((len(self.fronts), count), -1)
+        for index, of in enumerate(self.of):
+            if len(of):
+                place = np.searchsorted(of, np.arange(count))
+                before[index] = np.where(place > 0, of[np.maximum(place - 1, 0)], -1)
+                after[index] = np.where(place < len(of), of[np.minimum(place, len(of) - 1)], -1)
+        chosen = np.zeros(count, bool)
+        chosen[self.keys] = True
+        for front, of in self._each():
+            chosen[of[1:][front.lost[: max(len(of) - 1, 0)] > 0]] = True
+        for index in range(len(self.fronts)):
+            others = np.flatnonzero(chosen & (self.owner != index))
+            pairs += [np.stack([before[index, others], others]), np.stack([others, after[index, others]])]
+        both = np.concatenate(pairs, axis=1)
+        both = np.unique(both[:, (both >= 0).all(axis=0)], axis=1)
+        return both[0], both[1]
+
+    def couplings(self, reported: Floats | None, motion: OdometryMotion | None) -> Links:
+        """Return links between key scans and scans of other scanners.
+
+        Args:
+            reported: (M, 3) poses of the odometer at the nodes, or None.
+            motion: Its noise, or None.
+        """
+        if len(self.fronts) == 1:
+            return Links.joined([])
+        first, second = self.pairs()
+        if reported is not None and motion is not None:
+            links = shared_odometry(COUPLING, first, second, reported, motion)
+            spread = np.linalg.inv(links.information) + np.diag([_MOUNTS**2, _MOUNTS**2, _MOUNTS_TURN**2])
+            return Links.of(COUPLING, first, second, links.pose, np.linalg.inv(spread))
+        moved = relative(self.poses, first, second)
+        known = self.broken[first] == self.broken[second]
+        guessed = constant_motion_deviation(moved)
+        deviation = np.where(known[:, None], _shares(moved, _SHARE), guessed)
+        return Links.of(COUPLING, first, second, moved, _information(deviation))
+
+    def couplings_of_keys(self, poses: Floats) -> Links:
+        """Return links between successive key scans of different scanners by poses (M, 3), numbered by key scans."""
+        first = np.flatnonzero(self.owner[self.keys[:-1]] != self.owner[self.keys[1:]])
+        moved = relative(poses, self.keys[first], self.keys[first + 1])
+        known = self.broken[self.keys[first]] == self.broken[self.keys[first + 1]]
+        deviation = np.where(known[:, None], _shares(moved, _KEY_SHARE), constant_motion_deviation(moved))
+        return Links.of(COUPLING, first, first + 1, moved, _information(deviation))
+
+
+def _shares(moved: Floats, share: float) -> Floats:
+    """Return deviations (L, 2) that are a share of motions [m, rad]."""
+    return share * np.stack([np.hypot(moved[:, 0], moved[:, 1]), np.abs(moved[:, 2])], axis=1)
+
+
+def _information(deviation: Floats) -> Floats:
+    """Return the information (L, 3, 3) of couplings with deviations beside those of mounts."""
+    diagonal = 1 / (np.array([_MOUNTS, _MOUNTS, _MOUNTS_TURN]) ** 2 + deviation[:, [0, 0, 1]] ** 2)
+    return diagonal[:, :, None] * np.eye(3)
+
+
+def _below(keys: Sequence[int], count: int) -> Integers:
+    """Return the key scans among the first nodes."""
+    values = np.array(keys, np.int64)
+    return values[values < count]
+
+
+def _steps_of(of: Integers, count: int) -> tuple[Integers, Flags]:
+    """Return the steps (M - 1,) of a front end in which the motions between all nodes lie, and whether there is one."""
+    step = np.searchsorted(of, np.arange(max(count - 1, 0)), "right") - 1
+    return step, (step >= 0) & (step < len(of) - 1)

@@ -1,0 +1,163 @@
+"""Matches between scans of a log by their indices, of one scanner or of several scanners of a robot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.chaining.links import Links
+from gpusense.chaining.options import ChainOptions
+from gpusense.localization.pose_algebra import compose_poses, invert_poses
+from gpusense.matching.match import match_scan
+from gpusense.matching.result import ScanMatch
+from gpusense.world.scanner import Scanner
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+GROUP = 256
+"""Scans of a group."""
+# A match is used from this p_right on.
+SURE = 0.5
+# Half widths of the search of a match of scans whose relative pose is known from others [m, rad].
+NEAR = (0.5, 0.3)
+
+
+class Found(NamedTuple):
+    """Matches of L pairs: see :class:`gpusense.matching.result.ScanMatch` for the fields."""
+
+    pose: Floats
+    information: Floats
+    p_right: Floats
+    status: NDArray[np.str_]
+
+
+class Matcher:
+    """Matches scans of one scanner.
+
+    Args:
+        readings: (S, K) readings [m].
+        scanner: Their scanner.
+        options: Device and precision.
+
+    Attributes:
+        readings: The readings.
+        scanner: The scanner.
+        motion: (S, 3) motions of the robot during the scans; None where these take no time.
+    """
+
+    def __init__(self, readings: Floats, scanner: Scanner, options: ChainOptions) -> None:
+        self.readings, self.scanner, self._options = readings, scanner, options
+        self.motion: Floats | None = np.zeros((len(readings), 3)) if options.duration else None
+
+    def match(
+        self, first: Integers, second: Integers, guess: Floats, window: tuple[float, float] | None = None
+    ) -> ScanMatch:
+        """Return the poses of second scans in the frames of first ones; at least one pair.
+
+        Args:
+            first: (L,) indices.
+            second: (L,) indices.
+            guess: (L, 3) poses [m, m, rad].
+            window: Half widths of the search [m, rad]; None for the default of ``match_scan``.
+        """
+        moved = (None, None) if self.motion is None else (self.motion[first], self.motion[second])
+        return self._matched(self.scanner, self.readings[first], self.readings[second], guess, window, moved)
+
+    def across(
+        self, first: Integers, other: Matcher, second: Integers, guess: Floats, window: tuple[float, float] | None
+    ) -> Found:
+        """Return the poses of the robot at scans of another scanner of equal bearings, in the frames at these ones.
+
+        Both are matched as scans of one scanner in the middle of a robot, whose poses are then those of the scanners.
+        """
+        one, two = (np.array(matcher.scanner.mount) for matcher in (self, other))
+        plain = Scanner(
+            self.scanner.bearings, min(self.scanner.range_max, other.scanner.range_max),
+            max(self.scanner.range_min, other.scanner.range_min),
+        )  # fmt: skip
+        moved: tuple[Floats | None, Floats | None] = (None, None)
+        if self.motion is not None or other.motion is not None:
+            moved = _motion_at(self, first, one), _motion_at(other, second, two)
+        seen = compose_poses(invert_poses(one), compose_poses(guess, two))
+        match = self._matched(plain, self.readings[first], other.readings[second], seen, window, moved)
+        back = invert_poses(two)
+        pose = compose_poses(one, compose_poses(match.pose, back))
+        # Derivative of the robot's pose by the scanner's.
+        c, s = np.cos(match.pose[:, 2]), np.sin(match.pose[:, 2])
+        inner = np.tile(np.eye(3), (len(pose), 1, 1))
+        inner[:, 0, 2], inner[:, 1, 2] = -s * back[0] - c * back[1], c * back[0] - s * back[1]
+        c, s = np.cos(one[2]), np.sin(one[2])
+        inverse = np.linalg.inv(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ inner)
+        information = inverse.transpose(0, 2, 1) @ match.information @ inverse
+        return Found(pose, information, match.p_right, np.asarray(match.status))
+
+    def _matched(
+        self, scanner: Scanner, one: Floats, two: Floats, guess: Floats, window: tuple[float, float] | None,
+        moved: tuple[Floats | None, Floats | None],
+    ) -> ScanMatch:  # fmt: skip
+        """Return matches of readings."""
+        options: dict[str, Any] = {} if window is None else {"window": window}
+        if moved[0] is not None:
+            options |= {"motion": moved[1], "reference_motion": moved[0]}
+        return match_scan(
+            one, two, scanner, guess, backend=self._options.backend, precision=self._options.precision, **options
+        )
+
+    def links(self, kind: str, first: Integers, second: Integers, guess: Floats) -> Links:
+        """Return the links of those matches near their guesses that may be used."""
+        parts = []
+        for begin in range(0, len(first), 2 * GROUP):
+            part = slice(begin, begin + 2 * GROUP)
+            match = self.match(first[part], second[part], guess[part], NEAR)
+            links = Links.of(kind, first[part], second[part], match.pose, match.information, match.p_right)
+            parts.append(links[match.usable & (match.p_right >= SURE)])
+        return Links.joined(parts)
+
+
+class TeamMatcher:
+    """Matches scans of several scanners of a robot.
+
+    Args:
+        matchers: Those of the scanners.
+        sensor: (S,) indices of the scanners of all scans.
+        place: (S,) indices of the scans among those of their scanners.
+    """
+
+    def __init__(self, matchers: Sequence[Matcher], sensor: Integers, place: Integers) -> None:
+        self._matchers, self._sensor, self._place = matchers, sensor, place
+        bearings = [matcher.scanner.bearings for matcher in matchers]
+        self._alike = np.array([[np.array_equal(one, two) for two in bearings] for one in bearings])
+
+    def can_match(self, first: Integers, second: Integers) -> NDArray[np.bool]:
+        """Return whether scans can be matched: those of one scanner, and of scanners of equal bearings."""
+        result: NDArray[np.bool] = self._alike[self._sensor[first], self._sensor[second]]
+        return result
+
+    def match(self, first: Integers, second: Integers, guess: Floats, window: tuple[float, float]) -> Found:
+        """Return the poses at second scans in the frames at first ones, of pairs that can be matched."""
+        pairs = self._sensor[first] * len(self._matchers) + self._sensor[second]
+        parts, order = [], []
+        for pair in np.unique(pairs):
+            some = np.flatnonzero(pairs == pair)
+            one, two = (self._matchers[k] for k in divmod(int(pair), len(self._matchers)))
+            a, b = self._place[first[some]], self._place[second[some]]
+            if one is two:
+                match = one.match(a, b, guess[some], window)
+                parts.append(Found(match.pose, match.information, match.p_right, np.asarray(match.status)))
+            else:
+                parts.append(one.across(a, two, b, guess[some], window))
+            order.append(some)
+        back = np.argsort(np.concatenate(order))
+        return Found(*(np.concatenate(values)[back] for values in zip(*parts, strict=True)))
+
+
+def _motion_at(matcher: Matcher, scans: Integers, mount: Floats) -> Floats:
+    """Return the motions (L, 3) during scans of a point on the robot."""
+    if matcher.motion is None:
+        return np.zeros((len(scans), 3))
+    moved: Floats = compose_poses(invert_poses(mount), compose_poses(matcher.motion[scans], mount))
+    return moved

@@ -1,0 +1,102 @@
+"""Scans of one scanner, or of several scanners of a robot in the order of a log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense._util import checks
+from gpusense.world.scanner import Scanner
+
+Integers = NDArray[np.int64]
+Reader = Callable[[str, Any, Scanner], NDArray[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class SensorScans:
+    """S scans of L scanners.
+
+    Attributes:
+        scanners: The scanners.
+        sensor: (S,) index of the scanner of each scan.
+        rows: Of each scanner, the indices of its scans, ascending.
+        readings: Of each scanner, the readings (S_l, K_l) of these scans [m].
+    """
+
+    scanners: tuple[Scanner, ...]
+    sensor: Integers
+    rows: tuple[Integers, ...]
+    readings: tuple[NDArray[Any], ...]
+
+    def __len__(self) -> int:
+        return len(self.sensor)
+
+    def places(self) -> Integers:
+        """Return the index (S,) of each scan among those of its scanner."""
+        place = np.zeros(len(self), np.int64)
+        for rows in self.rows:
+            place[rows] = np.arange(len(rows))
+        return place
+
+
+def check_scans(scans: Any, scanner: Scanner | Sequence[Scanner], sensor: Any, read: Reader) -> SensorScans:
+    """Return S scans by their scanners.
+
+    Args:
+        scans: (S, K) readings of one scanner, or S readings of several, each of its scanner's length [m].
+        scanner: The scanner, or L scanners.
+        sensor: (S,) indices of the scanners; None for one scanner.
+        read: Returns the checked readings of one scanner by the name "scans", their value and the scanner.
+
+    Raises:
+        TypeError, ValueError: an argument is of the wrong kind or breaks its rule; the message names it.
+    """
+    if isinstance(scanner, Scanner):
+        if sensor is not None:
+            raise ValueError(f"sensor: must be None with a single scanner, got {checks.show(sensor)}")
+        values = np.atleast_2d(read("scans", scans, scanner))
+        return SensorScans((scanner,), np.zeros(len(values), np.int64), (np.arange(len(values)),), (values,))
+    scanners = tuple(scanner) if isinstance(scanner, Sequence) else ()
+    if not scanners or not all(isinstance(one, Scanner) for one in scanners):
+        raise TypeError(f"scanner: must be a Scanner or a sequence of them, got {checks.show(scanner)}")
+    if not hasattr(scans, "__len__"):
+        raise TypeError(f"scans: must be a sequence of readings with several scanners, got {checks.show(scans)}")
+    index = _check_sensor(sensor, len(scans), len(scanners))
+    rows = tuple(np.flatnonzero(index == one) for one in range(len(scanners)))
+    for one, some in enumerate(rows):
+        if not len(some):
+            raise ValueError(f"sensor: every scanner must have a scan, got none of scanner {one}")
+        for k in some.tolist():
+            if np.shape(scans[k]) != (scanners[one].count,):
+                rule = f"scan {k} must have the {scanners[one].count} readings of scanner {one}"
+                raise ValueError(f"scans: {rule}, got shape {np.shape(scans[k])}")
+    readings = tuple(
+        read("scans", np.stack([np.asarray(scans[k]) for k in some.tolist()]), one)
+        for some, one in zip(rows, scanners, strict=True)
+    )
+    return SensorScans(scanners, index, rows, readings)
+
+
+def _check_sensor(sensor: Any, scans: int, scanners: int) -> Integers:
+    """Return the scanner of each scan.
+
+    Raises:
+        TypeError, ValueError: not S indices of scanners.
+    """
+    if sensor is None:
+        if scanners == 1:
+            return np.zeros(scans, np.int64)
+        raise ValueError(f"sensor: must say which of the {scanners} scanners each scan is of, got None")
+    values = checks.as_array("sensor", sensor)
+    if values.dtype.kind not in "iu" or values.shape != (scans,):
+        rule = f"must have the index of the scanner of each of the {scans} scans"
+        raise ValueError(f"sensor: {rule}, got {values.dtype} of shape {values.shape}")
+    bad = np.flatnonzero((values < 0) | (values >= scanners))
+    if len(bad):
+        raise ValueError(f"sensor: must be in 0 to {scanners - 1}, got {values[bad[0]]} at scan {bad[0]}")
+    index: Integers = values.astype(np.int64)
+    return index

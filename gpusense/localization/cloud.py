@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from gpusense.backends.base import Backend, Buffer
-from gpusense.backends.recording import Recording, Repeated
+from gpusense.backends.programs import Repeated
+from gpusense.backends.recording import Recording
 from gpusense.interface.constants import ESTIMATE, LEFT, MOMENTS, SLOW_RATE, STAGE, STATE, WIDE_HEADINGS
 from gpusense.interface.launches import Program
 from gpusense.localization.filter_cloud import Contents, Summary, deeper, is_starved, meaningful, summary_of

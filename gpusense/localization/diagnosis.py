@@ -187,9 +187,7 @@ def _mount(
 
 def _mirrored(sensors: Sequence[Sensor], readings: Mapping[int, tuple[Any, ...]]) -> dict[int, tuple[Any, ...]]:
     """Return the scans among readings, with their ranges in the opposite order."""
-    return {
-        index: (reading[0][::-1], *reading[1:]) for index, reading in readings.items() if sensors[index].calibrates
-    }
+    return {index: (reading[0][::-1], *reading[1:]) for index, reading in readings.items() if sensors[index].calibrates}
 
 
 def _best_elsewhere(

@@ -9,7 +9,7 @@ from gpusense.backends.recording import Recording
 from gpusense.interface.launches import Program
 
 
-class Repeated:
+class ProgramCache:
     """Runs programs by keys, and records one that runs a second time.
 
     Args:

@@ -32,8 +32,8 @@ class ParticleFilter(Whole):
 
     All state is on the device of the models. Random numbers depend on seed, step and particle alone: the same seed
     gives the same particles on every backend, but for roundings of log-likelihoods. A correction has up to ``stages``
-    stages: each takes as much of the temperature as leaves a share of the particles with weight, draws, and lets
-    drawn particles differ a little (annealing). So a few hundred particles track a precise scanner.
+    stages. Each applies the largest share of the temperature that keeps the effective sample size above a threshold,
+    then resamples and jitters (annealing). So a few hundred particles track a precise scanner.
 
     Args:
         models: A measurement model, or several of one device: of scans, landmarks, beacons, positions, headings,

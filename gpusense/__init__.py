@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
+from gpusense._util import pictures
 from gpusense._version import __version__ as __version__
 
 # The public names by their modules. Type checkers read the stub beside this file, which is made from this table:
@@ -102,6 +103,10 @@ def __getattr__(name: str) -> Any:
     value = getattr(importlib.import_module(f"gpusense.{_HOME[name]}"), name)
     globals()[name] = value
     return value
+
+
+# ``plots`` lies above the rooms whose results have pictures: only this module may name both.
+pictures.register("pose likelihood", lambda result, path: __getattr__("plots").pose_likelihood_figure(result, path))
 
 
 def __dir__() -> list[str]:

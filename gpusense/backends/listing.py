@@ -8,8 +8,9 @@ from typing import Any
 from gpusense.backends import proof, registry
 from gpusense.backends.base import Backend
 from gpusense.backends.info import BackendInfo
+from gpusense.backends.library import Library
 from gpusense.backends.proof import Verdict
-from gpusense.backends.registry import BY_NAME, ENTRIES, Entry, Library
+from gpusense.backends.registry import BY_NAME, ENTRIES, Entry
 
 
 @dataclass(frozen=True)

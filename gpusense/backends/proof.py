@@ -87,7 +87,7 @@ def verdict_on(info: BackendInfo, *, setup: Any = None, anew: bool = False) -> V
 
     Args:
         info: The device.
-        setup: The preparation of the child; see ``registry.Library.child_setup``.
+        setup: The preparation of the child; see ``library.Library.child_setup``.
         anew: Whether the kept verdict is dropped.
     """
     if child.is_off():

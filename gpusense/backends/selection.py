@@ -24,8 +24,9 @@ from gpusense.backends import listing, notices, proof, registry
 from gpusense.backends.base import Backend
 from gpusense.backends.chain import Chain, best_of
 from gpusense.backends.info import ProcessBound
+from gpusense.backends.library import Library
 from gpusense.backends.listing import Device, short_driver
-from gpusense.backends.registry import BY_NAME, ENTRIES, Entry, Library
+from gpusense.backends.registry import BY_NAME, ENTRIES, Entry
 
 if TYPE_CHECKING:
     import pyopencl

@@ -5,23 +5,20 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gpusense._util.files import check_writable, write_whole
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import add_backend, add_json, add_seed, check_writer, positive_number, whole_number
-from gpusense.commands.fit_so_far import SoFar
+from gpusense.commands.fit_results import FitResult, PartialFit
 from gpusense.commands.output import print_json, print_table
 from gpusense.commands.scans import add_log, add_reference, options_named, read_scans
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
-    from gpusense.evaluation.held_out import HeldOut
     from gpusense.evaluation.range_data import RangeData
-    from gpusense.learning.beam.incidence import IncidenceFit
-    from gpusense.learning.beam.result import BeamFit
     from gpusense.localization.motion_fit import MotionFit
     from gpusense.world.parameters import BeamParameters
 
@@ -100,35 +97,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", type=_folder, metavar="DIR", help="folder for parameters.yaml and pictures, created if absent")
 
 
-@dataclass(frozen=True)
-class Result:
-    """Result of the command.
-
-    Attributes:
-        data: The readings of the fit.
-        fit: The fit.
-        incidence: The fit by angles of incidence, or None.
-        held_out: The comparison on held-out readings; empty without ``--holdout``.
-        held_out_readings: Number of held-out readings.
-        motion: The noise of the odometry, or None.
-    """
-
-    data: RangeData
-    fit: BeamFit
-    incidence: IncidenceFit | None
-    held_out: list[HeldOut]
-    held_out_readings: int
-    motion: MotionFit | None = None
-
-
 def run(args: argparse.Namespace) -> int:
     """Fit the parameters, print the result and write the files; after Ctrl-C print the best parameters so far."""
     _check_sources(args)
-    data, motion, so_far = _read(args), _motion(args), SoFar()
+    data, motion, partial = _read(args), _motion(args), PartialFit()
     try:
-        result = _fit(args, data, motion, so_far)
+        result = _fit(args, data, motion, partial)
     except KeyboardInterrupt:
-        so_far.print(json=args.json)
+        partial.print(json=args.json)
         raise
     files = _write(args.out, result) if args.out is not None else []
     if args.json:
@@ -180,7 +156,7 @@ def _read(args: argparse.Namespace) -> RangeData:
         )  # fmt: skip
 
 
-def _fit(args: argparse.Namespace, data: RangeData, motion: MotionFit | None, so_far: SoFar) -> Result:
+def _fit(args: argparse.Namespace, data: RangeData, motion: MotionFit | None, partial: PartialFit) -> FitResult:
     from gpusense.evaluation.held_out import compare_held_out
     from gpusense.learning.beam.fit import fit_beam_parameters
     from gpusense.learning.beam.incidence import fit_incidence_parameters
@@ -192,9 +168,9 @@ def _fit(args: argparse.Namespace, data: RangeData, motion: MotionFit | None, so
     blocks = data.block if len(set(known.tolist())) > 1 else None
     fit = fit_beam_parameters(
         data.ranges, data.expected, **sensor, method=args.method, seed=args.seed, restarts=args.restarts,
-        range_bias=args.range_bias, sigma_growth=args.sigma_growth, progress=True, callback=so_far.see, blocks=blocks,
+        range_bias=args.range_bias, sigma_growth=args.sigma_growth, progress=True, callback=partial.see, blocks=blocks,
     )  # fmt: skip
-    so_far.fit = fit
+    partial.fit = fit
     incidence = None
     if data.incidence is not None and args.incidence:
         incidence = fit_incidence_parameters(
@@ -204,7 +180,7 @@ def _fit(args: argparse.Namespace, data: RangeData, motion: MotionFit | None, so
     compared = []
     if rest is not None:
         compared = compare_held_out(fit.parameters, rest, readings=fit.hits + fit.max_readings, incidence=incidence)
-    return Result(data, fit, incidence, compared, 0 if rest is None else len(rest.ranges), motion)
+    return FitResult(data, fit, incidence, compared, 0 if rest is None else len(rest.ranges), motion)
 
 
 def _motion(args: argparse.Namespace) -> MotionFit | None:
@@ -225,7 +201,7 @@ def _motion(args: argparse.Namespace) -> MotionFit | None:
     return fit_odometry_motion(*references_to_learn_from(steps))
 
 
-def _document(args: argparse.Namespace, result: Result, files: list[Path]) -> dict[str, Any]:
+def _document(args: argparse.Namespace, result: FitResult, files: list[Path]) -> dict[str, Any]:
     options = {name: value for name, value in vars(args).items() if name not in ("run", "command", "json")}
     held_out = [{**asdict(row), "parameters": row.parameters.to_dict()} for row in result.held_out]
     return {
@@ -251,7 +227,7 @@ def _doubt(parameters: BeamParameters, what: str) -> None:
         sys.stderr.write(f"gpusense: readings are not near their expected ranges ({found}): {what} may be wrong\n")
 
 
-def _print(result: Result, files: list[Path]) -> None:
+def _print(result: FitResult, files: list[Path]) -> None:
     print(f"{result.fit}\nrange_max {result.data.range_max} m, of {len(result.data.ranges)} readings")
     if result.incidence is not None:
         print(f"\n{result.incidence}")
@@ -285,7 +261,7 @@ def _error(value: float) -> str:
     return f"{value:.4f}" if math.isfinite(value) else "-"
 
 
-def _write(folder: Path, result: Result) -> list[Path]:
+def _write(folder: Path, result: FitResult) -> list[Path]:
     """Write the files of a fit, each atomically, and return their paths."""
     from gpusense.commands.parameter_files import parameters_yaml
     from gpusense.plots import fits as fit_plots

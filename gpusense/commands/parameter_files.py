@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gpusense.commands.fit import Result
+    from gpusense.commands.fit_results import FitResult
     from gpusense.localization.nav2 import Nav2Options
     from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 
@@ -100,7 +100,7 @@ def _made(path: Path, name: str, values: Any, make: Any) -> Any:
         raise ValueError(f"{path}: {name}: {error}") from None
 
 
-def parameters_yaml(result: Result) -> str:
+def parameters_yaml(result: FitResult) -> str:
     """Format the fitted parameters as YAML for gpusense and for nav2_amcl."""
     import yaml
 

@@ -183,7 +183,7 @@ def _executor(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Iterator[Execu
     if args.dask is not None:
         with _dask(args, names, limits) as cluster:
             if args.dask != LOCAL and not args.no_send:
-                from gpusense.sweeps.sending import contents_of
+                from gpusense.sweeps.job_inputs import contents_of
 
                 cluster.send(contents_of(jobs, args.root))
             yield cluster

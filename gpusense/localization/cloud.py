@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from gpusense.backends.base import Backend, Buffer
-from gpusense.backends.recording import Recording, Repeated
+from gpusense.backends.programs import ProgramCache
+from gpusense.backends.recording import Recording
 from gpusense.interface.constants import ESTIMATE, LEFT, MOMENTS, SLOW_RATE, STAGE, STATE, WIDE_HEADINGS
 from gpusense.interface.launches import Program
 from gpusense.localization.filter_cloud import Contents, Summary, deeper, is_starved, meaningful, summary_of
@@ -40,7 +41,7 @@ class Cloud(Particles):
     ) -> None:
         super().__init__(backend, capacity, sensors, precision, residual=residual)
         self._recordings: dict[Hashable, tuple[Recording, object]] = {}
-        self._estimates, self._stages = Repeated(backend, 8), Repeated(backend, 24)
+        self._estimates, self._stages = ProgramCache(backend, 8), ProgramCache(backend, 24)
         self._uploads: list[np.ndarray] = []
 
     def place(self, poses: np.ndarray, weights: np.ndarray | None = None) -> None:

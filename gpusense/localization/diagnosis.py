@@ -173,7 +173,7 @@ def _mount(
     """Return the angle by which scans must be turned to fit at a pose, None for no angle, and whether mirrored."""
     best: tuple[float, float | None, bool] = (0.0, None, False)
     for mirrored in (False, True):
-        given = {index: _mirrored(reading) for index, reading in readings.items()} if mirrored else readings
+        given = _mirrored(sensors, readings) if mirrored else readings
         for k in range(_TURNS):
             angle = math.remainder(k * math.tau / _TURNS, math.tau)
             if not mirrored and abs(angle) < _LEAST_TURN:
@@ -185,9 +185,9 @@ def _mount(
     return best[1], best[2]
 
 
-def _mirrored(reading: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return a scan whose readings run the other direction."""
-    return (reading[0][::-1], *reading[1:])
+def _mirrored(sensors: Sequence[Sensor], readings: Mapping[int, tuple[Any, ...]]) -> dict[int, tuple[Any, ...]]:
+    """Return the scans among readings, with their ranges in the opposite order."""
+    return {index: (reading[0][::-1], *reading[1:]) for index, reading in readings.items() if sensors[index].calibrates}
 
 
 def _best_elsewhere(

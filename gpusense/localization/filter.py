@@ -2,41 +2,38 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from gpusense._util import checks
-from gpusense.localization import options, resetting, skipping, starts
-from gpusense.localization.adaptive import kld_count
-from gpusense.localization.beginnings import Beginnings
-from gpusense.localization.calibration import LOOK, due_of, is_together
+from gpusense._util.typing import AnyArray
+from gpusense.backends import BackendInfo
+from gpusense.localization import options, skipping, starts
+from gpusense.localization.assessment import estimate_of
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.device_cloud import DeviceCloud
-from gpusense.localization.estimates import covariance_of
-from gpusense.localization.filter_cloud import FilterCloud, Given, Step
-from gpusense.localization.journal import plain_state, set_state, settled, whole
-from gpusense.localization.motion import STILL, MotionModel, OdometryMotion, SampledMotion
-from gpusense.localization.rival import COMPARISONS, PARTICLES, PRIOR, Rival, evidence_of
-from gpusense.localization.rival_search import can_search
+from gpusense.localization.diagnosis import Diagnosis, diagnose
+from gpusense.localization.estimates import Estimate
+from gpusense.localization.filter_cloud import FilterCloud
+from gpusense.localization.journal import Whole, settled, whole
+from gpusense.localization.motion import MotionModel, OdometryMotion, SampledMotion
+from gpusense.localization.recovery import Recovery
 from gpusense.localization.scoring import given_of
-from gpusense.localization.sensors import sensors_of
-from gpusense.localization.state import FilterState, check_state, constructor_options, model_names, readings_on_host
+from gpusense.localization.sensors import grid_of, sensors_of
+from gpusense.localization.state import FilterState, check_state, constructor_options, memory_of, model_names, remember
+from gpusense.localization.tracker import Tracker, is_together
 from gpusense.localization.verdict import Verdict
-
-# Makes the seed of a rival from that of its filter.
-_RIVAL = 0x9E3779B97F4A7C15
-# Probability that another place is right above which a rival is searched for; more than before the first scan.
-_DOUBT = 0.2
+from gpusense.world.grid import OccupancyGrid
 
 
-class ParticleFilter(Beginnings):
+class ParticleFilter(Whole):
     """Monte Carlo localisation: particles that move with the odometry and are weighed by sensors.
 
     All state is on the device of the models. Random numbers depend on seed, step and particle alone: the same seed
     gives the same particles on every backend, but for roundings of log-likelihoods. A correction has up to ``stages``
-    stages: each takes as much of the temperature as leaves a share of the particles with weight, draws, and lets
-    drawn particles differ a little (annealing). So a few hundred particles track a precise scanner.
+    stages. Each applies the largest share of the temperature that keeps the effective sample size above a threshold,
+    then resamples and jitters (annealing). So a few hundred particles track a precise scanner.
 
     Args:
         models: A measurement model, or several of one device: of scans, landmarks, beacons, positions, headings,
@@ -75,12 +72,8 @@ class ParticleFilter(Beginnings):
         True
     """
 
-    MEMORY = (
-        "_step", "_started", "_pending", "_shown", "_wide", "_corrections", "_together", "_pool", "_last", "_rival",
-        "_everywhere", "_distinct",
-        "_verdict", "_sensors", "_cloud",
-    )  # fmt: skip
-    PARTS = ()
+    MEMORY: ClassVar[tuple[str, ...]] = ("_last",)
+    PARTS: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
         self,
@@ -105,35 +98,27 @@ class ParticleFilter(Beginnings):
             particles=particles, seed=seed, temperature=temperature, resampling=resampling, threshold=threshold,
             stages=stages, recovery=recovery, beam_skip=beam_skip,
         )  # fmt: skip
-        if self.options.recovery == "augmented" and not any(hasattr(one.model, "grid") for one in self._sensors):
+        if self.options.recovery == "augmented" and grid_of(self._sensors) is None:
             raise ValueError("recovery: 'augmented' needs a model with a map, got none")
         self._begin_journals()
         self._cloud = self._new_cloud()
-        self._step, self._started, self._pending = 0, False, None
-        self._shown, self._wide = self.options.most, 0
-        self._corrections, self._together = 0, False
-        self._pool = 0, (0.0, 0.0, 0.0)
-        self._verdict = Verdict(self._sensors, self._random_poses, seed=self.options.seed)
+        self._tracker = Tracker(self._sensors, self.options, self._cloud)
+        self._verdict = Verdict(self._sensors, self._tracker.random_poses, seed=self.options.seed)
+        self._recovery = Recovery(self._tracker, self._verdict)
+        # Readings of the last correction by the index of their sensor.
         self._last: dict[int, tuple[Any, ...]] = {}
-        self._rival: Rival | None = None
-        self._distinct = 1.0
-        self._everywhere = 0
 
     def _new_cloud(self) -> FilterCloud:
         """Return room for the particles."""
         return DeviceCloud(self._sensors, self.options.most, residual=self.options.resampling == "residual")
 
     def _keep(self) -> None:
-        self._cloud.kept = self._cloud.places
-        if self._rival is not None:
-            self._rival.keep()
+        self._tracker.keep()
+        self._recovery.keep()
 
-    def _changing(self, method: str) -> tuple[Any, ...]:
-        if method == "estimate" and self._pending is None:
-            # It runs the pending motion, and judges the pose.
-            return (self._verdict,)
-        rival = () if self._rival is None else self._rival.changing()
-        return self, self._cloud, self._verdict, *self._sensors, *rival
+    def _changing(self) -> tuple[Any, ...]:
+        parts = self._tracker, self._cloud, self._verdict
+        return self, *parts, *self._sensors, *self._recovery.changing()
 
     def __repr__(self) -> str:
         one = self.options
@@ -143,6 +128,100 @@ class ParticleFilter(Beginnings):
             f"ParticleFilter([{sensors}], {self.motion!r}, particles={count}, temperature={one.temperature!r}, "
             f"stages={one.stages}, backend={self.device.selection!r})"
         )
+
+    def _check_started(self) -> None:
+        if not self._tracker.started:
+            raise RuntimeError(
+                "ParticleFilter: must be initialised first, by initialize, initialize_uniform or initialize_from"
+            )
+
+    def _moved(self) -> Tracker:
+        """Return the particles after the motion of the last ``predict``."""
+        self._check_started()
+        self.flush()
+        return self._tracker
+
+    # ---- starts
+
+    @whole
+    def initialize(self, *, mean: AnyArray, covariance: AnyArray, particles: int | None = None) -> None:
+        """Draw particles from a normal density.
+
+        Args:
+            mean: (3,) pose [m, m, rad].
+            covariance: (3, 3) covariance, positive semidefinite.
+            particles: Their number; the filter's (most) by default.
+
+        Raises:
+            TypeError, ValueError: an argument breaks its rule.
+
+        Warns:
+            PlausibilityWarning: the mean lies off the map, or its heading is more than a turn.
+        """
+        tracker = self._tracker
+        self._begin(starts.normal(mean, covariance, tracker.number(particles), tracker.key()))
+        starts.look_at(np.asarray(mean, np.float64), grid_of(self._sensors))
+        tracker.together = is_together(np.asarray(covariance))
+
+    @whole
+    def initialize_uniform(self, *, bounds: AnyArray | None = None, particles: int | None = None) -> None:
+        """Draw particles uniformly over the free cells of the map, with any heading.
+
+        Without bounds and with ``recovery="sensor"``, the pose to which they converge is compared with other places.
+
+        Args:
+            bounds: ((x_min, y_min), (x_max, y_max)) [m]: only there. Needed for models without a grid.
+            particles: Their number; the filter's (most) by default.
+
+        Raises:
+            TypeError, ValueError: an argument breaks its rule, or no cell is free.
+        """
+        tracker = self._tracker
+        pool, spread = starts.free_pool(self.models, bounds)
+        self._begin(starts.spread(pool, spread, tracker.number(particles), tracker.key()))
+        tracker.wide = DEFAULTS.wide_scans
+        self._verdict.reset(anywhere=True)
+        if bounds is None:
+            self._recovery.expect_anywhere()
+
+    @whole
+    def initialize_from(self, likelihood: Any, *, particles: int | None = None) -> None:
+        """Draw particles from a likelihood over poses.
+
+        Args:
+            likelihood: The result of :func:`pose_likelihood`, or an object with ``log_p``, an array of M
+                log-likelihoods of any shape, and ``positions``, (M, 3) poses in the same order. Particles are spread
+                over the cells of its ``resolution`` [m] and the gaps of its ``headings``, if it has these.
+            particles: Their number; the filter's (most) by default.
+
+        Raises:
+            TypeError, ValueError: it has not these, or no finite log-likelihood.
+
+        Example:
+            >>> import gpusense as gs
+            >>> grid, scanner = gs.OccupancyGrid([[0, 0, 100]], 1.0), gs.Scanner([0.0], 9.0)
+            >>> model = gs.LikelihoodFieldModel(grid, scanner, backend="numpy")
+            >>> pf = gs.ParticleFilter(model, particles=100)
+            >>> pf.initialize_from(gs.pose_likelihood(model, [1.9], resolution=1.0, headings=4))
+            >>> pf.host_particles().shape
+            (100, 3)
+        """
+        tracker = self._tracker
+        count = tracker.number(particles)
+        pool, spread = starts.likely_pool(likelihood, count, tracker.key())
+        self._begin(starts.spread(pool, spread, count, tracker.key(), each=True))
+        self._recovery.expect_anywhere()
+
+    def _begin(self, poses: np.ndarray) -> None:
+        """Replace all particles, and forget what earlier ones have seen."""
+        self._tracker.place(poses)
+        self._tracker.pending, self._last = None, {}
+        self._recovery.restart()
+        self._verdict.reset()
+        for sensor in self._sensors:
+            sensor.restart()
+
+    # ---- steps
 
     @settled
     def predict(self, *motion: Any) -> None:
@@ -157,24 +236,27 @@ class ParticleFilter(Beginnings):
         """
         self._check_started()
         sampled = self.motion.sampled(*motion)
-        if self._rival is None or not self._rival.active:
+        if self._tracker.pending is None and self._recovery.active is None:
+            # One assignment.
+            self._tracker.follow(sampled)
+        else:
             self._follow(sampled)
-        else:
-            self._follow_both(sampled)
-
-    def _follow(self, motion: SampledMotion) -> None:
-        """Move the particles when the next correction begins: one program has both."""
-        if self._pending is None:
-            self._pending = motion
-        else:
-            self._move(motion)
 
     @whole
-    def _follow_both(self, motion: SampledMotion) -> None:
+    def _follow(self, motion: SampledMotion) -> None:
         """Move the particles and their rival."""
-        self._follow(motion)
-        if self._rival is not None:
-            self._rival.predict(motion)
+        self._tracker.follow(motion)
+        self._recovery.follow(motion)
+
+    @settled
+    def flush(self) -> None:
+        """Run the motion of the last ``predict`` now, as a step of its own; the next correction does it otherwise."""
+        if self._tracker.pending is not None:
+            self._move()
+
+    @whole
+    def _move(self) -> None:
+        self._tracker.move(None)
 
     @whole
     def correct(self, readings: Any) -> None:
@@ -198,89 +280,18 @@ class ParticleFilter(Beginnings):
         given = given_of(readings, self._sensors)
         if not given:
             return
-        chosen, whole = self.options, dict(given)
-        if self._verdict.watches(whole):
-            self._verdict.predicted(self.host_particles(), self.host_weights(), whole)
-        if chosen.beam_skip is not None:
+        everything, verdict, share = dict(given), self._verdict, self.options.beam_skip
+        if verdict.watches(everything):
+            verdict.predicted(self.host_particles(), self.host_weights(), everything)
+        if share is not None:
             particles = self.host_particles(), self.host_weights()
-            given = skipping.skipped(self._sensors, given, particles, self._verdict.anywhere, chosen.beam_skip)
-        self._weigh(given)
+            given = skipping.skipped(self._sensors, given, particles, verdict.anywhere, share)
+        self._tracker.weigh(given, again=bool(self._last))
         # The caller may write the next readings to the same arrays.
-        self._last = {index: tuple(map(_copied, reading)) for index, reading in whole.items()}
-        self._verdict.corrected()
-        self._corrections += 1
-        self._learn(given)
-        self._recover(given)
-
-    def _weigh(self, given: list[Given]) -> None:
-        """Run the motion, and correct the particles by readings of sensors."""
-        chosen, motion = self.options, STILL if self._pending is None else self._pending
-        self._distinct = self._distinct_share() if self._pending is None and self._last else 1.0
-        drawn = self._cloud.count if chosen.least == chosen.most else self._wanted()
-        settings = self._settings(motion, [index for index, _ in given])
-        self._shown, self._pending = self._cloud.count, None
-        self._cloud.correct(Step(settings, motion.kind, chosen.stages, drawn, given))
-        self._wide = max(self._wide - 1, 0)
-
-    def _distinct_share(self) -> float:
-        """Return the share of distinct particles before a correction without motion, where copies are alike."""
-        last = self._cloud.summary()
-        before = self._distinct if last.stages == 1 else 1.0
-        return before * min(last.effective_sample_size / self._shown, 1.0) if last.resampled else before
-
-    def _learn(self, given: list[Given]) -> None:
-        """Find out whether the particles lie together, and learn from scans at a pose that none contradicts."""
-        due = due_of(self._sensors, given) if self.options.temperature == "auto" else []
-        if not (due or not self._together or self._corrections % LOOK == 0):
-            return
-        numbers = self._cloud.estimate(self._shown)
-        covariance = covariance_of(numbers)
-        self._together = is_together(covariance)
-        if due and self._together and not self._is_doubted() and self._cloud.summary().effective_sample_size >= 2:
-            for sensor, reading in due:
-                sensor.correlate(numbers[:3], covariance, reading)
-
-    def _is_doubted(self) -> bool:
-        """Tell whether the last scans that were judged contradict the pose, or a rival competes with it."""
-        rival = self._rival is not None and self._rival.active
-        return rival or not self._together or self._verdict.wrong > _DOUBT or self._verdict.explains_little
-
-    def _recover(self, given: list[Given]) -> None:
-        """Compare the particles with their rival, or search for one where scans contradict the pose."""
-        if self.options.recovery != "sensor" or not can_search(self._sensors):
-            return
-        rival = self._rival
-        if rival is not None and rival.active:
-            rival.correct(given, evidence_of(self._cloud.summary()))
-            numbers = self._cloud.estimate(self._shown)
-            won = rival.judge(numbers[:3], covariance_of(numbers), given)
-            if won is not None:
-                self._take_over(*won)
-            return
-        if self._wide or (self._everywhere and not self._together):
-            return
-        if not (self._everywhere or self._is_doubted() or self._verdict.due):
-            return
-        found = self.estimate()
-        if self._everywhere or self._is_doubted():
-            rival = self._rival = self._rival or Rival(self._new_rival())
-            prior = 0.0 if self._everywhere else PRIOR
-            self._everywhere = max(self._everywhere - 1, 0)
-            rival.start(found.pose, found.covariance, list(self._last.items()), step=self._step, prior=prior)
-
-    def _new_rival(self) -> ParticleFilter:
-        """Return a filter for a rival, with the sensors of this one."""
-        one = self.options
-        return ParticleFilter(
-            self._sensors, motion=self.motion, particles=PARTICLES, seed=one.seed ^ _RIVAL, temperature=one.temperature,
-            resampling=one.resampling, threshold=one.threshold, stages=one.stages, recovery=None,
-        )  # fmt: skip
-
-    def _take_over(self, poses: np.ndarray, weights: np.ndarray) -> None:
-        """Replace the particles by those of the rival, which the next scans have to confirm."""
-        self._place(poses[starts.rows_by_weight(weights, self._cloud.count)], again=True)
-        self._verdict.doubt()
-        self._everywhere = COMPARISONS
+        self._last = {index: tuple(map(_copied, reading)) for index, reading in everything.items()}
+        verdict.corrected()
+        self._tracker.learn(given, self._recovery.is_doubted)
+        self._recovery.corrected(given, self._last)
 
     @whole
     def reset(self) -> None:
@@ -293,36 +304,145 @@ class ParticleFilter(Beginnings):
         """
         if not self._last:
             raise RuntimeError("reset: needs a correction first")
-        tries = self._random_poses(resetting.tries_of(self._cloud.count))
-        poses = self._cloud.host_poses(self._cloud.places.next, self._cloud.count)
-        chosen = resetting.with_likely_poses(
-            poses, tries, self._sensors, self._last, self.options.temperature, self._key()
+        tracker = self._tracker
+        tries = tracker.random_poses(starts.tries_of(self._cloud.count))
+        tracker.place(
+            starts.with_likely_poses(
+                tracker.next_particles(), tries, self._sensors, self._last, self.options.temperature, tracker.key()
+            )
         )
-        self._place(chosen, again=True)
+
+    # ---- results
+
+    @property
+    def device(self) -> BackendInfo:
+        """The device of all state."""
+        return self._backend.info
+
+    @property
+    @settled
+    def count(self) -> int:
+        """Number of particles of the next step."""
+        return self._cloud.count
 
     @settled
-    def flush(self) -> None:
-        """Run the motion of the last ``predict`` now, as a step of its own; the next correction does it otherwise."""
-        if self._pending is not None:
-            self._move(None)
+    def estimate(self, method: str = "mean") -> Estimate:
+        """Return the pose of the robot.
 
-    @whole
-    def _move(self, following: SampledMotion | None) -> None:
-        """Run the pending motion; another one follows it."""
-        motion = STILL if self._pending is None else self._pending
-        self._cloud.move(self._settings(motion, []), motion.kind)
-        self._shown, self._pending = self._cloud.count, following
+        Args:
+            method: "mean", the weighted mean with the circular mean of headings; "cluster", the mean of the heaviest
+                cluster of particles; "best", the heaviest particle.
+
+        Raises:
+            RuntimeError: the filter is not initialised.
+            ValueError: another method.
+        """
+        checks.choice("method", method, ("mean", "cluster", "best"))
+        return estimate_of(self._moved(), self._verdict, self._recovery, self._last, method)
+
+    @settled
+    def diagnose(self, *, search: bool = True) -> Diagnosis:
+        """Return the evidence of the last readings at the estimate, and the likely cause where they contradict it.
+
+        Args:
+            search: Whether to look for a better pose elsewhere on the map, which takes some milliseconds.
+
+        Raises:
+            RuntimeError: the filter is not initialised.
+        """
+        pose, _ = self.mean_and_covariance()
+        search = search and grid_of(self._sensors) is not None
+        return diagnose(self._sensors, self._last, pose, self._tracker.random_poses if search else None)
+
+    @settled
+    def mean_and_covariance(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the weighted mean (3,) and the covariance (3, 3), without the verdict of :meth:`estimate`."""
+        return self._moved().mean_and_covariance()
+
+    @property
+    def models(self) -> tuple[Any, ...]:
+        """The measurement models, in the order of ``temperatures``."""
+        return tuple(sensor.model for sensor in self._sensors)
+
+    @property
+    @settled
+    def temperatures(self) -> tuple[float, ...]:
+        """Temperature of each model now."""
+        return tuple(sensor.temperature(self.options.temperature) for sensor in self._sensors)
+
+    @property
+    @settled
+    def gain(self) -> float:
+        """Mean gain of recent features over features anywhere or false ones [nats]; below 1 the filter is lost.
+
+        NaN without a landmark model, and before 20 scans with features.
+        """
+        return self._verdict.gain
+
+    @property
+    def scoring_seconds(self) -> float:
+        """Seconds that the models' log-likelihoods have taken, if ``time_scoring`` was called before.
+
+        Without it they are the seconds in which they were started; 0 where a step is one recorded program. Those of a
+        filter over several devices are added up.
+        """
+        return self._cloud.scoring_seconds
+
+    def time_scoring(self) -> None:
+        """Wait for the log-likelihoods of each stage from now on, so that ``scoring_seconds`` is their time."""
+        self._cloud.time_scoring()
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """The map of the first model that has one.
+
+        Raises:
+            ValueError: none has one.
+        """
+        grid = grid_of(self._sensors)
+        if grid is None:
+            raise ValueError("models: must have a map, got none with one")
+        return grid
+
+    @settled
+    def host_particles(self) -> np.ndarray:
+        """Return a copy of the (N, 3) poses after the last step in host memory."""
+        return self._moved().host_particles()
+
+    @settled
+    def host_weights(self) -> np.ndarray:
+        """Return a copy of the (N,) weights of the particles in host memory; their sum is 1."""
+        return self._moved().host_weights()
+
+    @property
+    @settled
+    def particles(self) -> Any:
+        """(N, 3) poses after the last step: on a GPU an array of the device, which other libraries use in place."""
+        return self._cloud.particles(self._moved().shown)
+
+    @property
+    @settled
+    def weights(self) -> Any:
+        """(N,) weights of the particles, whose sum is 1: on a GPU an array of the device."""
+        return self._cloud.shares(self._moved().shown)
+
+    @property
+    @settled
+    def moments(self) -> Any:
+        """(9,) mean x, y, theta and covariance xx, xy, xt, yy, yt, tt: on a GPU an array of the device."""
+        return self._cloud.moments(self._moved().shown)
+
+    def explain(self) -> str:
+        """Return in one line how a step is started on the device."""
+        return self._cloud.explain()
 
     # ---- state
 
     @settled
     def state(self) -> FilterState:
         """Return a copy of the filter's state, without models and device: see :class:`FilterState`."""
-        memory = plain_state(self, without=("_cloud", "_last", "_rival"))
-        memory["rival"] = None if self._rival is None or not self._rival.active else self._rival.state()
-        memory["_last"] = readings_on_host(self._last, self._backend)
-        options, models = constructor_options(self.options, self.motion), model_names(self._sensors)
-        return FilterState(options, models, self._cloud.contents(self._shown), memory)
+        memory = memory_of(self._tracker, self._verdict, self._recovery, self._last)
+        return FilterState(*self._kind(), self._cloud.contents(self._tracker.shown), memory)
 
     @whole
     def restore(self, state: FilterState) -> None:
@@ -335,14 +455,13 @@ class ParticleFilter(Beginnings):
         Raises:
             TypeError, ValueError: it is no state, or of a filter with other options or models.
         """
-        given = check_state(state, constructor_options(self.options, self.motion), model_names(self._sensors))
+        given = check_state(state, *self._kind())
         self._cloud.restore(given.contents)
-        set_state(self, {name: value for name, value in given.memory.items() if name != "rival"})
-        if given.memory["rival"] is not None:
-            self._rival = self._rival or Rival(self._new_rival())
-            self._rival.restore(given.memory["rival"])
-        elif self._rival is not None:
-            self._rival.stop()
+        self._last = remember(given.memory, self._tracker, self._verdict, self._recovery)
+
+    def _kind(self) -> tuple[dict[str, Any], tuple[str, ...]]:
+        """Return the constructor's options, and the names of the models' classes."""
+        return constructor_options(self.options, self.motion), model_names(self._sensors)
 
     def __getstate__(self) -> dict[str, Any]:
         return {"models": self.models, "state": self.state()}
@@ -350,21 +469,6 @@ class ParticleFilter(Beginnings):
     def __setstate__(self, values: dict[str, Any]) -> None:
         ParticleFilter.__init__(self, values["models"], **values["state"].options)
         self.restore(values["state"])
-
-    def _settings(self, motion: SampledMotion, given: list[int]) -> np.ndarray:
-        """Return the numbers of a step."""
-        temperature, sensors = self.options.temperature, []
-        wide = DEFAULTS.wide_share if self._wide and temperature == "auto" else 1.0
-        for sensor in (self._sensors[index] for index in given):
-            sensors.append((sensor.temperature(temperature) * (wide if sensor.calibrates else 1.0), sensor.beams))
-        step, count = self._key()[2], self._cloud.count
-        one_peak = self._together and not any(self._sensors[index].ambiguous for index in given)
-        return options.settings_of_step(self.options, motion, step, count, self._pool, sensors, one_peak)
-
-    def _wanted(self) -> int:
-        """Return the particles of the next step by KLD sampling."""
-        poses = self._cloud.host_poses(self._cloud.places.next, self._cloud.count)
-        return kld_count(poses, self.options.least, self.options.most)
 
 
 def _copied(reading: Any) -> Any:

@@ -136,8 +136,8 @@ class Whole:
     def _keep(self) -> None:
         """Note what the call that begins must leave as it is."""
 
-    def _changing(self, method: str) -> tuple[Any, ...]:
-        """Return the objects whose state a method may change: this one and its parts, or a few of these."""
+    def _changing(self) -> tuple[Any, ...]:
+        """Return the objects whose state a call may change: this one and its parts."""
         return (self,)
 
     def settle(self) -> None:
@@ -161,7 +161,7 @@ def whole(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W, P],
                 # Part of a call that is whole.
                 return method(self, *args, **kwargs)
             self._keep()
-            journal = self._journal = Journal(self._changing(method.__name__), sys._getframe())
+            journal = self._journal = Journal(self._changing(), sys._getframe())
             try:
                 result = method(self, *args, **kwargs)
                 self._journal = None

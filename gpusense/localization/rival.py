@@ -19,25 +19,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from gpusense.interface.constants import EVIDENCE
 from gpusense.localization import starts
-from gpusense.localization.estimates import covariance_of
-from gpusense.localization.filter_cloud import Given, Summary
+from gpusense.localization.filter_cloud import Contents, Given, Summary
 from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import SampledMotion
 from gpusense.localization.pose_algebra import wrap_angle
 from gpusense.localization.ratio import ratio_of_scan
 from gpusense.localization.rival_search import RivalSearch, drawn
 from gpusense.localization.spread import FAR, FAR_TURN, deviations
+from gpusense.localization.tracker import Tracker
 from gpusense.localization.verdict import sightings
-
-if TYPE_CHECKING:
-    from gpusense.localization.filter import ParticleFilter
-    from gpusense.localization.state import FilterState
 
 # Logarithm of the Bayes factor that wins, and that ends a rival that falls behind; scans that a rival needs to win if
 # it lies together, and if it has several places; scans after which one that neither wins nor loses is given up.
@@ -67,38 +63,38 @@ class Rival:
     """The rival of a filter.
 
     Args:
-        rival: A filter of its own with the sensors of the filter.
+        tracker: Particles of its own with the sensors of the filter.
 
     Attributes:
         active: Whether there is a rival now.
         log_odds: Its log odds against the particles.
     """
 
-    def __init__(self, rival: ParticleFilter) -> None:
-        self._filter = rival
+    def __init__(self, tracker: Tracker) -> None:
+        self._tracker = tracker
         self.active, self.log_odds = False, PRIOR
         self._scans, self._place = 0, np.zeros(3)
         self._prior, self._settled = PRIOR, False
         # Weighted sums of the ratios of wrong against right, of the rival and of the particles, and of the weights.
         self._ratios = np.zeros(3)
-        self._search = RivalSearch(rival._sensors)
+        self._search = RivalSearch(tracker.sensors)
 
     def keep(self) -> None:
         """Note what the call that begins must leave as it is."""
-        self._filter._keep()
+        self._tracker.keep()
 
     def changing(self) -> tuple[Any, ...]:
         """Return the objects whose state a correction may change."""
-        return self, *self._filter._changing("correct")
+        return self, self._tracker, self._tracker.cloud
 
-    def state(self) -> tuple[dict[str, Any], FilterState]:
-        """Return the rival as plain data."""
-        return plain_state(self, without=("_filter", "_search")), self._filter.state()
+    def state(self) -> tuple[dict[str, Any], Contents, dict[str, Any]]:
+        """Return the rival as plain data: its own, its particles and their memory."""
+        return plain_state(self, without=("_tracker", "_search")), *self._tracker.state()
 
-    def restore(self, state: tuple[dict[str, Any], FilterState]) -> None:
+    def restore(self, state: tuple[dict[str, Any], Contents, dict[str, Any]]) -> None:
         """Take over a rival."""
         set_state(self, state[0])
-        self._filter.restore(state[1])
+        self._tracker.restore(*state[1:])
 
     def stop(self) -> None:
         """Give the rival up."""
@@ -116,8 +112,8 @@ class Rival:
             step: Number of the last step of the filter: the same ones have the same rival.
             prior: Prior log odds; at 0 places near the estimate are no rivals.
         """
-        self._filter._step = step
-        key, options = self._filter._key(), self._filter.options
+        self._tracker.step = step
+        key, options = self._tracker.key(), self._tracker.options
         tries, score, effective = self._search.found(pose, covariance, readings, key, options.temperature)
         if prior == 0.0:
             far = np.hypot(*(tries[:, :2] - pose[:2]).T) > FAR
@@ -126,15 +122,15 @@ class Rival:
         chosen = drawn(score, options.most, effective)
         if chosen is None:
             return
-        self._filter._pending = None
-        self._filter._place(starts.spread(tries[chosen], _SPREAD, options.most, key, each=True), again=True)
+        self._tracker.pending = None
+        self._tracker.place(starts.spread(tries[chosen], _SPREAD, options.most, key, each=True))
         self.active, self.log_odds, self._prior, self._scans, self._settled = True, prior, prior, 0, False
         self._ratios = np.zeros(3)
 
     def predict(self, motion: SampledMotion) -> None:
         """Move the rival."""
         if self.active:
-            self._filter._follow(motion)
+            self._tracker.follow(motion)
 
     def correct(self, readings: list[Given], evidence: float) -> None:
         """Correct the rival, and compare it with the particles.
@@ -143,8 +139,8 @@ class Rival:
             readings: Indices of sensors with their readings.
             evidence: Evidence of the filter, by :func:`evidence_of`.
         """
-        self._filter._weigh(readings)
-        mine = evidence_of(self._filter._cloud.summary())
+        self._tracker.weigh(readings)
+        mine = evidence_of(self._tracker.cloud.summary())
         if math.isfinite(mine) or math.isfinite(evidence):
             self.log_odds += min(max(mine - evidence, -_MOST), _MOST)
         self._scans += 1
@@ -159,14 +155,12 @@ class Rival:
             covariance: (3, 3) their covariance.
             readings: Indices of sensors with their readings.
         """
-        numbers = self._filter._cloud.estimate(self._filter._shown)
-        self._place = numbers[:3].copy()
+        self._place, own = self._tracker.mean_and_covariance()
         gain = self.log_odds - self._prior
-        own = covariance_of(numbers)
         together = deviations(own)[0] < _TOGETHER
         if not together:
             # The mean of several places is none of them.
-            poses, weights = self._filter.host_particles(), self._filter.host_weights()
+            poses, weights = self._tracker.host_particles(), self._tracker.host_weights()
             self._place, own = poses[int(np.argmax(weights))], np.zeros((3, 3))
         self._compare(own, pose, covariance, dict(readings))
         if together and not self._settled:
@@ -177,7 +171,7 @@ class Rival:
             self.stop()
         elif gain > WIN and self._scans >= (SCANS if together else APART) and self._is_plausible(better=True):
             self.stop()
-            return self._filter.host_particles(), self._filter.host_weights()
+            return self._tracker.host_particles(), self._tracker.host_weights()
         elif self._is_late(gain):
             self.stop()
         return None
@@ -186,7 +180,7 @@ class Rival:
         self, own: np.ndarray, pose: np.ndarray, covariance: np.ndarray, readings: dict[int, tuple[Any, ...]]
     ) -> None:
         """Add the ratios of both poses: among people, the likelihood alone prefers places with many walls."""
-        sensors = self._filter._sensors
+        sensors = self._tracker.sensors
         pair = [ratio_of_scan(sightings(sensors, readings, *at)) for at in ((self._place, own), (pose, covariance))]
         if not any(map(math.isnan, pair)):
             self._ratios = _KEPT * self._ratios + np.array([*pair, 1.0])

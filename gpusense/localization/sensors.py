@@ -20,6 +20,7 @@ from gpusense.models.landmark.base import FeatureModel
 from gpusense.models.point.base import PointModel
 from gpusense.models.scan.bound import DeviceCall
 from gpusense.models.scan.model import ScanModel
+from gpusense.world.grid import OccupancyGrid
 
 _DOUBLE = np.dtype(np.float64)
 # Calls that are started before one waits.
@@ -198,3 +199,8 @@ def sensors_of(models: Any) -> list[Sensor]:
     if not backend.info.float64:
         raise ValueError(f"models: must be on a device with float64, got {backend.info.name}")
     return sensors
+
+
+def grid_of(sensors: Sequence[Sensor]) -> OccupancyGrid | None:
+    """Return the map of the first sensor that has one."""
+    return next((sensor.model.grid for sensor in sensors if hasattr(sensor.model, "grid")), None)

@@ -18,7 +18,6 @@ from gpusense.backends import arrays
 from gpusense.localization.filter_cloud import Given
 from gpusense.localization.pose_algebra import mean_pose
 from gpusense.localization.sensors import Sensor
-from gpusense.localization.verdict import boundary
 
 # Particles that are asked; largest deviation of particles that lie together [m]; largest share of skipped beams.
 _ASKED, TOGETHER, _MOST_SKIPPED = 100, 0.5, 0.7
@@ -87,3 +86,19 @@ def without_skipped(
     ranges = np.array(arrays.copied_to_host(reading[0], sensor.backend, "ranges"), np.float64)
     ranges[~(used & explained)] = np.nan
     return (ranges, *reading[1:])
+
+
+def boundary(elsewhere: np.ndarray) -> float | None:
+    """Return the log-likelihood above which a beam is explained, between a poor and a good one.
+
+    Args:
+        elsewhere: (M, K) log-likelihoods of used beams at poses anywhere in the free space.
+
+    Returns:
+        None where all beams are equally likely everywhere, or none is possible.
+    """
+    values = elsewhere[np.isfinite(elsewhere)]
+    if not values.size:
+        return None
+    poor, good = np.percentile(values, (50, 99))
+    return float((poor + good) / 2) if good > poor else None

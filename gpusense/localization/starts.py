@@ -1,14 +1,22 @@
-"""First particles: drawn on the host by the reference of the kernels' generator, and so equal on every backend."""
+"""First particles, and those of a reset: drawn on the host by the reference of the kernels' generator.
+
+So they are equal on every backend. Sensor resetting: Lenser and Veloso, *Sensor resetting localization for poorly
+modelled mobile robots* (2000).
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from gpusense._util import checks
+from gpusense.localization.sensors import Sensor
 from gpusense.reference.philox import normal_pair, random_words, uniform_of
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.plausible import look_at_heading, look_at_start
 
 Key = tuple[int, int, int]
 Spread = tuple[float, float, float]
@@ -16,6 +24,10 @@ Spread = tuple[float, float, float]
 _MOST_POOL = 1 << 18
 # Stream of random numbers that no kernel uses.
 _STREAM = 64
+# Poses that a reset tries: for each new particle, and the fewest; new particles for each pose that is chosen of them.
+_TRIES, _LEAST_TRIES, _SHARE = 10, 20_000, 10
+# Half widths of the box around a chosen pose [m, m, rad].
+_SPREAD = (0.1, 0.1, 0.05)
 
 
 def _words(count: int, key: Key, stream: int) -> tuple[np.ndarray, ...]:
@@ -66,7 +78,7 @@ def spread(pool: np.ndarray, half: Spread, count: int, key: Key, *, each: bool =
     return _wrapped(pool[row] + offsets * half)
 
 
-def free_pool(models: list[Any], bounds: Any) -> tuple[np.ndarray, Spread]:
+def free_pool(models: Sequence[Any], bounds: Any) -> tuple[np.ndarray, Spread]:
     """Return the centres of free cells of the first map among the models, and half widths with any heading.
 
     Raises:
@@ -125,3 +137,57 @@ def likely_pool(likelihood: Any, count: int, key: Key) -> tuple[np.ndarray, Spre
         poses = np.asarray(likelihood.positions, np.float64).reshape(-1, 3)[rows]
     step, headings = float(getattr(likelihood, "resolution", 0.0)) / 2, np.size(getattr(likelihood, "headings", ()))
     return poses, (step, step, math.pi / headings if headings else 0.0)
+
+
+def look_at(pose: np.ndarray, grid: OccupancyGrid | None) -> None:
+    """Warn of a start that cannot be meant.
+
+    Args:
+        pose: (3,) pose.
+        grid: The map; None without one.
+    """
+    if grid is None:
+        look_at_heading("start", float(pose[2]))
+        return
+    (place,), (rows, cols) = grid.world_to_cells(pose[None, :2]), grid.shape
+    look_at_start(pose, bool(0 <= place[0] <= cols and 0 <= place[1] <= rows), grid.bounds())
+
+
+def _replaced(particles: int) -> int:
+    """Return how many particles get new poses."""
+    return max(particles // 2, 1)
+
+
+def tries_of(particles: int) -> int:
+    """Return how many poses a reset of particles tries."""
+    return max(_LEAST_TRIES, _TRIES * _replaced(particles))
+
+
+def with_likely_poses(
+    poses: np.ndarray,
+    tries: np.ndarray,
+    sensors: Sequence[Sensor],
+    readings: Mapping[int, tuple[Any, ...]],
+    temperature: float | str,
+    key: Key,
+) -> np.ndarray:
+    """Return particles half of which are drawn around the likeliest of other poses.
+
+    Args:
+        poses: (N, 3) particles.
+        tries: (M, 3) poses anywhere.
+        sensors: The filter's sensors.
+        readings: Last readings by the index of their sensor.
+        temperature: Temperature of scans, or "auto".
+        key: Seed and step.
+    """
+    score = np.zeros(len(tries))
+    for index, reading in readings.items():
+        sensor = sensors[index]
+        score += sensor.temperature(temperature) * sensor.log_likelihood(tries, reading)
+    count = _replaced(len(poses))
+    with np.errstate(invalid="ignore"):
+        best = np.argsort(-score, kind="stable")[: max(count // _SHARE, 1)]
+    result = poses.copy()
+    result[:: max(len(poses) // count, 1)][:count] = spread(tries[best], _SPREAD, count, key, each=True)
+    return result

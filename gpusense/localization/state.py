@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,8 +13,12 @@ from gpusense._util import checks
 from gpusense.backends import arrays
 from gpusense.backends.base import Backend
 from gpusense.localization.filter_cloud import Contents
+from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.options import Options
+from gpusense.localization.recovery import Recovery
 from gpusense.localization.sensors import Sensor
+from gpusense.localization.tracker import Tracker
+from gpusense.localization.verdict import Verdict
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +65,7 @@ class FilterState:
     @property
     def step(self) -> int:
         """Number of the last step, which random numbers depend on."""
-        return int(self.memory["_step"])
+        return int(self.memory["tracker"]["step"])
 
 
 def constructor_options(options: Options, motion: Any) -> dict[str, Any]:
@@ -73,6 +78,29 @@ def constructor_options(options: Options, motion: Any) -> dict[str, Any]:
 def model_names(sensors: Sequence[Sensor]) -> tuple[str, ...]:
     """Return the names of the classes of models."""
     return tuple(type(sensor.model).__name__ for sensor in sensors)
+
+
+def memory_of(
+    tracker: Tracker, verdict: Verdict, recovery: Recovery, readings: Mapping[int, tuple[Any, ...]]
+) -> dict[str, Any]:
+    """Return what a filter remembers beside its particles, as plain data with arrays in host memory."""
+    return {
+        "tracker": plain_state(tracker), "verdict": plain_state(verdict), "recovery": recovery.state(),
+        "sensors": [plain_state(sensor) for sensor in tracker.sensors],
+        "readings": readings_on_host(readings, tracker.sensors[0].backend),
+    }  # fmt: skip
+
+
+def remember(
+    memory: Mapping[str, Any], tracker: Tracker, verdict: Verdict, recovery: Recovery
+) -> dict[int, tuple[Any, ...]]:
+    """Take over the result of ``memory_of``, and return the last readings."""
+    set_state(tracker, memory["tracker"])
+    set_state(verdict, memory["verdict"])
+    for sensor, values in zip(tracker.sensors, memory["sensors"], strict=True):
+        set_state(sensor, values)
+    recovery.restore(memory["recovery"])
+    return {index: tuple(map(copy.copy, reading)) for index, reading in memory["readings"].items()}
 
 
 def readings_on_host(readings: Mapping[int, tuple[Any, ...]], backend: Backend) -> dict[int, tuple[Any, ...]]:

@@ -225,28 +225,3 @@ def _count(reading: tuple[Any, ...]) -> int:
     """Return the number of features of a reading; 0 for one that the model will refuse."""
     shape = np.shape(reading[0])
     return int(shape[0]) if shape else 0
-
-
-def explained_share(at: np.ndarray, elsewhere: np.ndarray) -> float:
-    """Return the share of beams that are explained; NaN without beams."""
-    used = np.isfinite(at) & (at != 0)
-    least = boundary(elsewhere[:, used])
-    if least is None:
-        return 1.0 if used.any() and np.isfinite(elsewhere[:, used]).any() else math.nan
-    return float(np.mean(at[used] > least))
-
-
-def boundary(elsewhere: np.ndarray) -> float | None:
-    """Return the log-likelihood above which a beam is explained, between a poor and a good one.
-
-    Args:
-        elsewhere: (M, K) log-likelihoods of used beams at poses anywhere in the free space.
-
-    Returns:
-        None where all beams are equally likely everywhere, or none is possible.
-    """
-    values = elsewhere[np.isfinite(elsewhere)]
-    if not values.size:
-        return None
-    poor, good = np.percentile(values, (50, 99))
-    return float((poor + good) / 2) if good > poor else None

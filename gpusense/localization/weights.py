@@ -142,7 +142,7 @@ def _residual(
         left %= total
     rest = size - int(copies.sum())
     if rest:
-        # The sum of what is left is rest * total, which exceeds 64 bits: its cumulative sums divided by rest.
+        # The remainders sum to rest * total, which overflows 64 bits, so cumulate left / rest instead.
         ends = np.cumsum(left // rest) + np.cumsum(left % rest) // rest
         drawn = np.searchsorted(ends, _below(int(ends[-1]), generator, rest), side="right")
         copies += np.bincount(drawn, minlength=len(steps))

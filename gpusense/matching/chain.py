@@ -138,7 +138,7 @@ def _prior(result: np.ndarray, guess: np.ndarray, options: MatchOptions) -> np.n
 
 
 def _repeat(device: IcpPairs, guess: np.ndarray, best: Best, options: MatchOptions, most: int, gap: float) -> None:
-    """Match pairs again from their results where the guess was poor: the way to a result may have ended nearby."""
+    """Match pairs again from their results where the guess was poor: ICP may have stopped short of it."""
     moved = np.abs(best.result[:, :3] - guess)
     rows = np.flatnonzero((moved[:, :2].max(axis=1) > _NEAR * options.capture) | (moved[:, 2] > _NEAR_TURN))
     if len(rows):

@@ -21,13 +21,13 @@ import numpy as np
 
 from gpusense._util.typing import Space
 from gpusense.backends import get_backend
-from gpusense.interface.terms import log_weight
 from gpusense.matching.pose_grid import Found, PoseGrid
 from gpusense.matching.score_tables import TOP, ScoreTables, quantized
 from gpusense.matching.search import Search
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.tables.distances import distance_transform
+from gpusense.world.field_density import FieldDensity
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Reading, classes
 
@@ -73,17 +73,18 @@ class FieldSearch:
         self._walled = outside == "occupied"
         obstacles = np.pad(model.grid.obstacles(unknown), 1, constant_values=self._walled)
         distances = distance_transform(obstacles, resolution=cell, backend=backend)
-        distances = np.minimum(distances, p.max_distance)
+        density = FieldDensity(p, model.scanner.range_max)
+        distances = density.capped(distances)
         for edge in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
             distances[edge] = 0.0 if self._walled else p.max_distance
-        self._low, self._high = (float(_log_density(model, np.array([d]))[0]) for d in (p.max_distance, 0.0))
+        self._low, self._high = map(float, density.log(np.array([p.max_distance, 0.0])))
         self._tiles = 0
         if p.interpolation == "bilinear":
             room = _MOST_TABLE_CELLS / distances.size
             self._tiles = next((n for n in _TILES if n * n <= room), _TILES[-1])
-            scores = self._tile_scores(model, distances)
+            scores = self._tile_scores(density, distances)
         else:
-            scores = quantized(_log_density(model, distances[1:-1, 1:-1]), self._low, self._high)
+            scores = quantized(density.log(distances[1:-1, 1:-1]), self._low, self._high)
         shortest = min(model.grid.shape) / stride
         levels = min(math.log2(max(_BLOCK * p.max_distance / (cell * stride), 1)), math.log2(max(shortest / 4, 1)))
         self._search = Search(
@@ -98,7 +99,7 @@ class FieldSearch:
             precision=model.precision, unknown=unknown, outside=outside, beams=model.beams,
         )  # fmt: skip
 
-    def _tile_scores(self, model: LikelihoodFieldModel, distances: np.ndarray) -> np.ndarray:
+    def _tile_scores(self, density: FieldDensity, distances: np.ndarray) -> np.ndarray:
         """Return the largest scores (n * n, H + 1, W + 1) of the tiles between four centres, rounded up."""
         n = self._tiles
         along = np.linspace(0, 1, n + 1)
@@ -108,8 +109,7 @@ class FieldSearch:
         for i in range(n):
             for j in range(n):
                 least = np.min([corners[i][j], corners[i][j + 1], corners[i + 1][j], corners[i + 1][j + 1]], axis=0)
-                values = _log_density(model, least)
-                exact = (np.clip(values, self._low, self._high) - self._low) * (TOP / self._step())
+                exact = (np.clip(density.log(least), self._low, self._high) - self._low) * (TOP / self._step())
                 scores[i * n + j] = np.minimum(np.ceil(exact + 0.01), TOP)
         return scores
 
@@ -209,13 +209,6 @@ def field_search(model: LikelihoodFieldModel, stride: int) -> FieldSearch:
     if search is None or search.grid is not model.grid or search.stride != stride:
         search = _SEARCHES[model] = FieldSearch(model, stride)
     return search
-
-
-def _log_density(model: LikelihoodFieldModel, distance: np.ndarray) -> np.ndarray:
-    """Return log densities of distances [m] to the nearest obstacle; see the kernel file ``field``."""
-    p = model.parameters
-    hit = log_weight(p.z_hit) - math.log(p.sigma_hit * math.sqrt(2 * math.pi)) - 0.5 * (distance / p.sigma_hit) ** 2
-    return np.logaddexp(hit, log_weight(p.z_rand) - math.log(model.scanner.range_max))
 
 
 def _first_of_largest(log_p: np.ndarray, found: Found, rows: np.ndarray) -> int:

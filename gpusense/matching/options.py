@@ -21,7 +21,7 @@ _MARGIN = 1e-3
 _SPARSE = 1.5
 # Points apart of those that make a score: a single one.
 _NO_SCORE = 1 << 24
-# Largest translation of a guess between scans [m]; float32 has 6 cm there.
+# Largest translation of a guess between scans [m]; float32 resolves 6 cm at that distance.
 _FARTHEST = 1e6
 
 

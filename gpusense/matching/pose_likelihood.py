@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 import os
 from collections.abc import Iterator
@@ -12,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gpusense._util import checks
+from gpusense._util import checks, pictures
 from gpusense.models.scan.model import ScanModel
 from gpusense.world.grid import OccupancyGrid
 
@@ -127,8 +126,7 @@ class PoseLikelihood:
         Raises:
             ImportError: Matplotlib is not installed.
         """
-        # Pictures are in a room above this one.
-        importlib.import_module("gpusense.plots.pose_maps").pose_likelihood_figure(self, path)
+        pictures.draw("pose likelihood", self, path)
 
 
 def pose_likelihood(

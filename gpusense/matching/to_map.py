@@ -13,7 +13,6 @@ from dataclasses import replace
 import numpy as np
 
 from gpusense.backends import Backend
-from gpusense.matching.alone import own_information
 from gpusense.matching.chain import DOUBTFUL, match_pairs, wrapped
 from gpusense.matching.climb import climb
 from gpusense.matching.evidence import pair_evidence
@@ -23,6 +22,7 @@ from gpusense.matching.points import ScanPoints, dense_scanner, scan_points
 from gpusense.matching.result import ScanMatch
 from gpusense.matching.score_tables import ScoreTables, field_scores
 from gpusense.matching.search import PoseGrid, Search
+from gpusense.matching.uncertainty import observable_directions
 from gpusense.matching.verdicts import concluded, judged, pair_sums
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
@@ -215,7 +215,7 @@ class MapMatcher:
         least, nothing = np.maximum(_LEAST_PAIRS, _LEAST_SHARE * pairs), np.zeros((len(pose), 3, 3))
         of_field = observed_information(information, nothing, lever, pairs, least).information
         of_field /= np.maximum(variance, 1e-12)[:, None, None]
-        own = own_information(ranges, pose, variance, self._scanner, self._backend, self._real, self._options)
+        own = observable_directions(ranges, pose, variance, self._scanner, self._backend, self._real, self._options)
         # Surfaces are half a cell off the centres of cells, and poses of a search are on a grid.
         spacing = self._stride * self._grid.resolution / math.sqrt(12) if method == "correlative" else 0.0
         bias = np.hypot(0.5 * self._grid.resolution, spacing)

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
-from gpusense.interface.terms import log_weight
 from gpusense.matching.pose_likelihood import PoseLikelihood
 from gpusense.plots.drawing import _over_grid, add_colour_bar, draw_map, draw_pose, new_figure, save
 from gpusense.plots.pose_densities import _scale
 from gpusense.tables.distances import distance_transform
+from gpusense.world.field_density import FieldDensity
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import LikelihoodFieldParameters
@@ -101,11 +101,8 @@ def draw_likelihood_field(
     """
     p = LikelihoodFieldParameters() if parameters is None else parameters
     distance = distance_transform(grid.occupied, resolution=grid.resolution, backend="numpy")
-    hit = -0.5 * (np.minimum(distance, p.max_distance) / p.sigma_hit) ** 2
-    hit += log_weight(p.z_hit) - math.log(p.sigma_hit * math.sqrt(2 * math.pi))
-    reach = checks.real("range_max", range_max, above=0)
-    density = np.logaddexp(hit, log_weight(p.z_rand) - math.log(reach))
-    image = _over_grid(ax, grid, density, cmap="gray", interpolation="nearest")
+    density = FieldDensity(p, checks.real("range_max", range_max, above=0))
+    image = _over_grid(ax, grid, density.log(density.capped(distance)), cmap="gray", interpolation="nearest")
     ax.set_aspect("equal")
     x_min, y_min, x_max, y_max = grid.bounds()
     ax.set(xlim=(x_min, x_max), ylim=(y_min, y_max), xlabel="x [m]", ylabel="y [m]")

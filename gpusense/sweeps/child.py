@@ -17,7 +17,8 @@ import traceback
 from multiprocessing.connection import Connection
 from typing import Any
 
-from gpusense.sweeps.worker import DEVICE, error_text
+from gpusense._util.worker_device import DEVICE
+from gpusense.sweeps.worker import error_text
 
 # Messages before an answer: the process has started, and it has begun a call.
 READY, BEGUN = b"ready", b"begun"

@@ -119,7 +119,7 @@ class Table:
         self._stream.seek(0, os.SEEK_END)
 
     def finish(self, keys: Sequence[str]) -> None:
-        """Write all rows in the order of their jobs, other ones behind, and the Parquet file."""
+        """Write the rows in plan order, then rows of unknown jobs, then the Parquet file."""
         if not self.columns:
             return
         ordered = [self.rows[key] for key in keys if key in self.rows]

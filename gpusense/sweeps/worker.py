@@ -10,12 +10,11 @@ import traceback
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from gpusense._util.worker_device import device_of
 from gpusense.sweeps.job import Job
 from gpusense.sweeps.store import Store
 from gpusense.sweeps.tasks import task_of
 
-# Environment variable with the selection string of a worker's device.
-DEVICE = "GPUSENSE_SWEEP_DEVICE"
 # Longest text of an error.
 _LONGEST = 400
 
@@ -54,11 +53,6 @@ def receive(sent: Mapping[str, Any]) -> None:
     with _LOCK:
         _SENT.update(sent)
         _STORES.clear()
-
-
-def device_of(device: str) -> str:
-    """Return the worker's own device, if the one that started it has given it one, else the sweep's."""
-    return os.environ.get(DEVICE) or device
 
 
 def work(job: Job, root: str, device: str, sweep: str = "") -> Outcome:

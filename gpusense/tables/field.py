@@ -8,10 +8,10 @@ import numpy as np
 
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
-from gpusense.interface.terms import log_weight
 from gpusense.tables.cells import check_size
 from gpusense.tables.distances import NO_OBSTACLE, squared_distances
 from gpusense.world.compat import OVERLAID, Beluga, Peer
+from gpusense.world.field_density import FieldDensity
 from gpusense.world.likelihood import Likelihood
 from gpusense.world.parameters import LikelihoodFieldParameters
 from gpusense.world.windows import Window
@@ -122,15 +122,9 @@ class FieldTable:
         p = self._parameters
         if self._peer is not None:
             return self._peer.terms(self._peer.field_values(squared, p, self._resolution, self._range_max))
-        distance = np.minimum(np.sqrt(squared) * self._resolution, p.max_distance)
-        return self._log_density(distance) if self._log_table else distance
-
-    def _log_density(self, distance: np.ndarray) -> np.ndarray:
-        p = self._parameters
-        with np.errstate(over="ignore"):
-            exponent = 0.5 * (distance / p.sigma_hit) ** 2
-        log_hit = log_weight(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi) - exponent
-        return np.logaddexp(log_hit, log_weight(p.z_rand) - math.log(self._range_max))
+        density = FieldDensity(p, self._range_max)
+        distance = density.capped(np.sqrt(squared) * self._resolution)
+        return density.log(distance) if self._log_table else distance
 
     def _density_of(self, rows: int, cols: int) -> np.ndarray | None:
         """Return the cell values of the squared distances 0, 1, ... and infinity; None if there are too many.

@@ -293,7 +293,7 @@ class OccupancyGrid:
             ("origin", self._origin),
             *((name, f"{share:.1%}") for name, share in shares),
         ]
-        return card("OccupancyGrid", table, picture=thumbnail(self))
+        return card("OccupancyGrid", table, picture=thumbnail(self.unknown, self.occupied))
 
     def __reduce__(self) -> tuple[Callable[..., OccupancyGrid], tuple[Any, ...]]:
         # Copies and pickles call the constructor, so that their cells are read-only too.

@@ -1,6 +1,6 @@
 """Beam model of a whole scan, log p(z | x, m): cast, evaluate the mixture and sum, in one launch (book table 6.1).
 
-Readings whose density does not depend on the pose are not passed in: their sum is the constant term fixed.
+Readings whose density does not depend on the pose are not passed in: their sum is the constant term.
 """
 
 import functools

@@ -119,7 +119,8 @@ def test_a_map_is_a_small_picture_with_its_walls(shape):
     cells = np.zeros(shape, np.int8)
     cells[0, :] = 100
     cells[-1, -1] = -1 if shape[0] > 1 else 100
-    picture = Image.open(io.BytesIO(thumbnail(gs.OccupancyGrid(cells))))
+    grid = gs.OccupancyGrid(cells)
+    picture = Image.open(io.BytesIO(thumbnail(grid.unknown, grid.occupied)))
     pixels = np.asarray(picture)
     assert picture.mode == "L" and max(pixels.shape) <= WIDEST
     assert (pixels[-1] == 60).all()  # row 0 of the map is the lowest

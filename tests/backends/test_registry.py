@@ -10,9 +10,10 @@ import pytest
 
 import gpusense as gs
 from gpusense.backends import BackendInfo, chain, get_backend, listing, registry, selection
+from gpusense.backends.library import Absent, Library
 from gpusense.backends.numpy.backend import NumpyBackend
 from gpusense.backends.proof import Verdict
-from gpusense.backends.registry import BY_NAME, ENTRIES, SPEED_CLASSES, Absent, Entry, Library
+from gpusense.backends.registry import BY_NAME, ENTRIES, SPEED_CLASSES, Entry
 
 INFO = BackendInfo("metal:0", "metal", "Some GPU", "gpu", "Metal 3", 1 << 30, 1 << 28, False)
 METAL = Entry(

@@ -12,12 +12,12 @@ from support.split_scene import field, scans
 from gpusense.backends import get_backend
 from gpusense.interface.constants import FAST, SLOW, SLOW_RATE, STRAIGHT
 from gpusense.localization.device_cloud import DeviceCloud
+from gpusense.localization.distributed.cloud import SplitCloud
+from gpusense.localization.distributed.teams import LocalTeam
 from gpusense.localization.filter_cloud import Contents, FilterCloud, Step
 from gpusense.localization.motion import STILL, OdometryMotion
 from gpusense.localization.options import checked, settings_of_step
 from gpusense.localization.sensors import Sensor
-from gpusense.sweeps.split import SplitCloud
-from gpusense.sweeps.teams import Here
 
 COUNT = 100
 POSES = np.random.default_rng(0).normal((3.0, 2.5, 0.4), (0.2, 0.2, 0.1), (COUNT, 3))
@@ -27,7 +27,7 @@ def made(kind: str, backend: str, capacity: int = COUNT) -> Any:
     """Return an empty cloud."""
     if kind == "one device":
         return DeviceCloud([Sensor(field(backend))], capacity)
-    return SplitCloud(Here([[field(backend)], [field(backend)]], capacity, False), capacity)
+    return SplitCloud(LocalTeam([[field(backend)], [field(backend)]], capacity, False), capacity)
 
 
 def host(values: Any) -> np.ndarray:

@@ -11,8 +11,8 @@ from support.filter_scene import COVARIANCE, FILTERS, START, begun, everything, 
 from support.split_scene import field
 
 import gpusense as gs
+from gpusense.localization.distributed.filter import SplitParticleFilter
 from gpusense.sweeps.executors import ProcessExecutor
-from gpusense.sweeps.split_filter import SplitParticleFilter
 
 
 def continued(pf, first=3, steps=4):

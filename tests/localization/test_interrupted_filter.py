@@ -16,7 +16,7 @@ from support.interrupts import Line, executed_lines, interrupt
 from support.split_scene import field
 
 import gpusense as gs
-from gpusense.localization import journal, resetting
+from gpusense.localization import journal, starts
 
 # Rooms whose lines are interrupted: those below them know nothing of a filter.
 ROOMS = ("localization", "sweeps")
@@ -37,7 +37,7 @@ OTHER_STATES: dict[str, Any] = {}
 @pytest.fixture(autouse=True)
 def few_tries(monkeypatch):
     """A reset tries few poses: a state has all or nothing of any number."""
-    monkeypatch.setattr(resetting, "_LEAST_TRIES", 300)
+    monkeypatch.setattr(starts, "_LEAST_TRIES", 300)
 
 
 def again(pf: Filter) -> Filter:
@@ -180,7 +180,7 @@ def test_an_interrupt_of_the_way_back_is_made_good_by_the_next_call(monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         pf.correct(readings(pf, 3))
     monkeypatch.setattr(journal.Journal, "restore", restore)
-    assert pf.count == 200 and pf._step == 4 and everything(pf) == before
+    assert pf.count == 200 and pf._tracker.step == 4 and everything(pf) == before
 
 
 def test_calls_of_threads_wait_for_one_another():

@@ -65,6 +65,16 @@ def test_another_map_and_another_mount_are_told_apart(model):
         assert monitor.diagnose().cause == "mount" and monitor.diagnose().mirrored
 
 
+def test_a_mount_is_found_beside_sensors_without_scans(model):
+    """Only scans are mirrored: a heading has no beams."""
+    compass = gs.HeadingModel(backend="numpy")
+    monitor = gs.PoseMonitor([model, compass])
+    for pose in POSES:
+        monitor.update(pose, {model: scan_at(pose + np.array([0.0, 0.0, math.pi / 2])), compass: float(pose[2])})
+    found = monitor.diagnose()
+    assert found.cause == "mount" and found.turned == pytest.approx(math.pi / 2, abs=0.1) and not found.mirrored
+
+
 def test_people_are_named(model):
     scans = [np.where(np.arange(71) % 2 == 0, scan_at(pose), 0.5) for pose in POSES]
     monitor, found = watched(model, POSES, scans)

@@ -10,8 +10,8 @@ from support.matching_scenes import CORRIDOR, FRONT, RING, ROOM, WALL, segments_
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.matching.alone import own_information
 from gpusense.matching.options import MatchOptions
+from gpusense.matching.uncertainty import observable_directions
 
 METHODS = ["auto", "gauss_newton", "correlative"]
 PLACES = {"near": (0.0, 0.0, 0.0), "far and yawed": (5e6, -4e6, 0.6)}
@@ -94,7 +94,7 @@ def test_lines_of_a_scan_have_the_information_of_their_normals():
     mount, scanner_pose = (0.3, -0.2, 0.0), (0.2, 0.1, 0.0)
     scanner = gs.Scanner(RING.bearings, range_max=30.0, mount=mount)
     scan, pose = segments_scan(ROOM[:4], scanner_pose, scanner), np.array([[5.0, -3.0, 0.7]])
-    found = own_information(
+    found = observable_directions(
         scan[None], pose, np.ones(1), scanner, get_backend("numpy"), np.dtype(np.float64), MatchOptions(0.01, 1.0, None)
     )
     place = scan[:, None] * np.stack([np.cos(scanner.bearings), np.sin(scanner.bearings)], axis=1)

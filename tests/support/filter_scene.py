@@ -11,7 +11,7 @@ import numpy as np
 from support.split_scene import GRID, SCANNER, TRUTH, field, field_and_compass, scans
 
 import gpusense as gs
-from gpusense.sweeps.split_filter import SplitParticleFilter
+from gpusense.localization.distributed.filter import SplitParticleFilter
 
 XY = np.random.default_rng(3).uniform(0, 6, (8, 2))
 START = TRUTH + np.array([0.2, -0.2, 0.1])

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from gpusense.backends.base import Backend
 from gpusense.backends.info import BackendInfo
+from gpusense.backends.library import Library
 from gpusense.backends.numpy.backend import NumpyBackend, describe
-from gpusense.backends.registry import Library
 
 
 class NumpyLibrary(Library):

@@ -6,7 +6,7 @@ import os
 
 from gpusense.backends.base import Backend
 from gpusense.backends.info import BackendInfo
-from gpusense.backends.registry import Absent, Library
+from gpusense.backends.library import Absent, Library
 from gpusense.backends.warp.backend import WarpBackend
 from gpusense.backends.warp.devices import list_devices
 from gpusense.backends.warp.settings import trouble

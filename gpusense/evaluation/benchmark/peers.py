@@ -12,7 +12,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import gpusense
 from gpusense._util.checks import existing_file
 from gpusense.evaluation.benchmark.candidates import PROBLEMS, Candidate
 
@@ -22,7 +21,7 @@ _MODULE = "gpusense_bench_peers"
 
 def checkout() -> Path | None:
     """Return the checkout that this package is imported from; None for an installed package."""
-    root = Path(gpusense.__file__).resolve().parents[1]
+    root = Path(__file__).resolve().parents[3]
     return root if (root / "pyproject.toml").is_file() and (root / "gpusense").is_dir() else None
 
 

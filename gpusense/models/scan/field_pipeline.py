@@ -13,7 +13,6 @@ from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import widened
 from gpusense.interface.launches import Program, launch
-from gpusense.interface.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
 from gpusense.models.poses import PlacedPoses
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.pipeline import ScanPipeline, Scoring, Setting, Tiles
@@ -21,6 +20,7 @@ from gpusense.models.scan.readings import Readings, Sensing
 from gpusense.models.scan.tiles import ENOUGH_SHORT, all_within, spread_of, sum_launch
 from gpusense.tables.field import RING, FieldTable
 from gpusense.tables.reachable import ReachableMap
+from gpusense.world.field_density import FieldDensity
 from gpusense.world.frames import split
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import LikelihoodFieldParameters
@@ -91,23 +91,13 @@ class FieldPipeline(ScanPipeline):
         self, p: LikelihoodFieldParameters, *, bilinear: bool, cubes: bool
     ) -> tuple[frozenset[str], np.ndarray]:
         """Return flags of the mixture, and the numbers of the kernel file ``field``."""
-        range_max, everything = self.scanner.range_max, not self.specialize
-        rand = p.z_rand / range_max
-        # 0 where z_hit is.
-        peak = p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
-        linear = sums_linearly(rand, peak, self.real)
+        density, everything = FieldDensity(p, self.scanner.range_max), not self.specialize
         flags = flags_if(
             FLOAT64=not self.careful, CAREFUL=self.careful, ALL_READINGS=everything, BILINEAR=bilinear,
-            LOG_TABLE=self.log_table, CUBES=cubes, HIT=p.z_hit > 0 or everything, LINEAR=linear,
-            SHARP=not self.log_table and (peak > HIGH_PEAK or everything),
+            LOG_TABLE=self.log_table, CUBES=cubes, HIT=p.z_hit > 0 or everything, LINEAR=density.is_linear(self.real),
+            SHARP=not self.log_table and (density.is_sharp or everything),
         )  # fmt: skip
-        if linear:
-            head = (peak, rand)
-        else:
-            log_scale = log_weight(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi)
-            head = (log_scale, log_weight(p.z_rand) - math.log(range_max))
-        terms = [head[0], 0.5 / p.sigma_hit / p.sigma_hit, head[1], log_weight(p.z_max)]
-        return flags, rounded_terms(terms, self.real)
+        return flags, density.terms(self.real)
 
     # ---- readings
 

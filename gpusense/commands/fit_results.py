@@ -1,4 +1,4 @@
-"""Results of ``gpusense fit`` before an interrupt."""
+"""Results of ``gpusense fit``: whole ones, and those before an interrupt."""
 
 from __future__ import annotations
 
@@ -9,12 +9,37 @@ from typing import TYPE_CHECKING
 from gpusense.commands.output import print_json
 
 if TYPE_CHECKING:
+    from gpusense.evaluation.held_out import HeldOut
+    from gpusense.evaluation.range_data import RangeData
+    from gpusense.learning.beam.incidence import IncidenceFit
     from gpusense.learning.beam.result import BeamFit
+    from gpusense.localization.motion_fit import MotionFit
     from gpusense.world.parameters import BeamParameters
 
 
+@dataclass(frozen=True)
+class FitResult:
+    """Result of the command.
+
+    Attributes:
+        data: The readings of the fit.
+        fit: The fit.
+        incidence: The fit by angles of incidence, or None.
+        held_out: The comparison on held-out readings; empty without ``--holdout``.
+        held_out_readings: Number of held-out readings.
+        motion: The noise of the odometry, or None.
+    """
+
+    data: RangeData
+    fit: BeamFit
+    incidence: IncidenceFit | None
+    held_out: list[HeldOut]
+    held_out_readings: int
+    motion: MotionFit | None = None
+
+
 @dataclass
-class SoFar:
+class PartialFit:
     """Results before an interrupt.
 
     Attributes:

@@ -9,13 +9,13 @@ import numpy as np
 
 from gpusense.backends.base import Backend, Buffer
 from gpusense.interface.launches import Program
+from gpusense.localization.distributed.parts import Piece
 from gpusense.localization.sums import Sums, block_of
-from gpusense.sweeps.parts import Piece
 
 _DOUBLE = np.dtype(np.float64)
 
 
-class Gathered:
+class ShardPool:
     """Buffers on a device for poses, cumulative weights and certain copies of particles of all shards.
 
     Args:

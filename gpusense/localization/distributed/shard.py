@@ -28,11 +28,11 @@ from gpusense.interface.constants import (
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
 from gpusense.localization.cloud import Cloud
+from gpusense.localization.distributed.parts import Given, Marks, Part, Piece, Step
+from gpusense.localization.distributed.shard_pool import ShardPool
 from gpusense.localization.particles import Places, Stage
 from gpusense.localization.sensors import Sensor
 from gpusense.reference.rungs import left_of, rung_of
-from gpusense.sweeps.gathered import Gathered
-from gpusense.sweeps.parts import Given, Marks, Part, Piece, Step
 
 # Units in the last place within which the product of two numbers reaches a neighbour of another product.
 _UNITS = 16
@@ -54,7 +54,7 @@ class Shard:
         self._cloud = Cloud(self._backend, max(capacity, 16), len(self._sensors), self._sensors[0].precision)
         self._part = Part(0, 0, 0, 16)
         self._settings = np.zeros(0)
-        self._gathered, self._residual = Gathered(self._backend), residual
+        self._pool, self._residual = ShardPool(self._backend), residual
         # Ones, and numbers of a step whose only temperature is a sum of weights.
         self._ones: tuple[Any, Any] | None = None
         self._recordings: dict[Hashable, tuple[Recording, object]] = {}
@@ -232,9 +232,9 @@ class Shard:
 
     def take(self, source: int, shards: Sequence[Shard]) -> Step:
         """Copy the particles of all shards from device to device."""
-        self._gathered.reserve(self._part.whole, self._part.whole)
+        self._pool.reserve(self._part.whole, self._part.whole)
         for one in shards:
-            self._gathered.take(one._cloud.poses[source], one._cloud.ends, one._part.first, one._part.size)
+            self._pool.take(one._cloud.poses[source], one._cloud.ends, one._part.first, one._part.size)
         yield
 
     def reaches(self, other: Shard) -> bool:
@@ -250,7 +250,7 @@ class Shard:
             pieces: Poses and cumulative weights of shards in their order; True for those that the device has taken, and
                 False to copy the own ones.
         """
-        cloud, found = self._cloud, self._gathered
+        cloud, found = self._cloud, self._pool
         of: tuple[Any, Any, int] = cloud.poses[stage.source], cloud.ends, self._part.size
         if pieces is not False:
             if pieces is not True:

@@ -7,11 +7,11 @@ from concurrent.futures import Executor
 from typing import Any
 
 from gpusense._util import checks
+from gpusense.localization.distributed.cloud import SplitCloud
+from gpusense.localization.distributed.parts import parts_of
+from gpusense.localization.distributed.shard_registry import models_of
+from gpusense.localization.distributed.teams import LocalTeam, RemoteTeam
 from gpusense.localization.filter import ParticleFilter
-from gpusense.sweeps.held import models_of
-from gpusense.sweeps.parts import parts_of
-from gpusense.sweeps.split import SplitCloud
-from gpusense.sweeps.teams import Here, There
 
 
 class SplitParticleFilter(ParticleFilter):
@@ -72,11 +72,11 @@ class SplitParticleFilter(ParticleFilter):
         most, count, residual = self.options.most, len(devices), self.options.resampling == "residual"
         # Parts are whole blocks, whose number does not always divide by that of the shards.
         share = min(most, most // count + 3 * parts_of(most, count)[0].block)
-        team: Here | There
+        team: LocalTeam | RemoteTeam
         if executors is None:
-            team = Here([self.models, *(models_of(make, device) for device in devices[1:])], share, residual)
+            team = LocalTeam([self.models, *(models_of(make, device) for device in devices[1:])], share, residual)
         else:
-            team = There(executors, make, devices, share, residual)
+            team = RemoteTeam(executors, make, devices, share, residual)
         return SplitCloud(team, most, residual=residual)
 
     def __repr__(self) -> str:

@@ -10,10 +10,10 @@ from support.split_scene import field, field_and_compass, states
 
 import gpusense as gs
 from gpusense.interface import constants as c
+from gpusense.localization.distributed.parts import parts_of
 from gpusense.reference.drawing import draw_particles
 from gpusense.reference.motion import move_particles
 from gpusense.sweep import ProcessExecutor, SplitParticleFilter
-from gpusense.sweeps.parts import parts_of
 
 OPTIONS = [
     {},

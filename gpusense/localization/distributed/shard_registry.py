@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from gpusense.sweeps.parts import finished
-from gpusense.sweeps.shard import Shard
-from gpusense.sweeps.worker import device_of
+from gpusense._util.worker_device import device_of
+from gpusense.localization.distributed.parts import finished
+from gpusense.localization.distributed.shard import Shard
 
-_HELD: dict[str, Shard] = {}
+_SHARDS: dict[str, Shard] = {}
 
 
 def hold(name: str, make: Callable[[str], Any], device: str, capacity: int, residual: bool) -> str:
@@ -23,20 +23,20 @@ def hold(name: str, make: Callable[[str], Any], device: str, capacity: int, resi
         residual: Whether draws are those of residual resampling.
     """
     models = models_of(make, device_of(device))
-    _HELD[name] = Shard(models, capacity, residual)
+    _SHARDS[name] = Shard(models, capacity, residual)
     return str(models[0].device.selection)
 
 
 def call(name: str, method: str, *arguments: Any) -> Any:
     """Run a method of a shard of this process to its end, and return its result."""
-    steps = getattr(_HELD[name], method)(*arguments)
+    steps = getattr(_SHARDS[name], method)(*arguments)
     next(steps)
     return finished(steps)
 
 
 def release(name: str) -> None:
     """Forget a shard of this process."""
-    _HELD.pop(name, None)
+    _SHARDS.pop(name, None)
 
 
 def models_of(make: Callable[[str], Any], device: str) -> list[Any]:

@@ -19,6 +19,8 @@ from gpusense.interface.constants import (
     WEIGHT_SUMS,
     WIDE_HEADINGS,
 )
+from gpusense.localization.distributed.parts import Part, parts_of
+from gpusense.localization.distributed.teams import LocalTeam, RemoteTeam
 from gpusense.localization.filter_cloud import (
     Contents,
     FilterCloud,
@@ -35,8 +37,6 @@ from gpusense.reference.draws import mark_of
 from gpusense.reference.estimate import finish_estimate
 from gpusense.reference.rungs import column_of, left_of, possible_of, rung_of, set_stage
 from gpusense.reference.weighing import join_rows
-from gpusense.sweeps.parts import Part, parts_of
-from gpusense.sweeps.teams import Here, There
 
 _PLAIN = frozenset[str]()
 # Bytes of a pose and a cumulative weight.
@@ -63,7 +63,7 @@ class SplitCloud(FilterCloud):
     MEMORY: ClassVar[tuple[str, ...]] = ("count", "places", "exchanged", "_state", "_pool")
     PARTS: ClassVar[tuple[str, ...]] = ()
 
-    def __init__(self, team: Here | There, capacity: int, *, residual: bool = False) -> None:
+    def __init__(self, team: LocalTeam | RemoteTeam, capacity: int, *, residual: bool = False) -> None:
         self._team, self._residual = team, residual
         self.count, self.places, self.kept, self.exchanged = capacity, Places(), Places(), 0
         self._state = np.zeros(STATE)

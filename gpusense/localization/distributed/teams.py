@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from typing import Any
 
-from gpusense.sweeps import held
-from gpusense.sweeps.parts import finished
-from gpusense.sweeps.shard import Shard
+from gpusense.localization.distributed import shard_registry
+from gpusense.localization.distributed.parts import finished
+from gpusense.localization.distributed.shard import Shard
 
 
-class Here:
+class LocalTeam:
     """Shards in this process: one thread starts the work of all before it waits for the first.
 
     Args:
@@ -46,7 +46,7 @@ class Here:
         self._shards = []
 
 
-class There:
+class RemoteTeam:
     """Shards in other processes, each behind an executor of one worker.
 
     Args:
@@ -74,7 +74,7 @@ class There:
         self._executors = list(executors)
         self._names = [secrets.token_hex(8) for _ in executors]
         made = [
-            executor.submit(held.hold, name, make, device, capacity, residual)
+            executor.submit(shard_registry.hold, name, make, device, capacity, residual)
             for executor, name, device in zip(executors, self._names, devices, strict=True)
         ]
         self.devices = [future.result() for future in made]
@@ -82,7 +82,7 @@ class There:
     def each(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
         """Run a method of all shards, each with its own arguments, and return the results."""
         running = [
-            executor.submit(held.call, name, method, *own)
+            executor.submit(shard_registry.call, name, method, *own)
             for executor, name, own in zip(self._executors, self._names, arguments, strict=True)
         ]
         return [future.result() for future in running]
@@ -94,4 +94,4 @@ class There:
     def close(self) -> None:
         """Forget the shards."""
         for executor, name in zip(self._executors, self._names, strict=True):
-            executor.submit(held.release, name).result()
+            executor.submit(shard_registry.release, name).result()

@@ -1,0 +1,21 @@
+"""Pictures of results: a result names its picture, and the root of the package, which knows all rooms, who draws it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+Drawer = Callable[[Any, str | os.PathLike[str]], None]
+
+_DRAWERS: dict[str, Drawer] = {}
+
+
+def register(name: str, drawer: Drawer) -> None:
+    """Set the function that draws a picture and writes it to a path."""
+    _DRAWERS[name] = drawer
+
+
+def draw(name: str, result: Any, path: str | os.PathLike[str]) -> None:
+    """Draw a picture of a result, and write it to a path."""
+    _DRAWERS[name](result, path)

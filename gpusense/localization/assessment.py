@@ -1,0 +1,65 @@
+"""The estimate of a filter: the pose, how sure it is by scans and by the particles, and the word for that."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from gpusense.localization.estimates import Estimate, clustered
+from gpusense.localization.recovery import Recovery
+from gpusense.localization.rival import evidence_of
+from gpusense.localization.spread import is_apart, is_narrow, is_wide, share_off, share_off_of
+from gpusense.localization.tracker import Tracker
+from gpusense.localization.verdict import Verdict
+from gpusense.localization.words import word_of
+
+# Most particles whose spread is counted one by one; of more, and of narrow clouds, a normal density is taken.
+_MOST_LOOKED_AT = 100_000
+
+
+def estimate_of(
+    tracker: Tracker, verdict: Verdict, recovery: Recovery, readings: Mapping[int, tuple[Any, ...]], method: str
+) -> Estimate:
+    """Return the estimate of a filter, and judge its pose by the last readings.
+
+    Args:
+        tracker: The particles.
+        verdict: Verdict on their pose.
+        recovery: Their rivals.
+        readings: Last readings by the index of their sensor.
+        method: "mean", "cluster" or "best".
+    """
+    cloud, shown = tracker.cloud, tracker.shown
+    pose, covariance = tracker.mean_and_covariance()
+    summary = cloud.summary()
+    if method == "best":
+        pose = tracker.host_particles()[int(np.argmax(cloud.host_weights(shown)))]
+    elif method == "cluster":
+        pose, covariance = clustered(tracker.host_particles(), cloud.host_weights(shown))
+    explained = verdict.judge(pose, covariance, readings, evidence_of(summary))
+    p_lost = _p_lost(tracker, verdict, recovery, pose, covariance)
+    word = word_of(p_lost, verdict.wrong, wide=is_wide(covariance), apart=is_apart(covariance))
+    size = summary.effective_sample_size
+    if not size > 0:
+        # The kernels have summed no squares: before a correction, or where no weighted particle was possible.
+        weights = cloud.host_weights(shown)
+        size = float(weights.sum() ** 2 / (weights @ weights))
+    temperature = tracker.sensors[0].temperature(tracker.options.temperature)
+    return Estimate(
+        pose, covariance, size * tracker.distinct, p_lost, word, explained, temperature, summary.temperature,
+        summary.degenerate, shown,
+    )  # fmt: skip
+
+
+def _p_lost(tracker: Tracker, verdict: Verdict, recovery: Recovery, pose: np.ndarray, covariance: np.ndarray) -> float:
+    """Return the probability that a pose is far off, by the scans and by the particles."""
+    if is_narrow(covariance) or tracker.shown > _MOST_LOOKED_AT:
+        share = share_off(covariance)
+    else:
+        share = share_off_of(tracker.host_particles(), tracker.cloud.host_weights(tracker.shown), pose)
+    if recovery.rival is not None:
+        share = 1 - (1 - share) * (1 - recovery.rival.probability(pose))
+    wrong = verdict.wrong
+    return wrong + (1 - wrong) * share

@@ -1,0 +1,1 @@
+"""A filter whose particles are spread over several devices."""

@@ -1,0 +1,138 @@
+"""Recovery of a filter from a wrong pose: rivals of its particles, searched for where scans contradict them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from gpusense.localization import starts
+from gpusense.localization.device_cloud import DeviceCloud
+from gpusense.localization.filter_cloud import Given
+from gpusense.localization.motion import SampledMotion
+from gpusense.localization.rival import COMPARISONS, PARTICLES, PRIOR, Rival, evidence_of
+from gpusense.localization.rival_search import can_search
+from gpusense.localization.tracker import Tracker
+from gpusense.localization.verdict import Verdict
+
+# Makes the seed of a rival from that of its filter.
+_RIVAL = 0x9E3779B97F4A7C15
+# Probability that another place is right above which a rival is searched for; more than before the first scan.
+_DOUBT = 0.2
+
+
+class Recovery:
+    """The rivals of a filter's particles.
+
+    Args:
+        tracker: The particles.
+        verdict: Verdict on their pose.
+
+    Attributes:
+        rival: The rival of the particles, if there was one.
+        everywhere: How many places anywhere are still to be compared with the one that is found.
+    """
+
+    MEMORY: ClassVar[tuple[str, ...]] = ("rival", "everywhere")
+    PARTS: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, tracker: Tracker, verdict: Verdict) -> None:
+        self._tracker, self._verdict = tracker, verdict
+        self._searches = tracker.options.recovery == "sensor" and can_search(tracker.sensors)
+        self.rival: Rival | None = None
+        self.everywhere = 0
+
+    @property
+    def active(self) -> Rival | None:
+        """The rival that competes with the particles now."""
+        return self.rival if self.rival is not None and self.rival.active else None
+
+    def changing(self) -> tuple[Any, ...]:
+        """Return the objects whose state a call may change."""
+        return (self,) if self.rival is None else (self, *self.rival.changing())
+
+    def keep(self) -> None:
+        """Note what the call that begins must leave as it is."""
+        if self.rival is not None:
+            self.rival.keep()
+
+    def restart(self) -> None:
+        """Forget the rival: the particles begin anew."""
+        self.everywhere = 0
+        if self.rival is not None:
+            self.rival.stop()
+
+    def expect_anywhere(self) -> None:
+        """Compare the pose to which the particles converge with other places."""
+        self.everywhere = COMPARISONS
+
+    def follow(self, motion: SampledMotion) -> None:
+        """Move the rival."""
+        if self.rival is not None:
+            self.rival.predict(motion)
+
+    def is_doubted(self) -> bool:
+        """Tell whether the last scans that were judged contradict the pose, or a rival competes with it."""
+        verdict = self._verdict
+        apart = self.active is not None or not self._tracker.together
+        return apart or verdict.wrong > _DOUBT or verdict.explains_little
+
+    def corrected(self, given: list[Given], readings: Mapping[int, tuple[Any, ...]]) -> None:
+        """Compare the particles with their rival, or search for one where scans contradict the pose.
+
+        Args:
+            given: Indices of sensors with the readings by which the particles were corrected.
+            readings: The same readings with all beams, which the next call cannot change.
+        """
+        if not self._searches:
+            return
+        if self.active is not None:
+            self._compare(self.active, given)
+            return
+        tracker = self._tracker
+        if tracker.wide or (self.everywhere and not tracker.together):
+            return
+        if not (self.everywhere or self.is_doubted() or self._verdict.due):
+            return
+        pose, covariance = tracker.mean_and_covariance()
+        self._verdict.judge(pose, covariance, readings, evidence_of(tracker.cloud.summary()))
+        if self.everywhere or self.is_doubted():
+            prior = 0.0 if self.everywhere else PRIOR
+            self.everywhere = max(self.everywhere - 1, 0)
+            self._made().start(pose, covariance, list(readings.items()), step=tracker.step, prior=prior)
+
+    def _compare(self, rival: Rival, given: list[Given]) -> None:
+        """Correct the rival, and let it replace the particles where it has won."""
+        tracker = self._tracker
+        rival.correct(given, evidence_of(tracker.cloud.summary()))
+        won = rival.judge(*tracker.mean_and_covariance(), given)
+        if won is not None:
+            poses, weights = won
+            # The next scans have to confirm them.
+            tracker.place(poses[starts.rows_by_weight(weights, tracker.cloud.count)])
+            self._verdict.doubt()
+            self.expect_anywhere()
+
+    def _made(self) -> Rival:
+        """Return the rival, which is made at its first use: it has the sensors of the filter."""
+        if self.rival is None:
+            tracker = self._tracker
+            options = tracker.options._replace(
+                least=PARTICLES, most=PARTICLES, seed=tracker.options.seed ^ _RIVAL, recovery=None, beam_skip=None
+            )
+            cloud = DeviceCloud(tracker.sensors, PARTICLES, residual=options.resampling == "residual")
+            self.rival = Rival(Tracker(tracker.sensors, options, cloud))
+        return self.rival
+
+    # ---- state
+
+    def state(self) -> dict[str, Any]:
+        """Return the state as plain data."""
+        return {"everywhere": self.everywhere, "rival": None if self.active is None else self.active.state()}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Take over a state."""
+        self.everywhere = state["everywhere"]
+        if state["rival"] is not None:
+            self._made().restore(state["rival"])
+        elif self.rival is not None:
+            self.rival.stop()

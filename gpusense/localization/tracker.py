@@ -1,0 +1,210 @@
+"""Particles that follow the robot: their motion, their weighing, and the numbers of each step.
+
+A filter has a tracker, and the rival of its particles is another one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.localization import starts
+from gpusense.localization.adaptive import kld_count
+from gpusense.localization.defaults import DEFAULTS
+from gpusense.localization.estimates import covariance_of
+from gpusense.localization.filter_cloud import Contents, FilterCloud, Given, Step
+from gpusense.localization.journal import plain_state, set_state
+from gpusense.localization.motion import STILL, SampledMotion
+from gpusense.localization.options import Options, settings_of_step
+from gpusense.localization.sensors import Sensor
+from gpusense.localization.skipping import TOGETHER
+
+# Interval [corrections] at which a converged filter re-checks that it is converged.
+_LOOK = 5
+
+
+class Tracker:
+    """Particles with the sensors that weigh them.
+
+    Args:
+        sensors: The sensors.
+        options: Options of the filter.
+        cloud: The particles.
+
+    Attributes:
+        started: Whether there are particles.
+        step: Number of the last step.
+        pending: The motion that the next step begins with.
+        shown: Number of the particles that are shown, those of the last step.
+        wide: Corrections left at a low temperature.
+        together: Whether the particles lie together, as far as is known.
+        pool: Poses that recovery injects: their number, and half widths of the box around each.
+        distinct: Share of distinct particles before the last correction.
+        corrections: Corrections so far.
+    """
+
+    MEMORY: ClassVar[tuple[str, ...]] = (
+        "started", "step", "pending", "shown", "wide", "together", "pool", "distinct", "corrections",
+    )  # fmt: skip
+    PARTS: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, sensors: Sequence[Sensor], options: Options, cloud: FilterCloud) -> None:
+        self.sensors, self.options, self.cloud = sensors, options, cloud
+        self._models = [sensor.model for sensor in sensors]
+        self.started, self.step, self.shown, self.wide = False, 0, options.most, 0
+        self.pending: SampledMotion | None = None
+        self.together, self.distinct, self.corrections = False, 1.0, 0
+        self.pool: tuple[int, starts.Spread] = 0, (0.0, 0.0, 0.0)
+
+    def keep(self) -> None:
+        """Note the particles that the call that begins must leave as they are."""
+        self.cloud.kept = self.cloud.places
+
+    # ---- particles
+
+    def key(self) -> starts.Key:
+        """Return the two words of the seed, and the number of a new step."""
+        self.step += 1
+        return *self.options.words, self.step
+
+    def number(self, particles: int | None) -> int:
+        """Return a checked number of particles; the most for None."""
+        most = self.options.most
+        return most if particles is None else checks.integer("particles", particles, low=1, high=most)
+
+    def place(self, poses: np.ndarray) -> None:
+        """Replace all particles."""
+        self.cloud.place(poses)
+        self.shown, self.started, self.wide, self.together = len(poses), True, 0, False
+        if self.options.recovery == "augmented" and not self.pool[0]:
+            pool, spread = starts.free_pool(self._models, None)
+            self.cloud.set_pool(pool)
+            self.pool = len(pool), spread
+
+    def random_poses(self, count: int) -> np.ndarray:
+        """Return poses anywhere in the free space, the same ones each time; around the particles without a grid."""
+        try:
+            pool, spread = starts.free_pool(self._models, None)
+        except ValueError:
+            pool, spread = self.host_particles().mean(axis=0)[None], (10.0, 10.0, math.pi)
+        return starts.spread(pool, spread, count, (*self.options.words, 0))
+
+    def host_particles(self) -> np.ndarray:
+        """Return a copy of the shown poses."""
+        return self.cloud.host_poses(self.cloud.places.shown, self.shown)
+
+    def next_particles(self) -> np.ndarray:
+        """Return a copy of the poses of the next step."""
+        return self.cloud.host_poses(self.cloud.places.next, self.cloud.count)
+
+    def host_weights(self) -> np.ndarray:
+        """Return a copy of the weights of the shown particles; their sum is 1."""
+        weights = self.cloud.host_weights(self.shown)
+        return weights / weights.sum()
+
+    def mean_and_covariance(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean and covariance of the shown particles."""
+        numbers = self.cloud.estimate(self.shown)
+        return numbers[:3].copy(), covariance_of(numbers)
+
+    # ---- state
+
+    def state(self) -> tuple[Contents, dict[str, Any]]:
+        """Return particles and memory as plain data."""
+        return self.cloud.contents(self.shown), plain_state(self)
+
+    def restore(self, contents: Contents, memory: Mapping[str, Any]) -> None:
+        """Take over particles and memory."""
+        self.cloud.restore(contents)
+        set_state(self, memory)
+
+    # ---- steps
+
+    def follow(self, motion: SampledMotion) -> None:
+        """Move the particles when the next correction begins: one program has both."""
+        if self.pending is None:
+            self.pending = motion
+        else:
+            self.move(motion)
+
+    def move(self, following: SampledMotion | None) -> None:
+        """Run the pending motion; another one follows it."""
+        motion = STILL if self.pending is None else self.pending
+        self.cloud.move(self.settings(motion, []), motion.kind)
+        self.shown, self.pending = self.cloud.count, following
+
+    def weigh(self, given: list[Given], *, again: bool = False) -> None:
+        """Run the motion, and correct the particles by readings of sensors.
+
+        Args:
+            given: Indices of sensors with their readings.
+            again: Whether the particles were corrected before, so that some may be copies.
+        """
+        chosen, motion = self.options, STILL if self.pending is None else self.pending
+        self.distinct = self._distinct_share() if self.pending is None and again else 1.0
+        drawn = self.cloud.count if chosen.least == chosen.most else self._wanted()
+        settings = self.settings(motion, [index for index, _ in given])
+        self.shown, self.pending = self.cloud.count, None
+        self.cloud.correct(Step(settings, motion.kind, chosen.stages, drawn, given))
+        self.wide = max(self.wide - 1, 0)
+
+    def _distinct_share(self) -> float:
+        """Return the share of distinct particles before a correction without motion, where copies are alike."""
+        last = self.cloud.summary()
+        before = self.distinct if last.stages == 1 else 1.0
+        return before * min(last.effective_sample_size / self.shown, 1.0) if last.resampled else before
+
+    def learn(self, given: list[Given], is_doubted: Callable[[], bool]) -> None:
+        """Find out whether the particles lie together, and learn from scans at a pose that none contradicts.
+
+        Args:
+            given: Indices of sensors with the readings of the last correction.
+            is_doubted: Tells whether something contradicts the pose.
+        """
+        self.corrections += 1
+        due = _due_of(self.sensors, given) if self.options.temperature == "auto" else []
+        if not (due or not self.together or self.corrections % _LOOK == 0):
+            return
+        pose, covariance = self.mean_and_covariance()
+        self.together = is_together(covariance)
+        if due and self.together and not is_doubted() and self.cloud.summary().effective_sample_size >= 2:
+            for sensor, reading in due:
+                sensor.correlate(pose, covariance, reading)
+
+    def settings(self, motion: SampledMotion, given: list[int]) -> np.ndarray:
+        """Return the numbers of a new step with readings of sensors, by their indices."""
+        temperature, sensors = self.options.temperature, []
+        wide = DEFAULTS.wide_share if self.wide and temperature == "auto" else 1.0
+        for sensor in (self.sensors[index] for index in given):
+            sensors.append((sensor.temperature(temperature) * (wide if sensor.calibrates else 1.0), sensor.beams))
+        step, count = self.key()[2], self.cloud.count
+        one_peak = self.together and not any(self.sensors[index].ambiguous for index in given)
+        return settings_of_step(self.options, motion, step, count, self.pool, sensors, one_peak)
+
+    def _wanted(self) -> int:
+        """Return the particles of the next step by KLD sampling."""
+        return kld_count(self.next_particles(), self.options.least, self.options.most)
+
+
+def _due_of(sensors: Sequence[Sensor], given: Sequence[Given]) -> list[tuple[Sensor, tuple[Any, ...]]]:
+    """Count the scans of a correction; return those to learn from, with their sensors."""
+    due = []
+    for index, reading in given:
+        sensor = sensors[index]
+        if sensor.calibrates:
+            sensor.count()
+            due += [(sensor, reading)] if sensor.due else []
+    return due
+
+
+def is_together(covariance: np.ndarray) -> bool:
+    """Tell whether particles of a covariance lie together: their deviation along x and along y is at most half a metre.
+
+    Args:
+        covariance: (3, 3) covariance of their poses [m, m, rad].
+    """
+    return bool(max(covariance[0, 0], covariance[1, 1]) <= TOGETHER**2)

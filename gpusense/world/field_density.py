@@ -1,0 +1,91 @@
+"""Density of a likelihood field on the host: the one home of its formula (*Probabilistic Robotics* table 6.3).
+
+    p(d) = z_hit N(d; 0, sigma_hit) + z_rand / range_max
+
+for the distance d [m] from the end point of a reading to the nearest obstacle. Kernels have the same formula, each in
+its language, and get their numbers here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.interface.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
+from gpusense.world.parameters import LikelihoodFieldParameters
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FieldDensity:
+    """The density of a field's parameters.
+
+    Attributes:
+        parameters: Parameters of the field.
+        range_max: Longest range of the scanner [m].
+    """
+
+    parameters: LikelihoodFieldParameters
+    range_max: float
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of hits [m]."""
+        return self.parameters.sigma_hit
+
+    @property
+    def peak(self) -> float:
+        """Density of a hit at distance 0 [1/m], with its weight; 0 where the weight is."""
+        return self.parameters.z_hit / (self.sigma * math.sqrt(2 * math.pi))
+
+    @property
+    def log_peak(self) -> float:
+        """Logarithm of ``peak``, which may be below the smallest number."""
+        return log_weight(self.parameters.z_hit) - math.log(self.sigma) - 0.5 * math.log(2 * math.pi)
+
+    @property
+    def rate(self) -> float:
+        """Factor of the squared distance in the exponent [1/m^2]."""
+        return 0.5 / self.sigma / self.sigma
+
+    @property
+    def rand(self) -> float:
+        """Density of random readings [1/m], with their weight."""
+        return self.parameters.z_rand / self.range_max
+
+    @property
+    def log_rand(self) -> float:
+        """Logarithm of ``rand``."""
+        return log_weight(self.parameters.z_rand) - math.log(self.range_max)
+
+    @property
+    def is_sharp(self) -> bool:
+        """Whether the peak is so high that kernels need the exponent in two parts."""
+        return self.peak > HIGH_PEAK
+
+    def is_linear(self, real: np.dtype) -> bool:
+        """Tell whether kernels sum densities, and not their logarithms."""
+        return sums_linearly(self.rand, self.peak, real)
+
+    def terms(self, real: np.dtype) -> np.ndarray:
+        """Return the numbers of the kernel file ``field_term``: those of a sum of densities, or of logarithms.
+
+        Raises:
+            ValueError: sigma_hit is too small or too large for the precision.
+        """
+        hit, rand = (self.peak, self.rand) if self.is_linear(real) else (self.log_peak, self.log_rand)
+        return rounded_terms([hit, self.rate, rand, log_weight(self.parameters.z_max)], real)
+
+    def capped(self, distance: Floats) -> Floats:
+        """Return distances, at most those beyond which all count as equal."""
+        return np.minimum(distance, self.parameters.max_distance)
+
+    def log(self, distance: Floats) -> Floats:
+        """Return the log density [log 1/m] of distances [m], which are not capped."""
+        with np.errstate(over="ignore"):
+            exponent = 0.5 * (distance / self.sigma) ** 2
+        return np.logaddexp(self.log_peak - exponent, self.log_rand)

@@ -17,6 +17,13 @@ from gpusense.reference.scans import particles_of_scans
 from gpusense.reference.sensor_table import tabulated_density
 
 
+def ray_limit(flags: frozenset[str], z: np.ndarray, terms: np.ndarray, scale: structs.RangeScale) -> np.ndarray:
+    """Return the distances in cells to which the rays of readings are cast."""
+    if "STOPS" not in flags:
+        return np.full_like(z, scale.limit)
+    return np.fmin(last_range(z, terms) / scale.resolution, scale.limit)
+
+
 def reading_term(
     flags: frozenset[str],
     z: np.ndarray,
@@ -108,9 +115,9 @@ def score_beams(
             )  # fmt: skip
         expected = ranges.reshape(end - begin, rays)[:, ray_of]
         z = np.broadcast_to(reading[:readings], expected.shape)
-        if "STOPS" in flags:
-            # Rays need not be cast farther; here they are.
-            expected = np.fmin(expected, last_range(z, terms))
+        # Rays need not be cast farther than their limits; here they are, and cut.
+        limit = ray_limit(flags, z, terms, scale)
+        expected = np.where(limit < scale.limit, np.fmin(expected, limit * scale.resolution), expected)
         term = reading_term(flags, z, expected, bin_terms, sensor, tables, scale.range_max)
         if "PER_BEAM" in flags:
             parts[begin * readings : end * readings] = term.ravel()

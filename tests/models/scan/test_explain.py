@@ -128,8 +128,8 @@ def test_the_text_of_the_kernel_lacks_what_is_left_out(part, needs):
     scalar = {
         "short_length_lanes(expected": "short_peak(terms",
         "hit_exponent_lanes(z": "hit_exponent(z, expected, terms)",
-        "TERM(10)": "terms[10]",
-        "TERM(12)": "terms[12]",
+        "TERM(10)": "expected + terms[10]",
+        "TERM(12)": "terms[12] * expected",
         "two_product_lanes(off": "two_product(off",
     }
     words = words if backend.info.lanes > 1 else scalar[words]

@@ -100,6 +100,11 @@ def read_scans_of_lasers(args: argparse.Namespace) -> tuple[list[tuple[int, Scan
     """
     from gpusense.evaluation.steps import read_steps
 
+    if len(args.topic) < 2:
+        # Scans of other scanners do not matter where they have no pose.
+        topic = args.topic[0] if args.topic else None
+        scans = read_scans(argparse.Namespace(**{**vars(args), "topic": topic}), posed=False)
+        return scans, [0] * len(scans)
     with options_named():
         steps = read_steps(
             args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit,

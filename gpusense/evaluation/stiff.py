@@ -132,7 +132,8 @@ def density_grid(backend: Selection, precision: str) -> Densities:
         parts = device.empty(count * len(z), real)
         first = device.upload(np.array([0, len(z)], np.int32))
         mixture = model._pipeline.mixture
-        device.compile("score_beams", flags | mixture.flags)(
+        # Rays that are shared do not end behind a reading.
+        device.compile("score_beams", flags | (mixture.flags - {"STOPS"}))(
             (count,), rectangles, none, cells, pose, ray, first, device.upload(z),
             device.upload(mixture.terms), none, none, first, none, device.empty(count, real), parts, *world,
             len(z), *laser, *casting, structs.Score(0.0, 1.0), structs.ScanBatch(1, 0),

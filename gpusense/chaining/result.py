@@ -97,7 +97,7 @@ class ScanChain:
 
     @property
     def later(self) -> Floats:
-        """Time [s] from each scan to its pose, (S,). It is that of the scan where beams are listed in reverse, else 0."""
+        """Time [s] from each scan to its pose, (S,); that of the scan if beams are listed in reverse, else 0."""
         result: Floats = np.maximum(-np.atleast_1d(np.array(self.duration, np.float64)), 0.0)[self.sensor]
         return result
 

@@ -41,13 +41,13 @@ SHOWN = {
     "landmarks": ("median error",),
 }  # fmt: skip
 NEEDS = tuple(SHOWN)
-# Methods with a knob that other implementations have, too.
+# Methods whose knob other implementations share.
 TABLES = ("cddt", "lookup", "march, centre")
 
 
 @dataclass(frozen=True)
 class Wish:
-    """An error or a time that somebody can afford.
+    """An upper limit of the error or of the time.
 
     Attributes:
         words: In words.

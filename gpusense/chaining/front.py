@@ -86,7 +86,7 @@ class Front:
 
     @property
     def has_odometry(self) -> bool:
-        """Whether there is odometry."""
+        """Return whether the log has odometry."""
         return self._odometry is not None
 
     @property

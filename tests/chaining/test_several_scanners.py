@@ -96,7 +96,7 @@ def test_a_laser_that_sees_nothing_is_bridged_by_the_other(needs) -> None:
 
 
 def test_a_direction_that_one_laser_observes_is_no_doubt(needs) -> None:
-    # In the corridor one laser looks at a wall that is parallel to it, the other one at the end of it, too.
+    # In the corridor one laser sees a parallel wall alone, the other one also the corridor's end.
     end = np.array([[8.0, -1.2, 8.0, 1.4]])
     truth = np.array([(0.15 * k, 0.0, 0.0) for k in range(40)])
     wall = gs.Scanner(np.radians(np.arange(30, 151)), 30.0)
@@ -136,7 +136,7 @@ def test_lasers_of_different_geometry_start_and_end_apart(needs) -> None:
         backend=needs("opencl"),
     )  # fmt: skip
     assert errors(chain, truth[keep]).max() < 0.05
-    # The last motion is told by a match of one laser.
+    # One laser alone measures the last motion.
     assert not chain.doubtful[:-1].any()
 
 

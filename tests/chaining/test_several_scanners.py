@@ -96,7 +96,7 @@ def test_a_laser_that_sees_nothing_is_bridged_by_the_other(needs) -> None:
 
 
 def test_a_direction_that_one_laser_observes_is_no_doubt(needs) -> None:
-    # In the corridor one laser sees a parallel wall alone, the other one also the corridor's end.
+    # In the corridor one laser sees a parallel wall, the other one also its end.
     end = np.array([[8.0, -1.2, 8.0, 1.4]])
     truth = np.array([(0.15 * k, 0.0, 0.0) for k in range(40)])
     wall = gs.Scanner(np.radians(np.arange(30, 151)), 30.0)

@@ -4,7 +4,7 @@
     python bench/error_vs_time/measure.py --backend warp:cuda:0 --deadline 280 --output bench/results/error_vs_time_h200
 
 NAME_tasks.json is the report of needs.py, NAME_models.json one of ``gpusense bench`` with 10 000 particles and 360
-beams: all methods in float32, and those that compute the model itself also in float64. Scenes are measured one after the
+beams: all methods in float32, exact ones also in float64. Scenes are measured one after the
 other; after --deadline no further one begins, and the report has those before. Reports are written as soon as they are
 there, that of the models after each scene. A checkout with uncommitted changes is refused; --commit names that of a
 copy without a repository.

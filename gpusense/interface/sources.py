@@ -1,4 +1,7 @@
-"""OpenCL source of one program: prelude, the files a kernel requires in order, and only the branches its spec needs."""
+"""OpenCL source of one program: prelude, the files a kernel requires in order, and only the branches its spec needs.
+
+A kernel's parameters are written from its row of the signature table: its file says ``kernel void name(ARGUMENTS)``.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from gpusense.interface import casters, structs
 from gpusense.interface.directives import resolve
 from gpusense.interface.flags import FLAGS
 from gpusense.interface.kernel_files import has_opencl_source, opencl_source
+from gpusense.interface.signatures import KERNELS
 
 _PRELUDE = """\
 #pragma OPENCL FP_CONTRACT OFF
@@ -17,6 +21,7 @@ typedef {real}4 real4;
 #define FLOAT64 {float64}
 #define SPLITTER ((real){splitter})
 """
+_HEAD = re.compile(r"^kernel void (\w+)\(ARGUMENTS\)", re.MULTILINE)
 _REQUIRES = re.compile(r"^// requires: (.*)$", re.MULTILINE)
 
 
@@ -33,6 +38,34 @@ def prelude(*, float64: bool, doubles: bool = False) -> str:
         float64=int(float64),
         splitter="134217729" if float64 else "4097",
     )
+
+
+def parameters(kernel: str) -> str:
+    """Return the parameters of a kernel in OpenCL C, in the order of its row."""
+    row = KERNELS[kernel]
+    star = "*restrict " if row.apart else "*"
+    return ", ".join(
+        f"const {argument.type} {argument.name}"
+        if argument.shape is None
+        else f"global {'' if argument.output else 'const '}{argument.type} {star}{argument.name}"
+        for argument in row.arguments
+    )
+
+
+def source_text(file: str) -> str:
+    """Return the text of a kernel file with the parameters of its kernels.
+
+    Raises:
+        ValueError: a kernel has no row in the signature table.
+    """
+
+    def head(match: re.Match[str]) -> str:
+        name = match.group(1)
+        if name not in KERNELS:
+            raise ValueError(f"{file}.cl: a kernel must have a row in the signature table, got {name!r}")
+        return f"kernel void {name}({parameters(name)})"
+
+    return _HEAD.sub(head, opencl_source(file))
 
 
 def required_files(name: str, flags: frozenset[str] = frozenset()) -> list[str]:
@@ -68,7 +101,7 @@ def _requirements(name: str) -> list[str]:
 
 def uses_double(file: str, flags: frozenset[str] = frozenset()) -> bool:
     """Return whether a kernel file computes in float64 also where the model's precision is float32."""
-    kept = (resolve(opencl_source(needed), flags - {"FLOAT64"}, needed) for needed in required_files(file, flags))
+    kept = (resolve(source_text(needed), flags - {"FLOAT64"}, needed) for needed in required_files(file, flags))
     texts = (re.sub(r"//.*", "", text) for text in kept)
     return any(re.search(r"\bdouble[24]?\b", text + _declarations(text)) for text in texts)
 
@@ -83,7 +116,7 @@ def assemble(file: str, flags: frozenset[str]) -> str:
     head = prelude(float64="FLOAT64" in flags, doubles=uses_double(file, flags))
     body = ""
     for needed in required_files(file, flags):
-        body += f'#line 1 "{needed}.cl"\n' + resolve(opencl_source(needed), flags, f"{needed}.cl")
+        body += f'#line 1 "{needed}.cl"\n' + resolve(source_text(needed), flags, f"{needed}.cl")
     return head + _declarations(body) + body
 
 
@@ -108,7 +141,7 @@ def with_places(log: str, source: str) -> str:
 def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
     """Return the flags that change a kernel file's code: one program serves all flags that agree on them."""
     files = required_files(file, flags)
-    text = "".join(opencl_source(needed) for needed in files)
+    text = "".join(source_text(needed) for needed in files)
     text += _declarations(text)
     words = set(re.findall(r"\b[A-Z][A-Z0-9_]*\b", text))
     if any({"caster", "lanes/caster"} & set(_requirements(needed)) for needed in files):

@@ -69,8 +69,7 @@ real log_waves(const real2 residual, global const real *terms) {
 // Score positions: one work-item takes a particle. terms = {a, b, c, peak}, each followed by its low part, and the log
 // of the uniform part. The exponent is (a x)^2 + (b x + c y)^2, where (x, y) is the offset from the reading to the
 // sensor.
-kernel void score_position(global const real4 *place, global const real *terms, global real *log_p, const int particles,
-                           const real temperature) {
+kernel void score_position(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const real2 x = place[n].xy, y = place[n].zw;
@@ -86,8 +85,7 @@ kernel void score_position(global const real4 *place, global const real *terms, 
 }
 
 // Score headings: one work-item takes a particle. Residuals are headings minus the reading, in [-pi, pi].
-kernel void score_heading(global const real2 *residual, global const real *terms, global real *log_p,
-                          const int particles, const int kind, const real temperature) {
+kernel void score_heading(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const real2 r = residual[n];

@@ -84,9 +84,7 @@ real log_range(const real2 d, global const real *beacon, global const real *term
 
 // Sum log p of the ranges over beacons: one work-item takes a particle. The first count numbers of the series belong to
 // a t.
-kernel void score_beacons(global const real4 *place, global const real *beacon, global const real *terms,
-                          global const real *series, global real *log_p, const int particles, const int beacons,
-                          const int count, const int kind, const real temperature) {
+kernel void score_beacons(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const real4 sensor = place[n];

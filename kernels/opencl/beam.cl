@@ -44,13 +44,7 @@ real scan_log(const real sum) {
 
 // Score scans: one work-item takes a particle. Where rays are shared, ray r has the readings from first[r] on, up to
 // first[r + 1] - 1. With SCANS, the rays of a scan begin at start[scan], and first counts the readings of all scans.
-kernel void score_beams(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
-                        global const real4 *pose, global const real2 *ray, global const int *first,
-                        global const real *reading, global const real *terms, global const real *edges,
-                        global const real *sensor, global const int *start, global const real *constant_terms,
-                        global real *log_p, global real *parts, const Window window, const int particles,
-                        const int rays, const int readings, const MixtureTables tables, const Cone cone,
-                        const Caster caster, const RangeScale scale, const Score score, const ScanBatch batch) {
+kernel void score_beams(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;
 #if SCANS
@@ -123,16 +117,7 @@ kernel void score_beams(global const entry *map_table, global const real2 *norma
 // Write the term of reading k to parts[place + k * particles], in tiles of particles and rays, for GPUs. With
 // STRANDED the number there is the sum of strand k, and a work-item takes whole strands. There are fewer than 2^31
 // numbers. With restrict the compiler need not read arguments again after a write.
-kernel void beam_tiles(global const entry *restrict map_table, global const real2 *restrict normals,
-                       global const int2 *restrict pose_cell, global const real4 *restrict pose,
-                       global const int *restrict order, global const real2 *restrict ray,
-                       global const int *restrict first, global const real *restrict reading,
-                       global const real *restrict terms, global const real *restrict edges,
-                       global const real *restrict sensor, global const int *restrict start,
-                       global real *restrict parts, const Window window, const int particles, const int rays,
-                       const int readings, const MixtureTables tables, const Cone cone, const Caster caster,
-                       const RangeScale scale, const int spread,
-                       const ScanBatch batch) {
+kernel void beam_tiles(ARGUMENTS) {
     const int item = get_global_id(0), place = tile_place(item, spread);
     if (place >= particles) return;
 #if ORDERED

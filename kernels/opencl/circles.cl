@@ -179,9 +179,7 @@ void fit_circle(const Part *mine, global real *result) {
 
 // Fit circles to parts of scans, of a first point and a number of points. Edges are the bearings of the right and the
 // left edge and their deviations, which are 0 where edges are not seen. One work-item takes a part.
-kernel void fit_circles(global const real4 *point, global const int *start, global const real *noise,
-                        global const int2 *part, global const int *scan, global const real4 *edge,
-                        global real *circle, const int scans, const int points, const int parts) {
+kernel void fit_circles(ARGUMENTS) {
     const int k = get_global_id(0);
     if (k >= parts) return;
     const int begin = start[scan[k]];

@@ -56,11 +56,7 @@ real log_bump(const int squared, const int pressed, global const real *terms) {
 
 // Sum log p over segments: one work-item takes a particle. Points start[s] to start[s + 1] - 1 belong to segment s;
 // pressed[s] is not 0 where it is pressed.
-kernel void score_contact(global const int *table, global const int2 *pose_cell, global const real4 *pose,
-                          global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
-                          global const int *start, global const int *pressed, global const real *terms,
-                          global real *log_p, const Window window, const int particles, const int segments,
-                          const real guard, const real temperature) {
+kernel void score_contact(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const int2 cell = pose_cell[n];

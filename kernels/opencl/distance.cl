@@ -9,8 +9,7 @@
 
 // First pass: count the cells to the nearest occupied cell of the same line, NO_OBSTACLE without one. One work-item
 // takes a line.
-kernel void distance_lines(global const uchar *occupied, global int *along, const int lines, const int length,
-                           const int line_stride, const int step) {
+kernel void distance_lines(ARGUMENTS) {
     const int line = get_global_id(0);
     if (line >= lines) return;
     global const uchar *cell = occupied + (long)line * line_stride;
@@ -35,8 +34,7 @@ int parabola(const int i, const int j, const int across) { return (i - j) * (i -
 // Second pass: evaluate the lower envelope of the parabolas of the first pass. One work-item takes a line. The stack of
 // vertices lies in squared, which is overwritten from its far end: entry q of the stack never lies beyond the cell that
 // reads it.
-kernel void distance_envelope(global const int *along, global int *starts, global int *squared, const int lines,
-                              const int length, const int line_stride, const int step) {
+kernel void distance_envelope(ARGUMENTS) {
     const int line = get_global_id(0);
     if (line >= lines) return;
     global const int *across = along + (long)line * line_stride;
@@ -82,8 +80,7 @@ kernel void distance_envelope(global const int *along, global int *starts, globa
 
 // First pass: count the cells to the nearest occupied cell of the same row, FAR where it is over reach. One work-item
 // takes a cell.
-kernel void distance_bits(global const int *bits, global ushort *nearest, const int rows, const int cols,
-                          const int words, const int reach) {
+kernel void distance_bits(ARGUMENTS) {
     const int col = get_global_id(0), row = get_global_id(1);
     if (row >= rows || col >= cols) return;
     global const int *line = bits + (long)row * words;
@@ -93,8 +90,7 @@ kernel void distance_bits(global const int *bits, global ushort *nearest, const 
 }
 
 // Find the minimum of each column of a block of rows. One work-item takes a column of a block.
-kernel void distance_blocks(global const ushort *nearest, global ushort *blocks, const int rows, const int cols,
-                            const int count) {
+kernel void distance_blocks(ARGUMENTS) {
     const int col = get_global_id(0), block = get_global_id(1);
     if (block >= count || col >= cols) return;
     const int last = min((block + 1) * BLOCK_ROWS, rows);
@@ -109,8 +105,7 @@ uint squares_sum(const uint a, const uint b) { return a * a + b * b; }
 // Second pass: find the least sum of squares along the column of a cell, UNREACHABLE where it is over most. One
 // work-item takes a cell. Near rows are read one by one. Farther away, the minima of blocks give an upper bound first,
 // and then the blocks that may hold less.
-kernel void distance_search(global const ushort *nearest, global const ushort *blocks, global int *squared,
-                            const int rows, const int cols, const int count, const int most) {
+kernel void distance_search(ARGUMENTS) {
     const int col = get_global_id(0), row = get_global_id(1);
     if (row >= rows || col >= cols) return;
     global const ushort *column = nearest + col, *block = blocks + col;

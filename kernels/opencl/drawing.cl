@@ -10,8 +10,7 @@
 #define WEIGHT_SUMS 17
 
 // Count the certain copies of a block; the other columns are 0: one work-item takes a block.
-kernel void count_copies(global const double *ends, global const double *state, global double *sums,
-                         const int particles, const int block, const int blocks, const int drawn, const int stage) {
+kernel void count_copies(ARGUMENTS) {
     const int b = get_global_id(0), begin = b * block;
     if (begin >= particles) return;
     const double total = state[stage * STAGE + TOTAL];
@@ -23,9 +22,7 @@ kernel void count_copies(global const double *ends, global const double *state, 
 }
 
 // Set the cumulative numbers of certain copies: one work-item takes a block.
-kernel void set_copies(global const double *ends, global const double *state, global const double *sums,
-                       global const double *joined, global double *copies, const int particles, const int block,
-                       const int blocks, const int fan, const int drawn, const int stage) {
+kernel void set_copies(ARGUMENTS) {
     const int b = get_global_id(0), begin = b * block;
     if (begin >= particles) return;
     const double total = state[stage * STAGE + TOTAL];
@@ -38,10 +35,7 @@ kernel void set_copies(global const double *ends, global const double *state, gl
 }
 
 // Draw the particles of the next stage or step, or copy them where no resampling is due: one work-item takes a particle.
-kernel void draw_particles(global const double *source, global const double *weight, global const double *ends,
-                           global const double *copies, global const double *settings, global const double *state,
-                           global const double *pool, global double *target, global double *after,
-                           const int particles, const int drawn, const int stage) {
+kernel void draw_particles(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= drawn) return;
     global const double *own = state + stage * STAGE;

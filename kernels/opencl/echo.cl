@@ -83,10 +83,7 @@ Echo nearest_echo(global const entry *map_table, global const real2 *normals, co
 
 // Cast cones to expected ranges and angles of incidence, NaN without a return; with COSINES to the angles' cosines, 2
 // without a return. One work-item takes a particle and cone.
-kernel void cast_echoes(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
-                        global const real4 *pose, global const real2 *ray, global real *ranges, global real *incidence,
-                        const Window window, const int particles, const int rays, const Cone cone, const Caster caster,
-                        const RangeScale scale) {
+kernel void cast_echoes(ARGUMENTS) {
     const int k = get_global_id(0), n = get_global_id(1);
     if (k >= rays || n >= particles) return;
     const Echo echo = nearest_echo(map_table, normals, window, pose_cell[n], pose[n], ray + k * cone.rays, cone,

@@ -12,9 +12,7 @@
 
 // Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings: one work-item takes a
 // number of lanes of a block.
-kernel void sum_poses(global const double *poses, global const double *weight, global const double *estimate,
-                      global double *sums, const int particles, const int block, const int lanes,
-                      const int again) {
+kernel void sum_poses(ARGUMENTS) {
     const int i = get_global_id(0), each = ESTIMATE_LANES / lanes, begin = i / each * block, first = i % each * lanes;
     if (begin >= particles) return;
     global const double *reference = again ? estimate : poses;
@@ -42,8 +40,7 @@ kernel void sum_poses(global const double *poses, global const double *weight, g
 
 // Write the mean pose and the covariance about it from the sums of all groups, and whether headings ask for a second
 // pass; that pass writes the covariance only. One work-item takes all.
-kernel void finish_estimate(global const double *poses, global const double *sums, global double *estimate,
-                            const int groups, const int again) {
+kernel void finish_estimate(ARGUMENTS) {
     if (get_global_id(0) > 0) return;
     double total[ESTIMATE_SUMS];
     for (int k = 0; k < ESTIMATE_SUMS; k++) total[k] = 0.0;
@@ -64,8 +61,7 @@ kernel void finish_estimate(global const double *poses, global const double *sum
 }
 
 // Divide weights by their sum, which the estimate holds: one work-item takes a particle.
-kernel void normalize_weights(global const double *weight, global const double *estimate, global double *share,
-                              const int particles) {
+kernel void normalize_weights(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n < particles) share[n] = weight[n] / estimate[9];
 }

@@ -8,9 +8,7 @@
 // Fill width x height cells of the table, the first of them at begin, from squared distances: density has a value for
 // each squared distance up to the cap. The first cell is (from_col, from_row) of the grid; cells outside the grid get
 // beyond.
-kernel void fill_field(global const int *squared, global const real *density, global real *table, const int rows,
-                       const int cols, const int cap, const real beyond, const int from_col, const int from_row,
-                       const int width, const int height, const int begin, const int stride) {
+kernel void fill_field(ARGUMENTS) {
     const int i = get_global_id(0), j = get_global_id(1), col = from_col + i, row = from_row + j;
     if (i >= width || j >= height) return;
     const int inside = col >= 0 && col < cols && row >= 0 && row < rows;
@@ -19,11 +17,7 @@ kernel void fill_field(global const int *squared, global const real *density, gl
 
 // Score scans: one work-item takes a particle. QUICK changes this kernel in Warp alone, on processors, whose compiler
 // makes vector code of loops.
-kernel void score_field(global const real *table, global const int2 *pose_cell, global const real4 *pose,
-                        global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
-                        global const real *terms, global const int *start, global const real *constant_terms,
-                        global real *log_p, global real *parts, const Window window, const int particles,
-                        const int readings, const real guard, const Score score, const ScanBatch batch) {
+kernel void score_field(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;
 #if SCANS
@@ -66,11 +60,7 @@ kernel void score_field(global const real *table, global const int2 *pose_cell, 
 // Write the sums of blocks of readings to parts[n + block * particles], for GPUs. One work-item takes a particle
 // and every 2^spread-th block. Each block has a guard of its own; with SCANS each scan has as many guards as the
 // longest one.
-kernel void field_blocks(global const real *table, global const int2 *pose_cell, global const real4 *pose,
-                         global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
-                         global const real *terms, global const real *guard, global const int *start,
-                         global real *parts, const Window window, const int particles, const int readings,
-                         const int spread, const ScanBatch batch) {
+kernel void field_blocks(ARGUMENTS) {
     const int item = get_global_id(0), n = ((item / GROUP) >> spread) * GROUP + item % GROUP;
     if (n >= particles) return;
 #if SCANS

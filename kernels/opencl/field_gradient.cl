@@ -34,12 +34,7 @@ real4 distance_slope(global const real *table, const int2 cell, const EndPoint e
 
 // Write log p, its gradient (3) and the information (9) of poses in the grid's frame, each times the temperature. One
 // work-item takes a particle. mount is the sensor's place on the robot in cells.
-kernel void field_gradient(global const real *table, global const int2 *pose_cell, global const real4 *pose,
-                           global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
-                           global const real *terms, global const int *start, global const real *constant_terms,
-                           global real *gradient, const Window window, const int particles, const int readings,
-                           const real guard, const real mount_x, const real mount_y, const real resolution,
-                           const Score score, const ScanBatch batch) {
+kernel void field_gradient(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;
 #if SCANS

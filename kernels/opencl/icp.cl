@@ -105,9 +105,7 @@ real4 agreement(global const real4 *point, global const real4 *line, const int c
 // Match scans: one work-item takes a pair (reference, second scan) and a guess (x, y, theta), the pose of the second
 // scan in the reference's frame. Every stride-th point and every skip-th of the reference take part until capture
 // radius and scale have shrunk, with thin also afterwards. With one_way the reference's points do not count in the score.
-kernel void match_scans(global const real4 *point, global const int *start, global const real4 *line,
-                        global const int2 *pair, global const real4 *guess, global real *result, const int scans,
-                        const int points, const int pairs, const int starts, const MatchRules rules) {
+kernel void match_scans(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= pairs * starts) return;
     const int2 which = pair[n / starts];

@@ -13,12 +13,7 @@
 
 // Find the best joint association: one work-item takes a particle. choice[s] has the landmark of each feature of set s,
 // and value[s] its log p; sets is 2^features.
-kernel void joint_features(global const real4 *landmark, global const real4 *normal, global const real4 *signature,
-                           global const int2 *pose_cell, global const real4 *pose, global const real4 *pose_low,
-                           global const real *feature, global const real *terms, global const real2 *arcs,
-                           global real *best, global int *choice, global real *value, global real *log_p,
-                           global real *parts, global int *which, const int landmarks, const int particles,
-                           const int features, const int sets, const Buckets buckets, const Score score) {
+kernel void joint_features(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const real4 high = pose[n], low = pose_low[n], place = sensor_place(pose_cell[n], high, low, buckets.size);

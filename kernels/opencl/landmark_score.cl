@@ -4,12 +4,7 @@
 // Sum log p over features: with the KNOWN partner, all landmarks (MARGINAL) or the likeliest one. One work-item takes a
 // particle. With PER_BEAM, parts has the term of each feature, and which the index of its likeliest landmark, -1 where
 // a false positive is likelier. With MARGINAL share is log(1 / landmarks), the prior of a landmark, else 0.
-kernel void score_features(global const real4 *landmark, global const real4 *normal, global const real4 *signature,
-                           global const int *start, global const int2 *pose_cell, global const real4 *pose,
-                           global const real4 *pose_low, global const real *feature, global const int *partner,
-                           global const real *terms, global const real2 *arcs, global real *log_p, global real *parts,
-                           global int *which, const Buckets buckets, const int landmarks, const int particles,
-                           const int features, const real share, const Score score) {
+kernel void score_features(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const real4 high = pose[n], low = pose_low[n], place = sensor_place(pose_cell[n], high, low, buckets.size);

@@ -96,9 +96,7 @@ void add_pair(const real z, const real expected, global const real *terms, real 
 }
 
 // Sum over blocks of pairs: one work-item takes a block. Pair k of a block is pair block * across + k * along.
-kernel void e_step(global const real *reading, global const real *expected, global const real *terms,
-                   global real *sums, const int blocks, const int readings, const int across, const int along,
-                   const int width) {
+kernel void e_step(ARGUMENTS) {
     const int block = get_global_id(0);
     if (block >= blocks) return;
     real total[SUMS], total_low[SUMS], part[SUMS];
@@ -120,9 +118,7 @@ kernel void e_step(global const real *reading, global const real *expected, glob
 }
 
 // Write log p and the responsibilities of each pair, NaN for padding. One work-item takes a block of pairs.
-kernel void pair_causes(global const real *reading, global const real *expected, global const real *terms,
-                        global real4 *causes, const int blocks, const int readings, const int across,
-                        const int along) {
+kernel void pair_causes(ARGUMENTS) {
     const int block = get_global_id(0);
     if (block >= blocks) return;
     for (int k = 0; k < readings; ++k) {

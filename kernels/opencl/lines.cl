@@ -6,9 +6,7 @@
 // farther from the last one than slack plus ratio times its range, nor than gap in bearing: unit normal, offset, and
 // 1 / (sum of squared distances along the line). A point without neighbours has the line across its beam, -1 in place
 // of that sum, and no pairs. One work-item takes a point of one of the chosen scans.
-kernel void fit_lines(global const real4 *point, global const int *start, global const int *which,
-                      global real4 *line, const int scans, const int points, const int chosen, const int reach,
-                      const int most, const real ratio, const real slack, const real width, const real gap) {
+kernel void fit_lines(ARGUMENTS) {
     const int k = get_global_id(0), scan = which[get_global_id(1)];
     const int first = start[scan], count = start[scan + 1] - first;
     if (k >= count) return;

@@ -2,8 +2,7 @@
 // requires: raycast
 
 // Fill rows of the table: one work-item takes a bin and cell. A hit is at most 65 534; 65 535 means no hit.
-kernel void fill_lookup(global const ushort *rectangles, global const real2 *ray, global ushort *lookup,
-                        const Window window, const int bins, const int first_row, const int count, const real limit) {
+kernel void fill_lookup(ARGUMENTS) {
     const int bin = get_global_id(0), index = get_global_id(1);
     if (bin >= bins || index >= count * window.cols) return;
     const int row = first_row + index / window.cols, col = index % window.cols;

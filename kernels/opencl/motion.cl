@@ -37,8 +37,7 @@ double wrap_any(const double theta) {
 }
 
 // Move particles from source to target, which may be the same array: one work-item takes a particle.
-kernel void move_particles(global const double *source, global const double *settings, global double *target,
-                           const int particles, const int kind) {
+kernel void move_particles(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const uint step = (uint)settings[STEP], key_0 = (uint)settings[SEED], key_1 = (uint)settings[SEED + 1];

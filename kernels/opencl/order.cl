@@ -20,8 +20,7 @@ int relative_turn(const real4 pose, const real4 other) {
 // Clear the bins and find the bounds: one work-item takes a bin, and the first SAMPLES of them a particle each. bounds,
 // which the caller sets to -2^31, become the negated smallest and the largest row, column and heading of these
 // particles; the last one becomes 0.
-kernel void order_bounds(global const int2 *pose_cell, global const real4 *pose, global int *bounds, global int *bins,
-                         const int particles) {
+kernel void order_bounds(ARGUMENTS) {
     const int bin = get_global_id(0);
     if (bin >= ALL_BINS) return;
     bins[bin] = 0;
@@ -44,8 +43,7 @@ int part_of(const int value, const int least, const int most) {
 }
 
 // Find the bin of each particle, and count it there. One work-item takes a particle.
-kernel void order_count(global const int2 *pose_cell, global const real4 *pose, global const int *bounds,
-                        global int *bins, global int *bin_of, const int particles) {
+kernel void order_count(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const int row = part_of(pose_cell[n].y, -bounds[0], bounds[1]);
@@ -57,7 +55,7 @@ kernel void order_count(global const int2 *pose_cell, global const real4 *pose, 
 }
 
 // Replace the counts of bins by the indices at which they begin. One work-item takes a stretch of neighbouring bins.
-kernel void order_starts(global int *bounds, global int *bins) {
+kernel void order_starts(ARGUMENTS) {
     const int stretch = get_global_id(0);
     if (stretch >= ALL_BINS / STRETCH) return;
     global int *counted = bins + stretch * STRETCH;
@@ -76,7 +74,7 @@ kernel void order_starts(global int *bounds, global int *bins) {
 }
 
 // Put each particle at the next index of its bin. One work-item takes a particle.
-kernel void order_fill(global const int *bin_of, global int *bins, global int *order, const int particles) {
+kernel void order_fill(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     order[atomic_add(&bins[bin_of[n]], 1)] = n;

@@ -80,9 +80,7 @@ void place_pose(const int particle, global const coordinate *poses, global int2 
 }
 
 // Place poses: one work-item takes a particle.
-kernel void place_poses(global const coordinate *poses, global int2 *pose_cell, global real4 *pose,
-                        global real4 *pose_low, global int *pose_status, const Frame frame, const Window window,
-                        const int particles) {
+kernel void place_poses(ARGUMENTS) {
     const int particle = get_global_id(0);
     if (particle >= particles) return;
     place_pose(particle, poses, pose_cell, pose, pose_low, pose_status, frame, window);

@@ -2,9 +2,7 @@
 // requires: caster tiles
 
 // Cast rays: one work-item takes a particle and ray.
-kernel void cast_ranges(global const entry *map_table, global const int2 *pose_cell, global const real4 *pose,
-                        global const real2 *ray, global real *ranges, const Window window, const int particles,
-                        const int rays, const Caster caster, const RangeScale scale) {
+kernel void cast_ranges(ARGUMENTS) {
     const int k = get_global_id(0), n = get_global_id(1);
     if (k >= rays || n >= particles) return;
     const real t = cast_ray(map_table, window, pose_cell[n], pose[n], ray[k], scale.limit, caster);
@@ -13,11 +11,7 @@ kernel void cast_ranges(global const entry *map_table, global const int2 *pose_c
 
 // Cast rays in tiles of particles and rays, for GPUs. There are fewer than 2^31 ranges. With restrict the compiler need
 // not read arguments again after a write.
-kernel void cast_tiles(global const entry *restrict map_table, global const int2 *restrict pose_cell,
-                       global const real4 *restrict pose, global const int *restrict order,
-                       global const real2 *restrict ray, global real *restrict ranges, const Window window,
-                       const int particles, const int rays, const Caster caster, const RangeScale scale,
-                       const int spread) {
+kernel void cast_tiles(ARGUMENTS) {
     const int item = get_global_id(0), place = tile_place(item, spread);
     if (place >= particles) return;
 #if ORDERED

@@ -25,9 +25,7 @@ long crossed_before(const int first, const long size, const long reached, const 
 }
 
 // Add the cells of rays to the counts; cells outside the grid are left out. One work-item takes a ray.
-kernel void count_rays(global const int2 *start_cell, global const int2 *start_inside, global const int2 *end_cell,
-                       global const int2 *end_inside, global const int *hit, global int *hits, global int *misses,
-                       const int rows, const int cols, const int rays) {
+kernel void count_rays(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= rays) return;
     const int2 begin = start_inside[n], across = end_cell[n] - start_cell[n];

@@ -40,8 +40,7 @@ int2 slope(const int sectors, const int sector) {
 
 // Count the free cells along columns of the band, to larger rows (direction 0) or smaller rows (direction 1), for
 // columns in [begin, end). For processors: one work-item takes 64 columns and a direction.
-kernel void free_columns(global const uchar *occupied, global uchar *runs, const int band, const int cols,
-                         const int begin, const int end) {
+kernel void free_columns(ARGUMENTS) {
     const int from = begin + 64 * get_global_id(0), direction = get_global_id(1), until = min(from + 64, end);
     global uchar *out = runs + (long)direction * band * cols;
     for (int i = 0; i < band; ++i) {
@@ -57,9 +56,7 @@ kernel void free_columns(global const uchar *occupied, global uchar *runs, const
 // quadrant. The widest rectangle of sufficient height is at most one column wider than that of its neighbour. The stack
 // has the columns that bound its height, each lower than all before it: free cells in the upper 16 bits, and the last
 // 16 bits of the column, which give the distance.
-kernel void rectangles_rows(global const uchar *runs, global int *stack, global ushort *rectangles, const int rows,
-                            const int cols, const int sectors, const int first, const int band, const int top,
-                            const int left, const int bottom, const int right) {
+kernel void rectangles_rows(ARGUMENTS) {
     const int quadrant = get_global_id(1), dx = quadrant & 1 ? -1 : 1, dy = quadrant & 2 ? -1 : 1;
     const int row = reach_begin(dy, top) + get_global_id(0);
     if (row >= reach_end(dy, bottom, rows)) return;
@@ -95,8 +92,7 @@ kernel void rectangles_rows(global const uchar *runs, global int *stack, global 
 
 // Count the free cells along rows, to the right (direction 0) and to the left (direction 1), for columns in [begin,
 // end). For GPUs: one work-item takes a cell.
-kernel void free_rows(global const int *bits, global uchar *runs, const int band, const int cols, const int words,
-                      const int begin, const int end) {
+kernel void free_rows(ARGUMENTS) {
     const int col = begin + get_global_id(0), row = get_global_id(1);
     if (row >= band || col >= end) return;
     global const int *line = bits + (long)row * words;
@@ -109,9 +105,7 @@ kernel void free_rows(global const int *bits, global uchar *runs, const int band
 
 // Find the rectangles along columns: the higher a rectangle, the narrower. For GPUs: one work-item takes a cell and
 // quadrant; the first work-item of a quadrant takes the first of its cells.
-kernel void rectangles_scan(global const uchar *runs, global ushort *rectangles, const int rows, const int cols,
-                            const int sectors, const int first, const int band, const int top, const int left,
-                            const int bottom, const int right) {
+kernel void rectangles_scan(ARGUMENTS) {
     const int quadrant = get_global_id(2), dx = quadrant & 1 ? -1 : 1, dy = quadrant & 2 ? -1 : 1;
     const int col = reach_begin(dx, left) + get_global_id(0), row = reach_begin(dy, top) + get_global_id(1);
     if (col >= reach_end(dx, right, cols) || row >= reach_end(dy, bottom, rows)) return;

@@ -43,9 +43,7 @@ real2 rounded_place(const double2 at) {
 
 // Place sensors relative to an origin: x, its low part, y, its low part. One work-item takes a particle. pose_status,
 // which the caller clears, becomes 1 at (0) if a pose is not finite; its place is the origin.
-kernel void place_relative(global const coordinate *poses, global real4 *place, global int *pose_status,
-                           const double origin_x, const double origin_y, const double mount_x, const double mount_y,
-                           const int particles) {
+kernel void place_relative(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const long first = 3 * (long)n;
@@ -69,8 +67,7 @@ kernel void place_relative(global const coordinate *poses, global real4 *place, 
 
 // Subtract the target from headings and wrap to [-pi, pi], a sum of two numbers. One work-item takes a particle.
 // pose_status is as for place_relative.
-kernel void wrap_headings(global const coordinate *poses, global real2 *residual, global int *pose_status,
-                          const double target, const double target_low, const int particles) {
+kernel void wrap_headings(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const long first = 3 * (long)n;

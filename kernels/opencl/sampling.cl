@@ -161,9 +161,7 @@ double cell_reading_of(const double u, const double v, const int column, global 
 
 // Replace expected ranges by readings; incidence holds cosines, and edges those between bins. One work-item takes a
 // particle and ray.
-kernel void draw_readings(global const real *incidence, global const double *mixture, global const real *edges,
-                          global const double *chances, global const double *settings, global real *ranges,
-                          const int particles, const int rays, const MixtureTables tables, const RangeScale scale) {
+kernel void draw_readings(ARGUMENTS) {
     const int k = get_global_id(0), i = get_global_id(1);
     if (k >= rays || i >= particles) return;
     const long place = (long)i * rays + k, n = (long)settings[DRAW_FIRST] + i, each = (long)settings[DRAW_PER_SCAN];

@@ -141,12 +141,7 @@ void place_reading(const int item, global const measured *ranges, global const i
 }
 
 // Place readings and poses: one work-item takes a beam and place, in whole groups; after these, one takes a particle.
-kernel void place_inputs(global const coordinate *poses, global int2 *pose_cell, global real4 *pose,
-                         global real4 *pose_low, global int *pose_status, global const measured *ranges,
-                         global const int *beam, global const double *vector, global real2 *point,
-                         global real2 *point_low, global real *reading, global real *guard, global real *constant_term,
-                         const Frame frame, const Window window, const int particles, const int head,
-                         const ReadingRules rules) {
+kernel void place_inputs(ARGUMENTS) {
     const int item = get_global_id(0);
     if (item < head) {
         if (item < max(max(rules.beams, rules.places), 1)) {

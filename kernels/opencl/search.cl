@@ -11,7 +11,7 @@
 // requires: score_cells
 
 // Write the largest of each cell and those reach rows and columns on. One work-item takes a cell.
-kernel void pool_scores(global const uchar *table, global uchar *pooled, const ScoreTable scores, const int reach) {
+kernel void pool_scores(ARGUMENTS) {
     const int col = get_global_id(0), line = get_global_id(1), image = get_global_id(2);
     const int lines = padded_lines(scores), stride = padded_stride(scores);
     if (col >= stride || line >= lines || image >= scores.tables) return;
@@ -24,8 +24,7 @@ kernel void pool_scores(global const uchar *table, global uchar *pooled, const S
 
 // Write every period-th row and column of each padded table as an image, for each of period^2 first cells. One work-item
 // takes a cell of an image.
-kernel void fold_scores(global const uchar *table, global uchar *out, const ScoreTable scores, const ScoreTable folded,
-                        const int period, const int beyond) {
+kernel void fold_scores(ARGUMENTS) {
     const int col = get_global_id(0), line = get_global_id(1), image = get_global_id(2);
     const int lines = padded_lines(folded), stride = padded_stride(folded);
     if (col >= stride || line >= lines || image >= folded.tables) return;
@@ -40,9 +39,7 @@ kernel void fold_scores(global const uchar *table, global uchar *out, const Scor
 
 // Sum the cells of each item's points at all shifts by less than height rows and width columns. One work-item takes a
 // shift of an item.
-kernel void shift_scores(global const uchar *table, global const int2 *point, global const int *image,
-                         global const int *first, global int *score, const ScoreTable scores, const int items,
-                         const int height, const int width) {
+kernel void shift_scores(ARGUMENTS) {
     const int col = get_global_id(0), row = get_global_id(1), item = get_global_id(2);
     if (col >= width || row >= height || item >= items) return;
     const int size = padded_lines(scores) * padded_stride(scores), last = first[item + 1];
@@ -54,9 +51,7 @@ kernel void shift_scores(global const uchar *table, global const int2 *point, gl
 
 // Sum the cells of candidates' points; a candidate is an item, and the row and column of its shift. One work-item takes a
 // candidate.
-kernel void candidate_scores(global const uchar *table, global const int2 *point, global const int *image,
-                             global const int *first, global const int *candidate, global int *score,
-                             const ScoreTable scores, const int candidates) {
+kernel void candidate_scores(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= candidates) return;
     const int item = candidate[3 * n], row = candidate[3 * n + 1], col = candidate[3 * n + 2];

@@ -208,9 +208,7 @@ void fit_line(global const real4 *point, const int begin, const int size, const 
 
 // Split scans into segments: stop is the end of the segment that begins at a point, -1 at all other points. One
 // work-item takes a scan.
-kernel void split_scans(global const real4 *point, global const int *start, global const real *noise,
-                        global real *cost, global int *stop, const int scans, const int points, const real penalty,
-                        const real gap) {
+kernel void split_scans(ARGUMENTS) {
     const int scan = get_global_id(0);
     if (scan >= scans) return;
     const int first = start[scan], last = start[scan + 1];
@@ -226,9 +224,7 @@ kernel void split_scans(global const real4 *point, global const int *start, glob
 
 // Fit lines to parts of scans: first point and number of points, which may go on at the scan's first point. One
 // work-item takes a part.
-kernel void fit_segments(global const real4 *point, global const int *start, global const real *noise,
-                         global const int2 *part, global const int *scan, global real *line, const int scans,
-                         const int points, const int parts) {
+kernel void fit_segments(ARGUMENTS) {
     const int k = get_global_id(0);
     if (k >= parts) return;
     const int begin = start[scan[k]], size = start[scan[k] + 1] - begin;

@@ -7,9 +7,7 @@
 // readings, and the numbers are sums of their strands. BLOCK_TERMS numbers are read before any is added, so that a
 // work-item waits once for all of them; numbers beyond the last count as 0, which changes no sum. There are fewer than
 // 2^31 numbers.
-kernel void sum_parts(global const real *parts, global const int *order, global const int *counts,
-                      global const real *constant_terms, global real *log_p, const int particles, const int count,
-                      const int block, const Score score, const ScanBatch batch) {
+kernel void sum_parts(ARGUMENTS) {
     const int place = get_global_id(0);
     if (place >= particles) return;
 #if ORDERED

@@ -11,8 +11,7 @@
 
 // Add a sensor's log-likelihoods times its temperature to the scores, which sensor 0 begins, and find the largest: one
 // work-item takes a block of particles.
-kernel void add_scores(global const real *log_p, global const double *settings, global double *score,
-                       global double *largest, const int particles, const int block, const int sensor) {
+kernel void add_scores(ARGUMENTS) {
     const int b = get_global_id(0), begin = b * block;
     if (begin >= particles) return;
     const double temperature = settings[TEMPERATURE + sensor];
@@ -28,7 +27,7 @@ kernel void add_scores(global const real *log_p, global const double *settings, 
 }
 
 // Find the largest score of each fan blocks: one work-item takes a group of blocks.
-kernel void join_scores(global const double *scores, global double *largest, const int blocks, const int fan) {
+kernel void join_scores(ARGUMENTS) {
     const int g = get_global_id(0), begin = g * fan;
     if (begin >= blocks) return;
     largest[g] = largest_of(scores, begin, min(begin + fan, blocks));
@@ -36,10 +35,7 @@ kernel void join_scores(global const double *scores, global double *largest, con
 
 // Sum the integer weights of each block on each rung, their squares, and the weights before: one work-item takes a block.
 // The first one writes the largest score.
-kernel void weigh_particles(global const double *score, global const double *before, global const double *largest,
-                            global const double *settings, global const double *state, global double *sums,
-                            global double *highest, const int particles, const int block, const int blocks,
-                            const int groups, const int stage) {
+kernel void weigh_particles(ARGUMENTS) {
     const int b = get_global_id(0), begin = b * block;
     if (begin >= particles) return;
     const double high = largest_of(largest, 0, groups), left = left_of(state, stage) * settings[DEPTH];
@@ -67,7 +63,7 @@ kernel void weigh_particles(global const double *score, global const double *bef
 
 // Add up each fan rows of sums, one after the other; a row becomes the sum of those before it in its group: one work-item
 // takes a column of a group.
-kernel void join_rows(global double *sums, global double *joined, const int rows, const int columns, const int fan) {
+kernel void join_rows(ARGUMENTS) {
     const int i = get_global_id(0), begin = i / columns * fan, end = min(begin + fan, rows);
     if (begin >= rows) return;
     global double *column = sums + i % columns;
@@ -87,11 +83,7 @@ kernel void join_rows(global double *sums, global double *joined, const int rows
 
 // Choose the rung, and set the weights and their exact cumulative sums: one work-item takes a block. The one after the
 // last block writes the stage's state.
-kernel void set_weights(global const double *score, global const double *before, global const double *highest,
-                        global const double *sums, global const double *joined, global const double *totals,
-                        global const double *settings, global double *state, global double *weight,
-                        global double *ends, const int particles, const int block, const int blocks, const int fan,
-                        const int stage, const int stages) {
+kernel void set_weights(ARGUMENTS) {
     const int b = get_global_id(0), begin = b * block;
     if (b > blocks) return;
     const double scale = settings[SCALE], left = left_of(state, stage), high = possible_of(totals, highest[0]);

@@ -33,7 +33,7 @@ SINE = (
 def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     types = precision(flags)
-    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    real, vec2 = types.real, types.vec2
     base = flags & {"FLOAT64"}
     exact, logs = error_free.functions(base), log_terms.functions(base)
     two_sum, pair_sum, pair_product = exact.two_sum, exact.pair_sum, exact.pair_product
@@ -93,14 +93,8 @@ def make(name, flags):
     # Score positions: one work-item takes a particle. terms = {a, b, c, peak}, each followed by its low part, and the
     # log of the uniform part. The exponent is (a x)^2 + (b x + c y)^2, where (x, y) is the offset from the reading to
     # the sensor.
-    @kernel
-    def score_position(
-        place: wp.array(dtype=vec4),
-        terms: wp.array(dtype=real),
-        log_p: wp.array(dtype=real),
-        particles: wp.int32,
-        temperature: real,
-    ):
+    @kernel(flags)
+    def score_position(place, terms, log_p, particles, temperature):
         n = wp.tid()
         if n >= particles:
             return
@@ -116,15 +110,8 @@ def make(name, flags):
         log_p[n] = temperature * log_density
 
     # Score headings: one work-item takes a particle. Residuals are headings minus the reading, in [-pi, pi].
-    @kernel
-    def score_heading(
-        residual: wp.array(dtype=vec2),
-        terms: wp.array(dtype=real),
-        log_p: wp.array(dtype=real),
-        particles: wp.int32,
-        kind: wp.int32,
-        temperature: real,
-    ):
+    @kernel(flags)
+    def score_heading(residual, terms, log_p, particles, kind, temperature):
         n = wp.tid()
         if n >= particles:
             return
@@ -144,4 +131,4 @@ def make(name, flags):
             log_density = either(log_density, terms[RANDOM])
         log_p[n] = temperature * log_density
 
-    return {"score_position": score_position, "score_heading": score_heading}[name]
+    return locals()[name]

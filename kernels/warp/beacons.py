@@ -117,19 +117,8 @@ def make(name, flags):
 
     # Sum log p of the ranges over beacons: one work-item takes a particle. The first count numbers of the series belong
     # to a t.
-    @kernel
-    def score_beacons(
-        place: wp.array(dtype=vec4),
-        beacon: wp.array(dtype=real),
-        terms: wp.array(dtype=real),
-        series: wp.array(dtype=real),
-        log_p: wp.array(dtype=real),
-        particles: wp.int32,
-        beacons: wp.int32,
-        count: wp.int32,
-        kind: wp.int32,
-        temperature: real,
-    ):
+    @kernel(flags)
+    def score_beacons(place, beacon, terms, series, log_p, particles, beacons, count, kind, temperature):
         n = wp.tid()
         if n >= particles:
             return
@@ -144,4 +133,4 @@ def make(name, flags):
             i += 1
         log_p[n] = wp.where(wp.isinf(total.x), total.x, temperature * (total.x + total.y))
 
-    return {"score_beacons": score_beacons}[name]
+    return locals()[name]

@@ -92,33 +92,11 @@ def make(name, flags):
     # Score scans: one work-item takes a particle. Where rays are shared, ray r has the readings first[r] to first[r +
     # 1] - 1. With SCANS, the rays of a scan begin at start[scan], and first counts the readings of all scans. A launch
     # has fewer than 2^31 parts.
-    @kernel
+    @kernel(flags, entry=ENTRY)
     def score_beams(
-        map_table: wp.array(dtype=ENTRY),
-        normals: wp.array(dtype=vec2),
-        pose_cell: wp.array(dtype=wp.vec2i),
-        pose: wp.array(dtype=vec4),
-        ray: wp.array(dtype=vec2),
-        first: wp.array(dtype=wp.int32),
-        reading: wp.array(dtype=real),
-        terms: wp.array(dtype=real),
-        edges: wp.array(dtype=real),
-        sensor: wp.array(dtype=real),
-        start: wp.array(dtype=wp.int32),
-        constant_terms: wp.array(dtype=real),
-        log_p: wp.array(dtype=real),
-        parts: wp.array(dtype=real),
-        window: types.Window,
-        particles: wp.int32,
-        rays: wp.int32,
-        readings: wp.int32,
-        tables: types.MixtureTables,
-        cone: types.Cone,
-        caster: types.Caster,
-        scale: types.RangeScale,
-        score: types.Score,
-        batch: types.ScanBatch,
-    ):
+        map_table, normals, pose_cell, pose, ray, first, reading, terms, edges, sensor, start, constant_terms, log_p,
+        parts, window, particles, rays, readings, tables, cone, caster, scale, score, batch,
+    ):  # fmt: skip
         n = wp.tid()
         if n >= particles:
             return
@@ -183,32 +161,11 @@ def make(name, flags):
 
     # Write the term of reading k to parts[place + k * particles], in tiles of particles and rays, for GPUs. With
     # STRANDED the number there is the sum of strand k, and a work-item takes whole strands.
-    @kernel
+    @kernel(flags, entry=ENTRY)
     def beam_tiles(
-        map_table: wp.array(dtype=ENTRY),
-        normals: wp.array(dtype=vec2),
-        pose_cell: wp.array(dtype=wp.vec2i),
-        pose: wp.array(dtype=vec4),
-        order: wp.array(dtype=wp.int32),
-        ray: wp.array(dtype=vec2),
-        first: wp.array(dtype=wp.int32),
-        reading: wp.array(dtype=real),
-        terms: wp.array(dtype=real),
-        edges: wp.array(dtype=real),
-        sensor: wp.array(dtype=real),
-        start: wp.array(dtype=wp.int32),
-        parts: wp.array(dtype=real),
-        window: types.Window,
-        particles: wp.int32,
-        rays: wp.int32,
-        readings: wp.int32,
-        tables: types.MixtureTables,
-        cone: types.Cone,
-        caster: types.Caster,
-        scale: types.RangeScale,
-        spread: wp.int32,
-        batch: types.ScanBatch,
-    ):
+        map_table, normals, pose_cell, pose, order, ray, first, reading, terms, edges, sensor, start, parts, window,
+        particles, rays, readings, tables, cone, caster, scale, spread, batch,
+    ):  # fmt: skip
         item = work_item(wp.tid())
         place = tile_place(item, spread)
         if place >= particles:
@@ -273,4 +230,4 @@ def make(name, flags):
             else:
                 r += tile_step(spread)
 
-    return {"score_beams": score_beams, "beam_tiles": beam_tiles}[name]
+    return locals()[name]

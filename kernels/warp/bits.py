@@ -2,8 +2,6 @@
 of the last word of a row are 0. One read of a word gives 32 cells.
 """
 
-from types import SimpleNamespace
-
 import warp as wp
 
 NONE = wp.constant(0x7FFFFFFF)
@@ -83,8 +81,3 @@ def cells_left(bits: wp.array(dtype=wp.int32), begin: wp.int32, col: wp.int32, m
     if word != wp.uint32(0):
         cells = col - 32 * i - highest_bit(word)
     return cells
-
-
-def functions(flags):
-    """Return the functions of the file; no flag changes them."""
-    return SimpleNamespace(cells_right=cells_right, cells_left=cells_left)

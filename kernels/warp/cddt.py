@@ -14,6 +14,7 @@ import warp as wp
 
 from . import ray as ray_file
 from .prelude import precision
+from .ray import off_grid
 
 ENTRY = wp.int32
 
@@ -24,7 +25,7 @@ def functions(flags):
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     geometry = ray_file.functions(flags)
-    ray_direction, angle_bin, off_grid = geometry.ray_direction, geometry.angle_bin, geometry.off_grid
+    ray_direction, angle_bin = geometry.ray_direction, geometry.angle_bin
     OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
     ZERO = real(0.0)
     ENTRY_UNIT = real(1024.0)
@@ -80,4 +81,4 @@ def functions(flags):
         t = real(map_table[low]) / ENTRY_UNIT - along
         return wp.max(wp.min(t, limit), ZERO)
 
-    return SimpleNamespace(cast_ray=cast_ray)
+    return SimpleNamespace(**locals())

@@ -228,30 +228,18 @@ def functions(flags):
         for i in range(6):
             result[place + 4 + i] = sums[4 + i]
 
-    return SimpleNamespace(Part=Part, fit_circle=fit_circle)
+    return SimpleNamespace(**locals())
 
 
 @functools.cache
 def make(name, flags):
     """Make a kernel of the file for a set of flags."""
-    types, made = precision(flags), functions(flags)
-    real, vec4 = types.real, types.vec4
+    made = functions(flags)
 
     # Fit circles to parts of scans, of a first point and a number of points. Edges are the bearings of the right and
     # the left edge and their deviations, which are 0 where edges are not seen. One work-item takes a part.
-    @kernel
-    def fit_circles(
-        point: wp.array(dtype=vec4),
-        start: wp.array(dtype=wp.int32),
-        noise: wp.array(dtype=real),
-        part: wp.array(dtype=wp.vec2i),
-        scan: wp.array(dtype=wp.int32),
-        edge: wp.array(dtype=vec4),
-        circle: wp.array(dtype=real),
-        scans: wp.int32,
-        points: wp.int32,
-        parts: wp.int32,
-    ):
+    @kernel(flags)
+    def fit_circles(point, start, noise, part, scan, edge, circle, scans, points, parts):
         k = wp.tid()
         if k >= parts:
             return
@@ -264,4 +252,4 @@ def make(name, flags):
         mine.sigma = noise[scan[k]]
         made.fit_circle(point, mine, circle, CIRCLE_NUMBERS * k)
 
-    return {"fit_circles": fit_circles}[name]
+    return locals()[name]

@@ -42,4 +42,4 @@ def functions(flags):
             p += terms[5]
         return p
 
-    return SimpleNamespace(compat_density=compat_density)
+    return SimpleNamespace(**locals())

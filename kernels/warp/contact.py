@@ -85,24 +85,11 @@ def make(name, flags):
 
     # Sum log p over segments: one work-item takes a particle. Points start[s] to start[s + 1] - 1 belong to segment s;
     # pressed[s] is not 0 where it is pressed.
-    @kernel
+    @kernel(flags)
     def score_contact(
-        table: wp.array(dtype=wp.int32),
-        pose_cell: wp.array(dtype=wp.vec2i),
-        pose: wp.array(dtype=vec4),
-        pose_low: wp.array(dtype=vec4),
-        point: wp.array(dtype=vec2),
-        point_low: wp.array(dtype=vec2),
-        start: wp.array(dtype=wp.int32),
-        pressed: wp.array(dtype=wp.int32),
-        terms: wp.array(dtype=real),
-        log_p: wp.array(dtype=real),
-        window: types.Window,
-        particles: wp.int32,
-        segments: wp.int32,
-        guard: real,
-        temperature: real,
-    ):
+        table, pose_cell, pose, pose_low, point, point_low, start, pressed, terms, log_p, window, particles, segments,
+        guard, temperature,
+    ):  # fmt: skip
         n = wp.tid()
         if n >= particles:
             return
@@ -124,4 +111,4 @@ def make(name, flags):
             s += 1
         log_p[n] = temperature * total
 
-    return {"score_contact": score_contact}[name]
+    return locals()[name]

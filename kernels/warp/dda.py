@@ -8,8 +8,9 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import ray as ray_file
-from . import rectangles as rectangles_file
 from .prelude import precision
+from .ray import off_grid
+from .rectangles import padded
 
 ENTRY = wp.uint8
 
@@ -20,8 +21,7 @@ def functions(flags):
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     geometry = ray_file.functions(flags)
-    make_ray, start_walk, off_grid = geometry.make_ray, geometry.start_walk, geometry.off_grid
-    padded = rectangles_file.functions(flags).padded
+    make_ray, start_walk = geometry.make_ray, geometry.start_walk
     ORIGINS_OUTSIDE = "ORIGINS_OUTSIDE" in flags
     OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
     ZERO = real(0.0)
@@ -64,4 +64,4 @@ def functions(flags):
             else:
                 k_y += 1
 
-    return SimpleNamespace(cast_ray=cast_ray)
+    return SimpleNamespace(**locals())

@@ -17,15 +17,8 @@ UNREACHABLE = wp.constant(0x7FFFFFFF)
 
 # First pass: count the cells to the nearest occupied cell of the same line, NO_OBSTACLE without one. One work-item
 # takes a line.
-@kernel
-def distance_lines(
-    occupied: wp.array(dtype=wp.uint8),
-    along: wp.array(dtype=wp.int32),
-    lines: wp.int32,
-    length: wp.int32,
-    line_stride: wp.int32,
-    step: wp.int32,
-):
+@kernel()
+def distance_lines(occupied, along, lines, length, line_stride, step):
     line = wp.tid()
     if line >= lines:
         return
@@ -58,16 +51,8 @@ def parabola(i: wp.int32, j: wp.int32, across: wp.int32):
 # Second pass: evaluate the lower envelope of the parabolas of the first pass. One work-item takes a line. The stack of
 # vertices lies in squared, which is overwritten from its far end: entry q of the stack never lies beyond the cell that
 # reads it.
-@kernel
-def distance_envelope(
-    along: wp.array(dtype=wp.int32),
-    starts: wp.array(dtype=wp.int32),
-    squared: wp.array(dtype=wp.int32),
-    lines: wp.int32,
-    length: wp.int32,
-    line_stride: wp.int32,
-    step: wp.int32,
-):
+@kernel()
+def distance_envelope(along, starts, squared, lines, length, line_stride, step):
     line = wp.tid()
     if line >= lines:
         return
@@ -113,15 +98,8 @@ STEP_ROWS = wp.constant(4)
 
 # First pass: count the cells to the nearest occupied cell of the same row, FAR where it is over reach. One work-item
 # takes a cell.
-@kernel
-def distance_bits(
-    bits: wp.array(dtype=wp.int32),
-    nearest: wp.array(dtype=wp.uint16),
-    rows: wp.int32,
-    cols: wp.int32,
-    words: wp.int32,
-    reach: wp.int32,
-):
+@kernel()
+def distance_bits(bits, nearest, rows, cols, words, reach):
     row, col = wp.tid()
     if row >= rows or col >= cols:
         return
@@ -133,14 +111,8 @@ def distance_bits(
 
 
 # Find the minimum of each column of a block of rows. One work-item takes a column of a block.
-@kernel
-def distance_blocks(
-    nearest: wp.array(dtype=wp.uint16),
-    blocks: wp.array(dtype=wp.uint16),
-    rows: wp.int32,
-    cols: wp.int32,
-    count: wp.int32,
-):
+@kernel()
+def distance_blocks(nearest, blocks, rows, cols, count):
     block, col = wp.tid()
     if block >= count or col >= cols:
         return
@@ -159,16 +131,8 @@ def squares_sum(a: wp.uint32, b: wp.uint32):
 # Second pass: find the least sum of squares along the column of a cell, UNREACHABLE where it is over most. One
 # work-item takes a cell. Near rows are read one by one. Farther away, the minima of blocks give an upper bound first,
 # and then the blocks that may hold less.
-@kernel
-def distance_search(
-    nearest: wp.array(dtype=wp.uint16),
-    blocks: wp.array(dtype=wp.uint16),
-    squared: wp.array(dtype=wp.int32),
-    rows: wp.int32,
-    cols: wp.int32,
-    count: wp.int32,
-    most: wp.int32,
-):
+@kernel()
+def distance_search(nearest, blocks, squared, rows, cols, count, most):
     row, col = wp.tid()
     if row >= rows or col >= cols:
         return
@@ -214,15 +178,6 @@ def distance_search(
     squared[row * cols + col] = result
 
 
-_KERNELS = {
-    "distance_lines": distance_lines,
-    "distance_envelope": distance_envelope,
-    "distance_bits": distance_bits,
-    "distance_blocks": distance_blocks,
-    "distance_search": distance_search,
-}
-
-
 def make(name, flags):
     """Return a kernel of the file; no flag changes it."""
-    return _KERNELS[name]
+    return globals()[name]

@@ -29,17 +29,8 @@ def make(name, flags):
     copies_of, found_residual = of.copies_of, of.found_residual
 
     # Count the certain copies of a block; the other columns are 0: one work-item takes a block.
-    @kernel
-    def count_copies(
-        ends: wp.array(dtype=wp.float64),
-        state: wp.array(dtype=wp.float64),
-        sums: wp.array(dtype=wp.float64),
-        particles: wp.int32,
-        block: wp.int32,
-        blocks: wp.int32,
-        drawn: wp.int32,
-        stage: wp.int32,
-    ):
+    @kernel(flags)
+    def count_copies(ends, state, sums, particles, block, blocks, drawn, stage):
         b = wp.tid()
         begin = b * block
         if begin >= particles:
@@ -53,20 +44,8 @@ def make(name, flags):
             sums[b * WEIGHT_SUMS + k] = ZERO
 
     # Set the cumulative numbers of certain copies: one work-item takes a block.
-    @kernel
-    def set_copies(
-        ends: wp.array(dtype=wp.float64),
-        state: wp.array(dtype=wp.float64),
-        sums: wp.array(dtype=wp.float64),
-        joined: wp.array(dtype=wp.float64),
-        copies: wp.array(dtype=wp.float64),
-        particles: wp.int32,
-        block: wp.int32,
-        blocks: wp.int32,
-        fan: wp.int32,
-        drawn: wp.int32,
-        stage: wp.int32,
-    ):
+    @kernel(flags)
+    def set_copies(ends, state, sums, joined, copies, particles, block, blocks, fan, drawn, stage):
         b = wp.tid()
         begin = b * block
         if begin >= particles:
@@ -81,21 +60,8 @@ def make(name, flags):
 
     # Draw the particles of the next stage or step, or copy them where no resampling is due: one work-item takes a
     # particle.
-    @kernel
-    def draw_particles(
-        source: wp.array(dtype=wp.float64),
-        weight: wp.array(dtype=wp.float64),
-        ends: wp.array(dtype=wp.float64),
-        copies: wp.array(dtype=wp.float64),
-        settings: wp.array(dtype=wp.float64),
-        state: wp.array(dtype=wp.float64),
-        pool: wp.array(dtype=wp.float64),
-        target: wp.array(dtype=wp.float64),
-        after: wp.array(dtype=wp.float64),
-        particles: wp.int32,
-        drawn: wp.int32,
-        stage: wp.int32,
-    ):
+    @kernel(flags)
+    def draw_particles(source, weight, ends, copies, settings, state, pool, target, after, particles, drawn, stage):
         n = wp.tid()
         if n >= drawn:
             return
@@ -120,4 +86,4 @@ def make(name, flags):
             chosen = found_at(ends, mark_of((at + start) / whole, total), particles)
         draw_particle(source, ends, settings, state, pool, target, after, particles, stage, n, chosen)
 
-    return {"count_copies": count_copies, "set_copies": set_copies, "draw_particles": draw_particles}[name]
+    return locals()[name]

@@ -8,7 +8,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import motion, philox
+from . import motion
+from .philox import random_words, uniform_of
 
 SEED, STEP, JITTER, FARTHEST_X, FARTHEST_THETA, POOL = (wp.constant(place) for place in (0, 2, 12, 13, 14, 15))
 SCALE, STRATIFIED, FIRST, WHOLE, DRAWN = (wp.constant(place) for place in (21, 26, 61, 62, 63))
@@ -22,8 +23,6 @@ ZERO, ONE, TWO = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0)), wp.
 def functions(flags):
     """Make the functions of the file."""
     wrap_once = motion.functions(frozenset()).wrap_once
-    numbers = philox.functions(frozenset())
-    random_words, uniform_of = numbers.random_words, numbers.uniform_of
 
     # Return the first index whose cumulative weight exceeds a mark.
     @wp.func
@@ -164,7 +163,4 @@ def functions(flags):
         target[3 * n + 1] = y
         target[3 * n + 2] = theta
 
-    return SimpleNamespace(
-        found_at=found_at, copies_of=copies_of, found_residual=found_residual, mark_of=mark_of, is_copied=is_copied,
-        copy_particle=copy_particle, words_of=words_of, start_of=start_of, draw_particle=draw_particle,
-    )  # fmt: skip
+    return SimpleNamespace(**locals())

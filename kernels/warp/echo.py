@@ -12,10 +12,11 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import ray as ray_file
-from . import rectangles as rectangles_file
 from .mixture import MIXTURE_TERMS
 from .prelude import kernel, precision
 from .ranges import caster_of
+from .ray import off_grid
+from .rectangles import padded
 
 
 @functools.cache
@@ -27,9 +28,8 @@ def functions(flags):
     ENTRY = casting.ENTRY
     cast_ray = casting.functions(flags).cast_ray
     geometry = ray_file.functions(flags)
-    Ray, make_ray, off_grid = geometry.Ray, geometry.make_ray, geometry.off_grid
+    Ray, make_ray = geometry.Ray, geometry.make_ray
     crossed, whole = geometry.crossed, geometry.whole
-    padded = rectangles_file.functions(flags).padded
     INCIDENCE = "INCIDENCE" in flags
     OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
     TO_THE_LIMIT = bool({"LOOKUP", "BRESENHAM"} & flags)
@@ -125,14 +125,14 @@ def functions(flags):
                     echo.t = t
         return echo
 
-    return SimpleNamespace(hit_normal=hit_normal, incidence_terms=incidence_terms, nearest_echo=nearest_echo)
+    return SimpleNamespace(**locals())
 
 
 @functools.cache
 def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     types = precision(flags)
-    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    real = types.real
     ENTRY = caster_of(flags).ENTRY
     nearest_echo = functions(flags).nearest_echo
     expected_range = ray_file.functions(flags).expected_range
@@ -142,22 +142,10 @@ def make(name, flags):
 
     # Cast cones to expected ranges and angles of incidence, NaN without a return; with COSINES to the angles' cosines,
     # 2 without a return. One work-item takes a particle and cone; a launch has fewer than 2^31.
-    @kernel
+    @kernel(flags, entry=ENTRY)
     def cast_echoes(
-        map_table: wp.array(dtype=ENTRY),
-        normals: wp.array(dtype=vec2),
-        pose_cell: wp.array(dtype=wp.vec2i),
-        pose: wp.array(dtype=vec4),
-        ray: wp.array(dtype=vec2),
-        ranges: wp.array(dtype=real),
-        incidence: wp.array(dtype=real),
-        window: types.Window,
-        particles: wp.int32,
-        rays: wp.int32,
-        cone: types.Cone,
-        caster: types.Caster,
-        scale: types.RangeScale,
-    ):
+        map_table, normals, pose_cell, pose, ray, ranges, incidence, window, particles, rays, cone, caster, scale,
+    ):  # fmt: skip
         n, k = wp.tid()
         if k >= rays or n >= particles:
             return
@@ -170,4 +158,4 @@ def make(name, flags):
         elif INCIDENCE:
             incidence[n * rays + k] = wp.where(echo.t < scale.limit, wp.atan2(echo.sine, echo.cosine), NOWHERE)
 
-    return {"cast_echoes": cast_echoes}[name]
+    return locals()[name]

@@ -5,9 +5,6 @@ exp x = 2^k exp r with r = x - k log 2, |r| <= log(2) / 2, by its power series. 
 t^2)) halves the angle. Errors are a few units in the last place.
 """
 
-import functools
-from types import SimpleNamespace
-
 import warp as wp
 
 LOG2_HIGH, LOG2_LOW = wp.constant(wp.float64(0.6931471803691238)), wp.constant(wp.float64(1.9082149292705877e-10))
@@ -86,9 +83,3 @@ def angle_of(x: wp.float64, y: wp.float64):
     angle = wp.where(size_y > size_x, QUARTER - angle, angle)
     angle = wp.where(x < ZERO, HALF_TURN - angle, angle)
     return wp.where(y < ZERO, -angle, angle)
-
-
-@functools.cache
-def functions(flags):
-    """Return the functions of the file; no flag changes them."""
-    return SimpleNamespace(exp_of=exp_of, log_of=log_of, angle_of=angle_of)

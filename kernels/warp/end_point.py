@@ -162,8 +162,4 @@ def functions(flags):
         else:
             return field_cell(start.x + near.x, start.y + near.y, window)
 
-    return SimpleNamespace(
-        ROUNDING_BITS=ROUNDING_BITS, careful_offset=careful_offset, whole_cells=whole_cells, EndPoint=EndPoint,
-        end_point=end_point, rounding_margin=rounding_margin, rounded_cell=rounded_cell, table_origin=table_origin,
-        table_cell=table_cell,
-    )  # fmt: skip
+    return SimpleNamespace(**locals())

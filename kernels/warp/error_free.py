@@ -73,12 +73,4 @@ def functions(flags):
     def add_strands(total: vec2, strands: vec4):
         return add_term(add_term(add_term(add_term(total, strands[0]), strands[1]), strands[2]), strands[3])
 
-    return SimpleNamespace(
-        two_sum=two_sum,
-        high_half=high_half,
-        two_product=two_product,
-        pair_sum=pair_sum,
-        pair_product=pair_product,
-        add_term=add_term,
-        add_strands=add_strands,
-    )
+    return SimpleNamespace(**locals())

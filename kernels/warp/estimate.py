@@ -10,7 +10,8 @@ import functools
 
 import warp as wp
 
-from . import elementary, heading, motion
+from . import heading, motion
+from .elementary import angle_of
 from .prelude import kernel
 
 ESTIMATE_SUMS, ESTIMATE_LANES, WIDE_HEADINGS = (wp.constant(number) for number in (13, 8, 10))
@@ -24,21 +25,11 @@ def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     cos_sin = heading.functions(frozenset()).cos_sin
     wrap_once = motion.functions(frozenset()).wrap_once
-    angle_of = elementary.functions(frozenset()).angle_of
 
     # Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings: one work-item takes
     # a number of lanes of a block.
-    @kernel
-    def sum_poses(
-        poses: wp.array(dtype=wp.float64),
-        weight: wp.array(dtype=wp.float64),
-        estimate: wp.array(dtype=wp.float64),
-        sums: wp.array(dtype=wp.float64),
-        particles: wp.int32,
-        block: wp.int32,
-        lanes: wp.int32,
-        again: wp.int32,
-    ):
+    @kernel(flags)
+    def sum_poses(poses, weight, estimate, sums, particles, block, lanes, again):
         i = wp.tid()
         each = ESTIMATE_LANES / lanes
         begin = i / each * block
@@ -81,14 +72,8 @@ def make(name, flags):
 
     # Write the mean pose and the covariance about it from the sums of all groups, and whether headings ask for a
     # second pass; that pass writes the covariance only. One work-item takes all.
-    @kernel
-    def finish_estimate(
-        poses: wp.array(dtype=wp.float64),
-        sums: wp.array(dtype=wp.float64),
-        estimate: wp.array(dtype=wp.float64),
-        groups: wp.int32,
-        again: wp.int32,
-    ):
+    @kernel(flags)
+    def finish_estimate(poses, sums, estimate, groups, again):
         i = wp.tid()
         if i > 0:
             return
@@ -116,13 +101,8 @@ def make(name, flags):
         estimate[8] = total[11] / weight - mean * (TWO * angle - mean)
 
     # Divide weights by their sum, which the estimate holds: one work-item takes a particle.
-    @kernel
-    def normalize_weights(
-        weight: wp.array(dtype=wp.float64),
-        estimate: wp.array(dtype=wp.float64),
-        share: wp.array(dtype=wp.float64),
-        particles: wp.int32,
-    ):
+    @kernel(flags)
+    def normalize_weights(weight, estimate, share, particles):
         n = wp.tid()
         if n < particles:
             share[n] = weight[n] / estimate[9]

@@ -44,22 +44,8 @@ def make(name, flags):
     # Fill width x height cells of the table, the first of them at begin, from squared distances: density has a value
     # for each squared distance up to the cap. The first cell is (from_col, from_row) of the grid; cells outside the
     # grid get beyond.
-    @kernel
-    def fill_field(
-        squared: wp.array(dtype=wp.int32),
-        density: wp.array(dtype=real),
-        table: wp.array(dtype=real),
-        rows: wp.int32,
-        cols: wp.int32,
-        cap: wp.int32,
-        beyond: real,
-        from_col: wp.int32,
-        from_row: wp.int32,
-        width: wp.int32,
-        height: wp.int32,
-        begin: wp.int32,
-        stride: wp.int32,
-    ):
+    @kernel(flags)
+    def fill_field(squared, density, table, rows, cols, cap, beyond, from_col, from_row, width, height, begin, stride):
         j, i = wp.tid()
         if i >= width or j >= height:
             return
@@ -71,26 +57,11 @@ def make(name, flags):
         table[begin + j * stride + i] = value
 
     # Score scans: one work-item takes a particle.
-    @kernel
+    @kernel(flags)
     def score_field(
-        table: wp.array(dtype=real),
-        pose_cell: wp.array(dtype=wp.vec2i),
-        pose: wp.array(dtype=vec4),
-        pose_low: wp.array(dtype=vec4),
-        point: wp.array(dtype=vec2),
-        point_low: wp.array(dtype=vec2),
-        terms: wp.array(dtype=real),
-        start: wp.array(dtype=wp.int32),
-        constant_terms: wp.array(dtype=real),
-        log_p: wp.array(dtype=real),
-        parts: wp.array(dtype=real),
-        window: types.Window,
-        particles: wp.int32,
-        readings: wp.int32,
-        guard: real,
-        score: types.Score,
-        batch: types.ScanBatch,
-    ):
+        table, pose_cell, pose, pose_low, point, point_low, terms, start, constant_terms, log_p, parts, window,
+        particles, readings, guard, score, batch,
+    ):  # fmt: skip
         n = wp.tid()
         if n >= particles:
             return
@@ -170,24 +141,11 @@ def make(name, flags):
     # Write the sums of blocks of readings to parts[n + block * particles], for GPUs. One work-item takes a
     # particle and every 2^spread-th block. Each block has a guard of its own; with SCANS each scan has as many guards
     # as the longest one.
-    @kernel
+    @kernel(flags)
     def field_blocks(
-        table: wp.array(dtype=real),
-        pose_cell: wp.array(dtype=wp.vec2i),
-        pose: wp.array(dtype=vec4),
-        pose_low: wp.array(dtype=vec4),
-        point: wp.array(dtype=vec2),
-        point_low: wp.array(dtype=vec2),
-        terms: wp.array(dtype=real),
-        guard: wp.array(dtype=real),
-        start: wp.array(dtype=wp.int32),
-        parts: wp.array(dtype=real),
-        window: types.Window,
-        particles: wp.int32,
-        readings: wp.int32,
-        spread: wp.int32,
-        batch: types.ScanBatch,
-    ):
+        table, pose_cell, pose, pose_low, point, point_low, terms, guard, start, parts, window, particles, readings,
+        spread, batch,
+    ):  # fmt: skip
         item = work_item(wp.tid())
         n = ((item // GROUP) >> spread) * GROUP + item % GROUP
         if n >= particles:
@@ -266,4 +224,4 @@ def make(name, flags):
             parts[n + block * particles] = total
             block += 1 << spread
 
-    return {"fill_field": fill_field, "score_field": score_field, "field_blocks": field_blocks}[name]
+    return locals()[name]

@@ -61,7 +61,7 @@ def functions(flags):
         y = end.to_next_x.x * (c - a) + end.rest_x.x * (d - b)
         return vec4(distance.x, distance.y, x, y)
 
-    return SimpleNamespace(hit_share=hit_share, distance_slope=distance_slope)
+    return SimpleNamespace(**locals())
 
 
 @functools.cache
@@ -82,28 +82,11 @@ def make(name, flags):
 
     # Write log p, its gradient (3) and the information (9) of poses in the grid's frame, each times the temperature.
     # One work-item takes a particle. mount is the sensor's place on the robot in cells.
-    @kernel
+    @kernel(flags)
     def field_gradient(
-        table: wp.array(dtype=real),
-        pose_cell: wp.array(dtype=wp.vec2i),
-        pose: wp.array(dtype=vec4),
-        pose_low: wp.array(dtype=vec4),
-        point: wp.array(dtype=vec2),
-        point_low: wp.array(dtype=vec2),
-        terms: wp.array(dtype=real),
-        start: wp.array(dtype=wp.int32),
-        constant_terms: wp.array(dtype=real),
-        gradient: wp.array(dtype=real),
-        window: types.Window,
-        particles: wp.int32,
-        readings: wp.int32,
-        guard: real,
-        mount_x: real,
-        mount_y: real,
-        resolution: real,
-        score: types.Score,
-        batch: types.ScanBatch,
-    ):
+        table, pose_cell, pose, pose_low, point, point_low, terms, start, constant_terms, gradient, window, particles,
+        readings, guard, mount_x, mount_y, resolution, score, batch,
+    ):  # fmt: skip
         n = work_item(wp.tid())
         if n >= particles:
             return
@@ -170,4 +153,4 @@ def make(name, flags):
         gradient[out + 11] = score.temperature * sums[7]
         gradient[out + 12] = score.temperature * sums[8]
 
-    return {"field_gradient": field_gradient}[name]
+    return locals()[name]

@@ -164,7 +164,4 @@ def functions(flags):
             cell = exact.cell
         return number_at(table, field_cell(origin.x + cell.x, origin.y + cell.y, window))
 
-    return SimpleNamespace(
-        between=between, bilinear=bilinear, field_exponent=field_exponent, log_field=log_field,
-        reading_value=reading_value, quick_value=quick_value, careful_value=careful_value,
-    )  # fmt: skip
+    return SimpleNamespace(**locals())

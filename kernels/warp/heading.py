@@ -150,4 +150,4 @@ def functions(flags):
         y = wp.where(odd, cosine, sine)
         return wp.vec2d(wp.where(((quadrant + 1) & 2) != 0, -x, x), wp.where((quadrant & 2) != 0, -y, y))
 
-    return SimpleNamespace(reduce_ordinary=reduce_ordinary, reduce_huge=reduce_huge, cos_sin=cos_sin)
+    return SimpleNamespace(**locals())

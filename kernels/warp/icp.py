@@ -161,7 +161,7 @@ def functions(flags):
             i += stride
         return total
 
-    return SimpleNamespace(nearest_point=nearest_point, add_pairing=add_pairing, agreement=agreement)
+    return SimpleNamespace(**locals())
 
 
 @functools.cache
@@ -181,20 +181,8 @@ def make(name, flags):
     # Match scans: one work-item takes a pair (reference, second scan) and a guess (x, y, theta), the pose of the second
     # scan in the reference's frame. Every stride-th point takes part until capture radius and scale have shrunk, with
     # thin also afterwards. With one_way the reference's points do not count in the score.
-    @kernel
-    def match_scans(
-        point: wp.array(dtype=vec4),
-        start: wp.array(dtype=wp.int32),
-        line: wp.array(dtype=vec4),
-        pair: wp.array(dtype=wp.vec2i),
-        guess: wp.array(dtype=vec4),
-        result: wp.array(dtype=real),
-        scans: wp.int32,
-        points: wp.int32,
-        pairs: wp.int32,
-        starts: wp.int32,
-        rules: types.MatchRules,
-    ):
+    @kernel(flags)
+    def match_scans(point, start, line, pair, guess, result, scans, points, pairs, starts, rules):
         n = work_item(wp.tid())
         if n >= pairs * starts:
             return
@@ -305,4 +293,4 @@ def make(name, flags):
         result[out + 33] = moved.y
         result[out + 34] = moved.z
 
-    return {"match_scans": match_scans}[name]
+    return locals()[name]

@@ -106,7 +106,4 @@ def functions(flags):
             blocks[level + 1] += rest * rest
         return blocks
 
-    return SimpleNamespace(
-        Sums=Sums, Blocks=Blocks, bearing_of=bearing_of, points_before=points_before, solve=solve,
-        add_to_blocks=add_to_blocks, close_blocks=close_blocks,
-    )  # fmt: skip
+    return SimpleNamespace(**locals())

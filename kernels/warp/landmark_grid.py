@@ -199,4 +199,4 @@ def functions(flags):
             match.log_p = match.best
         return match
 
-    return SimpleNamespace(bucket_at=bucket_at, may_match=may_match, log_match=log_match, search=search)
+    return SimpleNamespace(**locals())

@@ -12,7 +12,7 @@ import math
 
 import warp as wp
 
-from . import landmark_grid, landmarks
+from . import landmark_grid, landmarks, log_terms
 from .landmarks import FALSE_POSITIVE, FEATURE, GROUP, RADIUS
 from .prelude import kernel, precision
 
@@ -21,11 +21,11 @@ from .prelude import kernel, precision
 def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     types = precision(flags)
-    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    real = types.real
     shape = flags & {"FLOAT64", "RANGE", "BEARING", "SIGNATURE", "FIELD"}
+    either = log_terms.functions(flags & {"FLOAT64"}).either
     density = landmarks.functions(shape)
     sensor_place, direction, offset = density.sensor_place, density.direction, density.offset
-    either = density.either
     matches = landmark_grid.functions(flags & (shape | {"LINE"}))
     may_match, log_match = matches.may_match, matches.log_match
     PER_BEAM = "PER_BEAM" in flags
@@ -37,30 +37,11 @@ def make(name, flags):
 
     # Find the best joint association: one work-item takes a particle. choice[s] has the landmark of each feature of set
     # s, and value[s] its log p; sets is 2^features.
-    @kernel
+    @kernel(flags)
     def joint_features(
-        landmark: wp.array(dtype=vec4),
-        normal: wp.array(dtype=vec4),
-        signature: wp.array(dtype=vec4),
-        pose_cell: wp.array(dtype=wp.vec2i),
-        pose: wp.array(dtype=vec4),
-        pose_low: wp.array(dtype=vec4),
-        feature: wp.array(dtype=real),
-        terms: wp.array(dtype=real),
-        arcs: wp.array(dtype=vec2),
-        best: wp.array(dtype=real),
-        choice: wp.array(dtype=wp.int32),
-        value: wp.array(dtype=real),
-        log_p: wp.array(dtype=real),
-        parts: wp.array(dtype=real),
-        which: wp.array(dtype=wp.int32),
-        landmarks: wp.int32,
-        particles: wp.int32,
-        features: wp.int32,
-        sets: wp.int32,
-        buckets: types.Buckets,
-        score: types.Score,
-    ):
+        landmark, normal, signature, pose_cell, pose, pose_low, feature, terms, arcs, best, choice, value, log_p, parts,
+        which, landmarks, particles, features, sets, buckets, score,
+    ):  # fmt: skip
         n = wp.tid()
         if n >= particles:
             return
@@ -146,4 +127,4 @@ def make(name, flags):
                 parts[n * features + k] = wp.where(j >= 0, each, false_positive)
                 k += 1
 
-    return {"joint_features": joint_features}[name]
+    return locals()[name]

@@ -5,7 +5,7 @@ import math
 
 import warp as wp
 
-from . import error_free, landmark_grid, landmarks
+from . import error_free, landmark_grid, landmarks, log_terms
 from .landmarks import FALSE_POSITIVE, FEATURE
 from .prelude import kernel, precision
 
@@ -14,11 +14,11 @@ from .prelude import kernel, precision
 def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     types = precision(flags)
-    real, vec2, vec4 = types.real, types.vec2, types.vec4
+    real, vec2 = types.real, types.vec2
     add_term = error_free.functions(flags & {"FLOAT64"}).add_term
+    either = log_terms.functions(flags & {"FLOAT64"}).either
     density = landmarks.functions(flags & {"FLOAT64", "RANGE", "BEARING", "SIGNATURE", "FIELD"})
     sensor_place, direction, offset = density.sensor_place, density.direction, density.offset
-    either = density.either
     matches = landmark_grid.functions(flags - {"KNOWN", "PER_BEAM"})
     search, log_match = matches.search, matches.log_match
     KNOWN = "KNOWN" in flags
@@ -29,29 +29,11 @@ def make(name, flags):
     # takes a particle. With PER_BEAM, parts has the term of each feature, and which the index of its likeliest
     # landmark, -1 where a false positive is likelier. With MARGINAL share is log(1 / landmarks), the prior of a
     # landmark, else 0.
-    @kernel
+    @kernel(flags)
     def score_features(
-        landmark: wp.array(dtype=vec4),
-        normal: wp.array(dtype=vec4),
-        signature: wp.array(dtype=vec4),
-        start: wp.array(dtype=wp.int32),
-        pose_cell: wp.array(dtype=wp.vec2i),
-        pose: wp.array(dtype=vec4),
-        pose_low: wp.array(dtype=vec4),
-        feature: wp.array(dtype=real),
-        partner: wp.array(dtype=wp.int32),
-        terms: wp.array(dtype=real),
-        arcs: wp.array(dtype=vec2),
-        log_p: wp.array(dtype=real),
-        parts: wp.array(dtype=real),
-        which: wp.array(dtype=wp.int32),
-        buckets: types.Buckets,
-        landmarks: wp.int32,
-        particles: wp.int32,
-        features: wp.int32,
-        share: real,
-        score: types.Score,
-    ):
+        landmark, normal, signature, start, pose_cell, pose, pose_low, feature, partner, terms, arcs, log_p, parts,
+        which, buckets, landmarks, particles, features, share, score,
+    ):  # fmt: skip
         n = wp.tid()
         if n >= particles:
             return
@@ -98,4 +80,4 @@ def make(name, flags):
             first = last
         log_p[n] = wp.where(impossible, NEVER, score.temperature * (total[0] + total[1]))
 
-    return {"score_features": score_features}[name]
+    return locals()[name]

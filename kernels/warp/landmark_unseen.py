@@ -24,20 +24,8 @@ def make(name, flags):
         return d <= range_max and cosine * off[0] + sine * off[2] >= least * d
 
     # Add log_missed to log_p for every landmark in view that belongs to no feature. One work-item takes a particle.
-    @kernel
-    def count_unseen(
-        landmark: wp.array(dtype=vec4),
-        start: wp.array(dtype=wp.int32),
-        pose_cell: wp.array(dtype=wp.vec2i),
-        pose: wp.array(dtype=vec4),
-        pose_low: wp.array(dtype=vec4),
-        which: wp.array(dtype=wp.int32),
-        log_p: wp.array(dtype=real),
-        buckets: types.Buckets,
-        particles: wp.int32,
-        features: wp.int32,
-        view: types.SensorView,
-    ):
+    @kernel(flags)
+    def count_unseen(landmark, start, pose_cell, pose, pose_low, which, log_p, buckets, particles, features, view):
         n = wp.tid()
         if n >= particles:
             return
@@ -67,4 +55,4 @@ def make(name, flags):
         if unseen > 0:
             log_p[n] = log_p[n] + real(unseen) * view.log_missed
 
-    return {"count_unseen": count_unseen}[name]
+    return locals()[name]

@@ -17,7 +17,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import error_free, log_terms, offsets
+from . import error_free, offsets
 from .prelude import precision
 
 # Range; cosine and sine of the bearing on the robot; signature.
@@ -50,7 +50,7 @@ QUARTER_TURN, HALF_TURN = wp.constant(9), wp.constant(10)
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file for a set of flags, and either."""
+    """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact = error_free.functions(flags & {"FLOAT64"})
@@ -248,15 +248,4 @@ def functions(flags):
             log_p = log_p - wp.log(mass)
         return log_p
 
-    return SimpleNamespace(
-        sensor_place=sensor_place,
-        direction=direction,
-        offset=between.offset,
-        distance_pair=distance_pair,
-        across=across,
-        along=along,
-        angle_pair=angle_pair,
-        add_square=add_square,
-        log_detection=log_detection,
-        either=log_terms.functions(flags & {"FLOAT64"}).either,
-    )
+    return SimpleNamespace(**locals(), offset=between.offset)

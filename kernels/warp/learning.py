@@ -147,18 +147,8 @@ def make(name, flags):
         return sums
 
     # Sum over blocks of pairs: one work-item takes a block. Pair k of a block is pair block * across + k * along.
-    @kernel
-    def e_step(
-        reading: wp.array(dtype=real),
-        expected: wp.array(dtype=real),
-        terms: wp.array(dtype=real),
-        sums: wp.array(dtype=real),
-        blocks: wp.int32,
-        readings: wp.int32,
-        across: wp.int32,
-        along: wp.int32,
-        width: wp.int32,
-    ):
+    @kernel(flags)
+    def e_step(reading, expected, terms, sums, blocks, readings, across, along, width):
         block = wp.tid()
         if block >= blocks:
             return
@@ -186,17 +176,8 @@ def make(name, flags):
             j += 1
 
     # Write log p and the responsibilities of each pair, NaN for padding. One work-item takes a block of pairs.
-    @kernel
-    def pair_causes(
-        reading: wp.array(dtype=real),
-        expected: wp.array(dtype=real),
-        terms: wp.array(dtype=real),
-        causes: wp.array(dtype=vec4),
-        blocks: wp.int32,
-        readings: wp.int32,
-        across: wp.int32,
-        along: wp.int32,
-    ):
+    @kernel(flags)
+    def pair_causes(reading, expected, terms, causes, blocks, readings, across, along):
         block = wp.tid()
         if block >= blocks:
             return
@@ -209,4 +190,4 @@ def make(name, flags):
                 causes[n] = responsibilities(reading[n], expected[n], terms)
             k += 1
 
-    return {"e_step": e_step, "pair_causes": pair_causes}[name]
+    return locals()[name]

@@ -111,4 +111,4 @@ def functions(flags):
             log_p = log_p - wp.log(mass)
         return log_p
 
-    return SimpleNamespace(facing=facing, overlaps=overlaps, log_line=log_line)
+    return SimpleNamespace(**locals())

@@ -19,22 +19,8 @@ def make(name, flags):
     # farther from the last one than slack plus ratio times its range, nor than gap in bearing: unit normal, offset, and
     # 1 / (sum of squared distances along the line). A point without neighbours has the line across its beam, -1 in
     # place of that sum, and no pairs. One work-item takes a point of one of the chosen scans.
-    @kernel
-    def fit_lines(
-        point: wp.array(dtype=vec4),
-        start: wp.array(dtype=wp.int32),
-        which: wp.array(dtype=wp.int32),
-        line: wp.array(dtype=vec4),
-        scans: wp.int32,
-        points: wp.int32,
-        chosen: wp.int32,
-        reach: wp.int32,
-        most: wp.int32,
-        ratio: real,
-        slack: real,
-        width: real,
-        gap: real,
-    ):
+    @kernel(flags)
+    def fit_lines(point, start, which, line, scans, points, chosen, reach, most, ratio, slack, width, gap):
         row, k = wp.tid()
         if row >= chosen:
             return
@@ -107,4 +93,4 @@ def make(name, flags):
         offset = normal_x * (centre.x + mean_x) + normal_y * (centre.y + mean_y)
         line[first + k] = vec4(normal_x, normal_y, offset, doubt)
 
-    return {"fit_lines": fit_lines}[name]
+    return locals()[name]

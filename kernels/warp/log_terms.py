@@ -45,4 +45,4 @@ def functions(flags):
             log_sum = high + log_one_plus(wp.exp(low - high))
         return log_sum
 
-    return SimpleNamespace(bounded_square=bounded_square, log_one_plus=log_one_plus, either=either)
+    return SimpleNamespace(**locals())

@@ -9,6 +9,7 @@ import warp as wp
 
 from . import ray as ray_file
 from .prelude import precision
+from .ray import off_grid
 
 ENTRY = wp.uint16
 
@@ -19,7 +20,7 @@ def functions(flags):
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     geometry = ray_file.functions(flags)
-    make_ray, start_walk, off_grid = geometry.make_ray, geometry.start_walk, geometry.off_grid
+    make_ray, start_walk = geometry.make_ray, geometry.start_walk
     angle_bin = geometry.angle_bin
     ORIGINS_OUTSIDE = "ORIGINS_OUTSIDE" in flags
     OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
@@ -58,4 +59,4 @@ def functions(flags):
         t += real(part) * (limit / PARTS)
         return wp.min(t, limit)
 
-    return SimpleNamespace(cast_ray=cast_ray)
+    return SimpleNamespace(**locals())

@@ -20,17 +20,8 @@ def make(name, flags):
 
     # Fill rows of the table: one work-item takes a bin and cell. A hit is at most 65 534; 65 535 means no hit. The
     # table has fewer than 2^31 entries.
-    @kernel
-    def fill_lookup(
-        rectangles: wp.array(dtype=wp.uint16),
-        ray: wp.array(dtype=vec2),
-        lookup: wp.array(dtype=wp.uint16),
-        window: types.Window,
-        bins: wp.int32,
-        first_row: wp.int32,
-        count: wp.int32,
-        limit: real,
-    ):
+    @kernel(flags)
+    def fill_lookup(rectangles, ray, lookup, window, bins, first_row, count, limit):
         index, bin = wp.tid()
         if bin >= bins or index >= count * window.cols:
             return
@@ -41,4 +32,4 @@ def make(name, flags):
         part = int(t * (PARTS / limit) + HALF)
         lookup[(row * window.cols + col) * bins + bin] = wp.uint16(wp.where(t >= limit, 65535, wp.min(part, 65534)))
 
-    return {"fill_lookup": fill_lookup}[name]
+    return locals()[name]

@@ -13,6 +13,7 @@ import warp as wp
 
 from . import ray as ray_file
 from .prelude import precision
+from .ray import off_grid
 
 ENTRY = wp.float32
 
@@ -23,7 +24,7 @@ def functions(flags):
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     geometry = ray_file.functions(flags)
-    make_ray, start_walk, off_grid = geometry.make_ray, geometry.start_walk, geometry.off_grid
+    make_ray, start_walk = geometry.make_ray, geometry.start_walk
     ORIGINS_OUTSIDE = "ORIGINS_OUTSIDE" in flags
     OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
     ZERO = real(0.0)
@@ -65,4 +66,4 @@ def functions(flags):
             t += wp.max(distance - caster.slack, caster.tolerance + t * LEAST_STEP)
         return limit
 
-    return SimpleNamespace(cast_ray=cast_ray)
+    return SimpleNamespace(**locals())

@@ -214,7 +214,4 @@ def functions(flags):
                     p += wp.exp(at(terms, 5) - largest)
                 return largest + wp.log(p)
 
-    return SimpleNamespace(
-        last_range=last_range, hit_mass=hit_mass, short_factor=short_factor, log_hit=log_hit, log_short=log_short,
-        log_density=log_density,
-    )  # fmt: skip
+    return SimpleNamespace(**locals())

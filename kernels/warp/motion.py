@@ -11,7 +11,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import elementary, heading, philox
+from . import heading, philox
+from .elementary import angle_of
+from .philox import random_words, uniform_of
 from .prelude import kernel
 
 SEED, STEP, MEAN, DEVIATION, REVERSE, FIRST = (wp.constant(place) for place in (0, 2, 3, 7, 11, 61))
@@ -29,7 +31,6 @@ ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 def functions(flags):
     """Make the functions of the file; no flag changes them."""
     cos_sin = heading.functions(frozenset()).cos_sin
-    angle_of = elementary.functions(frozenset()).angle_of
 
     # Return the chord of an arc that turns by twice half_turn.
     @wp.func
@@ -55,7 +56,7 @@ def functions(flags):
             wrapped = angle_of(turn.x, turn.y)
         return wrapped
 
-    return SimpleNamespace(chord_of=chord_of, wrap_once=wrap_once, wrap_any=wrap_any, cos_sin=cos_sin)
+    return SimpleNamespace(**locals())
 
 
 @functools.cache
@@ -63,18 +64,11 @@ def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     made = functions(frozenset())
     chord_of, wrap_any, cos_sin = made.chord_of, made.wrap_any, made.cos_sin
-    numbers = philox.functions(frozenset())
-    random_words, uniform_of, normal_pair = numbers.random_words, numbers.uniform_of, numbers.normal_pair
+    normal_pair = philox.functions(frozenset()).normal_pair
 
     # Move particles from source to target, which may be the same array: one work-item takes a particle.
-    @kernel
-    def move_particles(
-        source: wp.array(dtype=wp.float64),
-        settings: wp.array(dtype=wp.float64),
-        target: wp.array(dtype=wp.float64),
-        particles: wp.int32,
-        kind: wp.int32,
-    ):
+    @kernel(flags)
+    def move_particles(source, settings, target, particles, kind):
         n = wp.tid()
         if n >= particles:
             return
@@ -104,4 +98,4 @@ def make(name, flags):
         target[3 * n + 1] = y + (ahead * turn.y + left * turn.x)
         target[3 * n + 2] = wrap_any(theta + second)
 
-    return {"move_particles": move_particles}[name]
+    return locals()[name]

@@ -46,4 +46,4 @@ def functions(flags):
             more = rest / (TWO * d)
         return vec2(d, more)
 
-    return SimpleNamespace(offset=offset, distance_pair=distance_pair)
+    return SimpleNamespace(**locals())

@@ -40,14 +40,8 @@ def make(name, flags):
     # Clear the bins and find the bounds: one work-item takes a bin, and the first SAMPLES of them a particle each.
     # bounds, which the caller sets to -2^31, become the negated smallest and the largest row, column and heading of
     # these particles; the last one becomes 0.
-    @kernel
-    def order_bounds(
-        pose_cell: wp.array(dtype=wp.vec2i),
-        pose: wp.array(dtype=vec4),
-        bounds: wp.array(dtype=wp.int32),
-        bins: wp.array(dtype=wp.int32),
-        particles: wp.int32,
-    ):
+    @kernel(flags)
+    def order_bounds(pose_cell, pose, bounds, bins, particles):
         bin = work_item(wp.tid())
         if bin >= ALL_BINS:
             return
@@ -72,15 +66,8 @@ def make(name, flags):
         return wp.where(part < ZERO, 0, wp.where(part >= PARTS, BINS - 1, int(part)))
 
     # Find the bin of each particle, and count it there. One work-item takes a particle.
-    @kernel
-    def order_count(
-        pose_cell: wp.array(dtype=wp.vec2i),
-        pose: wp.array(dtype=vec4),
-        bounds: wp.array(dtype=wp.int32),
-        bins: wp.array(dtype=wp.int32),
-        bin_of: wp.array(dtype=wp.int32),
-        particles: wp.int32,
-    ):
+    @kernel(flags)
+    def order_count(pose_cell, pose, bounds, bins, bin_of, particles):
         n = work_item(wp.tid())
         if n >= particles:
             return
@@ -96,8 +83,8 @@ def make(name, flags):
 
 
 # Replace the counts of bins by the indices at which they begin. One work-item takes a stretch of neighbouring bins.
-@kernel
-def order_starts(bounds: wp.array(dtype=wp.int32), bins: wp.array(dtype=wp.int32)):
+@kernel()
+def order_starts(bounds, bins):
     stretch = work_item(wp.tid())
     if stretch >= ALL_BINS // STRETCH:
         return
@@ -116,13 +103,8 @@ def order_starts(bounds: wp.array(dtype=wp.int32), bins: wp.array(dtype=wp.int32
 
 
 # Put each particle at the next index of its bin. One work-item takes a particle.
-@kernel
-def order_fill(
-    bin_of: wp.array(dtype=wp.int32),
-    bins: wp.array(dtype=wp.int32),
-    order: wp.array(dtype=wp.int32),
-    particles: wp.int32,
-):
+@kernel()
+def order_fill(bin_of, bins, order, particles):
     n = work_item(wp.tid())
     if n >= particles:
         return

@@ -9,7 +9,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import elementary, heading
+from . import heading
+from .elementary import log_of
 
 MULTIPLIER_0, MULTIPLIER_1 = wp.constant(wp.uint64(0xD2511F53)), wp.constant(wp.uint64(0xCD9E8D57))
 WEYL_0, WEYL_1 = wp.constant(wp.uint32(0x9E3779B9)), wp.constant(wp.uint32(0xBB67AE85))
@@ -47,7 +48,6 @@ def uniform_of(word: wp.uint32):
 def functions(flags):
     """Return the functions of the file; no flag changes them."""
     cos_sin = heading.functions(frozenset()).cos_sin
-    log_of = elementary.functions(frozenset()).log_of
 
     # Return two independent standard normal deviates.
     @wp.func
@@ -56,4 +56,4 @@ def functions(flags):
         turn = cos_sin(wp.float64(word_1) * WORD_TURN)
         return wp.vec2d(radius * turn.x, radius * turn.y)
 
-    return SimpleNamespace(random_words=random_words, uniform_of=uniform_of, normal_pair=normal_pair)
+    return SimpleNamespace(**locals())

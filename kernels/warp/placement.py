@@ -94,31 +94,21 @@ def functions(flags):
                 real(sine - wp.float64(rounded.w)),
             )
 
-    return SimpleNamespace(place_pose=place_pose, coordinate=coordinate)
+    return SimpleNamespace(**locals())
 
 
 @functools.cache
 def make(name, flags):
     """Make a kernel of the file for a set of flags."""
-    types, placing = precision(flags), functions(flags)
-    vec4 = types.vec4
-    place_pose, coordinate = placing.place_pose, placing.coordinate
+    placing = functions(flags)
+    place_pose = placing.place_pose
 
     # Place poses: one work-item takes a particle.
-    @kernel
-    def place_poses(
-        poses: wp.array(dtype=coordinate),
-        pose_cell: wp.array(dtype=wp.vec2i),
-        pose: wp.array(dtype=vec4),
-        pose_low: wp.array(dtype=vec4),
-        pose_status: wp.array(dtype=wp.int32),
-        frame: types.Frame,
-        window: types.Window,
-        particles: wp.int32,
-    ):
+    @kernel(flags)
+    def place_poses(poses, pose_cell, pose, pose_low, pose_status, frame, window, particles):
         particle = work_item(wp.tid())
         if particle >= particles:
             return
         place_pose(particle, poses, pose_cell, pose, pose_low, pose_status, frame, window)  # fmt: skip
 
-    return {"place_poses": place_poses}[name]
+    return locals()[name]

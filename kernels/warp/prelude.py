@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from gpusense.interface import structs
+from gpusense.interface.signatures import KERNELS
 
 # Ranges have the same bits on every device only if each product and sum is rounded by itself and division is correctly
 # rounded. fuse_fp=False bans fused multiply-add; CUDA divides correctly unless fast_math is on.
@@ -22,8 +23,52 @@ OPTIONS = {"fuse_fp": False, "fast_math": False, "enable_backward": False}
 # it.
 _ONE_EACH = {"grid_stride": False} if "grid_stride" in inspect.signature(wp.kernel).parameters else {}
 
-# Decorator: the kernel and the functions that it calls become a module of their own, named by their contents.
-kernel = wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS, **_ONE_EACH)
+_module = wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS, **_ONE_EACH)
+
+
+def kernel(flags=frozenset(), entry=None):
+    """Return the decorator of a kernel, whose parameters get the types of its row of the signature table.
+
+    The kernel and the functions that it calls become a module of their own, named by their contents.
+
+    Args:
+        flags: Flags of the kernel's code, which say what real, coordinate and measured are.
+        entry: What an entry of the map's table is, for kernels that cast rays.
+
+    Raises:
+        TypeError: the parameters' names are not those of the row.
+    """
+
+    def decorate(body):
+        row = KERNELS[body.__name__].arguments
+        names = tuple(inspect.signature(body).parameters)
+        if names != tuple(argument.name for argument in row):
+            raise TypeError(f"{body.__name__}: parameters must be those of its row, got {', '.join(names)}")
+        types = _argument_types(flags) | {"entry": entry}
+        body.__annotations__ = {
+            argument.name: types[argument.type] if argument.shape is None else wp.array(dtype=types[argument.type])
+            for argument in row
+        }
+        return _module(body)
+
+    return decorate
+
+
+@functools.cache
+def _argument_types(flags):
+    """Return the types of the signature table by name, for a set of flags."""
+    types = precision(flags)
+    return vars(types) | {
+        "real2": types.vec2,
+        "real4": types.vec4,
+        "int": wp.int32,
+        "int2": wp.vec2i,
+        "uchar": wp.uint8,
+        "ushort": wp.uint16,
+        "double": wp.float64,
+        "coordinate": wp.float32 if "POSES_FLOAT32" in flags else wp.float64,
+        "measured": wp.float32 if "RANGES_FLOAT32" in flags else wp.float64,
+    }
 
 
 @functools.cache

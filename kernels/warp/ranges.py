@@ -30,19 +30,8 @@ def make(name, flags):
     cell_at, pose_at, ray_at, put = reader(wp.vec2i), reader(vec4), reader(vec2), writer(real)
 
     # Cast rays: one work-item takes a particle and ray. A launch has fewer than 2^31.
-    @kernel
-    def cast_ranges(
-        map_table: wp.array(dtype=ENTRY),
-        pose_cell: wp.array(dtype=wp.vec2i),
-        pose: wp.array(dtype=vec4),
-        ray: wp.array(dtype=vec2),
-        ranges: wp.array(dtype=real),
-        window: types.Window,
-        particles: wp.int32,
-        rays: wp.int32,
-        caster: types.Caster,
-        scale: types.RangeScale,
-    ):
+    @kernel(flags, entry=ENTRY)
+    def cast_ranges(map_table, pose_cell, pose, ray, ranges, window, particles, rays, caster, scale):
         n, k = wp.tid()
         if k >= rays or n >= particles:
             return
@@ -50,21 +39,8 @@ def make(name, flags):
         put(ranges, n * rays + k, expected_range(t, scale))
 
     # Cast rays in tiles of particles and rays, for GPUs.
-    @kernel
-    def cast_tiles(
-        map_table: wp.array(dtype=ENTRY),
-        pose_cell: wp.array(dtype=wp.vec2i),
-        pose: wp.array(dtype=vec4),
-        order: wp.array(dtype=wp.int32),
-        ray: wp.array(dtype=vec2),
-        ranges: wp.array(dtype=real),
-        window: types.Window,
-        particles: wp.int32,
-        rays: wp.int32,
-        caster: types.Caster,
-        scale: types.RangeScale,
-        spread: wp.int32,
-    ):
+    @kernel(flags, entry=ENTRY)
+    def cast_tiles(map_table, pose_cell, pose, order, ray, ranges, window, particles, rays, caster, scale, spread):
         item = work_item(wp.tid())
         place = tile_place(item, spread)
         if place >= particles:
@@ -80,4 +56,4 @@ def make(name, flags):
             put(ranges, n * rays + k, expected_range(t, scale))
             k += tile_step(spread)
 
-    return {"cast_ranges": cast_ranges, "cast_tiles": cast_tiles}[name]
+    return locals()[name]

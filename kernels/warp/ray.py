@@ -159,8 +159,4 @@ def functions(flags):
             return wp.where(t == scale.limit, scale.range_max, t * scale.resolution)
         return wp.where(t >= scale.limit, scale.range_max, wp.min(t * scale.resolution, scale.range_max))
 
-    return SimpleNamespace(
-        Ray=Ray, Walk=Walk, off_grid=off_grid, ray_direction=ray_direction, make_ray=make_ray, COUNT=COUNT, FIRST=FIRST,
-        as_bits=as_bits, farther=farther, whole=whole, crossed=crossed, start_walk=start_walk, turn_of=turn_of,
-        angle_bin=angle_bin, expected_range=expected_range,
-    )  # fmt: skip
+    return SimpleNamespace(**locals())

@@ -38,19 +38,8 @@ def crossed_before(first: wp.int32, size: wp.int64, reached: wp.int64, other: wp
 
 
 # Add the cells of rays to the counts; cells outside the grid are left out. One work-item takes a ray.
-@kernel
-def count_rays(
-    start_cell: wp.array(dtype=wp.vec2i),
-    start_inside: wp.array(dtype=wp.vec2i),
-    end_cell: wp.array(dtype=wp.vec2i),
-    end_inside: wp.array(dtype=wp.vec2i),
-    hit: wp.array(dtype=wp.int32),
-    hits: wp.array(dtype=wp.int32),
-    misses: wp.array(dtype=wp.int32),
-    rows: wp.int32,
-    cols: wp.int32,
-    rays: wp.int32,
-):
+@kernel()
+def count_rays(start_cell, start_inside, end_cell, end_inside, hit, hits, misses, rows, cols, rays):
     n = wp.tid()
     if n >= rays:
         return
@@ -110,4 +99,4 @@ def count_rays(
 
 def make(name, flags):
     """Return the kernel of the file; no flag changes it."""
-    return {"count_rays": count_rays}[name]
+    return globals()[name]

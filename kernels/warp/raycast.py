@@ -10,8 +10,10 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import ray as ray_file
-from . import rectangles as rectangles_file
+from . import rectangles
 from .prelude import precision, reader
+from .ray import off_grid
+from .rectangles import padded
 
 ENTRY = wp.uint16
 
@@ -22,12 +24,11 @@ def functions(flags):
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     geometry = ray_file.functions(flags)
-    make_ray, start_walk, off_grid = geometry.make_ray, geometry.start_walk, geometry.off_grid
+    make_ray, start_walk = geometry.make_ray, geometry.start_walk
     crossed, as_bits, farther = geometry.crossed, geometry.as_bits, geometry.farther
     COUNT, FIRST = geometry.COUNT, geometry.FIRST
-    padded = rectangles_file.functions(flags).padded
     entry_at = reader(ENTRY)
-    OCCUPIED = wp.uint32(rectangles_file.OCCUPIED)
+    OCCUPIED = wp.uint32(rectangles.OCCUPIED)
     ORIGINS_OUTSIDE = "ORIGINS_OUTSIDE" in flags
     OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
     SECTORS_2 = "SECTORS_2" in flags
@@ -98,4 +99,4 @@ def functions(flags):
         else:
             return wp.where(t < limit and sides == OCCUPIED, t, limit)
 
-    return SimpleNamespace(cast_ray=cast_ray)
+    return SimpleNamespace(**locals())

@@ -13,8 +13,6 @@ whose rectangles can contain one of these are computed. For new planes all cells
 whole rows of the map, from row first on.
 """
 
-from types import SimpleNamespace
-
 import warp as wp
 
 from .bits import cells_left, cells_right
@@ -68,15 +66,8 @@ def slope(sectors: wp.int32, sector: wp.int32):
 
 # Count the free cells along columns of the band, to larger rows (direction 0) or smaller rows (direction 1), for
 # columns in [begin, end). For processors: one work-item takes 64 columns and a direction.
-@kernel
-def free_columns(
-    occupied: wp.array(dtype=wp.uint8),
-    runs: wp.array(dtype=wp.uint8),
-    band: wp.int32,
-    cols: wp.int32,
-    begin: wp.int32,
-    end: wp.int32,
-):
+@kernel()
+def free_columns(occupied, runs, band, cols, begin, end):
     direction, strip = wp.tid()
     first = begin + 64 * strip
     until = wp.min(first + 64, end)
@@ -96,21 +87,8 @@ def free_columns(
 # quadrant. The widest rectangle of sufficient height is at most one column wider than that of its neighbour. The stack
 # has the columns that bound its height, each lower than all before it: free cells in the upper 16 bits, and the last 16
 # bits of the column, which give the distance.
-@kernel
-def rectangles_rows(
-    runs: wp.array(dtype=wp.uint8),
-    stack: wp.array(dtype=wp.int32),
-    rectangles: wp.array(dtype=wp.uint16),
-    rows: wp.int32,
-    cols: wp.int32,
-    sectors: wp.int32,
-    first: wp.int32,
-    band: wp.int32,
-    top: wp.int32,
-    left: wp.int32,
-    bottom: wp.int32,
-    right: wp.int32,
-):
+@kernel()
+def rectangles_rows(runs, stack, rectangles, rows, cols, sectors, first, band, top, left, bottom, right):
     quadrant, item = wp.tid()
     dx = wp.where((quadrant & 1) != 0, -1, 1)
     dy = wp.where((quadrant & 2) != 0, -1, 1)
@@ -160,16 +138,8 @@ def rectangles_rows(
 
 # Count the free cells along rows, to the right (direction 0) and to the left (direction 1), for columns in [begin,
 # end). For GPUs: one work-item takes a cell.
-@kernel
-def free_rows(
-    bits: wp.array(dtype=wp.int32),
-    runs: wp.array(dtype=wp.uint8),
-    band: wp.int32,
-    cols: wp.int32,
-    words: wp.int32,
-    begin: wp.int32,
-    end: wp.int32,
-):
+@kernel()
+def free_rows(bits, runs, band, cols, words, begin, end):
     row, item = wp.tid()
     col = begin + item
     if row >= band or col >= end:
@@ -183,20 +153,8 @@ def free_rows(
 
 # Find the rectangles along columns: the higher a rectangle, the narrower. For GPUs: one work-item takes a cell and
 # quadrant; the first work-item of a quadrant takes the first of its cells.
-@kernel
-def rectangles_scan(
-    runs: wp.array(dtype=wp.uint8),
-    rectangles: wp.array(dtype=wp.uint16),
-    rows: wp.int32,
-    cols: wp.int32,
-    sectors: wp.int32,
-    first: wp.int32,
-    band: wp.int32,
-    top: wp.int32,
-    left: wp.int32,
-    bottom: wp.int32,
-    right: wp.int32,
-):
+@kernel()
+def rectangles_scan(runs, rectangles, rows, cols, sectors, first, band, top, left, bottom, right):
     quadrant, row_item, col_item = wp.tid()
     dx = wp.where((quadrant & 1) != 0, -1, 1)
     dy = wp.where((quadrant & 2) != 0, -1, 1)
@@ -238,19 +196,6 @@ def rectangles_scan(
         height += 1
 
 
-_KERNELS = {
-    "free_columns": free_columns,
-    "rectangles_rows": rectangles_rows,
-    "free_rows": free_rows,
-    "rectangles_scan": rectangles_scan,
-}
-
-
-def functions(flags):
-    """Return the functions of the file; no flag changes them."""
-    return SimpleNamespace(padded=padded)
-
-
 def make(name, flags):
     """Return a kernel of the file; no flag changes it."""
-    return _KERNELS[name]
+    return globals()[name]

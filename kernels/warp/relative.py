@@ -28,7 +28,6 @@ def make(name, flags):
     reduce_ordinary, reduce_huge, cos_sin = turning.reduce_ordinary, turning.reduce_huge, turning.cos_sin
     exact = error_free.functions(frozenset({"FLOAT64"}))
     two_sum, pair_sum = exact.two_sum, exact.pair_sum
-    coordinate = wp.float32 if "POSES_FLOAT32" in flags else wp.float64
     HUGE_HEADINGS = "HUGE_HEADINGS" in flags
 
     # Return theta - target in [-pi, pi]; the target is in that interval.
@@ -60,17 +59,8 @@ def make(name, flags):
 
     # Place sensors relative to an origin: x, its low part, y, its low part. One work-item takes a particle.
     # pose_status, which the caller clears, becomes 1 at (0) if a pose is not finite; its place is the origin.
-    @kernel
-    def place_relative(
-        poses: wp.array(dtype=coordinate),
-        place: wp.array(dtype=vec4),
-        pose_status: wp.array(dtype=wp.int32),
-        origin_x: wp.float64,
-        origin_y: wp.float64,
-        mount_x: wp.float64,
-        mount_y: wp.float64,
-        particles: wp.int32,
-    ):
+    @kernel(flags)
+    def place_relative(poses, place, pose_status, origin_x, origin_y, mount_x, mount_y, particles):
         n = wp.tid()
         if n >= particles:
             return
@@ -96,15 +86,8 @@ def make(name, flags):
 
     # Subtract the target from headings and wrap to [-pi, pi], a sum of two numbers. One work-item takes a particle.
     # pose_status is as for place_relative.
-    @kernel
-    def wrap_headings(
-        poses: wp.array(dtype=coordinate),
-        residual: wp.array(dtype=vec2),
-        pose_status: wp.array(dtype=wp.int32),
-        target: wp.float64,
-        target_low: wp.float64,
-        particles: wp.int32,
-    ):
+    @kernel(flags)
+    def wrap_headings(poses, residual, pose_status, target, target_low, particles):
         n = wp.tid()
         if n >= particles:
             return
@@ -118,4 +101,4 @@ def make(name, flags):
         rounded = real(angle.x)
         residual[n] = vec2(rounded, real((angle.x - wp.float64(rounded)) + angle.y))
 
-    return {"place_relative": place_relative, "wrap_headings": wrap_headings}[name]
+    return locals()[name]

@@ -17,8 +17,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import elementary, philox
 from . import sensor_table as sensor_table_file
+from .elementary import exp_of, log_of
+from .philox import random_words
 from .prelude import kernel, precision
 
 READING_STREAM = wp.constant(wp.uint32(1 << 30))
@@ -91,8 +92,6 @@ def fine_uniform(high: wp.uint32, low: wp.uint32):
 @functools.cache
 def functions(flags):
     """Make the functions of the file; no flag changes them."""
-    plain = elementary.functions(frozenset())
-    exp_of, log_of = plain.exp_of, plain.log_of
 
     # Return the mass of the standard normal between 0 and x >= 0.
     @wp.func
@@ -203,9 +202,7 @@ def functions(flags):
             return INFINITE
         return (wp.float64(low) + (margin + v * (ONE - TWO * margin))) * (range_max / wp.float64(cells))
 
-    return SimpleNamespace(
-        fine_uniform=fine_uniform, half_mass=half_mass, reading_of=reading_of, cell_reading_of=cell_reading_of
-    )
+    return SimpleNamespace(**locals())
 
 
 @functools.cache
@@ -215,26 +212,14 @@ def make(name, flags):
     real = types.real
     made = functions(frozenset())
     reading_of, cell_reading_of = made.reading_of, made.cell_reading_of
-    random_words = philox.functions(frozenset()).random_words
     range_bin = sensor_table_file.functions(flags).range_bin
     SENSOR_TABLE = "SENSOR_TABLE" in flags
     INCIDENCE = "INCIDENCE" in flags
 
     # Replace expected ranges by readings; incidence holds cosines, and edges those between bins. One work-item takes a
     # particle and ray; a launch has fewer than 2^31.
-    @kernel
-    def draw_readings(
-        incidence: wp.array(dtype=real),
-        mixture: wp.array(dtype=wp.float64),
-        edges: wp.array(dtype=real),
-        chances: wp.array(dtype=wp.float64),
-        settings: wp.array(dtype=wp.float64),
-        ranges: wp.array(dtype=real),
-        particles: wp.int32,
-        rays: wp.int32,
-        tables: types.MixtureTables,
-        scale: types.RangeScale,
-    ):
+    @kernel(flags)
+    def draw_readings(incidence, mixture, edges, chances, settings, ranges, particles, rays, tables, scale):
         i, k = wp.tid()
         if k >= rays or i >= particles:
             return
@@ -266,4 +251,4 @@ def make(name, flags):
         else:
             ranges[place] = real(wp.min(drawn, settings[DRAW_TOP]))
 
-    return {"draw_readings": draw_readings}[name]
+    return locals()[name]

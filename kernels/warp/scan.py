@@ -38,8 +38,8 @@ def is_chosen(rank: wp.int32, informative: wp.int32, chosen: wp.int32):
 def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     types, place = precision(flags), placement.functions(flags)
-    real, vec2, vec4 = types.real, types.vec2, types.vec4
-    coordinate, place_pose = place.coordinate, place.place_pose
+    real, vec2 = types.real, types.vec2
+    place_pose = place.place_pose
     measured = wp.float32 if "RANGES_FLOAT32" in flags else wp.float64
     block_terms = wp.types.vector(length=BLOCK_TERMS, dtype=wp.float64)
     SOME_BEAMS = "SOME_BEAMS" in flags
@@ -198,27 +198,11 @@ def make(name, flags):
 
     # Place readings and poses: one work-item takes a beam and place, in whole groups; after these, one takes a
     # particle.
-    @kernel
+    @kernel(flags)
     def place_inputs(
-        poses: wp.array(dtype=coordinate),
-        pose_cell: wp.array(dtype=wp.vec2i),
-        pose: wp.array(dtype=vec4),
-        pose_low: wp.array(dtype=vec4),
-        pose_status: wp.array(dtype=wp.int32),
-        ranges: wp.array(dtype=measured),
-        beam: wp.array(dtype=wp.int32),
-        vector: wp.array(dtype=wp.float64),
-        point: wp.array(dtype=vec2),
-        point_low: wp.array(dtype=vec2),
-        reading: wp.array(dtype=real),
-        guard: wp.array(dtype=real),
-        constant_term: wp.array(dtype=real),
-        frame: types.Frame,
-        window: types.Window,
-        particles: wp.int32,
-        head: wp.int32,
-        rules: types.ReadingRules,
-    ):
+        poses, pose_cell, pose, pose_low, pose_status, ranges, beam, vector, point, point_low, reading, guard,
+        constant_term, frame, window, particles, head, rules,
+    ):  # fmt: skip
         item = work_item(wp.tid())
         particle = item - head
         if particle >= 0 and particle < particles:
@@ -228,4 +212,4 @@ def make(name, flags):
                 item, ranges, beam, vector, point, point_low, reading, guard, constant_term, frame.resolution, rules
             )
 
-    return {"place_inputs": place_inputs}[name]
+    return locals()[name]

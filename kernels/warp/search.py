@@ -14,12 +14,12 @@ period-th cell of a table as an image of its own: shifts by whole periods read n
 import warp as wp
 
 from .prelude import kernel
-from .score_cells import ScoreTable, cell_index, padded_lines, padded_stride
+from .score_cells import cell_index, padded_lines, padded_stride
 
 
 # Write the largest of each cell and those reach rows and columns on. One work-item takes a cell.
-@kernel
-def pool_scores(table: wp.array(dtype=wp.uint8), pooled: wp.array(dtype=wp.uint8), scores: ScoreTable, reach: wp.int32):
+@kernel()
+def pool_scores(table, pooled, scores, reach):
     image, line, col = wp.tid()
     lines = padded_lines(scores)
     stride = padded_stride(scores)
@@ -35,15 +35,8 @@ def pool_scores(table: wp.array(dtype=wp.uint8), pooled: wp.array(dtype=wp.uint8
 
 # Write every period-th row and column of each padded table as an image, for each of period^2 first cells. One work-item
 # takes a cell of an image.
-@kernel
-def fold_scores(
-    table: wp.array(dtype=wp.uint8),
-    out: wp.array(dtype=wp.uint8),
-    scores: ScoreTable,
-    folded: ScoreTable,
-    period: wp.int32,
-    beyond: wp.int32,
-):
+@kernel()
+def fold_scores(table, out, scores, folded, period, beyond):
     image, line, col = wp.tid()
     lines = padded_lines(folded)
     stride = padded_stride(folded)
@@ -63,18 +56,8 @@ def fold_scores(
 
 # Sum the cells of each item's points at all shifts by less than height rows and width columns. One work-item takes a
 # shift of an item.
-@kernel
-def shift_scores(
-    table: wp.array(dtype=wp.uint8),
-    point: wp.array(dtype=wp.vec2i),
-    image: wp.array(dtype=wp.int32),
-    first: wp.array(dtype=wp.int32),
-    score: wp.array(dtype=wp.int32),
-    scores: ScoreTable,
-    items: wp.int32,
-    height: wp.int32,
-    width: wp.int32,
-):
+@kernel()
+def shift_scores(table, point, image, first, score, scores, items, height, width):
     item, row, col = wp.tid()
     if col >= width or row >= height or item >= items:
         return
@@ -88,17 +71,8 @@ def shift_scores(
 
 # Sum the cells of candidates' points; a candidate is an item, and the row and column of its shift. One work-item takes
 # a candidate.
-@kernel
-def candidate_scores(
-    table: wp.array(dtype=wp.uint8),
-    point: wp.array(dtype=wp.vec2i),
-    image: wp.array(dtype=wp.int32),
-    first: wp.array(dtype=wp.int32),
-    candidate: wp.array(dtype=wp.int32),
-    score: wp.array(dtype=wp.int32),
-    scores: ScoreTable,
-    candidates: wp.int32,
-):
+@kernel()
+def candidate_scores(table, point, image, first, candidate, score, scores, candidates):
     n = wp.tid()
     if n >= candidates:
         return
@@ -115,5 +89,4 @@ def candidate_scores(
 
 def make(name, flags):
     """Return a kernel of the file; no flag changes one."""
-    kernels = {"pool_scores": pool_scores, "fold_scores": fold_scores}
-    return (kernels | {"shift_scores": shift_scores, "candidate_scores": candidate_scores})[name]
+    return globals()[name]

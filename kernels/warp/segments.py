@@ -240,29 +240,18 @@ def functions(flags):
         line[place + 4] = rows[3]
         line[place + 5] = cost
 
-    return SimpleNamespace(split_scan=split_scan, merge_segments=merge_segments, move_ends=move_ends, fit_line=fit_line)
+    return SimpleNamespace(**locals())
 
 
 @functools.cache
 def make(name, flags):
     """Make a kernel of the file for a set of flags."""
-    types, made = precision(flags), functions(flags)
-    real, vec4 = types.real, types.vec4
+    made = functions(flags)
 
     # Split scans into segments: stop is the end of the segment that begins at a point, -1 at all other points. One
     # work-item takes a scan.
-    @kernel
-    def split_scans(
-        point: wp.array(dtype=vec4),
-        start: wp.array(dtype=wp.int32),
-        noise: wp.array(dtype=real),
-        cost: wp.array(dtype=real),
-        stop: wp.array(dtype=wp.int32),
-        scans: wp.int32,
-        points: wp.int32,
-        penalty: real,
-        gap: real,
-    ):
+    @kernel(flags)
+    def split_scans(point, start, noise, cost, stop, scans, points, penalty, gap):
         scan = wp.tid()
         if scan >= scans:
             return
@@ -278,18 +267,8 @@ def make(name, flags):
 
     # Fit lines to parts of scans: first point and number of points, which may go on at the scan's first point. One
     # work-item takes a part.
-    @kernel
-    def fit_segments(
-        point: wp.array(dtype=vec4),
-        start: wp.array(dtype=wp.int32),
-        noise: wp.array(dtype=real),
-        part: wp.array(dtype=wp.vec2i),
-        scan: wp.array(dtype=wp.int32),
-        line: wp.array(dtype=real),
-        scans: wp.int32,
-        points: wp.int32,
-        parts: wp.int32,
-    ):
+    @kernel(flags)
+    def fit_segments(point, start, noise, part, scan, line, scans, points, parts):
         k = wp.tid()
         if k >= parts:
             return
@@ -297,4 +276,4 @@ def make(name, flags):
         size = start[scan[k] + 1] - begin
         made.fit_line(point, begin, size, part[k][0], part[k][1], noise[scan[k]], line, LINE_NUMBERS * k)
 
-    return {"split_scans": split_scans, "fit_segments": fit_segments}[name]
+    return locals()[name]

@@ -37,4 +37,4 @@ def functions(flags):
         column = range_bin(expected, tables.per_metre, tables.cells, range_max)
         return sensor[range_bin(z, tables.per_metre, tables.cells, range_max) * (tables.cells + 1) + column]
 
-    return SimpleNamespace(range_bin=range_bin, tabulated_density=tabulated_density)
+    return SimpleNamespace(**locals())

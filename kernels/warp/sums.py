@@ -29,19 +29,8 @@ def make(name, flags):
     # All are added to a compensated total. BLOCK_TERMS numbers are read before any is added, so that a work-item waits
     # once for all of them; numbers beyond the last count as 0, which changes no sum. With SCANS each scan has a count
     # of its own; with STRANDED it is a count of readings, and the numbers are sums of their strands.
-    @kernel
-    def sum_parts(
-        parts: wp.array(dtype=real),
-        order: wp.array(dtype=wp.int32),
-        counts: wp.array(dtype=wp.int32),
-        constant_terms: wp.array(dtype=real),
-        log_p: wp.array(dtype=real),
-        particles: wp.int32,
-        count: wp.int32,
-        block: wp.int32,
-        score: types.Score,
-        batch: types.ScanBatch,
-    ):
+    @kernel(flags)
+    def sum_parts(parts, order, counts, constant_terms, log_p, particles, count, block, score, batch):
         place = work_item(wp.tid())
         if place >= particles:
             return
@@ -77,4 +66,4 @@ def make(name, flags):
         else:
             log_p[n] = score.temperature * (total.x + total.y)
 
-    return {"sum_parts": sum_parts}[name]
+    return locals()[name]

@@ -11,7 +11,7 @@ import functools
 
 import warp as wp
 
-from .prelude import kernel, loader, precision, writer
+from .prelude import kernel, loader, writer
 from .rungs import (
     DEPTH,
     NEVER,
@@ -41,20 +41,11 @@ sixteen = wp.types.vector(length=16, dtype=wp.float64)
 @functools.cache
 def make(name, flags):
     """Make a kernel of the file for a set of flags."""
-    real = precision(flags).real
 
     # Add a sensor's log-likelihoods times its temperature to the scores, which sensor 0 begins, and find the largest:
     # one work-item takes a block of particles.
-    @kernel
-    def add_scores(
-        log_p: wp.array(dtype=real),
-        settings: wp.array(dtype=wp.float64),
-        score: wp.array(dtype=wp.float64),
-        largest: wp.array(dtype=wp.float64),
-        particles: wp.int32,
-        block: wp.int32,
-        sensor: wp.int32,
-    ):
+    @kernel(flags)
+    def add_scores(log_p, settings, score, largest, particles, block, sensor):
         b = wp.tid()
         begin = b * block
         if begin >= particles:
@@ -70,13 +61,8 @@ def make(name, flags):
         largest[b] = high
 
     # Find the largest score of each fan blocks: one work-item takes a group of blocks.
-    @kernel
-    def join_scores(
-        scores: wp.array(dtype=wp.float64),
-        largest: wp.array(dtype=wp.float64),
-        blocks: wp.int32,
-        fan: wp.int32,
-    ):
+    @kernel(flags)
+    def join_scores(scores, largest, blocks, fan):
         g = wp.tid()
         begin = g * fan
         if begin < blocks:
@@ -84,21 +70,10 @@ def make(name, flags):
 
     # Sum the integer weights of each block on each rung, their squares, and the weights before: one work-item takes a
     # block. The first one writes the largest score.
-    @kernel
+    @kernel(flags)
     def weigh_particles(
-        score: wp.array(dtype=wp.float64),
-        before: wp.array(dtype=wp.float64),
-        largest: wp.array(dtype=wp.float64),
-        settings: wp.array(dtype=wp.float64),
-        state: wp.array(dtype=wp.float64),
-        sums: wp.array(dtype=wp.float64),
-        highest: wp.array(dtype=wp.float64),
-        particles: wp.int32,
-        block: wp.int32,
-        blocks: wp.int32,
-        groups: wp.int32,
-        stage: wp.int32,
-    ):
+        score, before, largest, settings, state, sums, highest, particles, block, blocks, groups, stage,
+    ):  # fmt: skip
         b = wp.tid()
         begin = b * block
         if begin >= particles:
@@ -131,14 +106,8 @@ def make(name, flags):
 
     # Add up each fan rows of sums, one after the other; a row becomes the sum of those before it in its group: one
     # work-item takes a column of a group.
-    @kernel
-    def join_rows(
-        sums: wp.array(dtype=wp.float64),
-        joined: wp.array(dtype=wp.float64),
-        rows: wp.int32,
-        columns: wp.int32,
-        fan: wp.int32,
-    ):
+    @kernel(flags)
+    def join_rows(sums, joined, rows, columns, fan):
         i = wp.tid()
         row = i / columns * fan
         if row >= rows:
@@ -161,25 +130,11 @@ def make(name, flags):
 
     # Choose the rung, and set the weights and their exact cumulative sums: one work-item takes a block. The one after
     # the last block writes the stage's state.
-    @kernel
+    @kernel(flags)
     def set_weights(
-        score: wp.array(dtype=wp.float64),
-        before: wp.array(dtype=wp.float64),
-        highest: wp.array(dtype=wp.float64),
-        sums: wp.array(dtype=wp.float64),
-        joined: wp.array(dtype=wp.float64),
-        totals: wp.array(dtype=wp.float64),
-        settings: wp.array(dtype=wp.float64),
-        state: wp.array(dtype=wp.float64),
-        weight: wp.array(dtype=wp.float64),
-        ends: wp.array(dtype=wp.float64),
-        particles: wp.int32,
-        block: wp.int32,
-        blocks: wp.int32,
-        fan: wp.int32,
-        stage: wp.int32,
-        stages: wp.int32,
-    ):
+        score, before, highest, sums, joined, totals, settings, state, weight, ends, particles, block, blocks, fan,
+        stage, stages,
+    ):  # fmt: skip
         b = wp.tid()
         if b > blocks:
             return

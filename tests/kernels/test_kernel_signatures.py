@@ -13,53 +13,57 @@ import numpy as np
 import pytest
 from support.kernel_scenes import PRECISIONS
 
+from gpusense.interface import sources
 from gpusense.interface.kernel_files import kernel_root, opencl_names, opencl_source, warp_module
-from gpusense.interface.signatures import KERNELS, Argument
+from gpusense.interface.signatures import KERNELS
+from gpusense.interface.sources import parameters, source_text
 
 each_kernel = pytest.mark.parametrize("kernel", list(KERNELS))
 
 
 @functools.cache
-def opencl_declarations() -> dict[str, list[tuple[str, str]]]:
-    """Return parameters and body of every kernel in the OpenCL files, by name; some have a second body for vectors."""
-    found: dict[str, list[tuple[str, str]]] = {}
+def opencl_bodies() -> dict[str, list[str]]:
+    """Return the bodies of every kernel in the OpenCL files, by name; some have a second body for vectors."""
+    found: dict[str, list[str]] = {}
     for file in opencl_names():
         text = opencl_source(file)
         for match in re.finditer(r"kernel void (\w+)\((.*?)\) \{(.*?)^\}", text, re.DOTALL | re.MULTILINE):
-            found.setdefault(match.group(1), []).append((match.group(2), match.group(3)))
+            assert match.group(2) == "ARGUMENTS", f"{file}.cl: {match.group(1)} writes its parameters itself"
+            found.setdefault(match.group(1), []).append(match.group(3))
     return found
 
 
-def opencl_argument(declaration: str) -> tuple[str, str, bool, bool]:
-    """Return name, type, whether an array, whether written, of one C parameter."""
-    match = re.fullmatch(r"(global )?(const )?(\w+) (\*)?(?:restrict )?(\w+)", " ".join(declaration.split()))
-    assert match is not None, declaration
-    space, constant, kind, pointer, name = match.groups()
-    assert bool(space) == bool(pointer)
-    assert pointer or constant, f"{name}: scalars are const"
-    return name, kind, bool(pointer), not constant
-
-
-def row_argument(argument: Argument) -> tuple[str, str, bool, bool]:
-    return argument.name, argument.type, argument.shape is not None, argument.output
-
-
 def test_every_opencl_kernel_has_a_row_and_every_row_a_kernel() -> None:
-    assert sorted(opencl_declarations()) == sorted(KERNELS)
+    assert sorted(opencl_bodies()) == sorted(KERNELS)
 
 
 @each_kernel
-def test_opencl_kernels_have_the_arguments_of_their_row(kernel: str) -> None:
-    for parameters, body in opencl_declarations()[kernel]:
-        assert [opencl_argument(one) for one in parameters.split(",")] == [
-            row_argument(argument) for argument in KERNELS[kernel].arguments
-        ]
+def test_opencl_kernels_have_the_axes_of_their_row(kernel: str) -> None:
+    for body in opencl_bodies()[kernel]:
         axes = {int(axis) for axis in re.findall(r"get_global_id\((\d)\)", body)}
         assert axes == set(range(len(KERNELS[kernel].launch)))
 
 
+def test_opencl_parameters_are_written_from_the_row() -> None:
+    assert parameters("sum_parts") == (
+        "global const real *parts, global const int *order, global const int *counts, global const real "
+        "*constant_terms, global real *log_p, const int particles, const int count, const int block, "
+        "const Score score, const ScanBatch batch"
+    )
+    assert "global const real2 *restrict ray, global real *restrict ranges, const Window window, const int " in (
+        parameters("cast_tiles")
+    )
+    assert f"kernel void cast_ranges({parameters('cast_ranges')}) {{" in source_text("ranges")
+
+
+def test_a_kernel_without_a_row_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sources, "opencl_source", lambda file: "kernel void fourth(ARGUMENTS) {\n}\n")
+    with pytest.raises(ValueError, match=r"^ranges.cl: a kernel must have a row in the signature table, got 'fourth'"):
+        source_text("ranges")
+
+
 def test_fifteen_kernels_have_a_second_body_in_lanes() -> None:
-    twice = {name for name, bodies in opencl_declarations().items() if len(bodies) > 1}
+    twice = {name for name, bodies in opencl_bodies().items() if len(bodies) > 1}
     assert twice == {
         "cast_ranges",
         "draw_particles",
@@ -119,6 +123,17 @@ def test_warp_kernels_have_the_arguments_of_their_row(
     # The last thread index runs fastest in Warp, the first axis of the row everywhere else.
     (indices,) = re.findall(r"^ *(.*) = (?:work_item\()?wp\.tid\(\)\)?$", inspect.getsource(made.func), re.MULTILINE)
     assert len(indices.split(",")) == len(row.launch)
+
+
+def test_a_warp_kernel_has_the_names_of_its_row(needs: Callable[[str], str]) -> None:
+    needs("warp")
+    prelude = warp_module("prelude")
+
+    def wrap_headings(poses, count):
+        pass
+
+    with pytest.raises(TypeError, match=r"^wrap_headings: parameters must be those of its row, got poses, count$"):
+        prelude.kernel()(wrap_headings)
 
 
 def test_both_languages_have_the_same_files() -> None:

@@ -71,7 +71,8 @@ class Kernel:
 
     A global size's first axis is rounded up to whole groups; the heavier a work-item, the smaller its group. Where a
     kernel is compiled for several lanes (WIDE), its groups have ``wide_group`` work-items, and with ``wide`` each of
-    them takes as many neighbours of the first axis as there are lanes.
+    them takes as many neighbours of the first axis as there are lanes. ``apart`` says that no two of its arrays share
+    memory, so a compiler need not read arguments again after a write.
     """
 
     file: str
@@ -80,6 +81,7 @@ class Kernel:
     group: int
     wide: bool = False
     wide_group: int = 1
+    apart: bool = False
 
 
 # Particles or beams of a work-item of such a kernel.
@@ -91,14 +93,22 @@ def lanes_of(flags: frozenset[str]) -> int:
     return LANES if "WIDE" in flags else 1
 
 
-def kernel(file: str, launch: str, *rows: str, group: int = 64, wide: bool = False, wide_group: int = 1) -> Kernel:
+def kernel(
+    file: str,
+    launch: str,
+    *rows: str,
+    group: int = 64,
+    wide: bool = False,
+    wide_group: int = 1,
+    apart: bool = False,
+) -> Kernel:
     """Return the kernel whose arguments are rows such as ``"out real parts [particles * features]"``."""
     arguments = []
     for row in rows:
         head, _, shape = row.partition("[")
         *output, kind, name = head.split()
         arguments.append(Argument(name, kind, shape.rstrip("]") if shape else None, output == ["out"]))
-    return Kernel(file, tuple(launch.split()), tuple(arguments), group, wide, wide_group)
+    return Kernel(file, tuple(launch.split()), tuple(arguments), group, wide, wide_group, apart)
 
 
 WINDOW = "Window window"

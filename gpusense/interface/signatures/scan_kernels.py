@@ -47,12 +47,13 @@ KERNELS: dict[str, Kernel] = {
     "cast_tiles": kernel(
         "ranges", "item", *_CAST, *POSES, "int order [particles]", "real2 ray [rays]",
         "out real ranges [particles * rays]", WINDOW, "int particles", "int rays", *_CASTING, "int spread",
+        apart=True,
     ),
     "beam_tiles": kernel(
         "beam", "item", *_CAST, *_NORMALS, *POSES, "int order [particles]", _CONES, "int first [rays + 1]",
         "real reading [readings]", *_TERMS, "int start [scans + 1]", "out real parts [readings * particles]", WINDOW,
         "int particles", "int rays", "int readings", "MixtureTables tables", "Cone cone", *_CASTING, "int spread",
-        "ScanBatch batch",
+        "ScanBatch batch", apart=True,
     ),
     "cast_echoes": kernel(
         "echo", "ray particle", *_CAST, *_NORMALS, *POSES, _CONES, "out real ranges [particles * rays]",

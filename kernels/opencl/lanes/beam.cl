@@ -46,13 +46,7 @@ typedef struct {
 #endif
 
 // Score scans: one work-item takes a particle, and its readings block by block.
-kernel void score_beams(global const entry *map_table, global const real2 *normals, global const int2 *pose_cell,
-                        global const real4 *pose, global const real2 *ray, global const int *first,
-                        global const real *reading, global const real *terms, global const real *edges,
-                        global const real *sensor, global const int *start, global const real *constant_terms,
-                        global real *log_p, global real *parts, const Window window, const int particles,
-                        const int rays, const int readings, const MixtureTables tables, const Cone cone,
-                        const Caster caster, const RangeScale scale, const Score score, const ScanBatch batch) {
+kernel void score_beams(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;
 #if SCANS

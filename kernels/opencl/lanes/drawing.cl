@@ -3,10 +3,7 @@
 // requires: lanes/types draws
 
 // A work-item takes LANES particles.
-kernel void draw_particles(global const double *source, global const double *weight, global const double *ends,
-                           global const double *copies, global const double *settings, global const double *state,
-                           global const double *pool, global double *target, global double *after,
-                           const int particles, const int drawn, const int stage) {
+kernel void draw_particles(ARGUMENTS) {
     const int first = LANES * get_global_id(0), last = min(first + LANES, drawn);
     global const double *own = state + stage * STAGE;
     const int copied = is_copied(own, particles, drawn), stratified = settings[STRATIFIED] > 0.0;

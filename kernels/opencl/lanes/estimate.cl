@@ -8,9 +8,7 @@
 double sum_in_order(const doubles a) { return ((((((a.s0 + a.s1) + a.s2) + a.s3) + a.s4) + a.s5) + a.s6) + a.s7; }
 
 // A work-item takes all lanes of a block. Lanes without a particle add zeros.
-kernel void sum_poses(global const double *poses, global const double *weight, global const double *estimate,
-                      global double *sums, const int particles, const int block, const int lanes,
-                      const int again) {
+kernel void sum_poses(ARGUMENTS) {
     const int b = get_global_id(0), begin = b * block;
     if (begin >= particles) return;
     global const double *reference = again ? estimate : poses;

@@ -151,11 +151,7 @@ __attribute__((noinline)) void refine_cells(EndPoints *ends, const real *most, c
 #endif
 
 // Score scans: one work-item takes TOGETHER particles, and the beams block by block.
-kernel void score_field(global const real *table, global const int2 *pose_cell, global const real4 *pose,
-                        global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
-                        global const real *terms, global const int *start, global const real *constant_terms,
-                        global real *log_p, global real *parts, const Window window, const int particles,
-                        const int readings, const real guard, const Score score, const ScanBatch batch) {
+kernel void score_field(ARGUMENTS) {
     const int item = get_global_id(0);
     if (item % ITEMS != 0) return;
 #if SCANS

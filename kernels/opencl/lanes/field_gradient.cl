@@ -13,12 +13,7 @@
                vload2(0, table + i[4]), vload2(0, table + i[5]), vload2(0, table + i[6]), vload2(0, table + i[7])))
 
 // A work-item takes LANES particles of one scan.
-kernel void field_gradient(global const real *table, global const int2 *pose_cell, global const real4 *pose,
-                           global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
-                           global const real *terms, global const int *start, global const real *constant_terms,
-                           global real *gradient, const Window window, const int particles, const int readings,
-                           const real guard, const real mount_x, const real mount_y, const real resolution,
-                           const Score score, const ScanBatch batch) {
+kernel void field_gradient(ARGUMENTS) {
     const int item = get_global_id(0);
 #if SCANS
     // No work-item has particles of two scans.

@@ -3,12 +3,7 @@
 // requires: lanes/landmark_grid
 
 // Sum log p over features: one work-item takes LANES particles. The last particle of all stands in for missing ones.
-kernel void score_features(global const real4 *landmark, global const real4 *normal, global const real4 *signature,
-                           global const int *start, global const int2 *pose_cell, global const real4 *pose,
-                           global const real4 *pose_low, global const real *feature, global const int *partner,
-                           global const real *terms, global const real2 *arcs, global real *log_p, global real *parts,
-                           global int *which, const Buckets buckets, const int landmarks, const int particles,
-                           const int features, const real share, const Score score) {
+kernel void score_features(ARGUMENTS) {
     const int first_particle = LANES * get_global_id(0);
     if (first_particle >= particles) return;
     real p[8][LANES];

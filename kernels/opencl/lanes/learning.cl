@@ -104,9 +104,7 @@ void add_pair_lanes(const lanes reading, const lanes expected_range, global cons
 }
 
 // Sum over blocks of pairs: one work-item takes a block, whose pairs are contiguous (along is 1) and fill all lanes.
-kernel void e_step(global const real *reading, global const real *expected, global const real *terms,
-                   global real *sums, const int blocks, const int readings, const int across, const int along,
-                   const int width) {
+kernel void e_step(ARGUMENTS) {
     const int block = get_global_id(0);
     if (block >= blocks) return;
     global const real *z = reading + (long)block * across, *z_star = expected + (long)block * across;

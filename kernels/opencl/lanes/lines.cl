@@ -4,9 +4,7 @@
 // Fit lines to LANES points and their neighbours. At most MOST points on either side.
 #define MOST 48
 #define WHOLE_TURN 6.283185307179586f
-kernel void fit_lines(global const real4 *point, global const int *start, global const int *which,
-                      global real4 *line, const int scans, const int points, const int chosen, const int reach,
-                      const int most, const real ratio, const real slack, const real width, const real gap) {
+kernel void fit_lines(ARGUMENTS) {
     const int begin = LANES * get_global_id(0), scan = which[get_global_id(1)];
     const int first = start[scan], count = start[scan + 1] - first;
     if (begin >= count) return;

@@ -75,8 +75,7 @@ void move_lanes(global const double *source, global const double *settings, glob
 }
 
 // A work-item takes LANES particles.
-kernel void move_particles(global const double *source, global const double *settings, global double *target,
-                           const int particles, const int kind) {
+kernel void move_particles(ARGUMENTS) {
     const int first = LANES * get_global_id(0), last = min(first + LANES, particles);
     for (int begin = first; begin < last; begin += DOUBLES)
         move_lanes(source, settings, target, begin, min(DOUBLES, last - begin), kind);

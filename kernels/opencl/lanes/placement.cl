@@ -112,9 +112,7 @@ void place_lanes(global const coordinate *poses, global int2 *pose_cell, global 
 }
 
 // A work-item takes LANES particles.
-kernel void place_poses(global const coordinate *poses, global int2 *pose_cell, global real4 *pose,
-                        global real4 *pose_low, global int *pose_status, const Frame frame, const Window window,
-                        const int particles) {
+kernel void place_poses(ARGUMENTS) {
     const int first = LANES * get_global_id(0), last = min(first + LANES, particles);
     for (int begin = first; begin < last; begin += DOUBLES)
         place_lanes(poses, pose_cell, pose, pose_low, pose_status, frame, window, begin, min(DOUBLES, last - begin));

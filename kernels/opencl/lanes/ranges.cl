@@ -5,9 +5,7 @@
 #define WORK_RAYS 16
 
 // Cast rays: one work-item takes a particle and WORK_RAYS rays.
-kernel void cast_ranges(global const entry *map_table, global const int2 *pose_cell, global const real4 *pose,
-                        global const real2 *ray, global real *ranges, const Window window, const int particles,
-                        const int rays, const Caster caster, const RangeScale scale) {
+kernel void cast_ranges(ARGUMENTS) {
     const int begin = WORK_RAYS * get_global_id(0), n = get_global_id(1);
     if (n >= particles) return;
     for (int first = begin; first < begin + WORK_RAYS && first < rays; first += LANES) {

@@ -3,9 +3,7 @@
 
 // Sum the cells of each item's points at all shifts by less than height rows and width columns. One work-item takes
 // LANES shifts of an item. A sum of 256 cells fits 16 bits.
-kernel void shift_scores(global const uchar *table, global const int2 *point, global const int *image,
-                         global const int *first, global int *score, const ScoreTable scores, const int items,
-                         const int height, const int width) {
+kernel void shift_scores(ARGUMENTS) {
     const int col = LANES * get_global_id(0), row = get_global_id(1), item = get_global_id(2);
     if (col >= width || row >= height || item >= items) return;
     const int size = padded_lines(scores) * padded_stride(scores), last = first[item + 1];

@@ -7,10 +7,7 @@ doubles tempered_lanes(const doubles score, const double largest, const double l
 }
 
 // A work-item takes a block; the first one writes the largest score.
-kernel void weigh_particles(global const double *score, global const double *before, global const double *largest,
-                            global const double *settings, global const double *state, global double *sums,
-                            global double *highest, const int particles, const int block, const int blocks,
-                            const int groups, const int stage) {
+kernel void weigh_particles(ARGUMENTS) {
     const int b = get_global_id(0), begin = b * block;
     if (begin >= particles) return;
     const double high = largest_of(largest, 0, groups), left = left_of(state, stage) * settings[DEPTH];
@@ -40,11 +37,7 @@ kernel void weigh_particles(global const double *score, global const double *bef
 
 // A work-item takes a block, and adds up its weights in the order of the particles. The one after the last block writes
 // the stage's state.
-kernel void set_weights(global const double *score, global const double *before, global const double *highest,
-                        global const double *sums, global const double *joined, global const double *totals,
-                        global const double *settings, global double *state, global double *weight,
-                        global double *ends, const int particles, const int block, const int blocks, const int fan,
-                        const int stage, const int stages) {
+kernel void set_weights(ARGUMENTS) {
     const int b = get_global_id(0), begin = b * block;
     if (b > blocks) return;
     const double scale = settings[SCALE], left = left_of(state, stage), high = possible_of(totals, highest[0]);

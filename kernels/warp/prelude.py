@@ -33,7 +33,7 @@ def kernel(flags=frozenset(), entry=None):
 
     Args:
         flags: Flags of the kernel's code, which say what real, coordinate and measured are.
-        entry: What an entry of the map's table is, for kernels that cast rays.
+        entry: The type of an entry of the map's table, where the kernel casts rays.
 
     Raises:
         TypeError: the parameters' names are not those of the row.

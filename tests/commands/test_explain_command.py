@@ -1,4 +1,4 @@
-"""``gpusense explain``: the report of ``model.explain()``, for the built-in scene and for a map and a log; bad input."""
+"""``gpusense explain``: the report of ``model.explain()``, of the built-in scene, and of a map and a log; bad input."""
 
 from __future__ import annotations
 

@@ -2,8 +2,9 @@
 
 Polynomials of least largest relative error of the function (Remez's exchange): e^r = 1 + r + r^2 E(r) for
 |r| <= log(2)/2, judged by e^r - 1; log(1 + f) = f - f^2/2 + f^3 L(f) for 1 + f from sqrt(1/2) to sqrt(2);
-erf(x) = 1 - exp(-x W(x)) for x up to 4; arctan t = t + t^3 A(t^2) for t up to tan(pi/8). log 2 is cut into a part that
-has products with counts without rounding and the rest.
+erf(x) = 1 - exp(-x W(x)) for x up to 4, judged by erf; log erfc(x) = -x V(x) for x up to 4, judged by
+1 - log(erfc(x) / 2); arctan t = t + t^3 A(t^2) for t up to tan(pi/8). log 2 is cut into a part that has products with
+counts without rounding and the rest.
 """
 
 from __future__ import annotations
@@ -62,6 +63,13 @@ def error_function() -> tuple[list[float], float]:
     return rounded_polynomial(lambda x: -mp.log(mp.erfc(x)) / x, lambda x: x * mp.erfc(x) / mp.erf(x), zero, ERF_ONE, 9)
 
 
+def log_complement() -> tuple[list[float], float]:
+    """Return V and its error."""
+    return rounded_polynomial(
+        lambda x: -mp.log(mp.erfc(x)) / x, lambda x: x / (1 - mp.log(mp.erfc(x) / 2)), mp.mpf(0), ERF_ONE, 10
+    )
+
+
 def arc() -> tuple[list[float], float]:
     """Return A and its error."""
     return rounded_polynomial(
@@ -78,7 +86,8 @@ def log_parts() -> list[float]:
 
 def main() -> None:
     """Print everything."""
-    for name, (powers, error) in (("E", exponential()), ("L", logarithm()), ("W", error_function()), ("A", arc())):
+    made = {"E": exponential(), "L": logarithm(), "W": error_function(), "V": log_complement(), "A": arc()}
+    for name, (powers, error) in made.items():
         print(name, ", ".join(f"{c:.9g}f" for c in powers), f"relative error 2^{error:.1f}")
     print("log 2 in parts, and 1 / log 2", *(f"{part:.9g}f" for part in log_parts()))
 

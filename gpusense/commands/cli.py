@@ -18,8 +18,8 @@ from gpusense.commands import signals
 
 # Modules of gpusense.commands, in the order of the help.
 COMMANDS = (
-    "devices", "selftest", "demo", "simulate", "map", "score", "localize", "fit", "match", "likelihood-map",
-    "features", "landmarks", "sweep", "bench",
+    "devices", "selftest", "demo", "explain", "simulate", "map", "score", "localize", "fit", "match",
+    "likelihood-map", "features", "landmarks", "sweep", "bench",
 )  # fmt: skip
 
 BAD_INPUT = 2

@@ -73,12 +73,17 @@ class Score:
         return 1 + int((self.log_p[:-1] > self.log_p[-1]).sum())
 
 
+def make_world(seed: int) -> tuple[OccupancyGrid, Scanner]:
+    """Make a building and the scanner that measures in it."""
+    first, step = -math.radians(FIELD_OF_VIEW) / 2, math.radians(FIELD_OF_VIEW) / (BEAMS - 1)
+    scanner = Scanner.uniform(angle_min=first, angle_increment=step, count=BEAMS, range_max=RANGE_MAX)
+    return worlds.building(seed, SIZE), scanner
+
+
 def make_scene(seed: int, particles: int, beams: int) -> Scene:
     """Make a building, a scan drawn from the beam model at a free pose, and a cloud of particles."""
     rng = np.random.default_rng(seed)
-    grid = worlds.building(seed, SIZE)
-    first, step = -math.radians(FIELD_OF_VIEW) / 2, math.radians(FIELD_OF_VIEW) / (BEAMS - 1)
-    scanner = Scanner.uniform(angle_min=first, angle_increment=step, count=BEAMS, range_max=RANGE_MAX)
+    grid, scanner = make_world(seed)
     truth = worlds.free_pose(grid, rng)
     ranges = worlds.simulate_scan(grid, scanner, truth, BeamParameters(), rng)
     around = worlds.cloud_around(truth, particles // 2, SIGMA_XY, SIGMA_THETA, rng)

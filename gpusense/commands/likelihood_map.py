@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import (
@@ -16,12 +15,9 @@ from gpusense.commands.arguments import (
     whole_number,
 )
 from gpusense.commands.output import print_json, print_table
-from gpusense.commands.scans import add_log, options_named
+from gpusense.commands.scans import add_log, read_scan
 from gpusense.commands.signals import code_of, word_of
 from gpusense.evaluation.machine import machine
-
-if TYPE_CHECKING:
-    from gpusense.logs import Scan
 
 NAME = "likelihood-map"
 HELP = "Draw the likelihood of a scan over all positions and headings of a map."
@@ -72,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     from gpusense.world.map_files import read_map
 
     grid = read_map(args.map)
-    scan = _scan(args)
+    scan = read_scan(args)
     kind = BeamModel if args.model == "beam" else LikelihoodFieldModel
     model = kind(grid, scan.scanner, backend=args.backend, beams=args.beams, temperature=args.temperature)
     result, tiles = prepare_tiles(
@@ -104,20 +100,3 @@ def run(args: argparse.Namespace) -> int:
         sys.stderr.write(f"gpusense: {word_of(stopped)}: {100 * done:.0f}% of the positions are done\n")
         return code_of(stopped)
     return 0
-
-
-def _scan(args: argparse.Namespace) -> Scan:
-    """Return the scan of the log that the arguments choose.
-
-    Raises:
-        ValueError: the log has fewer scans.
-    """
-    from gpusense.logs.several import read_laser
-
-    index = 0
-    with options_named():
-        for scan in read_laser(args.log, args.topic, range_max=args.range_max, mount=args.mount):
-            if index == args.scan:
-                return scan
-            index += 1
-    raise ValueError(f"--scan: must be below the log's number of scans, {index}, got {args.scan}")

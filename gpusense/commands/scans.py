@@ -91,6 +91,24 @@ def read_scans(args: argparse.Namespace, *, posed: bool = True) -> list[tuple[in
     return (with_poses if posed else with_one_scanner)(scans, args.log)
 
 
+def read_scan(args: argparse.Namespace) -> Scan:
+    """Read the scan ``--scan`` of ``--log``, the first one by default.
+
+    Raises:
+        FileNotFoundError: the log is missing.
+        ValueError: the log breaks its format, or has fewer scans.
+    """
+    from gpusense.logs.several import read_laser
+
+    wanted, index = args.scan or 0, 0
+    with options_named():
+        for scan in read_laser(args.log, args.topic, range_max=args.range_max, mount=args.mount):
+            if index == wanted:
+                return scan
+            index += 1
+    raise ValueError(f"--scan: must be below the log's number of scans, {index}, got {wanted}")
+
+
 def read_scans_of_lasers(args: argparse.Namespace) -> tuple[list[tuple[int, Scan]], list[int]]:
     """Read the chosen scans of the lasers of ``--topic`` in the order of their times, and the laser of each.
 

@@ -15,11 +15,11 @@ from gpusense.commands.arguments import (
     add_seed,
     add_temperature,
     not_negative_number,
-    number,
     output_path,
     positive_number,
     whole_number,
 )
+from gpusense.commands.model_options import add_model, add_parameters, parameters_of
 from gpusense.commands.output import TableStream
 from gpusense.commands.scans import add_log, add_reference, read_scans
 from gpusense.commands.score_report import number_text, pose_name, print_report
@@ -61,17 +61,6 @@ _COLUMNS = {
     "scan": 5, "backend": 10, "rank": 7, "percentile": 10, "error [m]": 9, "error [rad]": 11, "effective": 9,
     "beams": 5,
 }  # fmt: skip
-_SHARED = ("z_hit", "z_max", "z_rand", "sigma_hit")
-_SPECIFIC = {"beam": ("z_short", "lambda_short"), "field": ("max_distance", "interpolation")}
-_MEANING = {
-    "z_hit": "weight of a correct range with noise",
-    "z_max": "weight of 'no return'",
-    "z_rand": "weight of a random reading; the weights must sum to 1",
-    "sigma_hit": "deviation of a correct range, or of an end point from a wall [m]",
-    "z_short": "weight of an unexpected obstacle; beam model only",
-    "lambda_short": "rate of unexpected obstacles along a beam [1/m]; beam model only",
-    "max_distance": "largest distance to an obstacle that counts [m]; field only",
-}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -81,10 +70,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
     add_log(parser, "a log with corrected poses, or any with --reference")
     add_reference(parser)
-    add("--model", choices=("beam", "field"), default="beam", help="measurement model (default: %(default)s)")
+    add_model(parser)
     add("--backend", action="append", metavar="DEVICE",
         help=f"{BACKEND_HELP}; may be repeated to compare rankings (default: auto)")  # fmt: skip
-    add("--precision", choices=("float32", "float64"), default="float32", help="precision (default: %(default)s)")
     add("--particles", type=whole_number(low=2), default=20_000, metavar="N", help="per scan (default: %(default)s)")
     add("--sigma-position", type=not_negative_number, default=0.5, metavar="M",
         help="deviation of the particles around the logged pose, in x and in y [m] (default: %(default)s)")  # fmt: skip
@@ -98,12 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')")  # fmt: skip
     add("--beams", type=whole_number(low=1), metavar="B", help="thin each scan evenly to B beams (default: all)")
     add_temperature(parser, "auto: calibrated from the chosen scans")
-    group = parser.add_argument_group("parameters of the model")
-    group.add_argument("--parameters", "--params", type=Path, metavar="YAML",
-        help="a file with beam_model, such as 'gpusense fit --out' writes; beam model only")  # fmt: skip
-    for name, meaning in _MEANING.items():
-        group.add_argument(_option(name), type=number, metavar="X", help=meaning)
-    group.add_argument("--interpolation", choices=("nearest", "bilinear"), help="look-up of the field; field only")
+    add_parameters(parser)
     add_seed(parser)
     add_json(parser)
     add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
@@ -182,27 +165,16 @@ def make_models(args: argparse.Namespace, grid: OccupancyGrid, scans: list[tuple
     from gpusense.evaluation.fitness import temperature_of_log
     from gpusense.models.scan.beam import BeamModel
     from gpusense.models.scan.field import LikelihoodFieldModel
-    from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
+    from gpusense.world.parameters import BeamParameters
 
-    options = {name: getattr(args, name) for name in (*_SHARED, *_SPECIFIC["beam"], *_SPECIFIC["field"])}
-    changes = {name: value for name, value in options.items() if value is not None}
-    for name in changes:
-        if name not in (*_SHARED, *_SPECIFIC[args.model]):
-            raise ValueError(f"{_option(name)}: must be a parameter of the {args.model} model, got another model's")
-    beam = BeamParameters()
-    if args.parameters is not None:
-        if args.model != "beam":
-            raise ValueError(f"--parameters: must be left out with the field, got {args.parameters}")
-        from gpusense.commands.parameter_files import read_beam_parameters
-
-        beam = read_beam_parameters(args.parameters)
+    parameters = parameters_of(args)
     scanner, backends = scans[0][1].scanner, args.backend or ["auto"]
 
     def make(backend: str, temperature: float) -> Model:
         common = {"backend": backend, "precision": args.precision, "temperature": temperature, "beams": args.beams}
-        if args.model == "beam":
-            return BeamModel(grid, scanner, beam.replace(**changes), **common)
-        return LikelihoodFieldModel(grid, scanner, LikelihoodFieldParameters().replace(**changes), **common)
+        if isinstance(parameters, BeamParameters):
+            return BeamModel(grid, scanner, parameters, **common)
+        return LikelihoodFieldModel(grid, scanner, parameters, **common)
 
     temperature = args.temperature
     if temperature == "auto":
@@ -212,7 +184,3 @@ def make_models(args: argparse.Namespace, grid: OccupancyGrid, scans: list[tuple
         model = make(backend, temperature)
         models.setdefault(model.device.selection, model)
     return list(models.values())
-
-
-def _option(name: str) -> str:
-    return f"--{name.replace('_', '-')}"

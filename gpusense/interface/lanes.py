@@ -9,10 +9,11 @@ _NEVER: dict[str, frozenset[str]] = {
     "e_step": _SCALAR - {"FLOAT64"},
     "score_beams": frozenset(),
     "score_field": frozenset({"ALL_READINGS"}),
-    "score_features": _SCALAR | {"SIGNATURE", "FIELD", "MARGINAL", "PER_BEAM", "LINE"},
+    "score_features": _SCALAR | {"LINE"},
 }
 _NEEDED: dict[str, tuple[set[str], ...]] = {
     "cast_ranges": (set(),),
+    "count_unseen": (set(),),
     "draw_particles": (set(),),
     "e_step": (set(),),
     "field_gradient": ({"LINEAR"},),
@@ -20,7 +21,9 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
     "match_scans": (set(),),
     "move_particles": (set(),),
     "place_poses": (set(),),
+    "score_beacons": (set(),),
     "score_beams": (set(),),
+    "score_contact": (set(),),
     "score_features": ({"RANGE"}, {"BEARING"}),
     "score_field": (set(),),
     "set_weights": (set(),),

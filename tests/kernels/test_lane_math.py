@@ -88,6 +88,15 @@ def test_arc_rest_is_below_a_fifth_of_the_last_bit(evaluate):
     assert off.max() <= 0.2
 
 
+def test_the_log_of_erfc_is_within_two_eps(evaluate):
+    """In eps (1 + |log(erfc(x) / 2)|), the size of the terms of a bumper."""
+    x = spread(1e-30, 4.0)
+    exact = np.log(special.erfc(x.astype(np.float64)))
+    off = np.abs(evaluate("log_erfc_lanes", x) - exact) / (1 + np.log(2) - exact) / np.finfo(np.float32).eps
+    print(f"log_erfc_lanes: {off.max():.3f} eps at {x[int(np.argmax(off))]!r}")
+    assert off.max() <= 2
+
+
 def test_ends(evaluate):
     """Exact values, far arguments, and none that depends on a neighbour."""
 
@@ -120,8 +129,8 @@ def derived() -> ModuleType:
 def test_constants_are_those_that_were_derived():
     made, expected = derived(), {}
     with mp.workdps(50):
-        polynomials = (made.exponential(), made.logarithm(), made.error_function(), made.arc())
-        for name, (powers, error) in zip("ELWA", polynomials, strict=True):
+        polynomials = (made.exponential(), made.logarithm(), made.error_function(), made.arc(), made.log_complement())
+        for name, (powers, error) in zip("ELWAV", polynomials, strict=True):
             assert error < -24
             expected |= {f"{name}{i}": powers[i] for i in range(len(powers))}
         expected |= dict(zip(("LOG2_HIGH", "LOG2_LOW", "ONE_OVER_LOG2"), made.log_parts(), strict=True))

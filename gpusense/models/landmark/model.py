@@ -13,6 +13,7 @@ from gpusense._util.typing import AnyArray, Association, Precision
 from gpusense.backends import Selection
 from gpusense.backends.base import Buffer
 from gpusense.interface.flags import flags_if
+from gpusense.interface.lanes import widened
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission
 from gpusense.interface.structs import Buckets, SensorView
@@ -215,8 +216,9 @@ class LandmarkModel(FeatureModel):
         if not self.negative:
             return ()
         p = self.parameters
+        flags = widened(self._backend.info.lanes, "count_unseen", self._flags)
         return (launch(
-            "count_unseen", self._flags, (placed.count,), landmark=self._tables.landmark, start=self._tables.start,
+            "count_unseen", flags, (placed.count,), landmark=self._tables.landmark, start=self._tables.start,
             pose_cell=placed.cell, pose=placed.pose, pose_low=placed.low, which=which, log_p=log_p,
             buckets=Buckets(*self._buckets.shape, self._buckets.resolution), particles=placed.count, features=features,
             view=SensorView(

@@ -15,6 +15,7 @@ from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
 from gpusense.interface.constants import BEACON, BEACON_TERMS, FARTHEST, NORMAL, STUDENT_T, TWO_NORMALS
 from gpusense.interface.flags import flags_if
+from gpusense.interface.lanes import widened
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission, share
 from gpusense.interface.terms import log_weight
@@ -108,13 +109,14 @@ class BeaconModel(PointModel):
             return cast(np.ndarray, self._score(poses, out, None, left_out))
 
         (origin_x, origin_y), (mount_x, mount_y) = self._origin, self.parameters.mount
+        flags = widened(self._backend.info.lanes, "score_beacons", self._flags)
 
         def program(some: Poses, part: Part, log_p: Buffer) -> Program:
             middle = dict(origin_x=origin_x, origin_y=origin_y, mount_x=mount_x, mount_y=mount_y)
             place, placing = self._relative(some, part, "place_relative", middle)
             particles = part[1] - part[0]
             score = launch(
-                "score_beacons", self._flags, (particles,), place=place,
+                "score_beacons", flags, (particles,), place=place,
                 beacon=self._workspace.upload("beacon", beacon), terms=self._terms_buffer, series=self._series_buffer,
                 log_p=log_p, particles=particles, beacons=count, count=self._count, kind=self._kind,
                 temperature=self.temperature,

@@ -283,6 +283,20 @@ class ScanModel(Pickled):
         Raises:
             RuntimeError: ``measure`` before any call with a reading that depends on the pose.
         """
+        return str(self.plan(measure=measure))
+
+    def plan(self, *, measure: bool = False) -> Plan:
+        """Return the report of :meth:`explain` as data.
+
+        Args:
+            measure: As in :meth:`explain`.
+
+        Returns:
+            The title, the flags of the code, and the parts that are left out, kept, and could go.
+
+        Raises:
+            RuntimeError: as :meth:`explain`.
+        """
         title, omissions, kept, could_go = self._notes()
         plan = self._plan(title, omissions, kept, could_go)
         if measure:
@@ -292,7 +306,7 @@ class ScanModel(Pickled):
                     self.scanner.count,
                 )  # fmt: skip
             plan = dataclasses.replace(plan, measured=savings)
-        return str(plan)
+        return plan
 
     def sources(self) -> dict[str, str]:
         """Return the text of the kernels that score a scan, as compiled for the last call.

@@ -13,37 +13,75 @@ real2 ends_of_lanes(const lanes a) {
     return ends;
 }
 
-// Update the best log densities by one more landmark, and the squared radius within which another may be likelier.
-void with_landmark_lanes(const real4 landmark, const LanePlace place, const LanePlace turned, const lanes end_x,
-                         const lanes end_y, global const real *feature, global const real *terms, lanes *best,
-                         lanes *most) {
+// Results of a search: the log densities, of the likeliest landmarks or with MARGINAL of all of them; the log densities
+// of the likeliest ones, and their indices. With MARGINAL sum is the sum of densities relative to log_p. most is the
+// squared radius around an end point within which another landmark may be likelier.
+typedef struct {
+    lanes log_p, best, most;
+    ilanes chosen;
+    LanePair sum;
+} MatchLanes;
+
+// Update the matches by one more landmark in those lanes that see it. Of equally likely ones the first counts.
+void with_density_lanes(MatchLanes *match, const ilanes seen, const lanes log_p, const int j) {
+#if MARGINAL
+    const ilanes taken = seen & (log_p > -INFINITY), larger = taken & (log_p > match->log_p + RELATIVE);
+    const lanes other = exp_lanes(larger ? match->log_p - log_p : log_p - match->log_p);
+    const LanePair more = two_sum_lanes(match->sum.hi, other);
+    const lanes high = larger ? match->sum.hi * other + 1 : more.hi;
+    const lanes low = larger ? match->sum.lo * other : match->sum.lo + more.lo;
+    match->sum = (LanePair){taken ? high : match->sum.hi, taken ? low : match->sum.lo};
+    match->log_p = larger ? log_p : match->log_p;
+#endif
+    const ilanes better = seen & ((log_p > match->best) | ((log_p == match->best) & (j < match->chosen)));
+    match->best = better ? log_p : match->best;
+    match->chosen = better ? (ilanes)j : match->chosen;
+}
+
+// Update the matches by landmark j, where it lies in a feature's disc, within the limits of the sensor that the feature
+// does not measure, and may be likelier than the best so far.
+void with_landmark_lanes(MatchLanes *match, global const real4 *landmark, global const real4 *signature, const int j,
+                         const LanePlace place, const LanePlace turned, const lanes end_x, const lanes end_y,
+                         global const real *feature, global const real *terms) {
     // The disc has room for these rounding errors.
-    const lanes apart_x = landmark.x - end_x, apart_y = landmark.y - end_y;
+    const real4 here = landmark[j];
+    const lanes apart_x = here.x - end_x, apart_y = here.y - end_y;
     const lanes apart = apart_x * apart_x + apart_y * apart_y;
-    if (!any_lane(apart <= *most)) return;
+    if (!any_lane(apart <= match->most)) return;
     const float hole = feature[HOLE] * feature[HOLE], farthest = feature[FARTHEST] * feature[FARTHEST];
-    const LanePlace off = offset_lanes(landmark, place);
+    const LanePlace off = offset_lanes(here, place);
     const lanes squared = off.x.hi * off.x.hi + off.y.hi * off.y.hi;
-    const ilanes seen = (apart <= *most) & (squared >= hole) & (squared <= farthest);
+    ilanes seen = (apart <= match->most) & (squared >= hole) & (squared <= farthest);
+#if FIELD
+    seen &= turned.x.hi * off.x.hi + turned.y.hi * off.y.hi >= feature[AXIS] * sqrt(squared);
+#endif
     if (!any_lane(seen)) return;
-    const lanes log_p = log_detection_lanes(off, turned, feature, terms);
-    *best = (seen & (log_p > *best)) ? log_p : *best;
+#if SIGNATURE
+    const real4 known = signature[j];
+#else
+    const real4 known = 0;
+#endif
+    with_density_lanes(match, seen, log_detection_lanes(off, turned, feature, known, terms), j);
+#if !MARGINAL
     const float reach = feature[REACH];
     if (reach > 0 && reach == feature[RANGE_AT]) {
-        const lanes rest = feature[MOST] - *best, root = sqrt(rest > 0 ? rest : (lanes)0);
+        const lanes rest = feature[MOST] - match->best, root = sqrt(rest > 0 ? rest : (lanes)0);
         const lanes r = root * feature[RANGE_SPREAD], b = root * feature[BEARING_SPREAD];
         const lanes far = 1.01f * (r * r + reach * (reach + r) * (b * b)) + feature[SLACK];
-        *most = far < *most ? far : *most;
+        match->most = far < match->most ? far : match->most;
     }
+#endif
 }
 
 // Search the landmarks of some buckets. The landmark nearest to (x, y), the middle of the end points, comes first:
-// after it most others are too far to be likelier.
-void search_buckets_lanes(global const real4 *landmark, global const int *start, const int4 buckets, const int cols,
-                          const float x, const float y, const LanePlace place, const LanePlace turned,
-                          const lanes end_x, const lanes end_y, global const real *feature, global const real *terms,
-                          lanes most, lanes *best) {
+// after it most others are too far to be likelier. Sums have the order of the landmarks, which does not depend on the
+// other lanes.
+void search_buckets_lanes(MatchLanes *match, global const real4 *landmark, global const real4 *signature,
+                          global const int *start, const int4 buckets, const int cols, const float x, const float y,
+                          const LanePlace place, const LanePlace turned, const lanes end_x, const lanes end_y,
+                          global const real *feature, global const real *terms) {
     int nearest = -1;
+#if !MARGINAL
     float least = INFINITY;
     for (int row = buckets.z; row <= buckets.w; ++row) {
         const int last = start[row * cols + buckets.y + 1];
@@ -54,12 +92,13 @@ void search_buckets_lanes(global const real4 *landmark, global const int *start,
         }
     }
     if (nearest < 0) return;
-    with_landmark_lanes(landmark[nearest], place, turned, end_x, end_y, feature, terms, best, &most);
+    with_landmark_lanes(match, landmark, signature, nearest, place, turned, end_x, end_y, feature, terms);
+#endif
     for (int row = buckets.z; row <= buckets.w; ++row) {
         const int last = start[row * cols + buckets.y + 1];
         for (int j = start[row * cols + buckets.x]; j < last; ++j)
-            if (j != nearest) with_landmark_lanes(landmark[j], place, turned, end_x, end_y, feature, terms, best,
-                                                  &most);
+            if (j != nearest)
+                with_landmark_lanes(match, landmark, signature, j, place, turned, end_x, end_y, feature, terms);
     }
 }
 
@@ -71,34 +110,44 @@ int4 touched_buckets(const real2 x, const real2 y, const float radius, const Buc
     return (int4)(left, right, low, bucket_at(y.y + radius, buckets.size, buckets.rows));
 }
 
-// Return the log densities of the likeliest landmarks. Where the discs of all particles touch few more buckets together
-// than each disc alone, the particles search together, else one after the other. A lane has the same bits in both
-// cases.
-lanes search_lanes(global const real4 *landmark, global const int *start, const LanePlace place, const LanePlace turned,
-                   global const real *feature, global const real *terms, const Buckets buckets) {
+// Return the matches of a feature. Where the discs of all particles touch few more buckets together than each disc
+// alone, the particles search together, else one after the other. A lane has the same bits in both cases.
+MatchLanes search_lanes(global const real4 *landmark, global const real4 *signature, global const int *start,
+                        const LanePlace place, const LanePlace turned, global const real *feature,
+                        global const real *terms, const Buckets buckets) {
     const real radius = feature[RADIUS];
-    lanes best = -INFINITY;
-    if (radius < 0) return best;
+    MatchLanes match = {-INFINITY, -INFINITY, -1, -1, {0, 0}};
+    if (radius < 0) return match;
     const lanes end_x = place.x.hi + feature[REACH] * turned.x.hi, end_y = place.y.hi + feature[REACH] * turned.y.hi;
     const real2 x = ends_of_lanes(end_x), y = ends_of_lanes(end_y);
     const int4 all = touched_buckets(x, y, radius, buckets);
     const int across = min((int)(2 * fmin(radius, buckets.size * buckets.cols) / buckets.size) + 2, buckets.cols);
     const int up = min((int)(2 * fmin(radius, buckets.size * buckets.rows) / buckets.size) + 2, buckets.rows);
-    const lanes most = radius * radius;
     if ((long)(all.y - all.x + 1) * (all.w - all.z + 1) <= TOGETHER * (long)across * up) {
-        search_buckets_lanes(landmark, start, all, buckets.cols, 0.5f * (x.x + x.y), 0.5f * (y.x + y.y), place, turned,
-                             end_x, end_y, feature, terms, most, &best);
-        return best;
+        match.most = radius * radius;
+        search_buckets_lanes(&match, landmark, signature, start, all, buckets.cols, 0.5f * (x.x + x.y),
+                             0.5f * (y.x + y.y), place, turned, end_x, end_y, feature, terms);
+    } else {
+        real each_x[LANES], each_y[LANES];
+        store_lanes(end_x, 0, each_x);
+        store_lanes(end_y, 0, each_y);
+        for (int i = 0; i < LANES; ++i) {
+            const int4 touched = touched_buckets((real2)each_x[i], (real2)each_y[i], radius, buckets);
+            const ilanes active = (ilanes)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15) == i;
+            // No squared distance is negative, so the other lanes find nothing.
+            match.most = active ? (lanes)(radius * radius) : (lanes)-1;
+            search_buckets_lanes(&match, landmark, signature, start, touched, buckets.cols, each_x[i], each_y[i], place,
+                                 turned, end_x, end_y, feature, terms);
+        }
     }
-    real each_x[LANES], each_y[LANES];
-    store_lanes(end_x, 0, each_x);
-    store_lanes(end_y, 0, each_y);
-    for (int i = 0; i < LANES; ++i) {
-        const int4 touched = touched_buckets((real2)each_x[i], (real2)each_y[i], radius, buckets);
-        const ilanes active = (ilanes)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15) == i;
-        // No squared distance is negative, so the other lanes find nothing.
-        search_buckets_lanes(landmark, start, touched, buckets.cols, each_x[i], each_y[i], place, turned, end_x, end_y,
-                             feature, terms, active ? most : (lanes)-1, &best);
+#if MARGINAL
+    const ilanes any_found = match.log_p > -INFINITY;
+    if (any_lane(any_found)) {
+        const lanes sum = match.sum.hi + match.sum.lo;
+        match.log_p = any_found ? match.log_p + log_lanes(any_found ? sum : (lanes)1) : match.log_p;
     }
-    return best;
+#else
+    match.log_p = match.best;
+#endif
+    return match;
 }

@@ -1,5 +1,5 @@
-// Likelihood of a set of features for LANES particles at once: score_features of landmark_score.cl, for a partner that
-// is KNOWN or the likeliest one. Sums have the order of the scalar kernel.
+// Likelihood of a set of features for LANES particles at once: score_features of landmark_score.cl. Sums have the order
+// of the scalar kernel.
 // requires: lanes/landmark_grid
 
 // Sum log p over features: one work-item takes LANES particles. The last particle of all stands in for missing ones.
@@ -24,12 +24,32 @@ kernel void score_features(ARGUMENTS) {
             global const real *numbers = feature + FEATURE * k;
             const LanePlace turned = direction_lanes(heading, numbers);
 #if KNOWN
-            const lanes detected = log_detection_lanes(offset_lanes(landmark[partner[k]], place), turned, numbers,
-                                                       terms);
+            const int j = partner[k];
+#if SIGNATURE
+            const real4 known = signature[j];
 #else
-            const lanes detected = search_lanes(landmark, start, place, turned, numbers, terms, buckets);
+            const real4 known = 0;
 #endif
-            const lanes value = either_lanes(detected, numbers[FALSE_POSITIVE]);
+            const lanes detected =
+                log_detection_lanes(offset_lanes(landmark[j], place), turned, numbers, known, terms);
+#else
+            const MatchLanes match =
+                search_lanes(landmark, signature, start, place, turned, numbers, terms, buckets);
+            const lanes detected = match.log_p + share;
+#endif
+            const lanes value = either_lanes(detected, (lanes)numbers[FALSE_POSITIVE]);
+#if PER_BEAM
+#if KNOWN
+            const ilanes chosen = j;
+#else
+            const ilanes chosen = match.best + share >= numbers[FALSE_POSITIVE] ? match.chosen : (ilanes)-1;
+#endif
+            for (int i = 0; i < LANES && first_particle + i < particles; ++i) {
+                const long at = (long)(first_particle + i) * features + k;
+                parts[at] = ((const real *)&value)[i];
+                which[at] = ((const int *)&chosen)[i];
+            }
+#endif
             const ilanes zero = !(value > -INFINITY);
             impossible |= zero;
             block += zero ? (lanes)0 : value;
@@ -38,10 +58,5 @@ kernel void score_features(ARGUMENTS) {
         total = (LanePair){sum.hi, total.lo + sum.lo};
     }
     const lanes all = impossible ? (lanes)-INFINITY : score.temperature * (total.hi + total.lo);
-    if (first_particle + LANES <= particles) {
-        store_lanes(all, 0, log_p + first_particle);
-    } else {
-        store_lanes(all, 0, p[0]);
-        for (int i = 0; first_particle + i < particles; ++i) log_p[first_particle + i] = p[0][i];
-    }
+    store_some(all, log_p + first_particle, particles - first_particle);
 }

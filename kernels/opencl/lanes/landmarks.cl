@@ -1,13 +1,7 @@
-// Density of one feature at one landmark for LANES particles at once: landmarks.cl, offsets.cl and log_terms.cl in
-// lanes, for features that have ranges and bearings and are seen all around. Every lane has the arithmetic of the
-// scalar kernel, except that exp, log and erf are those of lanes/math, that the arc tangent has two arcs only, 0 and
-// pi/4, and that a fused multiply-add gives the rounding error of a product.
-// requires: landmarks lanes/error_free lanes/math
-
-// A place, an offset or a direction in each lane.
-typedef struct {
-    LanePair x, y;
-} LanePlace;
+// Density of one feature at one landmark for LANES particles at once: landmarks.cl in lanes. Every lane has the
+// arithmetic of the scalar kernel, except that exp, log and erf are those of lanes/math, that the arc tangent has two
+// arcs only, 0 and pi/4, and that a fused multiply-add gives the rounding error of a product.
+// requires: landmarks lanes/offsets lanes/log_terms
 
 // tan(pi/8); pi/4, pi/2 and pi as sums of two numbers.
 #define EIGHTH_SLOPE 0.414213562f
@@ -37,25 +31,7 @@ LanePlace direction_lanes(const LanePlace heading, global const real *feature) {
     return turned;
 }
 
-// Return the offset from the sensors to a landmark.
-LanePlace offset_lanes(const real4 landmark, const LanePlace place) {
-    const LanePair x = two_sum_lanes((lanes)landmark.x, -place.x.hi), y = two_sum_lanes((lanes)landmark.y, -place.y.hi);
-    return (LanePlace){two_sum_lanes(x.hi, x.lo + (landmark.z - place.x.lo)),
-                       two_sum_lanes(y.hi, y.lo + (landmark.w - place.y.lo))};
-}
-
-// Return the length of an offset.
-LanePair distance_pair_lanes(const LanePlace off) {
-    const LanePair xx = fused_product_lanes(off.x.hi, off.x.hi), yy = fused_product_lanes(off.y.hi, off.y.hi);
-    const LanePair sum = two_sum_lanes(xx.hi, yy.hi);
-    const lanes d = sqrt(sum.hi);
-    const LanePair dd = fused_product_lanes(d, d);
-    const lanes rest = (sum.hi - dd.hi) + ((sum.lo + ((xx.lo + yy.lo) - dd.lo)) +
-                                           2.0f * (off.x.hi * off.x.lo + off.y.hi * off.y.lo));
-    return (LanePair){d, d > 0 ? rest / (2.0f * d) : (lanes)0};
-}
-
-// Return the absolute value of the angle between an offset and a direction, in [0, pi].
+// Return the angle between an offset and a direction: its absolute value, in [0, pi], or with FIELD its sign, too.
 LanePair angle_pair_lanes(const LanePlace off, const LanePlace turned) {
     const LanePair right = fused_product_lanes(turned.x.hi, off.y.hi);
     const LanePair left = fused_product_lanes(turned.y.hi, off.x.hi);
@@ -91,8 +67,36 @@ LanePair angle_pair_lanes(const LanePlace off, const LanePlace turned) {
         const LanePair rest = difference_lanes(HALF_TURN, HALF_TURN_LOW, arc);
         arc = (LanePair){behind ? rest.hi : arc.hi, behind ? rest.lo : arc.lo};
     }
+#if FIELD
+    arc = (LanePair){under ? -arc.hi : arc.hi, under ? -arc.lo : arc.lo};
+#endif
     return arc;
 }
+
+#if FIELD
+// Return the mass of the normal around landmarks' bearings on the field of view; bearings are clamped to its ends.
+lanes field_mass_lanes(const LanePair angle, global const real *feature, const float field) {
+    const float scale = feature[BEARING_SCALE], whole = 2 * HALF_TURN;
+    lanes left = (feature[UPPER] - angle.hi) + (feature[UPPER_LOW] - angle.lo);
+    const lanes off = field / 2 - left;
+    left = off > HALF_TURN ? left + whole : off < -HALF_TURN ? left - whole : left;
+    left = left > 0 ? left : (lanes)0;
+    left = left < field ? left : (lanes)field;
+    const lanes right = field - left;
+    const lanes near_left = left < HALF_TURN ? left : (lanes)HALF_TURN;
+    const lanes near_right = right < HALF_TURN ? right : (lanes)HALF_TURN;
+    lanes mass = erf_lanes(near_left * scale) + erf_lanes(near_right * scale);
+    if (field > HALF_TURN) {
+        // Parts of the field more than half a turn away from the landmark are nearer in the other direction.
+        const float half_mass = erf(HALF_TURN * scale);
+        if (any_lane(left > HALF_TURN))
+            mass += left > HALF_TURN ? half_mass - erf_lanes((whole - left) * scale) : (lanes)0;
+        if (any_lane(right > HALF_TURN))
+            mass += right > HALF_TURN ? half_mass - erf_lanes((whole - right) * scale) : (lanes)0;
+    }
+    return 0.5f * mass;
+}
+#endif
 
 // Add (residual * scale)^2 to an exponent.
 LanePair add_square_lanes(const LanePair total, const LanePair residual, const float scale, const float scale_low) {
@@ -104,11 +108,12 @@ LanePair add_square_lanes(const LanePair total, const LanePair residual, const f
     return (LanePair){sum.hi, low - low == 0 ? low : (lanes)0};
 }
 
-// Return log(z_detect p(f | j)) of a feature at an offset.
+// Return log(z_detect p(f | j)) of a feature at an offset; signature is that of the landmark.
 lanes log_detection_lanes(const LanePlace off, const LanePlace turned, global const real *feature,
-                          global const real *terms) {
+                          const real4 signature, global const real *terms) {
     LanePair exponent = {0, 0};
     lanes mass = 1;
+    float norm = 0;
     const LanePair d = distance_pair_lanes(off);
 #if RANGE
     if (feature[RANGE_SCALE] > 0) {
@@ -126,22 +131,30 @@ lanes log_detection_lanes(const LanePlace off, const LanePlace turned, global co
 #if BEARING
     if (feature[BEARING_SCALE] > 0) {
         const ilanes has_bearing = d.hi > (float)ZERO_RANGE;
+        const LanePair angle = angle_pair_lanes(off, turned);
         const LanePair more =
-            add_square_lanes(exponent, angle_pair_lanes(off, turned), feature[BEARING_SCALE],
-                             feature[BEARING_SCALE_LOW]);
+            add_square_lanes(exponent, angle, feature[BEARING_SCALE], feature[BEARING_SCALE_LOW]);
         exponent = (LanePair){has_bearing ? more.hi : exponent.hi, has_bearing ? more.lo : exponent.lo};
-        mass = has_bearing ? mass : mass * (terms[3] * feature[BEARING_SCALE]);
+#if FIELD
+        const lanes seen = field_mass_lanes(angle, feature, terms[2]);
+#else
+        const lanes seen = 1;
+#endif
+        mass = mass * (has_bearing ? seen : (lanes)(terms[3] * feature[BEARING_SCALE]));
     }
 #endif
-    const lanes log_p = (feature[PEAK] - exponent.hi) + (feature[PEAK_LOW] - exponent.lo);
+#if SIGNATURE
+    if (feature[SIGNATURE_SCALE] > 0) {
+        // It is the same for all particles.
+        const real2 first = two_sum(feature[SIGNATURE_AT], -signature.x);
+        const real2 s = two_sum(first.x, first.y + (feature[SIGNATURE_LOW] - signature.y));
+        const real2 alone = add_square(0, s, feature[SIGNATURE_SCALE], feature[SIGNATURE_SCALE_LOW]);
+        const LanePair more = two_sum_lanes(exponent.hi, (lanes)alone.x);
+        const lanes low = more.lo + (exponent.lo + alone.y);
+        exponent = (LanePair){more.hi, low - low == 0 ? low : (lanes)0};
+        norm = signature.z;
+    }
+#endif
+    const lanes log_p = (feature[PEAK] - exponent.hi) + ((feature[PEAK_LOW] - exponent.lo) + norm);
     return any_lane(mass != 1) ? (mass == 1 ? log_p : log_p - log_lanes(mass)) : log_p;
-}
-
-// Return the log of the sum of two probabilities, from their logs; -inf only where both are 0.
-lanes either_lanes(const lanes detected, const float false_positive) {
-    const ilanes larger = detected > false_positive;
-    const lanes high = larger ? detected : (lanes)false_positive, low = larger ? (lanes)false_positive : detected;
-    const lanes small = exp_lanes(low - high), sum = 1.0f + small;
-    const lanes sum_log = high + (log_lanes(sum) + (small - (sum - 1.0f)) / sum);
-    return high > -INFINITY ? sum_log : high;
 }

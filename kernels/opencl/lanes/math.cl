@@ -1,7 +1,7 @@
 // Exponentials, logarithms, the error function and the arc tangent in lanes. PoCL's own are calls that pass vectors
 // through memory; those of float64 stand for want of better ones. With |r| <= log(2) / 2 and 1 + f from sqrt(1/2) to sqrt(2):
 //     e^a = 2^k e^r,  e^r = 1 + r + r^2 E(r);   log(2^k (1 + f)) = k log 2 + f - f^2 / 2 + f^3 L(f);
-//     erf(x) = 1 - exp(-x W(x));   arctan t = t + t^3 A(t^2).
+//     erf(x) = 1 - exp(-x W(x));   log erfc(x) = -x V(x);   arctan t = t + t^3 A(t^2).
 // bench/derive/lane_constants.py derives the constants; tests/kernels/test_lane_math.py measures the worst errors that
 // stand below, in ulps of float32.
 // requires: lanes/types
@@ -35,7 +35,8 @@ lanes erf_lanes(const lanes x) { return any_lane(x < LANE_ERF_ONE) ? erf(x) : (l
 #define ROOT_HALF 0x3f3504f3
 // From here on the error function is 1 to the last bit.
 #define LANE_ERF_ONE 4.0f
-// E, L, A and W, lowest power first. Their relative errors are 2^-25.6, 2^-27.2, 2^-28.6 (of arctan t) and 2^-24.2.
+// E, L, A, W and V, lowest power first. Their relative errors are 2^-25.6, 2^-27.2, 2^-28.6 (of arctan t), 2^-24.2 (of
+// erf) and 2^-24.4 (of 1 - log(erfc(x) / 2)).
 #define E0 0.49999997f
 #define E1 0.166665465f
 #define E2 0.041667223f
@@ -63,6 +64,16 @@ lanes erf_lanes(const lanes x) { return any_lane(x < LANE_ERF_ONE) ? erf(x) : (l
 #define W6 -0.000632835436f
 #define W7 0.000117640826f
 #define W8 -9.25621225e-06f
+#define V0 1.12838185f
+#define V1 0.636580169f
+#define V2 0.102969967f
+#define V3 -0.0195953287f
+#define V4 0.000385133055f
+#define V5 0.00129188842f
+#define V6 -0.000495358487f
+#define V7 9.69315297e-05f
+#define V8 -1.02969989e-05f
+#define V9 4.69292473e-07f
 
 // Return e^r - 1 and the count k of e^a. Polynomials are summed in pairs, which processors compute side by side.
 lanes reduced_exp_lanes(const lanes a, ilanes *count) {
@@ -108,5 +119,12 @@ lanes erf_lanes(const lanes x) {
     const lanes square = b * b, low = (W0 + W1 * b) + square * (W2 + W3 * b);
     const lanes high = (W4 + W5 * b) + square * ((W6 + W7 * b) + square * W8);
     return one_minus_exp_lanes(-b * (low + (square * square) * high));
+}
+
+// Return log(erfc(x)) for 0 <= x <= 4, within 2 eps (1 + |log(erfc(x) / 2)|).
+lanes log_erfc_lanes(const lanes x) {
+    const lanes square = x * x, low = (V0 + V1 * x) + square * (V2 + V3 * x);
+    const lanes high = (V4 + V5 * x) + square * ((V6 + V7 * x) + square * (V8 + V9 * x));
+    return -x * (low + (square * square) * high);
 }
 #endif

@@ -90,3 +90,12 @@ lanes load_some(global const real *numbers, const int count) {
     for (int i = 0; i < LANES; ++i) some[i] = numbers[min(i, count - 1)];
     return load_lanes(0, some);
 }
+
+// Write the first count lanes, all of them where count is larger.
+void store_some(const lanes values, global real *numbers, const int count) {
+    if (count >= LANES) {
+        store_lanes(values, 0, numbers);
+        return;
+    }
+    for (int i = 0; i < count; ++i) numbers[i] = ((const real *)&values)[i];
+}

@@ -1,0 +1,109 @@
+// Ranges to known beacons for LANES particles at once: beacons.cl in lanes, with the functions of lanes/math. Sums have
+// the order of the scalar kernel.
+// requires: lanes/offsets lanes/log_terms
+
+#define STUDENT_T 1
+#define TWO_NORMALS 2
+#define BEACON 7
+// Numbers of a density, as in beacons.cl.
+#define SCALE 0
+#define PEAK 2
+#define RANDOM 4
+#define RANGE_MAX 5
+#define WIDE_SCALE 6
+#define WIDE_PEAK 8
+#define OFFSET 6
+#define OFFSET_LOW 7
+#define POWER 8
+#define T_SCALE 9
+#define ARC 10
+#define ODD 11
+#define STEEPEST 1e18f
+// tan(pi/8), pi/4 and pi/2.
+#define EIGHTH_SLOPE 0.414213562f
+#define EIGHTH_TURN 0.785398163f
+#define QUARTER_TURN 1.57079633f
+
+// Return arctan t for t >= 0.
+lanes arc_lanes(const lanes t) {
+    const ilanes steep = t > 1;
+    const lanes high = steep ? (lanes)1 : t, low = steep ? t : (lanes)1;
+    const ilanes large = high > EIGHTH_SLOPE * low;
+    const lanes slope = (large ? high - low : high) / (large ? high + low : low);
+    const lanes arc = (large ? (lanes)EIGHTH_TURN : (lanes)0) + (slope + arc_rest_lanes(slope));
+    return steep ? QUARTER_TURN - arc : arc;
+}
+
+// Return the log of a truncated normal.
+lanes log_normal_lanes(const LanePair residual, const lanes near, const lanes far, global const real *terms,
+                       const int first, const int peak) {
+    const float scale = terms[first];
+    const LanePair exponent = bounded_square_lanes(scaled_pair_lanes(residual, scale, terms[first + 1]));
+    const lanes untruncated = (terms[peak] - exponent.hi) + (terms[peak + 1] - exponent.lo);
+    const lanes nearest = (near < far ? near : far) * scale;
+    if (!any_lane(nearest < LANE_ERF_ONE)) return untruncated;
+    return untruncated - log_lanes(0.5f * (erf_lanes(near * scale) + erf_lanes(far * scale)));
+}
+
+// Return the mass of a Student t between -t and t.
+lanes t_mass_lanes(const lanes any_t, global const real *terms, global const real *series, const int count) {
+    const lanes t = any_t < STEEPEST ? any_t : (lanes)STEEPEST, cosine = 1 / sqrt(1 + t * t), square = cosine * cosine;
+    lanes sum = 0;
+    for (int i = count - 1; i >= 0; --i) sum = sum * square + series[i];
+    if (!(terms[ODD] > 0)) return t * cosine * sum;
+    return terms[ARC] * arc_lanes(t) + t * cosine * cosine * sum;
+}
+
+// Return the log of a truncated Student t.
+lanes log_student_t_lanes(const LanePair residual, const lanes near, const lanes far, global const real *terms,
+                          global const real *series, const int count) {
+    const LanePair squared = bounded_square_lanes(scaled_pair_lanes(residual, terms[SCALE], terms[SCALE + 1]));
+    const LanePair sum = two_sum_lanes((lanes)terms[OFFSET], squared.hi);
+    const LanePair x = two_sum_lanes(sum.hi, sum.lo + (terms[OFFSET_LOW] + squared.lo));
+    const lanes below = t_mass_lanes(near * terms[T_SCALE], terms, series, count);
+    const lanes above = t_mass_lanes(far * terms[T_SCALE], terms, series, count);
+    return (terms[PEAK] - terms[POWER] * (log_lanes(x.hi) + x.lo / x.hi)) - log_lanes(0.5f * (below + above));
+}
+
+// Return log p of one range at distances.
+lanes log_range_lanes(const LanePair d, global const real *beacon, global const real *terms, global const real *series,
+                      const int count, const int kind) {
+    const LanePair first = two_sum_lanes(d.hi, (lanes)-beacon[4]);
+    const LanePair r = two_sum_lanes(first.hi, first.lo + (d.lo - beacon[5]));
+    lanes near = d.hi + beacon[6];
+    near = near > 0 ? near : (lanes)0;
+    near = near < terms[RANGE_MAX] ? near : (lanes)terms[RANGE_MAX];
+    const lanes far = terms[RANGE_MAX] - near;
+    lanes log_p;
+    if (kind == STUDENT_T)
+        log_p = log_student_t_lanes(r, near, far, terms, series, count);
+    else
+        log_p = log_normal_lanes(r, near, far, terms, SCALE, PEAK);
+    if (kind == TWO_NORMALS) log_p = either_lanes(log_p, log_normal_lanes(r, near, far, terms, WIDE_SCALE, WIDE_PEAK));
+#if RAND
+    return either_lanes(log_p, (lanes)terms[RANDOM]);
+#else
+    return log_p;
+#endif
+}
+
+// Sum log p of the ranges over beacons: one work-item takes LANES particles. The last particle of all stands in for
+// missing ones.
+kernel void score_beacons(global const real4 *place, global const real *beacon, global const real *terms,
+                          global const real *series, global real *log_p, const int particles, const int beacons,
+                          const int count, const int kind, const real temperature) {
+    const int first_particle = LANES * get_global_id(0);
+    if (first_particle >= particles) return;
+    const LanePlace sensor = load_places(place, first_particle, particles);
+    LanePair total = {0, 0};
+    for (int i = 0; i < beacons; ++i) {
+        global const real *numbers = beacon + BEACON * i;
+        const real4 here = (real4)(numbers[0], numbers[2], numbers[1], numbers[3]);
+        const LanePair d = distance_pair_lanes(offset_lanes(here, sensor));
+        const LanePair sum = two_sum_lanes(total.hi, log_range_lanes(d, numbers, terms, series, count, kind));
+        total = (LanePair){sum.hi, total.lo + sum.lo};
+    }
+    const ilanes finite = total.hi - total.hi == 0;
+    const lanes all = finite ? temperature * (total.hi + total.lo) : total.hi;
+    store_some(all, log_p + first_particle, particles - first_particle);
+}

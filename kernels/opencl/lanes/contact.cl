@@ -1,0 +1,129 @@
+// Probability of contact for LANES particles at once: contact.cl in lanes, with the functions of lanes/math. Cells of
+// points have the bits of the scalar kernel.
+// requires: lanes/end_point lanes/log_terms
+
+#define NO_OBSTACLE 0x7fffffff
+// Numbers of the model, as in contact.cl.
+#define SCALE 0
+#define SCALE_LOW 1
+#define REACH 2
+#define REACH_LOW 3
+#define SIDE 4
+#define SIDE_LOW 5
+#define HIT_TERM 6
+#define FALSE_TERM 7
+#define MISS_TERM 8
+#define NO_HIT_TERM 9
+#define FAR_CELLS 1e9f
+#define LOG_TWO 0.693147181f
+#define LOG_TWO_ROOT_PI 1.26551212f
+// From here on the series has the digits of float32.
+#define LARGE 4.0f
+#define SERIES 12
+
+// Poses of LANES particles.
+typedef struct {
+    ilanes col, row;
+    lanes x, y, cos, sin;
+} Particles;
+
+// Round down.
+ilanes floor_ilanes(const lanes a) {
+    const ilanes whole = to_ilanes(a);
+    return whole + (to_lanes(whole) > a);
+}
+
+// Return the numbers in the cells of one point of the outline. One near a cell's edge is computed again by end_point.
+ilanes look_up_lanes(global const int *table, const Particles *particle, const real2 point, const real2 point_low,
+                     global const int2 *pose_cell, global const real4 *pose, global const real4 *pose_low,
+                     const int first, const int particles, const Window window, const real guard) {
+    const lanes x = particle->x + (particle->cos * point.x - particle->sin * point.y);
+    const lanes y = particle->y + (particle->sin * point.x + particle->cos * point.y);
+    const ilanes to_col = floor_ilanes(x), to_row = floor_ilanes(y);
+    const lanes left_x = x - to_lanes(to_col), left_y = y - to_lanes(to_row);
+    const int stride = window.cols + 2 * FIELD_RING;
+    const ilanes col = within_lanes(particle->col + to_col, stride - 1);
+    const ilanes row = within_lanes(particle->row + to_row, window.rows + 2 * FIELD_RING - 1);
+    ilanes index = row * stride + col;
+    const ilanes near = (left_x < guard) | (left_y < guard) | (left_x > 1 - guard) | (left_y > 1 - guard);
+    if (any_lane(near)) {
+        for (int i = 0; i < LANES; ++i) {
+            if (!((const int *)&near)[i]) continue;
+            const int n = min(first + i, particles - 1);
+            const int2 at = pose_cell[n] + end_point(pose[n], pose_low[n], point, point_low, 0, guard).cell;
+            ((int *)&index)[i] = field_cell(at.x, at.y, window);
+        }
+    }
+    return GATHER(ilanes, table, index);
+}
+
+// Return the gaps between outline and obstacle, negative where they overlap; squared distances are in cells.
+LanePair gap_lanes(const ilanes squared, global const real *terms) {
+    const LanePair whole = two_sum_lanes(to_lanes(squared >> 12) * 4096, to_lanes(squared & 4095));
+    const lanes d = sqrt(whole.hi);
+    const LanePair dd = fused_product_lanes(d, d);
+    const lanes low = d > 0 ? ((whole.hi - dd.hi) + (whole.lo - dd.lo)) / (2 * d) : (lanes)0;
+    const ilanes none = squared == NO_OBSTACLE;
+    const LanePair cells = {none ? (lanes)FAR_CELLS : d, none ? (lanes)0 : low};
+    const LanePair away = scaled_pair_lanes(cells, terms[SIDE], terms[SIDE_LOW]);
+    const LanePair left = two_sum_lanes(away.hi, (lanes)-terms[REACH]);
+    return two_sum_lanes(left.hi, left.lo + (away.lo - terms[REACH_LOW]));
+}
+
+// Return log(erfc(x) / 2) for x >= 0, by an asymptotic series where erfc is small.
+lanes log_above_lanes(const LanePair x) {
+    const ilanes large = x.hi >= LARGE;
+    const lanes b = large ? (lanes)LARGE : x.hi;
+    lanes above = log_erfc_lanes(b) - LOG_TWO;
+    if (any_lane(large)) {
+        const lanes t = 0.5f / (x.hi * x.hi);
+        lanes series = 1;
+        for (int n = SERIES; n > 0; --n) series = 1 - (2 * n - 1) * t * series;
+        const LanePair square = bounded_square_lanes(x);
+        const lanes far = -square.hi - (log_lanes((large ? x.hi : (lanes)1) / (large ? series : (lanes)1)) +
+                                        (LOG_TWO_ROOT_PI + square.lo));
+        above = large ? far : above;
+    }
+    return above;
+}
+
+// Return the log probabilities that a segment is pressed, or that it is not.
+lanes log_bump_lanes(const ilanes squared, const int pressed, global const real *terms) {
+    const LanePair x = scaled_pair_lanes(gap_lanes(squared, terms), terms[SCALE], terms[SCALE_LOW]);
+    const ilanes overlaps = x.hi < 0;
+    // The smaller of the two probabilities, then the other one.
+    const LanePair size = {overlaps ? -x.hi : x.hi, overlaps ? -x.lo : x.lo};
+    const lanes small = log_above_lanes(size), large = log_lanes(1 - exp_lanes(small));
+    const lanes touching = overlaps ? large : small, clear = overlaps ? small : large;
+    const real hit = pressed ? terms[HIT_TERM] : terms[MISS_TERM];
+    const real no_hit = pressed ? terms[FALSE_TERM] : terms[NO_HIT_TERM];
+    return either_lanes(hit + touching, no_hit + clear);
+}
+
+// Sum log p over segments: one work-item takes LANES particles. The last particle of all stands in for missing ones.
+kernel void score_contact(global const int *table, global const int2 *pose_cell, global const real4 *pose,
+                          global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
+                          global const int *start, global const int *pressed, global const real *terms,
+                          global real *log_p, const Window window, const int particles, const int segments,
+                          const real guard, const real temperature) {
+    const int first_particle = LANES * get_global_id(0);
+    if (first_particle >= particles) return;
+    Particles some;
+    for (int i = 0; i < LANES; ++i) {
+        const int n = min(first_particle + i, particles - 1);
+        ((int *)&some.col)[i] = pose_cell[n].x + FIELD_RING, ((int *)&some.row)[i] = pose_cell[n].y + FIELD_RING;
+        ((real *)&some.x)[i] = pose[n].x, ((real *)&some.y)[i] = pose[n].y;
+        ((real *)&some.cos)[i] = pose[n].z, ((real *)&some.sin)[i] = pose[n].w;
+    }
+    lanes total = 0;
+    for (int s = 0; s < segments; ++s) {
+        ilanes nearest = NO_OBSTACLE;
+        for (int i = start[s]; i < start[s + 1]; ++i) {
+            const ilanes squared = look_up_lanes(table, &some, point[i], point_low[i], pose_cell, pose, pose_low,
+                                                 first_particle, particles, window, guard);
+            nearest = squared < nearest ? squared : nearest;
+        }
+        total += log_bump_lanes(nearest, pressed[s], terms);
+    }
+    store_some(temperature * total, log_p + first_particle, particles - first_particle);
+}

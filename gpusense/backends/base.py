@@ -117,7 +117,7 @@ class Backend(ABC):
         return _ProgramRecording(self, program)
 
     def replay(self, recording: Recording) -> None:
-        """Start a recording as part of the call that this thread gathers, or at once where it gathers none."""
+        """Start a recording as part of this thread's batch, or at once where it has none."""
         recording()
 
     @property
@@ -125,23 +125,23 @@ class Backend(ABC):
         """Tell whether to record bound calls of few particles, although a recording must copy their NumPy arrays."""
         return False
 
-    # ---- calls: where starts take longer than small work, the work of a call is gathered and started together
+    # ---- batches: where starts take longer than small work, the work of a call is started together
 
-    def gather(self) -> None:  # noqa: B027
-        """Gather this thread's launches and copies from now on; ``start`` or ``synchronize`` starts them in order.
+    def begin_batch(self) -> None:  # noqa: B027
+        """Put this thread's launches and copies off from now on; ``submit`` or ``synchronize`` starts them in order.
 
         A blocking copy first starts everything before it, so the order of a call is kept.
         """
 
-    def start(self) -> None:  # noqa: B027
-        """Start the gathered launches and copies."""
+    def submit(self) -> None:  # noqa: B027
+        """Start the launches and copies of this thread's batch; it goes on."""
 
-    def scatter(self) -> None:  # noqa: B027
-        """Start the gathered launches and copies, and gather no more."""
+    def end_batch(self) -> None:  # noqa: B027
+        """Start the launches and copies of this thread's batch, and end it."""
 
     @property
-    def gathers(self) -> bool:
-        """Tell whether this thread is recording launches and copies."""
+    def in_batch(self) -> bool:
+        """Tell whether this thread has a batch."""
         return False
 
     def address(self, buffer: Buffer) -> int:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gpusense._util import checks
+from gpusense.backends.programs import ProgramCache
 from gpusense.interface.launches import Program
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.filter_cloud import Given
@@ -64,7 +65,7 @@ class Scoring:
 
     def __init__(self, cloud: Cloud, sensors: Sequence[Sensor]) -> None:
         self._cloud, self._sensors, self._backend = cloud, sensors, cloud.backend
-        self._programs: dict[Hashable, tuple[Program, object]] = {}
+        self._programs = ProgramCache[tuple[Program, object]](_MOST_PROGRAMS)
 
     def records(self, given: Sequence[Given]) -> bool:
         """Tell whether a stage with such readings is one recorded program: on a GPU that can score all of them."""
@@ -95,19 +96,18 @@ class Scoring:
 
     def _program(self, key: Hashable, source: int, given: Sequence[Given]) -> tuple[Program, object]:
         """Return the launches that score the poses of a buffer, and the owners of their memory."""
-        if (key, source) not in self._programs:
-            if len(self._programs) >= _MOST_PROGRAMS:
-                self._programs.clear()
-            program: Program = ()
-            owners: list[object] = []
-            poses = self._poses(source)
-            for place, (index, _) in enumerate(given):
-                out = self._log_p(place)
-                launches, owner = self._sensors[index].program(poses, out)
-                program += launches
-                owners.append((poses, out, owner))
-            self._programs[key, source] = program, owners
-        return self._programs[key, source]
+        kept = self._programs.get((key, source))
+        if kept is not None:
+            return kept
+        program: Program = ()
+        owners: list[object] = []
+        poses = self._poses(source)
+        for place, (index, _) in enumerate(given):
+            out = self._log_p(place)
+            launches, owner = self._sensors[index].program(poses, out)
+            program += launches
+            owners.append((poses, out, owner))
+        return self._programs.keep((key, source), (program, owners))
 
     def _poses(self, source: int) -> Any:
         return self._backend.view(self._cloud.poses[source], (self._cloud.count, 3), np.dtype(np.float64))

@@ -58,7 +58,7 @@ def run(pipeline: ScanPipeline, request: Request, space: Workspace, last: LastCa
         most = pipeline.chunk(scans.most_readings * pipeline.rays_each, per_beam=request.per_beam)
         run_pieces(space, particles, most, _Scorer(pipeline, request, particles, scans, space, last))
         if request.scans > 1:
-            space.start()
+            space.submit()
 
 
 class _Scorer:

@@ -118,8 +118,8 @@ def _check_numbers(adopted: Adopted, name: str) -> None:
         TypeError: another type.
         ValueError: not C-contiguous.
     """
-    dtype = adopted.dtype.name if adopted.dtype.isnative else adopted.dtype.str
     if adopted.dtype not in (np.float32, np.float64):
+        dtype = adopted.dtype.name if adopted.dtype.isnative else adopted.dtype.str
         raise TypeError(f"{name}: must hold float32 or float64, got {dtype}")
     if not adopted.contiguous:
         raise ValueError(f"{name}: must be C-contiguous on the device, got strides {adopted.strides}")

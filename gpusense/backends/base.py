@@ -6,6 +6,8 @@ A method of an ability that it lacks does nothing, where that is correct, or rai
 
 from __future__ import annotations
 
+import itertools
+import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -172,7 +174,7 @@ class Backend(ABC):
 
     def view(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> Adopted:
         """Return the head of a buffer of this device as an array that models take."""
-        strides = np.cumprod([dtype.itemsize, *shape[:0:-1]])[::-1].tolist()
+        strides = [*itertools.accumulate(shape[:0:-1], operator.mul, initial=dtype.itemsize)][::-1]
 
         def to_host() -> np.ndarray:
             return self.download(buffer, np.empty(shape, dtype))

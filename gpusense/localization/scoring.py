@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gpusense._util import checks
+from gpusense.backends.base import Buffer
 from gpusense.backends.programs import ProgramCache
 from gpusense.interface.launches import Program
 from gpusense.localization.cloud import Cloud
@@ -18,6 +19,8 @@ from gpusense.localization.sensors import Sensor
 
 # Programs of scores that are kept.
 _MOST_PROGRAMS = 8
+_MOST_VIEWS = 32
+_DOUBLE = np.dtype(np.float64)
 
 
 def given_of(readings: Any, sensors: Sequence[Sensor]) -> list[Given]:
@@ -66,6 +69,8 @@ class Scoring:
     def __init__(self, cloud: Cloud, sensors: Sequence[Sensor]) -> None:
         self._cloud, self._sensors, self._backend = cloud, sensors, cloud.backend
         self._programs = ProgramCache[tuple[Program, object]](_MOST_PROGRAMS)
+        # Views of buffers by the number of particles, as models take them.
+        self._views: dict[tuple[str, int, int], Any] = {}
 
     def records(self, given: Sequence[Given]) -> bool:
         """Tell whether a stage with such readings is one recorded program: on a GPU that can score all of them."""
@@ -110,8 +115,19 @@ class Scoring:
         return self._programs.keep((key, source), (program, owners))
 
     def _poses(self, source: int) -> Any:
-        return self._backend.view(self._cloud.poses[source], (self._cloud.count, 3), np.dtype(np.float64))
+        count = self._cloud.count
+        key = ("poses", source, count)
+        return self._views.get(key) or self._view(key, self._cloud.poses[source], (count, 3), _DOUBLE)
 
     def _log_p(self, place: int) -> Any:
         """Return the array for a sensor's log-likelihoods."""
-        return self._backend.view(self._cloud.log_p[place], (self._cloud.count,), self._cloud.precision)
+        count = self._cloud.count
+        key = ("log_p", place, count)
+        return self._views.get(key) or self._view(key, self._cloud.log_p[place], (count,), self._cloud.precision)
+
+    def _view(self, key: tuple[str, int, int], buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> Any:
+        """Return a view of a buffer and keep it: clouds of one size have few."""
+        if len(self._views) >= _MOST_VIEWS:
+            self._views.clear()
+        self._views[key] = self._backend.view(buffer, shape, dtype)
+        return self._views[key]

@@ -14,6 +14,7 @@ from gpusense.models.poses import Poses
 from gpusense.models.scan.classed import check_ranges
 from gpusense.world.scanner import Scanner
 
+_FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
 # Poses that several models share, checked once, by the number of scans.
 Known = MutableMapping[int | None, Poses]
 
@@ -27,6 +28,7 @@ class Request(NamedTuple):
         shape: Shape of the result, (N,) or (S, N).
         result: Memory of the result.
         parts: (S, N, K) log-likelihoods of the readings; (S, N, 0) where they are not requested.
+        per_beam: Whether they are requested, of a scanner with beams.
         before: Called once readings are on the device; it starts the launches that write the poses.
     """
 
@@ -35,6 +37,7 @@ class Request(NamedTuple):
     shape: tuple[int, ...]
     result: Result
     parts: np.ndarray
+    per_beam: bool
     before: Callable[[], None] | None = None
 
     @property
@@ -46,11 +49,6 @@ class Request(NamedTuple):
     def per_scan(self) -> int:
         """N."""
         return self.shape[-1]
-
-    @property
-    def per_beam(self) -> bool:
-        """Tell whether the log-likelihoods of single readings are requested (``per_beam``)."""
-        return self.parts.shape[-1] > 0
 
     def result_parts(self) -> np.ndarray:
         """Return the log-likelihoods of the readings, (N, K) or (S, N, K)."""
@@ -83,7 +81,11 @@ def make_request(
     Raises:
         TypeError, ValueError: an argument breaks its rule.
     """
-    readings = check_ranges(arrays.copied_to_host(ranges, backend, "ranges"), scanner)
+    beams = scanner.count
+    if type(ranges) is np.ndarray and ranges.shape == (beams,) and ranges.dtype in _FLOATS:
+        readings: np.ndarray = ranges
+    else:
+        readings = check_ranges(arrays.copied_to_host(ranges, backend, "ranges"), scanner)
     known = {} if known is None else known
     shape: tuple[int, ...]
     if readings.ndim == 1:
@@ -94,8 +96,8 @@ def make_request(
         checked = known[scans] = known.get(scans) or _poses_of_scans(poses, scans, backend)
         shape = (scans, checked.count // scans if scans else np.shape(poses)[1])
     result = Result(poses, out, shape, real, backend)
-    parts = np.zeros((len(readings), shape[-1], scanner.count if per_beam else 0), real)
-    return Request(readings, checked, shape, result, parts)
+    parts = np.zeros((len(readings), shape[-1], beams if per_beam else 0), real)
+    return Request(readings, checked, shape, result, parts, per_beam and beams > 0)
 
 
 def _poses_of_scans(poses: Any, scans: int, backend: Backend) -> Poses:

@@ -54,10 +54,9 @@ def _is_several(value: Any) -> bool:
 
 
 class Scoring:
-    """Scores the particles of a cloud.
+    """Scores the particles of a cloud, which owns it.
 
     Args:
-        cloud: The particles.
         sensors: The sensors of the filter.
 
     Attributes:
@@ -66,8 +65,8 @@ class Scoring:
 
     timed = False
 
-    def __init__(self, cloud: Cloud, sensors: Sequence[Sensor]) -> None:
-        self._cloud, self._sensors, self._backend = cloud, sensors, cloud.backend
+    def __init__(self, sensors: Sequence[Sensor]) -> None:
+        self._sensors, self._backend = sensors, sensors[0].backend
         self._programs = ProgramCache[tuple[Program, object]](_MOST_PROGRAMS)
         # Views of buffers by the number of particles, as models take them.
         self._views: dict[tuple[str, int, int], Any] = {}
@@ -77,53 +76,53 @@ class Scoring:
         gpu = self._backend.info.kind == "gpu"
         return gpu and all(self._sensors[index].records(reading) for index, reading in given)
 
-    def of(self, given: Sequence[Given]) -> Callable[[Stage], None]:
+    def of(self, cloud: Cloud, given: Sequence[Given]) -> Callable[[Stage], None]:
         """Return the function that runs a stage with the readings of sensors, given by their indices."""
         if not self.records(given):
-            return functools.partial(self._called, given)
+            return functools.partial(self._called, cloud, given)
         for index, reading in given:
             self._sensors[index].upload(reading)
-        return functools.partial(self._recorded, given)
+        return functools.partial(self._recorded, cloud, given)
 
-    def _called(self, given: Sequence[Given], stage: Stage) -> None:
+    def _called(self, cloud: Cloud, given: Sequence[Given], stage: Stage) -> None:
         """Start the log-likelihoods of a stage call by call, and weigh."""
-        poses, cloud = self._poses(stage.source), self._cloud
+        poses = self._poses(cloud, stage.source)
         before = None if stage.kind is None else functools.partial(cloud.begin, stage)
         for place, (index, reading) in enumerate(given):
-            self._sensors[index].score(poses, reading, self._log_p(place), before=before, timed=self.timed)
+            self._sensors[index].score(poses, reading, self._log_p(cloud, place), before=before, timed=self.timed)
             before = None
         cloud.weigh(stage)
 
-    def _recorded(self, given: Sequence[Given], stage: Stage) -> None:
+    def _recorded(self, cloud: Cloud, given: Sequence[Given], stage: Stage) -> None:
         """Run a stage as one recorded program."""
-        key = (tuple((index, self._sensors[index].version) for index, _ in given), self._cloud.count)
-        self._cloud.replay(stage, key, lambda source: self._program(key, source, given))
+        key = (tuple((index, self._sensors[index].version) for index, _ in given), cloud.count)
+        cloud.replay(stage, key, lambda source: self._program(cloud, key, source, given))
 
-    def _program(self, key: Hashable, source: int, given: Sequence[Given]) -> tuple[Program, object]:
+    def _program(self, cloud: Cloud, key: Hashable, source: int, given: Sequence[Given]) -> tuple[Program, object]:
         """Return the launches that score the poses of a buffer, and the owners of their memory."""
         kept = self._programs.get((key, source))
         if kept is not None:
             return kept
         program: Program = ()
         owners: list[object] = []
-        poses = self._poses(source)
+        poses = self._poses(cloud, source)
         for place, (index, _) in enumerate(given):
-            out = self._log_p(place)
+            out = self._log_p(cloud, place)
             launches, owner = self._sensors[index].program(poses, out)
             program += launches
             owners.append((poses, out, owner))
         return self._programs.keep((key, source), (program, owners))
 
-    def _poses(self, source: int) -> Any:
-        count = self._cloud.count
+    def _poses(self, cloud: Cloud, source: int) -> Any:
+        count = cloud.count
         key = ("poses", source, count)
-        return self._views.get(key) or self._view(key, self._cloud.poses[source], (count, 3), _DOUBLE)
+        return self._views.get(key) or self._view(key, cloud.poses[source], (count, 3), _DOUBLE)
 
-    def _log_p(self, place: int) -> Any:
+    def _log_p(self, cloud: Cloud, place: int) -> Any:
         """Return the array for a sensor's log-likelihoods."""
-        count = self._cloud.count
+        count = cloud.count
         key = ("log_p", place, count)
-        return self._views.get(key) or self._view(key, self._cloud.log_p[place], (count,), self._cloud.precision)
+        return self._views.get(key) or self._view(key, cloud.log_p[place], (count,), cloud.precision)
 
     def _view(self, key: tuple[str, int, int], buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> Any:
         """Return a view of a buffer and keep it: clouds of one size have few."""

@@ -7,13 +7,11 @@ places them.
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Hashable
 from typing import NamedTuple
 
 import numpy as np
 
-from gpusense._util import checks
 from gpusense.backends import arrays
 from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.workspace import POSE_STATUS, Workspace
@@ -29,8 +27,6 @@ _INT = np.dtype(np.int32)
 _SINGLE, _DOUBLE = np.dtype(np.float32), np.dtype(np.float64)
 _PLAIN, _HUGE = frozenset[str](), frozenset({"HUGE_HEADINGS"})
 _HUGE_SINGLE = _HUGE | {"POSES_FLOAT32"}
-# Poses in a block whose bounds are computed together.
-_BLOCK = 8192
 
 Part = tuple[int, int]
 """Poses from a first one to before a last one."""
@@ -43,7 +39,7 @@ class Poses:
         poses: Numbers, or an array on the device.
         backend: The device.
         name: Their name in messages.
-        several: An array on the device is (S, N, 3), the poses of S scans one after the other.
+        scans: None, or S of (S, N, 3) poses of S scans, one after the other.
         in_place: An array on the device must be used without a copy, now and later.
 
     Raises:
@@ -52,27 +48,19 @@ class Poses:
     """
 
     def __init__(
-        self, poses: object, backend: Backend, name: str = "poses", *, several: bool = False, in_place: bool = False
+        self, poses: object, backend: Backend, name: str = "poses", *, scans: int | None = None, in_place: bool = False
     ) -> None:
         self.host: np.ndarray | None = None
         self._last_corners: tuple[Part, Corners] | None = None
         self.on_device = type(poses) is not np.ndarray and arrays.on_device(poses)
         if self.on_device:
             self._buffer, self.count, single, self._owner = arrays.adopt_poses(
-                poses, backend, name, several, in_place=in_place
+                poses, backend, name, scans, in_place=in_place
             )
             self._dtype = _SINGLE if single else _DOUBLE
             return
-        read = poses if type(poses) is np.ndarray else arrays.to_host(poses, name)
-        if isinstance(read, np.ndarray) and read.dtype.kind == "f" and read.ndim == 2 and read.shape[1] == 3:
-            self.host = np.ascontiguousarray(read, np.float64)
-            self._corners = corners_of(self.host)
-            if not all(map(math.isfinite, (*self._corners[0], *self._corners[3]))):
-                self.host = checks.array(name, read, ("N", 3))
-        else:
-            self.host = np.ascontiguousarray(checks.array(name, read, ("N", 3)))
-            self._corners = corners_of(self.host)
-        self.count = len(self.host)
+        self.host, bounds = arrays.host_poses(poses, name, scans)
+        self._corners, self.count = corners_of(bounds), len(self.host)
 
     def corners(self, part: Part) -> Corners | None:
         """Return four corners of the box of some poses, at 0 for no poses; None on the device."""
@@ -81,7 +69,7 @@ class Poses:
         if part[1] - part[0] == self.count:
             return self._corners
         if self._last_corners is None or self._last_corners[0] != part:
-            self._last_corners = part, corners_of(self.host[slice(*part)])
+            self._last_corners = part, corners_of(arrays.bounds_of(self.host[slice(*part)]))
         return self._last_corners[1]
 
     def window(self, table: ReachableMap, part: Part) -> tuple[Buffer, Window]:
@@ -235,20 +223,7 @@ def _place_on_host(poses: Poses, part: Part, frame: Frame, space: Workspace, rea
         space.upload(name, numbers if careful or name != "pose_low" else numbers[:1])
 
 
-def corners_of(poses: np.ndarray) -> Corners:
-    """Return four corners of the box of (N, 3) poses, at 0 for no poses; NaN where a column holds one.
-
-    Columns of three are slow to reduce; rows are not. Blocks that fit the nearest cache are transposed one by one.
-    """
-    if not len(poses):
-        return ((0.0, 0.0, 0.0),) * 4
-    lows, highs = [], []
-    for begin in range(0, len(poses), _BLOCK):
-        rows = np.ascontiguousarray(poses[begin : begin + _BLOCK].T)
-        lows.append(np.minimum.reduce(rows, axis=1))
-        highs.append(np.maximum.reduce(rows, axis=1))
-    # minimum.reduce and maximum.reduce keep NaN.
-    low = lows[0] if len(lows) == 1 else np.minimum.reduce(lows)
-    high = highs[0] if len(highs) == 1 else np.maximum.reduce(highs)
-    (x, y, turn), (far_x, far_y, far_turn) = low.tolist(), high.tolist()
+def corners_of(bounds: arrays.Bounds) -> Corners:
+    """Return four corners of the box of poses within bounds."""
+    (x, y, turn), (far_x, far_y, far_turn) = bounds
     return (x, y, turn), (x, far_y, turn), (far_x, y, turn), (far_x, far_y, far_turn)

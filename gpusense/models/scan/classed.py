@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpusense._util.checks import array, as_array
+from gpusense._util import checks
 from gpusense.models.scan.rules import Rules
 from gpusense.world.scanner import Scanner
 
@@ -121,9 +121,9 @@ class ClassedScans:
 
 def check_ranges(ranges: object, scanner: Scanner) -> np.ndarray:
     """Return readings of one scan (K,) or of several (S, K), checked, in their float dtype."""
-    readings = as_array("ranges", ranges, masked=True)
+    readings = checks.as_array("ranges", ranges, masked=True)
     shape = ("S", scanner.count) if readings.ndim == 2 else (scanner.count,)
-    return array("ranges", readings, shape=shape, finite=False, dtype=None)
+    return checks.array("ranges", readings, shape=shape, finite=False, dtype=None)
 
 
 @functools.lru_cache(maxsize=64)
@@ -163,7 +163,7 @@ def class_scans(ranges: np.ndarray, rules: Rules) -> ClassedScans:
     constants = np.zeros(len(ranges))
     if np.logical_and.reduce(evaluated, axis=None):
         # Scans without gaps need no selection.
-        counts = np.array([ranges.shape[1]] * len(ranges))
+        counts = np.asarray([ranges.shape[1]] * len(ranges))
         columns, values, vectors = rules.columns, ranges.reshape(-1).astype(np.float64), rules.vectors
         if len(ranges) > 1:
             columns, vectors = np.tile(columns, len(ranges)), np.tile(vectors, (len(ranges), 1))

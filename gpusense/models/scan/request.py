@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gpusense._util import checks
 from gpusense.backends import Backend, arrays
 from gpusense.backends.results import Result
 from gpusense.models.poses import Poses
@@ -93,28 +92,8 @@ def make_request(
         readings, shape = readings[None], (checked.count,)
     else:
         scans = len(readings)
-        checked = known[scans] = known.get(scans) or _poses_of_scans(poses, scans, backend)
+        checked = known[scans] = known.get(scans) or Poses(poses, backend, scans=scans)
         shape = (scans, checked.count // scans if scans else np.shape(poses)[1])
     result = Result(poses, out, shape, real, backend)
     parts = np.zeros((len(readings), shape[-1], beams if per_beam else 0), real)
     return Request(readings, checked, shape, result, parts, per_beam and beams > 0)
-
-
-def _poses_of_scans(poses: Any, scans: int, backend: Backend) -> Poses:
-    """Return the poses of S scans, one scan after the other, from (S, N, 3) poses.
-
-    Raises:
-        TypeError, ValueError: not numbers, another shape, or a pose that is not finite.
-    """
-    if arrays.on_device(poses):
-        shape = tuple(poses.shape)
-        if len(shape) != 3 or shape[0] != scans or shape[2] != 3:
-            raise ValueError(f"poses: shape must be ({scans}, N, 3), got {checks.shape_text(shape)}")
-        return Poses(poses, backend, several=True)
-    read = checks.array("poses", arrays.to_host(poses), (scans, "N", 3), finite=False)
-    try:
-        return Poses(read.reshape(-1, 3), backend)
-    except ValueError:
-        # This check names the scan in its message; the first one names the index among all poses.
-        checks.array("poses", read, (scans, "N", 3))
-        raise

@@ -286,7 +286,9 @@ def test_an_error_forgets_no_memory_that_launches_still_need(batching, monkeypat
     """Launches of the batch are started first."""
     device, int32, seen = batching[0], np.dtype(np.int32), []
     space, end_batch = Workspace(device), device.end_batch
-    monkeypatch.setattr(device, "end_batch", lambda: (seen.append(("pose_status", int32) in space._buffers), end_batch()))
+    monkeypatch.setattr(
+        device, "end_batch", lambda: (seen.append(("pose_status", int32) in space._buffers), end_batch())
+    )
     with pytest.raises(KeyboardInterrupt), space:
         space.empty("pose_status", 2, int32, zero=True)
         raise KeyboardInterrupt

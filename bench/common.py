@@ -175,9 +175,9 @@ class Recorder(Proxy):
         return self._backend
 
     @property
-    def gathers(self) -> bool:
-        """See Backend.gathers; while launches are recorded each copy and launch is started by itself."""
-        return not self._listening and super().gathers
+    def in_batch(self) -> bool:
+        """See Backend.in_batch; while launches are recorded each copy and launch is started by itself."""
+        return not self._listening and super().in_batch
 
     def launches_of(self, run: Callable[[], Any]) -> list[Callable[[], None]]:
         """Run a call and return its launches."""

@@ -58,9 +58,9 @@ def measure(backend: str, particles: int, beams: int, stages: int, steps: int) -
     means = [float(np.minimum(kept, 4 * np.median(kept)).mean()) for kept in (late, verdict, default)]
     pf = filters[0]
     in_a_row = with_estimate = None
-    if pf._cloud._recordings:
-        step = next(reversed(pf._cloud._recordings.values()))[0]
-        estimate = next(reversed([one for one in pf._cloud._estimates._kept.values() if one is not None]))
+    if len(pf._cloud._recordings):
+        step = pf._cloud._recordings.items()[-1][1].recording
+        estimate = pf._cloud._estimates.last
         in_a_row, with_estimate = _in_a_row(pf, steps, [step]), _in_a_row(pf, steps, [step, estimate])
     return dict(
         backend=backend, particles=particles, beams=beams, stages=stages, median_ms=float(np.median(late)),

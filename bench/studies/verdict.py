@@ -66,7 +66,7 @@ def follow(places, events, start, *, backend, particles, kind, beams, seed):
         pf.correct({models[event.scanner]: event.ranges})
         e = pf.estimate()
         d = e.pose - event.truth
-        belief, word = pf._verdict.state.belief, WORDS.index(e.verdict)
+        belief, word = pf._parts.verdict.state.belief, WORDS.index(e.verdict)
         rows.append((math.hypot(d[0], d[1]), abs(math.remainder(d[2], math.tau)), e.p_lost, word, belief.ratio,
                      math.sqrt(e.covariance[0, 0] + e.covariance[1, 1]), *e.pose))  # fmt: skip
     return np.array(rows)

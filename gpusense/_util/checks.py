@@ -10,10 +10,10 @@ import reprlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from gpusense._util import masks
 
@@ -136,7 +136,8 @@ def as_array(name: str, value: object, *, masked: bool = False) -> NDArray[Any]:
     """
     check_values(name, value)
     try:
-        return np.asarray(cast("ArrayLike", masks.filled(value) if masked else masks.unmasked(name, value)))
+        plain: Any = masks.filled(value) if masked else masks.unmasked(name, value)
+        return np.asarray(plain)
     except ValueError as error:
         if str(error).startswith(f"{name}: "):
             raise
@@ -273,8 +274,9 @@ def existing_file(file: Path) -> Path:
 
 
 def _fits(shape: tuple[int, ...], rule: Sequence[int | str]) -> bool:
-    return len(shape) == len(rule) and all(
-        isinstance(length, str) or length == size for size, length in zip(shape, rule, strict=True)
+    return shape == rule or (
+        len(shape) == len(rule)
+        and all(isinstance(length, str) or length == size for size, length in zip(shape, rule, strict=True))
     )
 
 

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+_NUMBERS = {int, float, np.float32, np.float64}
+
 
 def is_masked(value: object) -> bool:
     """Return whether a value is a masked array, or a list or tuple with one in it, however deep."""
@@ -18,6 +20,8 @@ def is_masked(value: object) -> bool:
     if isinstance(value, (list, tuple)):
         # Lists of numbers are long: only their types are looked at.
         kinds = set(map(type, value))
+        if kinds <= _NUMBERS:
+            return False
         return any(issubclass(kind, library.MaskedArray) for kind in kinds) or (
             any(issubclass(kind, (list, tuple)) for kind in kinds) and any(map(is_masked, value))
         )

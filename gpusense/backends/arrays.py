@@ -12,13 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from gpusense._util import masks
+from gpusense._util import checks, masks
 from gpusense._util.checks import check_gradients, shape_text, show
 from gpusense.backends.base import Adopted, Backend, Buffer
 from gpusense.backends.registry import entry_of_array, selection_for
 
 # DLPack's numbers for memory that the processor reads: host memory, also pinned for CUDA or ROCm.
 _HOST = (1, 3, 11)
+# Poses in a block whose bounds are computed together.
+_BLOCK = 8192
+
+Bounds = tuple[tuple[float, ...], tuple[float, ...]]
+"""The least and the largest x, y and theta of poses."""
 
 
 def on_device(array: object) -> bool:
@@ -75,10 +80,49 @@ def _adopt(array: Any, backend: Backend, name: str, *, in_place: bool = False) -
     )
 
 
+def host_poses(array: object, name: str, scans: int | None = None) -> tuple[np.ndarray, Bounds]:
+    """Return (N, 3) poses in host memory, or those of S scans one after the other, and their bounds.
+
+    The poses are C-contiguous float64 numbers. NaN and infinities are found by the bounds, which calls need anyway.
+
+    Raises:
+        TypeError: not numbers.
+        ValueError: another shape, or a value that is not finite.
+    """
+    read = array if type(array) is np.ndarray else to_host(array, name)
+    shape = ("N", 3) if scans is None else (scans, "N", 3)
+    if scans is None and isinstance(read, np.ndarray) and read.dtype.kind == "f" and read.shape[1:] == (3,):
+        poses = np.ascontiguousarray(read, np.float64)
+    else:
+        poses = np.ascontiguousarray(checks.array(name, read, shape, finite=False)).reshape(-1, 3)
+    bounds = bounds_of(poses)
+    if not all(map(math.isfinite, (*bounds[0], *bounds[1]))):
+        checks.array(name, read, shape)
+    return poses, bounds
+
+
+def bounds_of(poses: np.ndarray) -> Bounds:
+    """Return the least and the largest of each column of (N, 3) poses, 0 for no poses; NaN where a column holds one.
+
+    Columns of three are slow to reduce; rows are not. Blocks that fit the nearest cache are transposed one by one.
+    """
+    if not len(poses):
+        return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    lows, highs = [], []
+    for begin in range(0, len(poses), _BLOCK):
+        rows = np.ascontiguousarray(poses[begin : begin + _BLOCK].T)
+        lows.append(np.minimum.reduce(rows, axis=1))
+        highs.append(np.maximum.reduce(rows, axis=1))
+    # minimum.reduce and maximum.reduce keep NaN.
+    low = lows[0] if len(lows) == 1 else np.minimum.reduce(lows)
+    high = highs[0] if len(highs) == 1 else np.maximum.reduce(highs)
+    return tuple(low.tolist()), tuple(high.tolist())
+
+
 def adopt_poses(
-    array: object, backend: Backend, name: str, several: bool = False, *, in_place: bool = False
+    array: object, backend: Backend, name: str, scans: int | None = None, *, in_place: bool = False
 ) -> tuple[Buffer, int, bool, object]:
-    """Return (N, 3) poses on the device, or (S, N, 3) poses of several scans.
+    """Return (N, 3) poses on the device, or (S, N, 3) poses of S scans.
 
     Returns:
         A flat buffer, the number of all poses, whether they are float32, and the owner of the memory.
@@ -90,8 +134,8 @@ def adopt_poses(
     adopted = _adopt(array, backend, name, in_place=in_place)
     if not backend.info.float64:
         raise TypeError(f"{name}: must be in host memory on {backend.info.name}, which has no float64 to place them")
-    wanted = ("S", "N", 3) if several else ("N", 3)
-    if len(adopted.shape) != len(wanted) or adopted.shape[-1] != 3:
+    wanted = ("N", 3) if scans is None else (scans, "N", 3)
+    if len(adopted.shape) != len(wanted) or adopted.shape[-1] != 3 or adopted.shape[:-2] != wanted[:-2]:
         raise ValueError(f"{name}: shape must be {shape_text(wanted)}, got {shape_text(adopted.shape)}")
     _check_numbers(adopted, name)
     return adopted.buffer, math.prod(adopted.shape) // 3, adopted.dtype == np.float32, adopted.owner
@@ -118,8 +162,8 @@ def _check_numbers(adopted: Adopted, name: str) -> None:
         TypeError: another type.
         ValueError: not C-contiguous.
     """
-    dtype = adopted.dtype.name if adopted.dtype.isnative else adopted.dtype.str
     if adopted.dtype not in (np.float32, np.float64):
+        dtype = adopted.dtype.name if adopted.dtype.isnative else adopted.dtype.str
         raise TypeError(f"{name}: must hold float32 or float64, got {dtype}")
     if not adopted.contiguous:
         raise ValueError(f"{name}: must be C-contiguous on the device, got strides {adopted.strides}")

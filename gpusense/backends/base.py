@@ -6,6 +6,8 @@ A method of an ability that it lacks does nothing, where that is correct, or rai
 
 from __future__ import annotations
 
+import itertools
+import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -117,7 +119,7 @@ class Backend(ABC):
         return _ProgramRecording(self, program)
 
     def replay(self, recording: Recording) -> None:
-        """Start a recording as part of the call that this thread gathers, or at once where it gathers none."""
+        """Start a recording as part of this thread's batch, or at once where it has none."""
         recording()
 
     @property
@@ -125,23 +127,23 @@ class Backend(ABC):
         """Tell whether to record bound calls of few particles, although a recording must copy their NumPy arrays."""
         return False
 
-    # ---- calls: where starts take longer than small work, the work of a call is gathered and started together
+    # ---- batches: where starts take longer than small work, the work of a call is started together
 
-    def gather(self) -> None:  # noqa: B027
-        """Gather this thread's launches and copies from now on; ``start`` or ``synchronize`` starts them in order.
+    def begin_batch(self) -> None:  # noqa: B027
+        """Put this thread's launches and copies off from now on; ``submit`` or ``synchronize`` starts them in order.
 
         A blocking copy first starts everything before it, so the order of a call is kept.
         """
 
-    def start(self) -> None:  # noqa: B027
-        """Start the gathered launches and copies."""
+    def submit(self) -> None:  # noqa: B027
+        """Start the launches and copies of this thread's batch; it goes on."""
 
-    def scatter(self) -> None:  # noqa: B027
-        """Start the gathered launches and copies, and gather no more."""
+    def end_batch(self) -> None:  # noqa: B027
+        """Start the launches and copies of this thread's batch, and end it."""
 
     @property
-    def gathers(self) -> bool:
-        """Tell whether this thread is recording launches and copies."""
+    def in_batch(self) -> bool:
+        """Tell whether this thread has a batch."""
         return False
 
     def address(self, buffer: Buffer) -> int:
@@ -172,7 +174,7 @@ class Backend(ABC):
 
     def view(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> Adopted:
         """Return the head of a buffer of this device as an array that models take."""
-        strides = np.cumprod([dtype.itemsize, *shape[:0:-1]])[::-1].tolist()
+        strides = [*itertools.accumulate(shape[:0:-1], operator.mul, initial=dtype.itemsize)][::-1]
 
         def to_host() -> np.ndarray:
             return self.download(buffer, np.empty(shape, dtype))

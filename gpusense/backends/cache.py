@@ -188,7 +188,7 @@ def _shrink(folder: Path) -> None:
             _evict(Path(path))
 
 
-class ProgramCache:
+class BinaryCache:
     """Compiled programs of one device."""
 
     def __init__(self, info: BackendInfo) -> None:

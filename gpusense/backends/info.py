@@ -22,7 +22,7 @@ class BackendInfo:
         lanes: 1 leaves it to the compiler to compute several particles or beams at once, more asks for kernels that do.
         vector_loops: Whether the compiler makes vectors of a work-item's loops over readings, and not of work-items.
         target: The processor for which the driver compiles, by its compiler's name; empty where it is not known.
-        graphs: Whether the launches and copies of a call are gathered, and replayed as one graph once they repeat.
+        graphs: Whether the launches and copies of a call are a batch, which is replayed as one graph once it repeats.
 
     Example:
         >>> from gpusense.backends import get_backend

@@ -1,16 +1,135 @@
-"""Programs that run repeatedly: recorded by their keys."""
+"""The programs of earlier calls, which repeated calls start again.
+
+A cache belongs to one owner (a workspace, a bound call, the particles of a filter), holds strong references to its
+programs and to the buffers that they use, and is held by its owner alone. Nothing that it holds refers to the owner, so
+programs and their memory go with it at once, without the garbage collector. They go earlier:
+
+- the oldest one where there are too many,
+- all of them where the owner clears the cache: it replaces a buffer that they use, or the table of the map.
+
+The owner's lock serves the cache, too, since programs share the owner's buffers. A forked child must not use the
+device, and its first start of a program is an error (``Backend.check_process``).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
+from typing import Any, Generic, TypeVar
 
 from gpusense.backends.base import Backend
 from gpusense.backends.recording import Recording
-from gpusense.interface.launches import Program
+from gpusense.interface.launches import Program, flags_of
+
+T = TypeVar("T")
 
 
-class ProgramCache:
-    """Runs programs by keys, and records one that runs a second time.
+class ProgramCache(Generic[T]):
+    """Programs by their keys, in the form in which their owner starts them.
+
+    Args:
+        most: Most programs that are kept.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most, self._kept = most, dict[Hashable, T]()
+        # Keys of programs that have run once.
+        self._seen: dict[Hashable, None] = {}
+        # The program of a key, or None.
+        self.get = self._kept.get
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def keep(self, key: Hashable, program: T) -> T:
+        """Keep the program of a key, which determines it, and return it."""
+        _make_room(self._kept, self._most)
+        self._kept[key] = program
+        return program
+
+    def repeats(self, key: Hashable) -> bool:
+        """Tell whether this was asked before of a key: a program that runs once is not worth to be kept."""
+        if key in self._seen:
+            return True
+        _make_room(self._seen, self._most)
+        self._seen[key] = None
+        return False
+
+    def items(self) -> list[tuple[Hashable, T]]:
+        """Return the keys with their programs, the last one at the end."""
+        return [*self._kept.items()]
+
+    def clear(self) -> None:
+        """Drop all programs."""
+        self._kept.clear()
+        self._seen.clear()
+
+
+def _make_room(kept: dict[Hashable, Any], most: int) -> None:
+    """Drop the oldest of so many items."""
+    while len(kept) >= most:
+        del kept[next(iter(kept))]
+
+
+class ChangingProgram:
+    """A program without the arguments that change from call to call.
+
+    Args:
+        backend: The device.
+        program: The program.
+        changing: Names of the arguments.
+
+    Attributes:
+        flags: Flags of its launches.
+    """
+
+    def __init__(self, backend: Backend, program: Program, changing: Iterable[str]) -> None:
+        names = frozenset(changing)
+        self._backend, self.flags = backend, flags_of(program)
+        self._launches = [
+            (backend.compile(one.kernel, one.flags), one.size, one.without(names).arguments, one.places(names))
+            for one in program
+        ]
+
+    def __call__(self, changing: dict[str, Any]) -> None:
+        """Start it with the arguments of a call; a launch does not wait for the arguments of the next."""
+        self._backend.check_process()
+        for launcher, size, fixed, places in self._launches:
+            arguments = list(fixed)
+            for place, name in places:
+                arguments[place] = changing[name]
+            launcher(size, *arguments)
+
+
+class RecordedProgram:
+    """The recording of a program.
+
+    Args:
+        backend: The device.
+        program: The program.
+        owners: Owners of its memory, which stay alive as long as it does.
+
+    Attributes:
+        flags: Flags of its launches.
+        recording: The recording.
+    """
+
+    def __init__(self, backend: Backend, program: Program, owners: object = None) -> None:
+        self.flags, self.recording = flags_of(program), backend.record(program)
+        self._backend, self._owners = backend, owners
+
+    def __call__(self, changing: dict[str, Any]) -> None:
+        """Start it as part of a call; its key holds the arguments of the call."""
+        self._backend.check_process()
+        self._backend.replay(self.recording)
+
+    def start(self) -> None:
+        """Start it now."""
+        self._backend.check_process()
+        self.recording()
+
+
+class RepeatedPrograms:
+    """Programs that may run again: each is recorded when it runs a second time.
 
     Args:
         backend: The device.
@@ -18,19 +137,25 @@ class ProgramCache:
     """
 
     def __init__(self, backend: Backend, most: int) -> None:
-        self._backend, self._most = backend, most
-        self._kept: dict[Hashable, Recording | None] = {}
+        self._backend, self._programs = backend, ProgramCache[Recording](most)
 
     def run(self, key: Hashable, make: Callable[[], Program]) -> None:
         """Run the program of a key, which determines it."""
-        if recording := self._kept.get(key):
+        recording = self._programs.get(key)
+        if recording is not None:
+            self._backend.check_process()
             recording()
             return
         program = make()
         self._backend.run(program)
-        kept = self._backend.record(program) if key in self._kept else None
-        self._kept = dict([*self._kept.items()][1 - self._most :]) | {key: kept}
+        if self._programs.repeats(key):
+            self._programs.keep(key, self._backend.record(program))
+
+    @property
+    def last(self) -> Recording:
+        """The recording that was made last; there must be one."""
+        return self._programs.items()[-1][1]
 
     def clear(self) -> None:
-        """Forget all programs."""
-        self._kept.clear()
+        """Drop all programs."""
+        self._programs.clear()

@@ -57,22 +57,22 @@ class Proxy(Backend):
         """See Backend.synchronize."""
         self._backend.synchronize()
 
-    def gather(self) -> None:
-        """See Backend.gather."""
-        self._backend.gather()
+    def begin_batch(self) -> None:
+        """See Backend.begin_batch."""
+        self._backend.begin_batch()
 
-    def start(self) -> None:
-        """See Backend.start."""
-        self._backend.start()
+    def submit(self) -> None:
+        """See Backend.submit."""
+        self._backend.submit()
 
-    def scatter(self) -> None:
-        """See Backend.scatter."""
-        self._backend.scatter()
+    def end_batch(self) -> None:
+        """See Backend.end_batch."""
+        self._backend.end_batch()
 
     @property
-    def gathers(self) -> bool:
-        """See Backend.gathers."""
-        return self._backend.gathers
+    def in_batch(self) -> bool:
+        """See Backend.in_batch."""
+        return self._backend.in_batch
 
     @property
     def replays(self) -> bool:

@@ -30,7 +30,7 @@ class Result:
 
     def __init__(self, poses: Any, out: Any, shape: tuple[int, ...], real: np.dtype, backend: Backend) -> None:
         self._poses, self._out, self._shape, self._real, self._backend = poses, out, shape, real, backend
-        self._on_device = arrays.on_device(poses)
+        self._on_device = type(poses) is not np.ndarray and arrays.on_device(poses)
         if out is not None:
             self.flat = arrays.check_out(out, shape, real, poses, backend)
         elif self._on_device:
@@ -46,4 +46,5 @@ class Result:
             return self._out
         if self._on_device:
             return arrays.lent(self._poses, self._backend, self.flat, self._shape, self._real)
-        return arrays.like(self._poses, self.flat.reshape(self._shape))
+        result = self.flat.reshape(self._shape)
+        return result if type(self._poses) is np.ndarray else arrays.like(self._poses, result)

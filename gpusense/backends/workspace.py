@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+import functools
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import numpy as np
 
 from gpusense.backends.base import Backend, Buffer
-from gpusense.backends.recording import Recording
-from gpusense.interface.launches import Program, flags_of
+from gpusense.backends.programs import ChangingProgram, ProgramCache, RecordedProgram
+from gpusense.interface.launches import Program
 
 # Programs of earlier calls that are kept.
 _MOST_KEPT = 64
@@ -20,37 +20,35 @@ _ALIGNED = 64
 POSE_STATUS = ("pose_status", np.dtype(np.int32))
 
 
-class KeptProgram:
-    """A program of an earlier call, without the arguments that change from call to call.
+class _Result:
+    """Context of the launches that write a part of a result, which is delivered at its end."""
 
-    Attributes:
-        flags: Flags of its launches.
-    """
+    def __init__(
+        self, space: Workspace, backend: Backend, name: str, target: np.ndarray | Buffer, first: int, count: int,
+        dtype: np.dtype,
+    ) -> None:  # fmt: skip
+        self._space, self._backend, self._target, self._first, self._count = space, backend, target, first, count
+        self._begin = begin = first * dtype.itemsize
+        # Parts cannot begin at any byte.
+        self._in_place = not isinstance(target, np.ndarray) and begin % backend.alignment == 0
+        if isinstance(target, np.ndarray):
+            self._buffer = space.empty(name, count, dtype)
+        elif self._in_place:
+            self._buffer = backend.part(target, first, count, dtype)
+        else:
+            self._buffer = space.empty(f"{name} lent", count, dtype, lent=True)
+        self._bytes = count * dtype.itemsize
 
-    def __init__(self, program: Program, changing: Iterable[str]) -> None:
-        names = frozenset(changing)
-        self.flags = flags_of(program)
-        self._launches = [(one.without(names), one.places(names)) for one in program]
+    def __enter__(self) -> Buffer:
+        return self._buffer
 
-    def run(self, backend: Backend, changing: dict[str, Any]) -> None:
-        """Run the program with the arguments of a call; a launch does not wait for the arguments of the next."""
-        for one, places in self._launches:
-            arguments = list(one.arguments)
-            for place, name in places:
-                arguments[place] = changing[name]
-            backend.compile(one.kernel, one.flags)(one.size, *arguments)
-
-
-class KeptRecording(KeptProgram):
-    """The recording of a program of an earlier call, with all its arguments."""
-
-    def __init__(self, program: Program, recording: Recording) -> None:
-        super().__init__((), ())
-        self.flags, self._recording = flags_of(program), recording
-
-    def run(self, backend: Backend, changing: dict[str, Any]) -> None:
-        """Replay it; its key holds the arguments of the call."""
-        backend.replay(self._recording)
+    def __exit__(self, kind: object, *error: object) -> None:
+        if kind is not None or self._in_place:
+            return
+        if isinstance(self._target, np.ndarray):
+            self._space.download(self._buffer, self._target[self._first : self._first + self._count])
+        else:
+            self._backend.copy(self._buffer, self._target, self._bytes, to=self._begin)
 
 
 class Workspace:
@@ -62,20 +60,22 @@ class Workspace:
         # Host arrays that unfinished copies read or write.
         self._busy: list[np.ndarray] = []
         # Programs of earlier calls, by everything on which they depend.
-        self._programs: dict[Hashable, KeptProgram] = {}
+        self._programs = ProgramCache[ChangingProgram | RecordedProgram](_MOST_KEPT)
         self._version = 0
         self._parts: dict[Hashable, list[Buffer]] = {}
 
     def __enter__(self) -> Workspace:
-        """Begin a call, whose launches and copies the device gathers where it can."""
-        self._backend.gather()
+        """Begin a call, whose launches and copies are a batch where the device has graphs."""
+        if self._backend.info.graphs:
+            self._backend.begin_batch()
         return self
 
     def __exit__(self, kind: object, *error: object) -> None:
         try:
-            self._backend.scatter()
+            if self._backend.info.graphs:
+                self._backend.end_batch()
         finally:
-            # Not earlier: gathered launches may write the flag.
+            # Not earlier: launches of the batch may write the flag.
             if kind is not None:
                 self.abandon()
 
@@ -85,9 +85,9 @@ class Workspace:
             self._forget()
             del self._buffers[POSE_STATUS]
 
-    def start(self) -> None:
-        """Start the gathered work of the call."""
-        self._backend.start()
+    def submit(self) -> None:
+        """Start the work of the call so far."""
+        self._backend.submit()
 
     def run(
         self, key: Hashable, changing: dict[str, Any], make: Callable[[], Program], *, version: int
@@ -104,7 +104,7 @@ class Workspace:
             The flags of its launches.
         """
         backend = self._backend
-        records = backend.info.graphs and backend.gathers
+        records = backend.info.graphs and backend.in_batch
         if version != self._version:
             # In this order: an interrupt in between must not leave programs of the old table.
             self._programs.clear()
@@ -112,14 +112,14 @@ class Workspace:
         if records:
             # A recording keeps its numbers, and no buffer alive: their addresses tell it apart.
             key = (key, *map(self._identity, changing.values()))
-        kept = self._programs.get((records, key))
-        if kept is None:
-            program = make()
-            kept = KeptRecording(program, backend.record(program)) if records else KeptProgram(program, changing)
-            if len(self._programs) >= _MOST_KEPT:
-                del self._programs[next(iter(self._programs))]
-            self._programs[records, key] = kept
-        kept.run(backend, changing)
+            kept = self._programs.get((records, key)) or self._programs.keep(
+                (records, key), RecordedProgram(backend, make())
+            )
+        else:
+            kept = self._programs.get((records, key)) or self._programs.keep(
+                (records, key), ChangingProgram(backend, make(), changing)
+            )
+        kept(changing)
         return kept.flags
 
     def _identity(self, value: Any) -> Hashable:
@@ -157,12 +157,15 @@ class Workspace:
         """Start to copy a host array into the head of a named buffer; the array must not change until ``wait``."""
         array = np.ascontiguousarray(array)
         self._busy.append(array)
-        return self._backend.upload(array, self.empty(name, array.size, array.dtype), wait=False)
+        capacity, buffer = self._buffers.get((name, array.dtype), (0, None))
+        if buffer is None or capacity < array.size:
+            buffer = self.empty(name, array.size, array.dtype)
+        return self._backend.upload(array, buffer, wait=False)
 
     def upload_all(self, name: str, arrays: Sequence[np.ndarray]) -> list[Buffer]:
-        """Upload arrays of one dtype, none of them empty; a gathered call copies them as one."""
-        if not self._backend.gathers:
-            return [self.upload(f"{name} {i}", array) for i, array in enumerate(arrays)]
+        """Upload arrays of one dtype, none of them empty; a batch copies them as one."""
+        if not (self._backend.info.graphs and self._backend.in_batch):
+            return [*map(self.upload, _numbered(name, len(arrays)), arrays)]
         sizes = tuple([array.size for array in arrays])
         firsts, total = [], 0
         for size in sizes:
@@ -183,24 +186,9 @@ class Workspace:
             self._parts[key] = parts
         return parts
 
-    @contextmanager
-    def result(
-        self, name: str, target: np.ndarray | Buffer, first: int, count: int, dtype: np.dtype
-    ) -> Iterator[Buffer]:
-        """Yield the buffer in which launches write ``count`` numbers of a flat host array or a lent buffer."""
-        if isinstance(target, np.ndarray):
-            buffer = self.empty(name, count, dtype)
-            yield buffer
-            self.download(buffer, target[first : first + count])
-            return
-        begin = first * dtype.itemsize
-        if begin % self._backend.alignment == 0:
-            yield self._backend.part(target, first, count, dtype)
-            return
-        # Parts cannot begin at this byte.
-        buffer = self.empty(f"{name} lent", count, dtype, lent=True)
-        yield buffer
-        self._backend.copy(buffer, target, count * dtype.itemsize, to=begin)
+    def result(self, name: str, target: np.ndarray | Buffer, first: int, count: int, dtype: np.dtype) -> _Result:
+        """Return a context with the buffer in which launches write ``count`` numbers of a flat array or lent buffer."""
+        return _Result(self, self._backend, name, target, first, count, dtype)
 
     def download(self, buffer: Buffer, out: np.ndarray) -> None:
         """Start to copy the head of a buffer into a C-contiguous array, which is filled after ``wait``."""
@@ -222,3 +210,9 @@ class Workspace:
         self.wait()
         self._forget()
         self._buffers = {key: kept for key, kept in self._buffers.items() if key[0] == keep}
+
+
+@functools.cache
+def _numbered(name: str, count: int) -> tuple[str, ...]:
+    """Return names of arrays that are uploaded together."""
+    return tuple(f"{name} {number}" for number in range(count))

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from gpusense.backends.base import Backend, Buffer
-from gpusense.backends.programs import ProgramCache
-from gpusense.backends.recording import Recording
+from gpusense.backends.programs import ProgramCache, RecordedProgram, RepeatedPrograms
 from gpusense.interface.constants import ESTIMATE, LEFT, MOMENTS, SLOW_RATE, STAGE, STATE, WIDE_HEADINGS
 from gpusense.interface.launches import Program
 from gpusense.localization.filter_cloud import Contents, Summary, deeper, is_starved, meaningful, summary_of
@@ -40,8 +39,8 @@ class Cloud(Particles):
         self, backend: Backend, capacity: int, sensors: int, precision: np.dtype, *, residual: bool = False
     ) -> None:
         super().__init__(backend, capacity, sensors, precision, residual=residual)
-        self._recordings: dict[Hashable, tuple[Recording, object]] = {}
-        self._estimates, self._stages = ProgramCache(backend, 8), ProgramCache(backend, 24)
+        self._recordings = ProgramCache[RecordedProgram](_MOST_RECORDED)
+        self._estimates, self._stages = RepeatedPrograms(backend, 8), RepeatedPrograms(backend, 24)
         self._uploads: list[np.ndarray] = []
 
     def place(self, poses: np.ndarray, weights: np.ndarray | None = None) -> None:
@@ -157,19 +156,18 @@ class Cloud(Particles):
             scoring: Returns the program that scores the poses of a buffer, and the owners of its memory.
         """
         whole = (key, stage, self.count)
-        if whole not in self._recordings:
-            if len(self._recordings) > _MOST_RECORDED:
-                self._recordings.clear()
+        recorded = self._recordings.get(whole)
+        if recorded is None:
             move = () if stage.kind is None else self.motion(stage.origin, stage.source, stage.kind)
             program, owners = scoring(stage.source)
-            self._recordings[whole] = self.backend.record(move + program + self.weighing(stage)), owners
-        self._recordings[whole][0]()
+            program = move + program + self.weighing(stage)
+            recorded = self._recordings.keep(whole, RecordedProgram(self.backend, program, owners))
+        recorded.start()
 
     def explain(self) -> str:
         """Return how the last recorded step is started."""
-        if not self._recordings:
-            return "launches one by one"
-        return next(reversed(self._recordings.values()))[0].explain()
+        recorded = self._recordings.items()
+        return recorded[-1][1].recording.explain() if recorded else "launches one by one"
 
     # ---- what crosses to the host
 

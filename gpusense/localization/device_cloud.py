@@ -21,11 +21,11 @@ class DeviceCloud(Cloud, FilterCloud):
 
     def __init__(self, sensors: Sequence[Sensor], capacity: int, *, residual: bool = False) -> None:
         super().__init__(sensors[0].backend, capacity, len(sensors), sensors[0].precision, residual=residual)
-        self._scored, self._scoring = sensors, Scoring(self, sensors)
+        self._scored, self._scoring = sensors, Scoring(sensors)
 
     def correct(self, step: Step) -> None:
         """See FilterCloud.correct."""
-        score = self._scoring.of(step.given)
+        score = self._scoring.of(self, step.given)
         stages = self.places.stages(self.kept, step.stages, step.drawn, step.kind)
         self.run_stages(step.settings, stages, step.drawn, len(step.given), score)
 

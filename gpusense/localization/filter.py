@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray
 from gpusense.backends import BackendInfo
-from gpusense.localization import options, skipping, starts
+from gpusense.localization import options
 from gpusense.localization.assessment import estimate_of
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.device_cloud import DeviceCloud
 from gpusense.localization.diagnosis import Diagnosis, diagnose
 from gpusense.localization.estimates import Estimate
 from gpusense.localization.filter_cloud import FilterCloud
+from gpusense.localization.filter_parts import FilterParts
 from gpusense.localization.journal import Whole, settled, whole
 from gpusense.localization.motion import MotionModel, OdometryMotion, SampledMotion
-from gpusense.localization.recovery import Recovery
-from gpusense.localization.scoring import given_of
 from gpusense.localization.sensors import grid_of, sensors_of
-from gpusense.localization.state import FilterState, check_state, constructor_options, memory_of, model_names, remember
-from gpusense.localization.tracker import Tracker, is_together
-from gpusense.localization.verdict import Verdict
+from gpusense.localization.state import FilterState, check_state, constructor_options, model_names
+from gpusense.localization.tracker import Tracker
 from gpusense.world.grid import OccupancyGrid
 
 
@@ -72,9 +70,6 @@ class ParticleFilter(Whole):
         True
     """
 
-    MEMORY: ClassVar[tuple[str, ...]] = ("_last",)
-    PARTS: ClassVar[tuple[str, ...]] = ()
-
     def __init__(
         self,
         models: Any,
@@ -102,23 +97,17 @@ class ParticleFilter(Whole):
             raise ValueError("recovery: 'augmented' needs a model with a map, got none")
         self._begin_journals()
         self._cloud = self._new_cloud()
-        self._tracker = Tracker(self._sensors, self.options, self._cloud)
-        self._verdict = Verdict(self._sensors, self._tracker.random_poses, seed=self.options.seed)
-        self._recovery = Recovery(self._tracker, self._verdict)
-        # Readings of the last correction by the index of their sensor.
-        self._last: dict[int, tuple[Any, ...]] = {}
+        self._parts = FilterParts(self._sensors, self.options, self._cloud)
 
     def _new_cloud(self) -> FilterCloud:
         """Return room for the particles."""
         return DeviceCloud(self._sensors, self.options.most, residual=self.options.resampling == "residual")
 
     def _keep(self) -> None:
-        self._tracker.keep()
-        self._recovery.keep()
+        self._parts.keep()
 
     def _changing(self) -> tuple[Any, ...]:
-        parts = self._tracker, self._cloud, self._verdict
-        return self, *parts, *self._sensors, *self._recovery.changing()
+        return self._parts.changing()
 
     def __repr__(self) -> str:
         one = self.options
@@ -129,17 +118,11 @@ class ParticleFilter(Whole):
             f"stages={one.stages}, backend={self.device.selection!r})"
         )
 
-    def _check_started(self) -> None:
-        if not self._tracker.started:
-            raise RuntimeError(
-                "ParticleFilter: must be initialised first, by initialize, initialize_uniform or initialize_from"
-            )
-
     def _moved(self) -> Tracker:
         """Return the particles after the motion of the last ``predict``."""
-        self._check_started()
+        self._parts.check_started()
         self.flush()
-        return self._tracker
+        return self._parts.tracker
 
     # ---- starts
 
@@ -158,10 +141,7 @@ class ParticleFilter(Whole):
         Warns:
             PlausibilityWarning: the mean lies off the map, or its heading is more than a turn.
         """
-        tracker = self._tracker
-        self._begin(starts.normal(mean, covariance, tracker.number(particles), tracker.key()))
-        starts.look_at(np.asarray(mean, np.float64), grid_of(self._sensors))
-        tracker.together = is_together(np.asarray(covariance))
+        self._parts.start_around(mean, covariance, particles)
 
     @whole
     def initialize_uniform(self, *, bounds: AnyArray | None = None, particles: int | None = None) -> None:
@@ -176,13 +156,7 @@ class ParticleFilter(Whole):
         Raises:
             TypeError, ValueError: an argument breaks its rule, or no cell is free.
         """
-        tracker = self._tracker
-        pool, spread = starts.free_pool(self.models, bounds)
-        self._begin(starts.spread(pool, spread, tracker.number(particles), tracker.key()))
-        tracker.wide = DEFAULTS.wide_scans
-        self._verdict.reset(anywhere=True)
-        if bounds is None:
-            self._recovery.expect_anywhere()
+        self._parts.start_anywhere(bounds, particles)
 
     @whole
     def initialize_from(self, likelihood: Any, *, particles: int | None = None) -> None:
@@ -206,20 +180,7 @@ class ParticleFilter(Whole):
             >>> pf.host_particles().shape
             (100, 3)
         """
-        tracker = self._tracker
-        count = tracker.number(particles)
-        pool, spread = starts.likely_pool(likelihood, count, tracker.key())
-        self._begin(starts.spread(pool, spread, count, tracker.key(), each=True))
-        self._recovery.expect_anywhere()
-
-    def _begin(self, poses: np.ndarray) -> None:
-        """Replace all particles, and forget what earlier ones have seen."""
-        self._tracker.place(poses)
-        self._tracker.pending, self._last = None, {}
-        self._recovery.restart()
-        self._verdict.reset()
-        for sensor in self._sensors:
-            sensor.restart()
+        self._parts.start_from(likelihood, particles)
 
     # ---- steps
 
@@ -234,29 +195,27 @@ class ParticleFilter(Whole):
             RuntimeError: the filter is not initialised.
             TypeError, ValueError: an argument breaks its rule.
         """
-        self._check_started()
+        self._parts.check_started()
         sampled = self.motion.sampled(*motion)
-        if self._tracker.pending is None and self._recovery.active is None:
+        if self._parts.tracker.pending is None and self._parts.recovery.active is None:
             # One assignment.
-            self._tracker.follow(sampled)
+            self._parts.tracker.follow(sampled)
         else:
             self._follow(sampled)
 
     @whole
     def _follow(self, motion: SampledMotion) -> None:
-        """Move the particles and their rival."""
-        self._tracker.follow(motion)
-        self._recovery.follow(motion)
+        self._parts.follow(motion)
 
     @settled
     def flush(self) -> None:
         """Run the motion of the last ``predict`` now, as a step of its own; the next correction does it otherwise."""
-        if self._tracker.pending is not None:
+        if self._parts.tracker.pending is not None:
             self._move()
 
     @whole
     def _move(self) -> None:
-        self._tracker.move(None)
+        self._parts.tracker.move(None)
 
     @whole
     def correct(self, readings: Any) -> None:
@@ -276,22 +235,8 @@ class ParticleFilter(Whole):
             KeyError: a model that is not the filter's.
             TypeError, ValueError: readings that the model refuses.
         """
-        self._check_started()
-        given = given_of(readings, self._sensors)
-        if not given:
-            return
-        everything, verdict, share = dict(given), self._verdict, self.options.beam_skip
-        if verdict.watches(everything):
-            verdict.predicted(self.host_particles(), self.host_weights(), everything)
-        if share is not None:
-            particles = self.host_particles(), self.host_weights()
-            given = skipping.skipped(self._sensors, given, particles, verdict.anywhere, share)
-        self._tracker.weigh(given, again=bool(self._last))
-        # The caller may write the next readings to the same arrays.
-        self._last = {index: tuple(map(_copied, reading)) for index, reading in everything.items()}
-        verdict.corrected()
-        self._tracker.learn(given, self._recovery.is_doubted)
-        self._recovery.corrected(given, self._last)
+        self._parts.check_started()
+        self._parts.correct(readings)
 
     @whole
     def reset(self) -> None:
@@ -302,15 +247,9 @@ class ParticleFilter(Whole):
         Raises:
             RuntimeError: there are no readings since the particles were initialised.
         """
-        if not self._last:
+        if not self._parts.last:
             raise RuntimeError("reset: needs a correction first")
-        tracker = self._tracker
-        tries = tracker.random_poses(starts.tries_of(self._cloud.count))
-        tracker.place(
-            starts.with_likely_poses(
-                tracker.next_particles(), tries, self._sensors, self._last, self.options.temperature, tracker.key()
-            )
-        )
+        self._parts.reset()
 
     # ---- results
 
@@ -338,7 +277,8 @@ class ParticleFilter(Whole):
             ValueError: another method.
         """
         checks.choice("method", method, ("mean", "cluster", "best"))
-        return estimate_of(self._moved(), self._verdict, self._recovery, self._last, method)
+        parts = self._parts
+        return estimate_of(self._moved(), parts.verdict, parts.recovery, parts.last, method)
 
     @settled
     def diagnose(self, *, search: bool = True) -> Diagnosis:
@@ -352,7 +292,7 @@ class ParticleFilter(Whole):
         """
         pose, _ = self.mean_and_covariance()
         search = search and grid_of(self._sensors) is not None
-        return diagnose(self._sensors, self._last, pose, self._tracker.random_poses if search else None)
+        return diagnose(self._sensors, self._parts.last, pose, self._parts.tracker.random_poses if search else None)
 
     @settled
     def mean_and_covariance(self) -> tuple[np.ndarray, np.ndarray]:
@@ -377,7 +317,7 @@ class ParticleFilter(Whole):
 
         NaN without a landmark model, and before 20 scans with features.
         """
-        return self._verdict.gain
+        return self._parts.verdict.gain
 
     @property
     def scoring_seconds(self) -> float:
@@ -441,8 +381,7 @@ class ParticleFilter(Whole):
     @settled
     def state(self) -> FilterState:
         """Return a copy of the filter's state, without models and device: see :class:`FilterState`."""
-        memory = memory_of(self._tracker, self._verdict, self._recovery, self._last)
-        return FilterState(*self._kind(), self._cloud.contents(self._tracker.shown), memory)
+        return FilterState(*self._kind(), *self._parts.state())
 
     @whole
     def restore(self, state: FilterState) -> None:
@@ -456,8 +395,7 @@ class ParticleFilter(Whole):
             TypeError, ValueError: it is no state, or of a filter with other options or models.
         """
         given = check_state(state, *self._kind())
-        self._cloud.restore(given.contents)
-        self._last = remember(given.memory, self._tracker, self._verdict, self._recovery)
+        self._parts.restore(given.contents, given.memory)
 
     def _kind(self) -> tuple[dict[str, Any], tuple[str, ...]]:
         """Return the constructor's options, and the names of the models' classes."""
@@ -469,8 +407,3 @@ class ParticleFilter(Whole):
     def __setstate__(self, values: dict[str, Any]) -> None:
         ParticleFilter.__init__(self, values["models"], **values["state"].options)
         self.restore(values["state"])
-
-
-def _copied(reading: Any) -> Any:
-    """Return a copy of a NumPy array, and another object as it is."""
-    return reading.copy() if isinstance(reading, np.ndarray) else reading

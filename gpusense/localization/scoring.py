@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from gpusense._util import checks
+from gpusense.backends.base import Buffer
+from gpusense.backends.programs import ProgramCache
 from gpusense.interface.launches import Program
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.filter_cloud import Given
@@ -17,6 +19,8 @@ from gpusense.localization.sensors import Sensor
 
 # Programs of scores that are kept.
 _MOST_PROGRAMS = 8
+_MOST_VIEWS = 32
+_DOUBLE = np.dtype(np.float64)
 
 
 def given_of(readings: Any, sensors: Sequence[Sensor]) -> list[Given]:
@@ -50,10 +54,9 @@ def _is_several(value: Any) -> bool:
 
 
 class Scoring:
-    """Scores the particles of a cloud.
+    """Scores the particles of a cloud, which owns it.
 
     Args:
-        cloud: The particles.
         sensors: The sensors of the filter.
 
     Attributes:
@@ -62,56 +65,68 @@ class Scoring:
 
     timed = False
 
-    def __init__(self, cloud: Cloud, sensors: Sequence[Sensor]) -> None:
-        self._cloud, self._sensors, self._backend = cloud, sensors, cloud.backend
-        self._programs: dict[Hashable, tuple[Program, object]] = {}
+    def __init__(self, sensors: Sequence[Sensor]) -> None:
+        self._sensors, self._backend = sensors, sensors[0].backend
+        self._programs = ProgramCache[tuple[Program, object]](_MOST_PROGRAMS)
+        # Views of buffers by the number of particles, as models take them.
+        self._views: dict[tuple[str, int, int], Any] = {}
 
     def records(self, given: Sequence[Given]) -> bool:
         """Tell whether a stage with such readings is one recorded program: on a GPU that can score all of them."""
         gpu = self._backend.info.kind == "gpu"
         return gpu and all(self._sensors[index].records(reading) for index, reading in given)
 
-    def of(self, given: Sequence[Given]) -> Callable[[Stage], None]:
+    def of(self, cloud: Cloud, given: Sequence[Given]) -> Callable[[Stage], None]:
         """Return the function that runs a stage with the readings of sensors, given by their indices."""
         if not self.records(given):
-            return functools.partial(self._called, given)
+            return functools.partial(self._called, cloud, given)
         for index, reading in given:
             self._sensors[index].upload(reading)
-        return functools.partial(self._recorded, given)
+        return functools.partial(self._recorded, cloud, given)
 
-    def _called(self, given: Sequence[Given], stage: Stage) -> None:
+    def _called(self, cloud: Cloud, given: Sequence[Given], stage: Stage) -> None:
         """Start the log-likelihoods of a stage call by call, and weigh."""
-        poses, cloud = self._poses(stage.source), self._cloud
+        poses = self._poses(cloud, stage.source)
         before = None if stage.kind is None else functools.partial(cloud.begin, stage)
         for place, (index, reading) in enumerate(given):
-            self._sensors[index].score(poses, reading, self._log_p(place), before=before, timed=self.timed)
+            self._sensors[index].score(poses, reading, self._log_p(cloud, place), before=before, timed=self.timed)
             before = None
         cloud.weigh(stage)
 
-    def _recorded(self, given: Sequence[Given], stage: Stage) -> None:
+    def _recorded(self, cloud: Cloud, given: Sequence[Given], stage: Stage) -> None:
         """Run a stage as one recorded program."""
-        key = (tuple((index, self._sensors[index].version) for index, _ in given), self._cloud.count)
-        self._cloud.replay(stage, key, lambda source: self._program(key, source, given))
+        key = (tuple((index, self._sensors[index].version) for index, _ in given), cloud.count)
+        cloud.replay(stage, key, lambda source: self._program(cloud, key, source, given))
 
-    def _program(self, key: Hashable, source: int, given: Sequence[Given]) -> tuple[Program, object]:
+    def _program(self, cloud: Cloud, key: Hashable, source: int, given: Sequence[Given]) -> tuple[Program, object]:
         """Return the launches that score the poses of a buffer, and the owners of their memory."""
-        if (key, source) not in self._programs:
-            if len(self._programs) >= _MOST_PROGRAMS:
-                self._programs.clear()
-            program: Program = ()
-            owners: list[object] = []
-            poses = self._poses(source)
-            for place, (index, _) in enumerate(given):
-                out = self._log_p(place)
-                launches, owner = self._sensors[index].program(poses, out)
-                program += launches
-                owners.append((poses, out, owner))
-            self._programs[key, source] = program, owners
-        return self._programs[key, source]
+        kept = self._programs.get((key, source))
+        if kept is not None:
+            return kept
+        program: Program = ()
+        owners: list[object] = []
+        poses = self._poses(cloud, source)
+        for place, (index, _) in enumerate(given):
+            out = self._log_p(cloud, place)
+            launches, owner = self._sensors[index].program(poses, out)
+            program += launches
+            owners.append((poses, out, owner))
+        return self._programs.keep((key, source), (program, owners))
 
-    def _poses(self, source: int) -> Any:
-        return self._backend.view(self._cloud.poses[source], (self._cloud.count, 3), np.dtype(np.float64))
+    def _poses(self, cloud: Cloud, source: int) -> Any:
+        count = cloud.count
+        key = ("poses", source, count)
+        return self._views.get(key) or self._view(key, cloud.poses[source], (count, 3), _DOUBLE)
 
-    def _log_p(self, place: int) -> Any:
+    def _log_p(self, cloud: Cloud, place: int) -> Any:
         """Return the array for a sensor's log-likelihoods."""
-        return self._backend.view(self._cloud.log_p[place], (self._cloud.count,), self._cloud.precision)
+        count = cloud.count
+        key = ("log_p", place, count)
+        return self._views.get(key) or self._view(key, cloud.log_p[place], (count,), cloud.precision)
+
+    def _view(self, key: tuple[str, int, int], buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> Any:
+        """Return a view of a buffer and keep it: clouds of one size have few."""
+        if len(self._views) >= _MOST_VIEWS:
+            self._views.clear()
+        self._views[key] = self._backend.view(buffer, shape, dtype)
+        return self._views[key]

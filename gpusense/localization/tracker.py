@@ -97,6 +97,12 @@ class Tracker:
         """Return a copy of the shown poses."""
         return self.cloud.host_poses(self.cloud.places.shown, self.shown)
 
+    def moved_particles(self) -> tuple[np.ndarray, np.ndarray]:
+        """Move the particles that have not followed the last motion; return copies of their poses and weights."""
+        if self.pending is not None:
+            self.move(None)
+        return self.host_particles(), self.host_weights()
+
     def next_particles(self) -> np.ndarray:
         """Return a copy of the poses of the next step."""
         return self.cloud.host_poses(self.cloud.places.next, self.cloud.count)

@@ -7,13 +7,11 @@ places them.
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Hashable
 from typing import NamedTuple
 
 import numpy as np
 
-from gpusense._util import checks
 from gpusense.backends import arrays
 from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.workspace import POSE_STATUS, Workspace
@@ -29,8 +27,6 @@ _INT = np.dtype(np.int32)
 _SINGLE, _DOUBLE = np.dtype(np.float32), np.dtype(np.float64)
 _PLAIN, _HUGE = frozenset[str](), frozenset({"HUGE_HEADINGS"})
 _HUGE_SINGLE = _HUGE | {"POSES_FLOAT32"}
-# Poses in a block whose bounds are computed together.
-_BLOCK = 8192
 
 Part = tuple[int, int]
 """Poses from a first one to before a last one."""
@@ -43,7 +39,7 @@ class Poses:
         poses: Numbers, or an array on the device.
         backend: The device.
         name: Their name in messages.
-        several: An array on the device is (S, N, 3), the poses of S scans one after the other.
+        scans: None, or S of (S, N, 3) poses of S scans, one after the other.
         in_place: An array on the device must be used without a copy, now and later.
 
     Raises:
@@ -52,27 +48,19 @@ class Poses:
     """
 
     def __init__(
-        self, poses: object, backend: Backend, name: str = "poses", *, several: bool = False, in_place: bool = False
+        self, poses: object, backend: Backend, name: str = "poses", *, scans: int | None = None, in_place: bool = False
     ) -> None:
         self.host: np.ndarray | None = None
         self._last_corners: tuple[Part, Corners] | None = None
-        self.on_device = arrays.on_device(poses)
+        self.on_device = type(poses) is not np.ndarray and arrays.on_device(poses)
         if self.on_device:
             self._buffer, self.count, single, self._owner = arrays.adopt_poses(
-                poses, backend, name, several, in_place=in_place
+                poses, backend, name, scans, in_place=in_place
             )
             self._dtype = _SINGLE if single else _DOUBLE
             return
-        read = arrays.to_host(poses, name)
-        if isinstance(read, np.ndarray) and read.dtype.kind == "f" and read.ndim == 2 and read.shape[1] == 3:
-            self.host = np.ascontiguousarray(read, np.float64)
-            self._corners = self._bounds(0, len(read))
-            if not all(map(math.isfinite, (*self._corners[0], *self._corners[3]))):
-                self.host = checks.array(name, read, ("N", 3))
-        else:
-            self.host = np.ascontiguousarray(checks.array(name, read, ("N", 3)))
-            self._corners = self._bounds(0, len(self.host))
-        self.count = len(self.host)
+        self.host, bounds = arrays.host_poses(poses, name, scans)
+        self._corners, self.count = corners_of(bounds), len(self.host)
 
     def corners(self, part: Part) -> Corners | None:
         """Return four corners of the box of some poses, at 0 for no poses; None on the device."""
@@ -81,7 +69,7 @@ class Poses:
         if part[1] - part[0] == self.count:
             return self._corners
         if self._last_corners is None or self._last_corners[0] != part:
-            self._last_corners = part, self._bounds(*part)
+            self._last_corners = part, corners_of(arrays.bounds_of(self.host[slice(*part)]))
         return self._last_corners[1]
 
     def window(self, table: ReachableMap, part: Part) -> tuple[Buffer, Window]:
@@ -111,13 +99,6 @@ class Poses:
         backend.copy(self._buffer, copied, count * size, begin=first * size)
         return copied
 
-    def _bounds(self, begin: int, end: int) -> Corners:
-        assert self.host is not None
-        if begin == end:
-            return ((0.0, 0.0, 0.0),) * 4
-        low, high = _bounds(self.host[begin:end])
-        return low, (low[0], high[1], low[2]), (high[0], low[1], high[2]), high
-
 
 class Frame(NamedTuple):
     """The frame in which poses are placed.
@@ -140,25 +121,38 @@ class PlacedPoses(NamedTuple):
         count: Their number.
         corners: Corners of the box of the robot's poses; None where they are not known.
         frame: The frame.
-        cell: Cells, int2.
-        pose: Fractions of the cell in x and y, cosines and sines of the headings, real4.
-        low: Rounding errors (low parts) of ``pose``, real4.
+        space: The workspace, which holds their buffers.
+        real: Precision of the buffers.
+        lows: Numbers of ``low``.
         flags: Flags of the kernels that place them.
         source: The poses of the request; None where the host has placed them.
-        status: The non-finite flag.
         lanes: Particles that the device computes at once.
     """
 
     count: int  # type: ignore[assignment]  # hides tuple.count
     corners: Corners | None
     frame: Frame
-    cell: Buffer
-    pose: Buffer
-    low: Buffer
-    flags: frozenset[str] = _PLAIN
+    space: Workspace
+    real: np.dtype
+    lows: int
+    flags: frozenset[str]
     source: Buffer = None
-    status: Buffer = None
     lanes: int = 1
+
+    @property
+    def cell(self) -> Buffer:
+        """Cells, int2."""
+        return self.space.empty("cell", 2 * self.count, _INT)
+
+    @property
+    def pose(self) -> Buffer:
+        """Fractions of the cell in x and y, cosines and sines of the headings, real4."""
+        return self.space.empty("pose", 4 * self.count, self.real)
+
+    @property
+    def low(self) -> Buffer:
+        """Rounding errors (low parts) of ``pose``, real4."""
+        return self.space.empty("pose_low", self.lows, self.real)
 
     @property
     def headings(self) -> frozenset[str]:
@@ -173,8 +167,9 @@ class PlacedPoses(NamedTuple):
     def arguments(self) -> dict[str, object]:
         """Return the arguments of ``place_poses`` by name."""
         return dict(
-            poses=self.source, pose_cell=self.cell, pose=self.pose, pose_low=self.low, pose_status=self.status,
-            frame=frame_of(self.frame.cells, self.frame.mount), window=self.frame.window, particles=self.count,
+            poses=self.source, pose_cell=self.cell, pose=self.pose, pose_low=self.low,
+            pose_status=pose_status(self.space), frame=frame_of(self.frame.cells, self.frame.mount),
+            window=self.frame.window, particles=self.count,
         )  # fmt: skip
 
     def launches(self) -> Program:
@@ -201,14 +196,12 @@ def place(
         careful: Whether low parts are needed.
     """
     source, count, corners = poses.buffer(backend, space, part), part[1] - part[0], poses.corners(part)
+    lows = 4 * count if careful else 4
     if source is None:
-        return _place_on_host(poses, part, frame, space, real, careful=careful)
-    return PlacedPoses(
-        count, corners, frame, space.empty("cell", 2 * count, _INT), space.empty("pose", 4 * count, real),
-        space.empty("pose_low", 4 * count if careful else 4, real),
-        poses.flags | _precision_flags(real == _DOUBLE, careful),
-        source, pose_status(space), backend.info.lanes,
-    )  # fmt: skip
+        _place_on_host(poses, part, frame, space, real, careful=careful)
+        return PlacedPoses(count, corners, frame, space, real, lows, poses.flags)
+    flags = poses.flags | _precision_flags(real == _DOUBLE, careful)
+    return PlacedPoses(count, corners, frame, space, real, lows, flags, source, backend.info.lanes)
 
 
 @functools.cache
@@ -221,31 +214,16 @@ def pose_status(space: Workspace) -> Buffer:
     return space.empty(POSE_STATUS[0], 2, POSE_STATUS[1], zero=True)
 
 
-def _place_on_host(
-    poses: Poses, part: Part, frame: Frame, space: Workspace, real: np.dtype, *, careful: bool
-) -> PlacedPoses:
+def _place_on_host(poses: Poses, part: Part, frame: Frame, space: Workspace, real: np.dtype, *, careful: bool) -> None:
+    """Place some poses on the host, and upload them."""
     assert poses.host is not None
     placed = place_poses(poses.host[slice(*part)], frame.cells, frame.mount, real)
     placed.cell[:] -= (frame.window.col, frame.window.row)
-    low = placed.low if careful else placed.low[:1]
-    return PlacedPoses(
-        part[1] - part[0], poses.corners(part), frame, space.upload("cell", placed.cell),
-        space.upload("pose", placed.pose), space.upload("pose_low", low), poses.flags,
-    )  # fmt: skip
+    for name, numbers in (("cell", placed.cell), ("pose", placed.pose), ("pose_low", placed.low)):
+        space.upload(name, numbers if careful or name != "pose_low" else numbers[:1])
 
 
-def _bounds(poses: np.ndarray) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Return the least and the largest of each column of (N, 3) numbers, N > 0; NaN where a column holds one.
-
-    Columns of three are slow to reduce; rows are not. Blocks that fit the nearest cache are transposed one by one.
-    """
-    lows, highs = [], []
-    for begin in range(0, len(poses), _BLOCK):
-        rows = np.ascontiguousarray(poses[begin : begin + _BLOCK].T)
-        lows.append(np.minimum.reduce(rows, axis=1))
-        highs.append(np.maximum.reduce(rows, axis=1))
-    # minimum.reduce and maximum.reduce keep NaN.
-    low = lows[0] if len(lows) == 1 else np.minimum.reduce(lows)
-    high = highs[0] if len(highs) == 1 else np.maximum.reduce(highs)
-    (x, y, turn), (far_x, far_y, far_turn) = low.tolist(), high.tolist()
-    return (x, y, turn), (far_x, far_y, far_turn)
+def corners_of(bounds: arrays.Bounds) -> Corners:
+    """Return four corners of the box of poses within bounds."""
+    (x, y, turn), (far_x, far_y, far_turn) = bounds
+    return (x, y, turn), (x, far_y, turn), (far_x, y, turn), (far_x, far_y, far_turn)

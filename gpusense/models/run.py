@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -43,33 +42,24 @@ def _rounded(chunk: int) -> int:
     return chunk - chunk % _ROUND if chunk > _ROUND else chunk
 
 
-class Piece(NamedTuple):
+class Piece:
     """Particles scored by one program, among the S N particles of S scans in sequence.
 
     Attributes:
         begin: The first of them.
         end: The one after the last.
         per_scan: N, the particles of each scan.
+        count: Their number.
+        part: ``begin`` and ``end``.
+        scans: The first scan and the one after the last.
     """
 
-    begin: int
-    end: int
-    per_scan: int
+    __slots__ = ("begin", "count", "end", "part", "per_scan", "scans")
 
-    @property
-    def part(self) -> tuple[int, int]:
-        """``begin`` and ``end``."""
-        return self.begin, self.end
-
-    @property
-    def count(self) -> int:  # type: ignore[override]  # hides tuple.count
-        """Number of particles."""
-        return self.end - self.begin
-
-    @property
-    def scans(self) -> tuple[int, int]:
-        """The first scan and the one after the last."""
-        return self.begin // self.per_scan, -(-self.end // self.per_scan)
+    def __init__(self, begin: int, end: int, per_scan: int) -> None:
+        self.begin, self.end, self.per_scan = begin, end, per_scan
+        self.count, self.part = end - begin, (begin, end)
+        self.scans = (begin // per_scan, -(-end // per_scan)) if per_scan else (0, 0)
 
 
 def run_pieces(space: Workspace, whole: Piece, most: int, score: Callable[[Piece], None]) -> None:
@@ -85,9 +75,10 @@ def run_pieces(space: Workspace, whole: Piece, most: int, score: Callable[[Piece
         MemoryError: the smallest piece does not fit, or the map's table does not; the table is tried only once. The
             owner of the workspace still works for smaller calls.
     """
-    begin = whole.begin
+    begin, piece = whole.begin, whole
     while begin < whole.end:
-        piece = Piece(begin, _end(begin, whole.end, whole.per_scan, most), whole.per_scan)
+        if begin or piece.count > most:
+            piece = Piece(begin, _end(begin, whole.end, whole.per_scan, most), whole.per_scan)
         try:
             score(piece)
             begin = piece.end

@@ -87,6 +87,7 @@ class ReachableMap:
         self._backend, self._mount, self._reach, self._crop = backend, mount, reach, crop
         self._prepare, self._refresh, self._unknown = prepare, refresh, unknown
         self._mask_of, self._neighbors = obstacles_of, neighbors
+        self._whole = windows.whole(grid)
         self._state = _State(grid, self._obstacles_of(grid))
 
     @property
@@ -131,10 +132,13 @@ class ReachableMap:
         Raises:
             TableMemoryError: The device cannot hold the table.
         """
+        if self._state.window is self._whole and self._state.table is not None:
+            return self._state.table, self._whole
         if self._crop and corners is not None:
             window = windows.choose(self.grid, self.window, corners, self._mount, self._reach)
         else:
-            window = windows.whole(self.grid)
+            window = self._whole
+        window = self._whole if window == self._whole else window
         if window != self.window or self._state.table is None:
             # Both tables together may not fit the device.
             self._state = replace(self._state, table=None, window=None)

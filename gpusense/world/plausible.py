@@ -142,21 +142,24 @@ class FirstScans:
 
     Args:
         range_max: Of the scanner [m].
+
+    Attributes:
+        left: Calls that are still looked at.
     """
 
-    __slots__ = ("_left", "_range_max")
+    __slots__ = ("_range_max", "left")
 
     def __init__(self, range_max: float) -> None:
-        self._range_max, self._left = range_max, _CALLS
+        self._range_max, self.left = range_max, _CALLS
 
     def look_at(self, name: str, ranges: NDArray[np.floating], size: float | None = None) -> None:
         """Warn of readings that cannot be meant; arguments as for :func:`look_at_readings`."""
-        if not self._left:
+        if not self.left:
             return
-        self._left -= 1
+        self.left -= 1
         least = np.fmin.reduce(ranges, axis=None, initial=np.inf)
         if not 0 <= least < self._range_max and look_at_readings(name, ranges, self._range_max, size):
-            self._left = 0
+            self.left = 0
 
 
 def look_at_start(pose: NDArray[np.float64], inside: bool, bounds: tuple[float, float, float, float]) -> None:

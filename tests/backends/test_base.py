@@ -95,11 +95,11 @@ def test_a_recording_starts_nothing_until_it_is_called():
 def test_abilities_that_a_backend_lacks():
     """They do nothing where that is correct; else the message names the device."""
     device, array = Plain(), np.zeros(3)
-    device.gather()
-    device.start()
-    device.scatter()
+    device.begin_batch()
+    device.submit()
+    device.end_batch()
     device.check_process()
-    assert (device.gathers, device.replays, device.reads(array), device.alignment) == (False, False, False, 1)
+    assert (device.in_batch, device.replays, device.reads(array), device.alignment) == (False, False, False, 1)
     assert device.address(array) == id(array) and device.calls == []
     assert device.blank(2, INT).shape == (2,) and device.calls == [("empty", 2, False)]
     with pytest.raises(TypeError, match="poses: must be in host memory for numpy, got an array on a device"):
@@ -132,9 +132,9 @@ def test_a_proxy_defines_every_method():
         ("part", (1, 2, 3, 4), {}),
         ("compile", (1, 2), {}),
         ("synchronize", (), {}),
-        ("gather", (), {}),
-        ("start", (), {}),
-        ("scatter", (), {}),
+        ("begin_batch", (), {}),
+        ("submit", (), {}),
+        ("end_batch", (), {}),
         ("address", (1,), {}),
         ("check_process", (), {}),
         ("reads", (1,), {}),
@@ -160,10 +160,10 @@ def test_a_proxy_forwards_methods(name, arguments, options, monkeypatch):
 def test_a_proxy_forwards_properties():
     class Able(Plain):
         alignment = 256
-        gathers = replays = True
+        in_batch = replays = True
 
     proxy = Proxy(Able())
-    assert (proxy.info, proxy.alignment, proxy.gathers, proxy.replays) == (Plain.info, 256, True, True)
+    assert (proxy.info, proxy.alignment, proxy.in_batch, proxy.replays) == (Plain.info, 256, True, True)
 
 
 def test_a_proxy_sees_each_launch_of_programs_and_recordings(backend):

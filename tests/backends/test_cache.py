@@ -14,7 +14,7 @@ import pytest
 from support.cache_folders import BLOCKED, blocked, contents, entries_in
 
 from gpusense.backends import BackendInfo, cache, folders, packing
-from gpusense.backends.cache import ProgramCache, discard_entry, load_entry, store_entry
+from gpusense.backends.cache import BinaryCache, discard_entry, load_entry, store_entry
 from gpusense.backends.packing import pack, unpack, write_files
 
 INFO = BackendInfo("opencl:0:0", "opencl", "Some device", "gpu", "Driver 1", 1 << 30, 1 << 28, True)
@@ -32,7 +32,7 @@ def alarm():
 
 
 def test_a_program_is_kept_and_found_again(place):
-    programs = ProgramCache(INFO)
+    programs = BinaryCache(INFO)
     assert programs.load("source", ["-a"]) is None
     programs.store("source", ["-a"], b"binary")
     assert programs.load("source", ["-a"]) == b"binary"
@@ -44,7 +44,7 @@ def test_a_program_is_kept_and_found_again(place):
 @pytest.mark.parametrize("other", ["source", "options", "driver", "device", "processor"])
 def test_entries_are_keyed_by_device_driver_options_and_source(place, monkeypatch, other):
     base = dataclasses.replace(INFO, kind="cpu") if other == "processor" else INFO
-    ProgramCache(base).store("source", ["-a"], b"binary")
+    BinaryCache(base).store("source", ["-a"], b"binary")
     if other == "processor":
         monkeypatch.setattr(cache, "fingerprint", lambda: "another")
     info = {
@@ -52,12 +52,12 @@ def test_entries_are_keyed_by_device_driver_options_and_source(place, monkeypatc
         "device": BackendInfo("opencl:0:0", "opencl", "Other device", "gpu", "Driver 1", 1, 1, True),
     }.get(other, base)
     source = "changed" if other == "source" else "source"
-    assert ProgramCache(info).load(source, ["-b" if other == "options" else "-a"]) is None
+    assert BinaryCache(info).load(source, ["-b" if other == "options" else "-a"]) is None
 
 
 @pytest.mark.parametrize("damage", [b"", b"short", b"gpusense entry 3\n" + bytes(64) + b"binary"])
 def test_a_damaged_entry_is_none_and_is_written_again(place, damage):
-    programs = ProgramCache(INFO)
+    programs = BinaryCache(INFO)
     programs.store("source", [], b"binary")
     (entry,) = entries_in(place)
     entry.write_bytes(damage)
@@ -158,7 +158,7 @@ def test_an_entry_of_another_user_is_none(place):
 
 def test_the_cache_is_bounded_and_evicts_the_oldest(place, monkeypatch):
     monkeypatch.setattr(cache, "MAX_ENTRIES", 3)
-    programs = ProgramCache(INFO)
+    programs = BinaryCache(INFO)
     for number in range(5):
         programs.store(f"source {number}", [], b"binary")
         for entry in entries_in(place):
@@ -213,9 +213,9 @@ def test_unfinished_files_of_killed_processes_are_removed(place):
 
 def test_the_cache_can_be_switched_off(place, monkeypatch):
     monkeypatch.setenv("GPUSENSE_CACHE", "off")
-    ProgramCache(INFO).store("source", [], b"binary")
+    BinaryCache(INFO).store("source", [], b"binary")
     assert not place.exists()
-    assert ProgramCache(INFO).load("source", []) is None
+    assert BinaryCache(INFO).load("source", []) is None
 
 
 def test_a_folder_that_is_removed_meanwhile_is_made_again(place):

@@ -79,7 +79,7 @@ def test_landmarks_that_may_be_exchanged_keep_more_particles():
     for models in (model, gps()):
         pf = gs.ParticleFilter(models, particles=1000, seed=1)
         pf.initialize(mean=(0, 0, 0), covariance=np.diag([0.1, 0.1, 0.01]))
-        shares.append(pf._tracker.settings(STILL, [0])[SHARE])
+        shares.append(pf._parts.tracker.settings(STILL, [0])[SHARE])
     assert shares == [DEFAULTS.share_apart, DEFAULTS.share]
 
 

@@ -33,7 +33,7 @@ def test_a_stage_on_a_gpu_is_one_recorded_program(warp_as_gpu):
         pf, pose = tracked(stages)
         numbers, covariance = pf.mean_and_covariance()
         assert np.hypot(*(numbers - pose)[:2]) < 0.1 and covariance[0, 0] < 0.01
-        found = {stage.number: recording.explain() for (_, stage, _), (recording, _) in pf._cloud._recordings.items()}
+        found = {stage.number: program.recording.explain() for (_, stage, _), program in pf._cloud._recordings.items()}
         # A move, 3 launches for the scores, 4 for weights, and the draw of a single stage.
         assert f"{9 if stages == 1 else 8} launches" in found[0]
         assert stages == 1 or "7 launches" in found[1]

@@ -176,11 +176,11 @@ def test_an_interrupt_of_the_way_back_is_made_good_by_the_next_call(monkeypatch)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(journal.Journal, "restore", interrupted)
-    monkeypatch.setattr(type(pf._verdict), "corrected", interrupted)
+    monkeypatch.setattr(type(pf._parts.verdict), "corrected", interrupted)
     with pytest.raises(KeyboardInterrupt):
         pf.correct(readings(pf, 3))
     monkeypatch.setattr(journal.Journal, "restore", restore)
-    assert pf.count == 200 and pf._tracker.step == 4 and everything(pf) == before
+    assert pf.count == 200 and pf._parts.tracker.step == 4 and everything(pf) == before
 
 
 def test_calls_of_threads_wait_for_one_another():

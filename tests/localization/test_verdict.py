@@ -230,15 +230,15 @@ def test_people_and_a_state_that_is_put_back(model):
         scans.append(ranges)
     pf, found = followed(model, poses, scans)
     assert all(one.verdict == "tracking" for one in found[1:])
-    state = pf._verdict.state
+    state = pf._parts.verdict.state
     again = pf.estimate()
     # An estimate judges a correction once.
-    assert pf._verdict.state == state and again.p_lost == found[-1].p_lost
+    assert pf._parts.verdict.state == state and again.p_lost == found[-1].p_lost
     kept = dataclasses.replace(again)
     pf.correct(scan_at(poses[-1] + np.array([3.5, 2.0, 1.0])))
     pf.estimate()
-    assert pf._verdict.state != state
-    pf._verdict.state = state
+    assert pf._parts.verdict.state != state
+    pf._parts.verdict.state = state
     assert kept.p_lost == again.p_lost
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import os
 import re
 import threading
 import warnings
@@ -13,13 +14,13 @@ import numpy as np
 import pyopencl as cl
 
 from gpusense.backends.base import Adopted, Backend, Buffer
-from gpusense.backends.cache import ProgramCache
+from gpusense.backends.cache import BinaryCache
 from gpusense.backends.info import BackendInfo, ProcessBound
 from gpusense.backends.opencl import arrays, pocl, pocl_kernels
 from gpusense.backends.opencl.caches import new_kernel, without_caches
 from gpusense.backends.opencl.devices import shares_memory
 from gpusense.backends.opencl.launch import Launch
-from gpusense.backends.opencl.memory import SHARED, DeviceBuffer, SharedBuffer, driver_errors
+from gpusense.backends.opencl.memory import SHARED, DeviceBuffer, SharedBuffer, driver_errors, raise_clearly
 from gpusense.backends.opencl.replay import OpenCLRecording
 from gpusense.interface.launches import Program
 from gpusense.interface.signatures import KERNELS
@@ -33,13 +34,13 @@ _SLOW = (64 << 10, 256 << 10)
 _ROUNDED_DIVISION = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
 
 
-def _program_cache(info: BackendInfo, device: cl.Device) -> ProgramCache | None:
+def _binary_cache(info: BackendInfo, device: cl.Device) -> BinaryCache | None:
     """Return the cache of programs; None for PoCL, whose kernels are kept one by one.
 
     For a binary, PoCL would compile all kernels of the program, wanted or not, for work-groups of any size, which takes
     three times as long as everything else.
     """
-    return None if pocl.is_pocl(device) else ProgramCache(info)
+    return None if pocl.is_pocl(device) else BinaryCache(info)
 
 
 class OpenCLBackend(ProcessBound, Backend):
@@ -65,8 +66,8 @@ class OpenCLBackend(ProcessBound, Backend):
         self._launchers: dict[tuple[str, frozenset[str]], Launch] = {}
         # Each with the key of its entry in the cache.
         self._programs: dict[tuple[str, frozenset[str]], tuple[cl.Program, str]] = {}
-        self._keys = ProgramCache(info)
-        self._cache = _program_cache(info, device)
+        self._keys = BinaryCache(info)
+        self._cache = _binary_cache(info, device)
         self._pocl = pocl_kernels.pocl_kernels() if pocl.is_pocl(device) else None
         # Ranges are the same bits everywhere only if division is rounded correctly, which is an option on GPUs.
         rounded = bool(device.single_fp_config & _ROUNDED_DIVISION)
@@ -83,12 +84,14 @@ class OpenCLBackend(ProcessBound, Backend):
 
     def upload(self, array: np.ndarray, out: Buffer | None = None, *, wait: bool = True) -> Buffer:
         """See Backend.upload."""
-        self.check_process()
+        if os.getpid() != self._process:
+            self.check_process()
         buffer = self.empty(array.size, array.dtype) if out is None else out
         if array.size:
             array = np.ascontiguousarray(array)
             if isinstance(buffer, SHARED):
-                self._settle()
+                if self._ended != self._queued:
+                    self.synchronize()
                 buffer.bytes[: array.nbytes] = array.reshape(-1).view(np.uint8)
                 return buffer
             with driver_errors():
@@ -136,7 +139,8 @@ class OpenCLBackend(ProcessBound, Backend):
         """See Backend.download."""
         if out.size:
             if isinstance(buffer, SHARED):
-                self._settle()
+                if self._ended != self._queued:
+                    self.synchronize()
                 out.reshape(-1).view(np.uint8)[:] = buffer.bytes[: out.nbytes]
                 return out
             with driver_errors():
@@ -205,8 +209,10 @@ class OpenCLBackend(ProcessBound, Backend):
         """See Backend.synchronize."""
         with self._count:
             queued = self._queued
-        with driver_errors():
+        try:
             self._queue.finish()
+        except cl.Error as error:
+            raise_clearly(error)
         with self._count:
             self._ended = max(self._ended, queued)
         if self._pocl is not None and self._pocl.changed:
@@ -220,9 +226,11 @@ class OpenCLBackend(ProcessBound, Backend):
     def enqueue(self, kernel: cl.Kernel, size: tuple[int, ...], group: tuple[int, ...]) -> None:
         """Queue a launch of a kernel whose arguments are set."""
         # Before, so that an interrupt leaves no launch uncounted; and after, for a thread that waits in between.
-        self._counted(1)
+        with self._count:
+            self._queued += 1
         cl.enqueue_nd_range_kernel(self._queue, kernel, size, group)
-        self._counted(1)
+        with self._count:
+            self._queued += 1
 
     def _counted(self, launches: int) -> None:
         """Count queued launches."""

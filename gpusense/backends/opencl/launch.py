@@ -11,7 +11,7 @@ import numpy as np
 import pyopencl as cl
 
 from gpusense.backends.opencl.caches import new_kernel, without_caches
-from gpusense.backends.opencl.memory import driver_errors
+from gpusense.backends.opencl.memory import raise_clearly
 from gpusense.backends.opencl.replay import BoundLaunch
 from gpusense.interface import structs
 from gpusense.interface.signatures import Argument, Kernel, lanes_of
@@ -45,38 +45,49 @@ class Launch:
         real = np.dtype(np.float64 if "FLOAT64" in flags else np.float32)
         # With its types set, pyopencl sets all arguments in 1 us; otherwise a single number takes 6 us.
         self._types = [_set_as(argument, real) for argument in row.arguments]
+        # Places of structs, and functions that pack them into the bytes that the device reads.
         self._packers = [
-            (place, _Packer(argument.type, real)) for place, argument in enumerate(row.arguments) if argument.is_struct
+            (place, struct.Struct(structs.layout(argument.type, real)).pack)
+            for place, argument in enumerate(row.arguments)
+            if argument.is_struct
         ]
+        self._last_structs: list[tuple[Any, bytes]] = [(None, b"")] * len(self._packers)
         self._last_size: tuple[Any, Any] = (None, None)
         with without_caches():
             kernel.set_arg_types(self._types)
 
     def __call__(self, size: tuple[int, ...], *arguments: Any) -> None:
         """See Launcher.__call__."""
-        self._before_first()
+        if self._first is not None:
+            self._before_first()
         # Arguments belong to the kernel object, so two threads must not interleave.
-        with self._lock, driver_errors():
-            self._kernel.set_args(*self._packed(arguments))
+        with self._lock:
+            packed = list(arguments)
+            for number, (place, pack) in enumerate(self._packers):
+                # Calls mostly repeat the last struct.
+                if packed[place] is not self._last_structs[number][0]:
+                    self._last_structs[number] = packed[place], pack(*packed[place])
+                packed[place] = self._last_structs[number][1]
             if size != self._last_size[0]:
                 self._last_size = size, self._sizes(size)
-            self._backend.enqueue(self._kernel, *self._last_size[1])
+            try:
+                self._kernel.set_args(*packed)
+                self._backend.enqueue(self._kernel, *self._last_size[1])
+            except cl.Error as error:
+                raise_clearly(error)
 
     def bind(self, size: tuple[int, ...], arguments: tuple[Any, ...]) -> BoundLaunch:
         """Set the arguments of a new kernel object, and start nothing."""
-        self._before_first()
+        if self._first is not None:
+            self._before_first()
         kernel = new_kernel(self._kernel.program, self._kernel.function_name)
         with without_caches():
             kernel.set_arg_types(self._types)
-        kernel.set_args(*self._packed(arguments))
-        return BoundLaunch(kernel, *self._sizes(size), arguments)
-
-    def _packed(self, arguments: tuple[Any, ...]) -> list[Any]:
-        """Return the arguments with structs as the bytes that the device reads."""
         packed = list(arguments)
         for place, pack in self._packers:
-            packed[place] = pack(packed[place])
-        return packed
+            packed[place] = pack(*packed[place])
+        kernel.set_args(*packed)
+        return BoundLaunch(kernel, *self._sizes(size), arguments)
 
     def _before_first(self) -> None:
         """Call back before the first launch."""
@@ -88,21 +99,6 @@ class Launch:
         """Return the size in whole groups, and the group."""
         group = (self._group, *(1 for _ in size[1:]))
         return (-(-size[0] // (self._lanes * group[0])) * group[0], *size[1:]), group
-
-
-class _Packer:
-    """Packs a struct into the bytes that the device reads; calls mostly repeat the last one."""
-
-    def __init__(self, name: str, real: np.dtype) -> None:
-        self._pack = struct.Struct(structs.layout(name, real)).pack
-        self._last: tuple[Any, bytes] = (None, b"")
-
-    def __call__(self, value: tuple[Any, ...]) -> bytes:
-        last, packed = self._last
-        if value is not last:
-            packed = self._pack(*value)
-            self._last = value, packed
-        return packed
 
 
 def _set_as(argument: Argument, real: np.dtype) -> Any:

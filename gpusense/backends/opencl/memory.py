@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable
+from typing import NoReturn
 
 import numpy as np
 import pyopencl as cl
@@ -58,16 +59,21 @@ class SharedPart(cl.SVM):  # type: ignore[type-arg]
 SHARED = (SharedBuffer, SharedPart)
 
 
+def raise_clearly(error: cl.Error) -> NoReturn:
+    """Raise a driver's code as MemoryError, as RuntimeError where the device is gone, or as it is."""
+    if any(code in str(error) for code in _OUT_OF_MEMORY):
+        raise MemoryError(f"the OpenCL device is out of memory: {error}") from error
+    if any(code in str(error) for code in _LOST):
+        raise RuntimeError(f"the OpenCL device is no longer available, make the model anew: {error}") from error
+    raise error
+
+
 class driver_errors:
-    """Context in which the driver's codes become MemoryError, or RuntimeError where the device is gone."""
+    """Context in which ``raise_clearly`` raises the driver's codes."""
 
     def __enter__(self) -> None:
         return None
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if not isinstance(error, cl.Error):
-            return
-        if any(code in str(error) for code in _OUT_OF_MEMORY):
-            raise MemoryError(f"the OpenCL device is out of memory: {error}") from error
-        if any(code in str(error) for code in _LOST):
-            raise RuntimeError(f"the OpenCL device is no longer available, make the model anew: {error}") from error
+        if isinstance(error, cl.Error):
+            raise_clearly(error)

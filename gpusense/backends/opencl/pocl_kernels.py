@@ -26,15 +26,19 @@ _ENDINGS = (".bc", ".so")
 
 
 class PoclKernels:
-    """The compiled kernels of this process."""
+    """The compiled kernels of this process.
+
+    Attributes:
+        changed: Programs of which kernels were compiled since the last :meth:`save`, by the keys of their entries.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._lock = threading.RLock()
-        # By the keys of entries: the folders of a program, the files that its entry holds, programs to save.
+        # By the keys of entries: the folders of a program, the files that its entry holds.
         self._folders: dict[str, set[str]] = {}
         self._saved: dict[str, frozenset[str]] = {}
-        self._changed: set[str] = set()
+        self.changed: set[str] = set()
         self._process = os.getpid()
         atexit.register(self._save_all)
 
@@ -47,22 +51,17 @@ class PoclKernels:
             before = self._listed()
             yield
             self._folders[key] |= self._listed() - before
-            self._changed.add(key)
+            self.changed.add(key)
 
     def mark(self, key: str) -> None:
         """Note that a kernel of a program runs for the first time, for which PoCL compiles it."""
         with self._lock:
-            self._changed.add(key)
-
-    @property
-    def changed(self) -> bool:
-        """Tell whether kernels were compiled since the last :meth:`save`."""
-        return bool(self._changed)
+            self.changed.add(key)
 
     def save(self) -> None:
         """Put compiled kernels into entries of the cache; all launches must have ended."""
         with self._lock:
-            changed, self._changed = self._changed, set()
+            changed, self.changed = self.changed, set()
             for key in changed:
                 names = frozenset(self._files(key))
                 if names - self._saved.get(key, frozenset()):
@@ -75,7 +74,7 @@ class PoclKernels:
         """Save the kernels of all programs as the process ends; a forked child saves none."""
         if os.getpid() != self._process:
             return
-        self._changed |= self._folders.keys()
+        self.changed |= self._folders.keys()
         self.save()
 
     def _restore(self, key: str) -> set[str]:

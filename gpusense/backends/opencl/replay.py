@@ -12,7 +12,7 @@ import pyopencl as cl
 from gpusense._util.checks import show
 from gpusense._util.interrupts import undisturbed
 from gpusense.backends.opencl.arrays import check_in_order
-from gpusense.backends.opencl.memory import driver_errors
+from gpusense.backends.opencl.memory import driver_errors, raise_clearly
 from gpusense.backends.recording import Recording, counted
 
 
@@ -41,13 +41,16 @@ class OpenCLRecording(Recording):
         # Before and after; see ``OpenCLBackend.enqueue``.
         self._count(len(self._launches))
         # Launches of two threads must not interleave.
-        with self._lock, driver_errors():
+        with self._lock:
             if stream is not None and queue not in self._used:
                 self._used.append(queue)
-            for launch in self._launches:
-                cl.enqueue_nd_range_kernel(queue, launch.kernel, launch.size, launch.group)
-            # Without this a driver may wait for further commands before it begins.
-            queue.flush()
+            try:
+                for launch in self._launches:
+                    cl.enqueue_nd_range_kernel(queue, launch.kernel, launch.size, launch.group)
+                # Without this a driver may wait for further commands before it begins.
+                queue.flush()
+            except cl.Error as error:
+                raise_clearly(error)
         self._count(len(self._launches))
 
     def __del__(self, run: Callable[[Callable[[], object]], None] = undisturbed) -> None:

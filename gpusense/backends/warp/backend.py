@@ -42,7 +42,7 @@ class WarpBackend(ProcessBound, Backend):
         self.info = info
         self._device = wp.get_device(device)
         self._graphs = GraphCache(self._device)
-        # The queue of each thread that gathers a call, and the queues that no call uses.
+        # The queue of each thread that has a batch, and the queues that no call uses.
         self._thread = threading.local()
         self._queues: list[CallQueue] = []
         # By the flags that change code, and by all flags of a launch.
@@ -55,7 +55,7 @@ class WarpBackend(ProcessBound, Backend):
         array = np.ascontiguousarray(array)
         buffer = self.empty(array.size, array.dtype) if out is None else out
         if array.size:
-            queue = self.gathering()
+            queue = self.batch()
             if queue is not None:
                 if not wait and queue.upload(array, buffer):
                     return buffer
@@ -86,7 +86,7 @@ class WarpBackend(ProcessBound, Backend):
     def download(self, buffer: wp.array, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
         """See Backend.download."""
         if out.size:
-            queue = self.gathering()
+            queue = self.batch()
             if queue is not None:
                 if not wait and queue.download(buffer, out):
                     return out
@@ -124,9 +124,9 @@ class WarpBackend(ProcessBound, Backend):
         if not size:
             # Warp takes a count of 0 as the whole array.
             return
-        queue = self.gathering()
+        queue = self.batch()
         if queue is not None:
-            # The copy comes after all that was gathered before.
+            # The copy comes after everything that was put off before.
             self._flush(queue)
         from_size, to_size = (wp.types.type_size_in_bytes(array.dtype) for array in (source, target))
         wp.copy(target, source, dest_offset=to // to_size, src_offset=begin // from_size, count=size // from_size)
@@ -164,15 +164,15 @@ class WarpBackend(ProcessBound, Backend):
 
     def synchronize(self) -> None:
         """See Backend.synchronize."""
-        queue = self.gathering()
+        queue = self.batch()
         if queue is not None:
             self._flush(queue)
         self._wait()
         if queue is not None:
             queue.deliver()
 
-    def gather(self) -> None:
-        """See Backend.gather."""
+    def begin_batch(self) -> None:
+        """See Backend.begin_batch."""
         if not self.info.graphs:
             return
         try:
@@ -185,15 +185,15 @@ class WarpBackend(ProcessBound, Backend):
         queue.begin()
         self._thread.queue = queue
 
-    def start(self) -> None:
-        """See Backend.start."""
-        queue = self.gathering()
+    def submit(self) -> None:
+        """See Backend.submit."""
+        queue = self.batch()
         if queue is not None:
             self._flush(queue)
 
-    def scatter(self) -> None:
-        """See Backend.scatter."""
-        queue = self.gathering()
+    def end_batch(self) -> None:
+        """See Backend.end_batch."""
+        queue = self.batch()
         if queue is not None:
             self._thread.queue = None
             try:
@@ -202,9 +202,9 @@ class WarpBackend(ProcessBound, Backend):
                 self._queues.append(queue)
 
     @property
-    def gathers(self) -> bool:
-        """See Backend.gathers."""
-        return self.gathering() is not None
+    def in_batch(self) -> bool:
+        """See Backend.in_batch."""
+        return self.batch() is not None
 
     def record(self, program: Program) -> WarpRecording:
         """See Backend.record; launches know their buffers by address and keep none alive."""
@@ -213,7 +213,7 @@ class WarpBackend(ProcessBound, Backend):
 
     def replay(self, recording: Recording) -> None:
         """See Backend.replay."""
-        queue = self.gathering()
+        queue = self.batch()
         if queue is None or not isinstance(recording, WarpRecording):
             recording()
         else:
@@ -223,8 +223,8 @@ class WarpBackend(ProcessBound, Backend):
         """See Backend.address."""
         return int(buffer.ptr or 0)
 
-    def gathering(self) -> CallQueue | None:
-        """Return the queue in which this thread gathers a call; None where it gathers none."""
+    def batch(self) -> CallQueue | None:
+        """Return the queue of this thread's batch; None where it has none."""
         return getattr(self._thread, "queue", None)
 
     def _flush(self, queue: CallQueue) -> None:
@@ -251,5 +251,5 @@ class WarpBackend(ProcessBound, Backend):
                 load(compiled.module, self._device, group)
             except Exception as error:
                 raise RuntimeError(f"{row.file}.py did not compile on {self.info.name}: {error}") from error
-        launch = Launch(self._device, compiled, row, group, self.gathering)
+        launch = Launch(self._device, compiled, row, group, self.batch)
         return launch if self._device.is_cuda else shared(launch, row)

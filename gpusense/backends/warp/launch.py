@@ -1,4 +1,4 @@
-"""Launches of Warp kernels, started at once or gathered: arguments are bound by the signature table."""
+"""Launches of Warp kernels, started at once or in a batch: arguments are bound by the signature table."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ class Launch:
         kernel: wp.Kernel,
         row: Kernel,
         group: int,
-        gathering: Callable[[], CallQueue | None],
+        batch: Callable[[], CallQueue | None],
     ) -> None:
-        self._device, self._kernel, self._group, self._gathering = device, kernel, group, gathering
+        self._device, self._kernel, self._group, self._batch = device, kernel, group, batch
         self._binds = [
             _binding(argument, declared.type) for argument, declared in zip(row.arguments, kernel.adj.args, strict=True)
         ]
@@ -55,7 +55,7 @@ class Launch:
         """See Launcher.__call__."""
         if 0 in size:
             return
-        queue = self._gathering()
+        queue = self._batch()
         if queue is None:
             self.start(size, arguments, _keys(arguments), None)
         else:
@@ -94,7 +94,7 @@ def _keys(arguments: tuple[Any, ...]) -> list[Any]:
 
 
 class LaunchStep(Step):
-    """A launch that is gathered."""
+    """A launch of a batch."""
 
     launches = 1
 

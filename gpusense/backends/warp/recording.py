@@ -14,7 +14,7 @@ from gpusense.backends.warp.steps import Step, as_graph, one_by_one, start_each
 
 
 class WarpRecording(Recording, Step):
-    """Launches of a program, which are one step of a call that gathers them."""
+    """Launches of a program, which are one step of a batch."""
 
     reports = True
     _numbers = itertools.count()

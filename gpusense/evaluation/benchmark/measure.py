@@ -115,9 +115,9 @@ class Meter(Proxy):
             self.seconds["launch"] += time.perf_counter() - begin
 
     @property
-    def gathers(self) -> bool:
-        """See Backend.gathers; False while the meter measures, so that it sees every copy and launch."""
-        return not self._on and super().gathers
+    def in_batch(self) -> bool:
+        """See Backend.in_batch; False while the meter measures, so that it sees every copy and launch."""
+        return not self._on and super().in_batch
 
     def begin(self) -> None:
         """Start to record seconds and launches."""

@@ -7,12 +7,12 @@ keeps several devices busy. They take and return plain data, which crosses to ot
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from gpusense.backends.recording import Recording
+from gpusense.backends.programs import ProgramCache, RecordedProgram
 from gpusense.interface.constants import (
     DRAWN,
     ESTIMATE,
@@ -37,6 +37,7 @@ from gpusense.reference.rungs import left_of, rung_of
 # Units in the last place within which the product of two numbers reaches a neighbour of another product.
 _UNITS = 16
 _DOUBLE = np.dtype(np.float64)
+_MOST_RECORDED = 8
 
 
 class Shard:
@@ -57,7 +58,7 @@ class Shard:
         self._pool, self._residual = ShardPool(self._backend), residual
         # Ones, and numbers of a step whose only temperature is a sum of weights.
         self._ones: tuple[Any, Any] | None = None
-        self._recordings: dict[Hashable, tuple[Recording, object]] = {}
+        self._recordings = ProgramCache[RecordedProgram](_MOST_RECORDED)
         self._timed = False
 
     @property
@@ -125,7 +126,7 @@ class Shard:
         if self._gpu and all(self._sensors[index].records(reading) for index, reading in given):
             for index, reading in given:
                 self._sensors[index].upload(reading)
-            self._recorded(source, given)()
+            self._recorded(source, given).start()
         else:
             for place, (index, reading) in enumerate(given):
                 out = self._scores(place)
@@ -134,23 +135,22 @@ class Shard:
         yield
         return float(self._read(cloud.sums.largest, cloud.blocks).max())
 
-    def _recorded(self, source: int, given: Sequence[Given]) -> Recording:
+    def _recorded(self, source: int, given: Sequence[Given]) -> RecordedProgram:
         """Return the recorded program that scores a buffer; its start does not wait, so that devices work together."""
         sensors = tuple((index, self._sensors[index].version) for index, _ in given)
         key = (source, self._part.size, self._part.block, sensors)
-        if key not in self._recordings:
-            if len(self._recordings) > 8:
-                self._recordings.clear()
-            program: Program = ()
-            poses, owners = self._poses(source), []
-            for place, (index, _) in enumerate(given):
-                out = self._scores(place)
-                launches, owner = self._sensors[index].program(poses, out)
-                program += launches
-                owners.append((out, owner))
-            program += self._cloud.scoring(len(given))
-            self._recordings[key] = self._backend.record(program), (poses, owners)
-        return self._recordings[key][0]
+        kept = self._recordings.get(key)
+        if kept is not None:
+            return kept
+        program: Program = ()
+        poses, owners = self._poses(source), []
+        for place, (index, _) in enumerate(given):
+            out = self._scores(place)
+            launches, owner = self._sensors[index].program(poses, out)
+            program += launches
+            owners.append((out, owner))
+        program += self._cloud.scoring(len(given))
+        return self._recordings.keep(key, RecordedProgram(self._backend, program, (poses, owners)))
 
     def _poses(self, source: int) -> Any:
         return self._backend.view(self._cloud.poses[source], (self._part.size, 3), _DOUBLE)

@@ -21,7 +21,6 @@ from gpusense.models.scan.mixture import Mixture
 from gpusense.models.scan.pipeline import ScanPipeline, Scoring, Setting, Tiles
 from gpusense.models.scan.readings import Readings, Sensing
 from gpusense.models.scan.tiles import all_within, stranded, sum_launch, tiles_of
-from gpusense.tables.reachable import ReachableMap
 from gpusense.world.frames import ray_vectors
 
 
@@ -43,7 +42,7 @@ class BeamPipeline(ScanPipeline):
         self, setting: Setting, caster: MapCaster, cones: Cones, mixture: Mixture, *, max_evaluated: bool
     ) -> None:
         super().__init__(setting)
-        self.caster, self.cones, self.mixture = caster, cones, mixture
+        self.caster, self.cones, self.mixture, self.map = caster, cones, mixture, caster.map
         self.rays_each = cones.rays
         # The rays of each beam, several for a cone.
         self.cone_vectors = ray_vectors(self.scanner.ray_bearings, self.scanner.mount)
@@ -61,11 +60,6 @@ class BeamPipeline(ScanPipeline):
         )  # fmt: skip
         # The first reading of each ray where no rays are shared.
         self._one_each: Buffer = upload(np.arange(self.scanner.count + 1, dtype=np.int32))
-
-    @property
-    def map(self) -> ReachableMap:
-        """See ScanPipeline.map."""
-        return self.caster.map
 
     @property
     def _top(self) -> float:
@@ -146,7 +140,7 @@ class BeamPipeline(ScanPipeline):
 
     def score_launches(self, scoring: Scoring) -> Program:
         """See ScanPipeline.score_launches."""
-        placed, readings, parts, caster = scoring.placed, scoring.readings, scoring.parts, self.caster
+        placed, readings, parts, caster = scoring.placed, scoring.readings, self.parts(scoring), self.caster
         window, count = placed.frame.window, placed.count
         common = dict(
             map_table=scoring.table, normals=caster.normals(window, self.cones.flags), pose_cell=placed.cell,

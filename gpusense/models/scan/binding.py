@@ -189,8 +189,8 @@ class _StagedCall(BoundCall):
                 with self._space:
                     backend.upload(inputs.host, inputs.on_device, wait=False)
                     self._device.begin()
-                    backend.download(outputs.on_device, outputs.host, wait=not backend.gathers)
-                    if backend.gathers:
+                    backend.download(outputs.on_device, outputs.host, wait=not backend.in_batch)
+                    if backend.in_batch:
                         backend.synchronize()
             except MemoryError:
                 # The whole table of a map that has changed; the ordinary call needs only a part of it.

@@ -15,7 +15,7 @@ import numpy as np
 
 from gpusense.backends import arrays
 from gpusense.backends.base import Adopted, Buffer
-from gpusense.backends.recording import Recording
+from gpusense.backends.programs import ProgramCache, RecordedProgram
 from gpusense.backends.results import Result
 from gpusense.backends.workspace import POSE_STATUS, Workspace
 from gpusense.interface.constants import BLOCK_TERMS
@@ -122,23 +122,24 @@ class DeviceCall(BoundCall):
         whole = max(backend.alignment // _INT.itemsize, 1)
         chunk = pipeline.chunk(self._readings.readings * pipeline.rays_each)
         self._chunk = -(-chunk // whole) * whole
-        self._recording: Recording | None = None
+        # The program for the map as it is, by the version of its table.
+        self._programs = ProgramCache[RecordedProgram](1)
         self._recorded()
 
     def __call__(self, stream: Any = None) -> Any:
         """See BoundCall.__call__."""
-        self._current()(stream)
+        self._current().recording(stream)
         return self.out
 
     def explain(self) -> str:
         """See BoundCall.explain."""
-        if self._recording is None:
-            return "nothing is recorded: the map has changed, and its new table did not fit the device"
-        return self._recording.explain()
+        for _, program in self._programs.items():
+            return program.recording.explain()
+        return "nothing is recorded: the map has changed, and its new table did not fit the device"
 
     def begin(self) -> None:
-        """Start the recording, as part of the call gathered by this thread."""
-        self._pipeline.backend.replay(self._current())
+        """Start the recording, as part of this thread's batch."""
+        self._pipeline.backend.replay(self._current().recording)
 
     @property
     def program(self) -> Program:
@@ -149,8 +150,7 @@ class DeviceCall(BoundCall):
     def check(self) -> None:
         """See BoundCall.check."""
         self._pipeline.backend.check_process()
-        if self._recording is not None:
-            self._recording.wait()
+        self._wait()
         finish(self._space, on_device=True)
 
     def _placed_readings(self, adopted: Adopted, limits: np.dtype) -> Readings:
@@ -168,29 +168,34 @@ class DeviceCall(BoundCall):
             constants_there=sensing.constants_there, placing=placing,
         )  # fmt: skip
 
-    def _current(self) -> Recording:
-        """Return the recording for the map as it is."""
-        self._pipeline.backend.check_process()
-        if self._recording is not None and self._pipeline.map.version == self._version:
-            return self._recording
-        # The map, or its table, has changed.
-        if self._recording is not None:
-            self._recording.wait()
-        return self._recorded()
+    def _wait(self) -> None:
+        """Wait for all starts of the program."""
+        for _, program in self._programs.items():
+            program.recording.wait()
 
-    def _recorded(self) -> Recording:
+    def _current(self) -> RecordedProgram:
+        """Return the program for the map as it is."""
+        self._pipeline.backend.check_process()
+        program = self._programs.get(self._pipeline.map.version)
+        if program is None:
+            # The map, or its table, has changed.
+            self._wait()
+            program = self._recorded()
+        return program
+
+    def _recorded(self) -> RecordedProgram:
         """Make the table if it is missing, and record the program of a call; nothing is started."""
         backend, pipeline = self._pipeline.backend, self._pipeline
         with self._lock:
             # Keep the table, since another call of the model may replace it; free the last one first.
-            self._table = self._recording = None
+            self._table = None
+            self._programs.clear()
             self._table, _ = self._poses.window(pipeline.map, (0, self._poses.count))
-            self._version = pipeline.map.version
-            recording = backend.record(self._program())
+            version = pipeline.map.version
+            program = RecordedProgram(backend, self._program())
         # Other streams may use the buffers of this one first.
         backend.synchronize()
-        self._recording = recording
-        return recording
+        return self._programs.keep(version, program)
 
     def _program(self) -> Program:
         """Return all launches of a call."""

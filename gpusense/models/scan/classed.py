@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpusense._util.checks import array, as_array
+from gpusense._util import checks
 from gpusense.models.scan.rules import Rules
 from gpusense.world.scanner import Scanner
 
@@ -57,7 +57,7 @@ class LeftOut(NamedTuple):
         return int(np.count_nonzero(informative & ~(self.used | self.used_max)))
 
 
-class ClassedScans(NamedTuple):
+class ClassedScans:
     """The readings of S scans that are evaluated at every pose, one scan after the other.
 
     Attributes:
@@ -70,37 +70,30 @@ class ClassedScans(NamedTuple):
         counts: (S,) readings of each scan.
         constants: (S,) constant terms: log-likelihoods of the readings that do not depend on the pose.
         left_out: The other readings of the last scan.
+        scans: S.
+        most_readings: Readings of the scan that has most.
+        most_rays: Rays of the scan that has most.
     """
 
-    columns: np.ndarray
-    readings: np.ndarray
-    vectors: np.ndarray
-    rays: np.ndarray
-    first: np.ndarray
-    ray_counts: np.ndarray
-    counts: np.ndarray
-    constants: np.ndarray
-    left_out: LeftOut
+    __slots__ = (
+        "columns", "constants", "counts", "first", "left_out", "most_rays", "most_readings", "ray_counts", "rays",
+        "readings", "scans", "vectors",
+    )  # fmt: skip
 
-    @property
-    def scans(self) -> int:
-        """S."""
-        return len(self.counts)
+    def __init__(
+        self, columns: np.ndarray, readings: np.ndarray, vectors: np.ndarray, rays: np.ndarray, first: np.ndarray,
+        ray_counts: np.ndarray, counts: np.ndarray, constants: np.ndarray, left_out: LeftOut,
+    ) -> None:  # fmt: skip
+        self.columns, self.readings, self.vectors, self.rays, self.first = columns, readings, vectors, rays, first
+        self.ray_counts, self.counts, self.constants, self.left_out = ray_counts, counts, constants, left_out
+        self.scans = len(counts)
+        self.most_readings = len(readings) if self.scans == 1 else max(counts.tolist(), default=0)
+        self.most_rays = len(rays) if self.scans == 1 else max(ray_counts.tolist(), default=0)
 
     @property
     def shared(self) -> bool:
         """Tell whether several readings share a ray."""
         return len(self.rays) < len(self.readings)
-
-    @property
-    def most_readings(self) -> int:
-        """Readings of the scan that has most."""
-        return len(self.readings) if len(self.counts) == 1 else max(self.counts.tolist())
-
-    @property
-    def most_rays(self) -> int:
-        """Rays of the scan that has most."""
-        return len(self.rays) if len(self.counts) == 1 else max(self.ray_counts.tolist())
 
     def part(self, begin: int, end: int) -> ClassedScans:
         """Return scans ``begin`` to ``end`` - 1."""
@@ -128,9 +121,9 @@ class ClassedScans(NamedTuple):
 
 def check_ranges(ranges: object, scanner: Scanner) -> np.ndarray:
     """Return readings of one scan (K,) or of several (S, K), checked, in their float dtype."""
-    readings = as_array("ranges", ranges, masked=True)
+    readings = checks.as_array("ranges", ranges, masked=True)
     shape = ("S", scanner.count) if readings.ndim == 2 else (scanner.count,)
-    return array("ranges", readings, shape=shape, finite=False, dtype=None)
+    return checks.array("ranges", readings, shape=shape, finite=False, dtype=None)
 
 
 @functools.lru_cache(maxsize=64)
@@ -140,11 +133,11 @@ def _limits(range_min: float, range_max: float, dtype: np.dtype) -> tuple[np.flo
         return dtype.type(range_min), dtype.type(range_max)
 
 
-def hits_and_max(ranges: np.ndarray, scanner: Scanner) -> tuple[np.ndarray, np.ndarray]:
-    """Return which readings of scans are ranges, and which are max readings."""
-    nearest, farthest = _limits(scanner.range_min, scanner.range_max, ranges.dtype)
+def hits_and_max(ranges: np.ndarray, limits: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return which readings of scans are ranges, and which are max readings, by range_min and range_max."""
+    nearest, farthest = _limits(*limits, ranges.dtype)
     hit, far = ranges >= nearest, ranges >= farthest
-    if nearest == 0 < scanner.range_min:
+    if nearest == 0 < limits[0]:
         # A reading of 0 is missing, even where the limit is rounded to 0.
         hit, far = ranges > 0, far & (ranges > 0)
     hit &= ranges < farthest
@@ -153,21 +146,24 @@ def hits_and_max(ranges: np.ndarray, scanner: Scanner) -> tuple[np.ndarray, np.n
 
 def class_scans(ranges: np.ndarray, rules: Rules) -> ClassedScans:
     """Class, choose and group the readings of (S, K) scans, S > 0."""
-    rules.scanner._first_scans.look_at("ranges", ranges, rules.map_size)
-    hit, far = hits_and_max(ranges, rules.scanner)
+    if rules.first_scans.left:
+        rules.first_scans.look_at("ranges", ranges, rules.map_size)
+    hit, far = hits_and_max(ranges, rules.limits)
     if rules.max_is_range:
         finite = np.isfinite(ranges)
         hit, far = hit | (far & finite), far & ~finite
-    used, used_max = rules.choice.among(hit, far if rules.z_max > 0 else np.zeros(far.shape, bool))
+    used, used_max = hit, far if rules.z_max > 0 else np.zeros(far.shape, bool)
+    if not rules.choice.every:
+        used, used_max = rules.choice.among(used, used_max)
     if rules.max_is_constant:
         evaluated, constant = used, used_max
     else:
         evaluated, constant = used | used_max | (not rules.specialize), np.zeros(far.shape, bool)
         ranges = np.where(used, ranges, np.where(used_max, np.inf, np.nan))
     constants = np.zeros(len(ranges))
-    if evaluated.all():
+    if np.logical_and.reduce(evaluated, axis=None):
         # Scans without gaps need no selection.
-        counts = np.full(len(ranges), ranges.shape[1])
+        counts = np.asarray([ranges.shape[1]] * len(ranges))
         columns, values, vectors = rules.columns, ranges.reshape(-1).astype(np.float64), rules.vectors
         if len(ranges) > 1:
             columns, vectors = np.tile(columns, len(ranges)), np.tile(vectors, (len(ranges), 1))
@@ -192,10 +188,10 @@ def _grouped(scan: ClassedScans) -> ClassedScans:
     # Rays stand in the order of their first readings.
     place = np.argsort(index)
     order = np.argsort(np.argsort(place)[inverse.ravel()], kind="stable")
-    return scan._replace(
-        columns=scan.columns[order], readings=scan.readings[order], vectors=vectors[order],
-        rays=vectors[index[place]], first=np.append(0, np.cumsum(counts[place])).astype(np.int32),
-        ray_counts=np.array([len(index)]),
+    return ClassedScans(
+        scan.columns[order], scan.readings[order], vectors[order], vectors[index[place]],
+        np.append(0, np.cumsum(counts[place])).astype(np.int32), np.array([len(index)]), scan.counts, scan.constants,
+        scan.left_out,
     )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import widened
 from gpusense.interface.launches import Program, launch
+from gpusense.interface.structs import Score
 from gpusense.models.poses import PlacedPoses
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.pipeline import ScanPipeline, Scoring, Setting, Tiles
@@ -71,20 +72,16 @@ class FieldPipeline(ScanPipeline):
             weights=weights, log_table=self.log_table, flags=self.components,
         )  # fmt: skip
         reach = (range_max + parameters.max_distance) / grid.resolution
-        self._map = ReachableMap(
+        self._resolution = grid.resolution
+        self.map = ReachableMap(
             self.backend, grid, unknown, self.scanner.mount, reach, self.table.make, self.specialize,
             self.table.refresh, obstacles_of=weights.field_obstacles, neighbors=weights.neighbors,
         )  # fmt: skip
 
     @property
-    def map(self) -> ReachableMap:
-        """See ScanPipeline.map."""
-        return self._map
-
-    @property
     def table_bytes(self) -> int:
         """Bytes of the map's table on the device; 0 before it is made."""
-        window = self._map.window
+        window = self.map.window
         return 0 if window is None else self.real.itemsize * (window.rows + 2 * RING) * (window.cols + 2 * RING)
 
     def _mixture(
@@ -103,7 +100,7 @@ class FieldPipeline(ScanPipeline):
 
     def upload(self, scans: ClassedScans, space: Workspace) -> Readings:
         """See ScanPipeline.upload; a point is an end point in cells relative to the sensor."""
-        cells = scans.readings / self.grid.resolution
+        cells = scans.readings / self._resolution
         lengths = cells
         if not self.specialize:
             # Missing and max readings have no length; their points hold nan and inf.
@@ -112,7 +109,10 @@ class FieldPipeline(ScanPipeline):
         high, low = split(scans.vectors * lengths[:, None], self.real)
         if not self.specialize:
             high[~finite] = cells[~finite, None]
-        longest = self._longest_of_blocks(lengths, scans)
+        if scans.scans == 1:
+            longest = np.maximum.reduceat(lengths, np.arange(0, len(lengths), BLOCK_TERMS))
+        else:
+            longest = self._longest_of_blocks(lengths, scans)
         arrays = dict(point=high, point_low=low)
         if self.backend.info.kind == "gpu":
             arrays["guard"] = (self.guard * (longest + 2)).astype(self.real)
@@ -135,8 +135,6 @@ class FieldPipeline(ScanPipeline):
 
     def _longest_of_blocks(self, lengths: np.ndarray, scans: ClassedScans) -> np.ndarray:
         """Return the longest reading of each block, in cells; every scan has as many blocks as the longest scan."""
-        if scans.scans == 1:
-            return np.maximum.reduceat(lengths, np.arange(0, len(lengths), BLOCK_TERMS))
         blocks = -(-scans.most_readings // BLOCK_TERMS)
         padded = np.zeros((scans.scans, blocks * BLOCK_TERMS))
         padded[np.arange(padded.shape[1]) < scans.counts[:, None]] = lengths
@@ -179,15 +177,14 @@ class FieldPipeline(ScanPipeline):
 
     def numbers(self, scoring: Scoring) -> dict[str, Any]:
         """See ScanPipeline.numbers; blocks of readings have a guard each on the device."""
-        numbers = super().numbers(scoring)
-        if scoring.tiles is None:
-            # Bound of the errors of products of rounded factors and of their sums: 3.12 eps of the longest, 1.5 eps.
-            numbers["guard"] = self.guard * scoring.readings.reach
-        return numbers
+        readings = scoring.readings
+        score = Score(readings.constant_term, self.setting.temperature)
+        # Bound of the errors of products of rounded factors and of their sums: 3.12 eps of the longest, 1.5 eps.
+        return dict(score=score, guard=self.guard * readings.reach) if scoring.tiles is None else dict(score=score)
 
     def score_launches(self, scoring: Scoring) -> Program:
         """See ScanPipeline.score_launches."""
-        placed, readings, parts = scoring.placed, scoring.readings, scoring.parts
+        placed, readings, parts = scoring.placed, scoring.readings, self.parts(scoring)
         count = placed.count
         common = dict(
             table=scoring.table, pose_cell=placed.cell, pose=placed.pose, pose_low=placed.low, terms=self.terms,

@@ -198,7 +198,7 @@ class ScanModel(Pickled):
         Warns:
             PlausibilityWarning: in the first calls of a scanner, negative readings, or ones in millimetres.
         """
-        if out is None and not per_beam and is_recorded(poses):
+        if out is None and not per_beam and type(poses) is not np.ndarray and is_recorded(poses):
             calls = self._differentiable(ranges)
             if calls is not None:
                 return cast(np.ndarray, log_likelihood_of(poses, ranges, calls))

@@ -8,7 +8,7 @@ pieces that fit the memory of the device: the only loop.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Hashable, Iterator
+from collections.abc import Hashable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -79,19 +79,19 @@ class Scoring(NamedTuple):
         readings: The readings.
         placed: The poses.
         table: The map's table for the window of the poses.
-        parts: Numbers that each particle's sum adds, or the log-likelihoods of the readings.
         log_p: The buffer for the log-likelihoods.
         flags: Flags of the scoring kernel.
         tiles: The tiles of GPUs, which sum in a second launch; None where one launch does it all.
+        per_beam: Whether the log-likelihoods of single readings are kept.
     """
 
     readings: Readings
     placed: PlacedPoses
     table: Buffer
-    parts: Parts
     log_p: Buffer
     flags: frozenset[str]
     tiles: Tiles | None
+    per_beam: bool
 
     @property
     def batch(self) -> ScanBatch:
@@ -105,6 +105,7 @@ class ScanPipeline(ABC):
     Attributes:
         setting: The device and the rules.
         nothing: A buffer for arguments that are not read.
+        map: The map's table.
     """
 
     # Rays of each beam, and numbers that GPUs keep for each reading until they are summed.
@@ -116,11 +117,13 @@ class ScanPipeline(ABC):
     orders: bool = False
     # The kernels that score in one launch, and in tiles.
     kernel_names: tuple[tuple[str, ...], tuple[str, ...]]
+    map: ReachableMap
 
     def __init__(self, setting: Setting) -> None:
         self.setting = setting
         self.backend, self.real, self.rules = setting.backend, setting.real, setting.rules
         self.scanner, self.specialize = setting.rules.scanner, setting.rules.specialize
+        self._mount, self._readings, self._chunks = self.scanner.mount, setting.weights.readings, dict[Hashable, int]()
         self.nothing = self.backend.upload(np.zeros(1, np.int32))
         # Flags by everything on which they depend.
         self._flags: dict[Hashable, frozenset[str]] = {}
@@ -128,11 +131,6 @@ class ScanPipeline(ABC):
         self.trial: tuple[frozenset[str], frozenset[str]] | None = None
 
     # ---- stages that depend on the model
-
-    @property
-    @abstractmethod
-    def map(self) -> ReachableMap:
-        """The map's table."""
 
     @property
     def grid(self) -> OccupancyGrid:
@@ -177,8 +175,15 @@ class ScanPipeline(ABC):
 
     # ---- request: groups of scans that one program may score
 
-    def groups(self, request: Request) -> Iterator[tuple[Piece, ClassedScans]]:
-        """Yield the particles and readings of neighbouring scans that one program may score."""
+    def groups(self, request: Request) -> Iterable[tuple[Piece, ClassedScans]]:
+        """Return the particles and readings of neighbouring scans that one program may score."""
+        if len(request.ranges) == 1:
+            count = request.shape[-1]
+            return ((Piece(0, count, count), self.classed(request.ranges)),)
+        return self._groups_of_several(request)
+
+    def _groups_of_several(self, request: Request) -> Iterator[tuple[Piece, ClassedScans]]:
+        """Yield the groups of a request of several scans."""
         count = request.per_scan
         if self._shares_launches(request):
             scans = self.classed(request.ranges)
@@ -198,14 +203,17 @@ class ScanPipeline(ABC):
 
     def chunk(self, rays: int, *, per_beam: bool = False) -> int:
         """Return the particles of one launch with a number of rays each."""
-        kept = 1.0 if per_beam else self.kept_parts if self.backend.info.kind == "gpu" else 0.0
-        return chunk_of(self.backend, max(rays, 1), self.real.itemsize * kept)
+        chunk = self._chunks.get((rays, per_beam))
+        if chunk is None:
+            kept = 1.0 if per_beam else self.kept_parts if self.backend.info.kind == "gpu" else 0.0
+            chunk = self._chunks[rays, per_beam] = chunk_of(self.backend, max(rays, 1), self.real.itemsize * kept)
+        return chunk
 
     # ---- readings
 
     def classed(self, ranges: np.ndarray) -> ClassedScans:
         """Class, choose and group the readings of (S, K) scans."""
-        return class_scans(self.setting.weights.readings(ranges, self.scanner, self.end_points), self.rules)
+        return class_scans(self._readings(ranges, self.scanner, self.end_points), self.rules)
 
     def value(self, scans: ClassedScans) -> float | None:
         """Return the log-likelihood of scans where it is the same at every pose, None elsewhere."""
@@ -221,8 +229,8 @@ class ScanPipeline(ABC):
 
     def place(self, poses: Poses, part: Part, space: Workspace) -> tuple[PlacedPoses, Buffer]:
         """Place some poses in a window of the map; also return the map's table for it."""
-        table, window = poses.window(self.map, part)
-        frame = Frame(window, self.grid, self.scanner.mount)
+        table, window = self.map.ensure(poses.corners(part))
+        frame = Frame(window, self.map.grid, self._mount)
         return place(poses, part, frame, self.backend, space, self.real, careful=self.careful), table
 
     # ---- program
@@ -231,7 +239,7 @@ class ScanPipeline(ABC):
         self, readings: Readings, placed: PlacedPoses, table: Buffer, log_p: Buffer, space: Workspace, *,
         per_beam: bool = False, ordered: bool = True,
     ) -> Scoring:  # fmt: skip
-        """Describe a piece on the device, and allocate its parts."""
+        """Describe a piece on the device."""
         tiles = None
         if self.backend.info.kind == "gpu" and not per_beam:
             order = order_of(space, placed, readings.rays, self.real) if ordered and self.orders else None
@@ -244,14 +252,13 @@ class ScanPipeline(ABC):
             flags = self._flags[key] = self.flags(everything, tiled=tiles is not None, per_beam=per_beam)
         if self.trial is not None:
             flags = (flags | self.trial[0]) - self.trial[1]
-        count, block = self.layout(readings, flags)
-        numbers = placed.count * count if tiles or per_beam else 1
-        parts = Parts(count, block, space.empty("parts", numbers, self.real))
-        return Scoring(readings, placed, table, parts, log_p, flags, tiles)
+        return Scoring(readings, placed, table, log_p, flags, tiles, per_beam)
 
-    def kernels(self, scoring: Scoring) -> tuple[str, ...]:
-        """Return the names of the kernels that score a piece."""
-        return self.kernel_names[scoring.tiles is not None]
+    def parts(self, scoring: Scoring) -> Parts:
+        """Return the numbers that each particle's sum adds, or the log-likelihoods of the readings."""
+        count, block = self.layout(scoring.readings, scoring.flags)
+        numbers = scoring.placed.count * count if scoring.tiles or scoring.per_beam else 1
+        return Parts(count, block, scoring.placed.space.empty("parts", numbers, self.real))
 
     def program(self, scoring: Scoring) -> Program:
         """Return all launches of a piece."""

@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gpusense._util import checks
 from gpusense.backends import Backend, arrays
 from gpusense.backends.results import Result
 from gpusense.models.poses import Poses
 from gpusense.models.scan.classed import check_ranges
 from gpusense.world.scanner import Scanner
 
+_FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
 # Poses that several models share, checked once, by the number of scans.
 Known = MutableMapping[int | None, Poses]
 
@@ -27,6 +27,7 @@ class Request(NamedTuple):
         shape: Shape of the result, (N,) or (S, N).
         result: Memory of the result.
         parts: (S, N, K) log-likelihoods of the readings; (S, N, 0) where they are not requested.
+        per_beam: Whether they are requested, of a scanner with beams.
         before: Called once readings are on the device; it starts the launches that write the poses.
     """
 
@@ -35,6 +36,7 @@ class Request(NamedTuple):
     shape: tuple[int, ...]
     result: Result
     parts: np.ndarray
+    per_beam: bool
     before: Callable[[], None] | None = None
 
     @property
@@ -46,11 +48,6 @@ class Request(NamedTuple):
     def per_scan(self) -> int:
         """N."""
         return self.shape[-1]
-
-    @property
-    def per_beam(self) -> bool:
-        """Tell whether the log-likelihoods of single readings are requested (``per_beam``)."""
-        return self.parts.shape[-1] > 0
 
     def result_parts(self) -> np.ndarray:
         """Return the log-likelihoods of the readings, (N, K) or (S, N, K)."""
@@ -83,7 +80,11 @@ def make_request(
     Raises:
         TypeError, ValueError: an argument breaks its rule.
     """
-    readings = check_ranges(arrays.copied_to_host(ranges, backend, "ranges"), scanner)
+    beams = scanner.count
+    if type(ranges) is np.ndarray and ranges.shape == (beams,) and ranges.dtype in _FLOATS:
+        readings: np.ndarray = ranges
+    else:
+        readings = check_ranges(arrays.copied_to_host(ranges, backend, "ranges"), scanner)
     known = {} if known is None else known
     shape: tuple[int, ...]
     if readings.ndim == 1:
@@ -91,28 +92,8 @@ def make_request(
         readings, shape = readings[None], (checked.count,)
     else:
         scans = len(readings)
-        checked = known[scans] = known.get(scans) or _poses_of_scans(poses, scans, backend)
+        checked = known[scans] = known.get(scans) or Poses(poses, backend, scans=scans)
         shape = (scans, checked.count // scans if scans else np.shape(poses)[1])
     result = Result(poses, out, shape, real, backend)
-    parts = np.zeros((len(readings), shape[-1], scanner.count if per_beam else 0), real)
-    return Request(readings, checked, shape, result, parts)
-
-
-def _poses_of_scans(poses: Any, scans: int, backend: Backend) -> Poses:
-    """Return the poses of S scans, one scan after the other, from (S, N, 3) poses.
-
-    Raises:
-        TypeError, ValueError: not numbers, another shape, or a pose that is not finite.
-    """
-    if arrays.on_device(poses):
-        shape = tuple(poses.shape)
-        if len(shape) != 3 or shape[0] != scans or shape[2] != 3:
-            raise ValueError(f"poses: shape must be ({scans}, N, 3), got {checks.shape_text(shape)}")
-        return Poses(poses, backend, several=True)
-    read = checks.array("poses", arrays.to_host(poses), (scans, "N", 3), finite=False)
-    try:
-        return Poses(read.reshape(-1, 3), backend)
-    except ValueError:
-        # This check names the scan in its message; the first one names the index among all poses.
-        checks.array("poses", read, (scans, "N", 3))
-        raise
+    parts = np.zeros((len(readings), shape[-1], beams if per_beam else 0), real)
+    return Request(readings, checked, shape, result, parts, per_beam and beams > 0)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpusense._util.checks import integer, show
+from gpusense.world.plausible import FirstScans
 from gpusense.world.scanner import Reading, Scanner
 
 Beams = int | Sequence[int] | np.ndarray | None
@@ -48,8 +49,6 @@ class BeamChoice:
 
     def among(self, hit: np.ndarray, far: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return which of the ranges and of the informative max readings of (S, K) scans are used."""
-        if self.every:
-            return hit, far
         used = np.array([self.used(each) for each in hit | far])
         return hit & used, far & used
 
@@ -93,7 +92,17 @@ class Rules:
         """Tell whether each reading has its ray: all bearings differ, or nothing is left out."""
         return not self.specialize or len(np.unique(self.vectors, axis=0)) == len(self.vectors)
 
-    @property
+    @functools.cached_property
+    def limits(self) -> tuple[float, float]:
+        """Least range, and least max reading [m]."""
+        return self.scanner.range_min, self.scanner.range_max
+
+    @functools.cached_property
+    def first_scans(self) -> FirstScans:
+        """The look at the first scans of the scanner."""
+        return self.scanner._first_scans
+
+    @functools.cached_property
     def max_is_constant(self) -> bool:
         """Tell whether max readings are added as a constant term instead of being evaluated."""
         return self.specialize and not self.max_depends

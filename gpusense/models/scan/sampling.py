@@ -144,7 +144,7 @@ def poses_to_draw_at(poses: Any, backend: Backend) -> tuple[Poses, tuple[int, ..
     """
     if arrays.on_device(poses):
         shape = tuple(poses.shape)
-        return Poses(poses, backend, several=len(shape) == 3), shape[:-1]
+        return Poses(poses, backend, scans=shape[0] if len(shape) == 3 else None), shape[:-1]
     read: Any = arrays.to_host(poses)
     if np.ndim(read) == 3:
         several = checks.array("poses", read, ("S", "N", 3))

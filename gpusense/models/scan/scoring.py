@@ -57,8 +57,8 @@ def run(pipeline: ScanPipeline, request: Request, space: Workspace, last: LastCa
             continue
         most = pipeline.chunk(scans.most_readings * pipeline.rays_each, per_beam=request.per_beam)
         run_pieces(space, particles, most, _Scorer(pipeline, request, particles, scans, space, last))
-        if request.scans > 1:
-            space.start()
+        if len(request.ranges) > 1:
+            space.submit()
 
 
 class _Scorer:
@@ -74,7 +74,9 @@ class _Scorer:
 
     def __call__(self, piece: Piece) -> None:
         first, last = piece.scans
-        scans = self._scans.part(first - self._first, last - self._first)
+        scans = self._scans
+        if last - first < scans.scans:
+            scans = scans.part(first - self._first, last - self._first)
         value = self._pipeline.value(scans)
         if value is None and (self._uploaded is None or self._uploaded[0] != piece.scans):
             self._uploaded = piece.scans, self._pipeline.upload(scans, self._space)
@@ -98,7 +100,7 @@ class _Scorer:
                 key, dict(pipeline.numbers(scoring), poses=placed.source, log_p=log_p),
                 lambda: pipeline.program(scoring), version=pipeline.map.version,
             )  # fmt: skip
-        self._last.kernels = pipeline.kernels(scoring)
+        self._last.kernels = pipeline.kernel_names[scoring.tiles is not None]
         # Poses are placed in vectors, whatever scores them.
         self._last.flags = (flags - _WIDE) | (scoring.flags & _WIDE)
         if readings.scans > 1:
@@ -106,7 +108,7 @@ class _Scorer:
         if request.per_beam:
             each = np.empty((piece.count, len(scans.readings)), pipeline.real)
             rows = self._rows(piece)
-            rows[:, scans.columns] = pipeline.backend.download(scoring.parts.buffer, each)
+            rows[:, scans.columns] = pipeline.backend.download(pipeline.parts(scoring).buffer, each)
             rows[:, scans.left_out.constant_max] = log_weight(pipeline.rules.z_max)
 
     def _fill(self, piece: Piece, scans: ClassedScans, value: float) -> None:

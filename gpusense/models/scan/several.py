@@ -62,11 +62,11 @@ def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out
             stack.enter_context(model._lock)
         for _, model in different:
             stack.push(lambda kind, *error, space=model._workspace: space.abandon() if kind else None)
-        # Left first: gathered work is started before an error abandons its memory.
+        # Left first: the batch is started before an error abandons its memory.
         stack.enter_context(chosen[0]._workspace)
         for model, request in zip(chosen, requests, strict=True):
             run(model._pipeline, request, model._workspace, model._last)
-            model._workspace.start()
+            model._workspace.submit()
         on_device = {id(model) for model, request in zip(chosen, requests, strict=True) if request.poses.on_device}
         finish_all([(model._workspace, key in on_device) for key, model in different])
     return [request.result.array() for request in requests]

@@ -13,8 +13,8 @@ from gpusense.backends.base import Adopted
 
 
 @pytest.fixture
-def gathering(needs, monkeypatch):
-    """Return a backend that gathers, and a list that grows with each start of a graph."""
+def batching(needs, monkeypatch):
+    """Return a backend with batches, and a list that grows with each start of a graph."""
     needs("warp")
     import warp as wp
 

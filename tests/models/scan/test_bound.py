@@ -21,9 +21,9 @@ from gpusense.models.scan import tiles
 
 @pytest.mark.sampled(0.2)
 @pytest.mark.parametrize("case", CASES)
-def test_a_bound_call_has_the_bits_of_an_ordinary_one(case, gathering):
+def test_a_bound_call_has_the_bits_of_an_ordinary_one(case, batching):
     """With poses and readings on the device, whose contents change; half of them float32."""
-    device, started = gathering
+    device, started = batching
     model = CASES[case](backend=device)
     beams = model.scanner.count
     for i, real in enumerate((np.float32, np.float64)):
@@ -45,22 +45,22 @@ def test_a_bound_call_has_the_bits_of_an_ordinary_one(case, gathering):
     assert len(started) >= 2 * len(SCANS) - 2
 
 
-def test_bound_calls_that_add_up_strands(gathering, monkeypatch):
+def test_bound_calls_that_add_up_strands(batching, monkeypatch):
     """Where particles fill the device, work-items add up strands; the bits are the same."""
     poses, ranges = to_device(cloud(1)), to_device(mixed(1))
     found = []
     for enough in (1 << 21, 1):
         monkeypatch.setattr(tiles, "ENOUGH", enough)
-        call = BEAM(GRID, NEAR, backend=gathering[0]).bind(poses, ranges)
+        call = BEAM(GRID, NEAR, backend=batching[0]).bind(poses, ranges)
         assert ("STRANDED" in flags_of(call._program())) == (enough == 1)
         found.append(call().numpy().copy())
     assert differing(*found) == 0
 
 
 @pytest.mark.parametrize("kind", MODELS)
-def test_bearings_that_repeat_are_cast_one_by_one(kind, gathering):
+def test_bearings_that_repeat_are_cast_one_by_one(kind, batching):
     """The ordinary call sorts them by their rays, so sums differ in their order."""
-    model = kind(GRID, gs.Scanner(np.repeat(np.linspace(-3, 3, 8), 3), RANGE, 0.3), backend=gathering[0])
+    model = kind(GRID, gs.Scanner(np.repeat(np.linspace(-3, 3, 8), 3), RANGE, 0.3), backend=batching[0])
     poses, ranges = to_device(cloud(1)), to_device(mixed(4, 24))
     expected = model.log_likelihood(poses, ranges.numpy()).numpy()
     found = model.bind(poses, ranges)().numpy()
@@ -68,9 +68,9 @@ def test_bearings_that_repeat_are_cast_one_by_one(kind, gathering):
 
 
 @pytest.mark.parametrize("kind", MODELS)
-def test_a_map_that_changes(kind, gathering):
+def test_a_map_that_changes(kind, batching):
     """The table is updated or made anew, and the host's poses need only a part of it."""
-    device, _ = gathering
+    device, _ = batching
     model = kind(GRID, NEAR, backend=device)
     poses, ranges = to_device(cloud(1)), to_device(mixed(1))
     call, other = model.bind(poses, ranges), model.bind(poses, ranges)
@@ -83,9 +83,9 @@ def test_a_map_that_changes(kind, gathering):
         assert differing(other().numpy(), expected) == 0
 
 
-def test_other_calls_of_a_model_come_between(gathering):
+def test_other_calls_of_a_model_come_between(batching):
     """Bound calls have buffers of their own."""
-    model = FIELD(GRID, NEAR, backend=gathering[0])
+    model = FIELD(GRID, NEAR, backend=batching[0])
     arrays = [(to_device(cloud(i, 100 + 50 * i)), to_device(mixed(i))) for i in range(3)]
     expected = [model.log_likelihood(poses, ranges.numpy()).numpy() for poses, ranges in arrays]
     calls = [model.bind(*each) for each in arrays]
@@ -95,8 +95,8 @@ def test_other_calls_of_a_model_come_between(gathering):
             assert differing(call().numpy(), expected[i]) == 0
 
 
-def test_out_and_pieces_and_no_particles(gathering, monkeypatch):
-    model = BEAM(GRID, NEAR, backend=gathering[0])
+def test_out_and_pieces_and_no_particles(batching, monkeypatch):
+    model = BEAM(GRID, NEAR, backend=batching[0])
     poses, ranges = to_device(cloud(1)), to_device(mixed(1))
     expected = model.log_likelihood(poses, ranges.numpy()).numpy()
     monkeypatch.setattr(run, "CHUNK", 77)
@@ -111,17 +111,17 @@ def test_out_and_pieces_and_no_particles(gathering, monkeypatch):
         none.check()
 
 
-def test_no_beams(gathering):
+def test_no_beams(batching):
     for kind in MODELS:
-        model = kind(GRID, gs.Scanner([], RANGE), backend=gathering[0])
+        model = kind(GRID, gs.Scanner([], RANGE), backend=batching[0])
         call = model.bind(to_device(cloud(1)), to_device(np.empty(0)))
         for _ in range(3):
             assert (call().numpy() == 0).all()
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_pose_that_is_not_finite_is_reported_by_check(value, gathering):
-    model = FIELD(GRID, NEAR, backend=gathering[0])
+def test_a_pose_that_is_not_finite_is_reported_by_check(value, batching):
+    model = FIELD(GRID, NEAR, backend=batching[0])
     poses, ranges = to_device(cloud(1)), to_device(mixed(1))
     call = model.bind(poses, ranges)
     expected = call().numpy()
@@ -138,13 +138,13 @@ def test_a_pose_that_is_not_finite_is_reported_by_check(value, gathering):
     assert differing(found, expected) == 0
 
 
-def test_nothing_is_allocated_compiled_or_copied(gathering, monkeypatch):
-    device, started = gathering
+def test_nothing_is_allocated_compiled_or_copied(batching, monkeypatch):
+    device, started = batching
     model = FIELD(GRID, NEAR, backend=device)
     call = model.bind(to_device(cloud(1)), to_device(mixed(1)))
     call()
     call()
-    for name in ("empty", "compile", "upload", "download", "synchronize", "gather"):
+    for name in ("empty", "compile", "upload", "download", "synchronize", "begin_batch"):
         monkeypatch.setattr(type(device), name, lambda *arguments, **options: pytest.fail("a verb of the backend"))
     before = len(started)
     for _ in range(5):
@@ -152,11 +152,11 @@ def test_nothing_is_allocated_compiled_or_copied(gathering, monkeypatch):
     assert len(started) == before + 5
 
 
-def test_without_graphs_launches_are_started_one_by_one(gathering, monkeypatch):
+def test_without_graphs_launches_are_started_one_by_one(batching, monkeypatch):
     """Where a driver refuses, and beside other threads, which Warp cannot wait for while it records."""
     import warp as wp
 
-    device, started = gathering
+    device, started = batching
     model = FIELD(GRID, NEAR, backend=device)
     poses, ranges = to_device(cloud(1)), to_device(mixed(1))
     expected = model.log_likelihood(poses, ranges.numpy()).numpy()
@@ -210,10 +210,10 @@ def test_arrays_that_cannot_be_bound(name):
 
 
 @pytest.mark.parametrize("name", WRONG_THERE)
-def test_arrays_on_the_device_that_cannot_be_bound(name, gathering):
+def test_arrays_on_the_device_that_cannot_be_bound(name, batching):
     make, error, message = WRONG_THERE[name]
     with pytest.raises(error, match=r"^" + re.escape(message)):
-        FIELD(GRID, NEAR, backend=gathering[0]).bind(*make())
+        FIELD(GRID, NEAR, backend=batching[0]).bind(*make())
 
 
 def test_arrays_whose_numbers_cannot_change(monkeypatch):
@@ -222,8 +222,8 @@ def test_arrays_whose_numbers_cannot_change(monkeypatch):
         FIELD(GRID, NEAR, backend="numpy").bind(Array(cloud(1)), mixed(1))
 
 
-def test_a_stream_that_is_none(gathering):
-    model = FIELD(GRID, NEAR, backend=gathering[0])
+def test_a_stream_that_is_none(batching):
+    model = FIELD(GRID, NEAR, backend=batching[0])
     for call in (model.bind(to_device(cloud(1)), to_device(mixed(1))), model.bind(cloud(1), mixed(1))):
         with pytest.raises(TypeError, match=r"^stream: must be"):
             call(stream="a stream")

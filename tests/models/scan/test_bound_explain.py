@@ -35,8 +35,8 @@ def bound(device, poses=1, **options) -> gs.BoundCall:
     return FIELD(GRID, NEAR, backend=device, **options).bind(to_device(cloud(poses)), to_device(mixed(1)))
 
 
-def test_a_graph_is_captured_at_the_second_call(gathering):
-    call = bound(gathering[0])
+def test_a_graph_is_captured_at_the_second_call(batching):
+    call = bound(batching[0])
     waiting = ONE_BY_ONE + "a graph is captured when it is started again"
     assert call.explain() == waiting
     call()
@@ -45,9 +45,9 @@ def test_a_graph_is_captured_at_the_second_call(gathering):
     assert call.explain() == "one CUDA graph of 3 launches"
 
 
-def test_numpy_arrays_are_copied_within_the_graph(gathering):
+def test_numpy_arrays_are_copied_within_the_graph(batching):
     """Poses and readings are one copy, log-likelihoods and the status of poses another."""
-    call = FIELD(GRID, NEAR, backend=gathering[0]).bind(cloud(1), mixed(1))
+    call = FIELD(GRID, NEAR, backend=batching[0]).bind(cloud(1), mixed(1))
     call()
     assert call.explain().startswith("NumPy arrays are copied with each call: 3 launches")
     call()
@@ -55,8 +55,8 @@ def test_numpy_arrays_are_copied_within_the_graph(gathering):
 
 
 @pytest.mark.parametrize("there", [True, False])
-def test_another_thread_is_named(there, gathering):
-    device, done = gathering[0], threading.Event()
+def test_another_thread_is_named(there, batching):
+    device, done = batching[0], threading.Event()
     call = bound(device) if there else FIELD(GRID, NEAR, backend=device).bind(cloud(1), mixed(1))
     waiting = threading.Thread(target=done.wait, name="a reader of sensors")
     waiting.start()
@@ -71,9 +71,9 @@ def test_another_thread_is_named(there, gathering):
     assert "one CUDA graph of 3 launches" in call.explain()
 
 
-def test_a_program_that_the_driver_refuses_is_not_tried_again(gathering, monkeypatch, caplog):
+def test_a_program_that_the_driver_refuses_is_not_tried_again(batching, monkeypatch, caplog):
     """Other programs still have graphs, and a success ends a row of failures."""
-    device, started = gathering
+    device, started = batching
     first, second, third = (bound(device, poses) for poses in (1, 2, 3))
     for number, call in enumerate((first, second)):
         with monkeypatch.context() as patch:
@@ -92,8 +92,8 @@ def test_a_program_that_the_driver_refuses_is_not_tried_again(gathering, monkeyp
     assert not device._graphs.refusal
 
 
-def test_failures_in_a_row_end_all_captures_and_the_reason_is_kept(gathering, monkeypatch, caplog):
-    device, started = gathering
+def test_failures_in_a_row_end_all_captures_and_the_reason_is_kept(batching, monkeypatch, caplog):
+    device, started = batching
     before = bound(device)
     before()
     before()
@@ -112,8 +112,8 @@ def test_failures_in_a_row_end_all_captures_and_the_reason_is_kept(gathering, mo
     assert len(started) == count + 1 and before.explain() == "one CUDA graph of 3 launches"
 
 
-def test_a_refusal_shows_in_calls_of_numpy_arrays(gathering, monkeypatch):
-    call = FIELD(GRID, NEAR, backend=gathering[0]).bind(cloud(1), mixed(1))
+def test_a_refusal_shows_in_calls_of_numpy_arrays(batching, monkeypatch):
+    call = FIELD(GRID, NEAR, backend=batching[0]).bind(cloud(1), mixed(1))
     tries = refusing(monkeypatch)
     for _ in range(4):
         call()
@@ -121,12 +121,12 @@ def test_a_refusal_shows_in_calls_of_numpy_arrays(gathering, monkeypatch):
     assert call.explain().endswith("3 launches and 2 copies one by one: the driver captured no graph: no graphs here")
 
 
-def test_a_call_in_many_pieces(gathering, monkeypatch):
+def test_a_call_in_many_pieces(batching, monkeypatch):
     """A recording of any length is a graph; with copies around it, it counts as one of their steps."""
     from gpusense.models import run
 
     monkeypatch.setattr(run, "CHUNK", 7)
-    call = bound(gathering[0])
+    call = bound(batching[0])
     call()
     call()
     launches = len(call._program())
@@ -142,8 +142,8 @@ def ordinary(device, *arguments, **options) -> str:
     return reason
 
 
-def test_reasons_for_the_ordinary_call(gathering, monkeypatch):
-    device = gathering[0]
+def test_reasons_for_the_ordinary_call(batching, monkeypatch):
+    device = batching[0]
     poses, ranges = to_device(cloud(1)), to_device(mixed(1))
     assert ordinary(device, cloud(1), ranges) == "poses are in host memory"
     assert ordinary(device, poses, mixed(1)) == "ranges are in host memory"
@@ -158,8 +158,8 @@ def test_reasons_for_the_ordinary_call(gathering, monkeypatch):
     assert ordinary(device, cloud(1), mixed(1)) == "the map has more than 10 cells"
 
 
-def test_devices_without_recordings_give_their_reason(gathering, monkeypatch):
-    device = gathering[0]
+def test_devices_without_recordings_give_their_reason(batching, monkeypatch):
+    device = batching[0]
     arrays = to_device(cloud(1)), to_device(mixed(1))
     info = device.info
     monkeypatch.setattr(device, "info", dataclasses.replace(info, float64=False))
@@ -172,12 +172,12 @@ def test_devices_without_recordings_give_their_reason(gathering, monkeypatch):
     assert ordinary(device, *arrays) == "processors score scans that the host prepares"
 
 
-def test_a_table_that_does_not_fit(gathering, monkeypatch):
+def test_a_table_that_does_not_fit(batching, monkeypatch):
     def full(*arguments, **options):
         raise MemoryError
 
     monkeypatch.setattr(binding, "DeviceCall", full)
-    assert ordinary(gathering[0], cloud(1), mixed(1)) == "the table of the whole map does not fit the device"
+    assert ordinary(batching[0], cloud(1), mixed(1)) == "the table of the whole map does not fit the device"
 
 
 def test_numpy_and_opencl_have_no_graphs(needs):

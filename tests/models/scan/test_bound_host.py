@@ -16,9 +16,9 @@ from gpusense.models.scan import binding
 
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("case", CASES)
-def test_short_calls_of_the_host_are_one_graph(case, gathering, monkeypatch):
+def test_short_calls_of_the_host_are_one_graph(case, batching, monkeypatch):
     """Copies there and back and all launches; the bits are those of the ordinary call."""
-    device, started = gathering
+    device, started = batching
     model = CASES[case](backend=device)
     beams = model.scanner.count
     for real in (np.float32, np.float64):
@@ -55,10 +55,10 @@ BESIDE = np.array(
 
 @pytest.mark.parametrize("real", [np.float32, np.float64])
 @pytest.mark.parametrize("kind", MODELS)
-def test_limits_are_rounded_as_readings_are(kind, real, gathering):
+def test_limits_are_rounded_as_readings_are(kind, real, batching):
     """A driver's largest float32 reading is a max reading, however it gets to the device."""
     parameters = {BEAM: gs.BeamParameters(), FIELD: gs.LikelihoodFieldParameters(0.7, 0.2, 0.1)}[kind]
-    model = kind(GRID, ROUNDED, parameters, backend=gathering[0])
+    model = kind(GRID, ROUNDED, parameters, backend=batching[0])
     poses, ranges = cloud(1), np.resize(BESIDE, BEAMS).astype(real)
     expected = model.log_likelihood(to_device(poses), ranges).numpy()
     assert differing(model.bind(to_device(poses), to_device(ranges))().numpy(), expected) == 0
@@ -66,8 +66,8 @@ def test_limits_are_rounded_as_readings_are(kind, real, gathering):
     assert type(call) is binding._StagedCall and differing(call(), model.log_likelihood(poses, ranges)) == 0
 
 
-def test_calls_that_are_not_short_take_the_ordinary_path(gathering, monkeypatch):
-    device, _ = gathering
+def test_calls_that_are_not_short_take_the_ordinary_path(batching, monkeypatch):
+    device, _ = batching
     model = FIELD(GRID, NEAR, backend=device)
     integers = np.zeros((COUNT, 3), np.int64)
     for poses, ranges in ((integers, mixed(1)), (np.zeros((20_000, 3)), mixed(1))):
@@ -104,9 +104,9 @@ def test_arrays_of_the_host_on_every_backend(kind, backend):
 
 
 @pytest.mark.parametrize("compat", [None, "amcl"])
-def test_calls_that_take_the_ordinary_path_on_a_device(compat, gathering):
+def test_calls_that_take_the_ordinary_path_on_a_device(compat, batching):
     """Poses or readings of the host, and weights for which the host makes the readings."""
-    model = FIELD(GRID, NEAR, backend=gathering[0], compat=compat)
+    model = FIELD(GRID, NEAR, backend=batching[0], compat=compat)
     poses, ranges = to_device(cloud(1)), to_device(mixed(1))
     pairs = [(poses, mixed(1)), (cloud(1), ranges), *([(poses, ranges)] if compat else [])]
     expected = model.log_likelihood(cloud(1), mixed(1))

@@ -1,4 +1,4 @@
-"""Paths of calls of few particles against the plain one: memory that is shared, launches that are gathered."""
+"""Paths of calls of few particles against the plain one: memory that is shared, batches of launches."""
 
 from __future__ import annotations
 
@@ -71,19 +71,19 @@ def test_shared_memory_that_cannot_be_allocated(two_ways):
         SharedBuffer(two_ways[0]._context, 1 << 60, two_ways[0].synchronize)
 
 
-# ---- CUDA: launches and copies that are gathered, and graphs; Warp's processor stands in for a GPU
+# ---- CUDA: launches and copies in batches, and graphs; Warp's processor stands in for a GPU
 
 
 def plainly(device, monkeypatch, call):
-    """Return a result without anything gathered."""
+    """Return a result without batches."""
     with monkeypatch.context() as patch:
         patch.setattr(device, "info", dataclasses.replace(device.info, graphs=False))
         return call()
 
 
 @pytest.mark.parametrize("kind", MODELS)
-def test_graphs_change_no_bit(kind, gathering, monkeypatch):
-    device, started = gathering
+def test_graphs_change_no_bit(kind, batching, monkeypatch):
+    device, started = batching
     model = kind(GRID, SCANNER, backend=device)
     # Sizes that come and go, other readings, and poses with huge headings, which are other code.
     calls = [
@@ -112,8 +112,8 @@ def test_graphs_change_no_bit(kind, gathering, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", MODELS)
-def test_graphs_with_arrays_on_the_device(kind, gathering, monkeypatch):
-    device, started = gathering
+def test_graphs_with_arrays_on_the_device(kind, batching, monkeypatch):
+    device, started = batching
     model = kind(GRID, SCANNER, backend=device)
     poses, out = to_device(cloud(0)), to_device(np.zeros(COUNT, np.float32))
     for seed in range(5):
@@ -136,9 +136,9 @@ def test_graphs_with_arrays_on_the_device(kind, gathering, monkeypatch):
     assert differing(out.numpy(), expected) == 0
 
 
-def test_scans_and_pieces_are_gathered_in_their_order(gathering, monkeypatch):
+def test_scans_and_pieces_are_batched_in_their_order(batching, monkeypatch):
     """Buffers serve one piece after the other, so that an order lost would show."""
-    device, started = gathering
+    device, started = batching
     monkeypatch.setattr(run, "CHUNK", 77)
     model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=device)
     poses, scans = np.stack([cloud(1), cloud(2)]), np.stack([scan(1), scan(2)])
@@ -153,9 +153,9 @@ def test_scans_and_pieces_are_gathered_in_their_order(gathering, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", MODELS)
-def test_scans_that_share_launches_are_gathered(kind, gathering, monkeypatch):
+def test_scans_that_share_launches_are_batched(kind, batching, monkeypatch):
     """Calls of other scans, and of one scan with as many particles and readings, are not taken for one another."""
-    device, started = gathering
+    device, started = batching
     model = kind(GRID, SCANNER, backend=device, temperature=0.5)
     poses = np.stack([cloud(1, 100), cloud(2, 100), cloud(3, 100)])
     calls = [
@@ -176,8 +176,8 @@ def test_scans_that_share_launches_are_gathered(kind, gathering, monkeypatch):
 
 
 @pytest.mark.parametrize("count", [COUNT, 0])
-def test_several_models_are_gathered(count, gathering, monkeypatch):
-    device, started = gathering
+def test_several_models_are_batched(count, batching, monkeypatch):
+    device, started = batching
     models = [kind(GRID, SCANNER, backend=device) for kind in (*MODELS, gs.LikelihoodFieldModel)]
     models.append(models[0])
     poses, z = [cloud(s, count) for s in range(4)], [scan(s) for s in range(4)]
@@ -201,10 +201,10 @@ def test_several_models_are_gathered(count, gathering, monkeypatch):
         assert differing(gs.log_likelihoods(models, there, z)[2].numpy(), expected[2]) == 0
 
 
-def test_arrays_that_are_too_large_are_copied_at_once(gathering, monkeypatch):
+def test_arrays_that_are_too_large_are_copied_at_once(batching, monkeypatch):
     from gpusense.backends.warp import queue as _warp_queue
 
-    device, _ = gathering
+    device, _ = batching
     model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=device)
     expected = plainly(device, monkeypatch, lambda: model.log_likelihood(cloud(1), scan(1)))
     for largest, memory in ((1000, 4 << 20), (256 << 10, 2000), (0, 0)):
@@ -214,9 +214,9 @@ def test_arrays_that_are_too_large_are_copied_at_once(gathering, monkeypatch):
             assert differing(model.log_likelihood(cloud(1), scan(1)), expected) == 0
 
 
-def test_a_call_that_fails_leaves_nothing_behind(gathering, monkeypatch):
+def test_a_call_that_fails_leaves_nothing_behind(batching, monkeypatch):
     """The table that it made is whole, and its arrays are not written later."""
-    device, _ = gathering
+    device, _ = batching
     model = gs.BeamModel(GRID, SCANNER, backend=device)
     other = gs.BeamModel(GRID, SCANNER, backend=device)
     expected = plainly(device, monkeypatch, lambda: other.log_likelihood(cloud(1), scan(1)))
@@ -225,13 +225,13 @@ def test_a_call_that_fails_leaves_nothing_behind(gathering, monkeypatch):
         patch.setattr(model_module, "finish", lambda *arguments: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             model.log_likelihood(cloud(1), scan(1), out=out)
-    assert device.gathering() is None and (out == 7).all()
+    assert device.batch() is None and (out == 7).all()
     assert differing(model.log_likelihood(cloud(1), scan(1)), expected) == 0
     assert (out == 7).all()
 
 
-def test_threads_gather_on_their_own(gathering, monkeypatch):
-    device, started = gathering
+def test_threads_have_batches_of_their_own(batching, monkeypatch):
+    device, started = batching
     models = [gs.LikelihoodFieldModel(GRID, SCANNER, backend=device) for _ in range(3)]
     expected = plainly(device, monkeypatch, lambda: [models[0].log_likelihood(cloud(i), scan(i)) for i in range(3)])
     same: list[bool] = []
@@ -252,12 +252,12 @@ def test_threads_gather_on_their_own(gathering, monkeypatch):
     assert started
 
 
-def test_graphs_are_bounded_and_a_driver_without_them_is_used_plainly(gathering, monkeypatch):
+def test_graphs_are_bounded_and_a_driver_without_them_is_used_plainly(batching, monkeypatch):
     import warp as wp
 
     from gpusense.backends.warp import graphs as _warp_graphs
 
-    device, started = gathering
+    device, started = batching
     monkeypatch.setattr(_warp_graphs, "_MOST_GRAPHS", 2)
     monkeypatch.setattr(_warp_graphs, "_MOST_SEEN", 2)
     model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=device)
@@ -282,11 +282,13 @@ def test_graphs_are_bounded_and_a_driver_without_them_is_used_plainly(gathering,
     assert list(device._graphs._refused.values()) == ["the driver captured no graph: no graphs here"]
 
 
-def test_an_error_forgets_no_memory_that_launches_still_need(gathering, monkeypatch):
-    """Launches that were gathered before are started first."""
-    device, int32, seen = gathering[0], np.dtype(np.int32), []
-    space, scatter = Workspace(device), device.scatter
-    monkeypatch.setattr(device, "scatter", lambda: (seen.append(("pose_status", int32) in space._buffers), scatter()))
+def test_an_error_forgets_no_memory_that_launches_still_need(batching, monkeypatch):
+    """Launches of the batch are started first."""
+    device, int32, seen = batching[0], np.dtype(np.int32), []
+    space, end_batch = Workspace(device), device.end_batch
+    monkeypatch.setattr(
+        device, "end_batch", lambda: (seen.append(("pose_status", int32) in space._buffers), end_batch())
+    )
     with pytest.raises(KeyboardInterrupt), space:
         space.empty("pose_status", 2, int32, zero=True)
         raise KeyboardInterrupt

@@ -103,7 +103,7 @@ class Watch:
 
 
 def scan_uploads(device, size: int, *counts: int) -> list[int]:
-    """Return the bytes of a scan's arrays: a gathered call copies them at once, each begins at a multiple of 64."""
+    """Return the bytes of a scan's arrays: a batch copies them at once, each begins at a multiple of 64."""
     if device.info.graphs:
         return [sum(size * -(-count // 64) * 64 for count in counts)]
     return [size * count for count in counts]

@@ -1,0 +1,156 @@
+"""The parts of a particle filter, and the calls that change several of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+
+from gpusense._util.typing import AnyArray
+from gpusense.localization import skipping, starts
+from gpusense.localization.defaults import DEFAULTS
+from gpusense.localization.filter_cloud import Contents, FilterCloud
+from gpusense.localization.motion import SampledMotion
+from gpusense.localization.options import Options
+from gpusense.localization.recovery import Recovery
+from gpusense.localization.scoring import given_of
+from gpusense.localization.sensors import Sensor, grid_of
+from gpusense.localization.state import memory_of, remember
+from gpusense.localization.tracker import Tracker, is_together
+from gpusense.localization.verdict import Verdict
+
+
+class FilterParts:
+    """Particles that follow the robot, the verdict on their pose, and its recovery.
+
+    Args:
+        sensors: The sensors.
+        options: Options of the filter.
+        cloud: Room for the particles.
+
+    Attributes:
+        sensors: The sensors.
+        options: Options of the filter.
+        tracker: The particles, and the numbers of each step.
+        verdict: The verdict on their pose.
+        recovery: Their rivals.
+        last: Readings of the last correction by the index of their sensor.
+    """
+
+    MEMORY: ClassVar[tuple[str, ...]] = ("last",)
+    PARTS: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, sensors: Sequence[Sensor], options: Options, cloud: FilterCloud) -> None:
+        self.sensors, self.options = sensors, options
+        self.tracker = Tracker(sensors, options, cloud)
+        self.verdict = Verdict(sensors, self.tracker.random_poses, seed=options.seed)
+        self.recovery = Recovery(self.tracker, self.verdict)
+        self.last: dict[int, tuple[Any, ...]] = {}
+
+    def keep(self) -> None:
+        """Note what the call that begins must leave as it is."""
+        self.tracker.keep()
+        self.recovery.keep()
+
+    def changing(self) -> tuple[Any, ...]:
+        """Return the objects whose state a call may change."""
+        return self, self.tracker, self.tracker.cloud, self.verdict, *self.sensors, *self.recovery.changing()
+
+    def check_started(self) -> None:
+        """Refuse to go on without particles.
+
+        Raises:
+            RuntimeError: there are none.
+        """
+        if not self.tracker.started:
+            raise RuntimeError(
+                "ParticleFilter: must be initialised first, by initialize, initialize_uniform or initialize_from"
+            )
+
+    # ---- starts
+
+    def start_around(self, mean: AnyArray, covariance: AnyArray, particles: int | None) -> None:
+        """Draw particles from a normal density."""
+        tracker = self.tracker
+        self._begin(starts.normal(mean, covariance, tracker.number(particles), tracker.key()))
+        starts.look_at(np.asarray(mean, np.float64), grid_of(self.sensors))
+        tracker.together = is_together(np.asarray(covariance))
+
+    def start_anywhere(self, bounds: AnyArray | None, particles: int | None) -> None:
+        """Draw particles over the free cells of the map."""
+        tracker = self.tracker
+        pool, spread = starts.free_pool([sensor.model for sensor in self.sensors], bounds)
+        self._begin(starts.spread(pool, spread, tracker.number(particles), tracker.key()))
+        tracker.wide = DEFAULTS.wide_scans
+        self.verdict.reset(anywhere=True)
+        if bounds is None:
+            self.recovery.expect_anywhere()
+
+    def start_from(self, likelihood: Any, particles: int | None) -> None:
+        """Draw particles from a likelihood over poses."""
+        tracker = self.tracker
+        count = tracker.number(particles)
+        pool, spread = starts.likely_pool(likelihood, count, tracker.key())
+        self._begin(starts.spread(pool, spread, count, tracker.key(), each=True))
+        self.recovery.expect_anywhere()
+
+    def _begin(self, poses: np.ndarray) -> None:
+        """Replace all particles, and forget what earlier ones have seen."""
+        self.tracker.place(poses)
+        self.tracker.pending, self.last = None, {}
+        self.recovery.restart()
+        self.verdict.reset()
+        for sensor in self.sensors:
+            sensor.restart()
+
+    # ---- steps
+
+    def follow(self, motion: SampledMotion) -> None:
+        """Move the particles and their rival."""
+        self.tracker.follow(motion)
+        self.recovery.follow(motion)
+
+    def correct(self, readings: Any) -> None:
+        """Weigh the particles by readings; see ``ParticleFilter.correct``."""
+        given = given_of(readings, self.sensors)
+        if not given:
+            return
+        tracker, verdict, share = self.tracker, self.verdict, self.options.beam_skip
+        everything = dict(given)
+        if verdict.watches(everything):
+            verdict.predicted(*tracker.moved_particles(), everything)
+        if share is not None:
+            given = skipping.skipped(self.sensors, given, tracker.moved_particles(), verdict.anywhere, share)
+        tracker.weigh(given, again=bool(self.last))
+        # The caller may write the next readings to the same arrays.
+        self.last = {index: tuple(map(_copied, reading)) for index, reading in everything.items()}
+        verdict.corrected()
+        tracker.learn(given, self.recovery.is_doubted)
+        self.recovery.corrected(given, self.last)
+
+    def reset(self) -> None:
+        """Replace half of the particles by poses at which the last readings are likely."""
+        tracker = self.tracker
+        tries = tracker.random_poses(starts.tries_of(tracker.cloud.count))
+        temperature, key = self.options.temperature, tracker.key()
+        tracker.place(
+            starts.with_likely_poses(tracker.next_particles(), tries, self.sensors, self.last, temperature, key)
+        )
+
+    # ---- state
+
+    def state(self) -> tuple[Contents, dict[str, Any]]:
+        """Return particles and memory as plain data."""
+        tracker = self.tracker
+        return tracker.cloud.contents(tracker.shown), memory_of(tracker, self.verdict, self.recovery, self.last)
+
+    def restore(self, contents: Contents, memory: Mapping[str, Any]) -> None:
+        """Take over particles and memory."""
+        self.tracker.cloud.restore(contents)
+        self.last = remember(memory, self.tracker, self.verdict, self.recovery)
+
+
+def _copied(reading: Any) -> Any:
+    """Return a copy of a NumPy array, and another object as it is."""
+    return reading.copy() if isinstance(reading, np.ndarray) else reading

@@ -1,0 +1,191 @@
+"""Programs of earlier calls: which are kept, how long, and what goes with them."""
+
+from __future__ import annotations
+
+import gc
+import os
+import threading
+import weakref
+
+import numpy as np
+import pytest
+from support.split_scene import GRID
+
+import gpusense as gs
+from gpusense.backends import get_backend
+from gpusense.backends.programs import ChangingProgram, ProgramCache, RecordedProgram, RepeatedPrograms
+from gpusense.interface.launches import launch
+
+REAL, POSES = np.dtype(np.float64), np.array([(1.0, 1.0, 0.3), (1.2, 1.1, -0.4)])
+# Recordings of some backends keep no buffer alive.
+BUFFERS = {}
+SCANNER, RANGES = gs.Scanner(np.linspace(-1, 1, 8), range_max=4.0), np.full(8, 1.0)
+
+
+def program(device, source, target, count):
+    """Return the launch that copies an array."""
+    BUFFERS[device, count] = settings, largest = device.upload(np.ones(64)), device.empty(1, REAL)
+    return (
+        launch("add_scores", frozenset({"FLOAT64"}), (1,), log_p=source, settings=settings, score=target,
+               largest=largest, sensor=0, particles=count, block=count),
+    )  # fmt: skip
+
+
+def test_the_oldest_program_goes():
+    cache = ProgramCache[str](3)
+    for key in range(5):
+        cache.keep(key, str(key))
+    assert cache.items() == [(2, "2"), (3, "3"), (4, "4")] and len(cache) == 3
+    assert cache.get(1) is None and cache.get(2) == "2"
+    cache.clear()
+    assert cache.items() == [] and cache.get(4) is None
+
+
+def test_a_program_is_recorded_when_it_runs_a_second_time(backend):
+    device = get_backend(backend)
+    source, target = device.upload(np.arange(4.0)), device.empty(4, REAL)
+    made, programs = [], RepeatedPrograms(device, 2)
+
+    def make():
+        made.append(1)
+        return launches
+
+    results = []
+    launches = program(device, source, target, 4)
+    for _ in range(4):
+        programs.run("key", make)
+        results.append(device.download(target, np.empty(4)))
+    assert len(made) == 2 and programs.last is not None
+    np.testing.assert_array_equal(results, [np.arange(4.0)] * 4)
+    programs.clear()
+    programs.run("key", make)
+    assert len(made) == 3
+
+
+def test_arguments_change_from_call_to_call(backend):
+    device = get_backend(backend)
+    sources = [device.upload(np.full(4, value)) for value in (1.0, 2.0)]
+    target = device.empty(4, REAL)
+    changing = ChangingProgram(device, program(device, sources[0], target, 4), ["log_p"])
+    for source, value in zip(sources, (1.0, 2.0), strict=True):
+        changing({"log_p": source})
+        np.testing.assert_array_equal(device.download(target, np.empty(4)), value)
+
+
+def test_programs_of_threads_are_their_owners():
+    """Models of two threads on one device have caches of their own; a shared one has a lock around each call."""
+    model = gs.LikelihoodFieldModel(GRID, SCANNER, backend="numpy")
+    expected = [model.log_likelihood(POSES[:count], RANGES) for count in (1, 2)]
+    wrong = []
+
+    def work(count):
+        for _ in range(50):
+            if not np.array_equal(model.log_likelihood(POSES[:count], RANGES), expected[count - 1]):
+                wrong.append(count)
+
+    threads = [threading.Thread(target=work, args=(1 + i % 2,)) for i in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+    assert len(model._workspace._programs) <= 2
+
+
+@pytest.fixture
+def without_collector():
+    gc.collect()
+    gc.disable()
+    yield
+    gc.enable()
+
+
+def programs_of(owner):
+    """Return weak references to the programs of an owner's caches."""
+    caches = [value for value in vars(owner).values() if isinstance(value, ProgramCache)]
+    caches += [value._programs for value in vars(owner).values() if isinstance(value, RepeatedPrograms)]
+    return [weakref.ref(value) for cache in caches for _, value in cache.items() if not isinstance(value, tuple)]
+
+
+@pytest.mark.parametrize("kind", [gs.LikelihoodFieldModel, gs.BeamModel])
+def test_a_model_takes_its_programs_along(kind, backend, without_collector):
+    model = kind(GRID, SCANNER, backend=backend)
+    for count in (1, 2, 1):
+        model.log_likelihood(POSES[:count], RANGES)
+    kept = programs_of(model._workspace)
+    assert kept and all(one() is not None for one in kept)
+    del model
+    assert all(one() is None for one in kept)
+
+
+def test_a_filter_takes_its_programs_along(backend, without_collector):
+    model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=backend)
+    pf = gs.ParticleFilter(model, particles=64, seed=1)
+    pf.initialize(mean=POSES[0], covariance=np.diag([0.01, 0.01, 0.01]))
+    for _ in range(6):
+        pf.predict((0, 0, 0), (0.01, 0, 0))
+        pf.correct(RANGES)
+        pf.mean_and_covariance()
+    kept = programs_of(pf._cloud)
+    assert kept
+    del pf
+    assert all(one() is None for one in kept)
+
+
+def test_another_table_and_larger_buffers_drop_programs():
+    model = gs.LikelihoodFieldModel(GRID, SCANNER, backend="numpy")
+    model.log_likelihood(POSES[:1], RANGES)
+    first = programs_of(model._workspace)
+    model.log_likelihood(np.tile(POSES, (50, 1)), RANGES)
+    assert all(one() is None for one in first) and len(model._workspace._programs) == 1
+    second = programs_of(model._workspace)
+    model.update_map(100 - GRID.cells[:2, :2], (0, 0))
+    model.log_likelihood(POSES[:1], RANGES)
+    assert all(one() is None for one in second)
+
+
+def test_owners_of_memory_live_as_long_as_a_recording(backend):
+    device = get_backend(backend)
+
+    class Owner:
+        pass
+
+    owner = Owner()
+    gone = weakref.ref(owner)
+    buffers = device.upload(np.zeros(4)), device.empty(4, REAL)
+    recorded = RecordedProgram(device, program(device, *buffers, 4), owner)
+    del owner
+    recorded.start()
+    device.synchronize()
+    assert gone() is not None
+    del recorded
+    assert gone() is None
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
+def test_a_forked_child_starts_no_program(needs):
+    """The parent's device does not survive a fork: the child gets an error, at once."""
+    needs("opencl")
+    device = get_backend("opencl")
+    buffers = device.upload(np.zeros(4)), device.empty(4, REAL)
+    launches = program(device, *buffers, 4)
+    recorded, repeated = RecordedProgram(device, launches), RepeatedPrograms(device, 2)
+    changing = ChangingProgram(device, launches, ["log_p"])
+    for _ in range(3):
+        repeated.run("key", lambda: launches)
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        refused = 0
+        for start in (
+            recorded.start, lambda: recorded({}), lambda: changing({"log_p": buffers[0]}),
+            lambda: repeated.run("key", lambda: launches),
+        ):  # fmt: skip
+            try:
+                start()
+            except RuntimeError as error:
+                refused += "does not survive a fork" in str(error)
+        os.write(write, bytes([refused]))
+        os._exit(0)
+    os.waitpid(child, 0)
+    assert os.read(read, 1) == bytes([4])

@@ -1,0 +1,70 @@
+"""Python calls on the way of a steady call to a device: each costs time, and their number has no noise."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from support.split_scene import GRID
+
+import gpusense as gs
+
+SCANNER = gs.Scanner(np.linspace(-np.pi / 2, np.pi / 2, 60), range_max=9.0)
+POSE = np.array([4.0, 3.0, 0.3])
+RANGES = gs.RayCaster(GRID, 9.0, backend="numpy").cast(POSE[None], SCANNER.bearings)[0]
+# Most calls of Python functions, those of NumPy's included, with Python 3.11.
+MOST_FIELD, MOST_BEAMS, MOST_STEP, MOST_BOUND = 80, 90, 230, 90
+
+
+def calls_of(run: Callable[[], object]) -> int:
+    """Return the number of Python functions that are called while a function runs, without itself."""
+    found = []
+    sys.setprofile(lambda frame, event, argument: found.append(frame.f_code) if event == "call" else None)
+    try:
+        run()
+    finally:
+        sys.setprofile(None)
+    return len(found) - 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "most"), [(gs.LikelihoodFieldModel, MOST_FIELD), (gs.BeamModel, MOST_BEAMS)], ids=["field", "beams"]
+)
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_a_steady_call(kind, most, precision, needs):
+    needs("opencl")
+    model = kind(GRID, SCANNER, backend="opencl:pocl", precision=precision)
+    poses = POSE + np.random.default_rng(0).normal(0, 0.05, (200, 3))
+    for _ in range(40):
+        model.log_likelihood(poses, RANGES)
+    counts = [calls_of(lambda: model.log_likelihood(poses, RANGES)) for _ in range(3)]
+    assert max(counts) <= most and len(set(counts)) == 1, counts
+
+
+def test_a_bound_call(needs):
+    needs("opencl")
+    model = gs.LikelihoodFieldModel(GRID, SCANNER, backend="opencl:pocl")
+    call = model.bind(np.tile(POSE, (200, 1)), RANGES.copy())
+    for _ in range(40):
+        call()
+    assert calls_of(call) <= MOST_BOUND
+
+
+@pytest.mark.parametrize("recovery", [None, "sensor"])
+def test_a_step_of_a_filter(recovery, needs):
+    """The median: some steps find out whether the particles lie together, learn the temperature, or judge."""
+    needs("opencl")
+    model = gs.LikelihoodFieldModel(GRID, SCANNER, backend="opencl:pocl")
+    pf = gs.ParticleFilter(model, particles=500, seed=1, recovery=recovery)
+    pf.initialize(mean=POSE, covariance=np.diag([0.01, 0.01, 0.002]))
+
+    def step() -> None:
+        pf.predict((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        pf.correct(RANGES)
+
+    for _ in range(75):
+        step()
+    counts = [calls_of(step) for _ in range(21)]
+    assert np.median(counts) <= MOST_STEP, counts

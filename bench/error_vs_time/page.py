@@ -1,9 +1,9 @@
-"""Make docs/error-vs-time.md and its figures from the reports in bench/results; the site's build makes the interactive page.
+"""Make docs/error-vs-time.md and its figures from the reports in bench/results.
 
     python bench/error_vs_time/page.py           # write
     python bench/error_vs_time/page.py --check   # exit code 1 where a file differs, or a report is of older code
 
-The same reports give the same bytes everywhere.
+The same reports give the same bytes everywhere. The site's build writes the interactive page.
 """
 
 from __future__ import annotations

@@ -72,8 +72,8 @@ html_copy_source = False
 
 
 def mark_reports(app: Any, name: str, source: list[str]) -> None:
-    """Say that a report stands in no table of contents; pages link to it."""
-    if name.startswith("bench/results/"):
+    """Say that a report or a note stands in no table of contents; pages link to it."""
+    if name.startswith(("bench/results/", "docs/notes/")):
         source[0] = f"---\norphan: true\n---\n{source[0]}"
 
 

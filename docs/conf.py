@@ -8,7 +8,10 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
 from docutils import nodes
+from error_vs_time.page import interactive
+from make_figures import write_pages as write_figures
 from reference_pages import write_pages
 from sphinx import addnodes
 
@@ -21,17 +24,25 @@ author = "The gpusense developers"
 copyright = author
 version = release = gpusense.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_gallery.gen_gallery"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_gallery.gen_gallery"]
 root_doc = "docs/index"
 include_patterns = [
     "docs/**.md", "docs/**.rst", "bench/RESULTS.md", "bench/results/*.md", "CHANGELOG.md", "CODE_OF_CONDUCT.md",
     "CONTRIBUTING.md", "README.md", "SECURITY.md", "examples/ros2/**/README.md",
+    "examples/notebooks/*.ipynb",
 ]  # fmt: skip
 exclude_patterns = ["**/.*", "site", "docs/tour/GALLERY_HEADER.rst"]
 # Reports begin with the heading that they have in a page.
 suppress_warnings = ["myst.header", "config.cache"]
 
 myst_heading_anchors = 4
+# Notebooks have no outputs in the checkout; each runs here, in a folder of its own.
+nb_execution_mode = "force"
+nb_execution_in_temp = True
+nb_execution_raise_on_error = True
+nb_execution_timeout = 120
+nb_execution_show_tb = True
+nb_merge_streams = True
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 autodoc_inherit_docstrings = True
@@ -61,8 +72,8 @@ html_copy_source = False
 
 
 def mark_reports(app: Any, name: str, source: list[str]) -> None:
-    """Say that a report stands in no table of contents; pages link to it."""
-    if name.startswith("bench/results/"):
+    """Say that a report or a note stands in no table of contents; pages link to it."""
+    if name.startswith(("bench/results/", "docs/notes/")):
         source[0] = f"---\norphan: true\n---\n{source[0]}"
 
 
@@ -76,8 +87,11 @@ def open_figures(app: Any, doctree: nodes.document) -> None:
 
 
 def setup(app: Any) -> None:
-    """Write the pages of the public names before Sphinx looks for pages."""
+    """Write the pages of the public names and the figures that move before Sphinx looks for pages."""
     write_pages(ROOT / "docs" / "api")
+    figures = ROOT / "docs" / "front" / "figures"
+    write_figures(figures)
+    (figures / "error-vs-time.html").write_text(interactive(), encoding="utf-8")
     app.connect("source-read", mark_reports)
     # Before Sphinx collects the files to be downloaded.
     app.connect("doctree-read", open_figures, priority=100)

@@ -1,4 +1,4 @@
-"""Make the interactive figures of the site: python docs/make_figures.py.
+"""Make the interactive figures of the site; its build calls ``write_pages``.
 
 Each is one page that fetches nothing: the sources in ``docs/figures``, and data out of gpusense. Values of gpusense's
 NumPy backend are among the data, with which the script of the page compares its own.
@@ -15,7 +15,6 @@ import numpy as np
 import gpusense as gs
 
 SOURCES = Path(__file__).parent / "figures"
-TARGET = Path(__file__).parent / "front" / "figures"
 RANGE_MAX = 5.0
 # Weights of hit, short, max and rand, sigma_hit [m], lambda_short [1/m], and z* [m].
 SETTINGS = (
@@ -132,14 +131,8 @@ def page(name: str) -> str:
     return text
 
 
-def main() -> None:
-    """Write the pages."""
-    TARGET.mkdir(exist_ok=True)
+def write_pages(folder: Path) -> None:
+    """Write the pages into a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
     for name in DATA:
-        file = TARGET / f"{name}.html"
-        file.write_text(page(name), encoding="utf-8")
-        print(f"{file}: {file.stat().st_size} bytes")
-
-
-if __name__ == "__main__":
-    main()
+        (folder / f"{name}.html").write_text(page(name), encoding="utf-8")

@@ -1,9 +1,9 @@
-"""Make docs/error-vs-time.md, its figures and the interactive page from the reports in bench/results.
+"""Make docs/error-vs-time.md and its figures from the reports in bench/results.
 
     python bench/error_vs_time/page.py           # write
     python bench/error_vs_time/page.py --check   # exit code 1 where a file differs, or a report is of older code
 
-The same reports give the same bytes everywhere.
+The same reports give the same bytes everywhere. The site's build writes the interactive page.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from gpusense.evaluation.benchmark.choice import choose, error_text, front, time
 from gpusense.evaluation.benchmark.report import table
 
 HERE = Path(__file__).parent
-PAGE, FIGURE = Path("docs/error-vs-time.md"), Path("docs/front/figures/error-vs-time.html")
+PAGE = Path("docs/error-vs-time.md")
 IMAGES = Path("docs/img")
 WRONG, MEDIAN, TAIL, LARGEST = (
     "rays wrong by more than a cell", "median error of a ray", "95 % error of a ray", "largest error of a ray",
@@ -235,7 +235,7 @@ def picture(name: str) -> Path:
     return IMAGES / f"error-vs-time-{name.replace(' ', '-')}.svg"
 
 
-def interactive(rows: Sequence[Row]) -> str:
+def interactive(folder: Path = RESULTS) -> str:
     """Return the interactive page."""
     data = [
         {
@@ -245,7 +245,7 @@ def interactive(rows: Sequence[Row]) -> str:
             "errors": {name: _short(row.errors[name]) for name in SHOWN[row.need] if name in row.errors},
             "units": [row.units[name] for name in SHOWN[row.need] if name in row.errors],
         }
-        for row in rows
+        for row in rows_of(sources(folder))
     ]  # fmt: skip
     text = (HERE / "figure.html").read_text(encoding="utf-8")
     lines = ",\n".join(json.dumps(one, allow_nan=False, separators=(",", ":")) for one in data)
@@ -284,7 +284,7 @@ def files(folder: Path = RESULTS) -> dict[Path, str]:
     text = (HERE / "template.txt").read_text(encoding="utf-8")
     for name, lines in blocks.items():
         text = text.replace(f"{{{{{name}}}}}", "\n".join(lines))
-    return made | {PAGE: text, FIGURE: interactive(rows)}
+    return made | {PAGE: text}
 
 
 def main() -> int:

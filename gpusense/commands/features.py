@@ -27,7 +27,7 @@ HELP = "Extract lines, corners, doors, hallways, poles and reflectors from the s
 _CALL = 256
 
 _EPILOG = """\
-Each scan is split into lines, and corners, doors, hallways and poles are made of them (docs/features.md). With
+Each scan is split into lines, and corners, doors, hallways and poles are made of them (docs/landmarks.md). With
 --map-out the lines, corners, doors, poles and reflectors of all scans become a map, at the logged poses or those of
 --reference; --map-in makes a map of an occupancy grid instead. Reflectors need a log with intensities.
 

@@ -108,7 +108,8 @@ class FieldSearch:
         corners = [[(1 - f) * row[:, :-1] + f * row[:, 1:] for f in along] for row in rows]
         for i in range(n):
             for j in range(n):
-                least = np.min([corners[i][j], corners[i][j + 1], corners[i + 1][j], corners[i + 1][j + 1]], axis=0)
+                four = corners[i][j], corners[i][j + 1], corners[i + 1][j], corners[i + 1][j + 1]
+                least = np.minimum.reduce(four)
                 exact = (np.clip(density.log(least), self._low, self._high) - self._low) * (TOP / self._step())
                 scores[i * n + j] = np.minimum(np.ceil(exact + 0.01), TOP)
         return scores

@@ -38,7 +38,7 @@ def reports(page: ModuleType) -> ModuleType:
 
 
 def test_the_page_is_what_the_reports_give(page: ModuleType) -> None:
-    """Byte for byte, figures and the interactive page as well; nothing else of it is committed."""
+    """Byte for byte, figures as well; nothing else of it is committed."""
     made = page.files()
     assert {path for path, text in made.items() if (ROOT / path).read_bytes() != text.encode()} == set(), (
         "run python bench/error_vs_time/page.py"
@@ -171,7 +171,7 @@ def test_two_reports_of_a_device_are_refused(page: ModuleType, tmp_path: Path) -
 
 
 def test_the_interactive_page_fetches_nothing(page: ModuleType) -> None:
-    text = (ROOT / page.FIGURE).read_text(encoding="utf-8").replace("http://www.w3.org/2000/svg", "")
+    text = page.interactive().replace("http://www.w3.org/2000/svg", "")
     assert not re.search(
         r"https?:|\bsrc=|\bhref=|\bimport\b|\bfetch\(|XMLHttp|@import|url\(|\{(style|script|data)\}", text
     )
@@ -211,7 +211,7 @@ def test_the_interactive_page_works_in_a_browser(page: ModuleType, tmp_path: Pat
     document.body.dataset.tip = $("tip").textContent;
     document.body.dataset.front = [...$("front").rows].map(row => row.cells[0].textContent).join("; ");
     </script></html>"""
-    text = page.files(tmp_path)[page.FIGURE].replace("</html>", script)
+    text = page.interactive(tmp_path).replace("</html>", script)
     (tmp_path / "page.html").write_text(text, encoding="utf-8")
     command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}",
                "--dump-dom", f"file://{tmp_path / 'page.html'}"]  # fmt: skip

@@ -17,6 +17,8 @@ SCANNED = ("gpusense", "kernels", "docs", "README.md", "CHANGELOG.md", "CONTRIBU
 PENDING: tuple[str, ...] = ()
 
 BANNED = re.compile(r"\b(told|mend|mends|mended|mending|so\s+many|nobody)\b", re.IGNORECASE)
+# Pages say "also" before the verb.
+TOO = re.compile(r", too(?=[.;:])")
 # Sentences with a clause as their subject; a question may begin so.
 CLAUSE = re.compile(r"(What|Who|That\s+of|Of\s+which)\b")
 END = re.compile(r"[.!?:|](?=\s|[\"']|$)|\n\s*\n|\n\s*(?:[-*]|#+|\d+\.)\s")
@@ -94,6 +96,18 @@ def test_prose_has_no_banned_words():
         for offset, text in findings(passage)
     ]
     assert not found, "\n".join(["banned words, see CONTRIBUTING.md:", *found])
+
+
+def test_no_sentence_of_a_page_ends_with_too():
+    """Notes and the changelog are pages as well."""
+    found = [
+        f"{file.relative_to(ROOT).as_posix()}:{text.count(chr(10), 0, match.start()) + 1}"
+        for file in scanned_files()
+        if file.suffix == ".md"
+        for text in [file.read_text(encoding="utf-8")]
+        for match in TOO.finditer(text)
+    ]
+    assert found == [] and TOO.search("as on one device, too.") and not TOO.search("also, too many. Too")
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ class LineModel(FeatureModel):
 
     A line is ``x cos(angle) + y sin(angle) = distance`` in the robot's frame; its angle is that of the normal away from
     the scanner. Each adds ``log(z_detect p(f | j) + z_false / (2 pi range_max))`` with a normal density p(f | j) of
-    angle and distance; docs/features.md defines it. A line may be a wall that it overlaps, when projected on it. The
+    angle and distance; docs/landmarks.md defines it. A line may be a wall that it overlaps, when projected on it. The
     places of the ends do not matter otherwise: a scan shows a wall only as far as it is in sight. The wall j is known
     from ``correspondence``, or chosen by ``association``.
 

@@ -270,7 +270,7 @@ class Chainer:
             compose_poses(start, poses), turn @ covariance @ turn.T, solution.links.renumbered(nodes),
             nodes[joint.keys], None if self._odometry is None else self._motion, self._motions(count),
             durations[0] if len(durations) == 1 else durations, self._data.sensor[:count], corrections,
-            doubts_of(joint, self._odometry is None), len(nodes),
+            doubts_of(joint, self._odometry is None), len(nodes), 0 if self._loops is None else self._loops[1].searched,
         )  # fmt: skip
 
     def _motions(self, count: int) -> Floats | None:

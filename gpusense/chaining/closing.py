@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gpusense.chaining.drift import Drift
 from gpusense.chaining.graph import Solution, solve
 from gpusense.chaining.links import CLOSURE, Links
-from gpusense.chaining.matcher import TeamMatcher
+from gpusense.chaining.matcher import GROUP, TeamMatcher
 from gpusense.chaining.motion import relative
 from gpusense.chaining.places import overlaps
 from gpusense.localization.pose_algebra import compose_poses, invert_poses, wrap_angle
@@ -40,8 +40,8 @@ _DEVIATIONS, _GATE = 3.0, 16.0
 _SURE, _SURER = 0.9, 0.97
 # Closures that agree, and where the chain is broken.
 _AGREE, _AGREE_BROKEN = 3, 6
-# Passages that are compared are at most this far apart on both sides [m].
-_PASSAGE = 8.0
+# Passages that are compared are at most this far apart on both sides [m], and as many key scans; matches of a part.
+_PASSAGE, _KEYS, _MATCHES = 8.0, 64, 1024
 # Loops of two closures end within this of their beginning [m, rad], and a share of the way [m/m, rad/m].
 _MISSED, _MISSED_TURN, _SHARE, _SHARE_TURN = 0.15, 0.03, 0.03, 0.01
 # Closures of lower weight in the solution are dropped.
@@ -69,9 +69,8 @@ class Loops:
         closures: Closures so far.
         temperature: Factor of the information of matches.
         apart: Key scans of a pair are at least this many apart.
-        tried: Scanner and number of the first scan and second scan of pairs that were matched, with the level of the
-            search.
-        rejected: Number of matches that were sure but contradicted others, or stood alone.
+        matches: Sure matches of candidates so far.
+        searched: Number of candidates that were matched.
     """
 
     matcher: TeamMatcher
@@ -85,8 +84,10 @@ class Loops:
     apart: int
     closures: Links = field(default_factory=lambda: Links.joined([]))
     matches: Links = field(default_factory=lambda: Links.joined([]))
-    tried: dict[tuple[int, int, int], int] = field(default_factory=dict)
-    drift: tuple[Solution, Drift] | None = None
+    searched: int = 0
+    _drift_of: tuple[Solution, Drift] | None = None
+    # Ascending numbers of pairs that were matched, and the levels of their last searches.
+    _tried: tuple[Integers, Integers] = field(default_factory=lambda: (np.zeros(0, np.int64), np.zeros(0, np.int64)))
 
     def steps(self) -> Iterator[str]:
         """Search and close, and yield a word on each round."""
@@ -121,35 +122,48 @@ class Loops:
             some = needed == k
             found = self._matched(first[some], second[some], _LEVELS[k][0])
             self.matches = Links.joined([self.matches, found])
-        pairs = zip(*(values[first].tolist() for values in self.sequence), second.tolist(), strict=True)
-        self.tried.update(zip(pairs, needed.tolist(), strict=True))
+        self._keep_tried(self._pairs(first, second), needed)
+        self.searched += len(first)
         return bool(len(first))
 
     def _drift(self) -> Drift:
         """Return the drift of the solution so far."""
-        if self.drift is None or self.drift[0] is not self.solution:
-            self.drift = self.solution, Drift(self.solution)
-        return self.drift[1]
+        if self._drift_of is None or self._drift_of[0] is not self.solution:
+            self._drift_of = self.solution, Drift(self.solution)
+        return self._drift_of[1]
 
     def _is_tried(self, first: Integers, second: Integers, level: Integers) -> Flags:
         """Return whether pairs, or those with a neighbouring first scan, were matched at their level or a later one."""
-        shifts = range(-_NEIGHBOURS, _NEIGHBOURS + 1)
-        rows = zip(*(values[first].tolist() for values in self.sequence), second.tolist(), level.tolist(), strict=True)
-        found: Flags = np.array(
-            [
-                any(self.tried.get((scanner, one + shift, two), -1) >= least for shift in shifts)
-                for scanner, one, two, least in rows
-            ],
-            bool,
-        )
+        found = np.zeros(len(first), bool)
+        pairs, levels = self._tried
+        if not len(pairs):
+            return found
+        for shift in range(-_NEIGHBOURS, _NEIGHBOURS + 1):
+            wanted = self._pairs(first, second, shift)
+            place = np.minimum(np.searchsorted(pairs, wanted), len(pairs) - 1)
+            found |= (pairs[place] == wanted) & (levels[place] >= level)
         return found
+
+    def _pairs(self, first: Integers, second: Integers, shift: int = 0) -> Integers:
+        """Return numbers (L,) of pairs, or of those with neighbours of the first scans."""
+        scanner, rank = (values[first] for values in self.sequence)
+        count = len(self.nodes) + 2 * _NEIGHBOURS
+        numbers: Integers = (scanner * count + rank + _NEIGHBOURS + shift) * count + second
+        return numbers
+
+    def _keep_tried(self, pairs: Integers, levels: Integers) -> None:
+        """Remember pairs that were matched, each at its last level."""
+        before, so_far = self._tried
+        pairs, levels = np.append(pairs, before), np.append(levels, so_far)
+        pairs, last = np.unique(pairs, return_index=True)
+        self._tried = pairs, levels[last]
 
     def _matched(self, first: Integers, second: Integers, window: tuple[float, float]) -> Links:
         """Return the sure matches of candidates."""
         parts = []
         guess = relative(self.solution.poses, first, second)
-        for begin in range(0, len(first), 256):
-            part = slice(begin, begin + 256)
+        for begin in range(0, len(first), GROUP):
+            part = slice(begin, begin + GROUP)
             match = self.matcher.match(self.nodes[first[part]], self.nodes[second[part]], guess[part], window)
             links = Links.of(
                 CLOSURE, first[part], second[part], match.pose, self.temperature * match.information, match.p_right
@@ -228,20 +242,35 @@ def _consistent(matches: Links, poses: Floats, path: Floats) -> Any:
     """Return a sparse matrix (L, L), 1 where two matches of the same passages make a loop that closes."""
     from scipy import sparse
 
-    first, second = matches.first, matches.second
     rows, cols = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    for k in range(len(matches)):
-        one, two = np.abs(path[first] - path[first[k]]), np.abs(path[second] - path[second[k]])
-        near = np.flatnonzero((one <= _PASSAGE) & (two <= _PASSAGE) & (second != second[k]))
-        if not len(near):
-            continue
-        here = np.full(len(near), k)
+    for here, near in _neighbours(matches, path):
+        first, second = matches.first, matches.second
         there = compose_poses(matches.pose[here], relative(poses, second[here], second[near]))
         back = compose_poses(invert_poses(matches.pose[near]), relative(poses, first[near], first[here]))
-        off, along = compose_poses(there, back), (one + two)[near]
+        off = compose_poses(there, back)
+        along = sum(np.abs(path[end[here]] - path[end[near]]) for end in (first, second))
         closes = np.hypot(off[:, 0], off[:, 1]) <= _MISSED + _SHARE * along
         closes &= np.abs(wrap_angle(off[:, 2])) <= _MISSED_TURN + _SHARE_TURN * along
         rows.append(here[closes])
         cols.append(near[closes])
     row, col = np.concatenate(rows), np.concatenate(cols)
     return sparse.csr_matrix((np.ones(len(row), np.int64), (row, col)), shape=(len(matches), len(matches)))
+
+
+def _neighbours(matches: Links, path: Floats) -> Iterator[tuple[Integers, Integers]]:
+    """Yield pairs of matches of the same passages, some of all at a time; both ways, without those of one scan."""
+    first, second = matches.first, matches.second
+    order = np.argsort(second, kind="stable")
+    scans = second[order]
+    begin = np.searchsorted(scans, np.maximum(np.searchsorted(path, path - _PASSAGE), np.arange(len(path)) - _KEYS))
+    end = np.searchsorted(
+        scans, np.minimum(np.searchsorted(path, path + _PASSAGE, "right"), np.arange(len(path)) + _KEYS + 1)
+    )
+    for part in range(0, len(matches), _MATCHES):
+        some = order[part : part + _MATCHES]
+        low, count = begin[second[some]], (end - begin)[second[some]]
+        here = np.repeat(some, count)
+        near = order[np.repeat(low - np.cumsum(count) + count, count) + np.arange(len(here))]
+        apart = np.abs(path[first[here]] - path[first[near]]) <= _PASSAGE
+        apart &= (np.abs(first[here] - first[near]) <= _KEYS) & (second[here] != second[near])
+        yield here[apart], near[apart]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,7 +13,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 # Most poses whose joint covariance is kept; in a longer graph each stands for its neighbours.
-_ANCHORS = 300
+_ANCHORS = 200
 # Columns of the inverse that are solved for at once.
 _COLUMNS = 192
 # Damping [1/m^2, 1/rad^2]: a direction that no link observes has a variance of the inverse.
@@ -34,16 +36,10 @@ class Drift:
         if count < 2:
             return
         matrix, _ = normal_equations(solution.poses, solution.links, solution.links.weight, 0)
-        factor, size = factored(matrix, DAMPING), matrix.shape[0]
         # The first pose is known: its rows and columns are 0.
         rows = (3 * (anchors[1:, None] - 1) + np.arange(3)).ravel()
-        solved = np.zeros((len(rows), len(rows)))
-        for begin in range(0, len(rows), _COLUMNS):
-            columns = rows[begin : begin + _COLUMNS]
-            right = np.zeros((size, len(columns)))
-            right[columns, np.arange(len(columns))] = 1.0
-            solved[:, begin : begin + len(columns)] = factor.solve(right)[rows]
-        self._joint[1:, :, 1:, :] = (0.5 * (solved + solved.T)).reshape(len(anchors) - 1, 3, len(anchors) - 1, 3)
+        joint = _inverse_part(matrix, rows)
+        self._joint[1:, :, 1:, :] = joint.reshape(len(anchors) - 1, 3, len(anchors) - 1, 3)
 
     def relative(self, first: Integers, second: Integers) -> Floats:
         """Return the covariances (L, 3, 3) of the poses of second scans in the frames of first ones."""
@@ -54,3 +50,19 @@ class Drift:
         total += two @ self._joint[b, :, b, :] @ two.transpose(0, 2, 1)
         result: Floats = total + side + side.transpose(0, 2, 1)
         return result
+
+
+def _inverse_part(matrix: Any, rows: Integers) -> Floats:
+    """Return some rows and columns of the inverse of a sparse matrix, by Schur's complement of the others."""
+    from scipy.sparse import identity
+
+    damped = (matrix + DAMPING * identity(matrix.shape[0], format="csc")).tocsc()
+    others = np.setdiff1d(np.arange(matrix.shape[0]), rows)
+    left: Floats = damped[rows][:, rows].toarray()
+    if len(others):
+        side, factor = damped[others][:, rows].tocsc(), factored(matrix[others][:, others].tocsc(), DAMPING)
+        for begin in range(0, len(rows), _COLUMNS):
+            part = slice(begin, begin + _COLUMNS)
+            left[:, part] -= side.T @ factor.solve(side[:, part].toarray())
+    inverse: Floats = np.linalg.inv(0.5 * (left + left.T))
+    return 0.5 * (inverse + inverse.T)

@@ -18,7 +18,7 @@ from gpusense.world.scanner import Scanner
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-GROUP = 256
+GROUP = 1024
 """Scans of a group."""
 # A match is used from this p_right on.
 SURE = 0.5
@@ -110,8 +110,8 @@ class Matcher:
     def links(self, kind: str, first: Integers, second: Integers, guess: Floats) -> Links:
         """Return the links of those matches near their guesses that may be used."""
         parts = []
-        for begin in range(0, len(first), 2 * GROUP):
-            part = slice(begin, begin + 2 * GROUP)
+        for begin in range(0, len(first), GROUP):
+            part = slice(begin, begin + GROUP)
             match = self.match(first[part], second[part], guess[part], NEAR)
             links = Links.of(kind, first[part], second[part], match.pose, match.information, match.p_right)
             parts.append(links[match.usable & (match.p_right >= SURE)])

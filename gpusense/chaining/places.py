@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +20,8 @@ _SHARE = 0.3
 _ROWS = 512
 # Points farther than this many rms ranges say little of a place.
 _FAR = 2.0
+# Passages through a place that later ones are compared with, and key scans of a scanner between two passages.
+_PASSAGES, _AWAY = 8, 16
 
 
 def place_points_of(data: SensorScans, scans: Integers) -> list[Floats]:
@@ -44,7 +48,8 @@ def overlaps(
 ) -> tuple[Integers, Integers, Floats]:
     """Return pairs of key scans that share many cells, the best of each passage.
 
-    Of the key scans of a scanner in a row that share cells with another one, that with the most is taken.
+    Of the key scans of a scanner in a row that share cells with another one, that with the most is taken. The first
+    ones are of the first passages through each place, so that their number does not grow with that of passages.
 
     Args:
         places: End points of each key scan in the robot's frame.
@@ -58,28 +63,52 @@ def overlaps(
     """
     from scipy import sparse
 
-    rows, cols = [], []
-    for k, (points, pose) in enumerate(zip(places, poses, strict=True)):
-        at = np.zeros((len(points), 3))
-        at[:, :2] = points
-        cells = np.unique(np.floor(compose_poses(pose, at)[:, :2] / cell).astype(np.int64), axis=0)
-        rows.append(np.full(len(cells), k))
-        cols.append(cells)
-    row, place = np.concatenate(rows), np.concatenate(cols)
-    _, number = np.unique(place, axis=0, return_inverse=True)
+    row, number = _cells_of(places, poses, cell)
     table = sparse.csr_matrix(
-        (np.ones(len(row), np.float32), (row, number.ravel())), shape=(len(places), len(row) or 1)
+        (np.ones(len(row), np.float32), (row, number)), shape=(len(places), int(number.max(initial=0)) + 1)
     )
-    sizes = np.asarray(table.sum(axis=1)).ravel()
+    sizes = np.diff(table.indptr)
+    early = _first_passages(table, sequence)
+    others = table[early].T.tocsr()
     found: list[tuple[Integers, Integers, Floats]] = []
     for begin in range(0, len(places), _ROWS):
-        common = (table[begin : begin + _ROWS] @ table.T).tocoo()
-        second, first = common.row + begin, common.col
+        common = (table[begin : begin + _ROWS] @ others).tocoo()
+        second, first = common.row + begin, early[common.col]
         share = common.data / np.maximum(np.minimum(sizes[first], sizes[second]), 1)
         good = (second - first >= apart) & (share >= _SHARE)
         found.append(_best_of_passages(first[good], second[good], share[good], sequence))
     one, two, shares = (np.concatenate(part) for part in zip(*found, strict=True))
     return one.astype(np.int64), two.astype(np.int64), shares
+
+
+def _cells_of(places: list[Floats], poses: Floats, cell: float) -> tuple[Integers, Integers]:
+    """Return the key scans (C,) and the numbers (C,) of the cells that their points are in, each once."""
+    owner = np.repeat(np.arange(len(places)), [len(points) for points in places])
+    at = np.zeros((len(owner), 3))
+    at[:, :2] = np.concatenate(places)
+    cells = np.floor(compose_poses(poses[owner], at)[:, :2] / cell).astype(np.int64)
+    _, number = np.unique(cells @ np.array([1 << 31, 1]), return_inverse=True)
+    count = int(number.max(initial=0)) + 1
+    both = np.unique(owner * count + number)
+    return both // count, both % count
+
+
+def _first_passages(table: Any, sequence: tuple[Integers, Integers]) -> Integers:
+    """Return the key scans of the first passages through enough of their cells.
+
+    A cell is passed once more where a scanner sees it after some key scans in which it did not.
+    """
+    scanners, ranks = sequence
+    cells, early = table.shape[1], []
+    passed = np.zeros((int(scanners.max(initial=0)) + 1, cells), np.int64)
+    last = np.full(passed.shape, -_AWAY - 1, np.int64)
+    for k in range(table.shape[0]):
+        seen, one, rank = table.indices[table.indptr[k] : table.indptr[k + 1]], int(scanners[k]), int(ranks[k])
+        number = passed[one, seen] + (rank - last[one, seen] > _AWAY)
+        if np.count_nonzero(number <= _PASSAGES) >= _SHARE * len(seen):
+            early.append(k)
+            passed[one, seen], last[one, seen] = number, rank
+    return np.array(early, np.int64)
 
 
 def _best_of_passages(

@@ -59,6 +59,7 @@ class ScanChain:
         corrections: (C,) distances [m] by which the closures moved the second scans in the frames of the first ones.
         doubts: Stretches that are doubtful.
         matched: Number of scans that were matched; for the others the robot stood still by its odometry.
+        searched: Number of pairs of key scans that were matched in the search for places that are seen again.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -81,6 +82,7 @@ class ScanChain:
     corrections: Floats
     doubts: tuple[Doubt, ...]
     matched: int
+    searched: int
 
     @property
     def closures(self) -> Links:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import re
 from pathlib import Path
 from types import ModuleType
@@ -13,11 +14,16 @@ from support.paths import ROOT
 RESULTS = ROOT / "bench" / "results"
 PAGES = [*(ROOT / "docs").glob("*.md"), ROOT / "bench" / "RESULTS.md", ROOT / "README.md"]
 REPORTS = sorted(file for file in RESULTS.iterdir() if file.suffix in (".md", ".json"))
-MOST = 100
+MOST = 60
 COMMIT = re.compile(
     r'commit"?:? "?(?:[0-9a-f]{7,12}|main)|published_with": "[0-9a-f]{7}|Published with commit [0-9a-f]{7}'
 )
 COMMAND = re.compile(r"(?:python )?bench/[\w/]+\.py")
+SCRIPT = re.compile(r"(?:python |\"script\": \")(bench/[\w/]+\.py)")
+# Scripts of older reports, by today's; bench/RESULTS.md says so.
+FORMER = {
+    "absolute": "point_models", "landmarks": "point_models", "several_scans": "small_calls", "speed": "limits",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -33,11 +39,36 @@ def test_each_report_is_published(published: str) -> None:
     assert [file.name for file in REPORTS if file.stem not in names] == []
 
 
+def parts_of(file: Path) -> list[str]:
+    """Return the reports of a file: the elements of a list, or what stands under headings of the first level."""
+    text = file.read_text(encoding="utf-8")
+    if file.suffix == ".json":
+        whole = json.loads(text)
+        return [json.dumps(one) for one in whole] if isinstance(whole, list) else [text]
+    return [part for part in re.split(r"(?m)^(?=# )", text) if part.strip()]
+
+
 @pytest.mark.parametrize("file", REPORTS, ids=lambda file: file.name)
 def test_each_report_states_commit_and_command(file: Path) -> None:
-    text = file.read_text(encoding="utf-8")
-    assert COMMIT.search(text) or "--commit" in text, "no commit"
-    assert COMMAND.search(text), "no command"
+    for part in parts_of(file):
+        assert COMMIT.search(part) or "--commit" in part, f"no commit: {part[:80]}"
+        assert COMMAND.search(part), f"no command: {part[:80]}"
+
+
+@pytest.mark.parametrize("file", REPORTS, ids=lambda file: file.name)
+def test_scripts_of_reports_are_here(file: Path) -> None:
+    """The script of each command exists, by its path or, of older reports, by its name or today's."""
+    names = {path.stem for path in (ROOT / "bench").rglob("*.py")}
+    for script in SCRIPT.findall(file.read_text(encoding="utf-8")):
+        stem = Path(script).stem
+        assert (ROOT / script).is_file() or FORMER.get(stem, stem) in names, script
+
+
+def test_reports_of_a_file_are_told_apart(tmp_path: Path) -> None:
+    (tmp_path / "a.md").write_text("# One\n\n## Rows\n# Two\n")
+    (tmp_path / "a.json").write_text('[{"commit": 1}, {"commit": 2}]')
+    assert parts_of(tmp_path / "a.md") == ["# One\n\n## Rows\n", "# Two\n"]
+    assert len(parts_of(tmp_path / "a.json")) == 2
 
 
 @pytest.fixture

@@ -89,9 +89,7 @@ lanes log_range_lanes(const LanePair d, global const real *beacon, global const 
 
 // Sum log p of the ranges over beacons: one work-item takes LANES particles. The last particle of all stands in for
 // missing ones.
-kernel void score_beacons(global const real4 *place, global const real *beacon, global const real *terms,
-                          global const real *series, global real *log_p, const int particles, const int beacons,
-                          const int count, const int kind, const real temperature) {
+kernel void score_beacons(ARGUMENTS) {
     const int first_particle = LANES * get_global_id(0);
     if (first_particle >= particles) return;
     const LanePlace sensor = load_places(place, first_particle, particles);

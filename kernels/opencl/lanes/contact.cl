@@ -101,11 +101,7 @@ lanes log_bump_lanes(const ilanes squared, const int pressed, global const real 
 }
 
 // Sum log p over segments: one work-item takes LANES particles. The last particle of all stands in for missing ones.
-kernel void score_contact(global const int *table, global const int2 *pose_cell, global const real4 *pose,
-                          global const real4 *pose_low, global const real2 *point, global const real2 *point_low,
-                          global const int *start, global const int *pressed, global const real *terms,
-                          global real *log_p, const Window window, const int particles, const int segments,
-                          const real guard, const real temperature) {
+kernel void score_contact(ARGUMENTS) {
     const int first_particle = LANES * get_global_id(0);
     if (first_particle >= particles) return;
     Particles some;

@@ -9,10 +9,7 @@ lanes offset_to_lanes(const lanes landmark, const lanes landmark_low, const real
 }
 
 // Add log_missed to log_p for every landmark in view that belongs to no feature. One work-item takes a particle.
-kernel void count_unseen(global const real4 *landmark, global const int *start, global const int2 *pose_cell,
-                         global const real4 *pose, global const real4 *pose_low, global const int *which,
-                         global real *log_p, const Buckets buckets, const int particles, const int features,
-                         const SensorView view) {
+kernel void count_unseen(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const real4 sensor_pose = pose[n], place = sensor_place(pose_cell[n], sensor_pose, pose_low[n], buckets.size);

@@ -64,5 +64,5 @@ def _inverse_part(matrix: Any, rows: Integers) -> Floats:
         for begin in range(0, len(rows), _COLUMNS):
             part = slice(begin, begin + _COLUMNS)
             left[:, part] -= side.T @ factor.solve(side[:, part].toarray())
-    inverse: Floats = np.linalg.inv(0.5 * (left + left.T))
+    inverse: Floats = np.asarray(np.linalg.inv(0.5 * (left + left.T)), dtype=np.float64)
     return 0.5 * (inverse + inverse.T)

@@ -7,7 +7,7 @@ programs and their memory go with it at once, without the garbage collector. The
 - the oldest one where there are too many,
 - all of them where the owner clears the cache: it replaces a buffer that they use, or the table of the map.
 
-The owner's lock serves the cache, too, since programs share the owner's buffers. A forked child must not use the
+The owner's lock also serves the cache, since programs share the owner's buffers. A forked child must not use the
 device, and its first start of a program is an error (``Backend.check_process``).
 """
 

@@ -165,7 +165,7 @@ class Rival:
         self._compare(own, pose, covariance, dict(readings))
         if together and not self._settled:
             self._settled = True
-            # The particles were spread once, too: two clouds that lie together begin as equals.
+            # The particles were also spread once: two clouds that lie together begin as equals.
             self.log_odds, gain = (0.0, 0.0) if self._prior == 0.0 else (self.log_odds, gain)
         if together and self.is_at(pose, _SAME, _SAME_TURN):
             self.stop()

@@ -114,7 +114,7 @@ class DeviceSums:
 
         Args:
             point: The parameters.
-            information: Whether to sum the terms of second derivatives, too.
+            information: Whether to also sum the terms of second derivatives.
 
         Returns:
             (14,) or, with second derivatives, (40,) float64.

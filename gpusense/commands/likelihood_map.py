@@ -112,7 +112,7 @@ def _scan(args: argparse.Namespace) -> Scan:
     Raises:
         ValueError: the log has fewer scans.
     """
-    from gpusense.logs.several import read_laser
+    from gpusense.logs.merge import read_laser
 
     index = 0
     with options_named():

@@ -16,7 +16,7 @@ from gpusense._util.progress import progress as progress_bar
 from gpusense._util.typing import FitMethod, Precision
 from gpusense.backends import Selection
 from gpusense.learning.beam.blocks import check_blocks
-from gpusense.learning.beam.book import climb_book
+from gpusense.learning.beam.book import textbook_em
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.em import Climb, Watch, climb_em
 from gpusense.learning.beam.growth import fit_growth
@@ -171,7 +171,7 @@ def _climb(options: Options, problem: Problem, start: Point, watch: Watch) -> Cl
         case "em":
             return climb_em(problem, start, **settings)  # type: ignore[arg-type]
         case "em-book":
-            return climb_book(problem, start, **settings)  # type: ignore[arg-type]
+            return textbook_em(problem, start, **settings)  # type: ignore[arg-type]
         case "gradient":
             return climb_gradient(problem, start, **settings)  # type: ignore[arg-type]
         case "hill_climb":

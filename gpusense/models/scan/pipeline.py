@@ -123,7 +123,7 @@ class ScanPipeline(ABC):
         self.setting = setting
         self.backend, self.real, self.rules = setting.backend, setting.real, setting.rules
         self.scanner, self.specialize = setting.rules.scanner, setting.rules.specialize
-        self._mount, self._readings, self._chunks = self.scanner.mount, setting.weights.readings, dict[Hashable, int]()
+        self._mount, self._readings = self.scanner.mount, setting.weights.readings
         self.nothing = self.backend.upload(np.zeros(1, np.int32))
         # Flags by everything on which they depend.
         self._flags: dict[Hashable, frozenset[str]] = {}
@@ -203,11 +203,8 @@ class ScanPipeline(ABC):
 
     def chunk(self, rays: int, *, per_beam: bool = False) -> int:
         """Return the particles of one launch with a number of rays each."""
-        chunk = self._chunks.get((rays, per_beam))
-        if chunk is None:
-            kept = 1.0 if per_beam else self.kept_parts if self.backend.info.kind == "gpu" else 0.0
-            chunk = self._chunks[rays, per_beam] = chunk_of(self.backend, max(rays, 1), self.real.itemsize * kept)
-        return chunk
+        kept = 1.0 if per_beam else self.kept_parts if self.backend.info.kind == "gpu" else 0.0
+        return chunk_of(self.backend, max(rays, 1), self.real.itemsize * kept)
 
     # ---- readings
 

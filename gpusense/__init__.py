@@ -63,7 +63,7 @@ _NAMES = {
     "models.scan.bound": ("BoundCall",),
     "models.scan.caster": ("RayCaster",),
     "models.scan.field": ("LikelihoodFieldModel",),
-    "models.scan.several": ("log_likelihoods",),
+    "models.scan.joint_scoring": ("log_likelihoods",),
     "positions.bearings": ("triangulate", "triangulate_triangle"),
     "positions.fix": ("PositionFix",),
     "positions.locate": ("locate",),
@@ -77,7 +77,7 @@ _NAMES = {
     "world.parameters": ("BeamParameters", "IncidenceParameters", "LandmarkParameters", "LikelihoodFieldParameters"),
     "world.plausible": ("PlausibilityWarning",),
     "world.scanner": ("Reading", "Scanner", "classify"),
-    "world.sweep": ("deskew_scan",),
+    "world.deskew": ("deskew_scan",),
     "world.sensor_parameters": (
         "BeaconParameters",
         "BumperParameters",

@@ -75,7 +75,7 @@ from gpusense.models.scan.beam import BeamModel as BeamModel
 from gpusense.models.scan.bound import BoundCall as BoundCall
 from gpusense.models.scan.caster import RayCaster as RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel as LikelihoodFieldModel
-from gpusense.models.scan.several import log_likelihoods as log_likelihoods
+from gpusense.models.scan.joint_scoring import log_likelihoods as log_likelihoods
 from gpusense.positions.bearings import triangulate as triangulate
 from gpusense.positions.bearings import triangulate_triangle as triangulate_triangle
 from gpusense.positions.fix import PositionFix as PositionFix
@@ -83,6 +83,7 @@ from gpusense.positions.locate import locate as locate
 from gpusense.positions.ranges import trilaterate as trilaterate
 from gpusense.tables.distances import distance_transform as distance_transform
 from gpusense.tables.normals import surface_normals as surface_normals
+from gpusense.world.deskew import deskew_scan as deskew_scan
 from gpusense.world.grid import OccupancyGrid as OccupancyGrid
 from gpusense.world.landmarks import LandmarkMap as LandmarkMap
 from gpusense.world.line_map import LineMap as LineMap
@@ -101,4 +102,3 @@ from gpusense.world.sensor_parameters import BumperParameters as BumperParameter
 from gpusense.world.sensor_parameters import HeadingParameters as HeadingParameters
 from gpusense.world.sensor_parameters import LineParameters as LineParameters
 from gpusense.world.sensor_parameters import PositionParameters as PositionParameters
-from gpusense.world.sweep import deskew_scan as deskew_scan

@@ -213,7 +213,7 @@ def check_gradients(array: object, name: str, error: Exception) -> None:
 def nested(name: str, value: object, *, deepest: int, most: int) -> int:
     """Count the values in mappings, lists and tuples within each other, each time that they occur.
 
-    The keys of mappings count, too. A text counts once more for every 64 characters.
+    The keys of mappings also count. A text counts once more for every 64 characters.
 
     Args:
         name: Name of the argument.

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from gpusense.backends.info import BackendInfo
-from gpusense.backends.recording import Recording, counted
+from gpusense.backends.recording import Recording, pluralize
 from gpusense.interface.launches import Program
 
 Buffer = Any
@@ -216,4 +216,4 @@ class _ProgramRecording(Recording):
 
     def explain(self) -> str:
         """See Recording.explain."""
-        return f"{counted(len(self._program), 'launch')} one by one: {self._backend.info.selection} has no graphs"
+        return f"{pluralize(len(self._program), 'launch')} one by one: {self._backend.info.selection} has no graphs"

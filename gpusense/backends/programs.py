@@ -7,7 +7,7 @@ programs and their memory go with it at once, without the garbage collector. The
 - the oldest one where there are too many,
 - all of them where the owner clears the cache: it replaces a buffer that they use, or the table of the map.
 
-The owner's lock serves the cache, too, since programs share the owner's buffers. A forked child must not use the
+The owner's lock also serves the cache, since programs share the owner's buffers. A forked child must not use the
 device, and its first start of a program is an error (``Backend.check_process``).
 """
 
@@ -86,18 +86,18 @@ class ChangingProgram:
         names = frozenset(changing)
         self._backend, self.flags = backend, flags_of(program)
         self._launches = [
-            (backend.compile(one.kernel, one.flags), one.size, one.without(names).arguments, one.places(names))
-            for one in program
+            (one.kernel, one.flags, one.size, one.without(names).arguments, one.places(names)) for one in program
         ]
 
     def __call__(self, changing: dict[str, Any]) -> None:
         """Start it with the arguments of a call; a launch does not wait for the arguments of the next."""
-        self._backend.check_process()
-        for launcher, size, fixed, places in self._launches:
+        compiled = self._backend.compile
+        for kernel, flags, size, fixed, places in self._launches:
             arguments = list(fixed)
             for place, name in places:
                 arguments[place] = changing[name]
-            launcher(size, *arguments)
+            # A backend that watches another one sees each launch here.
+            compiled(kernel, flags)(size, *arguments)
 
 
 class RecordedProgram:

@@ -22,7 +22,7 @@ class Recording(ABC):
         """Return in one line how it is started: as one graph, or one by one, with the reason."""
 
 
-def counted(number: int, noun: str) -> str:
+def pluralize(number: int, noun: str) -> str:
     """Return a number of launches or copies in words: ``"3 launches"``."""
     if number == 1:
         return f"1 {noun}"

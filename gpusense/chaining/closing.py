@@ -196,7 +196,7 @@ class Loops:
         agree = np.zeros(len(matches), bool)
         table = _consistent(matches[good], self.solution.poses, path)
         needed = np.where(across[good], _AGREE_BROKEN, _AGREE) - 1
-        # A match counts only while it has enough that agree with it and count, too.
+        # A match counts only while enough of those that agree with it also count.
         kept = np.ones(len(good), bool)
         while True:
             enough = (table @ kept.astype(np.int64) >= needed) & kept

@@ -2,7 +2,7 @@
 
 Without odometry a robot that moves far between scans is guessed badly by rest: along a corridor, where scans look alike
 everywhere, the match then stays where it began. So matches that are not beyond doubt, or whose motion is unlike that
-of their neighbours, are tried from constant motion, too. The match with the highest ``p_right`` is taken, which falls
+of their neighbours, are also tried from constant motion. The match with the highest ``p_right`` is taken, which falls
 with the distance from the guess.
 """
 
@@ -68,7 +68,7 @@ def matched_by_motion(
         last: (3,) motion before the first pair; None where it is not known.
 
     Returns:
-        The matches, and (L, 3) offsets to another motion that may be used, too; NaN where there is none.
+        The matches, and (L, 3) offsets to another motion that may also be used; NaN where there is none.
     """
     seen = [found]
     for _ in range(_ROUNDS):

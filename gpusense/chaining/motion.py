@@ -95,7 +95,7 @@ def relative(poses: Floats, first: NDArray[np.int64], second: NDArray[np.int64])
 
 
 def partial_motion(motion: Floats, share: Floats) -> Floats:
-    """Return the motions (L, 3) after a share (L,) of others, which are arcs (see ``gpusense.world.sweep``)."""
+    """Return the motions (L, 3) after a share (L,) of others, which are arcs (see ``gpusense.world.deskew``)."""
     half = motion[:, 2] / 2
     length = share * np.sinc(share * half / math.pi) / np.sinc(half / math.pi)
     turn = (share - 1) * half

@@ -143,7 +143,7 @@ def _finite(text: str) -> float:
 def output_path(*suffixes: str) -> Callable[[str], Path]:
     """Make a type for ``add_argument``: a file that can be written, which is checked before any work is done.
 
-    The library that writes the file must be installed, too.
+    The library that writes the file must also be installed.
 
     Args:
         suffixes: Allowed endings, such as ``".png"``; none allows every ending.

@@ -24,7 +24,7 @@ from gpusense.evaluation.agreement import Agreement, Comparison, Model
 from gpusense.evaluation.worlds import cloud_around, cloud_uniform
 from gpusense.localization.weights import normalize_weights
 from gpusense.logs import Pose, Scan
-from gpusense.logs.several import read_laser
+from gpusense.logs.merge import read_laser
 from gpusense.models.scan.rules import choose_beams
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Reading, classify
@@ -195,7 +195,7 @@ def chosen_scans(
         every: Stride of the scans.
         offset: Index of the first scan.
         limit: Largest number of scans; None for all.
-        topic: The laser, see :func:`gpusense.logs.several.read_laser`; None for the only or main one.
+        topic: The laser, see :func:`gpusense.logs.merge.read_laser`; None for the only or main one.
         mount: Pose of a bag's laser on the robot [m, m, rad]; None for that of the bag's transforms.
 
     Raises:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense.evaluation.trajectory_files import poses_at
 from gpusense.localization.pose_algebra import compose_poses, pose_difference, wrap_angle
 from gpusense.logs import Odometry, Pose, Scan
-from gpusense.logs.several import read_lasers
+from gpusense.logs.merge import read_lasers
 from gpusense.world.scanner import Scanner
 
 Floats = NDArray[np.float64]

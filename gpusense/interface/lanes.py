@@ -33,7 +33,7 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
 }
 
 
-def widened(lanes: int, kernel: str, flags: frozenset[str] | set[str]) -> frozenset[str]:
+def with_lanes_flag(lanes: int, kernel: str, flags: frozenset[str] | set[str]) -> frozenset[str]:
     """Return the flags of a launch, with WIDE where the device asks for lanes and the kernel has a body in vectors."""
     never = _NEVER.get(kernel, _SCALAR)
     if lanes == 1 or flags & never or not any(needed <= flags for needed in _NEEDED.get(kernel, ())):

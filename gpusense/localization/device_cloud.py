@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from gpusense.localization.cloud import Cloud
 from gpusense.localization.filter_cloud import FilterCloud, Step
-from gpusense.localization.scoring import Scoring
+from gpusense.localization.scoring import FilterScoring
 from gpusense.localization.sensors import Sensor
 
 
@@ -21,7 +21,7 @@ class DeviceCloud(Cloud, FilterCloud):
 
     def __init__(self, sensors: Sequence[Sensor], capacity: int, *, residual: bool = False) -> None:
         super().__init__(sensors[0].backend, capacity, len(sensors), sensors[0].precision, residual=residual)
-        self._scored, self._scoring = sensors, Scoring(sensors)
+        self._scored, self._scoring = sensors, FilterScoring(sensors)
 
     def correct(self, step: Step) -> None:
         """See FilterCloud.correct."""

@@ -242,7 +242,7 @@ class ParticleFilter(Whole):
     def reset(self) -> None:
         """Replace half of the particles by poses at which the last readings are likely (sensor resetting).
 
-        A motion that was predicted after these readings moves the new particles, too.
+        A motion that was predicted after these readings also moves the new particles.
 
         Raises:
             RuntimeError: there are no readings since the particles were initialised.

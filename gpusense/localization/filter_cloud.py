@@ -35,7 +35,7 @@ _FEWEST = 10.0
 # Jitter of a stage on a deeper ladder: the peak lies beyond the particles, which must not shrink before they reach it.
 _WIDE_JITTER = 0.7
 # Index of a sensor, and its readings.
-Given = tuple[int, tuple[Any, ...]]
+SensorReadings = tuple[int, tuple[Any, ...]]
 
 
 class Step(NamedTuple):
@@ -53,7 +53,7 @@ class Step(NamedTuple):
     kind: int
     stages: int
     drawn: int
-    given: list[Given]
+    given: list[SensorReadings]
 
 
 class Contents(NamedTuple):

@@ -8,7 +8,7 @@ the odometer's translation reversed are counted, and give the probability of a r
 variances are multiplied by the mean square of standardised errors, each at most 9.
 
 Errors of an odometer repeat from step to step (a wheel's radius, a slope), while a filter draws new noise at each step.
-Their constant part is fitted, too (on the intel log 3 degrees a metre). For the rest, variances are multiplied by
+Their constant part is also fitted (on the intel log 3 degrees a metre). For the rest, variances are multiplied by
 1 + 2 sum rho_l, the inflation of the variance of a sum by the autocorrelation rho_l of standardised errors.
 
 A log may not determine each variance: a robot that never turned tells nothing of the noise of turns. The logarithm of

@@ -197,7 +197,7 @@ def _first_cells(
     # As unsigned numbers, negative ones are beyond every limit.
     within = (column.view(np.uint64) < columns) & (row.view(np.uint64) < rows)
     cells, place = grid.cells.reshape(-1), row * columns + column
-    # -1, unknown, is what is off the map, too.
+    # Cells off the map are unknown, -1.
     value = np.full(len(ray), -1, np.int8)
     np.copyto(value, cells.take(place, mode="clip"), where=within)
     wall = value >= grid.occupied_threshold

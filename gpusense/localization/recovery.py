@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from gpusense.localization import starts
 from gpusense.localization.device_cloud import DeviceCloud
-from gpusense.localization.filter_cloud import Given
+from gpusense.localization.filter_cloud import SensorReadings
 from gpusense.localization.motion import SampledMotion
 from gpusense.localization.rival import COMPARISONS, PARTICLES, PRIOR, Rival, evidence_of
 from gpusense.localization.rival_search import can_search
@@ -76,7 +76,7 @@ class Recovery:
         apart = self.active is not None or not self._tracker.together
         return apart or verdict.wrong > _DOUBT or verdict.explains_little
 
-    def corrected(self, given: list[Given], readings: Mapping[int, tuple[Any, ...]]) -> None:
+    def corrected(self, given: list[SensorReadings], readings: Mapping[int, tuple[Any, ...]]) -> None:
         """Compare the particles with their rival, or search for one where scans contradict the pose.
 
         Args:
@@ -100,7 +100,7 @@ class Recovery:
             self.everywhere = max(self.everywhere - 1, 0)
             self._made().start(pose, covariance, list(readings.items()), step=tracker.step, prior=prior)
 
-    def _compare(self, rival: Rival, given: list[Given]) -> None:
+    def _compare(self, rival: Rival, given: list[SensorReadings]) -> None:
         """Correct the rival, and let it replace the particles where it has won."""
         tracker = self._tracker
         rival.correct(given, evidence_of(tracker.cloud.summary()))

@@ -25,7 +25,7 @@ import numpy as np
 
 from gpusense.interface.constants import EVIDENCE
 from gpusense.localization import starts
-from gpusense.localization.filter_cloud import Contents, Given, Summary
+from gpusense.localization.filter_cloud import Contents, SensorReadings, Summary
 from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import SampledMotion
 from gpusense.localization.pose_algebra import wrap_angle
@@ -101,7 +101,13 @@ class Rival:
         self.active = False
 
     def start(
-        self, pose: np.ndarray, covariance: np.ndarray, readings: Sequence[Given], *, step: int, prior: float = PRIOR
+        self,
+        pose: np.ndarray,
+        covariance: np.ndarray,
+        readings: Sequence[SensorReadings],
+        *,
+        step: int,
+        prior: float = PRIOR,
     ) -> None:
         """Search for a rival by the last readings.
 
@@ -132,7 +138,7 @@ class Rival:
         if self.active:
             self._tracker.follow(motion)
 
-    def correct(self, readings: list[Given], evidence: float) -> None:
+    def correct(self, readings: list[SensorReadings], evidence: float) -> None:
         """Correct the rival, and compare it with the particles.
 
         Args:
@@ -146,7 +152,7 @@ class Rival:
         self._scans += 1
 
     def judge(
-        self, pose: np.ndarray, covariance: np.ndarray, readings: list[Given]
+        self, pose: np.ndarray, covariance: np.ndarray, readings: list[SensorReadings]
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the rival's particles and their weights if it has won; give it up where it cannot.
 
@@ -165,7 +171,7 @@ class Rival:
         self._compare(own, pose, covariance, dict(readings))
         if together and not self._settled:
             self._settled = True
-            # The particles were spread once, too: two clouds that lie together begin as equals.
+            # The particles were also spread once: two clouds that lie together begin as equals.
             self.log_odds, gain = (0.0, 0.0) if self._prior == 0.0 else (self.log_odds, gain)
         if together and self.is_at(pose, _SAME, _SAME_TURN):
             self.stop()

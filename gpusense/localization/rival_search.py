@@ -16,7 +16,7 @@ import numpy as np
 
 from gpusense.backends import arrays
 from gpusense.localization import starts
-from gpusense.localization.filter_cloud import Given
+from gpusense.localization.filter_cloud import SensorReadings
 from gpusense.localization.ratio import ratio_of_scan
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.spread import deviations
@@ -54,7 +54,7 @@ class RivalSearch:
         self,
         pose: np.ndarray,
         covariance: np.ndarray,
-        readings: Sequence[Given],
+        readings: Sequence[SensorReadings],
         key: starts.Key,
         temperature: float | str,
     ) -> tuple[np.ndarray, np.ndarray, int]:
@@ -78,13 +78,13 @@ class RivalSearch:
             score += sensor.temperature(temperature) * likelihood
         return tries, score - self._ratios(tries, readings) if on_map else score, effective
 
-    def _ratios(self, poses: np.ndarray, readings: Sequence[Given]) -> np.ndarray:
+    def _ratios(self, poses: np.ndarray, readings: Sequence[SensorReadings]) -> np.ndarray:
         """Return the log-likelihood ratios (M,) of "wrong" against "right" of poses; 0 where scans tell nothing."""
         known = dict(readings)
         ratios = [ratio_of_scan(sightings(self._sensors, known, pose, _SPREAD_OF_POSE)) for pose in poses]
         return np.nan_to_num(np.array(ratios))
 
-    def _on_map(self, readings: Sequence[Given]) -> np.ndarray:
+    def _on_map(self, readings: Sequence[SensorReadings]) -> np.ndarray:
         """Return candidates for the first scan among readings."""
         for index, reading in readings:
             sensor = self._sensors[index]

@@ -13,7 +13,7 @@ from gpusense.backends.base import Buffer
 from gpusense.backends.programs import ProgramCache
 from gpusense.interface.launches import Program
 from gpusense.localization.cloud import Cloud
-from gpusense.localization.filter_cloud import Given
+from gpusense.localization.filter_cloud import SensorReadings
 from gpusense.localization.particles import Stage
 from gpusense.localization.sensors import Sensor
 
@@ -23,7 +23,7 @@ _MOST_VIEWS = 32
 _DOUBLE = np.dtype(np.float64)
 
 
-def given_of(readings: Any, sensors: Sequence[Sensor]) -> list[Given]:
+def given_of(readings: Any, sensors: Sequence[Sensor]) -> list[SensorReadings]:
     """Return the readings that are not missing, in the order of the sensors.
 
     Args:
@@ -53,7 +53,7 @@ def _is_several(value: Any) -> bool:
     return isinstance(value, tuple) and len(value) > 0 and np.ndim(value[0]) > 0
 
 
-class Scoring:
+class FilterScoring:
     """Scores the particles of a cloud, which owns it.
 
     Args:
@@ -71,12 +71,12 @@ class Scoring:
         # Views of buffers by the number of particles, as models take them.
         self._views: dict[tuple[str, int, int], Any] = {}
 
-    def records(self, given: Sequence[Given]) -> bool:
+    def records(self, given: Sequence[SensorReadings]) -> bool:
         """Tell whether a stage with such readings is one recorded program: on a GPU that can score all of them."""
         gpu = self._backend.info.kind == "gpu"
         return gpu and all(self._sensors[index].records(reading) for index, reading in given)
 
-    def of(self, cloud: Cloud, given: Sequence[Given]) -> Callable[[Stage], None]:
+    def of(self, cloud: Cloud, given: Sequence[SensorReadings]) -> Callable[[Stage], None]:
         """Return the function that runs a stage with the readings of sensors, given by their indices."""
         if not self.records(given):
             return functools.partial(self._called, cloud, given)
@@ -84,7 +84,7 @@ class Scoring:
             self._sensors[index].upload(reading)
         return functools.partial(self._recorded, cloud, given)
 
-    def _called(self, cloud: Cloud, given: Sequence[Given], stage: Stage) -> None:
+    def _called(self, cloud: Cloud, given: Sequence[SensorReadings], stage: Stage) -> None:
         """Start the log-likelihoods of a stage call by call, and weigh."""
         poses = self._poses(cloud, stage.source)
         before = None if stage.kind is None else functools.partial(cloud.begin, stage)
@@ -93,12 +93,14 @@ class Scoring:
             before = None
         cloud.weigh(stage)
 
-    def _recorded(self, cloud: Cloud, given: Sequence[Given], stage: Stage) -> None:
+    def _recorded(self, cloud: Cloud, given: Sequence[SensorReadings], stage: Stage) -> None:
         """Run a stage as one recorded program."""
         key = (tuple((index, self._sensors[index].version) for index, _ in given), cloud.count)
         cloud.replay(stage, key, lambda source: self._program(cloud, key, source, given))
 
-    def _program(self, cloud: Cloud, key: Hashable, source: int, given: Sequence[Given]) -> tuple[Program, object]:
+    def _program(
+        self, cloud: Cloud, key: Hashable, source: int, given: Sequence[SensorReadings]
+    ) -> tuple[Program, object]:
         """Return the launches that score the poses of a buffer, and the owners of their memory."""
         kept = self._programs.get((key, source))
         if kept is not None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from gpusense.backends import arrays
-from gpusense.localization.filter_cloud import Given
+from gpusense.localization.filter_cloud import SensorReadings
 from gpusense.localization.pose_algebra import mean_pose
 from gpusense.localization.sensors import Sensor
 
@@ -31,11 +31,11 @@ def together(poses: np.ndarray, weights: np.ndarray) -> bool:
 
 def skipped(
     sensors: Sequence[Sensor],
-    given: list[Given],
+    given: list[SensorReadings],
     particles: tuple[np.ndarray, np.ndarray],
     anywhere: Callable[[], np.ndarray],
     share: float,
-) -> list[Given]:
+) -> list[SensorReadings]:
     """Return readings in which the scans lack the beams that too few particles explain.
 
     Args:

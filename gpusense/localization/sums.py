@@ -14,7 +14,7 @@ import numpy as np
 
 from gpusense.backends.base import Backend, Buffer
 from gpusense.interface.constants import ESTIMATE_LANES, ESTIMATE_SUMS, WEIGHT_SUMS
-from gpusense.interface.lanes import widened
+from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 
 _DOUBLE = np.dtype(np.float64)
@@ -34,7 +34,7 @@ def weight_block(backend: Backend, count: int) -> int:
     return block if backend.info.kind == "cpu" else max(block // (5 * _VECTOR), 1) * _VECTOR
 
 
-def fans_of(blocks: int) -> tuple[int, ...]:
+def reduction_fans(blocks: int) -> tuple[int, ...]:
     """Return the rows that are added up in turn: blocks of a group, then groups; or all blocks of a small cloud."""
     if blocks <= MOST_BLOCKS:
         return (blocks,)
@@ -68,11 +68,11 @@ class Sums:
 
     def launch(self, kernel: str, size: int, **arguments: Any) -> Program:
         """Return a launch of a kernel, in lanes where the device asks for them."""
-        return (launch(kernel, widened(self._backend.info.lanes, kernel, _PLAIN), (size,), **arguments),)
+        return (launch(kernel, with_lanes_flag(self._backend.info.lanes, kernel, _PLAIN), (size,), **arguments),)
 
     def highest(self, blocks: int) -> tuple[Program, Buffer, int]:
         """Return the launches that find the largest score of each group; their results, and the number of them."""
-        fan, *groups_of = fans_of(blocks)
+        fan, *groups_of = reduction_fans(blocks)
         if not groups_of:
             return (), self.largest, blocks
         groups = groups_of[0]
@@ -104,7 +104,7 @@ class Sums:
         """
         (stage, stages), (weight, ends), blocks = place, out, numbers["blocks"]
         return self.launch("set_weights", blocks + 1, highest=self._highest, sums=self.rows, joined=self._joined,
-                           totals=self.totals, fan=fans_of(blocks)[0], stage=stage, stages=stages, weight=weight,
+                           totals=self.totals, fan=reduction_fans(blocks)[0], stage=stage, stages=stages, weight=weight,
                            ends=ends, **numbers)  # fmt: skip
 
     def copies(self, numbers: dict[str, Any], copies: Buffer, drawn: int, stage: int) -> Program:
@@ -121,7 +121,7 @@ class Sums:
             *self.launch("count_copies", blocks, sums=self.rows, drawn=drawn, stage=stage, **numbers),
             *self._weight_totals(blocks),
             *self.launch("set_copies", blocks, sums=self.rows, joined=self._joined, copies=copies,
-                         fan=fans_of(blocks)[0], drawn=drawn, stage=stage, **numbers),
+                         fan=reduction_fans(blocks)[0], drawn=drawn, stage=stage, **numbers),
         )  # fmt: skip
 
     def estimate(self, poses: Buffer, weight: Buffer, estimate: Buffer, count: int, again: int = 0) -> Program:
@@ -133,7 +133,7 @@ class Sums:
         program = self.launch("sum_poses", blocks * each, poses=poses, weight=weight, estimate=estimate,
                               sums=self.rows, particles=count, block=block, lanes=lanes, again=again)  # fmt: skip
         # finish_estimate adds up the groups; on GPUs one more join is faster.
-        fans = (each, *fans_of(blocks)) if each > 1 else fans_of(blocks)[:-1]
+        fans = (each, *reduction_fans(blocks)) if each > 1 else reduction_fans(blocks)[:-1]
         source, target, groups = self.rows, self._joined, blocks * each
         for fan in fans:
             launches, groups = self._join(source, target, (groups, ESTIMATE_SUMS), fan)
@@ -146,7 +146,7 @@ class Sums:
         """Return the launches that add up the rows of weights of groups, and of all groups."""
         program: Program = ()
         source, shape = self.rows, (blocks, WEIGHT_SUMS)
-        *inner, last = fans_of(blocks)
+        *inner, last = reduction_fans(blocks)
         for fan in inner:
             program, rows = self._join(source, self._joined, shape, fan)
             source, shape = self._joined, (rows, WEIGHT_SUMS)

@@ -16,7 +16,7 @@ from gpusense.localization import starts
 from gpusense.localization.adaptive import kld_count
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.estimates import covariance_of
-from gpusense.localization.filter_cloud import Contents, FilterCloud, Given, Step
+from gpusense.localization.filter_cloud import Contents, FilterCloud, SensorReadings, Step
 from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import STILL, SampledMotion
 from gpusense.localization.options import Options, settings_of_step
@@ -143,7 +143,7 @@ class Tracker:
         self.cloud.move(self.settings(motion, []), motion.kind)
         self.shown, self.pending = self.cloud.count, following
 
-    def weigh(self, given: list[Given], *, again: bool = False) -> None:
+    def weigh(self, given: list[SensorReadings], *, again: bool = False) -> None:
         """Run the motion, and correct the particles by readings of sensors.
 
         Args:
@@ -164,7 +164,7 @@ class Tracker:
         before = self.distinct if last.stages == 1 else 1.0
         return before * min(last.effective_sample_size / self.shown, 1.0) if last.resampled else before
 
-    def learn(self, given: list[Given], is_doubted: Callable[[], bool]) -> None:
+    def learn(self, given: list[SensorReadings], is_doubted: Callable[[], bool]) -> None:
         """Find out whether the particles lie together, and learn from scans at a pose that none contradicts.
 
         Args:
@@ -196,7 +196,7 @@ class Tracker:
         return kld_count(self.next_particles(), self.options.least, self.options.most)
 
 
-def _due_of(sensors: Sequence[Sensor], given: Sequence[Given]) -> list[tuple[Sensor, tuple[Any, ...]]]:
+def _due_of(sensors: Sequence[Sensor], given: Sequence[SensorReadings]) -> list[tuple[Sensor, tuple[Any, ...]]]:
     """Count the scans of a correction; return those to learn from, with their sensors."""
     due = []
     for index, reading in given:

@@ -143,7 +143,7 @@ class Verdict:
 
     @property
     def explains_little(self) -> bool:
-        """Whether the last judged scans had beams of which the pose explains few: people explain it, too."""
+        """Whether the pose explains few beams of the last judged scans, which may also be due to people."""
         return self.state.explained < _FEW
 
     @property

@@ -26,7 +26,7 @@ class Format:
         suffixes: The ends of its files' names; empty for the format of all files that no other claims.
         begins: The first bytes of its text files, in place of suffixes.
         folder: Whether a folder with this file in it is a log of this format; "" for no folder.
-        topics: Whether ``read`` takes ``topic`` and ``mount``, too.
+        topics: Whether ``read`` also takes ``topic`` and ``mount``.
     """
 
     name: str
@@ -99,7 +99,7 @@ def read_log(
             stated in each message, or, for old messages without one, the largest reading of the log. If that reading
             occurs at least three times, it is the scanner's code for "no return"; else the limit is the next float64
             above it, so that every reading is a return. This takes a first pass over the file.
-        odometry: Whether to yield :class:`Odometry` records, too.
+        odometry: Whether to also yield :class:`Odometry` records.
         rear: Whether to yield the scans of the rear laser of a CARMEN log instead of those of the front laser.
         topic: Topic of the scans in a ROS bag; None takes ``/scan``, or the only one.
         mount: Pose (x, y, theta) of a ROS bag's laser on the robot [m, m, rad]; None takes it from the bag's fixed

@@ -13,10 +13,10 @@ from gpusense._util.memory import check_room
 from gpusense.backends import Selection, get_backend
 from gpusense.mapping.counts import BandCounts, bands
 from gpusense.mapping.rays import SCANS, RayEnds, Survey, batches, check_lengths, extent
+from gpusense.world.deskew import check_motion
 from gpusense.world.grid import OccupancyGrid, check_origin, check_resolution, grid_of_checked
 from gpusense.world.scanner import Scanner
 from gpusense.world.sensor_scans import check_scans
-from gpusense.world.sweep import check_motion
 from gpusense.world.windows import LONGEST_SIDE, Window
 
 BAND_CELLS = 1 << 22

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpusense.interface.constants import RAY_BITS
+from gpusense.world.deskew import beam_poses
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import FARTHEST_ORIGIN, OccupancyGrid
 from gpusense.world.scanner import Reading, Scanner, classify
 from gpusense.world.sensor_scans import SensorScans
-from gpusense.world.sweep import beam_poses
 from gpusense.world.windows import LONGEST_SIDE, Window
 
 # Scans whose rays are counted in one launch.
@@ -29,7 +29,7 @@ class Survey:
         poses: (S, 3) poses of the robot [m, m, rad].
         range_limit: Readings beyond it clear cells up to it and mark no obstacle [m]; at most that of each scanner.
         clear_max: Whether max readings clear cells up to ``range_limit``; otherwise they are left out.
-        motion: (S, 3) motions of the robot during the scans, see ``gpusense.world.sweep``; None: it is at rest.
+        motion: (S, 3) motions of the robot during the scans, see ``gpusense.world.deskew``; None: it is at rest.
     """
 
     data: SensorScans

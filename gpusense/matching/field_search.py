@@ -147,7 +147,7 @@ class FieldSearch:
         allowed: np.ndarray | None, most: int,
     ) -> Candidates:  # fmt: skip
         """Return the likeliest poses of a bilinear field: all whose bounds reach a likelihood that is known."""
-        # A cell of the tables lies between four centres; the ring outside the map has one, too.
+        # A cell of the tables lies between four centres; so do those of the ring outside the map.
         shifted = PoseGrid(searched.start + 0.5, searched.headings, searched.height, searched.width)
 
         def run(headings: slice, floor: int) -> Found:

@@ -11,7 +11,7 @@ from gpusense.backends import Backend
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import MATCH_RESULT
 from gpusense.interface.flags import flags_if
-from gpusense.interface.lanes import widened
+from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import launch
 from gpusense.interface.structs import MatchRules
 from gpusense.matching.points import GAP, ScanPoints
@@ -83,7 +83,7 @@ class IcpPairs:
         if not self._most:
             return
         scans = np.arange(self._counts[0], dtype=np.int32) if pairs is None else np.unique(self._pairs[pairs])
-        flags = widened(self._backend.info.lanes, "fit_lines", self._flags)
+        flags = with_lanes_flag(self._backend.info.lanes, "fit_lines", self._flags)
         lines = launch(
             "fit_lines", flags, (self._most, len(scans)), point=self._point, start=self._start,
             which=self._space.upload("match which", scans), line=self._line, chosen=len(scans),
@@ -119,7 +119,7 @@ class IcpPairs:
         padded[..., :3] = guesses
         space = self._space
         buffer = space.empty("match result", result.size, self._real)
-        flags = widened(self._backend.info.lanes, "match_scans", self._flags)
+        flags = with_lanes_flag(self._backend.info.lanes, "match_scans", self._flags)
         matching = launch(
             "match_scans", flags, (count * starts,), point=self._point, start=self._start, line=self._line,
             pair=space.upload("match pairs", self._pairs[pairs]), guess=space.upload("match guesses", padded),

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks, masks
-from gpusense.matching.climb import climb
 from gpusense.matching.field_search import Candidates, FieldSearch, field_search
 from gpusense.matching.location import Location, PoseMode, Status
 from gpusense.matching.location_evidence import NAMES, location_evidence, probability_right
 from gpusense.matching.pose_grid import PoseGrid, distinct_poses
+from gpusense.matching.refine_on_field import climb
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.models.scan.rules import BeamChoice

@@ -18,14 +18,16 @@ from gpusense.matching.noise import ASSUMED_NOISE, map_noise, match_noise, scan_
 from gpusense.matching.options import MatchOptions, check_guess, check_options
 from gpusense.matching.points import scan_points
 from gpusense.matching.result import ScanMatch
-from gpusense.matching.scan_map import match_by_maps
-from gpusense.matching.to_map import match_to_map
+from gpusense.matching.to_map import MapMatcher, match_to_map
 from gpusense.matching.verdicts import judged
 from gpusense.models.arguments import real_dtype
+from gpusense.world.deskew import check_motion, still_readings
+from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.scanner import Scanner
-from gpusense.world.sweep import check_motion, still_readings
+from gpusense.world.scanner import Reading, Scanner, classes
 
+# Side of a map's cell in capture radii, and most cells along a side; larger scans have larger cells.
+_CELL, _MOST_CELLS = 0.05, 1500
 METHODS = ("auto", "icp", "gauss_newton", "correlative")
 
 Method = Literal["auto", "icp", "gauss_newton", "correlative"]
@@ -201,3 +203,42 @@ def readings(name: str, ranges: object, scanner: Scanner, backend: Backend) -> n
     read = checks.array(name, values, shape, finite=False, dtype=None)
     scanner._first_scans.look_at(name, read)
     return read
+
+
+def scan_map(ranges: np.ndarray, scanner: Scanner, margin: float, cell: float) -> OccupancyGrid:
+    """Return the map of a scan in the robot's frame: cells of hits are occupied, all others unknown.
+
+    Args:
+        ranges: (K,) readings [m].
+        scanner: The scanner.
+        margin: Width of the space around the hits [m].
+        cell: Least side of a cell [m].
+    """
+    hits = classes(ranges, scanner.range_min, scanner.range_max) == Reading.HIT
+    place = ranges[hits, None] * ray_vectors(scanner.bearings, scanner.mount)[hits] + np.array(scanner.mount[:2])
+    if not len(place):
+        place = np.zeros((1, 2))
+    low = place.min(axis=0) - margin
+    size = float((place.max(axis=0) + margin - low).max())
+    cell = max(cell, size / _MOST_CELLS)
+    cols, rows = (np.ceil((place.max(axis=0) + margin - low) / cell)).astype(int)
+    cells = np.full((rows, cols), -1, np.int8)
+    if hits.any():
+        col, row = np.floor((place - low) / cell).astype(int).T
+        cells[row, col] = 100
+    return OccupancyGrid(cells, resolution=cell, origin=(float(low[0]), float(low[1]), 0.0))
+
+
+def match_by_maps(
+    references: np.ndarray, ranges: np.ndarray, scanner: Scanner, guess: np.ndarray, method: str, backend: Backend,
+    precision: str, options: MatchOptions,
+) -> ScanMatch:  # fmt: skip
+    """Match (S, K) readings to maps of (S, K) or (1, K) references from (S, 3) guesses, one after the other."""
+    matches = []
+    matcher = None
+    for i, scan in enumerate(ranges):
+        if matcher is None or len(references) > 1:
+            grid = scan_map(references[i], scanner, options.capture, _CELL * options.capture)
+            matcher = MapMatcher(grid, scanner, backend, precision, options)
+        matches.append(matcher.match(scan[None], guess[i : i + 1], method))
+    return ScanMatch.joined(matches)

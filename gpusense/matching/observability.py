@@ -112,7 +112,7 @@ def _generalised(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _is_lost(values: np.ndarray, vectors: np.ndarray, critical: np.ndarray, least: np.ndarray) -> np.ndarray:
-    """Return which directions noise alone explains, or have hardly a pair; all with smaller ratios are lost, too."""
+    """Return which directions noise alone explains, or have hardly a pair; all with smaller ratios are also lost."""
     pairs = values / np.maximum(np.square(vectors).sum(axis=1), 1e-300)
     lost = (values < critical[:, None]) | (pairs < least[:, None])
     result: np.ndarray = np.logical_or.accumulate(lost[:, ::-1], axis=1)[:, ::-1]

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gpusense.world.deskew import sensor_points
 from gpusense.world.scanner import Reading, Scanner, classes
-from gpusense.world.sweep import sensor_points
 
 _FULL_TURN = 2 * math.pi
 # Points nearer than this have no bearing [m].
@@ -74,7 +74,7 @@ def scan_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype, motion: np
         ranges: Readings [m].
         scanner: The scanner; its mount's yaw is added to bearings.
         real: Precision of the points.
-        motion: (S, 3) motions of the robot during the scans, see ``gpusense.world.sweep``; points are then in the
+        motion: (S, 3) motions of the robot during the scans, see ``gpusense.world.deskew``; points are then in the
             frames at the first beams. None: the robot is at rest.
     """
     if motion is not None and motion.any():

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gpusense.backends.workspace import Workspace
-from gpusense.interface.lanes import widened
+from gpusense.interface.lanes import with_lanes_flag
 from gpusense.matching.pose_grid import Found, PoseGrid, end_cells
 from gpusense.matching.score_tables import ScoreTables
 
@@ -125,7 +125,7 @@ class _Run:
         point, image = self._folded_points(period)
         bounds = np.empty((items, height, width), np.int32)
         each = min(max(_MOST_SUMS // (height * width), 1), _MOST_ITEMS)
-        flags = widened(self._backend.info.lanes, "shift_scores", _NO_FLAGS)
+        flags = with_lanes_flag(self._backend.info.lanes, "shift_scores", _NO_FLAGS)
         for begin in range(0, items, each):
             count = min(each, items - begin)
             first = self._space.upload("part", np.ascontiguousarray(self._first[begin : begin + count + 1]))

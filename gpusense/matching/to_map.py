@@ -14,11 +14,11 @@ import numpy as np
 
 from gpusense.backends import Backend
 from gpusense.matching.chain import DOUBTFUL, match_pairs, wrapped
-from gpusense.matching.climb import climb
 from gpusense.matching.evidence import pair_evidence
 from gpusense.matching.observability import axes_of, balance_of, observed_information, orthonormal
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import ScanPoints, dense_scanner, scan_points
+from gpusense.matching.refine_on_field import climb
 from gpusense.matching.result import ScanMatch
 from gpusense.matching.score_tables import ScoreTables, field_scores
 from gpusense.matching.search import PoseGrid, Search

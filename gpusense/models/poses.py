@@ -17,7 +17,7 @@ from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.workspace import POSE_STATUS, Workspace
 from gpusense.interface.constants import LARGEST_HEADING
 from gpusense.interface.flags import flags_if
-from gpusense.interface.lanes import widened
+from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.tables.reachable import ReachableMap
 from gpusense.world.frames import Cells, Mount, frame_of, place_poses
@@ -177,7 +177,9 @@ class PlacedPoses(NamedTuple):
         if self.source is None:
             return ()
         return (
-            launch("place_poses", widened(self.lanes, "place_poses", self.flags), (self.count,), **self.arguments()),
+            launch(
+                "place_poses", with_lanes_flag(self.lanes, "place_poses", self.flags), (self.count,), **self.arguments()
+            ),
         )
 
 

@@ -35,10 +35,7 @@ def chunk_of(backend: Backend, beams: int, itemsize: float = 0) -> int:
         chunk = min(chunk, int(CHUNK_BYTES // (beams * itemsize)))
     if backend.info.kind == "cpu":
         chunk = min(chunk, CHUNK_WORK // beams)
-    return _rounded(max(chunk, 1))
-
-
-def _rounded(chunk: int) -> int:
+    chunk = max(chunk, 1)
     return chunk - chunk % _ROUND if chunk > _ROUND else chunk
 
 
@@ -104,7 +101,7 @@ def _halved(piece: Piece) -> int:
     """Return the particles of the next try, 0 where there is none."""
     if piece.count > piece.per_scan:
         return max(piece.count // 2, piece.per_scan)
-    return 0 if piece.count <= SMALLEST_CHUNK else max(_rounded(piece.count // 2), SMALLEST_CHUNK)
+    return 0 if piece.count <= SMALLEST_CHUNK else max(piece.count // 2 // _ROUND * _ROUND, SMALLEST_CHUNK)
 
 
 def finish(space: Workspace, on_device: bool, name: str = "poses") -> None:

@@ -68,7 +68,7 @@ def two_circles(
         status = np.where((status == "two") & (slack <= tolerance), "tangent", status)
         status = np.where(a <= noise, "coincident", status)
         crossing = status == "two"
-        # A tangent point is a nearest point, too: gap and slack are rounding errors.
+        # A tangent point is also a nearest point: gap and slack are rounding errors.
         x = np.where(crossing, x, np.where(high == a, apart, inside))
         y = np.where(crossing, y, 0.0)
         along = np.where(a > noise, base / a, np.nan)

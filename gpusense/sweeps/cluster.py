@@ -44,7 +44,7 @@ class DaskExecutor(Executor):
         security: A ``distributed.Security`` with certificates for TLS; None has those of Dask's configuration, if any.
         timeout: Longest time to connect, and to wait for a worker where there is none [s].
         job_timeout: As that of :class:`ProcessExecutor`.
-        memory_limit: As that of :class:`ProcessExecutor`; the memory limit of a Dask worker holds for its jobs, too.
+        memory_limit: As that of :class:`ProcessExecutor`; the memory limit of a Dask worker also holds for its jobs.
 
     Attributes:
         slots: Workers.

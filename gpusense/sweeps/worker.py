@@ -80,7 +80,7 @@ def work(job: Job, root: str, device: str, sweep: str = "") -> Outcome:
             # In this process the user's, who ends the sweep.
             raise
         except BaseException as problem:
-            # SystemExit, too, is an error of the job and not the end of the worker.
+            # SystemExit is also an error of the job, and not the end of the worker.
             error, trace = error_text(problem), traceback.format_exc()
         seconds, cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
     return Outcome(values, error, trace, seconds, cpu, f"{platform.node()}:{os.getpid()}", chosen)

@@ -140,7 +140,7 @@ class March(Caster):
 
     def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
         """See Caster.prepare."""
-        # Walls outside the grid are obstacles, too.
+        # Walls outside the grid are also obstacles.
         ring = int(inputs.outside == "occupied")
         obstacles = np.pad(inputs.obstacles, ring, constant_values=True)
         squares = backend.download(squared_distances(backend, obstacles), np.empty(obstacles.shape, np.int32))

@@ -64,7 +64,7 @@ class FieldDensity:
 
     @property
     def is_sharp(self) -> bool:
-        """Whether the peak is so high that kernels need the exponent in two parts."""
+        """Whether the density peaks so sharply that kernels need its exponent in two parts."""
         return self.peak > HIGH_PEAK
 
     def is_linear(self, real: np.dtype) -> bool:

@@ -10,7 +10,7 @@ int lowest_bit(const uint word) { return 31 - (int)clz(word & (~word + 1)); }
 int highest_bit(const uint word) { return 31 - (int)clz(word); }
 
 // Count the cells from a cell to the first occupied one to its right, itself included; NONE if none is within most
-// cells. An occupied cell beyond most cells may be returned, too.
+// cells. An occupied cell beyond most cells may also be returned.
 int cells_right(global const int *row, const int words, const int col, const int most) {
     const int last = min((col + most) >> 5, words - 1);
     int i = col >> 5;

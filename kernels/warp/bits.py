@@ -53,7 +53,7 @@ def highest_bit(word: wp.uint32):
 
 
 # Count the cells from a cell to the first occupied one to its right, itself included; NONE if none is within most
-# cells. An occupied cell beyond most cells may be returned, too. The row begins at index begin.
+# cells. An occupied cell beyond most cells may also be returned. The row begins at index begin.
 @wp.func
 def cells_right(bits: wp.array(dtype=wp.int32), begin: wp.int32, words: wp.int32, col: wp.int32, most: wp.int32):
     last = wp.min((col + most) >> 5, words - 1)

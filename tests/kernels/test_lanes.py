@@ -14,7 +14,7 @@ import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import beam_tolerance, differing
 from gpusense.interface.kernel_files import opencl_names, opencl_source
-from gpusense.interface.lanes import widened
+from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.signatures import KERNELS, LANES, lanes_of
 from gpusense.interface.sources import assemble, relevant, required_files
 
@@ -220,18 +220,18 @@ def test_end_points_next_to_edges_and_far_away(resolution, device):
 def test_only_scenes_that_have_such_kernels_get_them():
     info = get_backend("numpy").info
     wide = dataclasses.replace(info, lanes=LANES)
-    assert widened(info.lanes, "cast_ranges", set()) == frozenset()
-    assert widened(wide.lanes, "cast_ranges", set()) == {"WIDE"}
+    assert with_lanes_flag(info.lanes, "cast_ranges", set()) == frozenset()
+    assert with_lanes_flag(wide.lanes, "cast_ranges", set()) == {"WIDE"}
     for flags in ({"FLOAT64"}, {"LOOKUP"}, {"MARCH", "ORIGINS_OUTSIDE"}):
-        assert widened(wide.lanes, "cast_ranges", flags) == {*flags, "WIDE"}
+        assert with_lanes_flag(wide.lanes, "cast_ranges", flags) == {*flags, "WIDE"}
     for flags in (set(), {"HIT"}, {"HIT", "LINEAR"}, {"HIT", "SHARP", "ECHO", "INCIDENCE"}, {"CUBES", "ALL_READINGS"}):
-        assert widened(wide.lanes, "score_beams", flags) == {*flags, "WIDE"}
+        assert with_lanes_flag(wide.lanes, "score_beams", flags) == {*flags, "WIDE"}
     for flags in ({"BILINEAR"}, {"BILINEAR", "LINEAR", "SHARP"}, {"LOG_TABLE", "CAREFUL"}, {"LOG_TABLE", "FLOAT64"}):
-        assert widened(wide.lanes, "score_field", flags) == {*flags, "WIDE"}
-    assert widened(wide.lanes, "score_field", {"ALL_READINGS"}) == {"ALL_READINGS"}
+        assert with_lanes_flag(wide.lanes, "score_field", flags) == {*flags, "WIDE"}
+    assert with_lanes_flag(wide.lanes, "score_field", {"ALL_READINGS"}) == {"ALL_READINGS"}
     for flag in ("FLOAT64", "SHARP"):
-        assert widened(wide.lanes, "field_gradient", {"LINEAR", flag}) == {"LINEAR", flag}
-    assert widened(wide.lanes, "beam_tiles", {"LINEAR"}) == {"LINEAR"}
+        assert with_lanes_flag(wide.lanes, "field_gradient", {"LINEAR", flag}) == {"LINEAR", flag}
+    assert with_lanes_flag(wide.lanes, "beam_tiles", {"LINEAR"}) == {"LINEAR"}
 
 
 def test_programs_in_lanes_begin_in_their_folder():

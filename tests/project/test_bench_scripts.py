@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 import json
 import math
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -198,13 +200,32 @@ def test_trees_are_compared(needs: Callable[[str], str], tmp_path: Path) -> None
     arguments = ["--old", str(BENCH.parent), "--new", str(BENCH.parent), "--backend", needs("opencl"), "--limit", "50"]
     arguments += ["--particles", "1000", "--beams", "8", "--size", "20", "--blocks", "2", "--turns", "2", "--bits"]
     words = ["--rows", "field, tracking", "rays, global", "preparation", "scans"]
-    report = run_script("speed/compare_trees.py", *arguments, "--seconds", "0.001", *words, output=tmp_path / "trees")
+    report = run_script(
+        "compare_trees.py", "speed", *arguments, "--seconds", "0.001", *words, output=tmp_path / "trees"
+    )
     names = {row["what"] for row in report["rows"]}
     assert {"rays, global, 1000 x 8", "field, tracking, 1000 x 8", "preparation, field"} <= names
     assert {"field, tracking, 1000 x 60", "field, tracking, 1000 x 60, bound", "field, 20 scans of 500 x 60"} <= names
     for row in report["rows"]:
         assert row["same_bits"] and not row["slower"] and len(row["blocks"]) == 2
         assert row["quartiles"][0] <= row["ratio"] <= row["quartiles"][1] and row["old_s"] > 0 and row["new_s"] > 0
+
+
+def test_bits_of_trees_are_compared(needs: Callable[[str], str], tmp_path: Path) -> None:
+    """A tree has the bits of itself; a record in which one result is changed is found."""
+    backend, cases = needs("numpy"), ["--rays", "300", "--models", "40", "--filters", "1", "--matches", "2"]
+    script, only = [sys.executable, str(BENCH / "compare_trees.py")], ["--only", "rays", "filters", "matches"]
+    both = [*script, "bits", "--old", str(BENCH.parent), "--backend", backend, *cases, *only]
+    done = subprocess.run(both, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0 and "0 results of 0 numbers differ" in done.stdout, done.stderr[-2000:]
+    old, new = tmp_path / "old.json", tmp_path / "new.json"
+    record = [*script, "record", "--backend", backend, "--rays", "300", "--only", "rays", "--output", str(old)]
+    subprocess.run(record, capture_output=True, check=True, timeout=300)
+    text = json.loads(old.read_text())
+    next(iter(text["cases"].values()))[0][3] = "another digest"
+    new.write_text(json.dumps(text))
+    done = subprocess.run([*script, "compare", str(old), str(new)], capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "1 results of" in done.stdout
 
 
 def test_map_memory_runs(needs: Callable[[str], str], tmp_path: Path) -> None:

@@ -194,7 +194,8 @@ class OpenCLBackend(ProcessBound, Backend):
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launch:
         """See Backend.compile."""
-        self.check_process()
+        if os.getpid() != self._process:
+            self.check_process()
         launcher = self._launchers.get((kernel, flags))
         if launcher is None:
             launcher = self._launchers[kernel, flags] = self._launcher(kernel, flags)

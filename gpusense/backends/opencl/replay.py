@@ -13,7 +13,7 @@ from gpusense._util.checks import show
 from gpusense._util.interrupts import undisturbed
 from gpusense.backends.opencl.arrays import check_in_order
 from gpusense.backends.opencl.memory import driver_errors, raise_clearly
-from gpusense.backends.recording import Recording, counted
+from gpusense.backends.recording import Recording, pluralize
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class OpenCLRecording(Recording):
 
     def explain(self) -> str:
         """See Recording.explain."""
-        return f"{counted(len(self._launches), 'launch')} one by one, their arguments stay set: OpenCL has no graphs"
+        return f"{pluralize(len(self._launches), 'launch')} one by one, their arguments stay set: OpenCL has no graphs"
 
     def _checked(self, stream: Any) -> cl.CommandQueue:
         """Return a user's queue for the stream of a call.

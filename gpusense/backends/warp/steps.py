@@ -7,7 +7,7 @@ from collections.abc import Hashable, Sequence
 
 import warp as wp
 
-from gpusense.backends.recording import counted
+from gpusense.backends.recording import pluralize
 
 
 class Step(ABC):
@@ -56,9 +56,9 @@ def start_each(steps: Sequence[Step], stream: wp.Stream | None) -> None:
 
 def contents(steps: Sequence[Step]) -> str:
     """Return the launches and copies of steps in words: ``"3 launches and 2 copies"``."""
-    launches = counted(sum(step.launches for step in steps), "launch")
+    launches = pluralize(sum(step.launches for step in steps), "launch")
     copies = sum(step.copies for step in steps)
-    return f"{launches} and {counted(copies, 'copy')}" if copies else launches
+    return f"{launches} and {pluralize(copies, 'copy')}" if copies else launches
 
 
 def as_graph(steps: Sequence[Step]) -> str:

@@ -15,7 +15,7 @@ from gpusense.learning.beam.problem import Problem, Value
 _SMALLEST = 1e-150
 
 
-def climb_book(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:
+def textbook_em(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:
     """Repeat lines 3 to 15 of table 6.2 until the log-likelihood changes by at most ``tolerance`` nats.
 
     sigma_hit and lambda_short follow the closed forms of the book, which ignore the components' normalisers; no bounds

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gpusense.backends import Backend
 from gpusense.interface.flags import flags_if
-from gpusense.interface.lanes import widened
+from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.signatures import LANES
 from gpusense.interface.terms import log_weight, rounded_terms
 from gpusense.learning.beam.pairs import Pairs
@@ -114,7 +114,7 @@ class DeviceSums:
 
         Args:
             point: The parameters.
-            information: Whether to sum the terms of second derivatives, too.
+            information: Whether to also sum the terms of second derivatives.
 
         Returns:
             (14,) or, with second derivatives, (40,) float64.
@@ -126,7 +126,7 @@ class DeviceSums:
         if not self._chunks:
             return total
         backend = self._backend
-        launch = backend.compile("e_step", widened(backend.info.lanes, "e_step", flags))
+        launch = backend.compile("e_step", with_lanes_flag(backend.info.lanes, "e_step", flags))
         terms = backend.upload(self.terms(point))
         for chunk in self._chunks:
             launch((chunk.blocks,), chunk.reading, chunk.expected, terms, self._rows, *chunk.layout, width)

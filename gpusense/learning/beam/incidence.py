@@ -176,7 +176,7 @@ def fit_incidence_parameters(
         tolerance: Expected gain below which a fit has converged [nats].
         restarts: Number of additional random starts of each fit.
         seed: Seed of the random starts.
-        range_bias: Whether to fit an offset of correct ranges in each bin, too.
+        range_bias: Whether to also fit an offset of correct ranges in each bin.
         blocks: Integer label of each reading's block, for standard errors of correlated readings.
         sigma_bounds: Smallest and largest sigma_hit [m].
         lambda_bounds: Smallest and largest lambda_short [1/m].

@@ -174,7 +174,7 @@ class Problem:
         """Return the (7,) mask of coordinates that may move at a point.
 
         A weight of 0 stays 0. The largest weight follows from the others. A shape stays at a bound if the gradient
-        points across the bound. The shape of a cause that accounts for no reading stays, too.
+        points across the bound. The shape of a cause that accounts for no reading also stays.
         """
         point, bounds = value.point, self.bounds
         free = np.append(point.weights > 0, [True, True, self.fit_bias])

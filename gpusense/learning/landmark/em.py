@@ -82,7 +82,7 @@ def climb(
     Args:
         pairs: Features and landmarks.
         start: Start of the search.
-        bias: Whether to fit offsets of ranges and bearings, too.
+        bias: Whether to also fit offsets of ranges and bearings.
         max_iterations: Most iterations.
         tolerance: Remaining gain [nats].
 

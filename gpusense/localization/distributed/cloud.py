@@ -32,7 +32,7 @@ from gpusense.localization.filter_cloud import (
     summary_of,
 )
 from gpusense.localization.particles import Places, Stage
-from gpusense.localization.sums import fans_of
+from gpusense.localization.sums import reduction_fans
 from gpusense.reference.draws import mark_of
 from gpusense.reference.estimate import finish_estimate
 from gpusense.reference.rungs import column_of, left_of, possible_of, rung_of, set_stage
@@ -209,7 +209,7 @@ class SplitCloud(FilterCloud):
             table = np.concatenate(
                 self._team.each("sum_poses", [(buffers, part.size, part.block, reference) for part in parts])
             )
-            for fan in fans_of(len(table)):
+            for fan in reduction_fans(len(table)):
                 sums, table = table.reshape(-1), np.empty((-(-len(table) // fan), ESTIMATE_SUMS))
                 join_rows(_PLAIN, sums, table.reshape(-1), len(sums) // ESTIMATE_SUMS, ESTIMATE_SUMS, fan)
             finish_estimate(_PLAIN, first, table.reshape(-1), result, 1, again)

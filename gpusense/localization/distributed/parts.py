@@ -14,7 +14,7 @@ from gpusense.localization.sums import block_of
 # lowest and the highest mark that each shard draws at.
 Step = Generator[None, None, Any]
 Piece = tuple[np.ndarray, np.ndarray]
-Given = tuple[int, tuple[Any, ...]]
+SensorReadings = tuple[int, tuple[Any, ...]]
 Marks = Sequence[tuple[float, float]] | None
 
 

@@ -28,7 +28,7 @@ from gpusense.interface.constants import (
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
 from gpusense.localization.cloud import Cloud
-from gpusense.localization.distributed.parts import Given, Marks, Part, Piece, Step
+from gpusense.localization.distributed.parts import Marks, Part, Piece, SensorReadings, Step
 from gpusense.localization.distributed.shard_pool import ShardPool
 from gpusense.localization.particles import Places, Stage
 from gpusense.localization.sensors import Sensor
@@ -117,7 +117,7 @@ class Shard:
         self._upload_settings(self._part)
         yield
 
-    def score(self, source: int, given: Sequence[Given]) -> Step:
+    def score(self, source: int, given: Sequence[SensorReadings]) -> Step:
         """Score the poses of a buffer by readings, and return the largest score."""
         cloud, part = self._cloud, self._part
         if not part.size:
@@ -135,7 +135,7 @@ class Shard:
         yield
         return float(self._read(cloud.sums.largest, cloud.blocks).max())
 
-    def _recorded(self, source: int, given: Sequence[Given]) -> RecordedProgram:
+    def _recorded(self, source: int, given: Sequence[SensorReadings]) -> RecordedProgram:
         """Return the recorded program that scores a buffer; its start does not wait, so that devices work together."""
         sensors = tuple((index, self._sensors[index].version) for index, _ in given)
         key = (source, self._part.size, self._part.block, sensors)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from abc import abstractmethod
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,10 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray, Association
 from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
-from gpusense.interface.lanes import widened
+from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Launch, Program, launch
 from gpusense.interface.structs import Buckets as BucketSizes
 from gpusense.interface.structs import Score
-from gpusense.models.landmark.call import Call, known_features
 from gpusense.models.landmark.features import PreparedFeatures, check_correspondence
 from gpusense.models.landmark.plan import feature_omissions, looked_at
 from gpusense.models.landmark.tables import LandmarkTables
@@ -33,6 +33,48 @@ JOINT_LANDMARKS = 1024
 _INT = np.dtype(np.int32)
 # Landmarks of a launch that cost what a reading of a scan does.
 _PER_READING = 8
+
+
+@dataclass(frozen=True)
+class Call:
+    """Values that all particles of a call share.
+
+    Attributes:
+        prepared: The evaluated features.
+        places: Places of the landmarks of known features among the buckets.
+        fixed: The constant term: log-likelihoods of known false positives.
+        flags: Flags of the scoring kernel.
+        joint: Whether the features are assigned jointly.
+    """
+
+    prepared: PreparedFeatures
+    places: np.ndarray
+    fixed: float
+    flags: frozenset[str]
+    joint: bool
+
+    @property
+    def count(self) -> int:
+        """Number of evaluated features."""
+        return len(self.prepared.columns)
+
+
+def known_features(
+    prepared: PreparedFeatures, partner: np.ndarray, buckets: Buckets
+) -> tuple[PreparedFeatures, np.ndarray, float]:
+    """Return the features with a landmark, the places of these, and the constant term of the false positives.
+
+    Args:
+        prepared: The features.
+        partner: (K,) landmark of each, -1 for a false positive, which is the same at every pose.
+        buckets: The landmarks in buckets.
+    """
+    known = partner >= 0
+    constant = float(prepared.false[prepared.columns[~known]].sum())
+    features = PreparedFeatures(
+        prepared.columns[known], prepared.numbers[known], prepared.measured[known], prepared.false
+    )
+    return features, buckets.place_of[partner[known]], constant
 
 
 class FeatureModel(PointModel):
@@ -213,7 +255,7 @@ class FeatureModel(PointModel):
         """Return the launch in which each feature chooses its landmark, or sums over them, independently."""
         prior = -math.log(self._count) if "MARGINAL" in call.flags and self._count else 0.0
         partner = self._workspace.upload("partner", np.append(call.places, np.int32(0)).astype(_INT))
-        flags = widened(self._backend.info.lanes, "score_features", call.flags)
+        flags = with_lanes_flag(self._backend.info.lanes, "score_features", call.flags)
         return launch(
             "score_features", flags, (common["particles"],), **common, start=self._tables.start, partner=partner,
             share=prior,

@@ -9,13 +9,12 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.interface import feature_layout as at
-from gpusense.models.landmark.reach import reach_of
 from gpusense.models.landmark.sensor import Sensor, full_circle
 from gpusense.world.frames import Mount, split
 from gpusense.world.parameters import LandmarkParameters
 from gpusense.world.plausible import look_at_bearings
 
-# Discs are widened by this share, for rounding errors of distances.
+# Discs are with_lanes_flag by this share, for rounding errors of distances.
 _WIDER = 1e-5
 
 
@@ -107,6 +106,58 @@ def check_correspondence(correspondence: object, count: int, landmarks: int) -> 
         rule = f"indices must be in [-1, {landmarks})"
         raise ValueError(f"correspondence: {rule}, got {indices[bad[0]]} at index {bad[0]}")
     return indices
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Bounds of the landmarks that can matter to a feature.
+
+    Attributes:
+        reach: Distance of the disc's centre along the bearing [m].
+        radius: Radius of the disc [m]; negative where no landmark matters.
+        hole: Least distance from the sensor [m].
+    """
+
+    reach: float
+    radius: float
+    hole: float
+
+
+def reach_of(p: LandmarkParameters, sensor: Sensor, z: float, measured: np.ndarray, bound: float) -> Reach:
+    """Return the disc outside which exponents are larger than ``bound``.
+
+    Args:
+        p: Deviations and limits.
+        sensor: Constants of the sensor.
+        z: The range; not read where it was not measured.
+        measured: Whether range, bearing and signature were measured.
+        bound: Largest exponent that matters; infinite where all do.
+    """
+    if bound < 0:
+        return Reach(0.0, -1.0, 0.0)
+    wide = math.sqrt(bound)
+    near, far = 0.0, p.range_max
+    if measured[0]:
+        near, far = max(z - wide / sensor.scales[0], 0.0), z + wide / sensor.scales[0]
+    elif not measured[1]:
+        return Reach(0.0, far, 0.0)
+    angle = min(wide / sensor.scales[1], math.pi) if measured[1] else math.pi
+    around = Reach(0.0, far, near)
+    if not measured[1]:
+        return around
+    if math.isinf(far):
+        # All landmarks may matter until one is likelier than all beyond some distance.
+        return Reach(z, far, 0.0)
+    # Of the points of a ring's sector, a corner is farthest from its middle.
+    if measured[0]:
+        ahead = z
+    else:
+        ahead = far / (2 * math.cos(angle)) if angle <= math.pi / 4 else far * math.cos(min(angle, math.pi / 2))
+    cosine = math.cos(angle)
+    radius = math.sqrt(max(max(ahead**2 + d**2 - 2 * ahead * d * cosine for d in (near, far)), 0.0))
+    if not measured[0]:
+        radius = max(radius, abs(far - ahead))
+    return Reach(ahead, radius, near) if radius < far else around
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ ANGLE, DISTANCE, FIRST, LAST, ANGLE_VARIANCE, MIXED, DISTANCE_VARIANCE = range(7
 _COLUMNS = (2, 4, 7)
 # Distance of ends that are not known [m].
 _UNKNOWN_END = 1e9
-# Gates are widened by this share, for rounding errors.
+# Gates are with_lanes_flag by this share, for rounding errors.
 _WIDER = 1e-5
 # Two features may be of one line if their angles differ by less [rad].
 _ALIKE = 0.5

@@ -230,7 +230,7 @@ class BeamModel(ScanModel):
         components share its weight.
 
         ``temperature`` and ``beams`` of the model have no effect, and with ``sensor_table`` readings are those of the
-        mixture. Readings below ``range_min`` are drawn, too; they are missing readings to every model.
+        mixture. Readings below ``range_min`` are also drawn; they are missing readings to every model.
 
         Args:
             poses: (N, 3) robot poses in the world [m, m, rad], or (S, N, 3) of S scans; arrays of other libraries as

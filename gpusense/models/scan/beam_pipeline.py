@@ -10,7 +10,7 @@ from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import BLOCK_TERMS, strands_in
 from gpusense.interface.flags import flags_if
-from gpusense.interface.lanes import widened
+from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.structs import MixtureTables
 from gpusense.models.poses import PlacedPoses
@@ -18,7 +18,7 @@ from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.cones import Cones
 from gpusense.models.scan.map_caster import MapCaster
 from gpusense.models.scan.mixture import Mixture
-from gpusense.models.scan.pipeline import ScanPipeline, Scoring, Setting, Tiles
+from gpusense.models.scan.pipeline import ModelContext, ScanLaunch, ScanPipeline, Tiles
 from gpusense.models.scan.readings import Readings, Sensing
 from gpusense.models.scan.tiles import all_within, stranded, sum_launch, tiles_of
 from gpusense.world.frames import ray_vectors
@@ -39,7 +39,7 @@ class BeamPipeline(ScanPipeline):
     kernel_names = ("score_beams",), ("beam_tiles", "sum_parts")
 
     def __init__(
-        self, setting: Setting, caster: MapCaster, cones: Cones, mixture: Mixture, *, max_evaluated: bool
+        self, setting: ModelContext, caster: MapCaster, cones: Cones, mixture: Mixture, *, max_evaluated: bool
     ) -> None:
         super().__init__(setting)
         self.caster, self.cones, self.mixture, self.map = caster, cones, mixture, caster.map
@@ -130,7 +130,7 @@ class BeamPipeline(ScanPipeline):
             flags -= {"STOPS"}
         if tiled:
             return flags
-        return widened(self.backend.info.lanes, "score_beams", flags | flags_if(PER_BEAM=per_beam))
+        return with_lanes_flag(self.backend.info.lanes, "score_beams", flags | flags_if(PER_BEAM=per_beam))
 
     def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
         """See ScanPipeline.layout."""
@@ -138,7 +138,7 @@ class BeamPipeline(ScanPipeline):
             return strands_in(readings.readings), 1
         return readings.readings, BLOCK_TERMS
 
-    def score_launches(self, scoring: Scoring) -> Program:
+    def score_launches(self, scoring: ScanLaunch) -> Program:
         """See ScanPipeline.score_launches."""
         placed, readings, parts, caster = scoring.placed, scoring.readings, self.parts(scoring), self.caster
         window, count = placed.frame.window, placed.count

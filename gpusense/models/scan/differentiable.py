@@ -40,7 +40,7 @@ def log_likelihood_of(poses: Any, ranges: object, calls: Differentiable) -> Any:
     """Return the log-likelihoods of recorded poses as an operation of their library.
 
     Raises:
-        TypeError: ranges that JAX traces, too.
+        TypeError: JAX also traces the ranges.
         ValueError: poses of another shape.
     """
     checks.check_values("ranges", ranges)

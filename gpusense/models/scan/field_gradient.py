@@ -6,7 +6,7 @@ import numpy as np
 
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import GRADIENT_NUMBERS
-from gpusense.interface.lanes import widened
+from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import launch
 from gpusense.interface.signatures.rows import LANES
 from gpusense.interface.structs import ScanBatch, Score
@@ -56,7 +56,7 @@ class _Gradient:
         resolution = pipeline.grid.resolution
         mount_x, mount_y = (value / resolution for value in pipeline.scanner.mount[:2])
         flags = (pipeline.components | readings.flags) - _OTHERS
-        flags, per_scan = widened(backend.info.lanes, "field_gradient", flags), piece.count // readings.scans
+        flags, per_scan = with_lanes_flag(backend.info.lanes, "field_gradient", flags), piece.count // readings.scans
         # Vectors of particles hold those of one scan.
         size = readings.scans * -(-per_scan // LANES) * LANES if "WIDE" in flags else piece.count
         given = readings.arguments

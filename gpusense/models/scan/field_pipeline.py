@@ -11,12 +11,12 @@ from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.interface.flags import flags_if
-from gpusense.interface.lanes import widened
+from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.structs import Score
 from gpusense.models.poses import PlacedPoses
 from gpusense.models.scan.classed import ClassedScans
-from gpusense.models.scan.pipeline import ScanPipeline, Scoring, Setting, Tiles
+from gpusense.models.scan.pipeline import ModelContext, ScanLaunch, ScanPipeline, Tiles
 from gpusense.models.scan.readings import Readings, Sensing
 from gpusense.models.scan.tiles import ENOUGH_SHORT, all_within, spread_of, sum_launch
 from gpusense.tables.field import RING, FieldTable
@@ -51,7 +51,7 @@ class FieldPipeline(ScanPipeline):
 
     def __init__(
         self,
-        setting: Setting,
+        setting: ModelContext,
         grid: OccupancyGrid,
         parameters: LikelihoodFieldParameters,
         *,
@@ -168,21 +168,21 @@ class FieldPipeline(ScanPipeline):
         """See ScanPipeline.flags."""
         flags = self.components | conditions
         if not tiled:
-            flags = widened(self.backend.info.lanes, "score_field", flags | flags_if(PER_BEAM=per_beam))
+            flags = with_lanes_flag(self.backend.info.lanes, "score_field", flags | flags_if(PER_BEAM=per_beam))
         return flags | flags_if(QUICK=self.quick and (tiled or self.backend.info.vector_loops))
 
     def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
         """See ScanPipeline.layout."""
         return readings.readings if "PER_BEAM" in flags else -(-readings.readings // BLOCK_TERMS), 1
 
-    def numbers(self, scoring: Scoring) -> dict[str, Any]:
+    def numbers(self, scoring: ScanLaunch) -> dict[str, Any]:
         """See ScanPipeline.numbers; blocks of readings have a guard each on the device."""
         readings = scoring.readings
         score = Score(readings.constant_term, self.setting.temperature)
         # Bound of the errors of products of rounded factors and of their sums: 3.12 eps of the longest, 1.5 eps.
         return dict(score=score, guard=self.guard * readings.reach) if scoring.tiles is None else dict(score=score)
 
-    def score_launches(self, scoring: Scoring) -> Program:
+    def score_launches(self, scoring: ScanLaunch) -> Program:
         """See ScanPipeline.score_launches."""
         placed, readings, parts = scoring.placed, scoring.readings, self.parts(scoring)
         count = placed.count

@@ -14,7 +14,7 @@ from gpusense.backends.base import Buffer
 from gpusense.backends.results import Result
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.flags import flags_if
-from gpusense.interface.lanes import widened
+from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission
 from gpusense.interface.structs import RangeScale
@@ -255,5 +255,5 @@ class MapCaster:
             places = placed.cell if order is None else order.order
             tiles = launch("cast_tiles", flags, (items,), **common, ranges=result, order=places, spread=spread)
             return (tiles,) if order is None else (*order.launches(), tiles)
-        flags = widened(self.backend.info.lanes, "cast_ranges", flags)
+        flags = with_lanes_flag(self.backend.info.lanes, "cast_ranges", flags)
         return (launch("cast_ranges", flags, (rays, count), **common, ranges=result),)

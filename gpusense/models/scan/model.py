@@ -24,7 +24,7 @@ from gpusense.models.run import finish
 from gpusense.models.scan.binding import bind
 from gpusense.models.scan.bound import BoundCall
 from gpusense.models.scan.differentiable import Differentiable, is_recorded, log_likelihood_of
-from gpusense.models.scan.pipeline import ScanPipeline, Setting
+from gpusense.models.scan.pipeline import ModelContext, ScanPipeline
 from gpusense.models.scan.request import Known, Request, make_request
 from gpusense.models.scan.rules import Beams, Rules, check_beams
 from gpusense.models.scan.savings import measured_savings, sources_of
@@ -75,7 +75,7 @@ class ScanModel(Pickled):
             specialize, max_is_range=weights.is_peer, max_depends=max_depends,
             map_size=math.hypot(grid.width, grid.height),
         )  # fmt: skip
-        self._setting = Setting(
+        self._setting = ModelContext(
             device, real_dtype(precision, device), rules, weights, cubes, self.temperature, constant_term,
             possible or cubes,
         )  # fmt: skip

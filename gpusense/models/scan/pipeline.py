@@ -36,7 +36,7 @@ TOGETHER = {"gpu": 1 << 22, "cpu": 1 << 20}
 
 
 @dataclass(frozen=True)
-class Setting:
+class ModelContext:
     """The device, and the rules for readings, of a scan model.
 
     Attributes:
@@ -72,7 +72,7 @@ class Tiles(NamedTuple):
     order: Order | None
 
 
-class Scoring(NamedTuple):
+class ScanLaunch(NamedTuple):
     """A piece of a request on the device, from which its program follows.
 
     Attributes:
@@ -119,11 +119,11 @@ class ScanPipeline(ABC):
     kernel_names: tuple[tuple[str, ...], tuple[str, ...]]
     map: ReachableMap
 
-    def __init__(self, setting: Setting) -> None:
+    def __init__(self, setting: ModelContext) -> None:
         self.setting = setting
         self.backend, self.real, self.rules = setting.backend, setting.real, setting.rules
         self.scanner, self.specialize = setting.rules.scanner, setting.rules.specialize
-        self._mount, self._readings, self._chunks = self.scanner.mount, setting.weights.readings, dict[Hashable, int]()
+        self._mount, self._readings = self.scanner.mount, setting.weights.readings
         self.nothing = self.backend.upload(np.zeros(1, np.int32))
         # Flags by everything on which they depend.
         self._flags: dict[Hashable, frozenset[str]] = {}
@@ -165,12 +165,12 @@ class ScanPipeline(ABC):
     def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
         """Return the count of numbers that each particle's sum adds, and their block size; see ``Parts``."""
 
-    def numbers(self, scoring: Scoring) -> dict[str, Any]:
+    def numbers(self, scoring: ScanLaunch) -> dict[str, Any]:
         """Return the arguments of the launches that change from call to call."""
         return dict(score=Score(scoring.readings.constant_term, self.setting.temperature))
 
     @abstractmethod
-    def score_launches(self, scoring: Scoring) -> Program:
+    def score_launches(self, scoring: ScanLaunch) -> Program:
         """Return the launches of a piece whose poses are placed."""
 
     # ---- request: groups of scans that one program may score
@@ -203,11 +203,8 @@ class ScanPipeline(ABC):
 
     def chunk(self, rays: int, *, per_beam: bool = False) -> int:
         """Return the particles of one launch with a number of rays each."""
-        chunk = self._chunks.get((rays, per_beam))
-        if chunk is None:
-            kept = 1.0 if per_beam else self.kept_parts if self.backend.info.kind == "gpu" else 0.0
-            chunk = self._chunks[rays, per_beam] = chunk_of(self.backend, max(rays, 1), self.real.itemsize * kept)
-        return chunk
+        kept = 1.0 if per_beam else self.kept_parts if self.backend.info.kind == "gpu" else 0.0
+        return chunk_of(self.backend, max(rays, 1), self.real.itemsize * kept)
 
     # ---- readings
 
@@ -238,7 +235,7 @@ class ScanPipeline(ABC):
     def scoring(
         self, readings: Readings, placed: PlacedPoses, table: Buffer, log_p: Buffer, space: Workspace, *,
         per_beam: bool = False, ordered: bool = True,
-    ) -> Scoring:  # fmt: skip
+    ) -> ScanLaunch:  # fmt: skip
         """Describe a piece on the device."""
         tiles = None
         if self.backend.info.kind == "gpu" and not per_beam:
@@ -252,15 +249,15 @@ class ScanPipeline(ABC):
             flags = self._flags[key] = self.flags(everything, tiled=tiles is not None, per_beam=per_beam)
         if self.trial is not None:
             flags = (flags | self.trial[0]) - self.trial[1]
-        return Scoring(readings, placed, table, log_p, flags, tiles, per_beam)
+        return ScanLaunch(readings, placed, table, log_p, flags, tiles, per_beam)
 
-    def parts(self, scoring: Scoring) -> Parts:
+    def parts(self, scoring: ScanLaunch) -> Parts:
         """Return the numbers that each particle's sum adds, or the log-likelihoods of the readings."""
         count, block = self.layout(scoring.readings, scoring.flags)
         numbers = scoring.placed.count * count if scoring.tiles or scoring.per_beam else 1
         return Parts(count, block, scoring.placed.space.empty("parts", numbers, self.real))
 
-    def program(self, scoring: Scoring) -> Program:
+    def program(self, scoring: ScanLaunch) -> Program:
         """Return all launches of a piece."""
         tiles = scoring.tiles
         order = () if tiles is None or tiles.order is None else tiles.order.launches()

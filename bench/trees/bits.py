@@ -1,19 +1,22 @@
 """Same bits: does a change of the code leave every number that the package computes as it was?
 
-    PYTHONPATH=old python bench/studies/same_bits.py record --rays 2000000 --models 15000 --output old.json
-    PYTHONPATH=new python bench/studies/same_bits.py record --rays 2000000 --models 15000 --output new.json
-    python bench/studies/same_bits.py compare old.json new.json
+    python bench/compare_trees.py bits --old ../before --rays 2000000 --models 15000
+
+    PYTHONPATH=old python bench/compare_trees.py record --rays 2000000 --models 15000 --output old.json
+    PYTHONPATH=new python bench/compare_trees.py record --rays 2000000 --models 15000 --output new.json
+    python bench/compare_trees.py compare old.json new.json
 
 ``record`` draws cases from fixed seeds, runs them with the package that Python finds, through its public interface
 alone, and keeps a digest of every result: rays by every caster, likelihoods by every model in many configurations,
-bound calls, arrays on the device, tables of maps. ``compare`` says what differs; exit code 1 where anything does.
+bound calls, arrays on the device, tables of maps, steps of filters, matches of scans. ``compare`` says what differs;
+exit code 1 where anything does. ``bits`` does all three, one tree after the other.
 
 Maps, poses and readings are drawn to be awkward, as in bench/accuracy/fuzz_rays.py. A case depends on its
 configuration and its number alone, and cases of a configuration share models, so ``--part 0/4`` to ``--part 3/4`` may
 run beside each other; ``compare old.json new-0.json new-1.json ...`` takes parts together. Run both sides on one
 machine with the same options. ``--as-gpu`` (OpenCL) lets a processor pass for a GPU, whose launches are others: this
 alone reaches for a name that is not public, ``gpusense.backends.get_backend``. ``--only`` takes the configurations
-with these words in their names.
+with these words in their names, among them rays, filters and matches.
 """
 
 from __future__ import annotations
@@ -22,23 +25,28 @@ import argparse
 import hashlib
 import itertools
 import json
+import os
 import platform
 import shlex
+import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bits.actions import ACTIONS, BEARINGS_OF_RAYS, POSES_OF_RAYS, act_rays, on_host
-from bits.cases import Case, Device, Outcome, World, draw_world, seeds
-from bits.configurations import configurations
-from bits.devices import devices_of
-from bits.models import make_models
 
 import gpusense as gs
+from trees.actions import ACTIONS, BEARINGS_OF_RAYS, POSES_OF_RAYS, act_rays, on_host
+from trees.cases import Case, Device, Outcome, World, draw_world, seeds
+from trees.configurations import configurations
+from trees.devices import devices_of
+from trees.models import make_models
+from trees.tasks import run_filter, run_match
 
+ROOT, SCRIPT = Path(__file__).resolve().parents[2], Path(__file__).resolve().parents[1] / "compare_trees.py"
 # Cases that share a model, and numbers of a result that are shown.
 ROUND, SHOWN = 10, 3
 
@@ -55,9 +63,19 @@ def digest(label: str, value: Any) -> list[Any]:
 
 def outcome_of(action: Callable[[Case], Outcome], case: Case) -> list[list[Any]]:
     """Return what is kept of a case: results, and the error that ended it."""
+    return kept_of(results_of(action, case))
+
+
+def results_of(action: Callable[[Case], Outcome], case: Case) -> Iterator[tuple[str, Any]]:
+    """Yield the results of a case."""
+    yield from action(case)
+
+
+def kept_of(results: Iterable[tuple[str, Any]]) -> list[list[Any]]:
+    """Return what is kept of results, and of the error that ended them."""
     kept = []
     try:
-        for label, value in action(case):
+        for label, value in results:
             kept.append(digest(label, value))
     except Exception as error:
         kept.append([f"error {type(error).__name__}", 0, "text", str(error)])
@@ -120,6 +138,16 @@ def record_models(record: Record, arguments: argparse.Namespace, devices: tuple[
             record.add(f"{name}/{number}", failure or outcome_of(ACTIONS[config["kind"]], case))
 
 
+def record_tasks(record: Record, arguments: argparse.Namespace) -> None:
+    """Run filters and matches."""
+    part, parts = arguments.part
+    for kind, run in (("filters", run_filter), ("matches", run_match)):
+        if not any(word in kind for word in arguments.only):
+            continue
+        for number in range(part, getattr(arguments, kind), parts):
+            record.add(f"{kind}/{number}", kept_of(run(arguments.seed, number, arguments.backend)))
+
+
 def record_command(arguments: argparse.Namespace) -> int:
     """Record what the package computes."""
     plain, there, info = devices_of(arguments.backend, arguments.as_gpu)
@@ -128,6 +156,8 @@ def record_command(arguments: argparse.Namespace) -> int:
     if any(word in "rays" for word in arguments.only):
         record_rays(record, arguments, (plain, there))
     record_models(record, arguments, (plain, there))
+    if not arguments.as_gpu:
+        record_tasks(record, arguments)
     head = {
         "command": shlex.join(["python", *sys.argv]), "date": time.strftime("%Y-%m-%d %H:%M"),
         "package": str(Path(gs.__file__).parent), "platform": platform.platform(terse=True), "numpy": np.__version__,
@@ -193,6 +223,25 @@ def compare_command(arguments: argparse.Namespace) -> int:
     return int(bool(bad_results or missing or not numbers))
 
 
+def bits_command(arguments: argparse.Namespace) -> int:
+    """Record both trees, each by a process of its own, and compare."""
+    with tempfile.TemporaryDirectory() as folder:
+        records = []
+        for name, tree in (("old", arguments.old), ("new", arguments.new)):
+            records.append(Path(folder) / f"{name}.json")
+            command = [sys.executable, "-P", str(SCRIPT), "record", "--output", str(records[-1])]
+            for option in ("backend", "rays", "models", "filters", "matches", "seed"):
+                command += [f"--{option}", str(getattr(arguments, option))]
+            command += ["--only", *arguments.only] + ["--as-gpu"] * arguments.as_gpu
+            search = os.pathsep.join(filter(None, (str(tree.resolve()), os.environ.get("PYTHONPATH"))))
+            subprocess.run(command, env=os.environ | {"PYTHONPATH": search}, check=True)
+            package = Path(read(records[-1])[0]["package"]).resolve()
+            if not package.is_relative_to(tree.resolve()):
+                raise RuntimeError(f"{tree}: must be a checkout of gpusense; {package} is imported")
+        arguments.old, arguments.new = records[0], records[1:]
+        return compare_command(arguments)
+
+
 def part_of(text: str) -> tuple[int, int]:
     """Read which part of how many."""
     part, parts = (int(number) for number in text.split("/"))
@@ -201,28 +250,37 @@ def part_of(text: str) -> tuple[int, int]:
     return part, parts
 
 
-def main() -> int:
-    """Record or compare."""
+def add_cases(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say which cases are run."""
+    parser.add_argument("--backend", default="opencl", help="selection string")
+    parser.add_argument("--rays", type=int, default=2_000_000)
+    parser.add_argument("--models", type=int, default=15_000, help="cases of models")
+    parser.add_argument("--filters", type=int, default=60, help="filters, of 12 steps each")
+    parser.add_argument("--matches", type=int, default=120, help="matches of scans")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", nargs="+", default=[""], metavar="WORDS", help="configurations with these words")
+    parser.add_argument("--as-gpu", action="store_true", help="take a processor for a GPU")
+
+
+def main(argv: Sequence[str]) -> int:
+    """Record, compare, or both."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
+    bits = commands.add_parser("bits", help="record both trees and compare")
+    bits.add_argument("--old", type=Path, required=True, help="a checkout")
+    bits.add_argument("--new", type=Path, default=ROOT, help="a checkout (default: this one)")
+    add_cases(bits)
+    bits.set_defaults(run=bits_command)
     record = commands.add_parser("record", help="record what the package computes")
-    record.add_argument("--backend", default="opencl", help="selection string")
-    record.add_argument("--rays", type=int, default=2_000_000)
-    record.add_argument("--models", type=int, default=15_000, help="cases of models")
-    record.add_argument("--seed", type=int, default=0)
+    add_cases(record)
     record.add_argument("--part", type=part_of, default=(0, 1), metavar="I/N", help="only the I-th of N parts")
-    record.add_argument("--only", nargs="+", default=[""], metavar="WORDS", help="configurations with these words")
-    record.add_argument("--as-gpu", action="store_true", help="take a processor for a GPU")
     record.add_argument("--output", type=Path, required=True)
     record.set_defaults(run=record_command)
     compare = commands.add_parser("compare", help="compare two records")
     compare.add_argument("old", type=Path)
     compare.add_argument("new", type=Path, nargs="+", help="a record, or its parts")
-    compare.add_argument("--messages", action="store_true", help="compare texts too: messages of errors, explain()")
     compare.set_defaults(run=compare_command)
-    arguments = parser.parse_args()
+    for one in (bits, compare):
+        one.add_argument("--messages", action="store_true", help="also compare texts: messages of errors, explain()")
+    arguments = parser.parse_args(argv)
     return int(arguments.run(arguments))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

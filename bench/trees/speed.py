@@ -1,15 +1,15 @@
 """Compare the rates of two trees (checkouts) in one run: time of the new one over that of the old one, row by row.
 
-    python bench/speed/compare_trees.py --old ../before                           # against this checkout
-    python bench/speed/compare_trees.py --old ../before --new . --backend warp:cuda:0 --blocks 5 --output NAME
-    python bench/speed/compare_trees.py --old . --new .                           # the noise of this machine
+    python bench/compare_trees.py speed --old ../before                     # against this checkout
+    python bench/compare_trees.py speed --old ../before --new . --backend warp:cuda:0 --blocks 5 --output NAME
+    python bench/compare_trees.py speed --old . --new .                     # the noise of this machine
 
 Rows are those of limits.py and small_calls.py that the public interface has: rays, beam model and field with a cloud
 over the whole map and one around a pose, calls of 2000 and 4000 particles x 60 beams, ordinary and bound, several scans
 in one call, and the preparation of the map; with NumPy arrays, and on GPUs with poses and results on the device, where
 a call is its launches and the start of these.
 
-Each tree has a process of its own (tree_calls.py), and both have the same arrays. The processes take turns in the order
+Each tree has a process of its own (calls.py), and both have the same arrays. The processes take turns in the order
 old, new, new, old, so that a machine that becomes slower favours neither. A turn takes --seconds, and its time is that
 of its shortest call. Each pair of neighbouring turns has a ratio. A block is a new pair of processes, since two
 processes of one tree differ too.
@@ -27,16 +27,14 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from common import ROOT, Scene, add_scene, make_parser, note, parse, publish, table, table_line
 
-CHILD = Path(__file__).with_name("tree_calls.py")
+CHILD, SCRIPT = Path(__file__).with_name("calls.py"), Path(__file__).parents[1] / "compare_trees.py"
 SMALL, FEW, SCANS, SCAN_PARTICLES = (2000, 4000), 60, 20, 500
 MOST_CALLS = 200
 COLUMNS = ("backend", "what", "old, ms", "new, ms", "new / old", "quartiles", "blocks", "shortest", "bits", "")
@@ -166,7 +164,7 @@ def cells(r: dict[str, Any]) -> list[str]:
     ]  # fmt: skip
 
 
-def main() -> int:
+def main(argv: Sequence[str]) -> int:
     """Compare and write."""
     parser = make_parser(__doc__)
     parser.add_argument("--old", type=Path, required=True, help="a checkout")
@@ -180,7 +178,7 @@ def main() -> int:
     parser.add_argument("--limit", type=float, default=1.02, help="a slower row's ratio (default: %(default)s)")
     parser.add_argument("--bits", action="store_true", help="fail where a result has other bits")
     add_scene(parser, 100.0)
-    arguments = parse(parser)
+    arguments = parse(parser, argv)
     with tempfile.TemporaryDirectory() as folder:
         arrays = Path(folder) / "arrays.npz"
         label = write_arrays(arrays, arguments)
@@ -193,9 +191,5 @@ def main() -> int:
         f"{arguments.seconds:g} s. Scene: {label}."
     )
     report = {"old": arguments.old.name, "new": arguments.new.name, "scene": label, "rows": rows}
-    publish(__file__, arguments, table(COLUMNS, map(cells, rows)), report, remark)
+    publish(str(SCRIPT), arguments, table(COLUMNS, map(cells, rows)), report, remark)
     return int(bool(slower) or (arguments.bits and not all(row["same_bits"] for row in rows)))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,4 +1,4 @@
-"""Time calls of one version of gpusense on request: the child of compare_trees.py.
+"""Time calls of one version of gpusense on request: the child of speed.py.
 
 It uses NumPy and the public interface alone, so that it runs with any version of the package that is on the path.
 Arguments are the file of arrays that the parent wrote, and a backend. The first line of standard output describes

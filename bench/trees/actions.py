@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 import gpusense as gs
-from bits.cases import Case, Outcome, draw_cloud, draw_count, draw_grid, draw_poses, draw_readings
-from bits.configurations import knobs, learned
+from trees.cases import Case, Outcome, draw_cloud, draw_count, draw_grid, draw_poses, draw_readings
+from trees.configurations import knobs, learned
 
 # Rays of a case of rays.
 POSES_OF_RAYS, BEARINGS_OF_RAYS = 150, 44

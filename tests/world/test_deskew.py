@@ -7,7 +7,7 @@ import pytest
 from support.matching_scenes import RING, ROOM, relative, segments_scan
 
 import gpusense as gs
-from gpusense.world.sweep import beam_poses
+from gpusense.world.deskew import beam_poses
 
 MOVING = gs.Scanner(RING.bearings[::2], range_max=30.0, mount=(0.2, 0.1, 0.3))
 # The second scans turn the other way.

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import gpusense as gs
-from bits.cases import Device
+from trees.cases import Device
 
 
 def pyopencl_device(info: Any) -> Device | None:

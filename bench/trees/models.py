@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 import gpusense as gs
-from bits.cases import World
+from trees.cases import World
 
 
 def make_scan_model(config: dict[str, Any], world: World, backend: Any, rng: np.random.Generator) -> Any:

@@ -61,13 +61,14 @@ _COLUMNS = {
     "scan": 5, "backend": 10, "rank": 7, "percentile": 10, "error [m]": 9, "error [rad]": 11, "effective": 9,
     "beams": 5,
 }  # fmt: skip
-_SHARED = ("z_hit", "z_max", "z_rand", "sigma_hit")
+_SHARED = ("z_hit", "z_max", "z_rand", "sigma_hit", "hit", "hit_dof")
 _SPECIFIC = {"beam": ("z_short", "lambda_short"), "field": ("max_distance", "interpolation")}
 _MEANING = {
     "z_hit": "weight of a correct range with noise",
     "z_max": "weight of 'no return'",
     "z_rand": "weight of a random reading; the weights must sum to 1",
     "sigma_hit": "deviation of a correct range, or of an end point from a wall [m]",
+    "hit_dof": "degrees of freedom of --hit student, 1 to 1e6",
     "z_short": "weight of an unexpected obstacle; beam model only",
     "lambda_short": "rate of unexpected obstacles along a beam [1/m]; beam model only",
     "max_distance": "largest distance to an obstacle that counts [m]; field only",
@@ -103,6 +104,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a file with beam_model, such as 'gpusense fit --out' writes; beam model only")  # fmt: skip
     for name, meaning in _MEANING.items():
         group.add_argument(_option(name), type=number, metavar="X", help=meaning)
+    group.add_argument("--hit", choices=("normal", "student"), help="shape of a correct range")
     group.add_argument("--interpolation", choices=("nearest", "bilinear"), help="look-up of the field; field only")
     add_seed(parser)
     add_json(parser)

@@ -156,7 +156,7 @@ def sample_readings(expected: ArrayLike, range_max: float, parameters: BeamParam
     """Draw readings from the beam mixture (*Probabilistic Robotics*, section 6.3.1) by inverting each component's CDF.
 
     With z* the expected range and Z = range_max, a reading is with probability z_hit normal around z* + range_bias,
-    clamped to [0, Z], with the deviation sigma_hit + sigma_growth z*, truncated to [0, Z] (or of another ``hit`` with this
+    clamped to [0, Z], with the deviation sigma_hit + sigma_growth z*, truncated to [0, Z] (another ``hit`` has this
     scale); z_short exponential with lambda_short, truncated to [0, z*]; z_max no return; z_rand uniform on [0, Z).
 
     Args:

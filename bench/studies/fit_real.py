@@ -196,7 +196,13 @@ def student(half: RangeData, rest: RangeData, normal: gs.BeamFit, backend: str) 
     mean, error = held_out.block_mean(log_p[0] - log_p[1], block)
     # One parameter more.
     bic = 2 * (fit.log_likelihood - normal.log_likelihood) - np.log(readings)
-    return {"fit": fit.to_dict(), "fit_s": seconds, "bic": finite(bic), "gain": finite(mean), "gain_error": finite(error)}
+    return {
+        "fit": fit.to_dict(),
+        "fit_s": seconds,
+        "bic": finite(bic),
+        "gain": finite(mean),
+        "gain_error": finite(error),
+    }
 
 
 def by_incidence(

@@ -65,6 +65,8 @@ _LEAST_HIT, _MOST_DEVIATION = 0.3, 0.5
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
+    from gpusense.world.hit_shapes import SHAPES
+
     parser.description, parser.epilog = _DESCRIPTION, _EPILOG
     add = parser.add_argument
     add("--map", type=Path, metavar="YAML", help="a map_server map; needs --log")
@@ -84,7 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="optimiser; em-book is table 6.2 as printed (default: %(default)s)")  # fmt: skip
     add("--range-bias", action="store_true", help="also fit an offset of all correct ranges")
     add("--sigma-growth", action="store_true", help="also fit a deviation of correct ranges that grows with range")
-    add("--hit", choices=("normal", "student"), default="normal",
+    add("--hit", choices=tuple(SHAPES), default="normal",
         help="shape of correct ranges; student fits a Student t (default: %(default)s)")  # fmt: skip
     add("--fit-motion", action="store_true", help="also learn the noise of the log's odometry from its poses")
     add("--incidence", type=whole_number(low=1, high=90), metavar="BINS",

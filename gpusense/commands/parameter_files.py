@@ -104,6 +104,8 @@ def parameters_yaml(result: FitResult) -> str:
     """Format the fitted parameters as YAML for gpusense and for nav2_amcl."""
     import yaml
 
+    from gpusense.world.hit_shapes import SHAPE_PARAMETERS
+
     def block(name: str, mapping: dict[str, Any]) -> str:
         return str(yaml.safe_dump({name: mapping}, sort_keys=False)).rstrip()
 
@@ -126,7 +128,7 @@ def parameters_yaml(result: FitResult) -> str:
         )
         lines.append("# alpha alone is too little noise there.")
         lines.append(block("odometry_motion", _plain(asdict(result.motion.motion))))
-    own = ("range_bias", "sigma_growth", "hit", "hit_dof")
+    own = ("range_bias", "sigma_growth", *SHAPE_PARAMETERS)
     shared = {name: value for name, value in values.items() if name not in own}
     nav2 = {"laser_model_type": "beam", **shared, "laser_max_range": float(result.data.range_max)}
     lines += [

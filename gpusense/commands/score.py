@@ -77,6 +77,8 @@ _MEANING = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
+    from gpusense.world.hit_shapes import SHAPES
+
     parser.epilog = _EPILOG
     add = parser.add_argument
     add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
@@ -104,7 +106,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a file with beam_model, such as 'gpusense fit --out' writes; beam model only")  # fmt: skip
     for name, meaning in _MEANING.items():
         group.add_argument(_option(name), type=number, metavar="X", help=meaning)
-    group.add_argument("--hit", choices=("normal", "student"), help="shape of a correct range")
+    group.add_argument("--hit", choices=tuple(SHAPES), help="shape of a correct range")
     group.add_argument("--interpolation", choices=("nearest", "bilinear"), help="look-up of the field; field only")
     add_seed(parser)
     add_json(parser)

@@ -35,8 +35,10 @@ def shape_weight(flags: frozenset[str], t: np.ndarray, numbers: np.ndarray) -> n
     return power * rate / (1 + rate * t)
 
 
-def half_mass(b: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-    """Return the mass between the mean and a distance."""
+def half_mass(flags: frozenset[str], b: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """Return the mass between the mean and a distance; kernels need no formula of it."""
+    if "STUDENT" not in flags:
+        raise ValueError(f"flags: must be those of a shape with a mass, got {sorted(flags)}")
     power, rate = numbers
     half_dof = np.asarray(power, np.float64) - 0.5
     with np.errstate(over="ignore", invalid="ignore"):

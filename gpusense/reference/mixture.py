@@ -38,7 +38,8 @@ def mass_within(flags: frozenset[str], mean: np.ndarray, scale: np.ndarray, term
     """Return the mass of a hit of any shape on [0, range_max]."""
     if "MASS_TABLE" not in flags:
         return hit_mass(mean, scale, terms[6])
-    return half_mass(mean * scale, terms[17:19]) + half_mass((terms[6] - mean) * scale, terms[17:19])
+    numbers = terms[17:19]
+    return half_mass(flags, mean * scale, numbers) + half_mass(flags, (terms[6] - mean) * scale, numbers)
 
 
 def mean_range(flags: frozenset[str], expected: np.ndarray, terms: np.ndarray) -> np.ndarray:

@@ -14,12 +14,13 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[Any]
+HitName: TypeAlias = Literal["normal", "student"]
 
 # Smallest and largest degrees of freedom of Student's t; beyond the largest it is the normal in float32.
 LEAST_DOF, MOST_DOF = 1.0, 1e6
@@ -266,6 +267,8 @@ def _student_half_mass(u: Floats, dof: float) -> Floats:
 
 SHAPES: dict[str, type[HitShape]] = {"normal": NormalHit, "student": StudentHit}
 NORMAL = NormalHit()
+# Parameters of scan models that describe a shape beside its scale.
+SHAPE_PARAMETERS = ("hit", *dict.fromkeys(name for shape in SHAPES.values() for name in shape.fitted))
 
 
 def shape_of(parameters: Any) -> HitShape:

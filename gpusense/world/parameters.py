@@ -9,8 +9,7 @@ from itertools import pairwise
 from typing import Any, ClassVar, Literal, Self
 
 from gpusense._util import checks
-from gpusense._util.typing import HitName
-from gpusense.world.hit_shapes import LEAST_DOF, MOST_DOF, SHAPES
+from gpusense.world.hit_shapes import LEAST_DOF, MOST_DOF, SHAPE_PARAMETERS, SHAPES, HitName
 
 _WEIGHT_SUM_TOLERANCE = 1e-6
 
@@ -77,7 +76,7 @@ class _HitParameters(_Parameters):
         """Return the fields by name, as plain numbers and strings; the shape of hits only where it is not normal."""
         values = super().to_dict()
         shape = ("hit", *SHAPES[self.hit].fitted) if self.hit != "normal" else ()
-        return {name: value for name, value in values.items() if name in shape or name not in ("hit", "hit_dof")}
+        return {name: value for name, value in values.items() if name in shape or name not in SHAPE_PARAMETERS}
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in self.to_dict().items())})"

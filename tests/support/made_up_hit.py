@@ -1,4 +1,4 @@
-"""A shape of hits that the package does not have: Student's t with 3 degrees of freedom, 1.7 times as wide as its scale.
+"""A shape of hits that the package does not have: Student's t with 3 degrees of freedom, 1.7 times as wide.
 
 ``same`` describes the same density by a shape that the package has, so that every user of densities must give equal
 results for both.

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense._util.progress import progress as progress_bar
-from gpusense._util.typing import FitMethod, HitName, Precision
+from gpusense._util.typing import FitMethod, Precision
 from gpusense.backends import Selection
 from gpusense.learning.beam.blocks import check_blocks
 from gpusense.learning.beam.book import climb_book
@@ -28,7 +28,7 @@ from gpusense.learning.beam.problem import NO_PRIOR, Prior, Problem, Value
 from gpusense.learning.beam.report import report
 from gpusense.learning.beam.result import BeamFit
 from gpusense.learning.beam.searches import climb_genetic, climb_gradient, climb_hill
-from gpusense.world.hit_shapes import SHAPES
+from gpusense.world.hit_shapes import SHAPES, HitName
 from gpusense.world.parameters import BeamParameters
 
 

@@ -15,7 +15,6 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense._util.typing import HitName
 from gpusense.learning.beam.pairs import Pairs
 from gpusense.learning.beam.point import Bounds, Floats
 from gpusense.learning.beam.result import BeamFit
@@ -23,7 +22,7 @@ from gpusense.learning.point.densities import truncated
 from gpusense.learning.point.problem import Problem, mix, of_weight
 from gpusense.learning.point.report import report
 from gpusense.learning.point.search import Climb, climb, maximize
-from gpusense.world.hit_shapes import SHAPES, HitShape
+from gpusense.world.hit_shapes import SHAPES, HitName, HitShape
 from gpusense.world.hit_tables import TabulatedHit
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.scanner import Reading

@@ -70,6 +70,7 @@ def beam_options(scene: Scene, scanner: gs.Scanner) -> Iterator[Option]:
     yield option("z_hit alone", 1.05, gs.BeamParameters(z_hit=1.0, z_short=0.0, z_max=0.0, z_rand=0.0))
     yield option("sigma_hit = 4 mm", 1.05, gs.BeamParameters(sigma_hit=0.004))
     yield option("fitted: 5 mm, bias, growth", 1.05, FITTED)
+    yield option('hit="student"', 1.5, gs.BeamParameters(hit="student"))
     yield option("sensor_table=0.05", 1.05, sensor_table=0.05)
     yield option(
         "incidence, 3 bins", 1.5, None, incidence=gs.IncidenceParameters((0.0, 0.5, 1.0, math.pi / 2), (BEAM,) * 3)
@@ -93,7 +94,9 @@ def field_options(scene: Scene, scanner: gs.Scanner) -> Iterator[Option]:
     yield option("default", 1.0)
     yield option("z_rand = 0", 1.05, gs.LikelihoodFieldParameters(z_hit=1.0, z_rand=0.0))
     yield option("sigma_hit = 4 mm", 1.05, gs.LikelihoodFieldParameters(sigma_hit=0.004))
+    yield option('hit="student"', 1.05, gs.LikelihoodFieldParameters(hit="student"))
     yield option("bilinear", 4.0, bilinear())
+    yield option('bilinear, hit="student"', 6.0, bilinear(hit="student"))
     yield option("bilinear, z_rand = 0", 4.0, bilinear(z_hit=1.0, z_rand=0.0))
     yield option("bilinear, sigma_hit = 4 mm", 4.0, bilinear(sigma_hit=0.004))
     yield option("float64", 2.2, precision="float64")

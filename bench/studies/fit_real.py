@@ -24,6 +24,7 @@ normalised mixture. Where the fitted parameters make a held-out reading impossib
 added to them ("softened"). --discrete adds the discrete model with dependent causes, learned in steps of that width
 on the same half, and its gain over the fitted mixture in the same steps. --incidence adds, for the logs of SICK lasers,
 parameters for a number of bins of angles of incidence, and their gain over the same parameters for all angles.
+--student adds fits with Student's t in place of the normal, and their gain over the fits with a normal.
 """
 
 from __future__ import annotations
@@ -175,7 +176,33 @@ def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, A
         report["discrete"] = discrete(half, rest, fit.parameters, arguments.discrete)
     if arguments.incidence and half.incidence is not None:
         report["incidence"] = by_incidence(half, rest, fit.parameters, arguments.incidence, arguments.backend)
+    if arguments.student:
+        report["student"] = student(half, rest, fit, arguments.backend)
     return report
+
+
+def student(half: RangeData, rest: RangeData, normal: gs.BeamFit, backend: str) -> dict[str, Any]:
+    """Fit hits of Student's t to one half, and compare with normal ones on the other."""
+    begin = time.perf_counter()
+    fit = gs.fit_beam_parameters(
+        half.ranges, half.expected, half.range_max, range_min=half.range_min, backend=backend,
+        range_bias=normal.bias_fitted, hit="student",
+    )  # fmt: skip
+    seconds = time.perf_counter() - begin
+    readings = fit.hits + fit.max_readings
+    rest = rest.chosen(rest.kinds != gs.Reading.MISSING)
+    log_p = [held_out.log_densities(held_out.softened(each.parameters, readings), rest) for each in (fit, normal)]
+    _, block = np.unique(rest.block, return_inverse=True)
+    mean, error = held_out.block_mean(log_p[0] - log_p[1], block)
+    # One parameter more.
+    bic = 2 * (fit.log_likelihood - normal.log_likelihood) - np.log(readings)
+    return {
+        "fit": fit.to_dict(),
+        "fit_s": seconds,
+        "bic": finite(bic),
+        "gain": finite(mean),
+        "gain_error": finite(error),
+    }
 
 
 def by_incidence(
@@ -239,7 +266,7 @@ def pair(value: float | None, error: float | None, digits: int = 3) -> str:
 def to_markdown(reports: list[dict[str, Any]]) -> str:
     """Format fitted parameters, held-out comparison, and what options add."""
     names = list(gs.BeamParameters().to_dict())
-    fitted, compared, discrete_lines, incidence_lines = [], [], [], []
+    fitted, compared, discrete_lines, incidence_lines, student_lines = [], [], [], [], []
     for report in reports:
         fit = report["fit"]
         cells = [pair(fit["parameters"][name], fit["standard_errors"][name]) for name in names]
@@ -256,6 +283,12 @@ def to_markdown(reports: list[dict[str, Any]]) -> str:
             own = report["discrete"]
             cells = [pair(own["causes"][name], own["standard_errors"][name]) for name in own["causes"]]
             discrete_lines.append([report["set"], own["bins"], *cells, pair(own["gain"], own["gain_error"])])
+        if "student" in report:
+            own = report["student"]
+            errors, values = own["fit"]["standard_errors"], own["fit"]["parameters"]
+            cells = [pair(values[name], errors[name]) for name in ("hit_dof", "sigma_hit", "z_hit", "z_rand")]
+            gain = pair(own["gain"], own["gain_error"])
+            student_lines.append([report["set"], *cells, f"{own['bic']:.0f}", gain, f"{own['fit_s']:.0f}"])
         if "incidence" in report:
             own = report["incidence"]
             each = own["fit"]["parameters"]["parameters"]
@@ -275,6 +308,11 @@ def to_markdown(reports: list[dict[str, Any]]) -> str:
             ("set", "sigma_hit of the bins [m]", "z_max of the bins", "readings without a surface", "gain [nats]"),
             incidence_lines,
         ),
+        "Hits of Student's t against normal ones": (
+            ("set", "hit_dof", "sigma_hit [m]", "z_hit", "z_rand", "fall of BIC", "gain of a held-out reading [nats]",
+             "fit [s]"),
+            student_lines,
+        ),
     }  # fmt: skip
     return "\n\n".join(f"### {title}\n\n{table(*content)}" for title, content in tables.items() if content[1])
 
@@ -289,6 +327,7 @@ def main() -> int:
     parser.add_argument(
         "--incidence", type=int, help="also fit that number of bins of angles of incidence, where known"
     )
+    parser.add_argument("--student", action="store_true", help="also fit hits of Student's t")
     arguments = parse(parser)
     reports = []
     for name in arguments.set or SETS:

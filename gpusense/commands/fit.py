@@ -65,6 +65,8 @@ _LEAST_HIT, _MOST_DEVIATION = 0.3, 0.5
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
+    from gpusense.world.hit_shapes import SHAPES
+
     parser.description, parser.epilog = _DESCRIPTION, _EPILOG
     add = parser.add_argument
     add("--map", type=Path, metavar="YAML", help="a map_server map; needs --log")
@@ -84,6 +86,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="optimiser; em-book is table 6.2 as printed (default: %(default)s)")  # fmt: skip
     add("--range-bias", action="store_true", help="also fit an offset of all correct ranges")
     add("--sigma-growth", action="store_true", help="also fit a deviation of correct ranges that grows with range")
+    add("--hit", choices=tuple(SHAPES), default="normal",
+        help="shape of correct ranges; student fits a Student t (default: %(default)s)")  # fmt: skip
     add("--fit-motion", action="store_true", help="also learn the noise of the log's odometry from its poses")
     add("--incidence", type=whole_number(low=1, high=90), metavar="BINS",
         help="also fit parameters for BINS bins of the angle of incidence")  # fmt: skip
@@ -100,6 +104,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Fit the parameters, print the result and write the files; after Ctrl-C print the best parameters so far."""
     _check_sources(args)
+    if args.incidence and args.hit != "normal":
+        raise ValueError(f"--hit: must be normal with --incidence, got {args.hit}")
     data, motion, partial = _read(args), _motion(args), PartialFit()
     try:
         result = _fit(args, data, motion, partial)
@@ -168,7 +174,8 @@ def _fit(args: argparse.Namespace, data: RangeData, motion: MotionFit | None, pa
     blocks = data.block if len(set(known.tolist())) > 1 else None
     fit = fit_beam_parameters(
         data.ranges, data.expected, **sensor, method=args.method, seed=args.seed, restarts=args.restarts,
-        range_bias=args.range_bias, sigma_growth=args.sigma_growth, progress=True, callback=partial.see, blocks=blocks,
+        range_bias=args.range_bias, sigma_growth=args.sigma_growth, hit=args.hit, progress=True, callback=partial.see,
+        blocks=blocks,
     )  # fmt: skip
     partial.fit = fit
     incidence = None

@@ -104,10 +104,15 @@ def parameters_yaml(result: FitResult) -> str:
     """Format the fitted parameters as YAML for gpusense and for nav2_amcl."""
     import yaml
 
+    from gpusense.world.hit_shapes import SHAPE_PARAMETERS
+
     def block(name: str, mapping: dict[str, Any]) -> str:
         return str(yaml.safe_dump({name: mapping}, sort_keys=False)).rstrip()
 
-    values = {name: float(value) for name, value in result.fit.parameters.to_dict().items()}
+    values = {
+        name: value if isinstance(value, str) else float(value)
+        for name, value in result.fit.parameters.to_dict().items()
+    }
     lines = [
         f"# gpusense fit: {result.fit.hits} ranges and {result.fit.max_readings} readings without return; "
         f"{result.fit.status}",
@@ -123,13 +128,13 @@ def parameters_yaml(result: FitResult) -> str:
         )
         lines.append("# alpha alone is too little noise there.")
         lines.append(block("odometry_motion", _plain(asdict(result.motion.motion))))
-    own = ("range_bias", "sigma_growth")
+    own = ("range_bias", "sigma_growth", *SHAPE_PARAMETERS)
     shared = {name: value for name, value in values.items() if name not in own}
     nav2 = {"laser_model_type": "beam", **shared, "laser_max_range": float(result.data.range_max)}
     lines += [
         "# For nav2_amcl: paste below amcl's ros__parameters. Its beam model sums cubes of densities that are not",
         "# normalised, so the likeliest parameters need not be the best ones there. laser_likelihood_max_dist belongs",
-        "# to its likelihood field, which this fit does not cover. It has no range_bias.",
+        "# to its likelihood field, which this fit does not cover. It has no range_bias, and normal hits only.",
         block("amcl", {"ros__parameters": nav2}),
     ]
     return "\n".join(lines) + "\n"

@@ -98,7 +98,7 @@ def read_scan(args: argparse.Namespace) -> Scan:
         FileNotFoundError: the log is missing.
         ValueError: the log breaks its format, or has fewer scans.
     """
-    from gpusense.logs.several import read_laser
+    from gpusense.logs.merge import read_laser
 
     wanted, index = args.scan or 0, 0
     with options_named():

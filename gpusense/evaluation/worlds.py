@@ -16,6 +16,7 @@ from gpusense.backends import Selection, get_backend
 from gpusense.evaluation.buildings import building
 from gpusense.models.scan.beam import BeamModel
 from gpusense.world.grid import OccupancyGrid
+from gpusense.world.hit_shapes import shape_of
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.scanner import Scanner
 
@@ -155,8 +156,8 @@ def sample_readings(expected: ArrayLike, range_max: float, parameters: BeamParam
     """Draw readings from the beam mixture (*Probabilistic Robotics*, section 6.3.1) by inverting each component's CDF.
 
     With z* the expected range and Z = range_max, a reading is with probability z_hit normal around z* + range_bias,
-    clamped to [0, Z], with the deviation sigma_hit + sigma_growth z*, truncated to [0, Z]; z_short exponential with
-    lambda_short, truncated to [0, z*]; z_max no return; z_rand uniform on [0, Z).
+    clamped to [0, Z], with the deviation sigma_hit + sigma_growth z*, truncated to [0, Z] (another ``hit`` has this
+    scale); z_short exponential with lambda_short, truncated to [0, z*]; z_max no return; z_rand uniform on [0, Z).
 
     Args:
         expected: (K,) expected ranges z*, from 0 to range_max [m].
@@ -177,8 +178,6 @@ def sample_readings(expected: ArrayLike, range_max: float, parameters: BeamParam
         >>> bool(abs(np.median(z) - 4.0) < 0.1)
         True
     """
-    from scipy.special import ndtr, ndtri
-
     if not isinstance(p := parameters, BeamParameters):
         raise TypeError(f"parameters: must be BeamParameters, got {checks.show(parameters)}")
     limit, z = checks.real("range_max", range_max, above=0), checks.array("expected", expected, ("K",))
@@ -187,8 +186,8 @@ def sample_readings(expected: ArrayLike, range_max: float, parameters: BeamParam
     weights = np.array([p.z_hit, p.z_short, p.z_max, p.z_rand])
     kind = rng.choice(4, size=z.shape, p=weights / weights.sum())
     mean, sigma = np.clip(z + p.range_bias, 0, limit), p.sigma_hit + p.sigma_growth * z
-    u, low, high = rng.random(z.shape), ndtr(-mean / sigma), ndtr((limit - mean) / sigma)
-    hit = mean + sigma * ndtri(low + u * (high - low))
+    u = rng.random(z.shape)
+    hit = mean + sigma * shape_of(p).drawn(u, mean / sigma, (limit - mean) / sigma)
     decay = np.maximum(p.lambda_short * z, 1e-12)  # below, the exponential is uniform to rounding
     short = -np.log1p(u * np.expm1(-decay)) / decay * z
     drawn = np.choose(kind, [np.clip(hit, 0, limit), np.minimum(short, z), np.inf, u * limit])

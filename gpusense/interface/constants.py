@@ -20,7 +20,12 @@ FIELD_RING = 2
 # Kernel file relative: coordinates are clamped to this [m]; its square is finite in float32.
 FARTHEST = float(1 << 60)
 # Kernel file mixture: numbers of the mixture for a bin of angles of incidence.
-MIXTURE_TERMS = 17
+MIXTURE_TERMS = 20
+# Kernel files hit_shape and sampling: cells of a table, cells in a unit of its logarithmic coordinate, and numbers of a
+# cell, by the bytes of a number.
+TABLE_CELLS = {4: 256, 8: 1024}
+TABLE_PER_LOG = {4: 16.0, 8: 27.0}
+TABLE_POWERS = {4: 5, 8: 8}
 # Kernel file absolute: distributions of a heading (a sum of normals, its Fourier series, von Mises); turns on either
 # side and waves that are summed; exp(-NEGLIGIBLE) is below half an eps.
 NEARBY, SERIES, VON_MISES = 0, 1, 2
@@ -62,7 +67,7 @@ SETTINGS = 64
 MOTION_STREAM, DRAW_STREAM, DRAW_STREAMS = 0, 16, 4
 # Kernel file sampling: its stream of random numbers, one further for each beam; numbers of a mixture; numbers of its
 # settings by place. DRAW_SEED takes 2 places.
-READING_STREAM, DRAW_TERMS = 1 << 30, 8
+READING_STREAM, DRAW_TERMS = 1 << 30, 9
 DRAW_SEED, DRAW_STEP, DRAW_FIRST, DRAW_PER_SCAN, DRAW_RANGE_MAX, DRAW_TOP, DRAW_MARGIN, DRAW_SETTINGS = 0, *range(2, 9)
 # Kinds of motion: a straight translation, or an arc.
 STRAIGHT, VELOCITY_MODEL = 0, 1

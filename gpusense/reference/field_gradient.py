@@ -1,8 +1,8 @@
 """Gradient and Gauss-Newton information of the interpolated likelihood field with respect to the pose.
 
-With d the distance of an end point, r = z_hit N(d) / p its share of the hit density, and J the derivatives of d:
-``d log p / d pose = -(d / sigma^2) r J``, and the information is the sum of ``r J J' / sigma^2``, which leaves out
-second derivatives of d and of r.
+With d the distance of an end point, r its share of the hit density times the weight of its shape (1 for a normal), and
+J the derivatives of d: ``d log p / d pose = -(d / sigma^2) r J``, and the information is the sum of ``r J J' /
+sigma^2``, which leaves out second derivatives of d and of r.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from gpusense.reference.beam import sum_terms
 from gpusense.reference.end_point import EndPoint, end_point, field_cell
 from gpusense.reference.error_free import Pair, block_sums
 from gpusense.reference.field import BLOCK
-from gpusense.reference.field_term import bilinear, field_exponent, log_field
+from gpusense.reference.field_term import bilinear, field_exponent, field_square, log_field
+from gpusense.reference.hit_shape import shape_weight
 from gpusense.reference.scans import particles_of_scans
 
 
@@ -89,7 +90,8 @@ def field_gradient(
         end = end_point(flags, at, low, to, to_low)
         col, row = end.col + pose_cell[part, None, 0], end.row + pose_cell[part, None, 1]
         pair, slope_x, slope_y = distance_slope(flags, table, col, row, end, window)
-        log_p, weight = log_field(flags, pair, terms), 2 * terms[1] * hit_share(flags, pair, terms)
+        bend = shape_weight(flags, field_square(flags, pair, terms)[0], terms[6:8])
+        log_p, weight = log_field(flags, pair, terms), 2 * terms[1] * hit_share(flags, pair, terms) * bend
         distance, x, y = pair[0], to[..., 0], to[..., 1]
         if "ALL_READINGS" in flags:
             length = to[..., 0]

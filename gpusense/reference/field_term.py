@@ -11,6 +11,7 @@ import numpy as np
 from gpusense.interface import structs
 from gpusense.reference.end_point import EndPoint, end_point, field_cell
 from gpusense.reference.error_free import Pair, pair_product, pair_sum
+from gpusense.reference.hit_shape import shape_exponent
 
 
 def between(flags: frozenset[str], weight_a: Pair, a: Pair, weight_b: Pair, b: Pair) -> Pair:
@@ -39,15 +40,21 @@ def bilinear(
     return between(flags, end.to_next_y, low, end.rest_y, high)
 
 
-def field_exponent(flags: frozenset[str], distance: Pair, terms: np.ndarray) -> Pair:
-    """Return the exponent of the normal in two parts: where the peak is high, exponent and log peak nearly cancel.
+def field_square(flags: frozenset[str], distance: Pair, terms: np.ndarray) -> Pair:
+    """Return the exponent of a normal in two parts: where the peak is high, exponent and log peak nearly cancel.
 
-    ``terms`` = (hit, 1 / (2 sigma^2), rand, log z_max, and the low parts of terms 0 and 1). hit is z_hit / (sigma
-    sqrt(2 pi)) and rand is z_rand / range_max, or their logarithms in the log domain.
+    ``terms`` = (hit, 1 / (2 sigma^2), rand, log z_max, the low parts of terms 0 and 1, two numbers of the shape of a
+    hit). hit is the peak of its density, z_hit / (sigma sqrt(2 pi)) for a normal, and rand is z_rand / range_max, or
+    their logarithms in the log domain.
     """
     if "SHARP" in flags:
         return pair_product(pair_product(distance, distance), (terms[1], terms[5]))
     return distance[0] * (distance[0] * terms[1]), np.zeros_like(distance[0])
+
+
+def field_exponent(flags: frozenset[str], distance: Pair, terms: np.ndarray) -> Pair:
+    """Return the exponent of the density of a hit in two parts."""
+    return shape_exponent(flags, field_square(flags, distance, terms), terms[6:8])
 
 
 def log_field(flags: frozenset[str], distance: Pair, terms: np.ndarray) -> np.ndarray:

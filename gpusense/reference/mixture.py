@@ -1,10 +1,11 @@
 """Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
 
 ``terms`` = (hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, the low parts of
-terms 0 and 1, range_bias and its low part, sigma_growth / sigma_hit and its low part, three numbers for last_range).
-In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max; in the log
-domain they are the logarithms of these. The mean of p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma
-is sigma_hit + sigma_growth z* (GROWTH).
+terms 0 and 1, range_bias and its low part, sigma_growth / sigma_hit and its low part, three numbers for last_range,
+two numbers of the shape of a hit, the place of the table of its masses, which only kernels read). In the linear domain
+hit is z_hit / (sigma sqrt(2 pi)) for a normal, short is z_short and rand is z_rand / range_max; in the log domain they
+are the logarithms of these. The mean of p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma is sigma_hit +
+sigma_growth z* (GROWTH).
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 from scipy.special import erf
 
 from gpusense.reference.error_free import Pair, pair_product, pair_sum, two_product, two_sum
+from gpusense.reference.hit_shape import half_mass, shape_exponent
 
 TINY = 1e-30
 SMALLEST_RANGE = 1e-37
@@ -26,10 +28,18 @@ def last_range(z: np.ndarray, terms: np.ndarray) -> np.ndarray:
     return np.maximum(terms[14] + terms[15] * z, terms[16])
 
 
-def hit_mass(expected: np.ndarray, erf_scale: float, range_max: np.floating) -> np.ndarray:
+def hit_mass(expected: np.ndarray, erf_scale: float | np.ndarray, range_max: np.floating) -> np.ndarray:
     """Return the mass of the normal around z* on [0, range_max], a sum of positive terms, so nothing cancels."""
     half = expected.dtype.type(0.5)
     return half * (erf(expected * erf_scale) + erf((range_max - expected) * erf_scale))
+
+
+def mass_within(flags: frozenset[str], mean: np.ndarray, scale: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """Return the mass of a hit of any shape on [0, range_max]."""
+    if "MASS_TABLE" not in flags:
+        return hit_mass(mean, scale, terms[6])
+    numbers = terms[17:19]
+    return half_mass(flags, mean * scale, numbers) + half_mass(flags, (terms[6] - mean) * scale, numbers)
 
 
 def mean_range(flags: frozenset[str], expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
@@ -63,7 +73,7 @@ def hit_scale(flags: frozenset[str], expected: np.ndarray, terms: np.ndarray) ->
     return y, (((one - back[0]) - back[1]) - y * x[1]) * y
 
 
-def hit_exponent(
+def normal_exponent(
     flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return ``(z - mean)^2 / (2 sigma^2)`` as a sum of two numbers.
@@ -83,12 +93,19 @@ def hit_exponent(
     return pair_product(exponent, pair_product(scale, scale)) if "GROWTH" in flags else exponent
 
 
+def hit_exponent(
+    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the exponent of a hit's density as a sum of two numbers."""
+    return shape_exponent(flags, normal_exponent(flags, z, expected, terms), terms[17:19])
+
+
 def log_hit(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
     """Return ``log(z_hit p_hit(z | z*))``; terms are those of the log domain."""
     exponent = hit_exponent(flags, z, expected, terms)
     scale = hit_scale(flags, expected, terms)[0]
     log_p = (terms[0] - exponent[0]) + (terms[8] - exponent[1]) + np.log(scale)
-    return log_p - np.log(hit_mass(mean_range(flags, expected, terms), terms[2] * scale, terms[6]))
+    return log_p - np.log(mass_within(flags, mean_range(flags, expected, terms), terms[2] * scale, terms))
 
 
 def short_factor(x: np.ndarray) -> np.ndarray:
@@ -121,7 +138,7 @@ def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, term
         if "HIT" in flags:
             exponent = hit_exponent(flags, z, expected, terms)
             scale = hit_scale(flags, expected, terms)[0]
-            mass = hit_mass(mean_range(flags, expected, terms), terms[2] * scale, terms[6])
+            mass = mass_within(flags, mean_range(flags, expected, terms), terms[2] * scale, terms)
             p += terms[0] * scale * np.exp(-exponent[0]) * (1 - exponent[1]) / mass
         if "SHORT" in flags:
             density = terms[3] * np.exp(-terms[4] * z) * short_peak(terms[4], expected)

@@ -7,8 +7,12 @@ and beyond SERIES_END one half less the continued fraction of Laplace. Quantiles
 241* (1988). p_short's is 1 - u (1 - exp(-lambda z*)), written as a sum of positive terms, or a series where lambda z*
 is small. All of it is float64 of +, -, *, / and sqrt, so that every device draws the same bits.
 
-``mixture`` = (z_hit, z_short, z_max, z_rand, sigma_hit, sigma_growth, range_bias, lambda_short) of each bin of angles
-of incidence. ``chances`` = for each bin of expected ranges, the cumulative probabilities of the bins of readings.
+Other shapes of hits than the normal (MASS_TABLE) have a table of masses and one of quantiles: cells of equal width in
+log(1 + b), b = u / sqrt 2, and in -log(1 - 2 mass), with the numbers of a polynomial in the share of the cell.
+
+``mixture`` = (z_hit, z_short, z_max, z_rand, sigma_hit, sigma_growth, range_bias, lambda_short, place of the tables) of
+each bin of angles of incidence, and then the tables. ``chances`` = for each bin of expected ranges, the cumulative
+probabilities of the bins of readings.
 """
 
 from __future__ import annotations
@@ -26,8 +30,11 @@ from gpusense.interface.constants import (
     DRAW_TERMS,
     DRAW_TOP,
     READING_STREAM,
+    TABLE_CELLS,
+    TABLE_PER_LOG,
+    TABLE_POWERS,
 )
-from gpusense.reference.elementary import exp_of, log_of
+from gpusense.reference.elementary import SQRT_HALF, exp_of, log_of
 from gpusense.reference.philox import random_words
 from gpusense.reference.sensor_table import range_bin
 
@@ -36,6 +43,9 @@ BLOCK = 1 << 18
 HALF_WORD, FINE = 1048576.0, 2.220446049250313e-16
 # 1 / sqrt(2 pi); the largest number below one half.
 NORMAL_PEAK, MOST_HALF = 0.3989422804014327, 0.49999999999999994
+# Tables of shapes; beyond FARTHEST_HIT scales the mass is one half.
+DRAW_CELLS, DRAW_PER_LOG, DRAW_POWERS = TABLE_CELLS[8], TABLE_PER_LOG[8], TABLE_POWERS[8]
+FARTHEST_HIT = 1e16
 # Where the series of the mass gives way to the continued fraction; where the mass is one half.
 SERIES_END, SERIES_TERMS, FRACTION_TERMS, HALF_FROM = 4.0, 48, 24, 9.0
 # AS 241: quantiles of central, outer and outermost probabilities, the highest power first.
@@ -120,6 +130,33 @@ def normal_within(u: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarra
     return np.minimum(np.maximum(np.where(mark < 0.0, -size, size), -low), high)
 
 
+def tabulated(at: np.ndarray, tables: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Return the numbers of tables that begin at places, at logarithmic coordinates."""
+    steps = at * DRAW_PER_LOG
+    cell = np.minimum(steps, DRAW_CELLS - 1.0).astype(np.int64)
+    share = steps - cell.astype(np.float64)
+    first = place.astype(np.int64) + cell * DRAW_POWERS
+    value = tables[first + (DRAW_POWERS - 1)]
+    for i in range(DRAW_POWERS - 2, -1, -1):
+        value = value * share + tables[first + i]
+    return value
+
+
+def table_mass(u: np.ndarray, tables: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Return the mass of a hit between its mean and a distance of u scales, from its table."""
+    at = log_of(1.0 + np.minimum(u, FARTHEST_HIT) * SQRT_HALF)
+    return np.minimum(tabulated(at, tables, place), 0.5)
+
+
+def table_within(u: np.ndarray, low: np.ndarray, high: np.ndarray, tables: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Return a deviate of a hit between -low <= 0 and high >= 0, from its tables."""
+    below, above = table_mass(low, tables, place), table_mass(high, tables, place)
+    mark = u * (below + above) - below
+    level = -log_of(1.0 - 2.0 * np.minimum(np.abs(mark), MOST_HALF))
+    size = (exp_of(tabulated(level, tables, place + DRAW_CELLS * DRAW_POWERS)) - 1.0) / SQRT_HALF
+    return np.minimum(np.maximum(np.where(mark < 0.0, -size, size), -low), high)
+
+
 def short_of(u: np.ndarray, expected: np.ndarray, decay: np.ndarray) -> np.ndarray:
     """Return a range drawn from p_short, up to the expected one, which is above 0."""
     x = decay * expected
@@ -132,11 +169,18 @@ def short_of(u: np.ndarray, expected: np.ndarray, decay: np.ndarray) -> np.ndarr
 
 
 def reading_of(
-    u: np.ndarray, v: np.ndarray, expected: np.ndarray, mixture: np.ndarray, bins: np.ndarray, range_max: float
+    flags: frozenset[str],
+    u: np.ndarray,
+    v: np.ndarray,
+    expected: np.ndarray,
+    mixture: np.ndarray,
+    bins: np.ndarray,
+    range_max: float,
 ) -> np.ndarray:
     """Return readings drawn from the mixture; infinity without return, NaN where no reading is possible.
 
     Args:
+        flags: Flags of the shape of hits.
         u: Numbers in (0, 1) that choose the component.
         v: Numbers in (0, 1) that choose the reading.
         expected: Expected ranges in [0, range_max].
@@ -144,7 +188,8 @@ def reading_of(
         bins: Mixture of each reading.
         range_max: Longest range.
     """
-    hit, short, none, rand, sigma, growth, bias, decay = mixture.reshape(-1, DRAW_TERMS)[bins].T
+    terms = (mixture[DRAW_TERMS * bins + i] for i in range(DRAW_TERMS))
+    hit, short, none, rand, sigma, growth, bias, decay, place = terms
     short = np.where(expected > 0.0, short, 0.0)
     first, second = hit, hit + short
     third = second + none
@@ -154,7 +199,11 @@ def reading_of(
     spread = sigma + growth * expected
     with np.errstate(over="ignore"):
         low, high = mean / spread, (range_max - mean) / spread
-    drawn_hit = mean + spread * normal_within(v, low, high)
+    if "MASS_TABLE" in flags:
+        deviate = table_within(v, low, high, mixture, place)
+    else:
+        deviate = normal_within(v, low, high)
+    drawn_hit = mean + spread * deviate
     drawn = np.where(mark < third, np.inf, v * range_max)
     drawn = np.where(mark < second, short_of(v, expected, decay), drawn)
     drawn = np.where(mark < first, np.maximum(drawn_hit, 0.0), drawn)
@@ -207,5 +256,5 @@ def draw_readings(
             if "INCIDENCE" in flags:
                 bins = (incidence[part, None] <= edges[: tables.incidence_bins - 1]).sum(axis=1)
             expected = np.minimum(z.astype(np.float64), limit)
-            drawn = reading_of(u, v, expected, mixture, bins, limit)
+            drawn = reading_of(flags, u, v, expected, mixture, bins, limit)
         ranges[part] = np.where(np.isinf(drawn), scale.range_max, np.minimum(drawn, top)).astype(ranges.dtype)

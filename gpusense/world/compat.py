@@ -257,11 +257,14 @@ def choose(compat: object) -> Likelihood:
 
 
 def check_weights(parameters: BeamParameters | LikelihoodFieldParameters, compat: object) -> None:
-    """Check that parameters whose weights need not sum to 1 are used with ``compat`` only.
+    """Check that parameters whose weights need not sum to 1 are used with ``compat`` only, and normal hits with it.
 
     Raises:
-        ValueError: ``parameters`` are a peer's weights and ``compat`` is None.
+        ValueError: ``parameters`` are a peer's weights and ``compat`` is None, or their hits have another shape than a
+            peer's.
     """
+    if compat is not None and parameters.hit != "normal":
+        raise ValueError(f"hit: must be 'normal' with compat, as in that program, got {parameters.hit!r}")
     if compat is None and isinstance(parameters, (BeamWeights, FieldWeights)):
         raise ValueError(f"parameters: weights must sum to 1 unless compat is given, got {checks.show(parameters)}")
 

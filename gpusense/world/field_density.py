@@ -1,9 +1,10 @@
 """Density of a likelihood field on the host: the one home of its formula (*Probabilistic Robotics* table 6.3).
 
-    p(d) = z_hit N(d; 0, sigma_hit) + z_rand / range_max
+    p(d) = z_hit f(d) + z_rand / range_max
 
-for the distance d [m] from the end point of a reading to the nearest obstacle. Kernels have the same formula, each in
-its language, and get their numbers here.
+for the distance d [m] from the end point of a reading to the nearest obstacle, with f the density of a hit of scale
+sigma_hit around 0 (``world.hit_shapes``). Kernels have the same formula, each in its language, and get their numbers
+here.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense.interface.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
+from gpusense.world.hit_shapes import HitShape, shape_of
 from gpusense.world.parameters import LikelihoodFieldParameters
 
 Floats = NDArray[np.float64]
@@ -34,22 +36,32 @@ class FieldDensity:
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of hits [m]."""
+        """Scale of hits [m]: the standard deviation of a normal."""
         return self.parameters.sigma_hit
+
+    @property
+    def shape(self) -> HitShape:
+        """Shape of the density of hits."""
+        return shape_of(self.parameters)
+
+    @property
+    def flags(self) -> frozenset[str]:
+        """Flags of the shape in kernels that evaluate the density."""
+        return self.shape.flags - {"MASS_TABLE"}
 
     @property
     def peak(self) -> float:
         """Density of a hit at distance 0 [1/m], with its weight; 0 where the weight is."""
-        return self.parameters.z_hit / (self.sigma * math.sqrt(2 * math.pi))
+        return self.shape.peak(self.parameters.z_hit, self.sigma)
 
     @property
     def log_peak(self) -> float:
         """Logarithm of ``peak``, which may be below the smallest number."""
-        return log_weight(self.parameters.z_hit) - math.log(self.sigma) - 0.5 * math.log(2 * math.pi)
+        return log_weight(self.parameters.z_hit) - math.log(self.sigma) - self.shape.log_width
 
     @property
     def rate(self) -> float:
-        """Factor of the squared distance in the exponent [1/m^2]."""
+        """Factor of the squared distance in the exponent of a normal [1/m^2]."""
         return 0.5 / self.sigma / self.sigma
 
     @property
@@ -78,7 +90,8 @@ class FieldDensity:
             ValueError: sigma_hit is too small or too large for the precision.
         """
         hit, rand = (self.peak, self.rand) if self.is_linear(real) else (self.log_peak, self.log_rand)
-        return rounded_terms([hit, self.rate, rand, log_weight(self.parameters.z_max)], real)
+        terms = rounded_terms([hit, self.rate, rand, log_weight(self.parameters.z_max)], real)
+        return np.append(terms, np.array(self.shape.numbers, real))
 
     def capped(self, distance: Floats) -> Floats:
         """Return distances, at most those beyond which all count as equal."""
@@ -87,5 +100,5 @@ class FieldDensity:
     def log(self, distance: Floats) -> Floats:
         """Return the log density [log 1/m] of distances [m], which are not capped."""
         with np.errstate(over="ignore"):
-            exponent = 0.5 * (distance / self.sigma) ** 2
+            exponent = self.shape.exponent(distance / self.sigma)
         return np.logaddexp(self.log_peak - exponent, self.log_rand)

@@ -9,6 +9,7 @@ from itertools import pairwise
 from typing import Any, ClassVar, Literal, Self
 
 from gpusense._util import checks
+from gpusense.world.hit_shapes import LEAST_DOF, MOST_DOF, SHAPE_PARAMETERS, SHAPES, HitName
 
 _WEIGHT_SUM_TOLERANCE = 1e-6
 
@@ -61,8 +62,28 @@ class _Parameters:
             raise ValueError(f"{' + '.join(names)}: {rule}, got {total}")
 
 
+class _HitParameters(_Parameters):
+    """Parameters with the shape of a correct range."""
+
+    hit: HitName
+    hit_dof: float
+
+    def _check_hit(self) -> None:
+        checks.choice("hit", self.hit, tuple(SHAPES))
+        self._check("hit_dof", low=LEAST_DOF, high=MOST_DOF)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields by name, as plain numbers and strings; the shape of hits only where it is not normal."""
+        values = super().to_dict()
+        shape = ("hit", *SHAPES[self.hit].fitted) if self.hit != "normal" else ()
+        return {name: value for name, value in values.items() if name in shape or name not in SHAPE_PARAMETERS}
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in self.to_dict().items())})"
+
+
 @dataclass(frozen=True, repr=False)
-class BeamParameters(_Parameters):
+class BeamParameters(_HitParameters):
     """Parameters of the beam model, *Probabilistic Robotics* section 6.3.
 
     Raises:
@@ -92,6 +113,10 @@ class BeamParameters(_Parameters):
     """The offset of a correct range [m]: its mean is z* + range_bias, clamped to [0, range_max]."""
     sigma_growth: float = 0.0
     """The growth of the standard deviation with range, >= 0 [1]: it is sigma_hit + sigma_growth z*."""
+    hit: HitName = "normal"
+    """The density of a correct range: ``"normal"``, or ``"student"``, a Student t of scale sigma_hit."""
+    hit_dof: float = 4.0
+    """The degrees of freedom of ``hit="student"``, 1 to 1e6 [1]; few make heavy tails."""
 
     def __post_init__(self) -> None:
         self._check_weights("z_hit", "z_short", "z_max", "z_rand")
@@ -99,14 +124,12 @@ class BeamParameters(_Parameters):
         self._check("lambda_short", low=0)
         self._check("range_bias")
         self._check("sigma_growth", low=0)
+        self._check_hit()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields by name; range_bias and sigma_growth only where they are not 0."""
+        """Return the fields by name; range_bias and sigma_growth where they are not 0, hit where it is not normal."""
         values = super().to_dict()
         return {name: value for name, value in values.items() if value or name not in ("range_bias", "sigma_growth")}
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({', '.join(f'{name}={value!r}' for name, value in self.to_dict().items())})"
 
 
 @dataclass(frozen=True)
@@ -183,8 +206,8 @@ class IncidenceParameters:
         )
 
 
-@dataclass(frozen=True)
-class LikelihoodFieldParameters(_Parameters):
+@dataclass(frozen=True, repr=False)
+class LikelihoodFieldParameters(_HitParameters):
     """Parameters of the likelihood field, *Probabilistic Robotics* section 6.4.
 
     Raises:
@@ -210,12 +233,17 @@ class LikelihoodFieldParameters(_Parameters):
     """Largest distance to the nearest obstacle, > 0 [m]; larger ones are clamped."""
     interpolation: Literal["nearest", "bilinear"] = "nearest"
     """Interpolation between cell centres: the distance of the end point's cell, or bilinear."""
+    hit: HitName = "normal"
+    """The density of a correct range's distance: ``"normal"``, or ``"student"``, a Student t of scale sigma_hit."""
+    hit_dof: float = 4.0
+    """The degrees of freedom of ``hit="student"``, 1 to 1e6 [1]; few make heavy tails."""
 
     def __post_init__(self) -> None:
         self._check_weights("z_hit", "z_max", "z_rand")
         self._check("sigma_hit", above=0)
         self._check("max_distance", above=0)
         checks.choice("interpolation", self.interpolation, ("nearest", "bilinear"))
+        self._check_hit()
 
 
 @dataclass(frozen=True)

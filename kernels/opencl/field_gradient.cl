@@ -1,7 +1,7 @@
 // Gradient and Gauss-Newton information of the interpolated likelihood field with respect to the pose. With d the
-// distance of an end point, r = z_hit N(d) / p its share of the hit density, and J the derivatives of d:
-// d log p / d pose = -(d / sigma^2) r J, and the information is the sum of r J J' / sigma^2, which leaves out second
-// derivatives of d and of r.
+// distance of an end point, r its share of the hit density times the weight of its shape (1 for a normal), and J the
+// derivatives of d: d log p / d pose = -(d / sigma^2) r J, and the information is the sum of r J J' / sigma^2, which
+// leaves out second derivatives of d and of r.
 // requires: field_term
 
 #define GRADIENT_NUMBERS 13
@@ -71,7 +71,8 @@ kernel void field_gradient(ARGUMENTS) {
         const real2 arm = to + (real2)(mount_x, mount_y);
         const real x = slope.z / resolution, y = slope.w / resolution;
         const real turn = slope.w * (at.z * arm.x - at.w * arm.y) - slope.z * (at.w * arm.x + at.z * arm.y);
-        const real weight = 2 * terms[1] * hit_share(distance, terms), pull = -weight * slope.x;
+        const real bend = shape_weight(field_square(distance, terms).x, terms[6], terms[7]);
+        const real weight = 2 * terms[1] * hit_share(distance, terms) * bend, pull = -weight * slope.x;
         sums[0] += pull * x;
         sums[1] += pull * y;
         sums[2] += pull * turn;

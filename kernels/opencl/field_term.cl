@@ -1,6 +1,6 @@
 // Term of one reading in the likelihood field (book table 6.3): log p of the distance from an end point to the nearest
 // obstacle, looked up in the cell of the end point or interpolated between four cells.
-// requires: end_point
+// requires: end_point hit_shape
 
 #if BILINEAR
 // Return the weighted sum of a and b, all of two parts. No term is negative, so small values keep their digits.
@@ -24,15 +24,21 @@ real2 bilinear(global const real *table, const int2 cell, const EndPoint end, co
 #endif
 
 #if !LOG_TABLE
-// Return the exponent of the normal in two parts: where the peak is high, exponent and log peak nearly cancel. terms[6]
-// = {hit, 1 / (2 sigma^2), rand, log z_max, and the low parts of terms 0 and 1}. hit is z_hit / (sigma sqrt(2 pi)) and
-// rand is z_rand / range_max, or their logarithms in the log domain.
-real2 field_exponent(const real2 distance, global const real *terms) {
+// Return the exponent of a normal in two parts: where the peak is high, exponent and log peak nearly cancel. terms[8]
+// = {hit, 1 / (2 sigma^2), rand, log z_max, the low parts of terms 0 and 1, two numbers of the shape of a hit}. hit is
+// the peak of its density, z_hit / (sigma sqrt(2 pi)) for a normal, and rand is z_rand / range_max, or their logarithms
+// in the log domain.
+real2 field_square(const real2 distance, global const real *terms) {
 #if SHARP
     return pair_product(pair_product(distance, distance), (real2)(terms[1], terms[5]));
 #else
     return (real2)(distance.x * (distance.x * terms[1]), 0);
 #endif
+}
+
+// Return the exponent of the density of a hit in two parts.
+real2 field_exponent(const real2 distance, global const real *terms) {
+    return shape_exponent(field_square(distance, terms), terms[6], terms[7]);
 }
 
 // Return log p of the distance from an end point to the nearest obstacle.

@@ -1,12 +1,13 @@
 // Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
-// terms[17] = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, the low parts of
-// terms 0 and 1, range_bias and its low part, sigma_growth / sigma_hit and its low part, three numbers for
-// last_range}. In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is z_rand /
-// range_max; in the log domain they are the logarithms of these. The mean of p_hit is z* + range_bias on [0,
-// range_max] (BIAS), and its sigma is sigma_hit + sigma_growth z* (GROWTH).
-// requires: error_free
+// terms[20] = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, the low parts of
+// terms 0 and 1, range_bias and its low part, sigma_growth / sigma_hit and its low part, three numbers for last_range,
+// two numbers of the shape of a hit, the place of the table of its masses after the first term}. In the linear domain
+// hit is z_hit / (sigma sqrt(2 pi)) for a normal, short is z_short and rand is z_rand / range_max; in the log domain
+// they are the logarithms of these. The mean of p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma is
+// sigma_hit + sigma_growth z* (GROWTH).
+// requires: error_free hit_shape
 
-#define MIXTURE_TERMS 17
+#define MIXTURE_TERMS 20
 // From here on the error function is 1 to the last bit.
 #define ERF_ONE ((real)(FLOAT64 ? 6 : 4))
 // Keep 2 / x and 1 / z* finite.
@@ -31,6 +32,16 @@ real hit_mass(const real expected, const real erf_scale, const real range_max) {
     if (nearer > ERF_ONE) return 1;
     const real rest = farther > ERF_ONE ? (real)1 : erf(farther);
     return (real)0.5 * (nearer > 0 ? erf(nearer) + rest : rest);
+}
+
+// Return the mass of a hit of any shape on [0, range_max].
+real mass_within(const real mean, const real scale, global const real *terms) {
+#if MASS_TABLE
+    global const real *table = terms + (int)terms[19];
+    return half_mass(mean * scale, table) + half_mass((terms[6] - mean) * scale, table);
+#else
+    return hit_mass(mean, scale, terms[6]);
+#endif
 }
 
 // Return the mean of p_hit.
@@ -73,7 +84,7 @@ real2 hit_scale(const real expected, global const real *terms) {
 
 // Return (z - mean)^2 / (2 sigma^2) as a sum of two numbers. Where the density's peak is high, exponent and log peak are
 // large and nearly cancel; the second part keeps the digits that remain.
-real2 hit_exponent(const real z, const real expected, global const real *terms) {
+real2 normal_exponent(const real z, const real expected, global const real *terms) {
     const real2 off = hit_offset(z, expected, terms);
 #if SHARP
     real2 square = two_product(off.x, off.x);
@@ -98,6 +109,11 @@ real2 hit_exponent(const real z, const real expected, global const real *terms) 
 #endif
 }
 
+// Return the exponent of a hit's density as a sum of two numbers.
+real2 hit_exponent(const real z, const real expected, global const real *terms) {
+    return shape_exponent(normal_exponent(z, expected, terms), terms[17], terms[18]);
+}
+
 // Return log(z_hit p_hit(z | z*)); terms are those of the log domain.
 real log_hit(const real z, const real expected, global const real *terms) {
     const real2 exponent = hit_exponent(z, expected, terms);
@@ -106,7 +122,7 @@ real log_hit(const real z, const real expected, global const real *terms) {
 #if GROWTH
     log_p += log(scale);
 #endif
-    const real mass = hit_mass(mean_range(expected, terms), terms[2] * scale, terms[6]);
+    const real mass = mass_within(mean_range(expected, terms), terms[2] * scale, terms);
     return mass == 1 ? log_p : log_p - log(mass);
 }
 #endif
@@ -141,7 +157,7 @@ real log_density(const real z, const real expected, global const real *terms) {
     const real2 exponent = hit_exponent(z, expected, terms);
     const real scale = hit_scale(expected, terms).x;
     const real hit = terms[0] * scale * exp(-exponent.x) * (1 - exponent.y);
-    const real mass = hit_mass(mean_range(expected, terms), terms[2] * scale, terms[6]);
+    const real mass = mass_within(mean_range(expected, terms), terms[2] * scale, terms);
     p += mass == 1 ? hit : hit / mass;
 #endif
 #if SHORT

@@ -5,12 +5,14 @@
 // ...), and beyond SERIES_END one half less the continued fraction of Laplace. Quantiles are those of Wichura,
 // "Algorithm AS 241" (1988). p_short's is 1 - u (1 - exp(-lambda z*)), written as a sum of positive terms, or a series
 // where lambda z* is small. All of it is float64 of +, -, *, / and sqrt, so that every device draws the same bits.
-// mixture = (z_hit, z_short, z_max, z_rand, sigma_hit, sigma_growth, range_bias, lambda_short) of each bin of angles of
-// incidence. chances = for each bin of expected ranges, the cumulative probabilities of the bins of readings.
+// Other shapes of hits than the normal (MASS_TABLE) have a table of masses and one of quantiles: cells of equal width in
+// log(1 + b), b = u / sqrt 2, and in -log(1 - 2 mass), with the numbers of a polynomial in the share of the cell.
+// mixture = (z_hit, z_short, z_max, z_rand, sigma_hit, sigma_growth, range_bias, lambda_short, place of the tables) of each
+// bin of angles of incidence, and then the tables. chances = for each bin of expected ranges, the cumulative probabilities of the bins of readings.
 // requires: philox sensor_table
 
 #define READING_STREAM 1073741824u
-#define DRAW_TERMS 8
+#define DRAW_TERMS 9
 // Numbers of the settings by place; DRAW_SEED takes 2.
 #define DRAW_SEED 0
 #define DRAW_STEP 2
@@ -25,6 +27,11 @@
 // 1 / sqrt(2 pi); the largest number below one half.
 #define NORMAL_PEAK 0.3989422804014327
 #define MOST_HALF 0.49999999999999994
+// Tables of shapes; beyond FARTHEST_HIT scales the mass is one half.
+#define DRAW_CELLS 1024
+#define DRAW_PER_LOG 27.0
+#define DRAW_POWERS 8
+#define FARTHEST_HIT 1e16
 // Where the series of the mass gives way to the continued fraction; where the mass is one half.
 #define SERIES_END 4.0
 #define SERIES_TERMS 48
@@ -115,6 +122,31 @@ double normal_within(const double u, const double low, const double high) {
     return fmin(fmax(mark < 0.0 ? -size : size, -low), high);
 }
 
+// Return the number of a table at a logarithmic coordinate.
+double tabulated(const double at, global const double *table) {
+    const double steps = at * DRAW_PER_LOG;
+    const int cell = (int)fmin(steps, DRAW_CELLS - 1.0);
+    const double share = steps - (double)cell;
+    global const double *number = table + cell * DRAW_POWERS;
+    double value = number[DRAW_POWERS - 1];
+    for (int i = DRAW_POWERS - 2; i >= 0; --i) value = value * share + number[i];
+    return value;
+}
+
+// Return the mass of a hit between its mean and a distance of u scales, from its table.
+double table_mass(const double u, global const double *table) {
+    return fmin(tabulated(log_of(1.0 + fmin(u, FARTHEST_HIT) * SQRT_HALF), table), 0.5);
+}
+
+// Return a deviate of a hit between -low <= 0 and high >= 0, from its tables.
+double table_within(const double u, const double low, const double high, global const double *tables) {
+    const double below = table_mass(low, tables), above = table_mass(high, tables);
+    const double mark = u * (below + above) - below;
+    const double level = -log_of(1.0 - 2.0 * fmin(fabs(mark), MOST_HALF));
+    const double size = (exp_of(tabulated(level, tables + DRAW_CELLS * DRAW_POWERS)) - 1.0) / SQRT_HALF;
+    return fmin(fmax(mark < 0.0 ? -size : size, -low), high);
+}
+
 // Return a range drawn from p_short, up to the expected one, which is above 0.
 double short_of(const double u, const double expected, const double decay) {
     const double x = decay * expected;
@@ -135,7 +167,12 @@ double reading_of(const double u, const double v, const double expected, global 
     if (!(total > 0.0)) return (double)NAN;
     if (mark < first) {
         const double mean = fmin(fmax(expected + p[6], 0.0), range_max), spread = p[4] + p[5] * expected;
-        return fmax(mean + spread * normal_within(v, mean / spread, (range_max - mean) / spread), 0.0);
+#if MASS_TABLE
+        const double off = table_within(v, mean / spread, (range_max - mean) / spread, mixture + (int)p[8]);
+#else
+        const double off = normal_within(v, mean / spread, (range_max - mean) / spread);
+#endif
+        return fmax(mean + spread * off, 0.0);
     }
     if (mark < second) return short_of(v, expected, p[7]);
     return mark < third ? (double)INFINITY : v * range_max;

@@ -1,8 +1,8 @@
 """Gradient and Gauss-Newton information of the interpolated likelihood field with respect to the pose.
 
-With d the distance of an end point, r = z_hit N(d) / p its share of the hit density, and J the derivatives of d:
-d log p / d pose = -(d / sigma^2) r J, and the information is the sum of r J J' / sigma^2, which leaves out second
-derivatives of d and of r.
+With d the distance of an end point, r its share of the hit density times the weight of its shape (1 for a normal), and
+J the derivatives of d: d log p / d pose = -(d / sigma^2) r J, and the information is the sum of r J J' / sigma^2, which
+leaves out second derivatives of d and of r.
 """
 
 import functools
@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import end_point as end_points
-from . import error_free, field_term
+from . import error_free, field_term, hit_shape
 from .end_point import field_cell
 from .prelude import kernel, precision, reader, work_item
 
@@ -69,7 +69,9 @@ def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
-    log_field = field_term.functions(flags).log_field
+    of_field = field_term.functions(flags)
+    log_field, field_square = of_field.log_field, of_field.field_square
+    shape_weight = hit_shape.functions(flags).shape_weight
     made = functions(flags)
     hit_share, distance_slope = made.hit_share, made.distance_slope
     end_point = end_points.functions(flags).end_point
@@ -126,7 +128,8 @@ def make(name, flags):
                 x = slope.z / resolution
                 y = slope.w / resolution
                 turn = slope.w * (at.z * arm_x - at.w * arm_y) - slope.z * (at.w * arm_x + at.z * arm_y)
-                weight = TWO * terms[1] * hit_share(distance, terms)
+                bend = shape_weight(field_square(distance, terms).x, terms[6], terms[7])
+                weight = TWO * terms[1] * hit_share(distance, terms) * bend
                 pull = -weight * slope.x
                 sums[0] += pull * x
                 sums[1] += pull * y

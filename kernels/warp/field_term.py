@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import end_point as end_points
-from . import error_free
+from . import error_free, hit_shape
 from .end_point import field_cell
 from .prelude import precision, reader
 
@@ -22,6 +22,7 @@ def functions(flags):
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     exact = error_free.functions(flags)
     pair_sum, pair_product = exact.pair_sum, exact.pair_product
+    shape_exponent = hit_shape.functions(flags).shape_exponent
     ends = end_points.functions(flags)
     EndPoint, end_point, rounded_cell = ends.EndPoint, ends.end_point, ends.rounded_cell
     table_cell, ROUNDING_BITS = ends.table_cell, ends.ROUNDING_BITS
@@ -54,15 +55,21 @@ def functions(flags):
         high = between(end.to_next_x, c, end.rest_x, d)
         return between(end.to_next_y, low, end.rest_y, high)
 
-    # Return the exponent of the normal in two parts: where the peak is high, exponent and log peak nearly cancel.
-    # terms[6] = {hit, 1 / (2 sigma^2), rand, log z_max, and the low parts of terms 0 and 1}. hit is z_hit / (sigma
-    # sqrt(2 pi)) and rand is z_rand / range_max, or their logarithms in the log domain.
+    # Return the exponent of a normal in two parts: where the peak is high, exponent and log peak nearly cancel.
+    # terms[8] = {hit, 1 / (2 sigma^2), rand, log z_max, the low parts of terms 0 and 1, two numbers of the shape of a
+    # hit}. hit is the peak of its density, z_hit / (sigma sqrt(2 pi)) for a normal, and rand is z_rand / range_max, or
+    # their logarithms in the log domain.
     @wp.func
-    def field_exponent(distance: vec2, terms: wp.array(dtype=real)):
+    def field_square(distance: vec2, terms: wp.array(dtype=real)):
         if SHARP:
             return pair_product(pair_product(distance, distance), vec2(terms[1], terms[5]))
         else:
             return vec2(distance.x * (distance.x * terms[1]), ZERO)
+
+    # Return the exponent of the density of a hit in two parts.
+    @wp.func
+    def field_exponent(distance: vec2, terms: wp.array(dtype=real)):
+        return shape_exponent(field_square(distance, terms), terms[6], terms[7])
 
     # Return log p of the distance from an end point to the nearest obstacle.
     if LINEAR:

@@ -1,8 +1,9 @@
 """Beam mixture density of one range reading, log p(z | z*), book equations 6.4 to 6.12 without the max atom.
 
-terms[17] = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, the low parts of
-terms 0 and 1, range_bias and its low part, sigma_growth / sigma_hit and its low part, three numbers for last_range}.
-In the linear domain hit is z_hit / (sigma sqrt(2 pi)), short is z_short and rand is z_rand / range_max; in the log
+terms[20] = {hit, 1 / (2 sigma^2), 1 / (sigma sqrt 2), short, lambda, rand, range_max, log z_max, the low parts of
+terms 0 and 1, range_bias and its low part, sigma_growth / sigma_hit and its low part, three numbers for last_range, two
+numbers of the shape of a hit, the place of the table of its masses after the first term}. In the linear domain hit is
+z_hit / (sigma sqrt(2 pi)) for a normal, short is z_short and rand is z_rand / range_max; in the log
 domain they are the logarithms of these. The mean of p_hit is z* + range_bias on [0, range_max] (BIAS), and its sigma
 is sigma_hit + sigma_growth z* (GROWTH).
 """
@@ -13,10 +14,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import error_free
+from . import error_free, hit_shape
 from .prelude import precision, reader
 
-MIXTURE_TERMS = 17
+MIXTURE_TERMS = 20
 
 
 @functools.cache
@@ -27,6 +28,9 @@ def functions(flags):
     exact = error_free.functions(flags)
     two_sum, two_product = exact.two_sum, exact.two_product
     pair_sum, pair_product = exact.pair_sum, exact.pair_product
+    shape = hit_shape.functions(flags)
+    shape_exponent, half_mass = shape.shape_exponent, shape.half_mass
+    MASS_TABLE = "MASS_TABLE" in flags
     SHARP = "SHARP" in flags
     BIAS = "BIAS" in flags
     GROWTH = "GROWTH" in flags
@@ -68,6 +72,16 @@ def functions(flags):
             rest += wp.erf(nearer)
         return HALF * rest
 
+    # Return the mass of a hit of any shape on [0, range_max].
+    @wp.func
+    def mass_within(mean: real, scale: real, terms: wp.array(dtype=real)):
+        if MASS_TABLE:
+            place = wp.int32(at(terms, 19))
+            below = half_mass(mean * scale, terms, place)
+            return below + half_mass((at(terms, 6) - mean) * scale, terms, place)
+        else:
+            return hit_mass(mean, scale, at(terms, 6))
+
     # Return the mean of p_hit.
     @wp.func
     def mean_range(expected: real, terms: wp.array(dtype=real)):
@@ -106,7 +120,7 @@ def functions(flags):
     # Return (z - mean)^2 / (2 sigma^2) as a sum of two numbers. Where the density's peak is high, exponent and log peak
     # are large and nearly cancel; the second part keeps the digits that remain.
     @wp.func
-    def hit_exponent(z: real, expected: real, terms: wp.array(dtype=real)):
+    def normal_exponent(z: real, expected: real, terms: wp.array(dtype=real)):
         off = hit_offset(z, expected, terms)
         if SHARP:
             square = two_product(off.x, off.x)
@@ -124,6 +138,11 @@ def functions(flags):
                 scaled = off.x * hit_scale(expected, terms).x
             return vec2(scaled * (scaled * at(terms, 1)), ZERO)
 
+    # Return the exponent of a hit's density as a sum of two numbers.
+    @wp.func
+    def hit_exponent(z: real, expected: real, terms: wp.array(dtype=real)):
+        return shape_exponent(normal_exponent(z, expected, terms), at(terms, 17), at(terms, 18))
+
     # Return log(z_hit p_hit(z | z*)); terms are those of the log domain.
     @wp.func
     def log_hit(z: real, expected: real, terms: wp.array(dtype=real)):
@@ -132,7 +151,7 @@ def functions(flags):
         log_p = (at(terms, 0) - exponent.x) + (at(terms, 8) - exponent.y)
         if GROWTH:
             log_p += wp.log(scale)
-        mass = hit_mass(mean_range(expected, terms), at(terms, 2) * scale, at(terms, 6))
+        mass = mass_within(mean_range(expected, terms), at(terms, 2) * scale, terms)
         if mass == ONE:
             return log_p
         return log_p - wp.log(mass)
@@ -174,7 +193,7 @@ def functions(flags):
                 exponent = hit_exponent(z, expected, terms)
                 scale = hit_scale(expected, terms).x
                 hit = at(terms, 0) * scale * wp.exp(-exponent.x) * (ONE - exponent.y)
-                mass = hit_mass(mean_range(expected, terms), at(terms, 2) * scale, at(terms, 6))
+                mass = mass_within(mean_range(expected, terms), at(terms, 2) * scale, terms)
                 if mass == ONE:
                     p += hit
                 else:

@@ -7,8 +7,12 @@ and beyond SERIES_END one half less the continued fraction of Laplace. Quantiles
 241* (1988). p_short's is 1 - u (1 - exp(-lambda z*)), written as a sum of positive terms, or a series where lambda z*
 is small. All of it is float64 of +, -, *, / and sqrt, so that every device draws the same bits.
 
-``mixture`` = (z_hit, z_short, z_max, z_rand, sigma_hit, sigma_growth, range_bias, lambda_short) of each bin of angles
-of incidence. ``chances`` = for each bin of expected ranges, the cumulative probabilities of the bins of readings.
+Other shapes of hits than the normal (MASS_TABLE) have a table of masses and one of quantiles: cells of equal width in
+log(1 + b), b = u / sqrt 2, and in -log(1 - 2 mass), with the numbers of a polynomial in the share of the cell.
+
+``mixture`` = (z_hit, z_short, z_max, z_rand, sigma_hit, sigma_growth, range_bias, lambda_short, place of the tables) of
+each bin of angles of incidence, and then the tables. ``chances`` = for each bin of expected ranges, the cumulative
+probabilities of the bins of readings.
 """
 
 import functools
@@ -23,7 +27,7 @@ from .philox import random_words
 from .prelude import kernel, precision
 
 READING_STREAM = wp.constant(wp.uint32(1 << 30))
-DRAW_TERMS = wp.constant(8)
+DRAW_TERMS = wp.constant(9)
 # Numbers of the settings by place; DRAW_SEED takes 2.
 DRAW_SEED, DRAW_STEP, DRAW_FIRST, DRAW_PER_SCAN, DRAW_RANGE_MAX, DRAW_TOP, DRAW_MARGIN = (
     wp.constant(place) for place in (0, 2, 3, 4, 5, 6, 7)
@@ -42,6 +46,10 @@ HALF_WORD, FINE, WORD_SHIFT = (
 )
 # 1 / sqrt(2 pi); the largest number below one half.
 NORMAL_PEAK, MOST_HALF = wp.constant(wp.float64(0.3989422804014327)), wp.constant(wp.float64(0.49999999999999994))
+# Tables of shapes; beyond FARTHEST_HIT scales the mass is one half.
+DRAW_CELLS, DRAW_POWERS = wp.constant(1024), wp.constant(8)
+DRAW_PER_LOG, DRAW_LAST = wp.constant(wp.float64(27.0)), wp.constant(wp.float64(1023.0))
+FARTHEST_HIT, SQRT_HALF = wp.constant(wp.float64(1e16)), wp.constant(wp.float64(0.7071067811865476))
 # Where the series of the mass gives way to the continued fraction; where the mass is one half.
 SERIES_END, HALF_FROM = wp.constant(wp.float64(4.0)), wp.constant(wp.float64(9.0))
 SERIES_TERMS, FRACTION_TERMS = wp.constant(48), wp.constant(24)
@@ -91,7 +99,9 @@ def fine_uniform(high: wp.uint32, low: wp.uint32):
 
 @functools.cache
 def functions(flags):
-    """Make the functions of the file; no flag changes them."""
+    """Make the functions of the file for a set of flags."""
+    MASS_TABLE = "MASS_TABLE" in flags
+
 
     # Return the mass of the standard normal between 0 and x >= 0.
     @wp.func
@@ -141,6 +151,35 @@ def functions(flags):
         size = half_quantile(wp.min(wp.abs(mark), MOST_HALF))
         return wp.min(wp.max(wp.where(mark < ZERO, -size, size), -low), high)
 
+    # Return the number of a table that begins at a place, at a logarithmic coordinate.
+    @wp.func
+    def tabulated(at: wp.float64, tables: wp.array(dtype=wp.float64), place: wp.int32):
+        steps = at * DRAW_PER_LOG
+        cell = wp.int32(wp.min(steps, DRAW_LAST))
+        share = steps - wp.float64(cell)
+        first = place + cell * DRAW_POWERS
+        value = tables[first + DRAW_POWERS - 1]
+        for i in range(DRAW_POWERS - 1):
+            value = value * share + tables[first + DRAW_POWERS - 2 - i]
+        return value
+
+    # Return the mass of a hit between its mean and a distance of u scales, from its table.
+    @wp.func
+    def table_mass(u: wp.float64, tables: wp.array(dtype=wp.float64), place: wp.int32):
+        return wp.min(tabulated(log_of(ONE + wp.min(u, FARTHEST_HIT) * SQRT_HALF), tables, place), HALF)
+
+    # Return a deviate of a hit between -low <= 0 and high >= 0, from its tables.
+    @wp.func
+    def table_within(
+        u: wp.float64, low: wp.float64, high: wp.float64, tables: wp.array(dtype=wp.float64), place: wp.int32
+    ):
+        below = table_mass(low, tables, place)
+        above = table_mass(high, tables, place)
+        mark = u * (below + above) - below
+        level = -log_of(ONE - TWO * wp.min(wp.abs(mark), MOST_HALF))
+        size = (exp_of(tabulated(level, tables, place + DRAW_CELLS * DRAW_POWERS)) - ONE) / SQRT_HALF
+        return wp.min(wp.max(wp.where(mark < ZERO, -size, size), -low), high)
+
     # Return a range drawn from p_short, up to the expected one, which is above 0.
     @wp.func
     def short_of(u: wp.float64, expected: wp.float64, decay: wp.float64):
@@ -172,7 +211,12 @@ def functions(flags):
         if mark < first:
             mean = wp.min(wp.max(expected + mixture[p + 6], ZERO), range_max)
             spread = mixture[p + 4] + mixture[p + 5] * expected
-            return wp.max(mean + spread * normal_within(v, mean / spread, (range_max - mean) / spread), ZERO)
+            low = mean / spread
+            high = (range_max - mean) / spread
+            if MASS_TABLE:
+                return wp.max(mean + spread * table_within(v, low, high, mixture, wp.int32(mixture[p + 8])), ZERO)
+            else:
+                return wp.max(mean + spread * normal_within(v, low, high), ZERO)
         if mark < second:
             return short_of(v, expected, mixture[p + 7])
         return wp.where(mark < third, INFINITE, v * range_max)
@@ -210,7 +254,7 @@ def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     types = precision(flags)
     real = types.real
-    made = functions(frozenset())
+    made = functions(flags & {"MASS_TABLE"})
     reading_of, cell_reading_of = made.reading_of, made.cell_reading_of
     range_bin = sensor_table_file.functions(flags).range_bin
     SENSOR_TABLE = "SENSOR_TABLE" in flags

@@ -157,7 +157,7 @@ PARAMETER_CASES = [
         lambda tmp: BeamParameters().replace(sigma=0.1),
         ValueError,
         "BeamParameters: every field must be one of z_hit, z_short, z_max, z_rand, sigma_hit, lambda_short, "
-        "range_bias, sigma_growth, got 'sigma'",
+        "range_bias, sigma_growth, hit, hit_dof, got 'sigma'",
     ),
     (
         "beam-no-mapping",

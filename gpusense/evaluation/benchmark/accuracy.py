@@ -21,6 +21,7 @@ from gpusense.localization.weights import normalize_weights
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
+from gpusense.models.scan.mixture import mixture_of
 from gpusense.reference.mixture import log_density
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.scanner import Reading, Scanner, classify
@@ -301,10 +302,7 @@ def score_ranges(
     kinds, p, limit = classify(readings, scanner), parameters, scanner.range_max
     hit = np.flatnonzero(kinds == Reading.HIT)
     log_p = np.full(len(ranges), np.count_nonzero(kinds == Reading.MAX) * math.log(p.z_max) if p.z_max > 0 else 0.0)
-    scale = p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
-    shape = (0.5 / p.sigma_hit**2, math.sqrt(0.5) / p.sigma_hit)
-    terms = np.array([scale, *shape, p.z_short, p.lambda_short, p.z_rand / limit, limit, 0.0, 0.0, 0.0])
-    flags = frozenset({"LINEAR", "HIT", "SHORT", "RAND"})
+    flags, terms = mixture_of((p,), limit, np.dtype(np.float64), specialize=True, max_depends=False)
     for begin in range(0, len(ranges), _PIECE):
         expected = np.clip(np.asarray(ranges[begin : begin + _PIECE, hit], np.float64), 0, limit)
         z = np.broadcast_to(readings[hit], expected.shape)

@@ -11,7 +11,7 @@ _POINTS = ("real4 point [points]", "int start [scans + 1]")
 KERNELS: dict[str, Kernel] = {
     "field_gradient": kernel(
         "field_gradient", "particle", "real table [(window.rows + 4) * (window.cols + 4)]", *PLACED,
-        "real2 point [readings]", "real2 point_low [readings]", "real terms [6]", "int start [scans + 1]",
+        "real2 point [readings]", "real2 point_low [readings]", "real terms [8]", "int start [scans + 1]",
         "real constant_terms [scans]", f"out real gradient [{GRADIENT_NUMBERS} * particles]", WINDOW,
         "int particles", "int readings", "real guard", "real mount_x", "real mount_y", "real resolution",
         "Score score", "ScanBatch batch", wide=True,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gpusense.interface.constants import MIXTURE_TERMS
+from gpusense.interface.constants import DRAW_TERMS, MIXTURE_TERMS
 from gpusense.interface.signatures.rows import PLACED, POSES, WINDOW, Kernel, kernel
 
 # Normals of the map's walls and of a ring of cells around it; not read without INCIDENCE.
@@ -17,7 +17,7 @@ _GIVEN = (
     "out real4 pose_low [particles]", "out int pose_status [2]",
 )  # fmt: skip
 _FRAME = ("Frame frame", WINDOW, "int particles")
-_POINTS = ("real2 point [readings]", "real2 point_low [readings]", "real terms [6]")
+_POINTS = ("real2 point [readings]", "real2 point_low [readings]", "real terms [8]")
 _TERMS = (
     f"real terms [{MIXTURE_TERMS} * tables.incidence_bins]", "real edges [tables.incidence_bins]",
     "real sensor [(tables.cells + 1) * (tables.cells + 1)]",
@@ -60,8 +60,9 @@ KERNELS: dict[str, Kernel] = {
         "out real incidence [particles * rays]", WINDOW, "int particles", "int rays", "Cone cone", *_CASTING,
     ),
     "draw_readings": kernel(
-        "sampling", "ray particle", "real incidence [particles * rays]", "double mixture [8 * tables.incidence_bins]",
-        "real edges [tables.incidence_bins]", "double chances [(tables.cells + 1) * (tables.cells + 1)]",
+        "sampling", "ray particle", "real incidence [particles * rays]",
+        f"double mixture [{DRAW_TERMS} * tables.incidence_bins]", "real edges [tables.incidence_bins]",
+        "double chances [(tables.cells + 1) * (tables.cells + 1)]",
         "double settings [9]", "out real ranges [particles * rays]", "int particles", "int rays",
         "MixtureTables tables", "RangeScale scale",
     ),

@@ -19,7 +19,7 @@ from gpusense.learning.beam.blocks import check_blocks
 from gpusense.learning.beam.book import textbook_em
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.em import Climb, Watch, climb_em
-from gpusense.learning.beam.growth import fit_growth
+from gpusense.learning.beam.growth import fit_jointly
 from gpusense.learning.beam.optimum import Search
 from gpusense.learning.beam.options import Callback, Options, check_options, make_bounds, open_device, start_of
 from gpusense.learning.beam.pairs import Pairs, make_pairs
@@ -28,6 +28,7 @@ from gpusense.learning.beam.problem import NO_PRIOR, Prior, Problem, Value
 from gpusense.learning.beam.report import report
 from gpusense.learning.beam.result import BeamFit
 from gpusense.learning.beam.searches import climb_genetic, climb_gradient, climb_hill
+from gpusense.world.hit_shapes import SHAPES, HitName
 from gpusense.world.parameters import BeamParameters
 
 
@@ -47,6 +48,7 @@ def fit_beam_parameters(
     seed: int = 0,
     range_bias: bool = False,
     sigma_growth: bool = False,
+    hit: HitName = "normal",
     responsibilities: bool = False,
     blocks: ArrayLike | None = None,
     sigma_bounds: tuple[float, float] | None = None,
@@ -79,6 +81,8 @@ def fit_beam_parameters(
             mean at z* + b, clamped to [0, range_max].
         sigma_growth: Whether the deviation of correct ranges also grows with range: it is sigma_hit + sigma_growth z*.
             All parameters are then fitted together on the host, from the fit without growth.
+        hit: Shape of correct ranges: ``"normal"``, or ``"student"``, a Student t whose degrees of freedom ``hit_dof``
+            are also fitted. All parameters are then fitted together on the host, from the fit with a normal.
         responsibilities: Whether to also return each reading's probabilities of the four causes.
         blocks: Integer label of each reading's block, of the same shape, or None. Readings of different blocks are
             independent; those of one block (a scan, or several neighbouring ones) need not be. Standard errors are
@@ -115,12 +119,19 @@ def fit_beam_parameters(
     if initial is not None and not isinstance(initial, BeamParameters):
         raise TypeError(f"initial: must be BeamParameters, got {checks.show(initial)}")
     checks.boolean("sigma_growth", sigma_growth)
+    checks.choice("hit", hit, tuple(SHAPES))
     if sigma_growth and method == "em-book":
         raise ValueError("sigma_growth: must be False with method 'em-book', which has no growth, got True")
+    if hit != "normal" and method == "em-book":
+        raise ValueError(f"hit: must be 'normal' with method 'em-book', as in the book, got {hit!r}")
     device = DeviceSums(*open_device(backend, precision), pairs)
     start = first_guess(pairs, bounds) if initial is None else start_of(initial, pairs, bounds)
     fit = fit_pairs(device, pairs, bounds, start, options, chosen=initial is not None)
-    return fit_growth(fit, pairs, bounds, options.tolerance, options.responsibilities) if sigma_growth else fit
+    if not sigma_growth and hit == "normal":
+        return fit
+    return fit_jointly(
+        fit, pairs, bounds, options.tolerance, options.responsibilities, growth=bool(sigma_growth), hit=hit
+    )
 
 
 def fit_pairs(

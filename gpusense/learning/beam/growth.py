@@ -1,8 +1,9 @@
-"""Fit the growth of the deviation with range, together with all other parameters, on the host.
+"""Fit the growth of the deviation with range, or another shape of hits, together with all other parameters.
 
-A correct range has the deviation ``sigma_hit + sigma_growth z*``. The device's sums have one deviation, so that this
-search computes every pair's log p and gradient in NumPy, in float64: Newton steps within bounds from the fit without
-growth, with shares of its deviation turned into growth.
+A correct range has the scale ``sigma_hit + sigma_growth z*``. The device's sums have one deviation and normal hits, so
+that this search computes every pair's log p and gradient on the host in NumPy, in float64: Newton steps within bounds
+from the normal fit without growth, with shares of its deviation turned into growth, and with the starts of the shape.
+No step lowers the likelihood.
 """
 
 from __future__ import annotations
@@ -21,19 +22,26 @@ from gpusense.learning.point.densities import truncated
 from gpusense.learning.point.problem import Problem, mix, of_weight
 from gpusense.learning.point.report import report
 from gpusense.learning.point.search import Climb, climb, maximize
+from gpusense.world.hit_shapes import SHAPES, HitName, HitShape
+from gpusense.world.hit_tables import TabulatedHit
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.scanner import Reading
 
 # Shares of the deviation at the mean expected range that starts turn into growth; iterations of a search.
 _SHARES, _ITERATIONS = (0.02, 0.3, 0.7, 0.95), 200
+# Readings from which on a table of masses is faster than the formula.
+_MANY = 2000
+# Share of a coordinate of the shape by which its derivative is taken.
+_SHAPE_STEP = 1e-4
 _TOP, _RAND, _SHORT, _SIGMA, _GROWTH, _RATE, _BIAS = range(7)
 
 
 @dataclass(frozen=True, eq=False)
 class _Growing(Problem):
-    """Likelihood by (z_max, share of rand, share of short in the rest, log sigma, growth, log rate[, bias]).
+    """Likelihood by (z_max, share of rand, share of short in the rest, log sigma, growth, log rate[, bias][, shape]).
 
-    The first three split the weights: z_rand is the share of rand times 1 - z_max, and so on.
+    The first three split the weights: z_rand is the share of rand times 1 - z_max, and so on. The last ones are the
+    coordinates of the shape.
     """
 
     per_reading: ClassVar[tuple[str, ...]] = ("reading", "expected", "none")
@@ -45,17 +53,24 @@ class _Growing(Problem):
     start: BeamParameters
     fit_bias: bool
     reach: float
+    kind: type[HitShape]
+    fit_growth: bool
 
     def bounds(self) -> tuple[Floats, Floats]:
         sigma, rate = (tuple(np.log(pair)) for pair in (self.limits.sigma, self.limits.rate))
-        pairs = [(0.0, 1.0)] * 3 + [sigma, (0.0, 1.0), rate] + [(-self.limits.bias, self.limits.bias)] * self.fit_bias
+        growth = (0.0, 1.0 if self.fit_growth else 0.0)
+        pairs = [(0.0, 1.0)] * 3 + [sigma, growth, rate] + [(-self.limits.bias, self.limits.bias)] * self.fit_bias
+        pairs += self.kind.limits
         low, high = np.array(pairs).T
         return low, high
 
     def scales(self, theta: Floats) -> Floats:
         sigma = math.exp(theta[_SIGMA]) + theta[_GROWTH] * self.reach
         shares = [of_weight(each) for each in theta[:_SIGMA]]
-        return np.array([*shares, 1.0, sigma / self.reach, 1.0, *([sigma] if self.fit_bias else [])])
+        shape = [
+            max(0.3 * low, min(at, 0.3)) for at, (low, _) in zip(self._shape_at(theta), self.kind.limits, strict=True)
+        ]
+        return np.array([*shares, 1.0, sigma / self.reach, 1.0, *([sigma] if self.fit_bias else []), *shape])
 
     def starts(self) -> list[Floats]:
         p = self.start
@@ -65,9 +80,17 @@ class _Growing(Problem):
         bias = [p.range_bias] if self.fit_bias else []
         rate = math.log(max(p.lambda_short, self.limits.rate[0]))
         return [
-            np.array([p.z_max, rand, short, math.log((1 - f) * p.sigma_hit), f * p.sigma_hit / self.reach, rate, *bias])
-            for f in _SHARES
-        ]
+            np.array([
+                p.z_max, rand, short, math.log((1 - f) * factor * p.sigma_hit), f * factor * p.sigma_hit / self.reach,
+                rate, *bias, *shape,
+            ])
+            for *shape, factor in self.kind.starts
+            for f in (_SHARES if self.fit_growth else (0.0,))
+        ]  # fmt: skip
+
+    def _shape_at(self, theta: Floats) -> Floats:
+        """Return the coordinates of the shape."""
+        return theta[_BIAS + self.fit_bias :]
 
     def parts(self, theta: Floats) -> tuple[list[tuple[float, Floats]], tuple[Floats, Floats, Floats], Floats, Floats]:
         """Return weights and densities of hit, short and rand, and the derivatives by the shapes."""
@@ -76,7 +99,7 @@ class _Growing(Problem):
         rate = math.exp(theta[_RATE])
         moved = expected + (theta[_BIAS] if self.fit_bias else 0.0)
         mean = np.clip(moved, 0, self.range_max)
-        hit = truncated(z - mean, mean, self.range_max, sigma, None)
+        hit = truncated(z - mean, mean, self.range_max, sigma, self._shape_of(self._shape_at(theta)))
         x = np.clip(rate * expected, 1e-12, 700.0)
         log_short = np.where(z <= expected, theta[_RATE] - rate * z - np.log(-np.expm1(-x)), -np.inf)
         by_rate = 1 - x / np.expm1(x) - rate * z
@@ -98,40 +121,99 @@ class _Growing(Problem):
             of_hit * by_sigma * self.expected / sigma,
             of_short * by_rate,
             *([of_hit * by_mean * free] if self.fit_bias else []),
+            *(of_hit * each for each in self._by_shape(theta)),
         ]
         gradient = np.where(self.none[:, None], 0.0, np.stack(columns, axis=1))
         gradient[self.none, _TOP] = 1 / max(top, 1e-300)
         with np.errstate(divide="ignore"):
             return np.where(self.none, np.log(top), log_p + np.log1p(-top)), gradient
 
+    def _by_shape(self, theta: Floats) -> list[Floats]:
+        """Return the derivatives of the log density of hits by the coordinates of the shape, as differences."""
+        columns: list[Floats] = []
+        if not self.kind.limits:
+            return columns
+        sigma, mean, u = self._hits_at(theta)
+        for place, (low, high) in enumerate(self.kind.limits):
+            at = self._shape_at(theta)
+            step = _SHAPE_STEP * min(at[place], 1.0)
+            ends = [np.where(np.arange(len(at)) == place, np.clip(at + each, low, high), at) for each in (-step, step)]
+            before, after = (
+                shape.log_pdf(u)
+                - np.log(shape.half_mass(mean / sigma) + shape.half_mass((self.range_max - mean) / sigma))
+                for shape in map(self._shape_of, ends)
+            )
+            columns.append((after - before) / (ends[1][place] - ends[0][place]))
+        return columns
+
+    def _hits_at(self, theta: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the scale and the mean of hits, and the distances of readings from it in scales."""
+        sigma = math.exp(theta[_SIGMA]) + theta[_GROWTH] * self.expected
+        mean = np.clip(self.expected + (theta[_BIAS] if self.fit_bias else 0.0), 0, self.range_max)
+        return sigma, mean, (self.reading - mean) / sigma
+
+    def _shape_of(self, coordinates: Floats) -> HitShape:
+        """Return the shape at coordinates, with masses from a table where readings are many."""
+        shape = self.kind.at(coordinates)
+        return TabulatedHit.of_shape(shape) if shape.tabulated and len(self.reading) > _MANY else shape
+
     def values(self, theta: Floats) -> dict[str, float]:
         rest, rand, short = 1 - float(theta[_TOP]), float(theta[_RAND]), float(theta[_SHORT])
         values = {
             "z_hit": rest * (1 - rand) * (1 - short), "z_short": rest * (1 - rand) * short, "z_max": float(theta[_TOP]),
             "z_rand": rest * rand, "sigma_hit": math.exp(theta[_SIGMA]), "lambda_short": math.exp(theta[_RATE]),
-            "sigma_growth": float(theta[_GROWTH]),
         }  # fmt: skip
-        return values | ({"range_bias": float(theta[_BIAS])} if self.fit_bias else {})
+        values |= {"sigma_growth": float(theta[_GROWTH])} if self.fit_growth else {}
+        values |= {"range_bias": float(theta[_BIAS])} if self.fit_bias else {}
+        return values | self.kind.at(self._shape_at(theta)).values()
+
+    def parameters(self, theta: Floats, hit: HitName) -> BeamParameters:
+        """Return the parameters of the model."""
+        return BeamParameters(**self.values(theta), hit=hit)
 
 
-def fit_growth(fit: BeamFit, pairs: Pairs, bounds: Bounds, tolerance: float, responsibilities: bool) -> BeamFit:
-    """Fit the parameters and the growth of the deviation, from a fit without growth."""
+def fit_jointly(
+    fit: BeamFit,
+    pairs: Pairs,
+    bounds: Bounds,
+    tolerance: float,
+    responsibilities: bool,
+    *,
+    growth: bool,
+    hit: HitName,
+) -> BeamFit:
+    """Fit the growth of the deviation or the shape of hits as well, from a normal fit without growth.
+
+    Args:
+        fit: The fit.
+        pairs: Its readings.
+        bounds: Bounds of the shapes.
+        tolerance: The search has converged once it expects to gain less than this [nats].
+        responsibilities: Whether to return each reading's probabilities of the causes.
+        growth: Whether to fit the growth.
+        hit: Name of the shape.
+    """
+    new = ("sigma_growth",) * growth + SHAPES[hit].fitted
     if not pairs.hits or not pairs.expected.any():
-        return replace(fit, status=f"{fit.status}; sigma_growth: no range determines it",
-                       held=fit.held | {"sigma_growth": "no range determines it"})  # fmt: skip
+        reason = "no range determines it"
+        return replace(
+            fit, parameters=fit.parameters.replace(hit=hit), status=f"{fit.status}; {', '.join(new)}: {reason}",
+            held=fit.held | dict.fromkeys(new, reason),
+        )  # fmt: skip
     known = pairs.kinds != Reading.MISSING
     reading, expected = np.zeros(len(known)), np.full(len(known), 0.5 * pairs.range_max)
     reading[pairs.places], expected[pairs.places] = pairs.reading, pairs.expected
     none = pairs.kinds[known] == Reading.MAX
     reach = float(np.mean(pairs.expected, dtype=np.float64))
     problem = _Growing(
-        reading[known], expected[known], none, pairs.range_max, bounds, fit.parameters, fit.bias_fitted, reach
-    )
+        reading[known], expected[known], none, pairs.range_max, bounds, fit.parameters, fit.bias_fitted, reach,
+        SHAPES[hit], growth,
+    )  # fmt: skip
     end = maximize(problem, _ITERATIONS, tolerance)
     blocks = None if pairs.block is None else np.unique(pairs.block[known], return_inverse=True)[1].ravel()
     values = problem.values(end.theta)
-    inner = report(problem, end, BeamParameters(**values), blocks, fit.missing)
-    names = (*fit.standard_errors, "sigma_growth")
+    inner = report(problem, end, problem.parameters(end.theta, hit), blocks, fit.missing)
+    names = (*fit.standard_errors, *new)
     if fit.bias_fitted:
         bias, error = values["range_bias"], inner.standard_errors["range_bias"]
     else:
@@ -151,7 +233,7 @@ def fit_growth(fit: BeamFit, pairs: Pairs, bounds: Bounds, tolerance: float, res
 def _offset(problem: _Growing, end: Climb, tolerance: float, blocks: NDArray[np.int64] | None) -> tuple[float, float]:
     """Return the offset that a fit with it would have, and its standard error; NaN if its search did not converge."""
     joint = replace(problem, fit_bias=True)
-    best = climb(joint, np.append(end.theta, 0.0), _ITERATIONS, tolerance)
+    best = climb(joint, np.insert(end.theta, _BIAS, 0.0), _ITERATIONS, tolerance)
     if not best.converged:
         return math.nan, math.nan
     errors = report(joint, best, problem.start, blocks, 0).standard_errors

@@ -117,8 +117,11 @@ def start_of(initial: BeamParameters, pairs: Pairs, bounds: Bounds) -> Point:
     """Make the start of a search from a user's parameters, without the causes that no reading can have.
 
     Raises:
-        ValueError: The remaining causes do not explain the readings, or sigma_hit grows with range.
+        ValueError: The remaining causes do not explain the readings, sigma_hit grows with range, or hits are no
+            normal.
     """
+    if initial.hit != "normal":
+        raise ValueError(f"initial: hit must be 'normal', from which other shapes start, got {checks.show(initial)}")
     if initial.sigma_growth:
         raise ValueError(f"initial: sigma_growth must be 0, since it is not learned, got {checks.show(initial)}")
     point = bounds.hold(Point.of(initial))

@@ -100,7 +100,10 @@ class BeamFit:
         }
 
     def __repr__(self) -> str:
-        values = ", ".join(f"{name}={value:.4g}" for name, value in self.parameters.to_dict().items())
+        values = ", ".join(
+            f"{name}={value!r}" if isinstance(value, str) else f"{name}={value:.4g}"
+            for name, value in self.parameters.to_dict().items()
+        )
         return f"BeamFit({values}, converged={self.converged})"
 
     def _repr_html_(self) -> str:

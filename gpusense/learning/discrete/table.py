@@ -68,6 +68,8 @@ class DiscreteBeamModel(SensorTable):
             if self.causes.range_bias or self.causes.sigma_growth:
                 rule = "range_bias and sigma_growth must be 0 in a table"
                 raise ValueError(f"causes: {rule}, got {checks.show(self.causes)}")
+            if self.causes.hit != "normal":
+                raise ValueError(f"causes: hit must be 'normal' in a table, got {checks.show(self.causes)}")
         object.__setattr__(self, "range_max", checks.real("range_max", self.range_max, above=0))
         object.__setattr__(self, "bins", checks.integer("bins", self.bins, low=1, high=MOST_BINS))
         if self.fit is not None and not isinstance(self.fit, DiscreteFit):

@@ -16,6 +16,7 @@ from gpusense.learning.point.problem import Floats, Integers, Problem, check_lab
 from gpusense.learning.point.report import report
 from gpusense.learning.point.result import PointFit
 from gpusense.learning.point.search import maximize
+from gpusense.world.hit_shapes import NORMAL, StudentHit
 from gpusense.world.sensor_parameters import MOST_DEGREES, BeaconParameters
 
 BiasKind = Literal["none", "common", "each"]
@@ -73,11 +74,13 @@ class _Beacons(Problem):
         residual = (self.ranges - self.distances) - bias
         rand = theta[1]
         share = theta[3] if self.kind == "mixture" else 0.0
-        first = truncated(residual, mean, self.range_max, math.exp(theta[0]), self.nu)
+        first = truncated(
+            residual, mean, self.range_max, math.exp(theta[0]), NORMAL if self.nu is None else StudentHit(self.nu)
+        )
         parts = [((1 - rand) * (1 - share), first[0]), (rand, np.full(len(mean), -math.log(self.range_max)))]
         hits = [first]
         if self.kind == "mixture":
-            hits.append(truncated(residual, mean, self.range_max, math.exp(theta[2]), None))
+            hits.append(truncated(residual, mean, self.range_max, math.exp(theta[2]), NORMAL))
             parts.append(((1 - rand) * share, hits[1][0]))
         log_p, shares, ratios = mix(parts)
         gradient = np.zeros((len(mean), len(theta)))

@@ -7,6 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense.world.hit_shapes import HitShape
+
 Floats = NDArray[np.float64]
 
 _LOG_ROOT_TWO_PI = 0.5 * math.log(2 * math.pi)
@@ -15,35 +17,25 @@ _WIDEST_SUM, _WRAPS, _WAVES = 1.5, 3, 6
 
 
 def truncated(
-    residual: Floats, mean: Floats, range_max: float, scale: float | Floats, nu: int | None
+    residual: Floats, mean: Floats, range_max: float, scale: float | Floats, shape: HitShape
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the log density of a normal, or of a Student t, truncated to [0, range_max], and its derivatives.
+    """Return the log density of a hit, truncated to [0, range_max], and its derivatives.
 
     Args:
         residual: (n,) range minus mean [m].
         mean: (n,) mean before it is clamped to [0, range_max] [m].
         range_max: Longest range [m].
         scale: Standard deviation or scale, one or (n,) [m].
-        nu: Degrees of freedom of a t, or None for a normal.
+        shape: Shape of the density.
 
     Returns:
         (n,) log density, its derivatives by log scale and by the mean [1/m].
     """
-    from scipy.special import ndtr, stdtr
-
     near = np.clip(mean, 0, range_max)
     u, x_0, x_1 = residual / scale, near / scale, (range_max - near) / scale
-    if nu is None:
-        log_peak, log_shape, pull = -_LOG_ROOT_TWO_PI, -0.5 * u * u, u
-        mass = ndtr(x_1) - ndtr(-x_0)
-        edges = [np.exp(-0.5 * x * x - _LOG_ROOT_TWO_PI) for x in (x_0, x_1)]
-    else:
-        power = (nu + 1) / 2
-        log_peak = math.lgamma(power) - math.lgamma(nu / 2) - 0.5 * math.log(nu * math.pi)
-        log_shape, pull = -power * np.log1p(u * u / nu), (nu + 1) * u / (nu + u * u)
-        mass = stdtr(nu, x_1) - stdtr(nu, -x_0)
-        edges = [np.exp(log_peak - power * np.log1p(x * x / nu)) for x in (x_0, x_1)]
-    log_p = log_peak - np.log(scale) + log_shape - np.log(mass)
+    pull, mass = shape.slope(u), shape.half_mass(x_0) + shape.half_mass(x_1)
+    edges = [np.exp(shape.log_pdf(x)) for x in (x_0, x_1)]
+    log_p = shape.log_pdf(u) - np.log(scale) - np.log(mass)
     by_scale = u * pull - 1 + (x_0 * edges[0] + x_1 * edges[1]) / mass
     by_mean = (pull + np.where(near == mean, (edges[1] - edges[0]) / mass, 0)) / scale
     return log_p, by_scale, by_mean

@@ -100,6 +100,8 @@ def _kept_of_mixture(pipeline: BeamPipeline, mixtures: Sequence[BeamParameters])
         kept.append(Note("log-domain sum", "z_rand does not bound the mixture from below"))
     if "SHARP" in flags:
         kept.append(Note("exponents in two parts", f"the hit density's peak is {peak:.4g} / m, above {HIGH_PEAK:g}"))
+    if (hit := mixtures[0].hit) != "normal":
+        kept.append(Note("shape of hits", f"hit = {hit!r}: a logarithm more, and masses from a table"))
     for flag, name, _ in _MOMENTS:
         if flag in flags:
             values = " or ".join(f"{value:g}" for value in sorted({getattr(p, name) for p in mixtures}))

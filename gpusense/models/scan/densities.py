@@ -10,11 +10,14 @@ The ``naive_`` functions are the textbook's formulas as printed. They serve comp
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import erf, erfcx
+
+from gpusense.world.hit_shapes import NORMAL, SHAPES, HitShape, NormalHit
 
 Floats = NDArray[np.floating]
 
@@ -22,10 +25,16 @@ _ROOT_HALF = math.sqrt(0.5)
 _ROOT_2PI = math.sqrt(2 * math.pi)
 _ROOT_HALF_PI = math.sqrt(math.pi / 2)
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
+# Panels of the mass of another shape around z* outside [0, Z]; each is twice as long as the one before.
+_PANELS = 60
 
 
-def log_hit(z: ArrayLike, expected: ArrayLike, sigma: ArrayLike, range_max: ArrayLike) -> Any:
-    """Return the log density of a normal around z*, truncated to [0, range_max] (book equations 6.4 to 6.6).
+def log_hit(
+    z: ArrayLike, expected: ArrayLike, sigma: ArrayLike, range_max: ArrayLike, *, shape: HitShape = NORMAL
+) -> Any:
+    """Return the log density of a hit around z*, truncated to [0, range_max] (book equations 6.4 to 6.6).
+
+    For a normal:
 
     For z* in [0, Z] the mass is ``(erf(z* / (sigma sqrt 2)) + erf((Z - z*) / (sigma sqrt 2))) / 2``, a sum of positive
     terms: nothing cancels, however large sigma is. Then ``-u^2 / 2 - log(sigma sqrt(2 pi) mass)``, u = (z - z*) /
@@ -37,19 +46,26 @@ def log_hit(z: ArrayLike, expected: ArrayLike, sigma: ArrayLike, range_max: Arra
     ``sqrt(pi / 2) (erfcx(a / sqrt 2) - erfcx((a + w) / sqrt 2) exp(-w (a + w / 2)))``, a difference that loses at most
     a bit; below, where it would cancel, ten Gauss-Legendre nodes are exact to rounding. z* > Z is the mirror image.
 
+    Other shapes have the mass ``H(z* / sigma) + H((Z - z*) / sigma)`` within [0, Z], with H the mass between mean and
+    distance. Around z* outside, their mass over the density at the nearer end is a sum of Gauss-Legendre panels that
+    grow with the distance from this end.
+
     Source: Johnson, Kotz and Balakrishnan, *Continuous Univariate Distributions* 1 (1994), section 13.10.1, for the
     distribution; Cody (1969) for erfc and its scaled form erfcx(x) = exp(x^2) erfc(x).
 
     Args:
         z: Readings [m].
         expected: Expected ranges z*, any real numbers [m].
-        sigma: Standard deviations, > 0 [m].
+        sigma: Standard deviations, or scales of another shape, > 0 [m].
         range_max: Longest ranges Z, > 0 [m].
+        shape: The shape.
 
     Returns:
         Natural logarithms of densities [1/m] in the broadcast shape; -inf outside [0, Z]. NaN for NaN arguments.
     """
     z, expected, sigma, range_max = _arrays(z, expected, sigma, range_max)
+    if not isinstance(shape, NormalHit):
+        return _scalar(_log_other_hit(z, expected, sigma, range_max, shape))
     real = z.dtype.type
     with np.errstate(all="ignore"):
         scale = real(_ROOT_HALF) / sigma
@@ -112,6 +128,8 @@ def log_mixture(
     range_max: ArrayLike,
     range_bias: ArrayLike = 0.0,
     sigma_growth: ArrayLike = 0.0,
+    hit: Any = "normal",
+    **shape: Any,
 ) -> Any:
     """Return log p(z | z*) of the mixture (book equation 6.12); ``**BeamParameters(...).to_dict()`` fits.
 
@@ -131,18 +149,21 @@ def log_mixture(
         range_max: Longest range Z [m].
         range_bias: Offset of a correct range [m]; its mean is then within [0, Z].
         sigma_growth: Growth of the standard deviation per metre of z*.
+        hit: Name of the shape of correct ranges.
+        shape: Further parameters of this shape, such as ``hit_dof``.
 
     Returns:
         Natural logarithms: of a density [1/m] for z in [0, Z), of the probability z_max for z >= Z, -inf for z < 0.
     """
-    z, expected, hit, short, top, rand, sigma, rate, range_max, bias, growth = _arrays(
+    density = SHAPES[hit].of(SimpleNamespace(**shape))
+    z, expected, correct, short, top, rand, sigma, rate, range_max, bias, growth = _arrays(
         z, expected, z_hit, z_short, z_max, z_rand, sigma_hit, lambda_short, range_max, range_bias, sigma_growth
     )
     mean, sigma = _moments(expected, bias, sigma, growth, range_max)
     with np.errstate(divide="ignore"):
         parts = np.stack(
             [
-                np.log(hit) + np.where(hit > 0, log_hit(z, mean, sigma, range_max), 0),
+                np.log(correct) + np.where(correct > 0, log_hit(z, mean, sigma, range_max, shape=density), 0),
                 np.log(short) + np.where(short > 0, log_short(z, np.minimum(expected, range_max), rate), 0),
                 np.log(rand) + np.where(rand > 0, log_rand(z, range_max), 0),
             ]
@@ -203,6 +224,42 @@ def _moments(expected: Floats, bias: Floats, sigma: Floats, growth: Floats, rang
     """Return mean and standard deviation of a correct range; without an offset the mean may be any number."""
     mean = np.where(bias == 0, expected, np.clip(expected + bias, 0, range_max))
     return mean, sigma + growth * np.maximum(expected, 0)
+
+
+def _log_other_hit(z: Floats, expected: Floats, sigma: Floats, range_max: Floats, shape: HitShape) -> Floats:
+    """Return the log density of a hit that is no normal; see log_hit."""
+    real = z.dtype.type
+    with np.errstate(all="ignore"):
+        u = np.abs(z - expected) / sigma
+        near, far = np.clip(expected, 0, range_max) / sigma, np.clip(range_max - expected, 0, range_max) / sigma
+        mass = shape.half_mass(near) + shape.half_mass(far)
+        log_p = np.asarray(-shape.exponent(u) - np.log(sigma * real(shape.width) * mass))
+    outside = (expected < 0) | (expected > range_max)
+    if outside.any():
+        beyond = np.where(expected < 0, -expected, expected - range_max)[outside] / sigma[outside]
+        width = range_max[outside] / sigma[outside]
+        # Numerator and normaliser share the density at the nearer end.
+        fall = shape.exponent(u[outside]) - shape.exponent(beyond)
+        log_p[outside] = -fall - np.log(sigma[outside] * _mass_beyond(beyond, width, shape))
+    return np.where(np.isnan(z + expected), real(np.nan), np.where((z < 0) | (z > range_max), real(-np.inf), log_p))
+
+
+def _mass_beyond(begin: Floats, width: Floats, shape: HitShape) -> Floats:
+    """Return the integral of exp(E(begin) - E(u)) from ``begin`` >= 0 over a width > 0."""
+    real = begin.dtype.type
+    # The first panel is as long as the density takes to fall, or to bend at its top.
+    first = np.minimum(1 / (1 + shape.slope(begin)), width)
+    total, start = np.zeros_like(begin), np.zeros_like(begin)
+    base = shape.exponent(begin)
+    for panel in range(_PANELS):
+        end = np.minimum(first * real(2.0**panel), width)
+        for node, weight in zip(_NODES, _WEIGHTS, strict=True):
+            at = begin + start + (end - start) * real(0.5 * (1 + node))
+            total = total + real(0.5 * weight) * (end - start) * np.exp(base - shape.exponent(at))
+        start = end
+        if (start >= width).all():
+            break
+    return total
 
 
 def _log_tail(u: Floats, a: Floats, w: Floats, sigma: Floats) -> Floats:

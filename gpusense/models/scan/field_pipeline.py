@@ -94,7 +94,7 @@ class FieldPipeline(ScanPipeline):
             LOG_TABLE=self.log_table, CUBES=cubes, HIT=p.z_hit > 0 or everything, LINEAR=density.is_linear(self.real),
             SHARP=not self.log_table and (density.is_sharp or everything),
         )  # fmt: skip
-        return flags, density.terms(self.real)
+        return flags | density.flags, density.terms(self.real)
 
     # ---- readings
 

@@ -11,6 +11,8 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.interface.flags import flags_if
 from gpusense.interface.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
+from gpusense.world.hit_shapes import shape_of
+from gpusense.world.hit_tables import mass_tables
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.sensor_table import SensorTable
 
@@ -105,13 +107,27 @@ def mixture_of(
         for p, peak in zip(kinds, peaks, strict=True)
     )
     ends = [_last_range(p, range_max, real, linear) for p in kinds]
+    shape = _common_flags(kinds)
     flags = flags_if(
         HIT=hit or everything, SHORT=short or everything, RAND=rand or everything,
         BIAS=everything or any(p.range_bias for p in kinds), GROWTH=everything or any(p.sigma_growth for p in kinds),
         SINGLE=specialize and hit + short + rand == 1, SHARP=max(peaks) > HIGH_PEAK or everything, LINEAR=linear,
         STOPS=specialize and len(ends) == 1 and ends[0] is not None,
     )  # fmt: skip
-    return flags, np.concatenate([_terms(p, range_max, real, linear, end) for p, end in zip(kinds, ends, strict=True)])
+    terms = [_terms(p, range_max, real, linear, end) for p, end in zip(kinds, ends, strict=True)]
+    return flags | shape, np.concatenate([*terms, *mass_tables([shape_of(p) for p in kinds], terms, real)])
+
+
+def _common_flags(kinds: Sequence[BeamParameters]) -> frozenset[str]:
+    """Return the flags of the shape of hits, which all bins of angles of incidence share.
+
+    Raises:
+        ValueError: bins differ in it.
+    """
+    shapes = {p.hit: shape_of(p).flags for p in kinds}
+    if len(shapes) > 1:
+        raise ValueError(f"hit: must be the same for all angles of incidence, got {sorted(shapes)}")
+    return next(iter(shapes.values()))
 
 
 def peer_mixture(
@@ -152,7 +168,7 @@ def tabulated(p: BeamParameters, width: float, range_max: float, real: np.dtype)
 
 def hit_peak(p: BeamParameters) -> float:
     """Return the peak of the hit density times its weight [1/m]."""
-    return p.z_hit / (p.sigma_hit * math.sqrt(2 * math.pi))
+    return shape_of(p).peak(p.z_hit, p.sigma_hit)
 
 
 def _shape(p: BeamParameters) -> tuple[float, float]:
@@ -165,10 +181,12 @@ def _terms(
     if linear:
         head = (hit_peak(p), p.z_short, p.z_rand / range_max)
     else:
-        log_scale = log_weight(p.z_hit) - math.log(p.sigma_hit) - 0.5 * math.log(2 * math.pi)
+        log_scale = log_weight(p.z_hit) - math.log(p.sigma_hit) - shape_of(p).log_width
         head = (log_scale, log_weight(p.z_short), log_weight(p.z_rand) - math.log(range_max))
     terms = [head[0], *_shape(p), head[1], p.lambda_short, head[2], range_max, log_weight(p.z_max)]
-    return np.concatenate([rounded_terms(terms, real), _moments(p, real), np.array(end or (0, 0, 0), real)])
+    # The last number is the place of the table of masses.
+    rest = [*(end or (0, 0, 0)), *shape_of(p).numbers, 0]
+    return np.concatenate([rounded_terms(terms, real), _moments(p, real), np.array(rest, real)])
 
 
 def _last_range(p: BeamParameters, range_max: float, real: np.dtype, linear: bool) -> tuple[float, float, float] | None:
@@ -189,9 +207,9 @@ def _last_range(p: BeamParameters, range_max: float, real: np.dtype, linear: boo
     offset, slope = 0.0, 1.0
     if p.z_hit:
         widest = p.sigma_hit + p.sigma_growth * range_max
-        mass = 0.5 * math.erf(range_max * math.sqrt(0.5) / widest)
+        mass = float(shape_of(p).half_mass(np.array([range_max / widest]))[0])
         excess = math.log(hit_peak(p)) - math.log(mass * rand) + (digits + 3) * math.log(2)
-        u = math.sqrt(max(2 * excess, 0.0))
+        u = shape_of(p).reach(max(excess, 0.0))
         if u * p.sigma_growth >= 0.5:
             return None
         slope = 1 / (1 - u * p.sigma_growth)

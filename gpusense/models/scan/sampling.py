@@ -16,6 +16,8 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Launch, launch
 from gpusense.interface.structs import MixtureTables, RangeScale
 from gpusense.models.poses import Poses
+from gpusense.world.hit_shapes import HitShape, shape_of
+from gpusense.world.hit_tables import mass_table, quantile_table
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.sensor_table import SensorTable
 
@@ -28,7 +30,7 @@ class Drawing:
     """The numbers by which readings are drawn.
 
     Attributes:
-        mixture: Numbers of the mixtures, for each bin of angles of incidence.
+        mixture: Numbers of the mixtures, for each bin of angles of incidence, then tables of the shape of hits.
         edges: Cosines between these bins, in the model's precision.
         chances: Cumulative probabilities of a table of a sensor; one number without a table.
         cells: Bins of a range in the table; 0 without one.
@@ -37,6 +39,7 @@ class Drawing:
         seed: The seed.
         step: Step of the first scan.
         per_scan: Particles of each scan.
+        shape_flags: Flags of the shape of hits.
     """
 
     mixture: np.ndarray
@@ -48,6 +51,7 @@ class Drawing:
     seed: int
     step: int
     per_scan: int
+    shape_flags: frozenset[str] = frozenset()
 
     @property
     def bins(self) -> int:
@@ -57,7 +61,8 @@ class Drawing:
     @property
     def flags(self) -> frozenset[str]:
         """The flags of the kernel."""
-        return flags_if(FLOAT64=self.real == np.float64, SENSOR_TABLE=self.cells, INCIDENCE=self.bins > 1)
+        flags = flags_if(FLOAT64=self.real == np.float64, SENSOR_TABLE=self.cells, INCIDENCE=self.bins > 1)
+        return flags | self.shape_flags
 
     @property
     def tables(self) -> MixtureTables:
@@ -117,16 +122,24 @@ def drawing_of(
     first = checks.integer("step", step, low=0, high=MOST_STEP)
     chances, cells = (np.zeros(1), 0) if table is None else (chances_of(table), table.bins)
     return Drawing(
-        mixture_numbers(mixtures), cosines.astype(real), chances, cells, range_max, real, key, first, max(per_scan, 1)
-    )
+        mixture_numbers(mixtures), cosines.astype(real), chances, cells, range_max, real, key, first, max(per_scan, 1),
+        shape_of(mixtures[0]).flags & {"MASS_TABLE"},
+    )  # fmt: skip
 
 
 def mixture_numbers(mixtures: tuple[BeamParameters, ...]) -> np.ndarray:
-    """Return the numbers of mixtures as kernels take them."""
+    """Return the numbers of mixtures as kernels take them, and behind them the tables of their shapes of hits."""
     names = (
         "z_hit", "z_short", "z_max", "z_rand", "sigma_hit", "sigma_growth", "range_bias", "lambda_short",
     )  # fmt: skip
-    return np.array([[getattr(p, name) for name in names] for p in mixtures]).ravel()
+    numbers = np.array([[*(getattr(p, name) for name in names), 0.0] for p in mixtures])
+    tables: dict[HitShape, np.ndarray] = {}
+    begin = numbers.size
+    for row, shape in zip(numbers, map(shape_of, mixtures), strict=True):
+        if shape.tabulated and shape not in tables:
+            tables[shape] = np.concatenate([mass_table(shape, np.dtype(np.float64)), quantile_table(shape)])
+        row[-1] = begin + list(tables).index(shape) * len(tables[shape]) if shape.tabulated else 0.0
+    return np.concatenate([numbers.ravel(), *tables.values()])
 
 
 def chances_of(table: SensorTable) -> np.ndarray:

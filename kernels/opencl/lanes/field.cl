@@ -1,6 +1,6 @@
 // Likelihood field of LANES particles at once: score_field of field.cl. Look-ups have the bits of the scalar kernel;
 // interpolation takes exp and log of vectors, which may differ in the last bit.
-// requires: lanes/end_point lanes/math
+// requires: lanes/end_point lanes/math lanes/hit_shape
 
 // Particles of a work-item, in vectors. They share each block of beams: while a robot is tracked, its end points lie in
 // few cells of the table. There is a work-item for each 16 particles; the first of ITEMS does the work of all of them.
@@ -46,11 +46,11 @@ LanePair between_lanes(const LanePair weight_a, const LanePair a, const LanePair
 // Return log p of distances from end points to the nearest obstacles: log_field of field_term.cl.
 lanes log_distance_lanes(const LanePair distance, global const real *terms) {
 #if SHARP
-    const LanePair exponent = pair_product_lanes(pair_product_lanes(distance, distance),
-                                                 (LanePair){terms[1], terms[5]});
+    const LanePair square = pair_product_lanes(pair_product_lanes(distance, distance), (LanePair){terms[1], terms[5]});
 #else
-    const LanePair exponent = {distance.hi * (distance.hi * terms[1]), 0};
+    const LanePair square = {distance.hi * (distance.hi * terms[1]), 0};
 #endif
+    const LanePair exponent = shape_exponent_lanes(square, terms[6], terms[7]);
 #if LINEAR
     lanes p = terms[2];
 #if HIT

@@ -1,6 +1,6 @@
 // Gradient and information of LANES particles at once: field_gradient of field_gradient.cl. End points are rounded to
 // the working precision: the interpolated distance is continuous, so an error of an end point moves it by as much.
-// requires: lanes/end_point lanes/math
+// requires: lanes/end_point lanes/math lanes/hit_shape
 
 #define GRADIENT_NUMBERS 13
 // Densities whose product is taken before the logarithm (a power of 2), if all are within these bounds.
@@ -68,8 +68,9 @@ kernel void field_gradient(ARGUMENTS) {
         const lanes low = a + rest_x * (b - a), high = d + rest_x * (e - d);
         const lanes slope_x = (b - a) + rest_y * ((e - d) - (b - a)), slope_y = high - low;
         const lanes distance = low + rest_y * slope_y;
+        const lanes square = distance * (distance * terms[1]);
 #if HIT
-        const lanes hit = peak * exp_lanes(-(distance * (distance * terms[1])));
+        const lanes hit = peak * exp_lanes(-shape_exponent_lanes((LanePair){square, 0}, terms[6], terms[7]).hi);
 #else
         const lanes hit = 0;
 #endif
@@ -81,7 +82,7 @@ kernel void field_gradient(ARGUMENTS) {
             total = sum;
             product = 1;
         }
-        const lanes weight = twice * (hit / density), pull = weight * distance;
+        const lanes weight = twice * (hit / density) * shape_weight_lanes(square, terms[6], terms[7]), pull = weight * distance;
         const lanes turn = slope_y * (arm_x + mounted_x) - slope_x * (arm_y + mounted_y);
         const lanes by_x = weight * slope_x, by_y = weight * slope_y;
         sums[0] -= pull * slope_x;

@@ -1,5 +1,5 @@
 // Beam mixture density of LANES readings at once: mixture.cl in lanes.
-// requires: error_free mixture lanes/error_free lanes/math
+// requires: error_free mixture lanes/error_free lanes/math lanes/hit_shape
 
 // Up to this 1 - exp(-x) is x within a quarter of the last bit.
 #if FLOAT64
@@ -49,8 +49,8 @@ LanePair hit_scale_lanes(const lanes expected, global const real *terms, const i
 }
 
 // Return (z - mean)^2 / (2 sigma^2) as sums of two numbers.
-LanePair hit_exponent_lanes(const lanes z, const lanes expected, const lanes mean, const ilanes clamped,
-                            const LanePair scale, global const real *terms, const ilanes bin_at) {
+LanePair normal_exponent_lanes(const lanes z, const lanes expected, const lanes mean, const ilanes clamped,
+                               const LanePair scale, global const real *terms, const ilanes bin_at) {
     LanePair off = {z - expected, 0};
 #if BIAS
     // z, z* and the bias nearly cancel.
@@ -81,6 +81,13 @@ LanePair hit_exponent_lanes(const lanes z, const lanes expected, const lanes mea
 #endif
 }
 
+// Return the exponents of a hit's density as sums of two numbers.
+LanePair hit_exponent_lanes(const lanes z, const lanes expected, const lanes mean, const ilanes clamped,
+                            const LanePair scale, global const real *terms, const ilanes bin_at) {
+    const LanePair t = normal_exponent_lanes(z, expected, mean, clamped, scale, terms, bin_at);
+    return shape_exponent_lanes(t, TERM(17), TERM(18));
+}
+
 // Return the normal's mass on [0, range_max]; within becomes whether it is 1 in every lane.
 lanes hit_mass_lanes(const lanes mean, const lanes erf_scale, const real range_max, int *within) {
     const lanes below = mean * erf_scale, above = (range_max - mean) * erf_scale;
@@ -88,6 +95,23 @@ lanes hit_mass_lanes(const lanes mean, const lanes erf_scale, const real range_m
     *within = !any_lane(nearer < ERF_ONE);
     if (*within) return 1;
     return (real)0.5 * (erf_lanes(nearer) + erf_lanes(below < above ? above : below));
+}
+
+// Return the mass of a hit of any shape on [0, range_max]; within becomes whether it is 1 in every lane.
+lanes mass_within_lanes(const lanes mean, const lanes scale, global const real *terms, const ilanes bin_at,
+                        int *within) {
+#if MASS_TABLE
+    *within = 0;
+#if INCIDENCE
+    const lanes after = TERM(19);
+    const ilanes place = bin_at + to_ilanes(after);
+#else
+    const ilanes place = (int)terms[19];
+#endif
+    return half_mass_lanes(mean * scale, terms, place) + half_mass_lanes((terms[6] - mean) * scale, terms, place);
+#else
+    return hit_mass_lanes(mean, scale, terms[6], within);
+#endif
 }
 #endif
 
@@ -114,9 +138,9 @@ lanes log_density_lanes(const lanes z, const lanes expected, global const real *
     lanes hit = TERM(0) * exp_lanes(-exponent.hi);
 #if GROWTH
     hit *= scale.hi;
-    const lanes mass = hit_mass_lanes(mean, TERM(2) * scale.hi, terms[6], &within);
+    const lanes mass = mass_within_lanes(mean, TERM(2) * scale.hi, terms, bin_at, &within);
 #else
-    const lanes mass = hit_mass_lanes(mean, TERM(2), terms[6], &within);
+    const lanes mass = mass_within_lanes(mean, TERM(2), terms, bin_at, &within);
 #endif
 #if SHARP
     // Where the density underflows, the second part may be anything.
@@ -143,9 +167,9 @@ lanes log_density_lanes(const lanes z, const lanes expected, global const real *
     lanes hit = (TERM(0) - exponent.hi) + (TERM(8) - exponent.lo);
 #if GROWTH
     hit += log_lanes(scale.hi);
-    const lanes mass = hit_mass_lanes(mean, TERM(2) * scale.hi, terms[6], &within);
+    const lanes mass = mass_within_lanes(mean, TERM(2) * scale.hi, terms, bin_at, &within);
 #else
-    const lanes mass = hit_mass_lanes(mean, TERM(2), terms[6], &within);
+    const lanes mass = mass_within_lanes(mean, TERM(2), terms, bin_at, &within);
 #endif
     if (!within) hit = mass == 1 ? hit : hit - log_lanes(mass);
     largest = hit;

@@ -1,0 +1,48 @@
+"""Shape of the density of a hit, as a change of the normal's exponent t = u^2 / 2 at a distance of u scales.
+
+The density falls from its peak by the factor exp(-E). A normal has E = t and the weight E'(t) = 1. STUDENT: Student's t
+with nu degrees of freedom has E = power log(1 + rate t), power = (nu + 1) / 2, rate = 2 / nu, and the weight
+(nu + 1) / (nu + u^2). Kernels look up the mass between the mean and a distance, b = u / sqrt 2, in a table
+(MASS_TABLE); here it is the incomplete beta function.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import betainc
+
+from gpusense.reference.error_free import Pair, two_product
+
+
+def shape_exponent(flags: frozenset[str], t: Pair, numbers: np.ndarray) -> Pair:
+    """Return the exponent E as a sum of two numbers; ``numbers`` are those of the shape."""
+    if "STUDENT" not in flags:
+        return t
+    power, rate = numbers
+    more = rate * t[0]
+    if "SHARP" not in flags:
+        return power * np.log1p(more), np.zeros_like(more)
+    exact = two_product(rate, t[0])
+    high, low = two_product(power, np.log1p(more))
+    return high, low + power * ((exact[1] + rate * t[1]) / (1 + more))
+
+
+def shape_weight(flags: frozenset[str], t: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """Return the weight E'(t)."""
+    if "STUDENT" not in flags:
+        return np.ones_like(t)
+    power, rate = numbers
+    return power * rate / (1 + rate * t)
+
+
+def half_mass(flags: frozenset[str], b: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """Return the mass between the mean and a distance; kernels need no formula of it."""
+    if "STUDENT" not in flags:
+        raise ValueError(f"flags: must be those of a shape with a mass, got {sorted(flags)}")
+    power, rate = numbers
+    half_dof = np.asarray(power, np.float64) - 0.5
+    with np.errstate(over="ignore", invalid="ignore"):
+        ratio = np.asarray(rate, np.float64) * np.square(np.asarray(b, np.float64))
+        share = np.where(np.isinf(ratio), 1, ratio / (1 + ratio))
+    near, far = betainc(0.5, half_dof, share), betainc(half_dof, 0.5, 1 / (1 + ratio))
+    return np.where(ratio < 1, 0.5 * near, 0.5 - 0.5 * far).astype(b.dtype)

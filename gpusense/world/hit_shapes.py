@@ -1,0 +1,276 @@
+"""Densities of a correct range on the host: the one home of each, with its numbers for kernels.
+
+A hit of scale sigma has the density ``exp(-E(u)) / (width sigma)`` at u = (z - mean) / sigma; it is symmetric and falls
+with |u|. Models truncate it to [0, range_max] or not, weigh it, and mix it with other causes. Everything that a model,
+a table, a search, a picture, a simulation or a fit needs of it comes from :class:`HitShape`; kernels have E in their
+file ``hit_shape`` and get all other numbers from here.
+
+A shape is registered in :data:`SHAPES` under its name, the value of ``hit=`` in the parameters of scan models.
+CONTRIBUTING.md has the recipe for another one.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, Self, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[Any]
+HitName: TypeAlias = Literal["normal", "student"]
+
+# Smallest and largest degrees of freedom of Student's t; beyond the largest it is the normal in float32.
+LEAST_DOF, MOST_DOF = 1.0, 1e6
+# From this half of the degrees of freedom on the ratio of gamma functions is its asymptotic series.
+_SERIES_FROM = 30.0
+# The largest number below one half.
+_MOST_HALF = math.nextafter(0.5, 0)
+
+
+class HitShape(ABC):
+    """The density of a correct range, of scale 1 around 0.
+
+    Attributes:
+        flags: Flags of the kernels that evaluate it.
+        tabulated: Whether kernels look up the mass in a table, which the host makes of ``half_mass``.
+        fitted: Names of the parameters that a fit finds beside the scale.
+        limits: (P, 2) smallest and largest coordinates of a fit, one for each of them.
+        starts: (S, P + 1) coordinates from which a fit starts, and the factor of a normal's scale there.
+    """
+
+    flags: ClassVar[frozenset[str]]
+    tabulated: ClassVar[bool] = True
+    fitted: ClassVar[tuple[str, ...]] = ()
+    limits: ClassVar[tuple[tuple[float, float], ...]] = ()
+    starts: ClassVar[tuple[tuple[float, ...], ...]] = ((1.0,),)
+
+    @classmethod
+    @abstractmethod
+    def of(cls, parameters: Any) -> Self:
+        """Make the shape that parameters of a scan model describe."""
+
+    @classmethod
+    def at(cls, coordinates: Floats) -> Self:
+        """Make the shape at coordinates of a fit."""
+        return cls()
+
+    def values(self) -> dict[str, float]:
+        """Return the values of the fitted parameters by name."""
+        return {}
+
+    @property
+    @abstractmethod
+    def width(self) -> float:
+        """Inverse of the density at 0."""
+
+    @property
+    @abstractmethod
+    def log_width(self) -> float:
+        """Logarithm of ``width``."""
+
+    @property
+    def numbers(self) -> tuple[float, float]:
+        """The numbers of the kernel file ``hit_shape``."""
+        return 0.0, 0.0
+
+    @abstractmethod
+    def exponent(self, u: Floats) -> Floats:
+        """Return E(u) = -log of the density over that at 0."""
+
+    @abstractmethod
+    def slope(self, u: Floats) -> Floats:
+        """Return the derivative E'(u)."""
+
+    @abstractmethod
+    def reach(self, exponent: float) -> float:
+        """Return the u >= 0 at which E is ``exponent`` >= 0."""
+
+    @abstractmethod
+    def half_mass(self, u: Floats) -> Floats:
+        """Return the mass between 0 and u >= 0; small values keep their digits."""
+
+    @abstractmethod
+    def drawn(self, share: Floats, low: Floats, high: Floats) -> Floats:
+        """Return the u below which a share of the mass between -low <= 0 and high >= 0 lies."""
+
+    @abstractmethod
+    def quantile(self, level: Floats) -> Floats:
+        """Return the u >= 0 with the mass (1 - exp(-level)) / 2 between 0 and u."""
+
+    def peak(self, weight: float, sigma: float) -> float:
+        """Return a weight times the density at the mean [1/m]."""
+        return weight / (sigma * self.width)
+
+    def log_pdf(self, u: Floats) -> Floats:
+        """Return the log density."""
+        with np.errstate(over="ignore"):
+            return -self.exponent(u) - self.log_width
+
+
+@dataclass(frozen=True)
+class NormalHit(HitShape):
+    """The normal density, equation 6.4 of *Probabilistic Robotics*: E = u^2 / 2."""
+
+    flags = frozenset()
+    tabulated = False
+
+    @classmethod
+    def of(cls, parameters: Any) -> Self:
+        """See HitShape.of."""
+        return cls()
+
+    @property
+    def width(self) -> float:
+        """See HitShape.width."""
+        return math.sqrt(2 * math.pi)
+
+    @property
+    def log_width(self) -> float:
+        """See HitShape.log_width."""
+        return 0.5 * math.log(2 * math.pi)
+
+    def exponent(self, u: Floats) -> Floats:
+        """See HitShape.exponent."""
+        return 0.5 * u**2
+
+    def slope(self, u: Floats) -> Floats:
+        """See HitShape.slope."""
+        return u
+
+    def reach(self, exponent: float) -> float:
+        """See HitShape.reach."""
+        return math.sqrt(2 * exponent)
+
+    def half_mass(self, u: Floats) -> Floats:
+        """See HitShape.half_mass."""
+        from scipy.special import erf
+
+        return u.dtype.type(0.5) * erf(u * u.dtype.type(math.sqrt(0.5)))
+
+    def drawn(self, share: Floats, low: Floats, high: Floats) -> Floats:
+        """See HitShape.drawn."""
+        from scipy.special import ndtr, ndtri
+
+        below = ndtr(-low)
+        return np.asarray(ndtri(below + share * (ndtr(high) - below)))
+
+    def quantile(self, level: Floats) -> Floats:
+        """See HitShape.quantile."""
+        from scipy.special import erfcinv, erfinv
+
+        root = np.where(level < math.log(2), erfinv(-np.expm1(-level)), erfcinv(np.exp(-level)))
+        return math.sqrt(2) * root
+
+
+@dataclass(frozen=True)
+class StudentHit(HitShape):
+    """Student's t with ``dof`` degrees of freedom, whose heavy tails take readings that a normal calls impossible.
+
+    E = (dof + 1) / 2 log(1 + u^2 / dof); with infinite dof it is the normal. It is a normal whose inverse variance is
+    drawn from a gamma distribution (Lange, Little and Taylor, "Robust statistical modeling using the t distribution",
+    1989).
+    """
+
+    dof: float
+
+    flags = frozenset({"STUDENT", "MASS_TABLE"})
+    fitted = ("hit_dof",)
+    # The coordinate is 1 / dof: the normal is at an end of its interval, not infinitely far.
+    limits = ((1 / MOST_DOF, 1 / LEAST_DOF),)
+    starts = ((0.8, 0.4), (0.3, 0.7), (0.03, 1.0))
+
+    @classmethod
+    def of(cls, parameters: Any) -> Self:
+        """See HitShape.of."""
+        return cls(parameters.hit_dof)
+
+    @classmethod
+    def at(cls, coordinates: Floats) -> Self:
+        """See HitShape.at."""
+        return cls(min(max(1 / float(coordinates[0]), LEAST_DOF), MOST_DOF))
+
+    def values(self) -> dict[str, float]:
+        """See HitShape.values."""
+        return {"hit_dof": self.dof}
+
+    @property
+    def width(self) -> float:
+        """See HitShape.width."""
+        return math.exp(self.log_width)
+
+    @property
+    def log_width(self) -> float:
+        """See HitShape.log_width: log(sqrt(2 pi a) gamma(a) / gamma(a + 1/2)) with a = dof / 2."""
+        a = 0.5 * self.dof
+        if a < _SERIES_FROM:
+            return 0.5 * math.log(2 * math.pi * a) + math.lgamma(a) - math.lgamma(a + 0.5)
+        x = 1 / a
+        series = x * (-1 / 8 + x**2 * (1 / 192 - x**2 * (1 / 640 - x**2 * (17 / 14336 - x**2 * 31 / 18432))))
+        return 0.5 * math.log(2 * math.pi) - series
+
+    @property
+    def numbers(self) -> tuple[float, float]:
+        """See HitShape.numbers: the power, and the factor of u^2 / 2."""
+        return 0.5 * (self.dof + 1), 2 / self.dof
+
+    def exponent(self, u: Floats) -> Floats:
+        """See HitShape.exponent."""
+        return 0.5 * (self.dof + 1) * np.log1p(u * u / self.dof)
+
+    def slope(self, u: Floats) -> Floats:
+        """See HitShape.slope."""
+        return (self.dof + 1) * u / (self.dof + u * u)
+
+    def reach(self, exponent: float) -> float:
+        """See HitShape.reach."""
+        return math.sqrt(self.dof * math.expm1(min(2 * exponent / (self.dof + 1), 700.0)))
+
+    def half_mass(self, u: Floats) -> Floats:
+        """See HitShape.half_mass."""
+        return _student_half_mass(u, self.dof)
+
+    def drawn(self, share: Floats, low: Floats, high: Floats) -> Floats:
+        """See HitShape.drawn."""
+        below = self.half_mass(low)
+        mark = share * (below + self.half_mass(high)) - below
+        level = -np.log1p(-2 * np.minimum(np.abs(mark), _MOST_HALF))
+        return np.clip(np.copysign(self.quantile(level), mark), -low, high)
+
+    def quantile(self, level: Floats) -> Floats:
+        """See HitShape.quantile."""
+        from scipy.special import betaincinv
+
+        # The inverse of the nearer end of the incomplete beta function has the digits, for few and many degrees.
+        middle = 3.0
+        near = betaincinv(0.5, 0.5 * self.dof, -np.expm1(-np.minimum(level, middle)))
+        far = betaincinv(0.5 * self.dof, 0.5, np.exp(-np.maximum(level, middle)))
+        return np.sqrt(self.dof * np.where(level < middle, near / (1 - near), (1 - far) / far))
+
+
+def _student_half_mass(u: Floats, dof: float) -> Floats:
+    """Return the mass of Student's t between 0 and u >= 0, by the incomplete beta function or its complement."""
+    from scipy.special import betainc
+
+    u = np.asarray(u)
+    with np.errstate(over="ignore", invalid="ignore"):
+        ratio = u * u / u.dtype.type(dof)
+        share = np.where(np.isinf(ratio), 1, ratio / (1 + ratio))
+    half, is_near = u.dtype.type(0.5), ratio < 1
+    mass = np.empty_like(u)
+    mass[is_near] = half * betainc(0.5, 0.5 * dof, share[is_near])
+    mass[~is_near] = half - half * betainc(0.5 * dof, 0.5, 1 / (1 + ratio[~is_near]))
+    return mass
+
+
+SHAPES: dict[str, type[HitShape]] = {"normal": NormalHit, "student": StudentHit}
+NORMAL = NormalHit()
+# Parameters of scan models that describe a shape beside its scale.
+SHAPE_PARAMETERS = ("hit", *dict.fromkeys(name for shape in SHAPES.values() for name in shape.fitted))
+
+
+def shape_of(parameters: Any) -> HitShape:
+    """Return the shape of the hits of parameters of a scan model."""
+    return SHAPES[parameters.hit].of(parameters)

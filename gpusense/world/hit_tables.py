@@ -1,0 +1,97 @@
+"""Tables of the mass and of the quantiles of hits whose kernels have no formula of them.
+
+A table has cells of equal width in the logarithmic coordinate log(1 + b), b = u / sqrt 2 for a distance of u scales, or
+-log(1 - 2 m) for a mass m between the mean and a distance. In each cell it has the numbers of a polynomial in the share
+of the cell, the lowest power first, which agrees with the function at the cell's start.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.interface.constants import TABLE_CELLS, TABLE_PER_LOG, TABLE_POWERS
+from gpusense.world.hit_shapes import HitShape
+
+Floats = NDArray[np.float64]
+
+_ROOT_TWO = math.sqrt(2)
+
+
+class TabulatedHit:
+    """A shape whose masses are looked up; all else is the shape's."""
+
+    def __init__(self, shape: HitShape) -> None:
+        self._shape, self._table = shape, mass_table(shape, np.dtype(np.float64))
+
+    @classmethod
+    @functools.lru_cache(maxsize=16)
+    def of_shape(cls, shape: HitShape) -> Any:
+        """Return the shape with a table, which is kept for its next use."""
+        return cls(shape)
+
+    def half_mass(self, u: Floats) -> Floats:
+        """See HitShape.half_mass."""
+        return np.minimum(looked_up(self._table, np.log1p(u / _ROOT_TWO)), 0.5)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._shape, name)
+
+
+def mass_tables(shapes: Sequence[HitShape], terms: list[np.ndarray], real: np.dtype) -> list[np.ndarray]:
+    """Return the tables of masses that follow the terms of all bins, and write their places into the terms.
+
+    A place counts from the first term of its bin. Equal shapes share a table.
+    """
+    tables: dict[HitShape, tuple[int, np.ndarray]] = {}
+    begin = sum(map(len, terms))
+    for number, shape in enumerate(shapes):
+        if not shape.tabulated:
+            continue
+        if shape not in tables:
+            table = mass_table(shape, real)
+            tables[shape] = begin + len(tables) * len(table), table
+        terms[number][-1] = tables[shape][0] - number * len(terms[0])
+    return [table for _, table in tables.values()]
+
+
+def mass_table(shape: HitShape, real: np.dtype) -> np.ndarray:
+    """Return the masses between the mean and a distance, by log(1 + b)."""
+    return _table(lambda at: shape.half_mass(_ROOT_TWO * np.expm1(at)), real)
+
+
+def looked_up(table: Floats, at: Floats) -> Floats:
+    """Return the numbers of a float64 table at logarithmic coordinates."""
+    size = table.itemsize
+    cells, powers, steps = TABLE_CELLS[size], TABLE_POWERS[size], at * TABLE_PER_LOG[size]
+    cell = np.minimum(steps, cells - 1).astype(np.intp)
+    share = np.minimum(steps - cell, 1.0)
+    numbers = np.ascontiguousarray(table.reshape(cells, powers).T)
+    value = numbers[-1][cell]
+    for number in numbers[-2::-1]:
+        value *= share
+        value += number[cell]
+    return value
+
+
+def quantile_table(shape: HitShape) -> Floats:
+    """Return log(1 + b) by -log(1 - 2 m)."""
+    return _table(lambda at: np.log1p(shape.quantile(at) / _ROOT_TWO), np.dtype(np.float64))
+
+
+def _table(function: Callable[[Floats], Floats], real: np.dtype) -> np.ndarray:
+    """Return a table of a function that is 0 at 0."""
+    size = real.itemsize
+    cells, per_log, powers = TABLE_CELLS[size], TABLE_PER_LOG[size], TABLE_POWERS[size]
+    places = np.arange(cells)[:, None]
+    start = function(places / per_log)
+    # The rest, divided by the share of the cell, at the nodes of Chebyshev.
+    share = 0.5 + 0.5 * np.cos(math.pi * (np.arange(powers - 1) + 0.5) / (powers - 1))
+    rest = (function((places + share) / per_log) - start) / share
+    powers_of_share = share[:, None] ** np.arange(powers - 1)
+    return np.hstack([start, np.linalg.solve(powers_of_share, rest.T).T]).astype(real).ravel()

@@ -1,0 +1,48 @@
+// Shape of the density of a hit, as a change of the normal's exponent t = u^2 / 2 at a distance of u scales: the density
+// falls from its peak by the factor exp(-E). A normal has E = t and the weight E'(t) = 1. STUDENT: Student's t with nu
+// degrees of freedom has E = power log(1 + rate t), power = (nu + 1) / 2, rate = 2 / nu, and the weight
+// (nu + 1) / (nu + u^2). The mass between the mean and a distance, b = u / sqrt 2, comes from a table (MASS_TABLE), whose
+// cells have the numbers of a polynomial in the share of the cell, by log(1 + b).
+// requires: error_free
+
+#define TABLE_CELLS (FLOAT64 ? 1024 : 256)
+#define TABLE_PER_LOG ((real)(FLOAT64 ? 27 : 16))
+#define TABLE_POWERS (FLOAT64 ? 8 : 5)
+
+// Return the exponent E as a sum of two numbers.
+real2 shape_exponent(const real2 t, const real power, const real rate) {
+#if STUDENT
+    const real more = rate * t.x;
+#if SHARP
+    const real2 product = two_product(power, log1p(more));
+    return (real2)(product.x, product.y + power * ((two_product(rate, t.x).y + rate * t.y) / (1 + more)));
+#else
+    return (real2)(power * log1p(more), 0);
+#endif
+#else
+    return t;
+#endif
+}
+
+// Return the weight E'(t).
+real shape_weight(const real t, const real power, const real rate) {
+#if STUDENT
+    return power * rate / (1 + rate * t);
+#else
+    return 1;
+#endif
+}
+
+#if MASS_TABLE
+// Return the mass between the mean and a distance.
+real half_mass(const real b, global const real *table) {
+    const real at = log1p(b) * TABLE_PER_LOG;
+    if (!(at < TABLE_CELLS)) return (real)0.5;
+    const int cell = (int)at;
+    const real share = at - cell;
+    global const real *number = table + cell * TABLE_POWERS;
+    real mass = number[TABLE_POWERS - 1];
+    for (int i = TABLE_POWERS - 2; i >= 0; --i) mass = mass * share + number[i];
+    return mass;
+}
+#endif

@@ -1,0 +1,70 @@
+"""Shape of the density of a hit, as a change of the normal's exponent t = u^2 / 2 at a distance of u scales.
+
+The density falls from its peak by the factor exp(-E). A normal has E = t and the weight E'(t) = 1. STUDENT: Student's t
+with nu degrees of freedom has E = power log(1 + rate t), power = (nu + 1) / 2, rate = 2 / nu, and the weight
+(nu + 1) / (nu + u^2). The mass between the mean and a distance, b = u / sqrt 2, comes from a table (MASS_TABLE), whose
+cells have the numbers of a polynomial in the share of the cell, by log(1 + b).
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from . import error_free, log_terms
+from .prelude import precision, reader
+
+
+@functools.cache
+def functions(flags):
+    """Make the functions of the file for a set of flags."""
+    types = precision(flags)
+    real, vec2 = types.real, types.vec2
+    two_product = error_free.functions(flags).two_product
+    log_one_plus = log_terms.functions(flags).log_one_plus
+    number_at = reader(real)
+    SHARP = "SHARP" in flags
+    STUDENT = "STUDENT" in flags
+    TABLE_CELLS = wp.constant(1024 if "FLOAT64" in flags else 256)
+    TABLE_PER_LOG = real(27.0 if "FLOAT64" in flags else 16.0)
+    TABLE_POWERS = wp.constant(8 if "FLOAT64" in flags else 5)
+    ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
+
+    # Return the exponent E as a sum of two numbers.
+    @wp.func
+    def shape_exponent(t: vec2, power: real, rate: real):
+        if STUDENT:
+            more = rate * t.x
+            log_more = log_one_plus(more)
+            exponent = vec2(power * log_more, ZERO)
+            if SHARP:
+                product = two_product(power, log_more)
+                exact = two_product(rate, t.x)
+                exponent = vec2(product.x, product.y + power * ((exact.y + rate * t.y) / (ONE + more)))
+            return exponent
+        else:
+            return t
+
+    # Return the weight E'(t).
+    @wp.func
+    def shape_weight(t: real, power: real, rate: real):
+        if STUDENT:
+            return power * rate / (ONE + rate * t)
+        else:
+            return ONE
+
+    # Return the mass between the mean and a distance; the table begins at a place of the terms.
+    @wp.func
+    def half_mass(b: real, terms: wp.array(dtype=real), place: wp.int32):
+        at = log_one_plus(b) * TABLE_PER_LOG
+        if not at < real(TABLE_CELLS):
+            return HALF
+        cell = wp.int32(at)
+        share = at - real(cell)
+        first = place + cell * TABLE_POWERS
+        mass = number_at(terms, first + TABLE_POWERS - 1)
+        for i in range(TABLE_POWERS - 1):
+            mass = mass * share + number_at(terms, first + TABLE_POWERS - 2 - i)
+        return mass
+
+    return SimpleNamespace(shape_exponent=shape_exponent, shape_weight=shape_weight, half_mass=half_mass)

@@ -1,0 +1,94 @@
+"""Fits of Student's t as the shape of correct ranges."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gpusense as gs
+from gpusense.learning.beam import growth
+from gpusense.models.scan.densities import log_mixture
+
+RANGE = 8.0
+NORMAL = gs.BeamParameters(0.8, 0.1, 0.05, 0.05, 0.05, 0.4)
+STUDENT = NORMAL.replace(hit="student", hit_dof=3.0)
+COUNT = 4000
+
+
+@functools.cache
+def drawn(truth: gs.BeamParameters, count: int = COUNT) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(11)
+    expected = rng.uniform(1, 7, count)
+    return gs.worlds.sample_readings(expected, RANGE, truth, rng), expected
+
+
+@functools.cache
+def fitted(truth: gs.BeamParameters, hit: str) -> gs.BeamFit:
+    return gs.fit_beam_parameters(*drawn(truth), RANGE, backend="numpy", hit=hit)
+
+
+def bic(fit: gs.BeamFit, parameters: int) -> float:
+    return parameters * np.log(COUNT) - 2 * fit.log_likelihood
+
+
+def test_degrees_of_freedom_are_found() -> None:
+    fit = fitted(STUDENT, "student")
+    assert fit.converged and fit.parameters.hit == "student"
+    for name, value in STUDENT.to_dict().items():
+        if name != "hit":
+            assert abs(getattr(fit.parameters, name) - value) < 4 * fit.standard_errors[name], name
+    assert 0 < fit.standard_errors["hit_dof"] < 0.5
+    assert "hit_dof" in str(fit) and "hit='student'" in repr(fit) and "hit_dof" in fit.to_dict()["standard_errors"]
+
+
+def test_the_likelihood_never_falls_and_is_that_of_the_mixture() -> None:
+    fit = fitted(STUDENT, "student")
+    assert len(fit.trace) > 2 and (np.diff(fit.trace) >= 0).all()
+    z, expected = drawn(STUDENT)
+    log_p = log_mixture(np.minimum(z, RANGE), expected, range_max=RANGE, **fit.parameters.to_dict())
+    assert log_p.sum() == pytest.approx(fit.log_likelihood, rel=1e-9)
+
+
+def test_bic_prefers_the_shape_of_the_readings() -> None:
+    # The normal has 5 free parameters, Student's t one more.
+    assert bic(fitted(STUDENT, "student"), 6) < bic(fitted(STUDENT, "normal"), 5) - 10
+    assert bic(fitted(NORMAL, "normal"), 5) < bic(fitted(NORMAL, "student"), 6)
+    heavy = fitted(NORMAL, "student")
+    assert heavy.log_likelihood >= fitted(NORMAL, "normal").log_likelihood - 1e-2
+    assert heavy.parameters.hit_dof > 20
+
+
+def test_growth_offset_and_shape_are_fitted_together() -> None:
+    truth = STUDENT.replace(range_bias=0.03, sigma_growth=0.015, hit_dof=4.0)
+    z, expected = drawn(truth)
+    options: Any = dict(backend="numpy", range_bias=True, sigma_growth=True, blocks=np.arange(COUNT) // 10)
+    fit = gs.fit_beam_parameters(z, expected, RANGE, hit="student", responsibilities=True, **options)
+    errors = fit.standard_errors | {"range_bias": fit.range_bias_error}
+    for name in ("sigma_hit", "sigma_growth", "range_bias", "hit_dof"):
+        assert abs(getattr(fit.parameters, name) - getattr(truth, name)) < 4 * errors[name], name
+    np.testing.assert_allclose(fit.responsibilities.sum(axis=1), 1, rtol=1e-9)
+    assert fit.log_likelihood > gs.fit_beam_parameters(z, expected, RANGE, **options).log_likelihood
+
+
+@pytest.mark.parametrize("bias", [False, True])
+def test_gradients_are_those_of_differences(bias: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Any] = []
+    real = growth.maximize
+    monkeypatch.setattr(growth, "maximize", lambda p, *rest: seen.append(p) or real(p, *rest))
+    z, expected = (each[:600] for each in drawn(STUDENT))
+    gs.fit_beam_parameters(z, expected, RANGE, range_bias=bias, hit="student", backend="numpy", max_iterations=2)
+    theta = np.array([0.1, 0.2, 0.15, np.log(0.1), 0.0, np.log(0.5), *([0.05] if bias else []), 0.3])
+    gradient = seen[0].log_p(theta)[1]
+    for k in set(range(len(theta))) - {4}:
+        step = 1e-6 * seen[0].scales(theta)[k]
+        ends = [seen[0].log_p(theta + sign * step * np.eye(len(theta))[k])[0] for sign in (1, -1)]
+        size = 1 + np.abs(gradient[:, k]).max()
+        np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), gradient[:, k], rtol=0, atol=1e-7 * size)
+
+
+def test_without_ranges_nothing_determines_the_shape() -> None:
+    fit = gs.fit_beam_parameters([RANGE] * 5, [4.0] * 5, RANGE, backend="numpy", hit="student")
+    assert fit.parameters.hit == "student" and fit.held["hit_dof"] == "no range determines it"

@@ -2,9 +2,9 @@
 
     python bench/speed/chaining_growth.py --backend opencl --output bench/results/chaining_growth
 
-"part" rows have the first scans of a recorded log. "passes" rows drive it again and again: forth, back in the reverse
-order of its scans, forth, ... Each pass has noise of its own, of 1 cm on ranges, and of 2 % on the odometer's motions,
-which is never corrected. "5000" joins the first passes to 5000 scans.
+Rows of less than a pass have the first scans of a recorded log. Those of more drive it again and again: forth, back in
+the reverse order of its scans, forth, ... Each scan then has noise of its own, of 1 cm on ranges, and of 2 % on the
+odometer's motions. The last row of fr079 has 5000 scans.
 
 "searched" are pairs of key scans that were matched to find places again. "links" are all of the pose graph. "launches"
 are those of kernels. Each row has a process of its own; "memory" is the growth of its largest resident set during the
@@ -32,11 +32,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "accuracy"))
 from chaining_logs import load
 from common import make_parser, note, parse, publish, table
 
-PARTS = (0.125, 0.25, 0.5, 1.0)
-PASSES = (1, 2, 4, 8)
+# Passes of each log.
+SCANS = 5000
+PASSES = {"intel": (0.25, 0.5, 1.0), "fr079": (0.125, 0.25, 0.5, 1.0, SCANS / 4791), "seattle": (1.0, 2.0, 4.0, 8.0)}
 # Noise of ranges [m], and of each pass's odometry.
 NOISE, STRETCH = 0.01, 0.02
-SCANS = 5000
 
 
 class Counter(Proxy):
@@ -99,15 +99,14 @@ def measured(data: Path, name: str, passes: float, backend: str) -> dict[str, An
 def main(argv: list[str] | None = None) -> None:
     """Measure, and publish a table."""
     parser = make_parser(__doc__, backend="auto", data=True)
-    parser.add_argument("--log", action="append", choices=("intel", "fr079", "seattle"), help="default: intel, fr079")
-    parser.add_argument("--most", type=float, default=max(PASSES), help="most passes (default: %(default)s)")
+    parser.add_argument("--log", action="append", choices=PASSES, help="default: all")
+    parser.add_argument("--most", type=float, default=np.inf, help="most passes (default: all)")
     arguments = parse(parser, argv)
     rows = []
-    for name in arguments.log or ("intel", "fr079"):
-        lengths = sorted({length for length in (*PARTS, *PASSES) if length <= arguments.most})
-        if name == "fr079" and arguments.most > 1:
-            lengths.append(SCANS / len(load(Path(arguments.data), name).ranges))
-        for length in lengths:
+    for name in arguments.log or PASSES:
+        for length in PASSES[name]:
+            if length > arguments.most:
+                continue
             with multiprocessing.get_context("spawn").Pool(1) as pool:
                 rows.append(pool.apply(measured, (Path(arguments.data), name, length, arguments.backend)))
             note(f"{name}, {length:.3g} passes: {rows[-1]['searched']} searched, {rows[-1]['processor_s']:.1f} s")

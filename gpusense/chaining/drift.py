@@ -64,5 +64,6 @@ def _inverse_part(matrix: Any, rows: Integers) -> Floats:
         for begin in range(0, len(rows), _COLUMNS):
             part = slice(begin, begin + _COLUMNS)
             left[:, part] -= side.T @ factor.solve(side[:, part].toarray())
-    inverse: Floats = np.linalg.inv(0.5 * (left + left.T))
-    return 0.5 * (inverse + inverse.T)
+    inverse: Floats = np.asarray(np.linalg.inv(0.5 * (left + left.T)), np.float64)
+    result: Floats = 0.5 * (inverse + inverse.T)
+    return result

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gpusense.chaining.drift import Drift
 from gpusense.chaining.graph import Solution, solve
 from gpusense.chaining.links import CLOSURE, Links
-from gpusense.chaining.matcher import GROUP, TeamMatcher
+from gpusense.chaining.matcher import BATCH, TeamMatcher
 from gpusense.chaining.motion import relative
 from gpusense.chaining.places import overlaps
 from gpusense.localization.pose_algebra import compose_poses, invert_poses, wrap_angle
@@ -162,8 +162,8 @@ class Loops:
         """Return the sure matches of candidates."""
         parts = []
         guess = relative(self.solution.poses, first, second)
-        for begin in range(0, len(first), GROUP):
-            part = slice(begin, begin + GROUP)
+        for begin in range(0, len(first), BATCH):
+            part = slice(begin, begin + BATCH)
             match = self.matcher.match(self.nodes[first[part]], self.nodes[second[part]], guess[part], window)
             links = Links.of(
                 CLOSURE, first[part], second[part], match.pose, self.temperature * match.information, match.p_right

@@ -13,7 +13,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 # Most poses whose joint covariance is kept; in a longer graph each stands for its neighbours.
-_ANCHORS = 200
+_ANCHORS = 100
 # Columns of the inverse that are solved for at once.
 _COLUMNS = 192
 # Damping [1/m^2, 1/rad^2]: a direction that no link observes has a variance of the inverse.
@@ -64,5 +64,6 @@ def _inverse_part(matrix: Any, rows: Integers) -> Floats:
         for begin in range(0, len(rows), _COLUMNS):
             part = slice(begin, begin + _COLUMNS)
             left[:, part] -= side.T @ factor.solve(side[:, part].toarray())
-    inverse: Floats = np.asarray(np.linalg.inv(0.5 * (left + left.T)), dtype=np.float64)
-    return 0.5 * (inverse + inverse.T)
+    inverse: Floats = np.asarray(np.linalg.inv(0.5 * (left + left.T)), np.float64)
+    result: Floats = 0.5 * (inverse + inverse.T)
+    return result

@@ -18,8 +18,10 @@ from gpusense.world.scanner import Scanner
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-GROUP = 1024
-"""Scans of a group."""
+GROUP = 256
+"""Scans of a group, after which an interrupt keeps what is matched."""
+BATCH = 1024
+"""Most pairs of a call."""
 # A match is used from this p_right on.
 SURE = 0.5
 # Half widths of the search of a match of scans whose relative pose is known from others [m, rad].
@@ -110,8 +112,8 @@ class Matcher:
     def links(self, kind: str, first: Integers, second: Integers, guess: Floats) -> Links:
         """Return the links of those matches near their guesses that may be used."""
         parts = []
-        for begin in range(0, len(first), GROUP):
-            part = slice(begin, begin + GROUP)
+        for begin in range(0, len(first), BATCH):
+            part = slice(begin, begin + BATCH)
             match = self.match(first[part], second[part], guess[part], NEAR)
             links = Links.of(kind, first[part], second[part], match.pose, match.information, match.p_right)
             parts.append(links[match.usable & (match.p_right >= SURE)])

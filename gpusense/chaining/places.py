@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense.localization.pose_algebra import compose_poses
+from gpusense.localization.pose_algebra import compose_poses, wrap_angle
 from gpusense.matching.points import ScanPoints, scan_points
 from gpusense.world.sensor_scans import SensorScans
 
@@ -20,8 +20,11 @@ _SHARE = 0.3
 _ROWS = 512
 # Points farther than this many rms ranges say little of a place.
 _FAR = 2.0
-# Passages through a place that later ones are compared with, and key scans of a scanner between two passages.
-_PASSAGES, _AWAY = 8, 16
+# Passages through a place in each of some directions that later ones are compared with, key scans of a scanner between
+# two passages, and most of one.
+_PASSAGES, _WAYS, _AWAY, _LONG = 4, 4, 16, 64
+# Most first scans of a second one, and the share of cells that is large.
+_PAIRS, _LARGE = 8, 0.6
 
 
 def place_points_of(data: SensorScans, scans: Integers) -> list[Floats]:
@@ -68,7 +71,7 @@ def overlaps(
         (np.ones(len(row), np.float32), (row, number)), shape=(len(places), int(number.max(initial=0)) + 1)
     )
     sizes = np.diff(table.indptr)
-    early = _first_passages(table, sequence)
+    early = _first_passages(table, poses, sequence)
     others = table[early].T.tocsr()
     found: list[tuple[Integers, Integers, Floats]] = []
     for begin in range(0, len(places), _ROWS):
@@ -76,7 +79,8 @@ def overlaps(
         second, first = common.row + begin, early[common.col]
         share = common.data / np.maximum(np.minimum(sizes[first], sizes[second]), 1)
         good = (second - first >= apart) & (share >= _SHARE)
-        found.append(_best_of_passages(first[good], second[good], share[good], sequence))
+        best = _best_of_passages(first[good], second[good], share[good], sequence)
+        found.append(_most_alike(*best, poses))
     one, two, shares = (np.concatenate(part) for part in zip(*found, strict=True))
     return one.astype(np.int64), two.astype(np.int64), shares
 
@@ -93,22 +97,34 @@ def _cells_of(places: list[Floats], poses: Floats, cell: float) -> tuple[Integer
     return both // count, both % count
 
 
-def _first_passages(table: Any, sequence: tuple[Integers, Integers]) -> Integers:
-    """Return the key scans of the first passages through enough of their cells.
+def _first_passages(table: Any, poses: Floats, sequence: tuple[Integers, Integers]) -> Integers:
+    """Return the key scans of the first passages, by a scanner in a direction, through enough of their cells.
 
-    A cell is passed once more where a scanner sees it after some key scans in which it did not.
+    A cell is passed once more where it is seen after some key scans in which it was not, or after many in a row.
     """
     scanners, ranks = sequence
-    cells, early = table.shape[1], []
-    passed = np.zeros((int(scanners.max(initial=0)) + 1, cells), np.int64)
-    last = np.full(passed.shape, -_AWAY - 1, np.int64)
-    for k in range(table.shape[0]):
-        seen, one, rank = table.indices[table.indptr[k] : table.indptr[k + 1]], int(scanners[k]), int(ranks[k])
-        number = passed[one, seen] + (rank - last[one, seen] > _AWAY)
+    ways = scanners * _WAYS + np.floor(poses[:, 2] / (2 * np.pi) * _WAYS + 0.5).astype(np.int64) % _WAYS
+    early = []
+    passed = np.zeros((int(ways.max(initial=0)) + 1, table.shape[1]), np.int64)
+    last, begun = np.full(passed.shape, -_AWAY - 1, np.int64), np.full(passed.shape, -_LONG - 1, np.int64)
+    for k, (way, rank) in enumerate(zip(ways.tolist(), ranks.tolist(), strict=True)):
+        seen = table.indices[table.indptr[k] : table.indptr[k + 1]]
+        new = (rank - last[way, seen] > _AWAY) | (rank - begun[way, seen] > _LONG)
+        number = passed[way, seen] + new
         if np.count_nonzero(number <= _PASSAGES) >= _SHARE * len(seen):
             early.append(k)
-            passed[one, seen], last[one, seen] = number, rank
+            passed[way, seen], last[way, seen] = number, rank
+            begun[way, seen[new]] = rank
     return np.array(early, np.int64)
+
+
+def _most_alike(first: Integers, second: Integers, share: Floats, poses: Floats) -> tuple[Integers, Integers, Floats]:
+    """Return a few pairs of each second scan: of large shares and like headings, the earliest first ones."""
+    apart = np.abs(wrap_angle(poses[first, 2] - poses[second, 2])) > 0.5 * np.pi
+    order = np.lexsort((first, apart.astype(np.int64) + (share < _LARGE), second))
+    begin = np.searchsorted(second[order], second[order])
+    kept = np.sort(order[np.arange(len(order)) - begin < _PAIRS])
+    return first[kept], second[kept], share[kept]
 
 
 def _best_of_passages(

@@ -68,7 +68,7 @@ def test_least_squares_are_those_of_scipy(seed: int) -> None:
     assert (found.links.weight == 1).all()
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_kernel_leaves_an_outlier_out_as_scipy_does(seed: int) -> None:
     start, links = scene(seed, outlier=True)
     found = solve(start, links, least=1e-14)
@@ -146,3 +146,8 @@ def test_covariances_are_blocks_of_the_dense_inverse(count: int) -> None:
         wide = np.zeros((3, 3 * count))
         wide[:, 3 * a : 3 * a + 3], wide[:, 3 * b : 3 * b + 3] = one[n], two[n]
         assert np.allclose(relative[n], wide @ joint @ wide.T, rtol=1e-6, atol=1e-10)
+    # Those of a few anchors, with all others eliminated, are the same.
+    some = Drift(found, most=max(count // 3, 1))
+    anchors = np.arange(0, count, -(-count // max(count // 3, 1)))
+    pairs = np.array([(a, b) for a in anchors for b in anchors if a < b], np.int64).reshape(-1, 2).T
+    assert np.allclose(some.relative(*pairs), Drift(found, most=count).relative(*pairs), rtol=1e-6, atol=1e-10)

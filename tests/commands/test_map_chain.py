@@ -152,6 +152,37 @@ def test_an_interrupt_keeps_the_chain_so_far(log, truth, tmp_path, capsys, monke
     assert off(read_tum(tum)[1], truth[:21]) < 0.05
 
 
+@pytest.mark.parametrize("kept", ["one scan", "no returns"])
+def test_a_log_of_hardly_anything(log, tmp_path, capsys, needs, kept):
+    lines = log.read_text().splitlines()[:6]
+    words = [line.split(" ") for line in lines]
+    poor, out = tmp_path / "poor.log", tmp_path / "map.yaml"
+    if kept == "one scan":
+        poor.write_text(lines[0] + "\n")
+    else:
+        far = [" ".join([*row[:2], *["60.0"] * FRONT.count, *row[2 + FRONT.count :]]) for row in words]
+        poor.write_text("\n".join(far) + "\n")
+    command = [
+        "map",
+        "--log",
+        str(poor),
+        "--chain",
+        "--out",
+        str(out),
+        "--range-max",
+        "29",
+        "--backend",
+        needs("opencl"),
+    ]
+    if kept == "one scan":
+        assert main(command) == 0
+        assert "1 scans, 1 matched" in capsys.readouterr().out
+        assert gs.read_map(out).occupied.any()
+    else:
+        assert error_of(command, capsys) == "scans: must have a range, got none"
+        assert not out.exists()
+
+
 def test_bad_options_are_one_line(log, tmp_path, capsys):
     out = str(tmp_path / "map.yaml")
     tum = tmp_path / "run.tum"

@@ -1,0 +1,147 @@
+"""Localise a robot on the map that a chain of scans made, and on the map of the data folder.
+
+    python bench/accuracy/chaining_localization.py --backend opencl --output bench/results/chaining_localization
+
+The even scans of a log are chained and make a map; the odd ones, which are in no map, correct a particle filter with
+the defaults of ``gpusense localize``, from around the pose of their first one. "given" is the map of the data folder,
+of the even scans at the corrected poses of the log (of all scans for jarvis); "at references" is of the same scans at
+the same poses, but counted by ``build_map``, so that it differs from "made" in poses alone.
+
+Errors are distances from the references after the best rigid alignment of each track, without the first 5 %; "over
+5 m" are errors of relative poses over 5 m of the way, which do not see how far a map is bent as a whole. Both are
+medians over the seeds of the median and of the 95 % quantile.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import gpusense as gs
+from gpusense.evaluation.tracking import START
+from gpusense.localization.defaults import DEFAULTS
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from chaining import LIMIT, figures
+from chaining_logs import Log, load, references
+from common import make_parser, note, parse, publish, table
+
+MAPS = {
+    "fr079": "carmen_logs/derived_maps/freiburg-079_even_05cm.yaml",
+    "csail": "carmen_logs/derived_maps/csail_even_05cm.yaml",
+    "aces": "carmen_logs/derived_maps/aces_even_05cm.yaml",
+    "fhw": "carmen_logs/derived_maps/fhw_even_05cm.yaml",
+    "seattle": "carmen_logs/derived_maps/seattle_even_05cm.yaml",
+    "jarvis-s3000": "jarvis_lab/jarvis_s3000_from_complex_03cm.yaml",
+    "jarvis-nav350": "jarvis_lab/jarvis_nav350_from_complex_03cm.yaml",
+}
+LENGTH = 5.0
+
+
+def part(log: Log, begin: int) -> Log:
+    """Return every second scan of a log."""
+    times = None if log.times is None else log.times[begin::2]
+    return replace(
+        log, ranges=log.ranges[begin::2], odometry=log.odometry[begin::2], truth=log.truth[begin::2], times=times
+    )
+
+
+def tracked(grid: gs.OccupancyGrid, log: Log, start: np.ndarray, seed: int, backend: str) -> np.ndarray:
+    """Return the poses of a particle filter."""
+    model = gs.LikelihoodFieldModel(
+        grid, log.scanner, gs.LikelihoodFieldParameters(**DEFAULTS.field), beams=DEFAULTS.beams, backend=backend
+    )
+    pf = gs.ParticleFilter(model, particles=DEFAULTS.particles, seed=seed)
+    pf.initialize(mean=start, covariance=np.diag(np.square(START)))
+    poses = []
+    for k, (ranges, odometry) in enumerate(zip(log.ranges, log.odometry, strict=True)):
+        if k:
+            pf.predict(log.odometry[k - 1], odometry)
+        pf.correct(ranges)
+        poses.append(pf.estimate().pose)
+    return np.array(poses)
+
+
+def aligned(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Return distances (S,) after the best rigid alignment [m]."""
+    p, q = poses[:, :2] @ (1, 1j), truth[:, :2] @ (1, 1j)
+    p, q = p - p.mean(), q - q.mean()
+    turn = np.vdot(p, q)
+    return np.abs(p * turn / abs(turn) - q)
+
+
+def over_length(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Return errors (P,) of relative poses over a path [m]."""
+    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T)))
+    first, second = np.arange(len(path)), np.searchsorted(path, path + LENGTH)
+    first, second = first[second < len(path)], second[second < len(path)]
+    moved = [gs.pose_difference(p[first], p[second]) for p in (truth, poses)]
+    return np.hypot(*(gs.pose_difference(*moved))[:, :2].T)
+
+
+def measured(log: Log, name: str, arguments: Any) -> list[dict[str, Any]]:
+    """Return the rows of a log: on each map."""
+    even, odd = part(log, 0), part(log, 1)
+    chain = gs.chain_scans(
+        even.ranges, odometry=even.odometry, times=even.times, backend=arguments.backend, **even.arguments
+    )
+    shift = figures(even, "", chain.poses, 0.0)["earlier_s"]
+    mapped, truth = references(even, shift), references(odd, shift)
+    given = gs.read_map(Path(arguments.data) / MAPS[name])
+    options = {"resolution": given.resolution, "range_limit": LIMIT, "backend": arguments.backend}
+    known = np.flatnonzero(np.isfinite(mapped).all(axis=1))
+    moved = chain.motions
+    maps = {
+        "given": given,
+        "at references": gs.build_map(
+            even.ranges[known], mapped[known], log.scanner, motion=None if moved is None else moved[known], **options
+        ),
+        "made": gs.build_map(even.ranges, chain.poses, log.scanner, motion=moved, **options),
+    }
+    chosen = np.flatnonzero(np.isfinite(truth).all(axis=1))[: arguments.scans]
+    runs, true = slice(int(chosen[0]), int(chosen[-1]) + 1), truth[chosen]
+    some = replace(odd, ranges=odd.ranges[runs], odometry=odd.odometry[runs])
+    step = gs.pose_difference(even.odometry[chosen[0]], odd.odometry[chosen[0]])
+    starts = {"made": gs.compose_poses(chain.poses[chosen[0]], step)}
+    late = slice(len(chosen) // 20, None)
+    rows = []
+    for kind, grid in maps.items():
+        found = []
+        for seed in range(arguments.seeds):
+            poses = tracked(grid, some, starts.get(kind, true[0]), seed, arguments.backend)[chosen - chosen[0]]
+            off, near = aligned(poses[late], true[late]), over_length(poses[late], true[late])
+            found.append([float(np.percentile(values, share)) for values in (off, near) for share in (50, 95)])
+        median = np.median(found, axis=0).tolist()
+        row = {"log": name, "map": kind, "held_out": len(chosen), "each_seed": found}
+        rows.append(row | dict(zip(("median_m", "p95_m", "median_5_m", "p95_5_m"), median, strict=True)))
+        note(f"{name}, {kind}: {median}")
+    return rows
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Measure, and publish a table."""
+    parser = make_parser(__doc__, backend="auto", data=True)
+    parser.add_argument("--log", action="append", choices=MAPS, help="default: all")
+    parser.add_argument("--seeds", type=int, default=3, help="runs on each map (default: %(default)s)")
+    parser.add_argument("--scans", type=int, default=1000, help="most held-out scans (default: %(default)s)")
+    arguments = parse(parser, argv)
+    rows = []
+    for name in arguments.log or MAPS:
+        rows += measured(load(Path(arguments.data), name), name, arguments)
+    columns = ["log", "held-out scans", "map", "median cm", "95 % cm", "over 5 m: median cm", "95 % cm"]
+    lines = [
+        [row["log"], row["held_out"], row["map"],
+         *(f"{100 * row[key]:.1f}" for key in ("median_m", "p95_m", "median_5_m", "p95_5_m"))]
+        for row in rows
+    ]  # fmt: skip
+    publish(__file__, arguments, table(columns, lines), {"rows": rows})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,95 @@
+"""How much of the drift of jarvis' lasers is their mount on the robot, as the log's transforms state it?
+
+    python bench/accuracy/chaining_mount.py --backend opencl --output bench/results/chaining_mount
+
+A chain of each laser is made with odometry and closures. The mount (x, y, heading) and the clock's offset that make the
+drift over 5 m least against the references of one half of the run are found by Nelder and Mead's method, and judged on
+the other half. "corrected" there is with the mount of the other half; "as stated" with the transforms' one, and the
+clock's offset of the other half as well.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+import gpusense as gs
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from chaining import drifts
+from chaining_logs import Log, load, references
+from common import make_parser, parse, publish, table
+
+LASERS = ("jarvis-s3000", "jarvis-nav350")
+LENGTH = 5.0
+# First steps of the search [m, m, rad, s].
+STEPS = (0.02, 0.02, 0.01, 0.03)
+
+
+def remounted(poses: np.ndarray, mount: np.ndarray, off: np.ndarray) -> np.ndarray:
+    """Return the robot's poses (S, 3) if the scanner is mounted as stated plus an offset (3,)."""
+    return gs.compose_poses(gs.compose_poses(poses, mount), gs.invert_poses(mount + off))
+
+
+def fitted(log: Log, poses: np.ndarray, part: slice, steps: tuple[float, ...]) -> np.ndarray:
+    """Return the offset of the mount and that of the clock (4,) with the least drift on a part; 0 where a step is."""
+    free = np.flatnonzero(steps)
+    start = np.array([0.0, 0.0, 0.0, 0.05])
+
+    def drift(values: np.ndarray) -> float:
+        found = start.copy()
+        found[free] = values
+        moved = remounted(poses, np.array(log.scanner.mount), found[:3])
+        return drifts(moved[part], references(log, found[3])[part], LENGTH)[0]
+
+    simplex = start[free] + np.concatenate([np.zeros((1, len(free))), np.diag(np.array(steps)[free])])
+    result = start.copy()
+    result[free] = minimize(
+        drift, start[free], method="Nelder-Mead", options={"initial_simplex": simplex, "maxiter": 200}
+    ).x
+    return result
+
+
+def measured(log: Log, backend: str) -> list[dict[str, Any]]:
+    """Return the rows of a laser: of each half."""
+    chain = gs.chain_scans(log.ranges, odometry=log.odometry, times=log.times, backend=backend, **log.arguments)
+    mount, half = np.array(log.scanner.mount), len(log.ranges) // 2
+    parts = {"first": slice(0, half), "second": slice(half, None)}
+    rows = []
+    for tuned, part in parts.items():
+        other = parts["second" if tuned == "first" else "first"]
+        plain, found = (fitted(log, chain.poses, part, steps) for steps in ((0.0, 0.0, 0.0, STEPS[3]), STEPS))
+        row = {"log": log.name, "tuned_on": tuned, "mount": found[:3].tolist(), "earlier_s": found[3]}
+        for name, value in (("stated", plain), ("corrected", found)):
+            moved = remounted(chain.poses, mount, value[:3])
+            row[name] = drifts(moved[other], references(log, value[3])[other], LENGTH)
+        rows.append(row)
+    return rows
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Measure, and publish a table."""
+    arguments = parse(make_parser(__doc__, backend="auto", data=True), argv)
+    rows = []
+    for name in LASERS:
+        rows += measured(load(Path(arguments.data), name), arguments.backend)
+    columns = ["laser", "mount tuned on", "correction: mm, mm, deg", "drift of the other half as stated", "corrected"]
+    lines = [
+        [
+            row["log"], f"{row['tuned_on']} half",
+            "{:.0f}, {:.0f}, {:.2f}".format(*np.multiply(row["mount"], (1e3, 1e3, np.degrees(1)))),
+            *("{:.2f} %, {:.3f} deg/m".format(*row[name]) for name in ("stated", "corrected")),
+        ]
+        for row in rows
+    ]  # fmt: skip
+    publish(__file__, arguments, table(columns, lines), {"rows": rows})
+
+
+if __name__ == "__main__":
+    main()

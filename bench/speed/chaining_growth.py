@@ -1,0 +1,130 @@
+"""Measure how key scans, searched places, memory and time of chains of scans grow with the length of a log.
+
+    python bench/speed/chaining_growth.py --backend opencl --output bench/results/chaining_growth
+
+Rows of less than a pass have the first scans of a recorded log. Those of more drive it again and again: forth, back in
+the reverse order of its scans, forth, ... Each scan then has noise of its own, of 1 cm on ranges, and of 2 % on the
+odometer's motions. The last row of fr079 has 5000 scans.
+
+"searched" are pairs of key scans that were matched to find places again. "links" are all of the pose graph. "launches"
+are those of kernels. Each row has a process of its own; "memory" is the growth of its largest resident set during the
+chain, "processor" the time of all threads, "main" that of the thread that calls, both without compilation.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import resource
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import gpusense as gs
+from gpusense.backends import get_backend
+from gpusense.backends.proxy import Proxy
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "accuracy"))
+
+from chaining_logs import load
+from common import make_parser, note, parse, publish, table
+
+# Passes of each log.
+SCANS = 5000
+PASSES = {"intel": (0.25, 0.5, 1.0), "fr079": (0.125, 0.25, 0.5, 1.0, SCANS / 4791), "seattle": (1.0, 2.0, 4.0, 8.0)}
+# Noise of ranges [m], and of each pass's odometry.
+NOISE, STRETCH = 0.01, 0.02
+
+
+class Counter(Proxy):
+    """A backend that counts launches."""
+
+    launches = 0
+
+    def compile(self, kernel: str, flags: frozenset[str]) -> Any:
+        """See Backend.compile."""
+        launcher = super().compile(kernel, flags)
+
+        def launch(*arguments: Any) -> None:
+            self.launches += 1
+            launcher(*arguments)
+
+        return launch
+
+
+def driven(data: Path, name: str, passes: float) -> tuple[np.ndarray, gs.Scanner, np.ndarray]:
+    """Return ranges, scanner and odometry of a recorded log that is driven forth and back, or of its first part."""
+    log, rng = load(data, name), np.random.default_rng(0)
+    count = len(log.ranges)
+    if passes <= 1:
+        count = round(count * passes)
+        return log.ranges[:count], log.scanner, log.odometry[:count]
+    rows = [np.arange(count)]
+    while sum(map(len, rows)) < passes * count - 0.5:
+        rows.append(rows[-1][::-1][1:])
+    order = np.concatenate(rows)[: round(passes * count)]
+    ranges = log.ranges[order] + rng.normal(0, NOISE, (len(order), log.scanner.count))
+    moved = gs.pose_difference(log.odometry[order[:-1]], log.odometry[order[1:]])
+    moved *= 1 + STRETCH * rng.normal(size=moved.shape)
+    odometry = [log.odometry[0]]
+    for step in moved:
+        odometry.append(gs.compose_poses(odometry[-1], step))
+    return ranges, log.scanner, np.array(odometry)
+
+
+def measured(data: Path, name: str, passes: float, backend: str) -> dict[str, Any]:
+    """Return the figures of a chain."""
+    ranges, scanner, odometry = driven(data, name, passes)
+    device = Counter(get_backend(backend))
+    gs.chain_scans(ranges[:40], scanner, odometry[:40], backend=device)
+    device.launches = 0
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    begun = time.perf_counter(), time.process_time(), time.thread_time()
+    chain = gs.chain_scans(ranges, scanner, odometry, backend=device)
+    ended = time.perf_counter(), time.process_time(), time.thread_time()
+    seconds, processor, main = (b - a for a, b in zip(begun, ended, strict=True))
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory) / 1024
+    path = float(np.hypot(*np.diff(chain.poses[:, :2], axis=0).T).sum())
+    return {
+        "log": name, "passes": passes, "scans": len(ranges), "beams": scanner.count, "path_m": path,
+        "key_scans": len(chain.keys), "searched": chain.searched, "links": len(chain.links),
+        "closures": len(chain.closures), "launches": device.launches, "memory_mb": grown,
+        "processor_s": processor, "main_s": main, "seconds": seconds,
+    }  # fmt: skip
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Measure, and publish a table."""
+    parser = make_parser(__doc__, backend="auto", data=True)
+    parser.add_argument("--log", action="append", choices=PASSES, help="default: all")
+    parser.add_argument("--most", type=float, default=np.inf, help="most passes (default: all)")
+    arguments = parse(parser, argv)
+    rows = []
+    for name in arguments.log or PASSES:
+        for length in PASSES[name]:
+            if length > arguments.most:
+                continue
+            with multiprocessing.get_context("spawn").Pool(1) as pool:
+                rows.append(pool.apply(measured, (Path(arguments.data), name, length, arguments.backend)))
+            note(f"{name}, {length:.3g} passes: {rows[-1]['searched']} searched, {rows[-1]['processor_s']:.1f} s")
+    columns = [
+        "log", "scans x beams", "passes", "path m", "key scans", "searched, a key scan", "links", "closures",
+        "launches", "memory MB", "processor s", "main s", "s", "processor ms a scan",
+    ]  # fmt: skip
+    lines = [
+        [
+            row["log"], f"{row['scans']} x {row['beams']}", f"{row['passes']:.3g}", f"{row['path_m']:.0f}",
+            row["key_scans"], f"{row['searched']}, {row['searched'] / row['key_scans']:.1f}", row["links"],
+            row["closures"], row["launches"], f"{row['memory_mb']:.0f}", f"{row['processor_s']:.1f}",
+            f"{row['main_s']:.1f}", f"{row['seconds']:.1f}", f"{1000 * row['processor_s'] / row['scans']:.2f}",
+        ]
+        for row in rows
+    ]  # fmt: skip
+    publish(__file__, arguments, table(columns, lines), {"rows": rows})
+
+
+if __name__ == "__main__":
+    main()

@@ -13,8 +13,8 @@ from support.bench_scripts import BENCH, run_script
 def test_features_are_measured(data_dir: Path, needs: Callable[[str], str], tmp_path: Path) -> None:
     """Simulated floors, one recording's worth of scans, and rates."""
     report = run_script(
-        "accuracy/features.py", "--data", str(data_dir), "--backend", needs("opencl"), "--floors", "1", "--scans", "4",
-        "--every", "6", "--limit", "40", "--repeats", "1", "--parts", "simulated", "real", "rates",
+        "accuracy/features.py", "--data", str(data_dir), "--backend", needs("opencl"), "--floors", "1", "--scans", "2",
+        "--every", "12", "--limit", "20", "--repeats", "1", "--parts", "simulated", "real", "rates",
         output=tmp_path / "features",
     )  # fmt: skip
     assert report["simulated"]["360 0.01 line"]["recall"] > 0.9

@@ -1,4 +1,4 @@
-"""Notebooks hold no outputs, stand on the site, whose build executes them, and name what they would fetch: nothing."""
+"""Notebooks hold no outputs and fetch nothing; the build of the site executes them."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ import io
 import itertools
 import re
 import tokenize
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -70,10 +70,18 @@ def missing_paths(name: str, text: str) -> list[str]:
     """Return the paths that a file names and that the project lacks, with their places.
 
     A path with folders is one of the project if its first folder is there, in the root, in one of the usual bases, or
-    beside the file. A bare name is one if it ends as a source does.
+    beside the file. A bare name is one if it ends as a source does. Few files have such a path at all, so most are not
+    split into code and prose.
     """
+    if not gone_in(name, enumerate(text.splitlines(), 1)):
+        return []
+    return gone_in(name, prose(name, text))
+
+
+def gone_in(name: str, lines: Iterable[tuple[int, str]]) -> list[str]:
+    """Return the missing paths of some lines of a file."""
     gone = []
-    for number, line in prose(name, text):
+    for number, line in lines:
         for match in _PATH.finditer(line):
             path = match.group(1).rstrip("/")
             here = Path(name).parent.as_posix()

@@ -9,7 +9,6 @@ The same reports give the same bytes everywhere.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -18,11 +17,13 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from error_vs_time.charts import Chart, Mark, drawing
-from error_vs_time.reports import ALL, LIMIT, RESULTS, ROOT, Row, Source, commit_trouble, rows_of, sources
+from error_vs_time.reports import LIMIT, RESULTS, ROOT, Source, commit_trouble, rows_of, sources
 
 from gpusense._util.files import write_whole
 from gpusense.evaluation.benchmark.choice import choose, error_text, front, time_text
 from gpusense.evaluation.benchmark.report import table
+from gpusense.evaluation.benchmark.rows import ALL, Row
+from gpusense.plots.error_page import error_page
 
 HERE = Path(__file__).parent
 PAGE, FIGURE = Path("docs/error-vs-time.md"), Path("docs/front/figures/error-vs-time.html")
@@ -235,31 +236,6 @@ def picture(name: str) -> Path:
     return IMAGES / f"error-vs-time-{name.replace(' ', '-')}.svg"
 
 
-def interactive(rows: Sequence[Row]) -> str:
-    """Return the interactive page."""
-    data = [
-        {
-            "need": row.need, "device": row.device, "map": row.scene, "name": row.text, "method": row.method,
-            "code": row.code, "outside": row.outside, "maps": row.maps, "time": _short(row.seconds),
-            "quartiles": [_short(one) for one in row.quartiles],
-            "errors": {name: _short(row.errors[name]) for name in SHOWN[row.need] if name in row.errors},
-            "units": [row.units[name] for name in SHOWN[row.need] if name in row.errors],
-        }
-        for row in rows
-    ]  # fmt: skip
-    text = (HERE / "figure.html").read_text(encoding="utf-8")
-    lines = ",\n".join(json.dumps(one, allow_nan=False, separators=(",", ":")) for one in data)
-    style = (ROOT / "docs" / "figures" / "style.css").read_text(encoding="utf-8")
-    script = (HERE / "figure.js").read_text(encoding="utf-8")
-    for mark, part in {"style": style, "script": script, "data": f"[{lines}]"}.items():
-        text = text.replace(f"/*{{{mark}}}*/", part)
-    return text
-
-
-def _short(number: float) -> float:
-    return float(f"{number:.4g}")
-
-
 def files(folder: Path = RESULTS) -> dict[Path, str]:
     """Return all files of the page by their paths in the checkout.
 
@@ -284,7 +260,7 @@ def files(folder: Path = RESULTS) -> dict[Path, str]:
     text = (HERE / "template.txt").read_text(encoding="utf-8")
     for name, lines in blocks.items():
         text = text.replace(f"{{{{{name}}}}}", "\n".join(lines))
-    return made | {PAGE: text, FIGURE: interactive(rows)}
+    return made | {PAGE: text, FIGURE: error_page(rows, SHOWN)}
 
 
 def main() -> int:

@@ -51,7 +51,7 @@ class Row:
     """A method on a device, in one map or in all.
 
     Attributes:
-        need: What it is for.
+        need: Its need, a value of ``NEEDS``.
         device: Title of the device.
         scene: Name of the map; ``ALL`` for the worst error and the mean time of all.
         method, setting, precision, code: As in the reports.

@@ -85,7 +85,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--backend", action="append", required=True, help="selection string, repeatable")
     parser.add_argument("--scene", action="append", help="scene of gpusense bench, repeatable; default: all")
-    parser.add_argument("--no-peers", action="store_true", help="without other implementations")
     parser.add_argument("--no-tasks", action="store_true", help="without the report of needs.py")
     parser.add_argument("--build-limit", type=float, default=20.0, help="longest time to build a table [s]")
     parser.add_argument("--point-seconds", type=float, default=1.0, help="longest time of a point's calls [s]")

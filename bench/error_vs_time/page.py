@@ -194,7 +194,7 @@ def peers(rows: Sequence[Row]) -> list[str]:
     """Return the table of other implementations beside the rows that they stand against."""
     outside = [row for row in rows if row.outside and row.scene == ALL]
     lines = []
-    for need in ("rays", "likelihood field"):
+    for need in ("rays", "beam model", "likelihood field"):
         measure = SHOWN[need][0]
         for device in dict.fromkeys(row.device for row in outside if row.need == need):
             rivals = [row for row in outside if (row.need, row.device) == (need, device)]
@@ -207,6 +207,21 @@ def peers(rows: Sequence[Row]) -> list[str]:
                 error = value(row.errors[measure], row.units[measure]) + " nats" * (need != "rays")
                 lines.append((need, row.text, row.outside or "gpusense", f"{rate:.3g}", error, device))
     return table(("for", "method", "version, threads", "M/s of one core", "error", "processor"), lines, 3)
+
+
+def rival_matchers(rows: Sequence[Row]) -> list[str]:
+    """Return the table of other programs that match pairs of scans, beside gpusense's methods; empty without them."""
+    outside = [row for row in rows if row.outside and row.need == "matching"]
+    lines = []
+    for device in dict.fromkeys(row.device for row in outside):
+        reference = [row for row in own(rows, "matching", device) if row.precision == "float32"]
+        settings = {row.setting for row in outside}
+        listed = [row for row in [*outside, *reference] if row.device == device and row.setting in settings]
+        for row in sorted(listed, key=lambda one: (int(one.setting.split()[0]), one.seconds)):
+            errors = [value(row.errors[name], "m") for name in SHOWN["matching"]]
+            lines.append((row.method, row.setting, row.outside or "gpusense", time_text(row.seconds), *errors, device))
+    columns = ("method", "scan", "version, threads", "a match, one core", *SHOWN["matching"], "processor")
+    return table(columns, lines, 3) if lines else ["(none in these reports)"]
 
 
 def by_map(rows: Sequence[Row], devices: Sequence[str]) -> list[str]:
@@ -251,7 +266,7 @@ def files(folder: Path = RESULTS) -> dict[Path, str]:
     made = {picture(need): chart(rows, need, devices) for need in needs}
     blocks = {
         "first": answers(rows, devices, FIRST), "answers": answers(rows, devices, WISHES), "peers": peers(rows),
-        "maps": by_map(rows, devices), "reports": listing(found), "limit": [str(LIMIT)],
+        "matchers": rival_matchers(rows), "maps": by_map(rows, devices), "reports": listing(found), "limit": [str(LIMIT)],
     }  # fmt: skip
     for need in NEEDS:
         blocks[need] = methods(rows, need, devices, fronts=need == "localisation") if need in needs else ["(none yet)"]

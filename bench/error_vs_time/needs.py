@@ -461,15 +461,24 @@ def main() -> None:
 def report_of(arguments: argparse.Namespace, backends: Sequence[str], command: str) -> dict[str, Any]:
     """Measure, and return the report."""
     stated, devices = arguments.commit or commit(), [get_backend(name) for name in backends]
-    rows = [
+    rows = [row for need in arguments.need or NEEDS for row in measured(need, devices, arguments)]
+    return document(rows, stated, command)
+
+
+def measured(need: str, devices: Sequence[Backend], arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """Return the rows of a need on some devices; other programs are measured beside the first one."""
+    return [
         row
-        for device in devices
-        for need in arguments.need or NEEDS
-        for row in measure(need, device, arguments, peers=device is devices[0] and not arguments.no_peers)
+        for i, device in enumerate(devices)
+        for row in measure(need, device, arguments, peers=i == 0 and not arguments.no_peers)
     ]
+
+
+def document(rows: Sequence[dict[str, Any]], stated: str | None, command: str) -> dict[str, Any]:
+    """Return the report of some rows."""
     return plain({
         "schema": SCHEMA, "kind": "needs", "date": time.strftime("%Y-%m-%d"), "commit": stated, "command": command,
-        "machine": machine(), "rows": rows,
+        "machine": machine(), "rows": list(rows),
     })  # fmt: skip
 
 

@@ -266,7 +266,8 @@ def files(folder: Path = RESULTS) -> dict[Path, str]:
     made = {picture(need): chart(rows, need, devices) for need in needs}
     blocks = {
         "first": answers(rows, devices, FIRST), "answers": answers(rows, devices, WISHES), "peers": peers(rows),
-        "matchers": rival_matchers(rows), "maps": by_map(rows, devices), "reports": listing(found), "limit": [str(LIMIT)],
+        "matchers": rival_matchers(rows), "maps": by_map(rows, devices), "reports": listing(found),
+        "limit": [str(LIMIT)],
     }  # fmt: skip
     for need in NEEDS:
         blocks[need] = methods(rows, need, devices, fronts=need == "localisation") if need in needs else ["(none yet)"]

@@ -61,6 +61,7 @@ START = (0.5, 0.5, 0.26)
 # Most particles x beams of a setting, by the kind of device.
 MOST = {"cpu": 4_000_000, "gpu": 1_100_000_000}
 PAIRS = 60
+BEAMS = (90, 180, 360, 720)
 # Most readings of the methods that take some hundred passes over them.
 MOST_SEARCHED = 100_000
 PARTICLES = 10_000
@@ -245,7 +246,7 @@ def pairs(device: Backend) -> Iterator[Pairs]:
     second = first + rng.uniform(-1, 1, first.shape) * (1.0, 1.0, np.radians(30))
     off = rng.uniform(-1, 1, first.shape) * (0.5, 0.5, np.radians(10))
     truth = relative_poses(first, second)
-    for count in (90, 180, 360, 720):
+    for count in BEAMS:
         scanner = gs.Scanner.uniform(angle_min=-np.pi, angle_increment=2 * np.pi / count, count=count, range_max=20.0)
         caster = gs.RayCaster(grid, scanner.range_max, backend=device)
         one, two = (caster.cast(poses, scanner.bearings).astype(np.float64) for poses in (first, second))

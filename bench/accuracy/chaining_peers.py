@@ -27,15 +27,15 @@ _CONFIGURATION = "#define STDC_HEADERS 1\n" + "\n".join(
 )  # fmt: skip
 
 
-def build(source: Path, gsl: Path | None, folder: Path) -> Path:
-    """Compile the program of ``peer_code/csm.c``, and return it.
+def build(source: Path, gsl: Path | None, folder: Path, *, shared: bool = False) -> Path:
+    """Compile the program of ``peer_code/csm.c``, and return it; with ``shared`` a library that has its functions.
 
     Args:
         source: A copy of CSM's repository.
         gsl: Where GSL's ``include`` and ``lib`` are; None where the compiler finds them.
         folder: Place of the program.
     """
-    root, program = source / "sm", folder / "csm"
+    root, program = source / "sm", folder / ("csm.so" if shared else "csm")
     files = [path for part in ("csm", "lib") for path in sorted((root / part).rglob("*.c"))]
     files = [path for path in files if not any(word in path.as_posix().split("/sm/")[-1] for word in _LEFT_OUT)]
     (folder / "config.h").write_text(_CONFIGURATION)
@@ -43,7 +43,8 @@ def build(source: Path, gsl: Path | None, folder: Path) -> Path:
     libraries = [] if gsl is None else [f"-L{path.parent}" for path in sorted(gsl.rglob("libgsl.so"))]
     paths = [f"-Wl,--disable-new-dtags,-rpath,{place[2:]}" for place in libraries]
     subprocess.run(
-        ["gcc", "-O2", "-DNDEBUG", "-std=gnu99", "-w", "-fcommon", *(f"-I{place}" for place in places), "-o",
+        ["gcc", "-O2", "-DNDEBUG", "-std=gnu99", "-w", "-fcommon", *(["-fPIC", "-shared"] if shared else []),
+         *(f"-I{place}" for place in places), "-o",
          str(program), str(CODE), *map(str, files), *libraries, *paths, "-lgsl", "-lgslcblas", "-lm"],
         check=True,
     )  # fmt: skip

@@ -75,6 +75,51 @@ class Compiled:
         return ranges
 
 
+class Weigher:
+    """A model of a peer that is made once; its calls give weights alone.
+
+    Args:
+        compiled: The peer.
+        grid: The map, without a yaw.
+        scanner: The scanner, without a mount.
+        parameters, model, options: As of ``Compiled.score``.
+    """
+
+    def __init__(
+        self,
+        compiled: Compiled,
+        grid: gs.OccupancyGrid,
+        scanner: gs.Scanner,
+        parameters: Sequence[float],
+        model: str,
+        options: int = 0,
+    ) -> None:
+        self._library, self._scanner = compiled.library, scanner
+        self._bearings = np.ascontiguousarray(scanner.bearings, np.float64)
+        cells, geometry = np.ascontiguousarray(grid.cells), np.array([grid.resolution, *grid.origin])
+        given = np.ascontiguousarray(parameters, np.float64)
+        make = compiled.library.prepare
+        make.restype = ctypes.c_void_p
+        self._made = ctypes.c_void_p(
+            make(_pointer(cells), *grid.shape, _pointer(geometry), _pointer(given), MODELS[model], options,
+                 scanner.count, ctypes.c_double(scanner.range_max), None)
+        )  # fmt: skip
+
+    def __call__(self, poses: np.ndarray, ranges: np.ndarray) -> np.ndarray:
+        """Return the weights of (N, 3) poses for (K,) readings."""
+        weights = np.empty(len(poses))
+        placed, read = np.ascontiguousarray(poses, np.float64), np.ascontiguousarray(ranges, np.float64)
+        self._library.weigh(
+            self._made, _pointer(placed), len(placed), _pointer(read), _pointer(self._bearings), len(read),
+            ctypes.c_double(self._scanner.range_min), ctypes.c_double(self._scanner.range_max), _pointer(weights),
+        )  # fmt: skip
+        return weights
+
+    def __del__(self) -> None:
+        if hasattr(self, "_made"):
+            self._library.discard(self._made)
+
+
 def build(name: str, source: Path, include: Sequence[Path], folder: Path) -> Compiled:
     """Compile a peer.
 

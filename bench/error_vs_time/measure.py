@@ -4,10 +4,10 @@
     python bench/error_vs_time/measure.py --backend warp:cuda:0 --deadline 280 --output bench/results/error_vs_time_h200
 
 NAME_tasks.json is the report of needs.py, NAME_models.json one of ``gpusense bench`` with 10 000 particles and 360
-beams: all methods in float32, exact ones also in float64. Scenes are measured one after the
-other; after --deadline no further one begins, and the report has those before. Reports are written as soon as they are
-there, that of the models after each scene. A checkout with uncommitted changes is refused; --commit names that of a
-copy without a repository.
+beams: all methods in float32, exact ones also in float64. Needs and scenes are measured one after the other, and the
+report is written after each; after --deadline no further one begins. --extend keeps what NAME's reports have, and adds
+the needs and scenes that they lack; they must be of the same commit, machine, devices and sizes. A checkout with
+uncommitted changes is refused; --commit names that of a copy without a repository.
 """
 
 from __future__ import annotations
@@ -25,13 +25,20 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import needs
 from common import command_line, note
+from reports import read_tasks
 
+from gpusense._util.files import write_whole
+from gpusense.backends import get_backend
 from gpusense.commands import bench
-from gpusense.evaluation.benchmark.report import commit, document, to_json
+from gpusense.evaluation.benchmark.report import commit, document, plain, to_json
 from gpusense.evaluation.benchmark.runner import Outcome, Plan, run
+from gpusense.evaluation.benchmark.stored import read_report
 from gpusense.evaluation.machine import machine
 
 SIZE = ["--particles", "10000", "--beams", "360", "--repeats", "15"]
+QUICK = ["--particles", "512", "--beams", "60", "--repeats", "3", "--checked", "64"]
+# Arguments that points of one report share.
+ALIKE = ("particles", "checked", "beams", "repeats", "seconds", "seed", "build_limit")
 # Scenes that are measured first.
 FIRST = ("building", "basement", "intel", "clutter", "willow", "spielberg")
 
@@ -40,7 +47,13 @@ def plans_of(arguments: argparse.Namespace) -> tuple[list[Plan], dict[str, Any],
     """Return a plan for each scene, exact methods in float64 included; the arguments, and what is absent."""
     parser = argparse.ArgumentParser()
     bench.add_arguments(parser)
-    words = [*SIZE, "--build-limit", str(arguments.build_limit), "--seconds", str(arguments.point_seconds)]
+    words = [
+        *(QUICK if arguments.quick else SIZE),
+        "--build-limit",
+        str(arguments.build_limit),
+        "--seconds",
+        str(arguments.point_seconds),
+    ]
     words += [word for name in arguments.backend for word in ("--backend", name)]
     words += [word for name in arguments.scene or () for word in ("--scene", name)]
     words += ["--no-peers"] if arguments.no_peers else []
@@ -56,12 +69,29 @@ def plans_of(arguments: argparse.Namespace) -> tuple[list[Plan], dict[str, Any],
     return plans, bench.arguments_of(given, replace(whole, sources=sources)), absent
 
 
-def models(arguments: argparse.Namespace, stated: str, begin: float) -> Iterator[dict[str, Any]]:
-    """Measure the scenes until the deadline; yield the report after each one."""
+def models(
+    arguments: argparse.Namespace, stated: str, begin: float, old: dict[str, Any] | None = None
+) -> Iterator[dict[str, Any]]:
+    """Measure the scenes that an old report lacks until the deadline; yield the report after each one.
+
+    Raises:
+        ValueError: the old report has other sizes or devices.
+    """
     plans, given, absent = plans_of(arguments)
-    outcome, done = Outcome([], []), []
+    outcome, command = Outcome([], []), command_line("bench/error_vs_time/measure.py")
+    if old is not None:
+        same(
+            {name: old["arguments"].get(name) for name in ALIKE}, {name: given.get(name) for name in ALIKE}, "arguments"
+        )
+        same([one["selection"] for one in old["devices"]], [one.info.selection for one in plans[0].backends], "devices")
+        outcome.scenes, outcome.points = list(old["scenes"]), list(old["points"])
+        command = f"{old['command']}; {command}"
+    done = [scene["name"] for scene in outcome.scenes]
+    measured = {(point["scene"], point["precision"]) for point in outcome.points if not point["outside"]}
     for plan in plans:
         name = plan.sources[0].name
+        if (name, plan.precisions[0]) in measured:
+            continue
         if time.perf_counter() - begin > arguments.deadline:
             note(f"left out, the {arguments.deadline:g} s were over: {name}")
             continue
@@ -76,8 +106,52 @@ def models(arguments: argparse.Namespace, stated: str, begin: float) -> Iterator
         done.append(name)
         note(f"{name}, {plan.precisions[0]}: {time.perf_counter() - begin:.0f} s")
         given |= {"scenes": list(dict.fromkeys(done)), "precisions": ["float32", "float64"]}
-        report = document(plans[0], outcome, given, machine(), absent, command_line("bench/error_vs_time/measure.py"))
-        yield report | {"commit": stated}
+        yield document(plans[0], outcome, given, machine(), absent, command) | {"commit": stated}
+
+
+def tasks(
+    arguments: argparse.Namespace, stated: str, begin: float, old: dict[str, Any] | None = None
+) -> Iterator[dict[str, Any]]:
+    """Measure the needs that an old report lacks until the deadline; yield the report after each one.
+
+    Raises:
+        ValueError: the old report has other devices.
+    """
+    devices, command = [get_backend(name) for name in arguments.backend], command_line("bench/error_vs_time/measure.py")
+    rows: list[dict[str, Any]] = []
+    if old is not None:
+        before = dict.fromkeys(row["backend"] for row in old["rows"] if row["backend"] != "outside")
+        same(list(before), [device.info.selection for device in devices], "devices")
+        rows, command = list(old["rows"]), f"{old['command']}; {command}"
+    for need in arguments.need or needs.NEEDS:
+        if any(row["need"] == need for row in rows):
+            continue
+        if time.perf_counter() - begin > arguments.deadline:
+            note(f"left out, the {arguments.deadline:g} s were over: {need}")
+            continue
+        rows += needs.measured(need, devices, arguments)
+        yield needs.document(rows, stated, command)
+
+
+def same(old: object, new: object, what: str) -> None:
+    """Raise ``ValueError`` where a report to extend has something else."""
+    if old != new:
+        raise ValueError(f"--extend: {what} must be as in the report, {old}, got {new}")
+
+
+def earlier(output: Path, kind: str, stated: str) -> dict[str, Any] | None:
+    """Return the report to extend; None where there is none.
+
+    Raises:
+        ValueError: it is damaged, or of another commit or machine.
+    """
+    file = output.with_name(f"{output.name}_{kind}.json")
+    if not file.is_file():
+        return None
+    report = (read_report if kind == "models" else read_tasks)(file)
+    same(report["commit"], stated, "the commit")
+    same(report["machine"], plain(machine()), "the machine")
+    return report
 
 
 def main() -> None:
@@ -85,11 +159,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--backend", action="append", required=True, help="selection string, repeatable")
     parser.add_argument("--scene", action="append", help="scene of gpusense bench, repeatable; default: all")
-    parser.add_argument("--no-peers", action="store_true", help="without other implementations")
     parser.add_argument("--no-tasks", action="store_true", help="without the report of needs.py")
+    parser.add_argument("--no-models", action="store_true", help="without the report of gpusense bench")
+    parser.add_argument("--quick", action="store_true", help="512 particles, 60 beams, to see whether all runs")
+    parser.add_argument("--extend", action="store_true", help="keep what the reports have, and add the rest")
     parser.add_argument("--build-limit", type=float, default=20.0, help="longest time to build a table [s]")
     parser.add_argument("--point-seconds", type=float, default=1.0, help="longest time of a point's calls [s]")
-    parser.add_argument("--deadline", type=float, default=1e9, help="time after which no scene begins [s]")
+    parser.add_argument("--deadline", type=float, default=1e9, help="time after which no need or scene begins [s]")
     parser.add_argument("--commit", default="", help="for a copy of the tree that is no git repository")
     parser.add_argument("--output", type=Path, required=True, help="path without ending of the .json files")
     needs.add_options(parser)
@@ -99,17 +175,22 @@ def main() -> None:
         parser.error(f"--commit: the checkout must have no uncommitted changes, got {stated or 'no repository'}")
     arguments.commit, begin = stated, time.perf_counter()
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
-    if not arguments.no_tasks:
-        made = needs.report_of(arguments, arguments.backend, command_line("bench/error_vs_time/measure.py"))
-        write(arguments.output, "tasks", made)
-    for report in models(arguments, stated, begin):
-        write(arguments.output, "models", report)
+    kinds = {"tasks": tasks, "models": models}
+    for kind, measure in kinds.items():
+        if getattr(arguments, f"no_{kind}"):
+            continue
+        try:
+            old = earlier(arguments.output, kind, stated) if arguments.extend else None
+            for report in measure(arguments, stated, begin, old):
+                write(arguments.output, kind, report)
+        except (OSError, ValueError) as error:
+            parser.error(str(error))
 
 
 def write(output: Path, kind: str, report: dict[str, Any]) -> None:
     """Write a report."""
     file = output.with_name(f"{output.name}_{kind}.json")
-    file.write_text(to_json(report), encoding="utf-8")
+    write_whole(file, lambda stream: stream.write(to_json(report).encode()))
     note(f"written: {file.name}")
 
 

@@ -43,8 +43,10 @@ from gpusense.evaluation.simulation.changes import surface_of
 from gpusense.localization.defaults import DEFAULTS
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from common import command_line, make_parser, note, parse, table
+from matchers import Matcher, matchers
 from recordings import BEAM
 from speed.learning import TYPICAL, values
 from speed.point_models import landmark_scene
@@ -59,6 +61,7 @@ START = (0.5, 0.5, 0.26)
 # Most particles x beams of a setting, by the kind of device.
 MOST = {"cpu": 4_000_000, "gpu": 1_100_000_000}
 PAIRS = 60
+BEAMS = (90, 180, 360, 720)
 # Most readings of the methods that take some hundred passes over them.
 MOST_SEARCHED = 100_000
 PARTICLES = 10_000
@@ -76,6 +79,7 @@ class Setting:
         precision: The precision.
         run: Makes a run of a seed; returns errors, and seconds of each step.
         together: Number of results of a step, by which its seconds are already divided.
+        outside: Version and threads of another program; empty for gpusense.
         errors, seconds, processor: Of all runs so far; ``processor`` has the processor's seconds of a step.
         runs: Number of runs.
         reason: Why it was left out; empty where it was not.
@@ -88,6 +92,7 @@ class Setting:
     precision: str
     run: Callable[[int], tuple[np.ndarray, np.ndarray]]
     together: int = 1
+    outside: str = ""
     errors: list[np.ndarray] = field(default_factory=list)
     seconds: list[np.ndarray] = field(default_factory=list)
     processor: list[float] = field(default_factory=list)
@@ -113,6 +118,8 @@ class Setting:
             "precision": self.precision, "unit": UNITS[self.need], "runs": self.runs, "reason": self.reason,
             "seconds": None, "processor_s": None, "error": None,
         }  # fmt: skip
+        if self.outside:
+            found |= {"backend": "outside", "device": self.outside, "kind": "cpu", "outside": self.outside}
         if self.runs:
             errors, seconds = np.concatenate(self.errors), np.concatenate(self.seconds)
             found["seconds"] = quantiles(seconds) | {"min": float(seconds.min())}
@@ -210,23 +217,52 @@ def free_poses(grid: gs.OccupancyGrid, count: int, rng: np.random.Generator) -> 
     return np.array([gs.worlds.free_pose(grid, rng, 0.4) for _ in range(count)])
 
 
-def matching(device: Backend) -> Iterator[Setting]:
-    """Yield the settings of matching: methods, numbers of beams, precisions."""
+@dataclass(frozen=True)
+class Pairs:
+    """Pairs of scans with as many beams.
+
+    Attributes:
+        grid: The map.
+        scanner: The scanner.
+        one, two: (P, K) readings of both scans [m].
+        places: (P, 3) poses of the second scans.
+        moved: (P, 3) the same in the frames of the first ones.
+        off: (P, 3) errors of the guesses.
+    """
+
+    grid: gs.OccupancyGrid
+    scanner: gs.Scanner
+    one: np.ndarray
+    two: np.ndarray
+    places: np.ndarray
+    moved: np.ndarray
+    off: np.ndarray
+
+
+def pairs(device: Backend) -> Iterator[Pairs]:
+    """Yield the pairs, by numbers of beams."""
     rng, grid = np.random.default_rng(5), gs.worlds.building(2, (50.0, 50.0))
     first = free_poses(grid, PAIRS, rng)
     second = first + rng.uniform(-1, 1, first.shape) * (1.0, 1.0, np.radians(30))
     off = rng.uniform(-1, 1, first.shape) * (0.5, 0.5, np.radians(10))
-    for count in (90, 180, 360, 720):
+    truth = relative_poses(first, second)
+    for count in BEAMS:
         scanner = gs.Scanner.uniform(angle_min=-np.pi, angle_increment=2 * np.pi / count, count=count, range_max=20.0)
         caster = gs.RayCaster(grid, scanner.range_max, backend=device)
         one, two = (caster.cast(poses, scanner.bearings).astype(np.float64) for poses in (first, second))
         # A pose in a wall sees nothing.
         seen = (one.min(axis=1) > 0.1) & (two.min(axis=1) > 0.1)
         one, two = (scan + rng.normal(0, 0.02, scan.shape) * (scan < scanner.range_max) for scan in (one, two))
-        truth = relative_poses(first, second)
+        yield Pairs(grid, scanner, one[seen], two[seen], second[seen], truth[seen], off[seen])
+
+
+def matching(device: Backend) -> Iterator[Setting]:
+    """Yield the settings of matching: methods, numbers of beams, precisions."""
+    for each in pairs(device):
+        count = each.scanner.count
         for need, reference, right, methods in (
-            ("matching", one[seen], truth[seen], ("auto", "icp", "gauss_newton", "correlative")),
-            ("in a map", grid, second[seen], ("auto", "gauss_newton", "correlative")),
+            ("matching", each.one, each.moved, ("auto", "icp", "gauss_newton", "correlative")),
+            ("in a map", each.grid, each.places, ("auto", "gauss_newton", "correlative")),
         ):
             for method, precision in itertools.product(methods, ("float32", "float64")):
                 if precision == "float64" and (count != 360 or method != "auto" or not device.info.float64):
@@ -236,8 +272,30 @@ def matching(device: Backend) -> Iterator[Setting]:
                 yield Setting(
                     need, method, f"{count} beams",
                     f'gs.match_scan({given}, ranges, scanner, guess, "{method}"{options})', precision,
-                    matcher(reference, two[seen], scanner, right, off[seen], method, device, precision), len(right),
+                    matcher(reference, each.two, each.scanner, right, each.off, method, device, precision), len(right),
                 )  # fmt: skip
+
+
+def rivals(device: Backend) -> Iterator[Setting]:
+    """Yield the settings of other programs that match pairs; note the reasons of those that cannot run."""
+    able = []
+    for one in matchers():
+        if one.match is None:
+            note(f"left out: {one.method}: {one.missing}")
+        else:
+            able.append(one)
+    for each, one in itertools.product(pairs(device) if able else (), able):
+
+        def run(seed: int, each: Pairs = each, one: Matcher = one) -> tuple[np.ndarray, np.ndarray]:
+            begin, guesses = time.perf_counter(), each.moved + each.off
+            found = one.match(each.one, each.two, each.scanner, guesses)
+            seconds = (time.perf_counter() - begin) / len(guesses)
+            return differences(np.where(np.isfinite(found), found, guesses), each.moved)[0], np.array([seconds])
+
+        yield Setting(
+            "matching", one.method, f"{each.scanner.count} beams", one.code, "float64", run, len(each.one),
+            outside=one.outside,
+        )  # fmt: skip
 
 
 def matcher(
@@ -340,9 +398,10 @@ SETTINGS: dict[str, Callable[[Backend], Iterator[Setting]]] = dict(
 # ---- all
 
 
-def measure(need: str, device: Backend, arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """Run all settings of a need in rounds; return their rows."""
-    begin, settings = time.perf_counter(), list(SETTINGS[need](device))
+def measure(need: str, device: Backend, arguments: argparse.Namespace, *, peers: bool = False) -> list[dict[str, Any]]:
+    """Run all settings of a need in rounds, with ``peers`` those of other programs; return their rows."""
+    settings = [*(rivals(device) if peers and need == "matching" else ()), *SETTINGS[need](device)]
+    begin = time.perf_counter()
     for number in range(arguments.rounds):
         for one in settings:
             if one.reason:
@@ -386,6 +445,7 @@ def add_options(parser: argparse.ArgumentParser, seconds: float = 120.0) -> None
     parser.add_argument("--seconds", type=float, default=seconds, help="longest time of a need on a device")
     parser.add_argument("--longest", type=float, default=0.5, help="longest step that is repeated [s]")
     parser.add_argument("--rounds", type=int, default=3, help="runs of each setting, each with a seed of its own")
+    parser.add_argument("--no-peers", action="store_true", help="without other implementations")
 
 
 def main() -> None:
@@ -402,10 +462,24 @@ def main() -> None:
 def report_of(arguments: argparse.Namespace, backends: Sequence[str], command: str) -> dict[str, Any]:
     """Measure, and return the report."""
     stated, devices = arguments.commit or commit(), [get_backend(name) for name in backends]
-    rows = [row for device in devices for need in arguments.need or NEEDS for row in measure(need, device, arguments)]
+    rows = [row for need in arguments.need or NEEDS for row in measured(need, devices, arguments)]
+    return document(rows, stated, command)
+
+
+def measured(need: str, devices: Sequence[Backend], arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """Return the rows of a need on some devices; other programs are measured beside the first one."""
+    return [
+        row
+        for i, device in enumerate(devices)
+        for row in measure(need, device, arguments, peers=i == 0 and not arguments.no_peers)
+    ]
+
+
+def document(rows: Sequence[dict[str, Any]], stated: str | None, command: str) -> dict[str, Any]:
+    """Return the report of some rows."""
     return plain({
         "schema": SCHEMA, "kind": "needs", "date": time.strftime("%Y-%m-%d"), "commit": stated, "command": command,
-        "machine": machine(), "rows": rows,
+        "machine": machine(), "rows": list(rows),
     })  # fmt: skip
 
 

@@ -9,7 +9,6 @@ The same reports give the same bytes everywhere. The site's build writes the int
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -18,11 +17,13 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from error_vs_time.charts import Chart, Mark, drawing
-from error_vs_time.reports import ALL, LIMIT, RESULTS, ROOT, Row, Source, commit_trouble, rows_of, sources
+from error_vs_time.reports import LIMIT, RESULTS, ROOT, Source, commit_trouble, rows_of, sources
 
 from gpusense._util.files import write_whole
 from gpusense.evaluation.benchmark.choice import choose, error_text, front, time_text
 from gpusense.evaluation.benchmark.report import table
+from gpusense.evaluation.benchmark.rows import ALL, Row
+from gpusense.plots.error_page import error_page
 
 HERE = Path(__file__).parent
 PAGE = Path("docs/error-vs-time.md")
@@ -193,7 +194,7 @@ def peers(rows: Sequence[Row]) -> list[str]:
     """Return the table of other implementations beside the rows that they stand against."""
     outside = [row for row in rows if row.outside and row.scene == ALL]
     lines = []
-    for need in ("rays", "likelihood field"):
+    for need in ("rays", "beam model", "likelihood field"):
         measure = SHOWN[need][0]
         for device in dict.fromkeys(row.device for row in outside if row.need == need):
             rivals = [row for row in outside if (row.need, row.device) == (need, device)]
@@ -206,6 +207,21 @@ def peers(rows: Sequence[Row]) -> list[str]:
                 error = value(row.errors[measure], row.units[measure]) + " nats" * (need != "rays")
                 lines.append((need, row.text, row.outside or "gpusense", f"{rate:.3g}", error, device))
     return table(("for", "method", "version, threads", "M/s of one core", "error", "processor"), lines, 3)
+
+
+def rival_matchers(rows: Sequence[Row]) -> list[str]:
+    """Return the table of other programs that match pairs of scans, beside gpusense's methods; empty without them."""
+    outside = [row for row in rows if row.outside and row.need == "matching"]
+    lines = []
+    for device in dict.fromkeys(row.device for row in outside):
+        reference = [row for row in own(rows, "matching", device) if row.precision == "float32"]
+        settings = {row.setting for row in outside}
+        listed = [row for row in [*outside, *reference] if row.device == device and row.setting in settings]
+        for row in sorted(listed, key=lambda one: (int(one.setting.split()[0]), one.seconds)):
+            errors = [value(row.errors[name], "m") for name in SHOWN["matching"]]
+            lines.append((row.method, row.setting, row.outside or "gpusense", time_text(row.seconds), *errors, device))
+    columns = ("method", "scan", "version, threads", "a match, one core", *SHOWN["matching"], "processor")
+    return table(columns, lines, 3) if lines else ["(none in these reports)"]
 
 
 def by_map(rows: Sequence[Row], devices: Sequence[str]) -> list[str]:
@@ -237,27 +253,7 @@ def picture(name: str) -> Path:
 
 def interactive(folder: Path = RESULTS) -> str:
     """Return the interactive page."""
-    data = [
-        {
-            "need": row.need, "device": row.device, "map": row.scene, "name": row.text, "method": row.method,
-            "code": row.code, "outside": row.outside, "maps": row.maps, "time": _short(row.seconds),
-            "quartiles": [_short(one) for one in row.quartiles],
-            "errors": {name: _short(row.errors[name]) for name in SHOWN[row.need] if name in row.errors},
-            "units": [row.units[name] for name in SHOWN[row.need] if name in row.errors],
-        }
-        for row in rows_of(sources(folder))
-    ]  # fmt: skip
-    text = (HERE / "figure.html").read_text(encoding="utf-8")
-    lines = ",\n".join(json.dumps(one, allow_nan=False, separators=(",", ":")) for one in data)
-    style = (ROOT / "docs" / "figures" / "style.css").read_text(encoding="utf-8")
-    script = (HERE / "figure.js").read_text(encoding="utf-8")
-    for mark, part in {"style": style, "script": script, "data": f"[{lines}]"}.items():
-        text = text.replace(f"/*{{{mark}}}*/", part)
-    return text
-
-
-def _short(number: float) -> float:
-    return float(f"{number:.4g}")
+    return error_page(rows_of(sources(folder)), SHOWN)
 
 
 def files(folder: Path = RESULTS) -> dict[Path, str]:
@@ -275,7 +271,8 @@ def files(folder: Path = RESULTS) -> dict[Path, str]:
     made = {picture(need): chart(rows, need, devices) for need in needs}
     blocks = {
         "first": answers(rows, devices, FIRST), "answers": answers(rows, devices, WISHES), "peers": peers(rows),
-        "maps": by_map(rows, devices), "reports": listing(found), "limit": [str(LIMIT)],
+        "matchers": rival_matchers(rows), "maps": by_map(rows, devices), "reports": listing(found),
+        "limit": [str(LIMIT)],
     }  # fmt: skip
     for need in NEEDS:
         blocks[need] = methods(rows, need, devices, fronts=need == "localisation") if need in needs else ["(none yet)"]

@@ -11,14 +11,16 @@ numba (``pip install numba``): code of our own from public descriptions, paralle
   field, headings rounded to a table of sines.
 
 range_libc appears where the variable RANGE_LIBC names a copy of its sources, which are compiled then; f1tenth_gym where
-it can be imported. Both run one thread. Their maps are the whole map in cells, with its yaw taken out.
+it can be imported, or where F1TENTH_GYM names its ``laser_models.py``, which is executed. Both run one thread. Their
+maps are the whole map in cells, with its yaw taken out. ``filters.py`` adds the models of nav2_amcl and Beluga.
 """
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import inspect
 import math
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -34,7 +36,7 @@ from gpusense.world.scanner import Reading, classify
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from speed import range_libc
+from speed import filters, range_libc
 
 THETA_BINS = (2000,)
 CDDT_BINS = (108, 720)
@@ -237,6 +239,20 @@ def f1tenth_scan(module: Any, bins: int) -> Callable[[Scene, None, str], Runner]
     return make
 
 
+def laser_models() -> tuple[Any, str]:
+    """Return f1tenth_gym's module of the scan simulator, or why there is none."""
+    file = os.environ.get("F1TENTH_GYM", "")
+    if not file:
+        return imported("f110_gym.envs.laser_models", "f1tenth_gym.envs.laser_models")
+    try:
+        spec = importlib.util.spec_from_file_location("f1tenth_laser_models", file)
+        module = sys.modules["f1tenth_laser_models"] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    except Exception as error:
+        return None, f"F1TENTH_GYM cannot be imported ({type(error).__name__}: {error})"
+    return module, ""
+
+
 def imported(*names: str) -> tuple[Any, str]:
     """Return the first module that can be imported, or the reasons why none can."""
     reasons = []
@@ -272,10 +288,10 @@ def candidates() -> list[Candidate]:
         )
         for kind, bins in casters
     ]  # fmt: skip
-    module, missing = imported("f110_gym.envs.laser_models", "f1tenth_gym.envs.laser_models")
+    module, missing = laser_models()
     own = {"outside": "f1tenth_gym, 1 thread", "missing": missing}
     found += [
         Candidate("ranges", "f1tenth_gym", f1tenth_scan(module, bins), "", "headings", bins, precision="float64", **own)
         for bins in THETA_BINS
     ]
-    return found
+    return found + filters.candidates()

@@ -43,6 +43,9 @@ bench/speed/baselines.py of a checkout or from the file that --peers names; the 
 its knob, exact points in the strip on the left, failed points in the strip on the right. Failures are listed with
 their reasons.
 
+--html FILE writes the interactive page of docs/error-vs-time.md for this measurement: time over error, the method for a
+budget, and performance profiles.
+
 At the end stands, for each device and problem, which method to take: the fastest with an error of at most --max-error,
 or the most exact with a call of at most --max-time. Nats are the KL divergence of the posterior, lengths the shift of
 its mean, both at a comparable temperature; percents are rays wrong by more than a cell, cells the range error that 95 %
@@ -54,7 +57,7 @@ them, and lists points that became slower or less exact; --compare OLD NEW compa
 Exit codes: 0 success, 1 something is less exact than in the old report, 2 bad input.
 
 example:
-  gpusense bench --quick
+  gpusense bench --quick --html bench.html
   gpusense bench --output results --backend opencl --backend warp:cpu
   gpusense bench --scene basement --method exact --method lookup --problem ranges
   gpusense bench --map office.yaml --particles 10000 --beams 60 --max-error "0.01 nats" --max-time "1 ms"
@@ -66,6 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     add = parser.add_argument
     add("--output", type=Path, metavar="DIR", help="folder for report and diagrams, created if absent")
+    add("--html", type=Path, metavar="FILE", help="interactive page of the measurement, one file that works offline")
     add("--compare", nargs="+", type=Path, metavar=("OLD", "NEW"), help="compare with an old report, or two reports")
     add("--slower", type=positive_number, default=1.3, metavar="F",
         help="with --compare, factor of the times above which a point is slower (default: %(default)s)")  # fmt: skip
@@ -125,6 +129,8 @@ def run(args: argparse.Namespace) -> int:
     if new is None:
         if args.output is not None:
             _check_folder(args.output)
+        if args.html is not None:
+            check_writable(args.html)
         plan, absent = make_plan(args, old)
         outcome = Outcome([], [])
         try:
@@ -137,6 +143,8 @@ def run(args: argparse.Namespace) -> int:
         new = document(plan, outcome, arguments_of(args, plan), machine(), absent, command_of(sys.argv[1:]))
         if args.output is not None:
             write_report(args.output, new, to_json(new), args.time)
+        if args.html is not None:
+            write_page(args.html, new)
     comparison = None if old is None or stopped is not None else comparing.compare(old, new, args.slower)
     if args.json:
         print_json(new if comparison is None else {"comparison": vars(comparison), "report": new if measured else None})
@@ -157,6 +165,8 @@ def _reports(args: argparse.Namespace) -> tuple[dict[str, Any] | None, dict[str,
 
     if not args.compare:
         return None, None
+    if args.html is not None and len(args.compare) > 1:
+        raise ValueError("--html: must not be given with two reports of --compare, as nothing is measured")
     if len(args.compare) > 2:
         raise ValueError(f"--compare: must be one or two reports, got {len(args.compare)}")
     if args.slower <= 1:
@@ -288,6 +298,15 @@ def write_report(folder: Path, report: Mapping[str, Any], text: str, timing: str
         images.append(("Performance profiles", "profiles.png"))
     write_whole(folder / "report.md", lambda stream: stream.write((markdown(report, images) + "\n").encode()))
     write_whole(folder / "report.json", lambda stream: stream.write(text.encode()))
+
+
+def write_page(file: Path, report: Mapping[str, Any]) -> None:
+    """Write the interactive page of a report, whole or not at all."""
+    from gpusense.evaluation.benchmark.rows import model_rows
+    from gpusense.plots.error_page import error_page
+
+    page = error_page(model_rows(report), text=f"{report['date']}. {machine_line()}")
+    write_whole(file, lambda stream: stream.write(page.encode()))
 
 
 def _print(report: Mapping[str, Any], folder: Path | None) -> None:

@@ -102,7 +102,6 @@ def functions(flags):
     """Make the functions of the file for a set of flags."""
     MASS_TABLE = "MASS_TABLE" in flags
 
-
     # Return the mass of the standard normal between 0 and x >= 0.
     @wp.func
     def half_mass(x: wp.float64):

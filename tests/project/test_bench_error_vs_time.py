@@ -33,7 +33,7 @@ def measure(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 def options(**changes: object) -> argparse.Namespace:
     given = {
         "backend": ["numpy"], "scene": None, "no_peers": True, "build_limit": 1.0, "point_seconds": 0.1,
-        "deadline": 1e9, "commit": "abc",
+        "deadline": 1e9, "commit": "abc", "quick": False, "need": ["learning", "landmarks"],
     }  # fmt: skip
     return argparse.Namespace(**(given | changes))
 
@@ -73,13 +73,86 @@ def test_a_report_needs_a_commit(tmp_path: Path) -> None:
     assert done.returncode == 2 and "--commit: the checkout must have no uncommitted changes, got abc+" in done.stderr
 
 
+def test_a_later_run_adds_scenes(measure: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scenes that the report has are kept as they are; other sizes and devices are refused."""
+    began = []
+
+    def run(plan):
+        name, precision = plan.sources[0].name, plan.precisions[0]
+        began.append((name, precision))
+        points = [made_point(scene=name, precision=precision)]
+        return Outcome([{"name": name, "fingerprint": "f"}], points, {"device": "d"})
+
+    monkeypatch.setattr(measure, "run", run)
+    begin = measure.time.perf_counter()
+    *_, first = measure.models(options(scene=["building"]), "abc", begin)
+    began.clear()
+    # As if the deadline had come between the precisions.
+    first["points"] = first["points"][:1]
+    *_, whole = measure.models(options(), "abc", begin, first)
+    assert began == [("building", "float64"), ("clutter", "float32"), ("clutter", "float64")]
+    assert [scene["name"] for scene in whole["scenes"]] == whole["arguments"]["scenes"] == ["building", "clutter"]
+    assert whole["points"][0] == first["points"][0] and len(whole["points"]) == 4
+    assert whole["command"] == f"{first['command']}; {first['command']}"
+    for changed, message in (({"quick": True}, "--extend: arguments must be"), ({"point_seconds": 2.0}, "arguments")):
+        with pytest.raises(ValueError, match=message):
+            next(measure.models(options(**changed), "abc", begin, first))
+    with pytest.raises(ValueError, match="--extend: devices must be"):
+        next(measure.models(options(), "abc", begin, first | {"devices": [{"selection": "other"}]}))
+
+
+def test_a_later_run_adds_needs(measure: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    began = []
+
+    def measured(need, devices, arguments):
+        began.append(need)
+        return [{"need": need, "backend": devices[0].info.selection}]
+
+    monkeypatch.setattr(measure.needs, "measured", measured)
+    first, whole = measure.tasks(options(), "abc", measure.time.perf_counter())
+    assert [row["need"] for row in first["rows"]] == ["learning"] and len(whole["rows"]) == 2
+    (again,) = measure.tasks(options(), "abc", measure.time.perf_counter(), first)
+    assert again["rows"] == whole["rows"] and began == ["learning", "landmarks", "landmarks"]
+    with pytest.raises(ValueError, match="--extend: devices must be"):
+        next(measure.tasks(options(), "abc", 0.0, {"rows": [{"need": "x", "backend": "y"}], "command": ""}))
+
+
+def test_reports_of_another_commit_or_machine_are_not_extended(measure: ModuleType, tmp_path: Path) -> None:
+    assert measure.earlier(tmp_path / "x", "tasks", "abc") is None
+    report = measure.needs.document([], "abc", "python x")
+    measure.write(tmp_path / "x", "tasks", report)
+    assert measure.earlier(tmp_path / "x", "tasks", "abc") == report
+    with pytest.raises(ValueError, match="--extend: the commit must be as in the report, abc, got def"):
+        measure.earlier(tmp_path / "x", "tasks", "def")
+    measure.write(tmp_path / "x", "tasks", report | {"machine": {"processors": 1}})
+    with pytest.raises(ValueError, match="the machine"):
+        measure.earlier(tmp_path / "x", "tasks", "abc")
+
+
+def test_other_matchers_find_the_motion(
+    measure: ModuleType, needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those that can run here: in most pairs within 6 cm; their rows name version and threads."""
+    tasks, device = importlib.import_module("needs"), get_backend(needs("opencl"))
+    monkeypatch.setattr(tasks, "PAIRS", 12)
+    monkeypatch.setattr(tasks, "BEAMS", (180,))
+    settings = list(tasks.rivals(device))
+    for one in settings:
+        one.once(0)
+        row = one.row(device)
+        assert (row["backend"], row["kind"], row["outside"]) == ("outside", "cpu", one.outside)
+        assert "1 thread" in one.outside and row["error"]["median"] < 0.06 and row["processor_s"] > 0
+    names = {one.method for one in importlib.import_module("matchers").matchers()}
+    assert names == {"small_gicp icp", "small_gicp gicp", "csm"} >= {one.method for one in settings}
+
+
 def test_tasks_are_measured(
     measure: ModuleType, needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Landmarks: known correspondences are the truth, the likeliest landmarks are not; and all times are there."""
     tasks, selection = importlib.import_module("needs"), needs("opencl")
     monkeypatch.setattr(tasks, "PARTICLES", 300)
-    given = argparse.Namespace(need=["landmarks"], rounds=2, seconds=99.0, longest=99.0, commit="abc")
+    given = argparse.Namespace(need=["landmarks"], rounds=2, seconds=99.0, longest=99.0, commit="abc", no_peers=True)
     report = tasks.report_of(given, [selection], "python bench/error_vs_time/needs.py")
     measure.write(tmp_path / "x", "tasks", report)
     assert json.loads((tmp_path / "x_tasks.json").read_text()) == report

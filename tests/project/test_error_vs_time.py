@@ -12,11 +12,9 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from support.browser import CHROMIUM, in_browser
 from support.paths import ROOT
 
-from gpusense.evaluation.benchmark import choice
-
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 DEVICE = "2 cores of an X, PoCL"
 
 
@@ -172,37 +170,14 @@ def test_two_reports_of_a_device_are_refused(page: ModuleType, tmp_path: Path) -
 
 def test_the_interactive_page_fetches_nothing(page: ModuleType) -> None:
     text = page.interactive().replace("http://www.w3.org/2000/svg", "")
-    assert not re.search(
-        r"https?:|\bsrc=|\bhref=|\bimport\b|\bfetch\(|XMLHttp|@import|url\(|\{(style|script|data)\}", text
-    )
-
-
-def test_the_script_chooses_as_python_does(page: ModuleType) -> None:
-    node = shutil.which("node")
-    if node is None:
-        pytest.skip("Node is not installed")
-    listed = [("a", 0.0, 5.0), ("b", 1e-9, 4.0), ("c", 0.3, 1.0), ("d", 0.2, 2.0), ("e", 0.9, 3.0), ("f", 0.9, 0.5)]
-    rows = json.dumps([{"name": name, "error": error, "time": time} for name, error, time in listed])
-    script = (Path(page.__file__).parent / "figure.js").read_text(encoding="utf-8")
-    budgets = [0.1, 0.6, 1.5, 2.5, 4.5, 9.0]
-    source = (
-        f'const document = {{getElementById: () => ({{textContent: "[]"}})}};\n{script}\nconst list = {rows};\n'
-        f"console.log(JSON.stringify([paretoFront(list).map(row => row.name), {budgets}.map(s => "
-        "(recommended(list, s) ?? {}).name ?? null)]));"
-    )
-    done = subprocess.run([node, "-"], input=source, capture_output=True, text=True, check=True)
-    front, chosen = json.loads(done.stdout)
-    entries = [choice.Entry("d", name, "", "", error, time) for name, error, time in listed]
-    assert front == [entry.method for entry in choice.front(entries)]
-    found = [choice.choose(entries, None, seconds) for seconds in budgets]
-    assert chosen == [None if entry is None else entry.method for entry in found]
+    assert not re.search(r"https?:|\bsrc=|\bhref=|\bimport\b|\bfetch\(|XMLHttp|@import|url\(|\{(script|data)\}", text)
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 def test_the_interactive_page_works_in_a_browser(page: ModuleType, tmp_path: Path) -> None:
     """Choose a need, move the budget, hover: answer, marked point, front and tooltip follow."""
     write_tasks(tmp_path, ROWS)
-    script = """<script>
+    script = """
     const slide = value => { $("budget").value = value; $("budget").dispatchEvent(new Event("input")); };
     document.body.dataset.most = $("answer").textContent; slide(0);
     document.body.dataset.least = $("answer").textContent;
@@ -210,14 +185,13 @@ def test_the_interactive_page_works_in_a_browser(page: ModuleType, tmp_path: Pat
     document.querySelector("circle").dispatchEvent(new MouseEvent("mousemove"));
     document.body.dataset.tip = $("tip").textContent;
     document.body.dataset.front = [...$("front").rows].map(row => row.cells[0].textContent).join("; ");
-    </script></html>"""
-    text = page.interactive(tmp_path).replace("</html>", script)
-    (tmp_path / "page.html").write_text(text, encoding="utf-8")
-    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}",
-               "--dump-dom", f"file://{tmp_path / 'page.html'}"]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
-    body = dict(re.findall(r'data-(\w+)="([^"]*)"', re.search(r"<body[^>]*>", done.stdout)[0]))
+    $("view").value = "profile"; $("view").dispatchEvent(new Event("change"));
+    document.body.dataset.profile = $("answer").textContent;
+    """
+    body = in_browser(page.interactive(tmp_path), script, tmp_path)
     assert body["most"].startswith("Within 50.5 ms: beam, 1000 x 60, temperature 1, 1 ms, 1 mm. make(beam)")
     assert body["least"] == "Nothing within 990 us." and body["circles"] == "6"
-    assert "field, 10000 x 60" in body["tip"] and "make(field)" in body["tip"]
+    for part in ("field, 10000 x 60", "make(field)", "python x (2026-01-01, commit abc)"):
+        assert part in body["tip"]
     assert body["front"] == "method; beam, 1000 x 60, temperature 1"
+    assert body["profile"] == "One scene only: a profile is about several."

@@ -68,42 +68,69 @@ struct Scan : beluga::BaseLaserScan<Scan> {
 
 Sophus::SE2d state(const double *pose) { return {Sophus::SO2d{pose[2]}, Eigen::Vector2d{pose[0], pose[1]}}; }
 
-template <class Model, class Points>
-void weigh(const Model &model, Points points, const double *poses, int n, double *weights) {
-    const auto weight = model(std::move(points));
-    for (int j = 0; j < n; ++j) weights[j] = weight(state(poses + 3 * j));
-}
+using Points = std::vector<std::pair<double, double>>;
+
+struct Made {
+    virtual ~Made() = default;
+    virtual void weigh(Points points, const double *poses, int n, double *weights) const = 0;
+    virtual void copy(float *field) const = 0;
+};
+
+template <class Model, bool with_field>
+struct Of : Made {
+    Model model;
+    template <class... Given>
+    explicit Of(Given &&...given) : model(std::forward<Given>(given)...) {}
+    void weigh(Points points, const double *poses, int n, double *weights) const override {
+        const auto weight = model(std::move(points));
+        for (int j = 0; j < n; ++j) weights[j] = weight(state(poses + 3 * j));
+    }
+    void copy(float *field) const override {
+        if constexpr (with_field) {
+            const auto &cells = model.likelihood_field().data();
+            for (std::size_t i = 0; i < cells.size(); ++i) field[i] = cells[i];
+        }
+    }
+};
 
 }  // namespace
 
-// Score n poses with a scan of k readings; see nav2.cpp. options: 1 model_unknown_space, 2 only_obstacle_boundaries.
-extern "C" void score(const signed char *cells, int rows, int cols, const double *geometry, const double *p, int model,
-                      int options, const double *poses, int n, const double *ranges, const double *bearings, int k,
-                      double range_min, double range_max, const long *nearest, double *weights, float *field) {
+// Make a model, with its likelihood field; see nav2.cpp. options: 1 model_unknown_space, 2 only_obstacle_boundaries.
+extern "C" void *prepare(const signed char *cells, int rows, int cols, const double *geometry, const double *p,
+                         int model, int options, int, double range_max, const long *nearest) {
     nearest_obstacle = nearest;
     const Grid grid{cells, rows, cols, geometry};
+    const beluga::BeamModelParam beam{p[0], p[1], p[2], p[3], p[4], p[5], range_max};
+    const beluga::LikelihoodFieldModelParam param{p[6],  range_max,        p[0],              p[3],
+                                                  p[4], (options & 1) != 0, (options & 2) != 0};
+    if (model == 0) return static_cast<Made *>(new Of<beluga::BeamSensorModel<Grid>, false>(beam, grid));
+    if (model == 1) return static_cast<Made *>(new Of<beluga::LikelihoodFieldModel<Grid>, true>(param, grid));
+    return static_cast<Made *>(new Of<beluga::LikelihoodFieldProbModel<Grid>, true>(param, grid));
+}
+
+// Weigh n poses with a scan of k readings.
+extern "C" void weigh(void *made, const double *poses, int n, const double *ranges, const double *bearings, int k,
+                      double range_min, double range_max, double *weights) {
     Scan scan;
     scan.ranges_.assign(ranges, ranges + k);
     scan.angles_.assign(bearings, bearings + k);
     scan.least = range_min;
     scan.most = range_max;
-    std::vector<std::pair<double, double>> points;
+    Points points;
     for (const auto &point : scan.points_in_cartesian_coordinates()) points.emplace_back(point.x(), point.y());
-    if (model == 0) {
-        const beluga::BeamModelParam param{p[0], p[1], p[2], p[3], p[4], p[5], range_max};
-        weigh(beluga::BeamSensorModel<Grid>{param, grid}, points, poses, n, weights);
-        return;
-    }
-    const beluga::LikelihoodFieldModelParam param{p[6],  range_max,        p[0],              p[3],
-                                                  p[4], (options & 1) != 0, (options & 2) != 0};
-    const auto with = [&](const auto &made) {
-        for (int i = 0; field && i < rows * cols; ++i) field[i] = made.likelihood_field().data()[i];
-        weigh(made, points, poses, n, weights);
-    };
-    if (model == 1)
-        with(beluga::LikelihoodFieldModel<Grid>{param, grid});
-    else
-        with(beluga::LikelihoodFieldProbModel<Grid>{param, grid});
+    static_cast<Made *>(made)->weigh(std::move(points), poses, n, weights);
+}
+
+extern "C" void discard(void *made) { delete static_cast<Made *>(made); }
+
+// Score n poses with a scan of k readings, all at once.
+extern "C" void score(const signed char *cells, int rows, int cols, const double *geometry, const double *p, int model,
+                      int options, const double *poses, int n, const double *ranges, const double *bearings, int k,
+                      double range_min, double range_max, const long *nearest, double *weights, float *field) {
+    void *made = prepare(cells, rows, cols, geometry, p, model, options, k, range_max, nearest);
+    if (field) static_cast<Made *>(made)->copy(field);
+    weigh(made, poses, n, ranges, bearings, k, range_min, range_max, weights);
+    discard(made);
 }
 
 // Return the range of the map alone, range_max without a hit.

@@ -24,6 +24,28 @@ static LDP make(int k, const double *bearings, const double *ranges) {
     return ld;
 }
 
+/* Match n pairs of scans of K bearings: ranges (n, K) of both, guesses (n, 3); found (n, 4) as the program writes it. */
+int pairs(int k, int n, const double *bearings, const double *first, const double *second, const double *guesses,
+          double *found) {
+    struct sm_params params;
+    struct option *ops = options_allocate(100);
+    sm_options(&params, ops);
+    params.min_reading = 0.01;
+    params.max_reading = 1000.0;
+    for (int i = 0; i < n; i++) {
+        struct sm_result result;
+        params.laser_ref = make(k, bearings, first + (size_t)i * k);
+        params.laser_sens = make(k, bearings, second + (size_t)i * k);
+        for (int j = 0; j < 3; j++) params.first_guess[j] = guesses[3 * i + j];
+        sm_icp(&params, &result);
+        double row[4] = {result.valid, result.x[0], result.x[1], result.x[2]};
+        for (int j = 0; j < 4; j++) found[4 * i + j] = row[j];
+        ld_free(params.laser_ref);
+        ld_free(params.laser_sens);
+    }
+    return 0;
+}
+
 int main(int argc, const char *argv[]) {
     struct sm_params params;
     struct option *ops = options_allocate(100);

@@ -16,12 +16,13 @@ extern "C" void pf_update_sensor(pf_t *, pf_sensor_model_fn_t sensor_fn, void *d
     sensor_fn(data, set);
 }
 
-// Score n poses with a scan of k readings. model: 0 beam, 1 likelihood field, 2 its product form. p = {z_hit, z_short,
-// z_max, z_rand, sigma_hit, lambda_short, max_occ_dist}. With nearest (the index of the nearest obstacle of each cell,
-// -1 without one) distances are exact; field takes the distances.
-extern "C" void score(const signed char *cells, int rows, int cols, const double *geometry, const double *p, int model,
-                      int, const double *poses, int n, const double *ranges, const double *bearings, int k,
-                      double range_min, double range_max, const long *nearest, double *weights, float *field) {
+namespace {
+struct Made {
+    map_t *map;
+    nav2_amcl::Laser *laser;
+};
+
+map_t *map_of(const signed char *cells, int rows, int cols, const double *geometry) {
     map_t *map = map_alloc();
     map->size_x = cols;
     map->size_y = rows;
@@ -31,6 +32,16 @@ extern "C" void score(const signed char *cells, int rows, int cols, const double
     map->cells = static_cast<map_cell_t *>(std::malloc(sizeof(map_cell_t) * rows * cols));
     // The rule of AmclNode::convertMap.
     for (int i = 0; i < rows * cols; ++i) map->cells[i].occ_state = cells[i] == 0 ? -1 : cells[i] == 100 ? 1 : 0;
+    return map;
+}
+}  // namespace
+
+// Make a model for scans of k readings. model: 0 beam, 1 likelihood field, 2 its product form. p = {z_hit, z_short,
+// z_max, z_rand, sigma_hit, lambda_short, max_occ_dist}. With nearest (the index of the nearest obstacle of each cell,
+// -1 without one) distances are exact.
+extern "C" void *prepare(const signed char *cells, int rows, int cols, const double *geometry, const double *p,
+                         int model, int, int k, double, const long *nearest) {
+    map_t *map = map_of(cells, rows, cols, geometry);
     nav2_amcl::Laser *laser;
     if (model == 0) {
         laser = new nav2_amcl::BeamModel(p[0], p[1], p[2], p[3], p[4], p[5], 0, k, map);
@@ -39,9 +50,9 @@ extern "C" void score(const signed char *cells, int rows, int cols, const double
     } else {
         laser = new nav2_amcl::LikelihoodFieldModelProb(p[0], p[3], p[4], p[6], false, 0.5, 0.3, 0.9, k, map);
     }
-    if (model != 0) {
+    if (model != 0 && nearest) {
         CachedDistanceMap *table = get_distance_map(map->scale, map->max_occ_dist);
-        for (int i = 0; nearest && i < rows * cols; ++i) {
+        for (int i = 0; i < rows * cols; ++i) {
             map->cells[i].occ_dist = map->max_occ_dist;
             if (nearest[i] < 0) continue;
             const int across = std::abs(int(nearest[i] % cols) - i % cols), up = std::abs(int(nearest[i] / cols) - i / cols);
@@ -49,12 +60,17 @@ extern "C" void score(const signed char *cells, int rows, int cols, const double
             const double distance = table->distances_[across][up];
             if (distance <= table->cell_radius_) map->cells[i].occ_dist = distance * map->scale;
         }
-        for (int i = 0; field && i < rows * cols; ++i) field[i] = map->cells[i].occ_dist;
     }
     pf_vector_t nowhere = pf_vector_zero();
     laser->SetLaserPose(nowhere);
+    return new Made{map, laser};
+}
+
+// Weigh n poses with a scan of k readings.
+extern "C" void weigh(void *made, const double *poses, int n, const double *ranges, const double *bearings, int k,
+                      double range_min, double range_max, double *weights) {
     nav2_amcl::LaserData data;
-    data.laser = laser;
+    data.laser = static_cast<Made *>(made)->laser;
     data.range_count = k;
     data.range_max = range_max;
     data.ranges = new double[k][2];
@@ -72,24 +88,33 @@ extern "C" void score(const signed char *cells, int rows, int cols, const double
     set.sample_count = n;
     set.samples = samples;
     result = reinterpret_cast<double *>(&set);
-    laser->sensorUpdate(nullptr, &data);
+    data.laser->sensorUpdate(nullptr, &data);
     for (int j = 0; j < n; ++j) weights[j] = samples[j].weight;
     delete[] samples;
-    delete laser;
-    map_free(map);
+}
+
+extern "C" void discard(void *made) {
+    Made *one = static_cast<Made *>(made);
+    delete one->laser;
+    map_free(one->map);
+    delete one;
+}
+
+// Score n poses with a scan of k readings, all at once; field takes the distances.
+extern "C" void score(const signed char *cells, int rows, int cols, const double *geometry, const double *p, int model,
+                      int options, const double *poses, int n, const double *ranges, const double *bearings, int k,
+                      double range_min, double range_max, const long *nearest, double *weights, float *field) {
+    void *made = prepare(cells, rows, cols, geometry, p, model, options, k, range_max, nearest);
+    const map_cell_t *distances = static_cast<Made *>(made)->map->cells;
+    for (int i = 0; model != 0 && field && i < rows * cols; ++i) field[i] = distances[i].occ_dist;
+    weigh(made, poses, n, ranges, bearings, k, range_min, range_max, weights);
+    discard(made);
 }
 
 // Return the range of the map alone.
 extern "C" void cast(const signed char *cells, int rows, int cols, const double *geometry, const double *poses, int n,
                      const double *bearings, int k, double range_max, double *expected) {
-    map_t *map = map_alloc();
-    map->size_x = cols;
-    map->size_y = rows;
-    map->scale = geometry[0];
-    map->origin_x = geometry[1] + (cols / 2) * map->scale;
-    map->origin_y = geometry[2] + (rows / 2) * map->scale;
-    map->cells = static_cast<map_cell_t *>(std::malloc(sizeof(map_cell_t) * rows * cols));
-    for (int i = 0; i < rows * cols; ++i) map->cells[i].occ_state = cells[i] == 0 ? -1 : cells[i] == 100 ? 1 : 0;
+    map_t *map = map_of(cells, rows, cols, geometry);
     for (int j = 0; j < n; ++j)
         for (int i = 0; i < k; ++i)
             expected[j * k + i] =

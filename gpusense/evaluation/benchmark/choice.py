@@ -144,7 +144,8 @@ def entries(
 ) -> list[Entry]:
     """Return the methods of a problem on one device, over all scenes and clouds where they were measured.
 
-    A method that failed, was left out or is not finite in any of them is not listed.
+    A method that failed, was left out or is not finite in any of them is not listed. A scene where every method was
+    left out, such as one after the deadline of a quick run, does not count.
 
     Args:
         points: Points of a report.
@@ -154,8 +155,11 @@ def entries(
         timing: Time of a point [s]; None where it was not measured.
     """
     chosen = [point for point in points if point["problem"] == problem and point["backend"] == backend]
+    places = {(point["scene"], point["cloud"]) for point in chosen if point["status"] != "left out"}
     groups: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
     for point in chosen:
+        if (point["scene"], point["cloud"]) not in places:
+            continue
         groups.setdefault((label(point), setting(point), point["precision"]), []).append(point)
     listed = []
     for (method, at, precision), group in groups.items():

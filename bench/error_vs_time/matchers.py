@@ -1,0 +1,134 @@
+"""Other programs that match pairs of scans, for ``needs.py``: small_gicp where it is installed, and CSM.
+
+small_gicp (``pip install small_gicp``) aligns clouds in space. ``icp`` gets the end points at height 0; ``gicp`` gets
+them at three heights, so that walls are planes that stand upright. CSM (Censi 2008) is compiled where the variable CSM
+names a copy of its sources; GSL names the folder with GSL's ``include`` and ``lib`` where the compiler does not find
+them. Both run one thread, pair by pair.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from accuracy import chaining_peers
+
+import gpusense as gs
+
+# Heights of the copies of a scan [m], and the grid to which clouds are thinned [m].
+HEIGHTS, THINNED = (-0.1, 0.0, 0.1), 0.02
+# A scan has no far points to reach from a guess that is off by half a metre and 10 degrees.
+REACH = 1.0
+_kept: list[tempfile.TemporaryDirectory[str]] = []
+Match = Callable[[np.ndarray, np.ndarray, gs.Scanner, np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Matcher:
+    """A program that matches pairs.
+
+    Attributes:
+        method: Name of program and method.
+        code: How it is called.
+        outside: Version and threads.
+        match: From (P, K) ranges of both scans, scanner and (P, 3) guesses to (P, 3) poses of the second scan in the
+            frame of the first; NaN where it fails.
+        missing: Why it cannot run; empty if it can.
+    """
+
+    method: str
+    code: str
+    outside: str
+    match: Match | None
+    missing: str = ""
+
+
+def matchers() -> Iterator[Matcher]:
+    """Yield all; those that cannot run say why."""
+    yield from small_gicp()
+    yield csm()
+
+
+def small_gicp() -> Iterator[Matcher]:
+    """Yield the methods of small_gicp."""
+    try:
+        import small_gicp as library
+    except ImportError as error:
+        missing, library = f"not installed ({error}): pip install small_gicp", None
+    else:
+        missing = ""
+    for kind, heights in (("ICP", (0.0,)), ("GICP", HEIGHTS)):
+        code = f'small_gicp.align(first, second, guess, "{kind}", max_correspondence_distance={REACH:g})'
+        found = None if library is None else _aligner(library, kind, heights)
+        yield Matcher(f"small_gicp {kind.lower()}", code, f"small_gicp {_version()}, 1 thread", found, missing)
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("small_gicp")
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _aligner(library: Any, kind: str, heights: tuple[float, ...]) -> Match:
+    def points(ranges: np.ndarray, scanner: gs.Scanner) -> np.ndarray:
+        hit = (ranges > scanner.range_min) & (ranges < scanner.range_max)
+        z, bearings = ranges[hit], scanner.bearings[hit]
+        flat = np.stack([z * np.cos(bearings), z * np.sin(bearings)], axis=1)
+        return np.concatenate([np.column_stack([flat, np.full(len(flat), height)]) for height in heights])
+
+    def match(first: np.ndarray, second: np.ndarray, scanner: gs.Scanner, guesses: np.ndarray) -> np.ndarray:
+        poses = np.full((len(first), 3), np.nan)
+        for i, (x, y, turn) in enumerate(guesses):
+            start = np.eye(4)
+            start[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+            start[:2, 3] = x, y
+            found = library.align(
+                points(first[i], scanner), points(second[i], scanner), start, kind,
+                downsampling_resolution=THINNED, max_correspondence_distance=REACH, num_threads=1,
+            ).T_target_source  # fmt: skip
+            poses[i] = found[0, 3], found[1, 3], np.arctan2(found[1, 0], found[0, 0])
+        return poses
+
+    return match
+
+
+def csm() -> Matcher:
+    """Return CSM's point-to-line ICP."""
+    source, gsl = os.environ.get("CSM", ""), os.environ.get("GSL", "")
+    code, outside = "sm_icp(&params, &result)", "CSM, 1 thread"
+    if not source:
+        return Matcher("csm", code, outside, None, "not compiled: CSM must name a copy of its sources")
+    _kept.append(tempfile.TemporaryDirectory())
+    try:
+        place = Path(gsl) if gsl else None
+        library = ctypes.CDLL(str(chaining_peers.build(Path(source), place, Path(_kept[-1].name), shared=True)))
+    except (OSError, subprocess.CalledProcessError) as error:
+        return Matcher("csm", code, outside, None, f"not compiled: {' '.join(str(error).split())[:200]}")
+    return Matcher("csm", code, outside, _csm_match(library))
+
+
+def _csm_match(library: ctypes.CDLL) -> Match:
+    def match(first: np.ndarray, second: np.ndarray, scanner: gs.Scanner, guesses: np.ndarray) -> np.ndarray:
+        def given(array: np.ndarray) -> np.ndarray:
+            return np.ascontiguousarray(array, np.float64)
+
+        def hits(ranges: np.ndarray) -> np.ndarray:
+            hit = (ranges > max(scanner.range_min, 0.01)) & (ranges < scanner.range_max)
+            return given(np.where(hit, ranges, np.nan))
+
+        parts = [given(scanner.bearings), hits(first), hits(second), given(guesses)]
+        found = np.empty((len(first), 4))
+        library.pairs(scanner.count, len(first), *(ctypes.c_void_p(part.ctypes.data) for part in (*parts, found)))
+        return np.where(found[:, :1] > 0, found[:, 1:], np.nan)
+
+    return match

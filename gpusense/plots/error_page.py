@@ -1,0 +1,58 @@
+"""Write error against run time as one interactive HTML page that fetches nothing."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from gpusense.evaluation.benchmark.rows import Row
+
+_PAGES = Path(__file__).parent / "pages"
+
+
+def error_page(rows: Sequence[Row], shown: Mapping[str, Sequence[str]] | None = None, text: str = "") -> str:
+    """Return the page: a figure of time over error, a budget, and performance profiles.
+
+    A reader chooses need, device, map and error. The most exact method within the budget is marked. The other view is
+    the performance profile of Dolan and More (2002): the share of scenes that a method solves to a largest error within
+    a factor of the best time.
+
+    Args:
+        rows: Rows of reports.
+        shown: By need the texts of the measures that the page offers; None for all.
+        text: A line about the machine, below the title.
+    """
+    origins = list(dict.fromkeys(row.origin for row in rows))
+    lines = ",\n".join(_json(_plain(row, origins, shown)) for row in rows)
+    data = f'{{"origins":{_json(origins)},"text":{_json(text)},"rows":[\n{lines}]}}'
+    page = (_PAGES / "error.html").read_text(encoding="utf-8")
+    script = (_PAGES / "error.js").read_text(encoding="utf-8")
+    return page.replace("/*{script}*/", script).replace("/*{data}*/", data)
+
+
+def _plain(row: Row, origins: Sequence[str], shown: Mapping[str, Sequence[str]] | None) -> dict[str, Any]:
+    measures = [name for name in (row.errors if shown is None else shown[row.need]) if name in row.errors]
+    return {
+        "need": row.need, "device": row.device, "map": row.scene, "name": row.text, "method": row.method,
+        "code": row.code, "outside": row.outside, "maps": row.maps, "time": _short(row.seconds),
+        "quartiles": [_short(one) for one in row.quartiles],
+        "errors": {name: _short(row.errors[name]) for name in measures},
+        "units": [row.units[name] for name in measures],
+        "cases": [
+            [case.name, _short(case.seconds), [_short(case.errors[name]) if name in case.errors else None
+                                               for name in measures]]
+            for case in row.cases
+        ],
+        "origin": origins.index(row.origin),
+    }  # fmt: skip
+
+
+def _json(value: Any) -> str:
+    """Format a value as JSON that no HTML parser takes for the end of its element."""
+    return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def _short(number: float) -> float:
+    return float(f"{number:.4g}")

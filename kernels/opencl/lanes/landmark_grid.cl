@@ -14,7 +14,7 @@ real2 ends_of_lanes(const lanes a) {
 }
 
 // Results of a search: the log densities, of the likeliest landmarks or with MARGINAL of all of them; the log densities
-// of the likeliest ones, and their indices. With MARGINAL sum is the sum of densities relative to log_p. most is the
+// of the likeliest ones, and with PER_BEAM their indices. With MARGINAL sum is the sum of densities relative to log_p. most is the
 // squared radius around an end point within which another landmark may be likelier.
 typedef struct {
     lanes log_p, best, most;
@@ -33,9 +33,13 @@ void with_density_lanes(MatchLanes *match, const ilanes seen, const lanes log_p,
     match->sum = (LanePair){taken ? high : match->sum.hi, taken ? low : match->sum.lo};
     match->log_p = larger ? log_p : match->log_p;
 #endif
+#if PER_BEAM
     const ilanes better = seen & ((log_p > match->best) | ((log_p == match->best) & (j < match->chosen)));
     match->best = better ? log_p : match->best;
     match->chosen = better ? (ilanes)j : match->chosen;
+#else
+    match->best = (seen & (log_p > match->best)) ? log_p : match->best;
+#endif
 }
 
 // Update the matches by landmark j, where it lies in a feature's disc, within the limits of the sensor that the feature

@@ -113,7 +113,9 @@ lanes log_detection_lanes(const LanePlace off, const LanePlace turned, global co
                           const real4 signature, global const real *terms) {
     LanePair exponent = {0, 0};
     lanes mass = 1;
+#if SIGNATURE
     float norm = 0;
+#endif
     const LanePair d = distance_pair_lanes(off);
 #if RANGE
     if (feature[RANGE_SCALE] > 0) {
@@ -155,6 +157,10 @@ lanes log_detection_lanes(const LanePlace off, const LanePlace turned, global co
         norm = signature.z;
     }
 #endif
+#if SIGNATURE
     const lanes log_p = (feature[PEAK] - exponent.hi) + ((feature[PEAK_LOW] - exponent.lo) + norm);
+#else
+    const lanes log_p = (feature[PEAK] - exponent.hi) + (feature[PEAK_LOW] - exponent.lo);
+#endif
     return any_lane(mass != 1) ? (mass == 1 ? log_p : log_p - log_lanes(mass)) : log_p;
 }

@@ -1,5 +1,5 @@
-// Offsets between places in sums of two numbers: offsets.cl in lanes. A fused multiply-add gives the rounding error of a
-// product.
+// Offsets between places in sums of two numbers: offsets.cl in lanes. A fused multiply-add gives the rounding error of
+// a product.
 // requires: lanes/error_free
 
 // A place, an offset or a direction in each lane.
@@ -32,8 +32,10 @@ LanePlace load_places(global const real4 *place, const int first, const int coun
         global const real *numbers = (global const real *)(place + first);
         const lanes a = load_lanes(0, numbers), b = load_lanes(1, numbers);
         const lanes c = load_lanes(2, numbers), d = load_lanes(3, numbers);
-        some.x.hi = (lanes)(a.s048c, b.s048c, c.s048c, d.s048c), some.x.lo = (lanes)(a.s159d, b.s159d, c.s159d, d.s159d);
-        some.y.hi = (lanes)(a.s26ae, b.s26ae, c.s26ae, d.s26ae), some.y.lo = (lanes)(a.s37bf, b.s37bf, c.s37bf, d.s37bf);
+        some.x.hi = (lanes)(a.s048c, b.s048c, c.s048c, d.s048c);
+        some.x.lo = (lanes)(a.s159d, b.s159d, c.s159d, d.s159d);
+        some.y.hi = (lanes)(a.s26ae, b.s26ae, c.s26ae, d.s26ae);
+        some.y.lo = (lanes)(a.s37bf, b.s37bf, c.s37bf, d.s37bf);
         return some;
     }
     for (int i = 0; i < LANES; ++i) {

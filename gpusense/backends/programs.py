@@ -65,7 +65,7 @@ class ProgramCache(Generic[T]):
 
 
 def _make_room(kept: dict[Hashable, Any], most: int) -> None:
-    """Drop the oldest of so many items."""
+    """Drop the oldest items until there is room for one more."""
     while len(kept) >= most:
         del kept[next(iter(kept))]
 

@@ -65,7 +65,7 @@ class ProgramCache(Generic[T]):
 
 
 def _make_room(kept: dict[Hashable, Any], most: int) -> None:
-    """Drop the oldest items until there are fewer than most."""
+    """Drop the oldest items until there is room for one more."""
     while len(kept) >= most:
         del kept[next(iter(kept))]
 

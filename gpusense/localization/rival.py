@@ -131,7 +131,8 @@ class Rival:
         self._tracker.pending = None
         self._tracker.place(starts.spread(tries[chosen], _SPREAD, options.most, key, each=True))
         self.active, self.log_odds, self._prior, self._scans, self._settled = True, prior, prior, 0, False
-        self._ratios = np.zeros(3)
+        # Nothing of an earlier rival is part of the state.
+        self._ratios, self._place = np.zeros(3), np.zeros(3)
 
     def predict(self, motion: SampledMotion) -> None:
         """Move the rival."""

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from support import filter_scene as scene
 
 import gpusense as gs
 from gpusense.localization.rival_search import drawn
@@ -168,3 +169,17 @@ def test_the_likeliest_poses_of_a_map_hold_the_right_one():
         turned = np.abs(gs.wrap_angle(poses[:, None, 2] - poses[None, :, 2]))
         assert ((apart > 0.5) | (turned > 0.26) | np.eye(len(poses), dtype=bool)).all()
     assert likely_poses(field, np.full(90, np.inf), 20).shape == (0, 3)
+
+
+def test_a_second_rival_has_nothing_of_the_first(backend, monkeypatch):
+    """A state does not depend on rivals that the filter has given up: a copy made before them goes on alike."""
+    monkeypatch.setattr("gpusense.localization.starts._LEAST_TRIES", 300)
+    pf = scene.begun(scene.FILTERS["sensors, resetting"](backend), 4, everywhere=True)
+    pf.predict(*scene.odometry(3))
+    start, found = pf.state(), []
+    for corrections in (1, 2, 1):
+        pf.restore(start)
+        for _ in range(corrections):
+            pf.correct(scene.readings(pf, 3))
+        found.append(scene.everything(pf))
+    assert found[0] == found[2] != found[1]

@@ -6,7 +6,7 @@ import functools
 import math
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +19,7 @@ from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Launch, Program, launch
 from gpusense.interface.structs import Buckets as BucketSizes
 from gpusense.interface.structs import Score
-from gpusense.models.landmark.features import PreparedFeatures, check_correspondence
+from gpusense.models.landmark.features import PreparedFeatures, check_correspondence, look_at_feature_angles
 from gpusense.models.landmark.plan import feature_omissions, looked_at
 from gpusense.models.landmark.tables import LandmarkTables
 from gpusense.models.point.base import PointModel
@@ -94,6 +94,8 @@ class FeatureModel(PointModel):
     """
 
     parameters: Any
+    # The column of features with angles, and their name.
+    _angles: ClassVar[tuple[int, str]]
     _buckets: Buckets
     _tables: LandmarkTables
 
@@ -107,8 +109,16 @@ class FeatureModel(PointModel):
             raise ValueError(f"{name}: must be at most {JOINT_LANDMARKS} with association='joint', got {count}")
         x, y, yaw = (float(value) for value in checks.array("mount", mount, (3,)))
         self.mount = (x, y, yaw)
-        self._name, self._count = name, count
+        self._name, self._count, self._seen = name, count, False
         super().__init__(backend, precision, temperature)
+
+    def _arguments(self) -> dict[str, Any]:
+        names = (self._name, "association", "mount")
+        own = {name: getattr(self, name) for name in names} | {"specialize": self._specialize}
+        return super()._arguments() | own
+
+    def _options(self) -> tuple[str, ...]:
+        return f"{self._name}={self._count}", f"association={self.association!r}"
 
     @property
     @abstractmethod
@@ -140,8 +150,21 @@ class FeatureModel(PointModel):
         _, which, parts = self._evaluate(poses, features, None, each=True)
         return which, parts
 
-    @abstractmethod
+    def _partners(self, correspondence: ArrayLike | None) -> np.ndarray:
+        """Return the indices that features are drawn of: all of the map, or those of a correspondence."""
+        if correspondence is None:
+            return np.arange(self._count)
+        return check_correspondence(correspondence, np.size(correspondence), self._count)
+
     def _read(self, features: object) -> tuple[np.ndarray, np.ndarray]:
+        """Return features as ``_possible`` does; the first ones are looked at for angles in degrees."""
+        full, impossible = self._possible(features)
+        if not self._seen:
+            self._seen = look_at_feature_angles(features, *self._angles)
+        return full, impossible
+
+    @abstractmethod
+    def _possible(self, features: object) -> tuple[np.ndarray, np.ndarray]:
         """Return features as float64 rows, all NaN where impossible, and (F,) whether they are impossible."""
 
     @abstractmethod

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,7 +13,7 @@ from gpusense.backends import Selection
 from gpusense.interface.flags import flags_if
 from gpusense.interface.plan import Omission
 from gpusense.models.landmark.base import JOINT_FEATURES, FeatureModel
-from gpusense.models.landmark.features import PreparedFeatures, check_correspondence, look_at_feature_angles
+from gpusense.models.landmark.features import PreparedFeatures
 from gpusense.models.landmark.line_features import possible_lines, prepare_lines
 from gpusense.models.landmark.line_sampling import draw_lines
 from gpusense.models.landmark.plan import common_omissions
@@ -60,6 +60,8 @@ class LineModel(FeatureModel):
         1
     """
 
+    _angles: ClassVar[tuple[int, str]] = (0, "features: angles")
+
     def __init__(
         self,
         lines: LineMap,
@@ -84,7 +86,6 @@ class LineModel(FeatureModel):
         )  # fmt: skip
         for name in ("sigma_angle", "sigma_distance"):
             self._check_scale(name, getattr(self.parameters, name))
-        self._seen = False
         self._buckets = make_buckets(LandmarkMap(lines.middles))
         order, half = self._buckets.index, 0.5 * lines.lengths
         self._longest = float(half.max(initial=0.0))
@@ -158,29 +159,16 @@ class LineModel(FeatureModel):
             >>> model.sample([(1.0, 0.0, 0.0)] * 5, seed=1).shape
             (5, 2, 4)
         """
-        draws = draws_at(poses, self._backend, seed, step)
-        partners = np.arange(len(self.lines))
-        if correspondence is not None:
-            partners = check_correspondence(correspondence, np.size(correspondence), len(self.lines))
+        draws, partners = draws_at(poses, self._backend, seed, step), self._partners(correspondence)
         return draw_lines(
             draws, partners, self.lines, self.parameters, self.mount, every=correspondence is not None
         )  # fmt: skip
 
-    def _arguments(self) -> dict[str, Any]:
-        own = dict(lines=self.lines, association=self.association, mount=self.mount, specialize=self._specialize)
-        return super()._arguments() | own
-
-    def _options(self) -> tuple[str, ...]:
-        return f"lines={len(self.lines)}", f"association={self.association!r}"
-
     def _describe(self) -> tuple[str, list[Omission]]:
         return f"line model, {self.association}", common_omissions(self.mount, self.precision)
 
-    def _read(self, features: object) -> tuple[np.ndarray, np.ndarray]:
-        full, impossible = possible_lines(features, self.parameters)
-        if not self._seen:
-            self._seen = look_at_feature_angles(features, 0, "features: angles")
-        return full, impossible
+    def _possible(self, features: object) -> tuple[np.ndarray, np.ndarray]:
+        return possible_lines(features, self.parameters)
 
     def _numbers(self, full: np.ndarray, known: bool) -> PreparedFeatures:
         return prepare_lines(

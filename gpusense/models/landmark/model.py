@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,8 +21,6 @@ from gpusense.interface.terms import log_weight
 from gpusense.models.landmark.base import FeatureModel
 from gpusense.models.landmark.features import (
     PreparedFeatures,
-    check_correspondence,
-    look_at_feature_angles,
     possible_features,
     prepare_features,
 )
@@ -70,6 +68,8 @@ class LandmarkModel(FeatureModel):
         1
     """
 
+    _angles: ClassVar[tuple[int, str]] = (1, "features: bearings")
+
     def __init__(
         self,
         landmarks: LandmarkMap,
@@ -99,7 +99,7 @@ class LandmarkModel(FeatureModel):
             "landmarks", len(landmarks), backend, precision, association=association, mount=mount,
             temperature=temperature, specialize=specialize,
         )  # fmt: skip
-        self._sensor, self._seen = describe(p, landmarks), False
+        self._sensor = describe(p, landmarks)
         tiny, most = np.finfo(self._real).tiny, np.finfo(self._real).max
         if any(scale and not tiny <= scale <= most for scale in self._sensor.scales):
             raise ValueError(f"parameters: deviations must fit {self._real.name}, got {p}")
@@ -137,8 +137,7 @@ class LandmarkModel(FeatureModel):
         return cast(np.ndarray, self._evaluate(poses, features, correspondence, out=out)[0])
 
     def _arguments(self) -> dict[str, Any]:
-        own = dict(landmarks=self.landmarks, association=self.association, negative=self.negative, mount=self.mount)
-        return super()._arguments() | own | {"specialize": self._specialize}
+        return super()._arguments() | {"negative": self.negative}
 
     def sample(
         self, poses: AnyArray, seed: int = 0, *, step: int = 0, correspondence: ArrayLike | None = None
@@ -172,27 +171,18 @@ class LandmarkModel(FeatureModel):
             >>> model.sample([(0.0, 0.0, 0.0)] * 5, seed=1).shape
             (5, 2, 2)
         """
-        draws = draws_at(poses, self._backend, seed, step)
-        partners = np.arange(len(self.landmarks))
-        if correspondence is not None:
-            partners = check_correspondence(correspondence, np.size(correspondence), len(self.landmarks))
+        draws, partners = draws_at(poses, self._backend, seed, step), self._partners(correspondence)
         return draw_features(
             draws, partners, self.landmarks, self.parameters, self._sensor.span, self.mount,
             every=correspondence is not None,
         )  # fmt: skip
 
-    def _options(self) -> tuple[str, ...]:
-        return f"landmarks={len(self.landmarks)}", f"association={self.association!r}"
-
     def _describe(self) -> tuple[str, list[Omission]]:
         omissions = parameter_omissions(self.parameters, self.negative, self.mount, self.precision)
         return f"landmark model, {self.association}", omissions
 
-    def _read(self, features: object) -> tuple[np.ndarray, np.ndarray]:
-        full, impossible = possible_features(features, self.parameters, self._sensor.span)
-        if not self._seen:
-            self._seen = look_at_feature_angles(features, 1, "features: bearings")
-        return full, impossible
+    def _possible(self, features: object) -> tuple[np.ndarray, np.ndarray]:
+        return possible_features(features, self.parameters, self._sensor.span)
 
     def _numbers(self, full: np.ndarray, known: bool) -> PreparedFeatures:
         return prepare_features(

@@ -13,7 +13,7 @@ from gpusense._util.typing import AnyArray, Association, Precision
 from gpusense.backends import Selection
 from gpusense.backends.base import Buffer
 from gpusense.interface.flags import flags_if
-from gpusense.interface.lanes import widened
+from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission
 from gpusense.interface.structs import Buckets, SensorView
@@ -206,7 +206,7 @@ class LandmarkModel(FeatureModel):
         if not self.negative:
             return ()
         p = self.parameters
-        flags = widened(self._backend.info.lanes, "count_unseen", self._flags)
+        flags = with_lanes_flag(self._backend.info.lanes, "count_unseen", self._flags)
         return (launch(
             "count_unseen", flags, (placed.count,), landmark=self._tables.landmark, start=self._tables.start,
             pose_cell=placed.cell, pose=placed.pose, pose_low=placed.low, which=which, log_p=log_p,

@@ -15,7 +15,7 @@ from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
 from gpusense.interface.constants import BEACON, BEACON_TERMS, FARTHEST, NORMAL, STUDENT_T, TWO_NORMALS
 from gpusense.interface.flags import flags_if
-from gpusense.interface.lanes import widened
+from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission, share
 from gpusense.interface.terms import log_weight
@@ -109,7 +109,7 @@ class BeaconModel(PointModel):
             return cast(np.ndarray, self._score(poses, out, None, left_out))
 
         (origin_x, origin_y), (mount_x, mount_y) = self._origin, self.parameters.mount
-        flags = widened(self._backend.info.lanes, "score_beacons", self._flags)
+        flags = with_lanes_flag(self._backend.info.lanes, "score_beacons", self._flags)
 
         def program(some: Poses, part: Part, log_p: Buffer) -> Program:
             middle = dict(origin_x=origin_x, origin_y=origin_y, mount_x=mount_x, mount_y=mount_y)

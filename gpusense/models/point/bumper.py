@@ -15,7 +15,7 @@ from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
 from gpusense.interface.constants import FIELD_RING
 from gpusense.interface.flags import flags_if
-from gpusense.interface.lanes import widened
+from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission, share
 from gpusense.models.arguments import map_words
@@ -144,7 +144,7 @@ class BumperModel(PointModel):
         start = np.concatenate([[0], np.cumsum(sizes[valid])]).astype(np.int32)
         known = states[valid].astype(np.int32)
         flags = self._flags | flags_if(CAREFUL=self._real == np.float32)
-        flags = widened(self._backend.info.lanes, "score_contact", flags)
+        flags = with_lanes_flag(self._backend.info.lanes, "score_contact", flags)
         window, space = self._window, self._workspace
 
         def program(some: Poses, part: Part, log_p: Buffer) -> Program:

@@ -13,7 +13,7 @@ import pytest
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import beam_tolerance, differing
-from gpusense.interface.lanes import widened
+from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.signatures import LANES, lanes_of
 
 PARTICLES = 75
@@ -182,8 +182,8 @@ def test_bumpers(outline, changes, device, compiled):
 
 def test_float64_and_lines_have_no_vectors():
     for kernel in ("score_features", "count_unseen", "score_beacons", "score_contact"):
-        assert widened(LANES, kernel, {"RANGE", "BEARING"}) == {"RANGE", "BEARING", "WIDE"}
-        assert widened(LANES, kernel, {"RANGE", "FLOAT64"}) == {"RANGE", "FLOAT64"}
-    assert widened(LANES, "score_features", {"RANGE", "LINE"}) == {"RANGE", "LINE"}
+        assert with_lanes_flag(LANES, kernel, {"RANGE", "BEARING"}) == {"RANGE", "BEARING", "WIDE"}
+        assert with_lanes_flag(LANES, kernel, {"RANGE", "FLOAT64"}) == {"RANGE", "FLOAT64"}
+    assert with_lanes_flag(LANES, "score_features", {"RANGE", "LINE"}) == {"RANGE", "LINE"}
     for flag in ("SIGNATURE", "FIELD", "MARGINAL", "PER_BEAM"):
-        assert "WIDE" in widened(LANES, "score_features", {"BEARING", flag})
+        assert "WIDE" in with_lanes_flag(LANES, "score_features", {"BEARING", flag})

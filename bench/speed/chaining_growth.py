@@ -34,7 +34,7 @@ from common import make_parser, note, parse, publish, table
 
 # Passes of each log.
 SCANS = 5000
-PASSES = {"intel": (0.25, 0.5, 1.0), "fr079": (0.125, 0.25, 0.5, 1.0, SCANS / 4791), "seattle": (1.0, 2.0, 4.0, 8.0)}
+PASSES = {"intel": (0.25, 0.5, 1.0), "fr079": (0.25, 0.5, SCANS / 4791), "seattle": (1.0, 2.0, 4.0, 8.0)}
 # Noise of ranges [m], and of each pass's odometry.
 NOISE, STRETCH = 0.01, 0.02
 

@@ -13,7 +13,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 # Most poses whose joint covariance is kept; in a longer graph each stands for its neighbours.
-_ANCHORS = 100
+_ANCHORS = 300
 # Columns of the inverse that are solved for at once.
 _COLUMNS = 192
 # Damping [1/m^2, 1/rad^2]: a direction that no link observes has a variance of the inverse.

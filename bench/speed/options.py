@@ -96,7 +96,7 @@ def field_options(scene: Scene, scanner: gs.Scanner) -> Iterator[Option]:
     yield option("sigma_hit = 4 mm", 1.05, gs.LikelihoodFieldParameters(sigma_hit=0.004))
     yield option('hit="student"', 1.05, gs.LikelihoodFieldParameters(hit="student"))
     yield option("bilinear", 4.0, bilinear())
-    yield option('bilinear, hit="student"', 6.0, bilinear(hit="student"))
+    yield option('bilinear, hit="student"', 5.0, bilinear(hit="student"))
     yield option("bilinear, z_rand = 0", 4.0, bilinear(z_hit=1.0, z_rand=0.0))
     yield option("bilinear, sigma_hit = 4 mm", 4.0, bilinear(sigma_hit=0.004))
     yield option("float64", 2.2, precision="float64")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 
 from gpusense.interface import casters, structs
@@ -17,6 +18,7 @@ typedef {real}4 real4;
 #define FLOAT64 {float64}
 #define SPLITTER ((real){splitter})
 """
+_WORD = re.compile(r"\w+")
 _REQUIRES = re.compile(r"^// requires: (.*)$", re.MULTILINE)
 
 
@@ -68,14 +70,33 @@ def _requirements(name: str) -> list[str]:
 
 def uses_double(file: str, flags: frozenset[str] = frozenset()) -> bool:
     """Return whether a kernel file computes in float64 also where the model's precision is float32."""
-    kept = (resolve(opencl_source(needed), flags - {"FLOAT64"}, needed) for needed in required_files(file, flags))
+    kept = (_kept(needed, flags - {"FLOAT64"}) for needed in required_files(file, flags))
     texts = (re.sub(r"//.*", "", text) for text in kept)
     return any(re.search(r"\bdouble[24]?\b", text + _declarations(text)) for text in texts)
 
 
 def _declarations(text: str) -> str:
     """Return the declarations of the structs that a source names."""
-    return "".join(structs.declaration(name) for name in structs.STRUCTS if re.search(rf"\b{name}\b", text))
+    words = _words(text)
+    return "".join(structs.declaration(name) for name in structs.STRUCTS if name in words)
+
+
+@functools.lru_cache(maxsize=512)
+def _words(text: str) -> frozenset[str]:
+    """Return the words of a source."""
+    return frozenset(_WORD.findall(text))
+
+
+@functools.lru_cache(maxsize=512)
+def _resolved(text: str, flags: frozenset[str], name: str) -> str:
+    """Return a source with the branches that flags take."""
+    return resolve(text, flags, name)
+
+
+def _kept(file: str, flags: frozenset[str]) -> str:
+    """Return the branches of a kernel file that flags take; those that it does not name make no difference."""
+    text = opencl_source(file)
+    return _resolved(text, flags & _words(text), f"{file}.cl")
 
 
 def assemble(file: str, flags: frozenset[str]) -> str:
@@ -83,7 +104,7 @@ def assemble(file: str, flags: frozenset[str]) -> str:
     head = prelude(float64="FLOAT64" in flags, doubles=uses_double(file, flags))
     body = ""
     for needed in required_files(file, flags):
-        body += f'#line 1 "{needed}.cl"\n' + resolve(opencl_source(needed), flags, f"{needed}.cl")
+        body += f'#line 1 "{needed}.cl"\n' + _kept(needed, flags)
     return head + _declarations(body) + body
 
 
@@ -108,9 +129,8 @@ def with_places(log: str, source: str) -> str:
 def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
     """Return the flags that change a kernel file's code: one program serves all flags that agree on them."""
     files = required_files(file, flags)
-    text = "".join(opencl_source(needed) for needed in files)
-    text += _declarations(text)
-    words = set(re.findall(r"\b[A-Z][A-Z0-9_]*\b", text))
+    words = set().union(*(_words(opencl_source(needed)) for needed in files))
+    words |= _words("".join(structs.declaration(name) for name in structs.STRUCTS if name in words))
     if any({"caster", "lanes/caster"} & set(_requirements(needed)) for needed in files):
         words |= casters.FLAGS.keys()
     if _in_lanes(file, flags):
@@ -118,6 +138,6 @@ def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
     unknown = flags - FLAGS.keys()
     if unknown:
         raise ValueError(f"flags: must be among {sorted(FLAGS)}, got {sorted(unknown)}")
-    if re.search(r"\breal\b", text):
+    if "real" in words:
         words.add("FLOAT64")
     return flags & words

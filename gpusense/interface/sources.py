@@ -5,6 +5,7 @@ A kernel's parameters are written from its row of the signature table: its file 
 
 from __future__ import annotations
 
+import functools
 import re
 
 from gpusense.interface import casters, structs
@@ -22,6 +23,7 @@ typedef {real}4 real4;
 #define SPLITTER ((real){splitter})
 """
 _HEAD = re.compile(r"^kernel void (\w+)\(ARGUMENTS\)", re.MULTILINE)
+_WORD = re.compile(r"\w+")
 _REQUIRES = re.compile(r"^// requires: (.*)$", re.MULTILINE)
 
 
@@ -58,6 +60,12 @@ def source_text(file: str) -> str:
     Raises:
         ValueError: a kernel has no row in the signature table.
     """
+    return _with_parameters(opencl_source(file), file)
+
+
+@functools.lru_cache(maxsize=512)
+def _with_parameters(text: str, file: str) -> str:
+    """Return a source with the parameters of its kernels."""
 
     def head(match: re.Match[str]) -> str:
         name = match.group(1)
@@ -65,7 +73,7 @@ def source_text(file: str) -> str:
             raise ValueError(f"{file}.cl: a kernel must have a row in the signature table, got {name!r}")
         return f"kernel void {name}({parameters(name)})"
 
-    return _HEAD.sub(head, opencl_source(file))
+    return _HEAD.sub(head, text)
 
 
 def required_files(name: str, flags: frozenset[str] = frozenset()) -> list[str]:
@@ -101,14 +109,33 @@ def _requirements(name: str) -> list[str]:
 
 def uses_double(file: str, flags: frozenset[str] = frozenset()) -> bool:
     """Return whether a kernel file computes in float64 also where the model's precision is float32."""
-    kept = (resolve(source_text(needed), flags - {"FLOAT64"}, needed) for needed in required_files(file, flags))
+    kept = (_kept(needed, flags - {"FLOAT64"}) for needed in required_files(file, flags))
     texts = (re.sub(r"//.*", "", text) for text in kept)
     return any(re.search(r"\bdouble[24]?\b", text + _declarations(text)) for text in texts)
 
 
 def _declarations(text: str) -> str:
     """Return the declarations of the structs that a source names."""
-    return "".join(structs.declaration(name) for name in structs.STRUCTS if re.search(rf"\b{name}\b", text))
+    words = _words(text)
+    return "".join(structs.declaration(name) for name in structs.STRUCTS if name in words)
+
+
+@functools.lru_cache(maxsize=512)
+def _words(text: str) -> frozenset[str]:
+    """Return the words of a source."""
+    return frozenset(_WORD.findall(text))
+
+
+@functools.lru_cache(maxsize=512)
+def _resolved(text: str, flags: frozenset[str], name: str) -> str:
+    """Return a source with the branches that flags take."""
+    return resolve(text, flags, name)
+
+
+def _kept(file: str, flags: frozenset[str]) -> str:
+    """Return the branches of a kernel file that flags take; those that it does not name make no difference."""
+    text = source_text(file)
+    return _resolved(text, flags & _words(text), f"{file}.cl")
 
 
 def assemble(file: str, flags: frozenset[str]) -> str:
@@ -116,7 +143,7 @@ def assemble(file: str, flags: frozenset[str]) -> str:
     head = prelude(float64="FLOAT64" in flags, doubles=uses_double(file, flags))
     body = ""
     for needed in required_files(file, flags):
-        body += f'#line 1 "{needed}.cl"\n' + resolve(source_text(needed), flags, f"{needed}.cl")
+        body += f'#line 1 "{needed}.cl"\n' + _kept(needed, flags)
     return head + _declarations(body) + body
 
 
@@ -141,9 +168,8 @@ def with_places(log: str, source: str) -> str:
 def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
     """Return the flags that change a kernel file's code: one program serves all flags that agree on them."""
     files = required_files(file, flags)
-    text = "".join(source_text(needed) for needed in files)
-    text += _declarations(text)
-    words = set(re.findall(r"\b[A-Z][A-Z0-9_]*\b", text))
+    words = set().union(*(_words(source_text(needed)) for needed in files))
+    words |= _words("".join(structs.declaration(name) for name in structs.STRUCTS if name in words))
     if any({"caster", "lanes/caster"} & set(_requirements(needed)) for needed in files):
         words |= casters.FLAGS.keys()
     if _in_lanes(file, flags):
@@ -151,6 +177,6 @@ def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
     unknown = flags - FLAGS.keys()
     if unknown:
         raise ValueError(f"flags: must be among {sorted(FLAGS)}, got {sorted(unknown)}")
-    if re.search(r"\breal\b", text):
+    if "real" in words:
         words.add("FLOAT64")
     return flags & words

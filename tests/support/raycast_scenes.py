@@ -10,7 +10,7 @@ import numpy as np
 from support.ray_oracles import Ray, walk
 
 from gpusense.backends import get_backend
-from gpusense.interface.lanes import widened
+from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.structs import Caster, RangeScale, Window
 from gpusense.tables.rectangles import empty_rectangles
 
@@ -67,7 +67,7 @@ def cast(scene: Scene, backend: str, precision: str, sectors: int = 1, *, wide: 
     table = empty_rectangles(device, scene.occupied, sectors)
     cell, pose = device.upload(scene.cell.astype(np.int32)), device.upload(pose.astype(real))
     rays, ranges = device.upload(np.array([[1.0, 0.0]], real)), device.empty(count, real)
-    code = widened(device.info.lanes, "cast_ranges", flags) if wide else frozenset(flags)
+    code = with_lanes_flag(device.info.lanes, "cast_ranges", flags) if wide else frozenset(flags)
     device.compile("cast_ranges", code)(
         (1, count),
         table,

@@ -32,8 +32,6 @@ class ProgramCache(Generic[T]):
 
     def __init__(self, most: int) -> None:
         self._most, self._kept = most, dict[Hashable, T]()
-        # Keys of programs that have run once.
-        self._seen: dict[Hashable, None] = {}
         # The program of a key, or None.
         self.get = self._kept.get
 
@@ -42,17 +40,10 @@ class ProgramCache(Generic[T]):
 
     def keep(self, key: Hashable, program: T) -> T:
         """Keep the program of a key, which determines it, and return it."""
-        _make_room(self._kept, self._most)
+        while len(self._kept) >= self._most:
+            del self._kept[next(iter(self._kept))]
         self._kept[key] = program
         return program
-
-    def repeats(self, key: Hashable) -> bool:
-        """Tell whether this was asked before of a key: a program that runs once is not worth to be kept."""
-        if key in self._seen:
-            return True
-        _make_room(self._seen, self._most)
-        self._seen[key] = None
-        return False
 
     def items(self) -> list[tuple[Hashable, T]]:
         """Return the keys with their programs, the last one at the end."""
@@ -61,13 +52,6 @@ class ProgramCache(Generic[T]):
     def clear(self) -> None:
         """Drop all programs."""
         self._kept.clear()
-        self._seen.clear()
-
-
-def _make_room(kept: dict[Hashable, Any], most: int) -> None:
-    """Drop the oldest items until there is room for one more."""
-    while len(kept) >= most:
-        del kept[next(iter(kept))]
 
 
 class ChangingProgram:
@@ -138,6 +122,8 @@ class RepeatedPrograms:
 
     def __init__(self, backend: Backend, most: int) -> None:
         self._backend, self._programs = backend, ProgramCache[Recording](most)
+        # Keys of programs that have run once.
+        self._seen = ProgramCache[bool](most)
 
     def run(self, key: Hashable, make: Callable[[], Program]) -> None:
         """Run the program of a key, which determines it."""
@@ -148,8 +134,10 @@ class RepeatedPrograms:
             return
         program = make()
         self._backend.run(program)
-        if self._programs.repeats(key):
+        if self._seen.get(key):
             self._programs.keep(key, self._backend.record(program))
+        else:
+            self._seen.keep(key, True)
 
     @property
     def last(self) -> Recording:
@@ -159,3 +147,4 @@ class RepeatedPrograms:
     def clear(self) -> None:
         """Drop all programs."""
         self._programs.clear()
+        self._seen.clear()

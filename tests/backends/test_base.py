@@ -10,7 +10,7 @@ import pytest
 
 from gpusense.backends import Backend, get_backend
 from gpusense.backends.proxy import Proxy
-from gpusense.backends.recording import Recording, counted
+from gpusense.backends.recording import Recording, pluralize
 from gpusense.interface.launches import Launch
 
 INT, REAL = np.dtype(np.int32), np.dtype(np.float32)
@@ -192,4 +192,4 @@ def test_a_proxy_sees_each_launch_of_programs_and_recordings(backend):
     [(0, "launch", "0 launches"), (1, "launch", "1 launch"), (3, "launch", "3 launches"), (2, "copy", "2 copies")],
 )
 def test_numbers_in_words(number, noun, text):
-    assert counted(number, noun) == text
+    assert pluralize(number, noun) == text

@@ -11,8 +11,8 @@ numba (``pip install numba``): code of our own from public descriptions, paralle
   field, headings rounded to a table of sines.
 
 range_libc appears where the variable RANGE_LIBC names a copy of its sources, which are compiled then; f1tenth_gym where
-it can be imported, or where F1TENTH_GYM names its ``laser_models.py``, which is executed. Both run one thread. Their
-maps are the whole map in cells, with its yaw taken out. ``filters.py`` adds the models of nav2_amcl and Beluga.
+it can be imported, or where F1TENTH_GYM names its file of the scan simulator, which is executed. Both run one thread.
+Their maps are the whole map in cells, with its yaw taken out. ``filters.py`` adds the models of nav2_amcl and Beluga.
 """
 
 from __future__ import annotations

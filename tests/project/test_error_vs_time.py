@@ -165,6 +165,26 @@ def test_two_reports_of_a_device_are_refused(page: ModuleType, tmp_path: Path) -
         page.files(tmp_path)
 
 
+def test_devices_and_other_matchers_have_their_places(page: ModuleType, tmp_path: Path) -> None:
+    """A GPU by OpenCL, Warp's processor device, and a program that matches on one core."""
+    outside = {"backend": "outside", "device": "csm 1, 1 thread", "outside": "csm 1, 1 thread"}
+    rows = [
+        task("icp", "180 beams", 0.0003, 0.005, need="matching", backend="warp:cpu", device="CPU"),
+        task("icp", "180 beams", 0.00002, 0.005, need="matching", device="NVIDIA H200", kind="gpu"),
+        task("csm", "180 beams", 0.001, 0.004, need="matching", precision="float64") | outside,
+    ]  # fmt: skip
+    write_tasks(tmp_path, rows)
+    text = page.files(tmp_path)[page.PAGE]
+    assert "| to do | 1 core of an X, Warp | NVIDIA H200, OpenCL |" in text
+    assert (
+        "| match of two scans, at most 1 cm | **icp, 180 beams**: 300 us, 5 mm | **icp, 180 beams**: 40 us, 5 mm |"
+        in text
+    )
+    assert re.findall(r"^\| (\w+) \| 180 beams \| (.*?) \| (.*?) \|", text, re.MULTILINE) == [
+        ("icp", "gpusense", "300 us"), ("csm", "csm 1, 1 thread", "1 ms"),
+    ]  # fmt: skip
+
+
 # ---- the interactive page
 
 

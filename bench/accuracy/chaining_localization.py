@@ -2,10 +2,11 @@
 
     python bench/accuracy/chaining_localization.py --backend opencl --output bench/results/chaining_localization
 
-The even scans of a log are chained and make a map; the odd ones, which are in no map, correct a particle filter with
-the defaults of ``gpusense localize``, from around the pose of their first one. "given" is the map of the data folder,
-of the even scans at the corrected poses of the log (of all scans for jarvis); "at references" is of the same scans at
-the same poses, but counted by ``build_map``, so that it differs from "made" in poses alone.
+All scans of a log are chained, and the even ones make a map at these poses, as those of the data folder were made at the
+poses of another program. The odd ones, which are in no map, correct a particle filter with the defaults of ``gpusense
+localize``, from around the pose of their first one. "given" is the map of the data folder, of the even scans at the
+corrected poses of the log (of all scans for jarvis); "at references" is of the same scans at the same poses, but
+counted by ``build_map``, so that it differs from "made" in poses alone.
 
 Errors are distances from the references after the best rigid alignment of each track, without the first 5 %; "over
 5 m" are errors of relative poses over 5 m of the way, which do not see how far a map is bent as a whole. Both are
@@ -89,26 +90,25 @@ def measured(log: Log, name: str, arguments: Any) -> list[dict[str, Any]]:
     """Return the rows of a log: on each map."""
     even, odd = part(log, 0), part(log, 1)
     chain = gs.chain_scans(
-        even.ranges, odometry=even.odometry, times=even.times, backend=arguments.backend, **even.arguments
+        log.ranges, odometry=log.odometry, times=log.times, backend=arguments.backend, **log.arguments
     )
-    shift = figures(even, "", chain.poses, 0.0)["earlier_s"]
+    shift = figures(log, "", chain.poses, 0.0)["earlier_s"]
     mapped, truth = references(even, shift), references(odd, shift)
     given = gs.read_map(Path(arguments.data) / MAPS[name])
     options = {"resolution": given.resolution, "range_limit": LIMIT, "backend": arguments.backend}
     known = np.flatnonzero(np.isfinite(mapped).all(axis=1))
-    moved = chain.motions
+    moved = None if chain.motions is None else chain.motions[::2]
     maps = {
         "given": given,
         "at references": gs.build_map(
             even.ranges[known], mapped[known], log.scanner, motion=None if moved is None else moved[known], **options
         ),
-        "made": gs.build_map(even.ranges, chain.poses, log.scanner, motion=moved, **options),
+        "made": gs.build_map(even.ranges, chain.poses[::2], log.scanner, motion=moved, **options),
     }
     chosen = np.flatnonzero(np.isfinite(truth).all(axis=1))[: arguments.scans]
     runs, true = slice(int(chosen[0]), int(chosen[-1]) + 1), truth[chosen]
     some = replace(odd, ranges=odd.ranges[runs], odometry=odd.odometry[runs])
-    step = gs.pose_difference(even.odometry[chosen[0]], odd.odometry[chosen[0]])
-    starts = {"made": gs.compose_poses(chain.poses[chosen[0]], step)}
+    starts = {"made": chain.poses[1::2][chosen[0]]}
     late = slice(len(chosen) // 20, None)
     rows = []
     for kind, grid in maps.items():

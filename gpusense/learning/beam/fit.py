@@ -75,11 +75,11 @@ def fit_beam_parameters(
         tolerance: The method has converged once it expects to gain less than ``tolerance`` [nats].
         restarts: Number of additional random starts; the best result is returned.
         seed: Seed of the random starts and of ``"genetic"``.
-        range_bias: Whether the parameters contain an offset b of correct ranges, too: z = z* + b. p_hit then has its
+        range_bias: Whether the parameters also contain an offset b of correct ranges: z = z* + b. p_hit then has its
             mean at z* + b, clamped to [0, range_max].
-        sigma_growth: Whether the deviation of correct ranges grows with range, too: it is sigma_hit + sigma_growth z*.
+        sigma_growth: Whether the deviation of correct ranges also grows with range: it is sigma_hit + sigma_growth z*.
             All parameters are then fitted together on the host, from the fit without growth.
-        responsibilities: Whether to return each reading's probabilities of the four causes, too.
+        responsibilities: Whether to also return each reading's probabilities of the four causes.
         blocks: Integer label of each reading's block, of the same shape, or None. Readings of different blocks are
             independent; those of one block (a scan, or several neighbouring ones) need not be. Standard errors are
             then computed over blocks.

@@ -115,7 +115,7 @@ class _Growing(Problem):
 
 
 def fit_growth(fit: BeamFit, pairs: Pairs, bounds: Bounds, tolerance: float, responsibilities: bool) -> BeamFit:
-    """Fit the growth of the deviation, too, from a fit without it."""
+    """Fit the parameters and the growth of the deviation, from a fit without growth."""
     if not pairs.hits or not pairs.expected.any():
         return replace(fit, status=f"{fit.status}; sigma_growth: no range determines it",
                        held=fit.held | {"sigma_growth": "no range determines it"})  # fmt: skip

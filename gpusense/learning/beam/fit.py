@@ -81,8 +81,11 @@ def fit_beam_parameters(
             mean at z* + b, clamped to [0, range_max].
         sigma_growth: Whether the deviation of correct ranges also grows with range: it is sigma_hit + sigma_growth z*.
             All parameters are then fitted together on the host, from the fit without growth.
+<<<<<<< HEAD
         hit: Shape of correct ranges: ``"normal"``, or ``"student"``, a Student t whose degrees of freedom ``hit_dof``
             are also fitted. All parameters are then fitted together on the host, from the fit with a normal.
+=======
+>>>>>>> work-e
         responsibilities: Whether to also return each reading's probabilities of the four causes.
         blocks: Integer label of each reading's block, of the same shape, or None. Readings of different blocks are
             independent; those of one block (a scan, or several neighbouring ones) need not be. Standard errors are

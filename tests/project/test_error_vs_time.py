@@ -58,6 +58,7 @@ def test_reports_state_command_and_device(reports: ModuleType) -> None:
     for source in reports.sources():
         assert source.report["command"].startswith("python bench/error_vs_time/"), source.name
         assert source.titles and source.report["date"] and "/work" not in source.report["command"]
+        assert "--quick" not in source.report["command"], f"{source.name}: of 512 particles"
 
 
 # ---- commits

@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from support.bench_world import made_point, made_report
 from support.browser import CHROMIUM, in_browser
 from support.paths import ROOT
 
@@ -57,6 +58,7 @@ def test_reports_state_command_and_device(reports: ModuleType) -> None:
     for source in reports.sources():
         assert source.report["command"].startswith("python bench/error_vs_time/"), source.name
         assert source.titles and source.report["date"] and "/work" not in source.report["command"]
+        assert "--quick" not in source.report["command"], f"{source.name}: of 512 particles"
 
 
 # ---- commits
@@ -163,6 +165,20 @@ def test_two_reports_of_a_device_are_refused(page: ModuleType, tmp_path: Path) -
     shutil.copy(tmp_path / "error_vs_time_x_tasks.json", tmp_path / "error_vs_time_y_tasks.json")
     with pytest.raises(ValueError, match="each device must have one of a kind"):
         page.files(tmp_path)
+
+
+def test_methods_of_one_kind_of_cloud_are_on_the_interactive_page_alone(page: ModuleType, tmp_path: Path) -> None:
+    """A table that was left out in the tracking clouds has no error there, and so no place in the tables."""
+    points = [
+        made_point(problem="beam", cloud=cloud, method=method, status="left out" if alone else "ok")
+        for method, cloud, alone in (("exact", "global", False), ("exact", "tracking", False),
+                                     ("lookup", "global", False), ("lookup", "tracking", True))
+    ]  # fmt: skip
+    own = {"points": points, "machine": {"processors": 2, "processor": "X"}, "commit": "abc", "date": "2026-01-01"}
+    (tmp_path / "error_vs_time_x_models.json").write_text(json.dumps(made_report() | own | {"command": "python x"}))
+    made = page.files(tmp_path)
+    assert "lookup" not in made[page.PAGE].split("## Localisation")[0].split("## Rays")[0]
+    assert '"method":"lookup"' in made[page.FIGURE] and "lookup" not in made[page.picture("beam model")]
 
 
 def test_devices_and_other_matchers_have_their_places(page: ModuleType, tmp_path: Path) -> None:

@@ -24,7 +24,6 @@ from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, fr
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from common import add_repeats, make_parser, note, parse, publish, table, table_line
-
 from speed import range_libc
 
 BEARINGS, RANGE_MAX = np.linspace(-2.35, 2.35, 360), 15.0

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 from support.bench_scripts import BENCH, run_script
 from support.paths import ROOT
@@ -430,3 +431,20 @@ def test_calibration_runs(tmp_path: Path) -> None:
     assert [row["model"] for row in report["rows"]] == ["heading", "beam"]
     assert all(sum(counts) == 60 for row in report["rows"] for counts in row["counts"])
     assert all(0 < row["least_p"] <= 1 for row in report["rows"])
+
+
+def test_rays_per_core_runs(needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows of both clouds for every caster; a stand-in takes range_libc's place."""
+    monkeypatch.syspath_prepend(str(BENCH))
+    script = importlib.import_module("speed.rays_per_core")
+
+    class Caster:
+        def __init__(self, *arguments: object) -> None: ...
+
+        def cast(self, poses: np.ndarray, angles: np.ndarray) -> np.ndarray:
+            return np.zeros((len(poses), len(angles)), np.float32)
+
+    monkeypatch.setattr(script.range_libc, "Caster", Caster)
+    rows = script.measure(None, needs("opencl"), 20, 1, 1.0)
+    assert [row["cloud"] for row in rows] == ["tracking", "global"] * 3
+    assert all(row["rate"] > 0 and row["apart"] > 0 for row in rows)

@@ -58,59 +58,56 @@ def fit_beam_parameters(
 ) -> BeamFit:
     """Fit the parameters of the beam model by maximum likelihood (book section 6.3.3, table 6.2).
 
-        Readings are classified as by :func:`gpusense.classify`: missing ones are left out, "no return" has probability
-        z_max, all others have the mixture's density. The device computes the sums over all pairs.
+    Readings are classified as by :func:`gpusense.classify`: missing ones are left out, "no return" has probability
+    z_max, all others have the mixture's density. The device computes the sums over all pairs.
 
     Args:
-            ranges: Readings z of any shape [m].
-            expected: Expected ranges z* of the same shape, in [0, range_max] [m]; any value beside a missing reading.
-            range_max: Readings of at least ``range_max`` are "no return" [m].
-            method: ``"em"``: EM with the exact M-step and Newton steps; ``"em-book"``: the book's closed forms, with their
-                failures; ``"gradient"``: L-BFGS-B; ``"hill_climb"``: Powell's method; ``"genetic"``: differential
-                evolution, finished by gradients.
-            range_min: Readings below ``range_min`` are missing [m].
-            initial: Start of the search; None chooses the best of several from the readings. A cause of weight 0 stays
-                out; shapes beyond their bounds are clamped. The status says if a start from the readings is better.
-            backend: The device, see :func:`gpusense.devices`.
-            precision: ``"float64"`` or ``"float32"``; None is float64 if the device has it.
-            max_iterations: Most iterations of the method; None is 500 of EM, 60 of the book's, 1000 of the others.
-            tolerance: The method has converged once it expects to gain less than ``tolerance`` [nats].
-            restarts: Number of additional random starts; the best result is returned.
-            seed: Seed of the random starts and of ``"genetic"``.
-            range_bias: Whether the parameters also contain an offset b of correct ranges: z = z* + b. p_hit then has its
-                mean at z* + b, clamped to [0, range_max].
-            sigma_growth: Whether the deviation of correct ranges also grows with range: it is sigma_hit + sigma_growth z*.
-                All parameters are then fitted together on the host, from the fit without growth.
-    <<<<<<< HEAD
-            hit: Shape of correct ranges: ``"normal"``, or ``"student"``, a Student t whose degrees of freedom ``hit_dof``
-                are also fitted. All parameters are then fitted together on the host, from the fit with a normal.
-    =======
-    >>>>>>> work-e
-            responsibilities: Whether to also return each reading's probabilities of the four causes.
-            blocks: Integer label of each reading's block, of the same shape, or None. Readings of different blocks are
-                independent; those of one block (a scan, or several neighbouring ones) need not be. Standard errors are
-                then computed over blocks.
-            sigma_bounds: Smallest and largest sigma_hit [m]. None is from the step that readings are rounded to, divided by
-                sqrt(12), or else 1e-6 range_max, to range_max.
-            lambda_bounds: Smallest and largest lambda_short [1/m]. None is 1e-3 / range_max to 1e4 / range_max.
-            progress: Whether to show a progress bar on standard error if that is a terminal.
-            callback: Function called after each iteration with its number, the log-likelihood and the parameters.
+        ranges: Readings z of any shape [m].
+        expected: Expected ranges z* of the same shape, in [0, range_max] [m]; any value beside a missing reading.
+        range_max: Readings of at least ``range_max`` are "no return" [m].
+        method: ``"em"``: EM with the exact M-step and Newton steps; ``"em-book"``: the book's closed forms, with their
+            failures; ``"gradient"``: L-BFGS-B; ``"hill_climb"``: Powell's method; ``"genetic"``: differential
+            evolution, finished by gradients.
+        range_min: Readings below ``range_min`` are missing [m].
+        initial: Start of the search; None chooses the best of several from the readings. A cause of weight 0 stays
+            out; shapes beyond their bounds are clamped. The status says if a start from the readings is better.
+        backend: The device, see :func:`gpusense.devices`.
+        precision: ``"float64"`` or ``"float32"``; None is float64 if the device has it.
+        max_iterations: Most iterations of the method; None is 500 of EM, 60 of the book's, 1000 of the others.
+        tolerance: The method has converged once it expects to gain less than ``tolerance`` [nats].
+        restarts: Number of additional random starts; the best result is returned.
+        seed: Seed of the random starts and of ``"genetic"``.
+        range_bias: Whether the parameters also contain an offset b of correct ranges: z = z* + b. p_hit then has its
+            mean at z* + b, clamped to [0, range_max].
+        sigma_growth: Whether the deviation of correct ranges also grows with range: it is sigma_hit + sigma_growth z*.
+            All parameters are then fitted together on the host, from the fit without growth.
+        hit: Shape of correct ranges: ``"normal"``, or ``"student"``, a Student t whose degrees of freedom ``hit_dof``
+            are also fitted. All parameters are then fitted together on the host, from the fit with a normal.
+        responsibilities: Whether to also return each reading's probabilities of the four causes.
+        blocks: Integer label of each reading's block, of the same shape, or None. Readings of different blocks are
+            independent; those of one block (a scan, or several neighbouring ones) need not be. Standard errors are
+            then computed over blocks.
+        sigma_bounds: Smallest and largest sigma_hit [m]. None is from the step that readings are rounded to, divided by
+            sqrt(12), or else 1e-6 range_max, to range_max.
+        lambda_bounds: Smallest and largest lambda_short [1/m]. None is 1e-3 / range_max to 1e4 / range_max.
+        progress: Whether to show a progress bar on standard error if that is a terminal.
+        callback: Function called after each iteration with its number, the log-likelihood and the parameters.
 
     Returns:
-            The fit.
+        The fit.
 
     Raises:
-            TypeError: An argument has the wrong type.
-            ValueError: A value breaks a rule above, the shapes differ, every reading is missing, the backend is absent, or
-                the initial parameters make a reading impossible.
+        TypeError: An argument has the wrong type.
+        ValueError: A value breaks a rule above, the shapes differ, every reading is missing, the backend is absent, or
+            the initial parameters make a reading impossible.
 
     Example:
-            >>> import gpusense as gs, numpy as np
-            >>> expected = np.full(1000, 4.0)
-            >>> ranges = expected + np.random.default_rng(0).normal(0, 0.1, 1000)
-            >>> fit = gs.fit_beam_parameters(ranges, expected, range_max=8.0, backend="numpy")
-            >>> fit.converged, round(fit.parameters.sigma_hit, 3)
-            (True, 0.098)
+        >>> import gpusense as gs, numpy as np
+        >>> expected = np.full(1000, 4.0)
+        >>> ranges = expected + np.random.default_rng(0).normal(0, 0.1, 1000)
+        >>> fit = gs.fit_beam_parameters(ranges, expected, range_max=8.0, backend="numpy")
+        >>> fit.converged, round(fit.parameters.sigma_hit, 3)
+        (True, 0.098)
     """
     pairs = make_pairs(ranges, expected, range_max, range_min)
     if blocks is not None:

@@ -2,8 +2,8 @@
 
     python bench/accuracy/chaining_localization.py --backend opencl --output bench/results/chaining_localization
 
-All scans of a log are chained, and the even ones make a map at these poses, as those of the data folder were made at the
-poses of another program. The odd ones, which are in no map, correct a particle filter with the defaults of ``gpusense
+All scans of a log are chained, and the even ones make a map at these poses, as the data folder's were made at the poses
+of another program. The odd ones, which are in no map, correct a particle filter with the defaults of ``gpusense
 localize``, from around the pose of their first one. "given" is the map of the data folder, of the even scans at the
 corrected poses of the log (of all scans for jarvis); "at references" is of the same scans at the same poses, but
 counted by ``build_map``, so that it differs from "made" in poses alone.

@@ -2,11 +2,11 @@
 
     python bench/accuracy/chaining_localization.py --backend opencl --output bench/results/chaining_localization
 
-All scans of a log are chained, and the even ones make a map at these poses, as those of the data folder were made at
-the poses of another program. The odd ones, which are in no map, correct a particle filter with the defaults of
-``gpusense localize``, from around the pose of their first one. "given" is the map of the data folder, of the even
-scans at the corrected poses of the log (of all scans for jarvis); "at references" is of the same scans at the same
-poses, but counted by ``build_map``, so that it differs from "made" in poses alone.
+All scans of a log are chained, and the even ones make a map at these poses, as the data folder's were made at the poses
+of another program. The odd ones, which are in no map, correct a particle filter with the defaults of ``gpusense
+localize``, from around the pose of their first one. "given" is the map of the data folder, of the even scans at the
+corrected poses of the log (of all scans for jarvis); "at references" is of the same scans at the same poses, but
+counted by ``build_map``, so that it differs from "made" in poses alone.
 
 Errors are distances from the references after the best rigid alignment of each track, without the first 5 %; "over
 5 m" are errors of relative poses over 5 m of the way, which do not see how far a map is bent as a whole. Both are

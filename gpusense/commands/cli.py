@@ -10,7 +10,7 @@ import os
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from gpusense._util.extras import explained
 from gpusense._version import __version__
@@ -62,17 +62,26 @@ class Layout(argparse.RawDescriptionHelpFormatter):
 
 @contextlib.contextmanager
 def _short_warnings() -> Iterator[None]:
-    """Print a warning as one line, without the place in the source that raised it."""
+    """Print a warning as one line, without the place in the source that raised it, and once.
+
+    Python's own memory of warnings is lost where a library changes the filters, as some do when they are imported.
+    """
+    shown: set[tuple[str, type[Warning]]] = set()
 
     def line(message: Warning | str, *_: object, **__: object) -> str:
         return f"gpusense: warning: {' '.join(str(message).split())}\n"
 
-    before = warnings.formatwarning
-    warnings.formatwarning = line
+    def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        if (key := (str(message), category)) not in shown:
+            shown.add(key)
+            show_before(message, category, *place, **more)
+
+    before, show_before = warnings.formatwarning, warnings.showwarning
+    warnings.formatwarning, warnings.showwarning = line, show
     try:
         yield
     finally:
-        warnings.formatwarning = before
+        warnings.formatwarning, warnings.showwarning = before, show_before
 
 
 def main(argv: Sequence[str] | None = None) -> int:

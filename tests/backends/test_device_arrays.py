@@ -165,7 +165,7 @@ def test_a_pose_on_the_device_that_is_not_finite(value, scan, warp_as_gpu):
 def test_a_pose_that_is_not_finite_is_reported_after_memory_ran_out(warp_as_gpu, monkeypatch):
     """The first piece has it; the second is tried again in halves."""
     model = gs.BeamModel(GRID, SCANNER, backend=warp_as_gpu)
-    poses = np.tile(POSES, (4, 1))
+    poses = np.tile(POSES, (6, 1))
     model.log_likelihood(to_device(poses), SCAN)
     poses[3, 0] = np.nan
     monkeypatch.setattr(run, "CHUNK", 600)

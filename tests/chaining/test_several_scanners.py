@@ -194,6 +194,7 @@ def test_an_interrupt_keeps_the_scans_of_all_lasers_so_far(lap: tuple, needs, mo
     assert errors(part, truth[: chainer.scans]).max() < 0.3
 
 
+@pytest.mark.slow
 def test_two_lasers_of_a_recorded_run_are_better_than_the_worse_one(data_dir: Path, needs) -> None:
     folder = data_dir / "jarvis_lab"
     topics = ["/driver_laser_security/laser_scan", "/driver_laser_navigation/laser_scan"]

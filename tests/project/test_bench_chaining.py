@@ -45,6 +45,7 @@ def test_errors_and_drifts_are_those_of_closed_forms(script: ModuleType) -> None
     assert np.isnan(script.drifts(longer, truth, 100)[0])
 
 
+@pytest.mark.slow
 def test_growth_is_counted(needs: Callable[[str], str], data_dir: Path, tmp_path: Path) -> None:
     arguments = ["--data", str(data_dir), "--log", "seattle", "--most", "1", "--backend", needs("opencl")]
     (row,) = run_script("speed/chaining_growth.py", *arguments, output=tmp_path / "growth")["rows"]
@@ -53,6 +54,7 @@ def test_growth_is_counted(needs: Callable[[str], str], data_dir: Path, tmp_path
     assert row["launches"] > 50 and row["processor_s"] >= row["main_s"] > 0
 
 
+@pytest.mark.slow
 def test_scans_are_localised_on_the_map_that_was_made(
     needs: Callable[[str], str], data_dir: Path, tmp_path: Path
 ) -> None:

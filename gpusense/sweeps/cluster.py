@@ -7,6 +7,7 @@ consequences.
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import pickle
 import secrets
@@ -101,6 +102,9 @@ class DaskExecutor(Executor):
         """
         import distributed
 
+        # A client that is garbage closes itself when it is collected. In the midst of the start of another one it would
+        # wait forever for a lock that this thread holds.
+        gc.collect()
         try:
             self._cluster = None if address is not None else local_cluster(names, security)
             target = address if self._cluster is None else self._cluster

@@ -23,6 +23,7 @@ def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return importlib.import_module("accuracy.chaining")
 
 
+@pytest.mark.slow
 def test_chains_are_measured(needs: Callable[[str], str], data_dir: Path, tmp_path: Path) -> None:
     arguments = ["--data", str(data_dir), "--log", "olin", "--backend", needs("opencl")]
     report = run_script("accuracy/chaining.py", *arguments, output=tmp_path / "chaining")

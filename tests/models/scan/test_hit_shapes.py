@@ -130,6 +130,7 @@ def test_models_have_the_density_on_every_backend(real, backend):
         assert np.isfinite(log_p).all()
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("real", ["float32", "float64"])
 def test_fields_and_their_gradients_on_every_backend(real, backend):
     cases = itertools.product(("nearest", "bilinear"), (0.2, 1e-3), (0.1, 0.0))

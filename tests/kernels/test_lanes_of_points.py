@@ -97,7 +97,7 @@ def assert_no_particle_depends_on_its_lane(call, poses: np.ndarray) -> None:
     assert differing(np.concatenate(pieces), together) == 0
 
 
-@pytest.mark.sampled(0.25)
+@pytest.mark.sampled(0.15)
 @pytest.mark.parametrize("side", [9.0, 90.0])
 @pytest.mark.parametrize("name", LANDMARKS)
 def test_landmarks(name, side, device, compiled):
@@ -130,7 +130,7 @@ def test_unseen_landmarks_have_the_bits_of_one(device):
     assert len(counts[0]) > 3 and np.array_equal(*counts)
 
 
-@pytest.mark.sampled(0.3)
+@pytest.mark.sampled(0.2)
 @pytest.mark.parametrize("kind", ["normal", "student_t", "mixture"])
 @pytest.mark.parametrize(
     "changes",
@@ -157,7 +157,7 @@ def test_beacons(kind, changes, device, compiled):
 SQUARE = np.array([(0.2, 0.25), (-0.2, 0.25), (-0.2, -0.25), (0.2, -0.25)])
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("outline", ["circle", "square"])
 @pytest.mark.parametrize("changes", [{}, {"sigma": 0.01, "p_contact": 1.0, "p_false": 0.0}, {"sigma": 1e5}])
 def test_bumpers(outline, changes, device, compiled):

@@ -1,4 +1,4 @@
-"""How much of the drift of jarvis' lasers is their mount on the robot, as the log's transforms state it?
+"""Measure the share of the drift of jarvis' lasers that the mounts in the log's transforms cause.
 
     python bench/accuracy/chaining_mount.py --backend opencl --output bench/results/chaining_mount
 

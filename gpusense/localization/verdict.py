@@ -143,7 +143,7 @@ class Verdict:
 
     @property
     def explains_little(self) -> bool:
-        """Whether the pose explains few beams of the last judged scans, which may also be due to people."""
+        """Tell whether few beams of the last judged scans agree with the pose; people can also be the cause."""
         return self.state.explained < _FEW
 
     @property

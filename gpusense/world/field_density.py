@@ -76,7 +76,7 @@ class FieldDensity:
 
     @property
     def is_sharp(self) -> bool:
-        """Whether the density peaks so sharply that kernels need its exponent in two parts."""
+        """Tell whether kernels need the exponent in two parts, because the density has a sharp peak."""
         return self.peak > HIGH_PEAK
 
     def is_linear(self, real: np.dtype) -> bool:

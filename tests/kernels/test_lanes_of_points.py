@@ -84,7 +84,7 @@ def cloud(side: float) -> np.ndarray:
 
 
 def assert_alike(wide: np.ndarray, one: np.ndarray, terms: int) -> None:
-    """Check for the same infinities, and for the tolerance of two float32 results of so many terms."""
+    """Check for equal infinities, and for the tolerance of two float32 sums of this number of terms."""
     assert np.array_equal(np.isneginf(wide), np.isneginf(one)) and not np.isnan(wide).any()
     allowed, finite = beam_tolerance(np.float32).twice(), np.isfinite(one)
     assert allowed.difference(wide[finite], one[finite]) <= allowed.value * terms

@@ -132,7 +132,7 @@ def test_reports_of_another_commit_or_machine_are_not_extended(measure: ModuleTy
 def test_other_matchers_find_the_motion(
     measure: ModuleType, needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Those that can run here: in most pairs within 6 cm; their rows name version and threads."""
+    """Matchers that are installed find most motions to 6 cm; their rows name version and threads."""
     tasks, device = importlib.import_module("needs"), get_backend(needs("opencl"))
     monkeypatch.setattr(tasks, "PAIRS", 12)
     monkeypatch.setattr(tasks, "BEAMS", (180,))

@@ -31,7 +31,7 @@ LanePlace direction_lanes(const LanePlace heading, global const real *feature) {
     return turned;
 }
 
-// Return the angle between an offset and a direction: its absolute value, in [0, pi], or with FIELD its sign, too.
+// Return the angle between an offset and a direction: its absolute value, in [0, pi]; with FIELD also its sign.
 LanePair angle_pair_lanes(const LanePlace off, const LanePlace turned) {
     const LanePair right = fused_product_lanes(turned.x.hi, off.y.hi);
     const LanePair left = fused_product_lanes(turned.y.hi, off.x.hi);

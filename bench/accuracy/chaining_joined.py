@@ -5,13 +5,16 @@
 The scans of the second log follow those of the first one, with odometry that goes on from where the first one ends, and
 without odometry. Logs are cut to their first scans. Scans of both must have equal beams to be those of one scanner: all
 are thinned to the beams at whole degrees, and their odometry is that of the corrected poses, which makes drifts small.
-"within" are the closures in the logs themselves.
+"within" are the closures in the logs themselves, "across" those between them. "matches across" are those of a high
+p_right, "group" is the largest number of them that agree with one another, and how many of these are nearly certain: a
+closure across a break of the chain needs a group, see ``gpusense.chaining.agreement``. Times are of the processor.
 """
 
 from __future__ import annotations
 
 import itertools
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +27,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from chaining_logs import Log, from_scans
 from common import make_parser, note, parse, publish, table
+
+from gpusense.chaining.agreement import largest_group
+from gpusense.chaining.chain import Chainer
 
 NAMES = ("acapulco", "aces", "belgioioso", "csail", "fhw", "freiburg-079", "infinite-corridor", "intel", "seattle")
 LIMIT = 50.0
@@ -45,15 +51,20 @@ def joined(one: Log, two: Log, with_odometry: bool, backend: str) -> dict[str, A
     border = len(one.ranges)
     moved = gs.pose_difference(np.repeat(two.odometry[:1], len(two.odometry), axis=0), two.odometry)
     odometry = np.concatenate([one.odometry, gs.compose_poses(one.odometry[-1], moved)])
-    chain = gs.chain_scans(
-        np.concatenate([one.ranges, two.ranges]), one.scanner, odometry if with_odometry else None, backend=backend
-    )
-    closures = chain.closures
-    across = (closures.first < border) != (closures.second < border)
+    begun = time.process_time()
+    ranges = np.concatenate([one.ranges, two.ranges])
+    chainer = Chainer(ranges, one.scanner, odometry if with_odometry else None, backend=backend)
+    for _ in chainer.steps():
+        pass
+    chain, loops = chainer.chain(), chainer.loops
+    closures, matches = chain.closures, loops.matches.renumbered(loops.nodes)
+    across, between = ((links.first < border) != (links.second < border) for links in (closures, matches))
+    group, sure = largest_group(loops.matches[between], loops.solution.poses)
     return {
         "first": one.name, "second": two.name, "odometry": with_odometry, "scans": len(odometry),
-        "within": int((~across).sum()), "across": int(across.sum()),
-        "said": bool(chain.doubtful[border]),
+        "within": int((~across).sum()), "across": int(across.sum()), "matches": int(between.sum()),
+        "group": group, "sure": sure, "said": bool(chain.doubtful[border]),
+        "processor_s": time.process_time() - begun,
     }  # fmt: skip
 
 
@@ -75,10 +86,13 @@ def main(argv: list[str] | None = None) -> None:
             note(f"{one.name} and {two.name}: {rows[-1]['across']} of {rows[-1]['within']} closures across")
     lines = [
         [row["first"], row["second"], "with" if row["odometry"] else "no", row["scans"], row["within"], row["across"],
-         "yes" if row["said"] else "no"]
+         row["matches"], f"{row['group']}, {row['sure']}", "yes" if row["said"] else "no", f"{row['processor_s']:.1f}"]
         for row in rows
     ]  # fmt: skip
-    columns = ["first", "second", "odometry", "scans", "closures within", "across", "border is doubtful"]
+    columns = [
+        "first", "second", "odometry", "scans", "closures within", "across", "matches across", "group, certain",
+        "border is doubtful", "s",
+    ]  # fmt: skip
     total = f"{len(rows)} chains of {len(rows) // 2} pairs: {sum(row['across'] for row in rows)} closures across."
     publish(__file__, arguments, table(columns, lines) + "\n\n" + total, {"rows": rows})
 

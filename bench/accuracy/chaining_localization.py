@@ -8,9 +8,12 @@ localize``, from around the pose of their first one. "given" is the map of the d
 corrected poses of the log (of all scans for jarvis); "at references" is of the same scans at the same poses, but
 counted by ``build_map``, so that it differs from "made" in poses alone.
 
-Errors are distances from the references after the best rigid alignment of each track, without the first 5 %; "over
-5 m" are errors of relative poses over 5 m of the way, which do not see how far a map is bent as a whole. Both are
-medians over the seeds of the median and of the 95 % quantile.
+"on the map" are distances from the poses at which the map was made: the references for "given" and "at references",
+those of the chain for "made". They say how well a robot finds its place on each map. "against references" are distances
+from the references after the best rigid alignment of each track, which hold how far the made map is bent against them,
+and so the errors of the chain and those of the references. "over 5 m" and "over 20 m" are errors of relative poses over
+this length of the way against the references, "-" where the track is shorter. The first 5 % of each track are left out.
+Figures are medians over the seeds of the median and of the 95 % quantile.
 """
 
 from __future__ import annotations
@@ -42,7 +45,8 @@ MAPS = {
     "jarvis-s3000": "jarvis_lab/jarvis_s3000_from_complex_03cm.yaml",
     "jarvis-nav350": "jarvis_lab/jarvis_nav350_from_complex_03cm.yaml",
 }
-LENGTH = 5.0
+LENGTHS = (5.0, 20.0)
+KEYS = ("on_the_map_m", "against_references_m", "over_5_m", "over_20_m")
 
 
 def part(log: Log, begin: int) -> Log:
@@ -77,13 +81,18 @@ def aligned(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.abs(p * turn / abs(turn) - q)
 
 
-def over_length(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Return errors (P,) of relative poses over a path [m]."""
+def over_length(poses: np.ndarray, truth: np.ndarray, length: float) -> np.ndarray:
+    """Return errors (P,) of relative poses over a path of a length [m]; none where the track is shorter."""
     path = np.append(0.0, np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T)))
-    first, second = np.arange(len(path)), np.searchsorted(path, path + LENGTH)
+    first, second = np.arange(len(path)), np.searchsorted(path, path + length)
     first, second = first[second < len(path)], second[second < len(path)]
     moved = [gs.pose_difference(p[first], p[second]) for p in (truth, poses)]
     return np.hypot(*(gs.pose_difference(*moved))[:, :2].T)
+
+
+def quantiles(errors: np.ndarray) -> list[float]:
+    """Return the median and the 95 % quantile; NaN where there are no errors."""
+    return np.percentile(errors, [50, 95]).tolist() if len(errors) else [np.nan, np.nan]
 
 
 def measured(log: Log, name: str, arguments: Any) -> list[dict[str, Any]]:
@@ -108,18 +117,19 @@ def measured(log: Log, name: str, arguments: Any) -> list[dict[str, Any]]:
     chosen = np.flatnonzero(np.isfinite(truth).all(axis=1))[: arguments.scans]
     runs, true = slice(int(chosen[0]), int(chosen[-1]) + 1), truth[chosen]
     some = replace(odd, ranges=odd.ranges[runs], odometry=odd.odometry[runs])
-    starts = {"made": chain.poses[1::2][chosen[0]]}
+    placed = {"given": true, "at references": true, "made": chain.poses[1::2][chosen]}
     late = slice(len(chosen) // 20, None)
     rows = []
     for kind, grid in maps.items():
         found = []
         for seed in range(arguments.seeds):
-            poses = tracked(grid, some, starts.get(kind, true[0]), seed, arguments.backend)[chosen - chosen[0]]
-            off, near = aligned(poses[late], true[late]), over_length(poses[late], true[late])
-            found.append([float(np.percentile(values, share)) for values in (off, near) for share in (50, 95)])
-        median = np.median(found, axis=0).tolist()
-        row = {"log": name, "map": kind, "held_out": len(chosen), "each_seed": found}
-        rows.append(row | dict(zip(("median_m", "p95_m", "median_5_m", "p95_5_m"), median, strict=True)))
+            poses = tracked(grid, some, placed[kind][0], seed, arguments.backend)[chosen - chosen[0]]
+            off = np.hypot(*(poses - placed[kind])[late, :2].T)
+            errors = [off, aligned(poses[late], true[late])]
+            errors += [over_length(poses[late], true[late], length) for length in LENGTHS]
+            found.append([quantiles(values) for values in errors])
+        median = [[None if np.isnan(value) else float(value) for value in both] for both in np.median(found, axis=0)]
+        rows.append({"log": name, "map": kind, "held_out": len(chosen)} | dict(zip(KEYS, median, strict=True)))
         note(f"{name}, {kind}: {median}")
     return rows
 
@@ -134,10 +144,10 @@ def main(argv: list[str] | None = None) -> None:
     rows = []
     for name in arguments.log or MAPS:
         rows += measured(load(Path(arguments.data), name), name, arguments)
-    columns = ["log", "held-out scans", "map", "median cm", "95 % cm", "over 5 m: median cm", "95 % cm"]
+    columns = ["log", "scans", "map", "on the map: median, 95 % cm", "against references", "over 5 m", "over 20 m"]
     lines = [
         [row["log"], row["held_out"], row["map"],
-         *(f"{100 * row[key]:.1f}" for key in ("median_m", "p95_m", "median_5_m", "p95_5_m"))]
+         *("-" if row[key][0] is None else f"{100 * row[key][0]:.1f}, {100 * row[key][1]:.1f}" for key in KEYS)]
         for row in rows
     ]  # fmt: skip
     publish(__file__, arguments, table(columns, lines), {"rows": rows})

@@ -156,6 +156,11 @@ class Chainer:
         ]
         return min(ends, default=len(self._data))
 
+    @property
+    def loops(self) -> Loops | None:
+        """The search for places that are seen again; None before it begins."""
+        return None if self._loops is None else self._loops[1]
+
     def steps(self) -> Iterator[str]:
         """Match, search and close, a part at a time, and yield a word on each."""
         for one, duration in enumerate(self._durations):

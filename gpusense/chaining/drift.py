@@ -12,8 +12,11 @@ from gpusense.chaining.graph import Solution, factored, normal_equations, pose_j
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Most poses whose joint covariance is kept; in a longer graph each stands for its neighbours.
-_ANCHORS = 300
+# Most poses whose joint covariance is kept; in a longer graph each stands for those after it. At most this share are
+# sides of steps whose variance is this many times the usual one, so that breaks of the chain are seen.
+_ANCHORS, _BREAKS, _LOOSE = 300, 0.4, 10.0
+# Lever [m] with which variances of headings count beside those of positions.
+_LEVER = 3.0
 # Columns of the inverse that are solved for at once.
 _COLUMNS = 192
 # Damping [1/m^2, 1/rad^2]: a direction that no link observes has a variance of the inverse.
@@ -25,13 +28,16 @@ class Drift:
 
     Args:
         solution: The poses and links.
-        most: Most poses whose joint covariance is kept; others have that of the nearest one before.
+        most: Most poses whose joint covariance is kept, at least 3; others have that of the nearest one before.
+
+    Attributes:
+        anchors: (A,) numbers of these poses, ascending.
     """
 
     def __init__(self, solution: Solution, most: int = _ANCHORS) -> None:
         count = len(solution.poses)
-        self._poses, self._stride = solution.poses, -(-count // most)
-        anchors = np.arange(0, count, self._stride)
+        self._poses = solution.poses
+        self.anchors = anchors = _anchors_of(solution, most)
         self._joint = np.zeros((len(anchors), 3, len(anchors), 3))
         if count < 2:
             return
@@ -43,13 +49,32 @@ class Drift:
 
     def relative(self, first: Integers, second: Integers) -> Floats:
         """Return the covariances (L, 3, 3) of the poses of second scans in the frames of first ones."""
-        a, b = first // self._stride, second // self._stride
-        one, two = pose_jacobians(self._poses, a * self._stride, b * self._stride)
+        a, b = (np.searchsorted(self.anchors, scans, "right") - 1 for scans in (first, second))
+        one, two = pose_jacobians(self._poses, self.anchors[a], self.anchors[b])
         side = one @ self._joint[a, :, b, :] @ two.transpose(0, 2, 1)
         total = one @ self._joint[a, :, a, :] @ one.transpose(0, 2, 1)
         total += two @ self._joint[b, :, b, :] @ two.transpose(0, 2, 1)
         result: Floats = total + side + side.transpose(0, 2, 1)
         return result
+
+
+def _anchors_of(solution: Solution, most: int) -> Integers:
+    """Return the poses whose joint covariance is kept: even ones, and both sides of the loosest steps."""
+    count = len(solution.poses)
+    if count <= most:
+        return np.arange(count)
+    links = solution.links
+    information = np.zeros((count, 3, 3))
+    follow = np.abs(links.second - links.first) == 1
+    later = np.maximum(links.first, links.second)[follow]
+    np.add.at(information, later, links.information[follow] * links.weight[follow, None, None])
+    spread = np.linalg.inv(information[1:] + DAMPING * np.eye(3))
+    variance = spread[:, 0, 0] + spread[:, 1, 1] + _LEVER**2 * spread[:, 2, 2]
+    loose = np.flatnonzero(variance > _LOOSE * np.median(variance))
+    loose = loose[np.argsort(-variance[loose], kind="stable")][: int(_BREAKS * most / 2)]
+    even = np.arange(0, count, -(-count // (most - 2 * len(loose))))
+    anchors: Integers = np.unique(np.concatenate([even, loose, loose + 1]))
+    return anchors
 
 
 def _inverse_part(matrix: Any, rows: Integers) -> Floats:

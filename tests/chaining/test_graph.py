@@ -148,6 +148,23 @@ def test_covariances_are_blocks_of_the_dense_inverse(count: int) -> None:
         assert np.allclose(relative[n], wide @ joint @ wide.T, rtol=1e-6, atol=1e-10)
     # Those of a few anchors, with all others eliminated, are the same.
     some = Drift(found, most=max(count // 3, 1))
-    anchors = np.arange(0, count, -(-count // max(count // 3, 1)))
-    pairs = np.array([(a, b) for a in anchors for b in anchors if a < b], np.int64).reshape(-1, 2).T
+    pairs = np.array([(a, b) for a in some.anchors for b in some.anchors if a < b], np.int64).reshape(-1, 2).T
     assert np.allclose(some.relative(*pairs), Drift(found, most=count).relative(*pairs), rtol=1e-6, atol=1e-10)
+
+
+def test_breaks_of_a_long_graph_are_seen_between_its_anchors() -> None:
+    # Each pose is linked to the next one; a link in the middle tells hardly anything.
+    count, broken = 320, 161
+    information = np.tile(np.diag([1e4, 1e4, 1e5]), (count - 1, 1, 1))
+    information[broken - 1] = np.diag([1.0, 1.0, 4.0])
+    steps = np.tile([0.5, 0.0, 0.0], (count - 1, 1))
+    links = Links.of(MATCH, np.arange(count - 1), np.arange(1, count), steps, information)
+    found = solve(chained(np.zeros(3), steps), links)
+    pairs = np.array([broken - 3, broken - 1, 10]), np.array([broken + 2, broken, 14])
+    for drift, most in ((Drift(found), 300), (Drift(found, most=20), 20)):
+        deviation = np.sqrt(drift.relative(*pairs)[:, 0, 0])
+        assert len(drift.anchors) <= most
+        assert deviation[:2] == pytest.approx(1.0, abs=0.01)
+        assert deviation[2] < 0.05
+    # Up to 300 poses nothing is left out.
+    assert len(Drift(solve(found.poses[:300], links[:299])).anchors) == 300

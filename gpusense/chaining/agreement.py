@@ -1,0 +1,133 @@
+"""Which matches of places agree with one another: the evidence that a place was seen again.
+
+T1 and T2 between the same passages and the paths along both make a loop that ends where it began. A match counts only
+while enough of those that agree with it also count. Where the drift does not tell whether a match may be right, a group
+of several that agree is needed: across a break of the chain, or farther than the drift allows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.chaining.links import Links
+from gpusense.chaining.motion import relative
+from gpusense.localization.pose_algebra import compose_poses, invert_poses, wrap_angle
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool]
+
+# Matches that agree with one, itself among them.
+_AGREE = 3
+# Matches of a group that agree with one another, those of them of a high p_right, and that p_right.
+_GROUP, _SURE_ONES, _SURER = 6, 3, 0.97
+# Passages that are compared are at most this far apart on both sides [m], and as many key scans; matches of a part.
+_PASSAGE, _KEYS, _MATCHES = 8.0, 64, 1024
+# Loops of two closures end within this of their beginning [m, rad], and a share of the way [m/m, rad/m].
+_MISSED, _MISSED_TURN, _SHARE, _SHARE_TURN = 0.15, 0.03, 0.03, 0.01
+
+
+def agreeing(matches: Links, poses: Floats, strict: Flags) -> Flags:
+    """Return which matches (L,) enough others of the same passages agree with.
+
+    Args:
+        matches: Matches of places.
+        poses: (K, 3) poses of the key scans.
+        strict: (L,) whether a match must be of a group.
+    """
+    if not len(matches):
+        return np.zeros(0, bool)
+    table = _consistent(matches, poses)
+    kept = np.ones(len(matches), bool)
+    while True:
+        kept = _supported(table, kept)
+        group, size, sure, scans = _groups(table, kept, matches)
+        large = (size >= _GROUP) & (sure >= _SURE_ONES) & (scans >= _AGREE)
+        lone = kept & strict
+        lone[kept] &= ~large[group]
+        if not lone.any():
+            return kept
+        kept = kept & ~lone
+
+
+def largest_group(matches: Links, poses: Floats) -> tuple[int, int]:
+    """Return the size of the largest group of matches that agree, and how many of it have a very high p_right."""
+    if not len(matches):
+        return 0, 0
+    table = _consistent(matches, poses)
+    _, size, sure, _ = _groups(table, _supported(table, np.ones(len(matches), bool)), matches)
+    best = np.lexsort((sure, size))[-1:]
+    return int(size[best].sum()), int(sure[best].sum())
+
+
+def _supported(table: Any, kept: Flags) -> Flags:
+    """Return which matches (L,) enough others agree with, each of which is also supported."""
+    while True:
+        fewer = kept & (table @ kept.astype(np.int64) >= _AGREE - 1)
+        if (fewer == kept).all():
+            return kept
+        kept = fewer
+
+
+def _groups(table: Any, kept: Flags, matches: Links) -> tuple[Integers, Integers, Integers, Integers]:
+    """Return groups of kept matches that agree, directly or by others.
+
+    Returns:
+        The number of the group of each of the kept matches; of each group the number of matches, of those with a very
+        high p_right, and of different scans on the side where these are fewer.
+    """
+    from scipy.sparse.csgraph import connected_components
+
+    rows = np.flatnonzero(kept)
+    if not len(rows):
+        return (np.zeros(0, np.int64),) * 4
+    count, group = connected_components(table[rows][:, rows], directed=False)
+    sure = np.bincount(group[matches.p_right[rows] >= _SURER], minlength=count)
+    scans = [
+        np.bincount(np.unique(np.stack([group, ends[rows]]), axis=1)[0], minlength=count)
+        for ends in (matches.first, matches.second)
+    ]
+    return group, np.bincount(group, minlength=count), sure, np.minimum(*scans)
+
+
+def _consistent(matches: Links, poses: Floats) -> Any:
+    """Return a sparse matrix (L, L), 1 where two matches of the same passages make a loop that closes."""
+    from scipy import sparse
+
+    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+    rows, cols = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    for here, near in _neighbours(matches, path):
+        first, second = matches.first, matches.second
+        there = compose_poses(matches.pose[here], relative(poses, second[here], second[near]))
+        back = compose_poses(invert_poses(matches.pose[near]), relative(poses, first[near], first[here]))
+        off = compose_poses(there, back)
+        along = sum(np.abs(path[end[here]] - path[end[near]]) for end in (first, second))
+        closes = np.hypot(off[:, 0], off[:, 1]) <= _MISSED + _SHARE * along
+        closes &= np.abs(wrap_angle(off[:, 2])) <= _MISSED_TURN + _SHARE_TURN * along
+        rows.append(here[closes])
+        cols.append(near[closes])
+    row, col = np.concatenate(rows), np.concatenate(cols)
+    return sparse.csr_matrix((np.ones(len(row), np.int64), (row, col)), shape=(len(matches), len(matches)))
+
+
+def _neighbours(matches: Links, path: Floats) -> Iterator[tuple[Integers, Integers]]:
+    """Yield pairs of matches of the same passages, some of all at a time; both ways, without those of one scan."""
+    first, second = matches.first, matches.second
+    order = np.argsort(second, kind="stable")
+    scans = second[order]
+    begin = np.searchsorted(scans, np.maximum(np.searchsorted(path, path - _PASSAGE), np.arange(len(path)) - _KEYS))
+    end = np.searchsorted(
+        scans, np.minimum(np.searchsorted(path, path + _PASSAGE, "right"), np.arange(len(path)) + _KEYS + 1)
+    )
+    for part in range(0, len(matches), _MATCHES):
+        some = order[part : part + _MATCHES]
+        low, count = begin[second[some]], (end - begin)[second[some]]
+        here = np.repeat(some, count)
+        near = order[np.repeat(low - np.cumsum(count) + count, count) + np.arange(len(here))]
+        apart = np.abs(path[first[here]] - path[first[near]]) <= _PASSAGE
+        apart &= (np.abs(first[here] - first[near]) <= _KEYS) & (second[here] != second[near])
+        yield here[apart], near[apart]

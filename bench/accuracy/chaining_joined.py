@@ -6,8 +6,8 @@ The scans of the second log follow those of the first one, with odometry that go
 without odometry. Logs are cut to their first scans. Scans of both must have equal beams to be those of one scanner: all
 are thinned to the beams at whole degrees, and their odometry is that of the corrected poses, which makes drifts small.
 "within" are the closures in the logs themselves, "across" those between them. "matches across" are those of a high
-p_right, "group" is the largest number of them that agree with one another, and how many of these are nearly certain: a
-closure across a break of the chain needs a group, see ``gpusense.chaining.agreement``. Times are of the processor.
+p_right; "group" is the number of those that agree with one another with the most evidence, and this evidence: closures
+across a break of the chain need 6.5, see ``gpusense.chaining.agreement``. Times are of the processor.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ def joined(one: Log, two: Log, with_odometry: bool, backend: str) -> dict[str, A
     chain, loops = chainer.chain(), chainer.loops
     closures, matches = chain.closures, loops.matches.renumbered(loops.nodes)
     across, between = ((links.first < border) != (links.second < border) for links in (closures, matches))
-    group, sure = largest_group(loops.matches[between], loops.solution.poses)
+    group, evidence = largest_group(loops.matches[between], loops.solution.poses)
     return {
         "first": one.name, "second": two.name, "odometry": with_odometry, "scans": len(odometry),
         "within": int((~across).sum()), "across": int(across.sum()), "matches": int(between.sum()),
-        "group": group, "sure": sure, "said": bool(chain.doubtful[border]),
+        "group": group, "evidence": evidence, "said": bool(chain.doubtful[border]),
         "processor_s": time.process_time() - begun,
     }  # fmt: skip
 
@@ -86,11 +86,12 @@ def main(argv: list[str] | None = None) -> None:
             note(f"{one.name} and {two.name}: {rows[-1]['across']} of {rows[-1]['within']} closures across")
     lines = [
         [row["first"], row["second"], "with" if row["odometry"] else "no", row["scans"], row["within"], row["across"],
-         row["matches"], f"{row['group']}, {row['sure']}", "yes" if row["said"] else "no", f"{row['processor_s']:.1f}"]
+         row["matches"], f"{row['group']}, {row['evidence']:.1f}", "yes" if row["said"] else "no",
+         f"{row['processor_s']:.1f}"]
         for row in rows
     ]  # fmt: skip
     columns = [
-        "first", "second", "odometry", "scans", "closures within", "across", "matches across", "group, certain",
+        "first", "second", "odometry", "scans", "closures within", "across", "matches across", "group, evidence",
         "border is doubtful", "s",
     ]  # fmt: skip
     total = f"{len(rows)} chains of {len(rows) // 2} pairs: {sum(row['across'] for row in rows)} closures across."

@@ -2,7 +2,7 @@
 
 T1 and T2 between the same passages and the paths along both make a loop that ends where it began. A match counts only
 while enough of those that agree with it also count. Where the drift does not tell whether a match may be right, a group
-of several that agree is needed: across a break of the chain, or farther than the drift allows.
+of more evidence is needed: across a break of the chain, or farther than the drift allows.
 """
 
 from __future__ import annotations
@@ -23,12 +23,13 @@ Flags = NDArray[np.bool]
 
 # Matches that agree with one, itself among them.
 _AGREE = 3
-# Matches of a group that agree with one another, those of them of a high p_right, and that p_right.
-_GROUP, _SURE_ONES, _SURER = 6, 3, 0.97
+# Evidence of a group, the sum of -log10(1 - p_right) with p_right at most a largest one; different scans on both sides.
+_EVIDENCE, _MOST_RIGHT, _SCANS = 6.5, 0.999, 3
 # Passages that are compared are at most this far apart on both sides [m], and as many key scans; matches of a part.
 _PASSAGE, _KEYS, _MATCHES = 8.0, 64, 1024
-# Loops of two closures end within this of their beginning [m, rad], and a share of the way [m/m, rad/m].
+# Loops of two matches end within this of their beginning [m, rad], and a share of the way [m/m, rad/m].
 _MISSED, _MISSED_TURN, _SHARE, _SHARE_TURN = 0.15, 0.03, 0.03, 0.01
+_NONE = np.zeros(0, np.int64)
 
 
 def agreeing(matches: Links, poses: Floats, strict: Flags) -> Flags:
@@ -45,23 +46,21 @@ def agreeing(matches: Links, poses: Floats, strict: Flags) -> Flags:
     kept = np.ones(len(matches), bool)
     while True:
         kept = _supported(table, kept)
-        group, size, sure, scans = _groups(table, kept, matches)
-        large = (size >= _GROUP) & (sure >= _SURE_ONES) & (scans >= _AGREE)
         lone = kept & strict
-        lone[kept] &= ~large[group]
+        group, _, evidence, scans = _groups(table, lone, matches)
+        lone[lone] = ((evidence < _EVIDENCE) | (scans < _SCANS))[group]
         if not lone.any():
             return kept
         kept = kept & ~lone
 
 
-def largest_group(matches: Links, poses: Floats) -> tuple[int, int]:
-    """Return the size of the largest group of matches that agree, and how many of it have a very high p_right."""
+def largest_group(matches: Links, poses: Floats) -> tuple[int, float]:
+    """Return the size and the evidence of the group of matches that agree with the most evidence."""
     if not len(matches):
-        return 0, 0
+        return 0, 0.0
     table = _consistent(matches, poses)
-    _, size, sure, _ = _groups(table, _supported(table, np.ones(len(matches), bool)), matches)
-    best = np.lexsort((sure, size))[-1:]
-    return int(size[best].sum()), int(sure[best].sum())
+    _, size, evidence, _ = _groups(table, _supported(table, np.ones(len(matches), bool)), matches)
+    return max(zip(size.tolist(), evidence.tolist(), strict=True), key=lambda group: group[1], default=(0, 0.0))
 
 
 def _supported(table: Any, kept: Flags) -> Flags:
@@ -73,25 +72,25 @@ def _supported(table: Any, kept: Flags) -> Flags:
         kept = fewer
 
 
-def _groups(table: Any, kept: Flags, matches: Links) -> tuple[Integers, Integers, Integers, Integers]:
+def _groups(table: Any, kept: Flags, matches: Links) -> tuple[Integers, Integers, Floats, Integers]:
     """Return groups of kept matches that agree, directly or by others.
 
     Returns:
-        The number of the group of each of the kept matches; of each group the number of matches, of those with a very
-        high p_right, and of different scans on the side where these are fewer.
+        The number of the group of each of the kept matches; of each group the number of matches, their evidence, and
+        the number of different scans on the side where these are fewer.
     """
     from scipy.sparse.csgraph import connected_components
 
     rows = np.flatnonzero(kept)
     if not len(rows):
-        return (np.zeros(0, np.int64),) * 4
+        return _NONE, _NONE, np.zeros(0), _NONE
     count, group = connected_components(table[rows][:, rows], directed=False)
-    sure = np.bincount(group[matches.p_right[rows] >= _SURER], minlength=count)
+    evidence = np.bincount(group, -np.log10(1 - np.minimum(matches.p_right[rows], _MOST_RIGHT)), count)
     scans = [
         np.bincount(np.unique(np.stack([group, ends[rows]]), axis=1)[0], minlength=count)
         for ends in (matches.first, matches.second)
     ]
-    return group, np.bincount(group, minlength=count), sure, np.minimum(*scans)
+    return group, np.bincount(group, minlength=count), evidence, np.minimum(*scans)
 
 
 def _consistent(matches: Links, poses: Floats) -> Any:

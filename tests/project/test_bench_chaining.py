@@ -31,7 +31,7 @@ def test_chains_are_measured(needs: Callable[[str], str], data_dir: Path, tmp_pa
     assert len(rows) == ROWS
     closed, plain = rows["chain, with odometry, closures"], rows["scan to scan"]
     assert closed["error_m"] < 0.5 * plain["error_m"]
-    assert closed["contradicted"] == 0 < closed["closures"]
+    assert closed["contradicted"] == 0 == closed["fit_better"] < closed["closures"]
     assert report["maps"][0]["chain"][0] > 95
 
 
@@ -44,6 +44,17 @@ def test_errors_and_drifts_are_those_of_closed_forms(script: ModuleType) -> None
     percent, degrees = script.drifts(longer, truth, 5)
     assert abs(percent - 2) < 1e-9 and degrees == 0
     assert np.isnan(script.drifts(longer, truth, 100)[0])
+
+
+def test_closures_are_compared_with_references_by_end_points(script: ModuleType, data_dir: Path) -> None:
+    log = importlib.import_module("accuracy.chaining_logs").load(data_dir, "seattle")
+    moved = log.truth.copy()
+    moved[100:] = gs.compose_poses(np.array([0.6, -0.8, 0.1]), moved[100:])
+    pose = gs.pose_difference(log.truth[96], log.truth[104])
+    at_closure, at_reference = script.fits(log, log.truth, moved, 96, 104, pose)
+    assert at_closure > 0.6 > 2 * at_reference
+    wrong = gs.pose_difference(moved[96], moved[104])
+    assert script.fits(log, log.truth, log.truth, 96, 104, wrong) == (at_reference, at_closure)
 
 
 @pytest.mark.slow
@@ -66,8 +77,10 @@ def test_scans_are_localised_on_the_map_that_was_made(
     rows = {row["map"]: row for row in report["rows"]}
     assert set(rows) == {"given", "at references", "made"}
     assert all(row["held_out"] == 150 for row in rows.values())
-    assert all(0.002 < row["median_m"] < 0.1 for row in rows.values())
-    assert rows["made"]["median_m"] < 1.5 * rows["given"]["median_m"]
+    assert all(0.002 < row["on_the_map_m"][0] < 0.1 for row in rows.values())
+    assert rows["made"]["against_references_m"][0] < 1.5 * rows["given"]["against_references_m"][0]
+    # The track is shorter.
+    assert rows["made"]["over_20_m"] == [None, None]
 
 
 def test_the_mount_of_a_scanner_is_found(monkeypatch: pytest.MonkeyPatch) -> None:

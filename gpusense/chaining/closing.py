@@ -208,7 +208,7 @@ class Loops:
                 break
             agree[np.flatnonzero(agree)[weight < _WEIGHT]] = False
         self.closures = left[agree]
-        self.broken = _joined(self.broken, self.closures)
+        self.broken = joined_breaks(self.broken, self.closures)
 
     def _squared(self, matches: Links) -> Floats:
         """Return squared distances (L,) in deviations of matches from the drift of the graph so far."""
@@ -228,7 +228,7 @@ class Loops:
         return squared
 
 
-def _joined(broken: Integers, closures: Links) -> Integers:
+def joined_breaks(broken: Integers, closures: Links) -> Integers:
     """Return the numbers of breaks (K,) where closures join the sides of some: the least of each joined part."""
     from scipy import sparse
     from scipy.sparse.csgraph import connected_components

@@ -1,0 +1,59 @@
+"""Agreement of matches of places: single ones, groups, evidence, and breaks that closures join."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gpusense.chaining.agreement import agreeing, largest_group
+from gpusense.chaining.closing import joined_breaks
+from gpusense.chaining.links import CLOSURE, Links
+from gpusense.localization.pose_algebra import compose_poses, pose_difference
+
+COUNT = 12
+
+
+def passages(right: list[float], off: tuple[float, ...] = (2.0, -1.0, 0.2)) -> tuple[np.ndarray, Links]:
+    """Return poses of two passages, the second of which has drifted, and matches of like places with these p_right."""
+    one = np.stack([0.8 * np.arange(COUNT), 0.05 * np.arange(COUNT), 0.02 * np.arange(COUNT)], axis=1)
+    poses = np.concatenate([one, compose_poses(np.array(off), one)])
+    at = np.arange(len(right))
+    pose = pose_difference(one[at], one[at + 1])
+    return poses, Links.of(CLOSURE, at, at + 1 + COUNT, pose, np.tile(1e3 * np.eye(3), (len(at), 1, 1)), right)
+
+
+def test_two_matches_do_not_suffice_and_a_wrong_one_is_left_out() -> None:
+    poses, links = passages([0.95, 0.95])
+    assert not agreeing(links, poses, np.zeros(2, bool)).any()
+    poses, links = passages([0.95] * 5)
+    links.pose[3] += (1.0, 0.0, 0.2)
+    assert agreeing(links, poses, np.zeros(5, bool)).tolist() == [True, True, True, False, True]
+    assert not len(agreeing(links[:0], poses, np.zeros(0, bool)))
+
+
+@pytest.mark.parametrize(("right", "taken"), [([0.9] * 6, False), ([0.9] * 7, True), ([0.99] * 4, True)])
+def test_where_the_drift_tells_nothing_a_group_needs_evidence(right: list[float], taken: bool) -> None:
+    poses, links = passages(right)
+    assert agreeing(links, poses, np.zeros(len(right), bool)).all()
+    assert agreeing(links, poses, np.ones(len(right), bool)).tolist() == [taken] * len(right)
+    size, evidence = largest_group(links, poses)
+    assert size == len(right)
+    assert evidence == pytest.approx(-np.log10(1 - np.array(right)).sum())
+    # Matches that need none do not count for those that do.
+    mixed = np.arange(len(right)) < 2
+    assert agreeing(links, poses, mixed).tolist() == [False] * 2 + [len(right) > 4] * (len(right) - 2)
+
+
+def test_matches_of_one_scan_are_no_group() -> None:
+    poses, links = passages([0.999] * 6)
+    one = Links.of(CLOSURE, np.zeros(6, int), links.second, pose_difference(poses[:1], compose_poses(
+        np.array([-2.0, 1.0, 0.0]), poses[links.second])), links.information, links.p_right)  # fmt: skip
+    assert agreeing(one, poses, np.zeros(6, bool)).all()
+    assert not agreeing(one, poses, np.ones(6, bool)).any()
+
+
+def test_closures_join_the_sides_of_breaks() -> None:
+    broken = np.array([0, 0, 1, 1, 2, 3, 3])
+    links = Links.of(CLOSURE, [1, 2], [5, 3], np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), 1.0)
+    assert joined_breaks(broken, links).tolist() == [0, 0, 1, 1, 2, 0, 0]
+    assert joined_breaks(broken, links[:0]).tolist() == broken.tolist()

@@ -22,6 +22,14 @@ typedef {real}4 real4;
 #define FLOAT64 {float64}
 #define SPLITTER ((real){splitter})
 """
+# Vectors multiply and add at once where the processor does; elsewhere fma is a call.
+_LANES = """\
+#if defined(__FMA__) || defined(__ARM_FEATURE_FMA)
+#define FUSES 1
+#else
+#define FUSES 0
+#endif
+"""
 _HEAD = re.compile(r"^kernel void (\w+)\(ARGUMENTS\)", re.MULTILINE)
 _WORD = re.compile(r"\w+")
 _REQUIRES = re.compile(r"^// requires: (.*)$", re.MULTILINE)
@@ -141,6 +149,8 @@ def _kept(file: str, flags: frozenset[str]) -> str:
 def assemble(file: str, flags: frozenset[str]) -> str:
     """Return the complete OpenCL C source of a kernel file for a set of flags."""
     head = prelude(float64="FLOAT64" in flags, doubles=uses_double(file, flags))
+    if _in_lanes(file, flags):
+        head += _LANES
     body = ""
     for needed in required_files(file, flags):
         body += f'#line 1 "{needed}.cl"\n' + _kept(needed, flags)

@@ -21,10 +21,7 @@ typedef {real}2 real2;
 typedef {real}4 real4;
 #define FLOAT64 {float64}
 #define SPLITTER ((real){splitter})
-"""
-# Vectors multiply and add at once where the processor does; elsewhere fma is a call.
-_LANES = """\
-#if defined(__FMA__) || defined(__ARM_FEATURE_FMA)
+#if defined(__FMA__) || defined(__ARM_FEATURE_FMA) || defined({fast_fma})
 #define FUSES 1
 #else
 #define FUSES 0
@@ -38,6 +35,8 @@ _REQUIRES = re.compile(r"^// requires: (.*)$", re.MULTILINE)
 def prelude(*, float64: bool, doubles: bool = False) -> str:
     """Return the head of every program: it forbids contraction and defines ``real``.
 
+    FUSES says whether the device multiplies and adds at once; elsewhere ``fma`` is a call.
+
     Args:
         float64: Whether ``real`` is float64.
         doubles: Whether the program uses float64 also where ``real`` is float32.
@@ -47,6 +46,7 @@ def prelude(*, float64: bool, doubles: bool = False) -> str:
         real="double" if float64 else "float",
         float64=int(float64),
         splitter="134217729" if float64 else "4097",
+        fast_fma="FP_FAST_FMA" if float64 else "FP_FAST_FMAF",
     )
 
 
@@ -149,8 +149,6 @@ def _kept(file: str, flags: frozenset[str]) -> str:
 def assemble(file: str, flags: frozenset[str]) -> str:
     """Return the complete OpenCL C source of a kernel file for a set of flags."""
     head = prelude(float64="FLOAT64" in flags, doubles=uses_double(file, flags))
-    if _in_lanes(file, flags):
-        head += _LANES
     body = ""
     for needed in required_files(file, flags):
         body += f'#line 1 "{needed}.cl"\n' + _kept(needed, flags)

@@ -37,7 +37,7 @@ class Cells(Protocol):
         """Numbers of rows and columns."""
 
 
-_CAREFUL = frozenset({"CAREFUL"})
+_IN_TWO_PARTS = frozenset({"TWO_PART_POINTS"})
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def place_poses(poses: np.ndarray, grid: Cells, mount: Mount, real: np.dtype) ->
     pose_status = np.zeros(2, np.int32)
     with np.errstate(all="ignore"):
         placement.place_poses(
-            _CAREFUL, np.ascontiguousarray(poses, np.float64), placed.cell, placed.pose, placed.low, pose_status,
+            _IN_TWO_PARTS, np.ascontiguousarray(poses, np.float64), placed.cell, placed.pose, placed.low, pose_status,
             frame_of(grid, mount), structs.Window(0, 0, *grid.shape), count,
         )  # fmt: skip
     return placed

@@ -16,7 +16,6 @@ import numpy as np
 from gpusense.interface import structs
 from gpusense.reference import placement
 from gpusense.reference.heading import cos_sin
-from gpusense.world.grid import OccupancyGrid
 
 Mount = tuple[float, float, float]
 
@@ -62,15 +61,6 @@ def split(values: np.ndarray, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
     """
     high = values.astype(real)
     return high, (values - high).astype(real)
-
-
-def to_grid(grid: OccupancyGrid, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Convert world coordinates [m] to column and row coordinates of the grid's frame [cells], float64."""
-    yaw = grid.origin[2]
-    if yaw != 0.0:
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        x, y = cos * x + sin * y, cos * y - sin * x
-    return x / grid.resolution, y / grid.resolution
 
 
 @functools.lru_cache(maxsize=256)

@@ -36,7 +36,7 @@ class Result:
         elif self._on_device:
             self.flat = backend.blank(math.prod(shape), real)
         else:
-            self.flat = np.empty(shape, real)
+            self.flat = backend.empty_result(shape, real)
         if not self._on_device:
             self.flat = self.flat.reshape(-1)
 

@@ -58,7 +58,7 @@ class _Gradient:
         flags = (pipeline.components | readings.flags) - _OTHERS
         flags, per_scan = with_lanes_flag(backend.info.lanes, "field_gradient", flags), piece.count // readings.scans
         # Vectors of particles hold those of one scan.
-        size = readings.scans * -(-per_scan // LANES) * LANES if "WIDE" in flags else piece.count
+        size = readings.scans * -(-per_scan // LANES) * LANES if "IN_LANES" in flags else piece.count
         given = readings.arguments
         gradient = launch(
             "field_gradient", flags, (size,), table=table, pose_cell=placed.cell, pose=placed.pose,

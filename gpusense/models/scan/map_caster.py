@@ -243,7 +243,7 @@ class MapCaster:
             map_table=table, pose_cell=placed.cell, pose=placed.pose, ray=ray, window=window, particles=count,
             rays=rays, caster=self.method.struct(), scale=self.scale,
         )  # fmt: skip
-        if "ECHO" in flags:
+        if "CONES" in flags:
             heard = dict(
                 normals=self.normals(window, cones.flags), ranges=result, incidence=incidence, cone=cones.struct
             )

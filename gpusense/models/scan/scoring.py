@@ -16,7 +16,7 @@ from gpusense.models.scan.readings import Readings
 from gpusense.models.scan.request import Request
 from gpusense.world.windows import whole
 
-_WIDE = frozenset({"WIDE"})
+_IN_LANES = frozenset({"IN_LANES"})
 
 
 @dataclass
@@ -102,7 +102,7 @@ class _Scorer:
             )  # fmt: skip
         self._last.kernels = pipeline.kernel_names[scoring.tiles is not None]
         # Poses are placed in vectors, whatever scores them.
-        self._last.flags = (flags - _WIDE) | (scoring.flags & _WIDE)
+        self._last.flags = (flags - _IN_LANES) | (scoring.flags & _IN_LANES)
         if readings.scans > 1:
             self._last.together = max(self._last.together, readings.scans)
         if request.per_beam:

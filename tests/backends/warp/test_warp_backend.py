@@ -151,7 +151,7 @@ def field_launch(warp_backend: Backend, monkeypatch: pytest.MonkeyPatch):
         np.zeros(6, np.float32),
     )
     backend = _warp.WarpBackend(warp_backend.info, "cpu")
-    flags = frozenset({"LOG_TABLE", "CAREFUL", "PER_BEAM"})
+    flags = frozenset({"LOG_TABLE", "TWO_PART_POINTS", "PER_BEAM"})
     launch = backend.compile("score_field", flags)
     assert isinstance(launch, _warp_pieces.SharedLaunch)
     nowhere = np.zeros(1, np.int32), np.zeros(1, np.float32)

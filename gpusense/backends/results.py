@@ -39,7 +39,7 @@ class Result:
         elif on_device:
             self.flat = backend.blank(math.prod(shape), real)
         else:
-            self.flat = np.empty(shape, real)
+            self.flat = backend.empty_result(shape, real)
         if not on_device:
             self.flat = self.flat.reshape(-1)
 

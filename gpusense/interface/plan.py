@@ -119,7 +119,7 @@ def launch_omissions(code: frozenset[str], least_ordered: tuple[int, int] | None
             or a model puts none in order.
     """
     omissions = [ORDINARY_HEADINGS] if code and "HUGE_HEADINGS" not in code else []
-    if "QUICK" in code:
+    if "ROUNDED_CELLS" in code:
         omissions.append(
             Omission(
                 "guard of each end point",

@@ -224,39 +224,50 @@ def test_only_scenes_that_have_such_kernels_get_them():
     info = get_backend("numpy").info
     wide = dataclasses.replace(info, lanes=LANES)
     assert with_lanes_flag(info.lanes, "cast_ranges", set()) == frozenset()
-    assert with_lanes_flag(wide.lanes, "cast_ranges", set()) == {"WIDE"}
+    assert with_lanes_flag(wide.lanes, "cast_ranges", set()) == {"IN_LANES"}
     for flags in ({"FLOAT64"}, {"LOOKUP"}, {"MARCH", "ORIGINS_OUTSIDE"}):
-        assert with_lanes_flag(wide.lanes, "cast_ranges", flags) == {*flags, "WIDE"}
-    for flags in (set(), {"HIT"}, {"HIT", "LINEAR"}, {"HIT", "SHARP", "ECHO", "INCIDENCE"}, {"CUBES", "ALL_READINGS"}):
-        assert with_lanes_flag(wide.lanes, "score_beams", flags) == {*flags, "WIDE"}
-    for flags in ({"BILINEAR"}, {"BILINEAR", "LINEAR", "SHARP"}, {"LOG_TABLE", "CAREFUL"}, {"LOG_TABLE", "FLOAT64"}):
-        assert with_lanes_flag(wide.lanes, "score_field", flags) == {*flags, "WIDE"}
+        assert with_lanes_flag(wide.lanes, "cast_ranges", flags) == {*flags, "IN_LANES"}
+    for flags in (
+        set(),
+        {"HIT"},
+        {"HIT", "LINEAR"},
+        {"HIT", "EXACT_EXPONENT", "CONES", "INCIDENCE"},
+        {"CUBES", "ALL_READINGS"},
+    ):
+        assert with_lanes_flag(wide.lanes, "score_beams", flags) == {*flags, "IN_LANES"}
+    for flags in (
+        {"BILINEAR"},
+        {"BILINEAR", "LINEAR", "EXACT_EXPONENT"},
+        {"LOG_TABLE", "TWO_PART_POINTS"},
+        {"LOG_TABLE", "FLOAT64"},
+    ):
+        assert with_lanes_flag(wide.lanes, "score_field", flags) == {*flags, "IN_LANES"}
     assert with_lanes_flag(wide.lanes, "score_field", {"ALL_READINGS"}) == {"ALL_READINGS"}
-    for flag in ("FLOAT64", "SHARP"):
+    for flag in ("FLOAT64", "EXACT_EXPONENT"):
         assert with_lanes_flag(wide.lanes, "field_gradient", {"LINEAR", flag}) == {"LINEAR", flag}
     assert with_lanes_flag(wide.lanes, "beam_tiles", {"LINEAR"}) == {"LINEAR"}
 
 
 def test_programs_in_lanes_begin_in_their_folder():
     for file in {row.file for row in KERNELS.values()}:
-        scalar, wide = required_files(file), required_files(file, frozenset({"WIDE"}))
+        scalar, wide = required_files(file), required_files(file, frozenset({"IN_LANES"}))
         assert not any(name.startswith("lanes/") for name in scalar)
         assert scalar[-1] == file
         if f"lanes/{file}" in opencl_names():
             assert wide[-1] == f"lanes/{file}"
             assert "lanes/types" in wide
             assert file not in wide or "kernel void" not in opencl_source(file)
-            assert "WIDE" in relevant(file, frozenset({"WIDE"}))
-            assert f'#line 1 "lanes/{file}.cl"' in assemble(file, frozenset({"WIDE"}))
+            assert "IN_LANES" in relevant(file, frozenset({"IN_LANES"}))
+            assert f'#line 1 "lanes/{file}.cl"' in assemble(file, frozenset({"IN_LANES"}))
         else:
             assert wide == scalar
-            assert "WIDE" not in relevant(file, frozenset({"WIDE"}))
+            assert "IN_LANES" not in relevant(file, frozenset({"IN_LANES"}))
 
 
 def test_scalar_files_hold_nothing_of_vectors():
     for name in opencl_names():
         text = opencl_source(name)
-        assert "WIDE" not in text.replace("WIDE_", "")
+        assert "IN_LANES" not in text.replace("WIDE_HEADINGS", "")
         if not name.startswith("lanes/"):
             assert "lanes" not in text.split("// requires:")[-1].splitlines()[0]
 

@@ -182,8 +182,8 @@ def test_bumpers(outline, changes, device, compiled):
 
 def test_float64_and_lines_have_no_vectors():
     for kernel in ("score_features", "count_unseen", "score_beacons", "score_contact"):
-        assert with_lanes_flag(LANES, kernel, {"RANGE", "BEARING"}) == {"RANGE", "BEARING", "WIDE"}
+        assert with_lanes_flag(LANES, kernel, {"RANGE", "BEARING"}) == {"RANGE", "BEARING", "IN_LANES"}
         assert with_lanes_flag(LANES, kernel, {"RANGE", "FLOAT64"}) == {"RANGE", "FLOAT64"}
     assert with_lanes_flag(LANES, "score_features", {"RANGE", "LINE"}) == {"RANGE", "LINE"}
     for flag in ("SIGNATURE", "FIELD", "MARGINAL", "PER_BEAM"):
-        assert "WIDE" in with_lanes_flag(LANES, "score_features", {"BEARING", flag})
+        assert "IN_LANES" in with_lanes_flag(LANES, "score_features", {"BEARING", flag})

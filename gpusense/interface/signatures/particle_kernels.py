@@ -11,7 +11,7 @@ _LARGEST, _SUMS = "double largest [groups]", "double sums [17 * blocks]"
 KERNELS: dict[str, Kernel] = {
     "move_particles": kernel(
         "motion", "pose", "double source [3 * particles]", _SETTINGS, "out double target [3 * particles]",
-        "int particles", "int kind", wide=True,
+        "int particles", "int kind", in_lanes=True,
     ),
     "add_scores": kernel(
         "weighing", "group", "real log_p [particles]", _SETTINGS, f"out {_SCORE}", "out double largest [particles]",
@@ -45,7 +45,7 @@ KERNELS: dict[str, Kernel] = {
     "draw_particles": kernel(
         "drawing", "pose", "double source [3 * particles]", "double weight [particles]", "double ends [particles]",
         "double copies [particles]", _SETTINGS, _STATE, "double pool [3]", "out double target [3 * drawn]",
-        "out double after [drawn]", "int particles", "int drawn", "int stage", wide=True,
+        "out double after [drawn]", "int particles", "int drawn", "int stage", in_lanes=True,
     ),
     "sum_poses": kernel(
         "estimate", "group", "double poses [3 * particles]", "double weight [particles]", "double estimate [11]",

@@ -21,7 +21,7 @@ typedef struct {
 
 // Return the offset of end points in cells from the corners of the particles' cells, or with BILINEAR from their centres.
 void offsets_lanes(const Particles *particle, const real2 point, const real2 point_low, LanePair *x, LanePair *y) {
-#if CAREFUL
+#if TWO_PART_POINTS
     const real2 p = (real2)(point.x, point_low.x), q = (real2)(point.y, point_low.y);
     *x = careful_offset_lanes(particle->x, particle->x_low, particle->cos, particle->cos_low, p, particle->sin,
                               particle->sin_low, q, -1);
@@ -34,9 +34,9 @@ void offsets_lanes(const Particles *particle, const real2 point, const real2 poi
 }
 
 #if BILINEAR
-// Return the weighted sum of distances of one part; only weights and sums of SHARP have two.
+// Return the weighted sum of distances of one part; only weights and sums of EXACT_EXPONENT have two.
 LanePair between_cells_lanes(const LanePair weight_a, const lanes a, const LanePair weight_b, const lanes b) {
-#if SHARP
+#if EXACT_EXPONENT
     return pair_sum_lanes(pair_times_lanes(weight_a, a), pair_times_lanes(weight_b, b));
 #else
     return (LanePair){weight_a.hi * a + weight_b.hi * b, 0};
@@ -45,7 +45,7 @@ LanePair between_cells_lanes(const LanePair weight_a, const lanes a, const LaneP
 
 // Return the weighted sum of a and b.
 LanePair between_lanes(const LanePair weight_a, const LanePair a, const LanePair weight_b, const LanePair b) {
-#if SHARP
+#if EXACT_EXPONENT
     return pair_sum_lanes(pair_product_lanes(weight_a, a), pair_product_lanes(weight_b, b));
 #else
     return (LanePair){weight_a.hi * a.hi + weight_b.hi * b.hi, 0};
@@ -54,7 +54,7 @@ LanePair between_lanes(const LanePair weight_a, const LanePair a, const LanePair
 
 // Return log p of distances from end points to the nearest obstacles: log_field of field_term.cl.
 lanes log_distance_lanes(const LanePair distance, global const real *terms) {
-#if SHARP
+#if EXACT_EXPONENT
     const LanePair square = pair_product_lanes(pair_product_lanes(distance, distance), (LanePair){terms[1], terms[5]});
 #else
     const LanePair square = {distance.hi * (distance.hi * terms[1]), 0};
@@ -64,7 +64,7 @@ lanes log_distance_lanes(const LanePair distance, global const real *terms) {
     lanes p = terms[2];
 #if HIT
     const lanes hit = terms[0] * exp_lanes(-exponent.hi);
-#if SHARP
+#if EXACT_EXPONENT
     p += hit > 0 ? hit * (1 - exponent.lo) : hit;
 #else
     p += hit;
@@ -88,7 +88,7 @@ lanes log_distance_lanes(const LanePair distance, global const real *terms) {
 typedef struct {
     ilanes cell[BLOCK_TERMS];
     lanes rest_x[BLOCK_TERMS], rest_y[BLOCK_TERMS], to_next_x[BLOCK_TERMS], to_next_y[BLOCK_TERMS];
-#if SHARP
+#if EXACT_EXPONENT
     lanes rest_x_low[BLOCK_TERMS], rest_y_low[BLOCK_TERMS], to_next_x_low[BLOCK_TERMS], to_next_y_low[BLOCK_TERMS];
 #endif
 } EndPoints;
@@ -108,14 +108,14 @@ void find_places(EndPoints *ends, const Particles *particle, global const real2 
         ends->cell[k] = r * stride + c;
         ends->rest_x[k] = rest_x.hi, ends->rest_y[k] = rest_y.hi;
         ends->to_next_x[k] = to_next_x.hi, ends->to_next_y[k] = to_next_y.hi;
-#if SHARP
+#if EXACT_EXPONENT
         ends->rest_x_low[k] = rest_x.lo, ends->rest_y_low[k] = rest_y.lo;
         ends->to_next_x_low[k] = to_next_x.lo, ends->to_next_y_low[k] = to_next_y.lo;
 #endif
     }
 }
 
-// Interpolate the distances of a block's end points; those of SHARP have two parts. distance_low may be distance.
+// Interpolate the distances of a block's end points; those of EXACT_EXPONENT have two parts. distance_low may be distance.
 void interpolate(lanes *distance, lanes *distance_low, const EndPoints *ends, global const real *table, const int size,
                  const Window window) {
     global const real *above = table + window.cols + 2 * FIELD_RING;
@@ -124,7 +124,7 @@ void interpolate(lanes *distance, lanes *distance_low, const EndPoints *ends, gl
         lanes a, b, d, e;
         gather_pairs(table, at, &a, &b);
         gather_pairs(above, at, &d, &e);
-#if SHARP
+#if EXACT_EXPONENT
         const LanePair rest_x = {ends->rest_x[k], ends->rest_x_low[k]}, rest_y = {ends->rest_y[k], ends->rest_y_low[k]};
         const LanePair to_next_x = {ends->to_next_x[k], ends->to_next_x_low[k]};
         const LanePair to_next_y = {ends->to_next_y[k], ends->to_next_y_low[k]};
@@ -254,7 +254,7 @@ kernel void score_field(ARGUMENTS) {
             ((real *)&particle->y)[i] = pose[n].y;
             ((real *)&particle->cos)[i] = pose[n].z;
             ((real *)&particle->sin)[i] = pose[n].w;
-#if CAREFUL
+#if TWO_PART_POINTS
             ((real *)&particle->x_low)[i] = pose_low[n].x;
             ((real *)&particle->y_low)[i] = pose_low[n].y;
             ((real *)&particle->cos_low)[i] = pose_low[n].z;
@@ -262,7 +262,7 @@ kernel void score_field(ARGUMENTS) {
 #endif
         }
         // Subtract half a cell: interpolation is between centres, and rounding to nearest must give the cell.
-#if CAREFUL
+#if TWO_PART_POINTS
 #if BILINEAR
         const LanePair x = two_sum_lanes(particle->x, (lanes)-0.5f), y = two_sum_lanes(particle->y, (lanes)-0.5f);
         particle->x = x.hi, particle->x_low = x.lo + particle->x_low;
@@ -279,7 +279,7 @@ kernel void score_field(ARGUMENTS) {
     real most[BLOCK_TERMS];
     for (int from = 0; from < all_readings; from += BLOCK_TERMS) {
         const int size = all_readings - from < BLOCK_TERMS ? all_readings - from : BLOCK_TERMS;
-#if CAREFUL
+#if TWO_PART_POINTS
 #if !BILINEAR
         // Rounding errors of an end point are at most 2.5 eps times its reading in cells, plus 0.7 eps.
         real least = 0.5f;
@@ -298,7 +298,7 @@ kernel void score_field(ARGUMENTS) {
             EndPoints ends;
             lanes distance[BLOCK_TERMS];
             find_places(&ends, &all[v], point + from, point_low + from, size, window);
-#if SHARP
+#if EXACT_EXPONENT
             lanes distance_low[BLOCK_TERMS];
             interpolate(distance, distance_low, &ends, table, size, window);
 #else
@@ -316,7 +316,7 @@ kernel void score_field(ARGUMENTS) {
 #endif
             for (int k = 0; k < size; ++k) {
 #if BILINEAR
-#if SHARP
+#if EXACT_EXPONENT
                 const lanes term = log_distance_lanes((LanePair){distance[k], distance_low[k]}, terms);
 #else
                 const lanes term = log_distance_lanes((LanePair){distance[k], 0}, terms);

@@ -41,6 +41,10 @@ class Proxy(Backend):
         """See Backend.download."""
         return self._backend.download(buffer, out, wait=wait)
 
+    def empty_result(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+        """See Backend.empty_result."""
+        return self._backend.empty_result(shape, dtype)
+
     def part(self, buffer: Buffer, first: int, count: int, dtype: np.dtype) -> Buffer:
         """See Backend.part."""
         return self._backend.part(buffer, first, count, dtype)

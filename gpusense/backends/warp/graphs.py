@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
+from gpusense.backends.helpers import HELPERS
 from gpusense.backends.warp.steps import Step, as_graph, one_by_one, start_each
 
 _LOG = logging.getLogger("gpusense")
@@ -25,8 +26,6 @@ _STALE = 16
 _MOST_STEPS = 64
 # Captures that fail one after the other until no more are tried.
 _MOST_FAILURES = 3
-# Prefix of the names of threads that share launches on the processor.
-HELPERS = "gpusense pieces"
 # Reasons for calls without a graph.
 FIRST = "a graph is captured when it is started again"
 SHORT = "a graph would save nothing"

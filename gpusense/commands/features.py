@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Extract the features and print their numbers; after Ctrl-C those so far."""
+    """Extract the features and print their numbers; after Ctrl-C, the features so far."""
     if (args.log is None) == (args.map_in is None):
         raise ValueError("--log: must be given, or else --map-in, and not both")
     if args.map_in is not None:
@@ -125,7 +125,7 @@ def _of_map(args: argparse.Namespace) -> int:
 def _report(
     args: argparse.Namespace, scans: list[tuple[int, Scan]], parts: list[Features], posed: bool, seconds: float
 ) -> None:
-    """Print and write the features of all scans, or of those before an interrupt."""
+    """Print and write the features of all scans, or of the scans before an interrupt."""
     from gpusense.features.landmarks import map_features
     from gpusense.features.result import joined
 

@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compute and draw the likelihoods, after Ctrl-C those so far."""
+    """Compute and draw the likelihoods; after Ctrl-C, the tiles so far."""
     from gpusense.matching.pose_likelihood import prepare_tiles
     from gpusense.models.scan.beam import BeamModel
     from gpusense.models.scan.field import LikelihoodFieldModel

@@ -112,7 +112,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Localise, and print the results; after Ctrl-C those so far."""
+    """Localise, and print the results; after Ctrl-C, the results so far."""
     from gpusense.commands.localize_report import report
     from gpusense.commands.localize_setup import make_filter, read_chosen, read_parameters, start_of
     from gpusense.evaluation.tracking import Track, follow, start

@@ -81,7 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Build and write the map, after Ctrl-C that of the scans so far."""
+    """Build and write the map; after Ctrl-C, the map of the scans so far."""
     from gpusense.evaluation.scoring import check_poses
     from gpusense.mapping.build import MapBuilder
 

@@ -75,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Match the scans and print the results; after Ctrl-C those so far."""
+    """Match the scans and print the results; after Ctrl-C, the results so far."""
     from gpusense.evaluation.matching import match_log
     from gpusense.world.map_files import read_map
 
@@ -108,7 +108,7 @@ def _report(
     parts: list[LogMatches],
     seconds: float,
 ) -> None:
-    """Print and write the results of all matches, or of those before an interrupt."""
+    """Print and write the results of all matches, or of the matches before an interrupt."""
     from gpusense.evaluation.matching import joined, summary
 
     matches = joined(parts)

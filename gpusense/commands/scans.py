@@ -1,4 +1,4 @@
-"""The scans of a log that a command takes: their laser, and their poses, its own or those of a trajectory."""
+"""The scans of a log for a command: the choice of lasers, and poses from the log or from a trajectory."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def scanners_of(scans: list[tuple[int, Scan]], sensor: list[int]) -> dict[str, A
 
 
 def _referenced(args: argparse.Namespace, scans: list[Scan]) -> list[tuple[int, Scan]]:
-    """Return those scans of which the trajectory of ``--reference`` has the pose, with their numbers."""
+    """Return the scans whose pose the trajectory of ``--reference`` has, with their numbers."""
     from gpusense.evaluation.trajectory_files import poses_at, read_tum
 
     poses = poses_at([scan.time for scan in scans], *read_tum(args.reference))

@@ -88,7 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Score the scans and print the results; after Ctrl-C those so far."""
+    """Score the scans and print the results; after Ctrl-C, the results so far."""
     from gpusense.evaluation.fitness import FitnessOfLog
     from gpusense.evaluation.scoring import LogScoring, ParticleSampler
     from gpusense.world.map_files import read_map

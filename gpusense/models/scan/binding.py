@@ -68,7 +68,7 @@ def bind(
 
 
 def _host_task(pipeline: ScanPipeline) -> str:
-    """Return the preparation of a scan that only the host can do; empty where the device can do all of it."""
+    """Return the preparation that only the host can do, as a clause; empty where the device can do all of it."""
     if pipeline.setting.weights.is_peer:
         return "the host classes the readings for another program's weights"
     if not pipeline.backend.info.float64:
@@ -194,7 +194,7 @@ class _StagedCall(BoundCall):
                     if backend.in_batch:
                         backend.synchronize()
             except MemoryError:
-                # The whole table of a map that has changed; the ordinary call needs only a part of it.
+                # This call would need the whole table of a changed map; the ordinary call needs only a part.
                 return self._host()
             if not status[0]:
                 self.out[...] = log_p

@@ -145,7 +145,7 @@ class LikelihoodFieldModel(ScanModel):
         )  # fmt: skip
 
     def update_map(self, cells: ArrayLike, region: Sequence[int]) -> None:
-        """Replace cells of the map; afterwards every result is that of a model of the changed grid.
+        """Replace cells of the map; later results equal those of a model made with the changed grid.
 
         Only distances within ``max_distance`` of a changed obstacle are computed again.
 

@@ -181,7 +181,7 @@ class FieldPipeline(ScanPipeline):
         """See ScanPipeline.numbers; blocks of readings have a guard each on the device."""
         readings = scoring.readings
         score = Score(readings.constant_term, self.setting.temperature)
-        # Bound of the errors of products of rounded factors and of their sums: 3.12 eps of the longest, 1.5 eps.
+        # Error bounds: products of rounded factors err by at most 3.12 eps of the longest, their sums by 1.5 eps.
         return dict(score=score, guard=self.guard * readings.reach) if scoring.tiles is None else dict(score=score)
 
     def score_launches(self, scoring: ScanLaunch) -> Program:
@@ -194,7 +194,7 @@ class FieldPipeline(ScanPipeline):
             parts=parts.buffer, **readings.arguments,
         )  # fmt: skip
         if scoring.tiles is None:
-            # Vectors of particles hold those of one scan.
+            # The particles of a vector belong to one scan.
             grouped = readings.scans * -(-scoring.batch.per_scan // _GROUP) * _GROUP
             size = grouped if "IN_LANES" in scoring.flags else count
             common |= self.numbers(scoring)

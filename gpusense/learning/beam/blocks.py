@@ -23,6 +23,7 @@ from gpusense._util import checks
 from gpusense.learning.beam.pairs import Pairs
 from gpusense.learning.beam.point import BIAS, HIT, MAX, RAND, RATE, SHORT, SIGMA, Floats, Point
 from gpusense.learning.beam.problem import Problem
+from gpusense.world.range_causes import ShortDensity
 from gpusense.world.scanner import Reading
 
 # Readings whose gradients are computed at once.
@@ -106,8 +107,7 @@ def _terms(z: Floats, expected: Floats, parts: Floats, point: Point, range_max: 
     mass = ndtr(x_1) - ndtr(-x_0)
     by_sigma = u * u - 1 + (x_0 * phi_0 + x_1 * phi_1) / mass
     by_bias = np.where(mean == expected + point.bias, u + (phi_1 - phi_0) / mass, 0) / point.sigma
-    x = np.clip(point.rate * expected, 1e-9, 700.0)
-    by_rate = 1 - x / np.expm1(x) - point.rate * z
+    by_rate = ShortDensity(point.rate).by_log_rate(z, expected)
     return {
         HIT: hit, SHORT: short, RAND: rand,
         SIGMA: np.where(hit > 0, hit * by_sigma, 0.0), BIAS: np.where(hit > 0, hit * by_bias, 0.0),

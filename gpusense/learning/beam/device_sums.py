@@ -16,6 +16,7 @@ from gpusense.interface.signatures import LANES
 from gpusense.interface.terms import log_weight, rounded_terms
 from gpusense.learning.beam.pairs import Pairs
 from gpusense.learning.beam.point import Point
+from gpusense.world.range_causes import NoReturn, RandomDensity, ShortDensity
 
 # Length of a row of sums, without and with second derivatives; see kernels/opencl/learning.cl.
 _SUMS = {False: 14, True: 40}
@@ -105,8 +106,9 @@ class DeviceSums:
         hit, short, top, rand = point.weights
         log_scale = log_weight(hit) - math.log(point.sigma) - 0.5 * math.log(2 * math.pi)
         shape = (0.5 / point.sigma / point.sigma, math.sqrt(0.5) / point.sigma)
-        heads = (log_weight(short), point.rate, log_weight(rand) - math.log(self._range_max))
-        terms = rounded_terms([log_scale, *shape, *heads, self._range_max, log_weight(top)], self.real)
+        random = RandomDensity(self._range_max).log_peak(rand)
+        heads = (log_weight(short), ShortDensity(point.rate).rate, random)
+        terms = rounded_terms([log_scale, *shape, *heads, self._range_max, NoReturn(top).number], self.real)
         return np.append(terms, np.array([point.bias, 1 / point.sigma]).astype(self.real))
 
     def sums(self, point: Point, *, information: bool = False) -> NDArray[np.float64]:

@@ -25,6 +25,7 @@ from gpusense.learning.point.search import Climb, climb, maximize
 from gpusense.world.hit_shapes import SHAPES, HitName, HitShape
 from gpusense.world.hit_tables import TabulatedHit
 from gpusense.world.parameters import BeamParameters
+from gpusense.world.range_causes import NoReturn, RandomDensity, ShortDensity
 from gpusense.world.scanner import Reading
 
 # Shares of the deviation at the mean expected range that starts turn into growth; iterations of a search.
@@ -96,16 +97,14 @@ class _Growing(Problem):
         """Return weights and densities of hit, short and rand, and the derivatives by the shapes."""
         z, expected = self.reading, self.expected
         sigma = math.exp(theta[_SIGMA]) + theta[_GROWTH] * expected
-        rate = math.exp(theta[_RATE])
+        obstacle = ShortDensity(math.exp(theta[_RATE]))
         moved = expected + (theta[_BIAS] if self.fit_bias else 0.0)
         mean = np.clip(moved, 0, self.range_max)
         hit = truncated(z - mean, mean, self.range_max, sigma, self._shape_of(self._shape_at(theta)))
-        x = np.clip(rate * expected, 1e-12, 700.0)
-        log_short = np.where(z <= expected, theta[_RATE] - rate * z - np.log(-np.expm1(-x)), -np.inf)
-        by_rate = 1 - x / np.expm1(x) - rate * z
+        log_short, by_rate = obstacle.log_pdf(z, expected), obstacle.by_log_rate(z, expected)
         rand, short = theta[_RAND], theta[_SHORT]
         weights = ((1 - rand) * (1 - short), (1 - rand) * short, rand)
-        densities = hit[0], log_short, np.full(len(z), -math.log(self.range_max))
+        densities = hit[0], log_short, np.full(len(z), RandomDensity(self.range_max).log_peak(1.0))
         return list(zip(weights, densities, strict=True)), hit, by_rate, np.where(mean == moved, 1.0, 0.0)
 
     def log_p(self, theta: Floats) -> tuple[Floats, Floats]:
@@ -126,7 +125,7 @@ class _Growing(Problem):
         gradient = np.where(self.none[:, None], 0.0, np.stack(columns, axis=1))
         gradient[self.none, _TOP] = 1 / max(top, 1e-300)
         with np.errstate(divide="ignore"):
-            return np.where(self.none, np.log(top), log_p + np.log1p(-top)), gradient
+            return np.where(self.none, NoReturn(top).log_mass, log_p + np.log1p(-top)), gradient
 
     def _by_shape(self, theta: Floats) -> list[Floats]:
         """Return the derivatives of the log density of hits by the coordinates of the shape, as differences."""

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.pairs import Pairs
 from gpusense.learning.beam.point import BIAS, HIT, MAX, RAND, RATE, SHORT, SIGMA, Bounds, Floats, Point
+from gpusense.world.range_causes import NoReturn
 
 # Coordinates of the terms y of a pair.
 _PLACES = np.array([HIT, SHORT, RAND, SIGMA, BIAS, RATE])
@@ -135,7 +136,7 @@ class Problem:
         top = float(point.weights[MAX])
         log_likelihood = float(sums[0])
         if self.pairs.max_readings:
-            log_likelihood += self.pairs.max_readings * (math.log(top) if top > 0 else -math.inf)
+            log_likelihood += self.pairs.max_readings * NoReturn(top).number
         totals = np.array([sums[1], sums[2], self.pairs.max_readings, sums[3]]) + self.prior.counts
         first, curve = self.prior.derivatives(point)
         gradient = first + np.array([*(totals - self.total * point.weights), sums[4], sums[6], sums[5] / point.sigma])

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from gpusense.learning.beam.pairs import Pairs
 from gpusense.learning.beam.point import Bounds, Floats
 from gpusense.learning.beam.result import BeamFit
-from gpusense.learning.point.densities import truncated
+from gpusense.learning.beam.shapes import without_ranges
+from gpusense.learning.point.densities import by_shape, truncated
 from gpusense.learning.point.problem import Problem, mix, of_weight
 from gpusense.learning.point.report import report
 from gpusense.learning.point.search import Climb, climb, maximize
@@ -32,8 +33,6 @@ from gpusense.world.scanner import Reading
 _SHARES, _ITERATIONS = (0.02, 0.3, 0.7, 0.95), 200
 # Readings from which on a table of masses is faster than the formula.
 _MANY = 2000
-# Share of a coordinate of the shape by which its derivative is taken.
-_SHAPE_STEP = 1e-4
 _TOP, _RAND, _SHORT, _SIGMA, _GROWTH, _RATE, _BIAS = range(7)
 
 
@@ -129,21 +128,9 @@ class _Growing(Problem):
 
     def _by_shape(self, theta: Floats) -> list[Floats]:
         """Return the derivatives of the log density of hits by the coordinates of the shape, as differences."""
-        columns: list[Floats] = []
-        if not self.kind.limits:
-            return columns
         sigma, mean, u = self._hits_at(theta)
-        for place, (low, high) in enumerate(self.kind.limits):
-            at = self._shape_at(theta)
-            step = _SHAPE_STEP * min(at[place], 1.0)
-            ends = [np.where(np.arange(len(at)) == place, np.clip(at + each, low, high), at) for each in (-step, step)]
-            before, after = (
-                shape.log_pdf(u)
-                - np.log(shape.half_mass(mean / sigma) + shape.half_mass((self.range_max - mean) / sigma))
-                for shape in map(self._shape_of, ends)
-            )
-            columns.append((after - before) / (ends[1][place] - ends[0][place]))
-        return columns
+        ends = mean / sigma, (self.range_max - mean) / sigma
+        return by_shape(u, *ends, self._shape_at(theta), self._shape_of, self.kind.limits)
 
     def _hits_at(self, theta: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the scale and the mean of hits, and the distances of readings from it in scales."""
@@ -194,11 +181,7 @@ def fit_jointly(
     """
     new = ("sigma_growth",) * growth + SHAPES[hit].fitted
     if not pairs.hits or not pairs.expected.any():
-        reason = "no range determines it"
-        return replace(
-            fit, parameters=fit.parameters.replace(hit=hit), status=f"{fit.status}; {', '.join(new)}: {reason}",
-            held=fit.held | dict.fromkeys(new, reason),
-        )  # fmt: skip
+        return without_ranges(fit, hit, growth)
     known = pairs.kinds != Reading.MISSING
     reading, expected = np.zeros(len(known)), np.full(len(known), 0.5 * pairs.range_max)
     reading[pairs.places], expected[pairs.places] = pairs.reading, pairs.expected

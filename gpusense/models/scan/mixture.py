@@ -119,6 +119,17 @@ def mixture_of(
     return flags | shape, np.concatenate([*terms, *mass_tables([shape_of(p) for p in kinds], terms, real)])
 
 
+def learning_terms(p: BeamParameters, range_max: float, real: np.dtype) -> np.ndarray:
+    """Return the numbers of the kernel file ``learning``, with the table of masses behind them.
+
+    Raises:
+        ValueError: a number is beyond what the precision can hold.
+    """
+    shape = shape_of(p)
+    terms = _terms(p, range_max, real, False, (1 / p.sigma_hit, 1 / shape.width, 0.0))
+    return np.concatenate([terms, *mass_tables([shape], [terms], real)])
+
+
 def _common_flags(kinds: Sequence[BeamParameters]) -> frozenset[str]:
     """Return the flags of the shape of hits, which all bins of angles of incidence share.
 

@@ -23,7 +23,7 @@ from gpusense.learning.beam.pairs import make_pairs
 from gpusense.learning.beam.problem import NO_PRIOR, Problem
 from gpusense.learning.point import beacons
 from gpusense.models.scan.densities import log_mixture
-from gpusense.models.scan.mixture import peer_mixture
+from gpusense.models.scan.mixture import mixture_of, peer_mixture, tabulated
 from gpusense.world.field_density import FieldDensity
 from gpusense.world.range_causes import NoReturn, RandomDensity, ShortDensity
 
@@ -100,6 +100,19 @@ def learned(at):
     }  # fmt: skip
 
 
+def numbers(p, real=np.float32):
+    """Return the numbers of kernels that depend on the density, log ones of a random density far below the peak."""
+    settings = dict(specialize=True, max_depends=False)
+    # The other densities' peak decides whether a kernel sums densities; a steep one has a last range.
+    far = p.replace(z_hit=p.z_hit + p.z_rand - 1e-7, z_rand=1e-7, lambda_short=1e23 * p.lambda_short)
+    steep = p.replace(lambda_short=50 * p.lambda_short)
+    flags, terms = mixture_of((far,), RANGE, np.dtype(real), **settings)
+    return {
+        "sum of densities": np.array("LINEAR" in flags), "terms of logarithms": terms[[4, 5]].astype(np.float64),
+        "last range": mixture_of((steep,), RANGE, np.dtype(np.float64), **settings)[1][16],
+    }  # fmt: skip
+
+
 def drawn(p):
     """Return readings drawn by a model and by the simulation of worlds."""
     model = gs.BeamModel(ROOM, SCANNER, p, **HOST)
@@ -132,7 +145,8 @@ def test_a_made_up_short_density_is_followed(monkeypatch):
         found = models(p)
         peer = gs.BeamModel(ROOM, SCANNER, p, compat="beluga", **HOST).log_likelihood(POSES, Z)
         at = point(0.6, 0.2, 0.1, 0.1, sigma=0.3, rate=p.lambda_short)
-        return found | learned(at) | drawn(p) | table(p) | mixture(at.weights, p.lambda_short) | {"peer": peer}
+        found |= learned(at) | numbers(p) | drawn(p) | table(p) | {"peer": peer}
+        return found | mixture(at.weights, p.lambda_short)
 
     plain, wanted = users(1), users(2)
     monkeypatch.setattr(ShortDensity, "__init__", lambda self, rate: setattr(self, "rate", 2 * rate))
@@ -155,8 +169,10 @@ def test_a_made_up_random_density_is_followed(monkeypatch):
 
     # Without random readings, nothing of the sum of logarithms depends on them.
     skipped = ("sum of logarithms",)
-    plain, wanted = users(weights), users(halved)
+    plain, wanted, ranges = users(weights), users(halved), far_ranges()
     at = point(*weights, sigma=0.3, rate=0.4)
+    steep = BASE.replace(z_hit=0.7 - 1e-7, z_rand=1e-7, lambda_short=10.0)
+    log_term = numbers(steep)["terms of logarithms"][1]
     before = learned(at), drawn(gs.BeamParameters(0.0, 0.0, 0.0, 1.0))["worlds"], peers(), radio()
     monkeypatch.setattr(RandomDensity, "__init__", lambda self, longest: setattr(self, "range_max", 2 * longest))
     compare(users(weights), wanted, plain)
@@ -166,6 +182,8 @@ def test_a_made_up_random_density_is_followed(monkeypatch):
     np.testing.assert_allclose(after[1], np.minimum(2 * before[1], RANGE))
     np.testing.assert_allclose(after[2], 0.5 * before[2], rtol=1e-6)
     np.testing.assert_allclose(after[3], before[3] - math.log(2))
+    assert numbers(steep)["terms of logarithms"][1] == pytest.approx(log_term - math.log(2))
+    np.testing.assert_allclose(far_ranges(), 2 * ranges)
     # The joint fit's density is that of the host's mixture.
     growing = {**dict(zip(("z_hit", "z_short", "z_max", "z_rand"), weights, strict=True)), "sigma_growth": 0.01}
     truth = log_mixture(WITH_MAX, EXPECTED, sigma_hit=0.3, lambda_short=0.4, range_max=RANGE, **growing)
@@ -190,6 +208,12 @@ def radio():
     return np.append(model, fit.log_p(np.array([math.log(0.1), 0.2]))[0])
 
 
+def far_ranges():
+    """Return random readings to a beacon."""
+    p = gs.BeaconParameters(z_hit=0.0, z_rand=1.0, range_max=RANGE)
+    return gs.BeaconModel([(0.0, 0.0)], p, **HOST).sample(POSES, seed=4)
+
+
 def test_a_made_up_probability_of_no_return_is_followed(monkeypatch):
     far = WITH_MAX >= RANGE
 
@@ -203,8 +227,12 @@ def test_a_made_up_probability_of_no_return_is_followed(monkeypatch):
         found |= {"joint fit": at["density"], "objective": at["objective"], "kernel's term": at["terms"][7]}
         found["peer"] = np.log(peer_mixture(BASE, RANGE, np.dtype(np.float64), amcl=False)[1][7])
         nothing = gs.BeamModel(ROOM, SCANNER, BASE, **HOST).log_likelihood(POSES, np.full(20, RANGE), per_beam=True)
+        found["tabulated"] = tabulated(BASE, 0.5, RANGE, np.dtype(np.float64))[-1]
         found |= {"only max readings": nothing[0], "each of them": nothing[1]}
-        impossible = gs.BeamParameters(0.0, 0.0, 1.0, 0.0)
+        impossible, every = gs.BeamParameters(0.0, 0.0, 1.0, 0.0), dict(specialize=False) | HOST
+        found["placed"] = gs.BeamModel(ROOM, SCANNER, impossible, **every).log_likelihood(
+            POSES, WITH_MAX, per_beam=True
+        )[1][:, ::5]
         found["nothing but no return"] = gs.BeamModel(ROOM, SCANNER, impossible, **HOST).log_likelihood(
             POSES, WITH_MAX, per_beam=True
         )[1][:, ::5]
@@ -216,7 +244,7 @@ def test_a_made_up_probability_of_no_return_is_followed(monkeypatch):
         self.weight = 0.5 * weight
 
     monkeypatch.setattr(NoReturn, "__init__", halve)
-    once = dict.fromkeys(("kernel's term", "peer", "each of them", "nothing but no return"), 1)
+    once = dict.fromkeys(("tabulated", "placed", "kernel's term", "peer", "each of them", "nothing but no return"), 1)
     counts = dict.fromkeys(("host", "sum", "objective"), far.sum()) | once | {"only max readings": 20}
     for name, values in users().items():
         count = counts.get(name, far)

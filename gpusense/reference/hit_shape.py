@@ -49,7 +49,7 @@ def half_mass(flags: frozenset[str], b: np.ndarray, numbers: np.ndarray) -> np.n
     with np.errstate(over="ignore", invalid="ignore"):
         ratio = np.asarray(rate, np.float64) * np.square(np.asarray(b, np.float64))
         share, is_near = ratio / (1 + ratio), ratio < 1
-    mass = np.empty_like(ratio)
-    mass[is_near] = 0.5 * betainc(0.5, half_dof, share[is_near])
-    mass[~is_near] = 0.5 - 0.5 * betainc(half_dof, 0.5, 1 / (1 + ratio[~is_near]))
+    mass, half_dof = np.empty_like(ratio), np.broadcast_to(half_dof, ratio.shape)
+    mass[is_near] = 0.5 * betainc(0.5, half_dof[is_near], share[is_near])
+    mass[~is_near] = 0.5 - 0.5 * betainc(half_dof[~is_near], 0.5, 1 / (1 + ratio[~is_near]))
     return mass.astype(b.dtype)

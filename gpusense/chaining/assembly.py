@@ -19,7 +19,7 @@ Flags = NDArray[np.bool]
 TEMPERATURE = 0.04
 """Factor of the information of matches: recorded scans have errors that repeat, which no single match shows."""
 INFLATION = 2.0
-"""Factor of the covariances of poses: halves of the recorded logs ask for 2.2 and 2.4 (docs/chaining.md)."""
+"""Factor of the covariances of poses: halves of the recorded logs ask for 2.2 and 2.4 (docs/matching.md)."""
 # Share of the largest eigenvalue below which the information of a scan's links leaves a direction open.
 _OPEN = 1e-6
 # Deviations of a pose in a direction of which nothing is known [m, rad].

@@ -79,15 +79,15 @@ def _with_parameters(text: str, file: str) -> str:
 def required_files(name: str, flags: frozenset[str] = frozenset()) -> list[str]:
     """List the files of a kernel file's program, the file itself last.
 
-    With ``WIDE``, ``lanes/<name>`` takes the place of ``<name>`` where there is such a file. Names in ``// requires:``
-    are taken as they stand, so a file in lanes names files of both folders. ``caster`` stands for the caster of the
+    With ``IN_LANES``, ``lanes/<name>`` replaces ``<name>`` where there is such a file. Names in ``// requires:`` are
+    taken as they stand, so a file in lanes names files of both folders. ``caster`` stands for the caster of the
     flags, and ``lanes/caster`` for its body in lanes or, where it has none, for ``lanes/other_caster``.
     """
     return _with_requirements(f"lanes/{name}" if _in_lanes(name, flags) else name, flags)
 
 
 def _in_lanes(name: str, flags: frozenset[str]) -> bool:
-    return "WIDE" in flags and has_opencl_source(f"lanes/{name}")
+    return "IN_LANES" in flags and has_opencl_source(f"lanes/{name}")
 
 
 def _with_requirements(name: str, flags: frozenset[str]) -> list[str]:
@@ -173,7 +173,7 @@ def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
     if any({"caster", "lanes/caster"} & set(_requirements(needed)) for needed in files):
         words |= casters.FLAGS.keys()
     if _in_lanes(file, flags):
-        words.add("WIDE")
+        words.add("IN_LANES")
     unknown = flags - FLAGS.keys()
     if unknown:
         raise ValueError(f"flags: must be among {sorted(FLAGS)}, got {sorted(unknown)}")

@@ -1,4 +1,4 @@
-"""The cloud of a filter: its particles, the steps that change them, and what of it crosses to the host.
+"""The particle cloud of a filter on one device: its steps, and the numbers that it copies to the host.
 
 A correction has stages until no temperature is left. On a GPU motion, scores and weights of a stage are one recorded
 program.
@@ -231,7 +231,7 @@ class Cloud(Particles):
         return self._read(self.weights[self.places.weight], count)
 
     def contents(self, count: int) -> Contents:
-        """Return a copy of all particles, given the number of the shown ones."""
+        """Return a copy of all particles, ``count`` of which are shown."""
         places, weighed = self.places, self.places.shown != self.places.next
         return Contents(
             self.host_poses(places.shown, count), self.host_weights(count),

@@ -1,8 +1,8 @@
-"""Sums over the particles of a filter: of blocks, of groups of blocks, and of all.
+"""Sums over a filter's particles: first over blocks, then over groups of blocks, then over all.
 
-A work-item adds up a block, so blocks, their number in a group and the number of groups are alike: the cube root of the
-number of particles. Small clouds have one group. GPUs take smaller blocks of weights, and more of them, since sums of
-weights are exact. Sums of poses have the same blocks everywhere, of which work-items of GPUs take single lanes.
+A work-item adds up a block. Particles per block, blocks per group and groups are all about the cube root of the number
+of particles. Small clouds have one group. GPUs use more and smaller blocks of weights, since sums of weights are exact.
+Sums of poses have the same blocks on every device; on GPUs a work-item adds one lane of a block.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from gpusense.interface.launches import Program, launch
 
 _DOUBLE = np.dtype(np.float64)
 _PLAIN = frozenset[str]()
-# Particles of a vector of float64, the fewest of a block, and the most blocks of a cloud with one group.
+# Particles in a float64 vector; fewest particles of a block; most blocks of a cloud with one group.
 _VECTOR, _LEAST, MOST_BLOCKS = 8, 8, 128
 
 
@@ -71,7 +71,7 @@ class Sums:
         return (launch(kernel, with_lanes_flag(self._backend.info.lanes, kernel, _PLAIN), (size,), **arguments),)
 
     def highest(self, blocks: int) -> tuple[Program, Buffer, int]:
-        """Return the launches that find the largest score of each group; their results, and the number of them."""
+        """Return the launches that find the largest score of each group, their buffer of results, and its length."""
         fan, *groups_of = reduction_fans(blocks)
         if not groups_of:
             return (), self.largest, blocks

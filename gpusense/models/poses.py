@@ -208,7 +208,7 @@ def place(
 
 @functools.cache
 def _precision_flags(double: bool, careful: bool) -> frozenset[str]:
-    return flags_if(FLOAT64=double, CAREFUL=careful)
+    return flags_if(FLOAT64=double, TWO_PART_POINTS=careful)
 
 
 def pose_status(space: Workspace) -> Buffer:

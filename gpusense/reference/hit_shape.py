@@ -20,7 +20,7 @@ def shape_exponent(flags: frozenset[str], t: Pair, numbers: np.ndarray) -> Pair:
         return t
     power, rate = numbers
     more = rate * t[0]
-    if "SHARP" not in flags:
+    if "EXACT_EXPONENT" not in flags:
         return power * np.log1p(more), np.zeros_like(more)
     exact = two_product(rate, t[0])
     high, low = two_product(power, np.log1p(more))

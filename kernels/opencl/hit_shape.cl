@@ -13,7 +13,7 @@
 real2 shape_exponent(const real2 t, const real power, const real rate) {
 #if STUDENT
     const real more = rate * t.x;
-#if SHARP
+#if EXACT_EXPONENT
     const real2 product = two_product(power, log1p(more));
     return (real2)(product.x, product.y + power * ((two_product(rate, t.x).y + rate * t.y) / (1 + more)));
 #else

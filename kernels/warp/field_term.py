@@ -32,14 +32,14 @@ def functions(flags):
     HIT = "HIT" in flags
     LINEAR = "LINEAR" in flags
     LOG_TABLE = "LOG_TABLE" in flags
-    SHARP = "SHARP" in flags
+    EXACT_EXPONENT = "EXACT_EXPONENT" in flags
     ZERO, ONE = real(0.0), real(1.0)
     SHIFT = real(0.5 if BILINEAR else 0.0)
 
     # Return the weighted sum of a and b, all of two parts. No term is negative, so small values keep their digits.
     @wp.func
     def between(weight_a: vec2, a: vec2, weight_b: vec2, b: vec2):
-        if SHARP:
+        if EXACT_EXPONENT:
             return pair_sum(pair_product(weight_a, a), pair_product(weight_b, b))
         else:
             return vec2(weight_a.x * a.x + weight_b.x * b.x, ZERO)
@@ -61,7 +61,7 @@ def functions(flags):
     # their logarithms in the log domain.
     @wp.func
     def field_square(distance: vec2, terms: wp.array(dtype=real)):
-        if SHARP:
+        if EXACT_EXPONENT:
             return pair_product(pair_product(distance, distance), vec2(terms[1], terms[5]))
         else:
             return vec2(distance.x * (distance.x * terms[1]), ZERO)

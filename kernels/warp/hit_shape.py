@@ -23,7 +23,7 @@ def functions(flags):
     two_product = error_free.functions(flags).two_product
     log_one_plus = log_terms.functions(flags).log_one_plus
     number_at = reader(real)
-    SHARP = "SHARP" in flags
+    EXACT_EXPONENT = "EXACT_EXPONENT" in flags
     STUDENT = "STUDENT" in flags
     TABLE_CELLS = wp.constant(1024 if "FLOAT64" in flags else 256)
     TABLE_PER_LOG = real(27.0 if "FLOAT64" in flags else 16.0)
@@ -37,7 +37,7 @@ def functions(flags):
             more = rate * t.x
             log_more = log_one_plus(more)
             exponent = vec2(power * log_more, ZERO)
-            if SHARP:
+            if EXACT_EXPONENT:
                 product = two_product(power, log_more)
                 exact = two_product(rate, t.x)
                 exponent = vec2(product.x, product.y + power * ((exact.y + rate * t.y) / (ONE + more)))

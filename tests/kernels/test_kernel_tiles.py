@@ -239,10 +239,15 @@ def test_blocks_of_fields_of_every_kind(name: str, names: tuple[str, ...], real:
     assert_near(found, expected.astype(np.float64), bound)
 
 
-@pytest.mark.parametrize("names", [("CAREFUL",), ("CAREFUL", "QUICK"), ("CAREFUL", "QUICK", "ALL_READINGS")])
+@pytest.mark.parametrize(
+    "names",
+    [(), ("ROUNDED_CELLS",), ("ROUNDED_CELLS", "ALL_READINGS")],
+)
 def test_blocks_of_fields(names: tuple[str, ...], device: Backend) -> None:
     for count, readings, spread in itertools.product((1, 64, 65), (1, 16, 17, 53), SPREADS):
-        found, expected, _ = field_blocks(device, "log table", np.float32, names, spread, readings, count)
+        found, expected, _ = field_blocks(
+            device, "log table", np.float32, ("TWO_PART_POINTS", *names), spread, readings, count
+        )
         assert differing(found, expected) == 0
 
 
@@ -258,8 +263,8 @@ def test_blocks_of_end_points_inside(readings: int, device: Backend) -> None:
     given = [scene[key] for key in ("table", "pose_cell", "pose", "pose_low")]
     given += [high, (point - high).astype(np.float32), scene["terms"]]
     blocks, found = -(-readings // BLOCK_TERMS), []
-    for names in (("CAREFUL",), ("CAREFUL", "QUICK"), ("CAREFUL", "QUICK", "INSIDE")):
-        flags = scene_flags(np.float32, *FIELDS["log table"], *names)
+    for names in ((), ("ROUNDED_CELLS",), ("ROUNDED_CELLS", "INSIDE")):
+        flags = scene_flags(np.float32, *FIELDS["log table"], "TWO_PART_POINTS", *names)
         both = on_both(
             device, "field_blocks", flags, items(count, 0, 64, 64), *given, guards_of(high),
             NOWHERE, np.empty(count * blocks, np.float32), WINDOW, count, readings, 0, ONE_SCAN,

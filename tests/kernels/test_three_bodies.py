@@ -53,6 +53,7 @@ ON_PURPOSE = [
     Purpose("bits", "unpacked", REFERENCE_ONLY, "the reference unpacks words to bool"),
     Purpose("circles", "point_of add_error", KERNELS_ONLY, "points come one after another"),
     Purpose("distance", "_lines _lowest", REFERENCE_ONLY, ARRAYS),
+    Purpose("distance", "parabola", KERNELS_ONLY, "the reference lowers all cells of a line at each distance"),
     Purpose("echo", "echoes", REFERENCE_ONLY, ARRAYS),
     Purpose("end_point", "within", (OPENCL,), FLOOR),
     Purpose("end_point", "rounding_margin rounded_cell table_origin table_cell", KERNELS_ONLY, QUICK),

@@ -185,7 +185,7 @@ def run_step(selection, count, flags=PLAIN, *, lanes=True, draws=c.SYSTEMATIC, l
     program += sums.launch("normalize_weights", count, weight=on["weight"], estimate=on["estimate"], share=on["share"],
                            particles=count)  # fmt: skip
     if not lanes:
-        program = [one._replace(flags=one.flags - {"WIDE"}) for one in program]
+        program = [one._replace(flags=one.flags - {"IN_LANES"}) for one in program]
     device.run(tuple(program))
     found = {name: device.download(on[name], np.empty_like(values)) for name, values in buffers.items()}
     device.synchronize()
@@ -307,7 +307,7 @@ def test_headings_are_wrapped_after_any_move_with_the_same_bits(backend, deviati
         "move_particles", count, source=on, settings=step, target=on, particles=count, kind=kind
     )
     if not lanes:
-        program = tuple(one._replace(flags=one.flags - {"WIDE"}) for one in program)
+        program = tuple(one._replace(flags=one.flags - {"IN_LANES"}) for one in program)
     device.run(program)
     assert np.array_equal(device.download(on, np.empty(3 * count)), expected)
 

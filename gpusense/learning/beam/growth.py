@@ -1,6 +1,6 @@
-"""Fit the growth of the deviation with range, or another shape of hits, together with all other parameters.
+"""Fit the growth of the deviation with range, together with all other parameters and the shape of hits.
 
-A correct range has the scale ``sigma_hit + sigma_growth z*``. The device's sums have one deviation and normal hits, so
+A correct range has the scale ``sigma_hit + sigma_growth z*``. The device's sums have one deviation, so
 that this search computes every pair's log p and gradient on the host in NumPy, in float64: Newton steps within bounds
 from the normal fit without growth, with shares of its deviation turned into growth, and with the starts of the shape.
 No step lowers the likelihood.
@@ -168,7 +168,7 @@ def fit_jointly(
     growth: bool,
     hit: HitName,
 ) -> BeamFit:
-    """Fit the growth of the deviation or the shape of hits as well, from a normal fit without growth.
+    """Fit the growth of the deviation, and the shape of hits, from a normal fit without growth.
 
     Args:
         fit: The fit.

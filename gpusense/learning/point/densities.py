@@ -14,7 +14,7 @@ from gpusense.world.hit_shapes import HitShape
 Floats = NDArray[np.float64]
 Limits: TypeAlias = tuple[tuple[float, float], ...]
 
-# Share of a coordinate of the shape by which its derivative is taken.
+# Relative step of numerical derivatives by a coordinate of the shape.
 _SHAPE_STEP = 1e-4
 
 _LOG_ROOT_TWO_PI = 0.5 * math.log(2 * math.pi)

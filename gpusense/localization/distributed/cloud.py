@@ -46,10 +46,10 @@ _PARTICLE = 32
 class SplitCloud(FilterCloud):
     """Particles over several shards.
 
-    A stage of a correction has two exchanges, of the largest score and of the sums of integer weights, and a third one
-    of particles where it draws: without jitter each shard gets the parents of its own particles; with jitter, and in
-    residual resampling, all. Each call names the particles and buffers that it works on; shards remember none, and
-    their state is here.
+    Each stage of a correction exchanges the largest score, then the sums of integer weights. A stage that draws also
+    exchanges particles: without jitter each shard receives the parents that it draws; with jitter or residual
+    resampling it receives all parents. Each call names the particles and buffers that it works on; shards remember
+    none, and their state is here.
 
     Args:
         team: The shards.
@@ -125,7 +125,7 @@ class SplitCloud(FilterCloud):
         self._set(stage.places, step.drawn, state)
 
     def _run(self, stage: Stage, step: Step, state: np.ndarray) -> None:
-        """Score and weigh the particles of a stage, and draw: those of the next step where nothing is left."""
+        """Score and weigh the particles of a stage, and draw; the last stage draws the particles of the next step."""
         number = stage.number
         each, totals, column, settings = self._weigh(stage, step, state)
         drawn = self._parts(self.count if state[number * STAGE + LEFT] > 0.0 else step.drawn)

@@ -68,7 +68,7 @@ def bind(
 
 
 def _host_task(pipeline: ScanPipeline) -> str:
-    """Return the preparation of a scan that only the host can do; empty where the device can do all of it."""
+    """Return the preparation that only the host can do, as a clause; empty where the device can do all of it."""
     if pipeline.setting.weights.is_peer:
         return "the host classes the readings for another program's weights"
     if not pipeline.backend.info.float64:
@@ -88,7 +88,8 @@ class _HostCall(BoundCall):
 
     def __init__(self, pipeline: ScanPipeline, score: Callable[..., Any], poses: Any, ranges: Any, out: Any) -> None:
         backend, real, beams = pipeline.backend, pipeline.real, pipeline.scanner.count
-        if arrays.on_device(poses):
+        on_device = arrays.on_device(poses)
+        if on_device:
             count = arrays.adopt_poses(poses, backend, "poses")[1]
         else:
             count = _shape_of("poses", poses, ("N", 3))[0]
@@ -96,7 +97,7 @@ class _HostCall(BoundCall):
             arrays.adopt_readings(ranges, backend, beams, in_place=False)
         else:
             _shape_of("ranges", ranges, (beams,))
-        self.out = Result(poses, out, (count,), real, backend).array()
+        self.out = Result(poses, out, (count,), real, backend, on_device=on_device).user_array()
         self.pipeline, self.arrays, self._score = pipeline, (poses, ranges), score
 
     def __call__(self, stream: Any = None) -> Any:
@@ -193,7 +194,7 @@ class _StagedCall(BoundCall):
                     if backend.in_batch:
                         backend.synchronize()
             except MemoryError:
-                # The whole table of a map that has changed; the ordinary call needs only a part of it.
+                # This call would need the whole table of a changed map; the ordinary call needs only a part.
                 return self._host()
             if not status[0]:
                 self.out[...] = log_p

@@ -112,7 +112,8 @@ def mixture_of(
     flags = flags_if(
         HIT=hit or everything, SHORT=short or everything, RAND=rand or everything,
         BIAS=everything or any(p.range_bias for p in kinds), GROWTH=everything or any(p.sigma_growth for p in kinds),
-        SINGLE=specialize and hit + short + rand == 1, SHARP=max(peaks) > HIGH_PEAK or everything, LINEAR=linear,
+        SINGLE=specialize and hit + short + rand == 1, EXACT_EXPONENT=max(peaks) > HIGH_PEAK or everything,
+        LINEAR=linear,
         STOPS=specialize and len(ends) == 1 and ends[0] is not None,
     )  # fmt: skip
     terms = [_terms(p, range_max, real, linear, end) for p, end in zip(kinds, ends, strict=True)]

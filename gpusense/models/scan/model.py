@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import threading
 from abc import abstractmethod
@@ -24,9 +25,9 @@ from gpusense.models.run import finish
 from gpusense.models.scan.binding import bind
 from gpusense.models.scan.bound import BoundCall
 from gpusense.models.scan.differentiable import Differentiable, is_recorded, log_likelihood_of
-from gpusense.models.scan.pipeline import ModelContext, ScanPipeline
-from gpusense.models.scan.request import Known, Request, make_request
-from gpusense.models.scan.rules import Beams, Rules, check_beams
+from gpusense.models.scan.pipeline import ScanPipeline
+from gpusense.models.scan.request import make_request
+from gpusense.models.scan.rules import Beams, ModelContext, Rules, check_beams
 from gpusense.models.scan.savings import measured_savings, sources_of
 from gpusense.models.scan.scoring import LastCall, run
 from gpusense.world.compat import Peer, choose
@@ -202,11 +203,11 @@ class ScanModel(Pickled):
             calls = self._differentiable(ranges)
             if calls is not None:
                 return cast(np.ndarray, log_likelihood_of(poses, ranges, calls))
-        request = self._request(poses, ranges, out, per_beam=per_beam)
+        request = make_request(self._setting, poses, ranges, out, per_beam=per_beam)
         with self._lock, self._workspace:
             run(self._pipeline, request, self._workspace, self._last)
             finish(self._workspace, request.poses.on_device)
-        log_p = request.result.array()
+        log_p = request.result.user_array()
         return (log_p, request.result_parts()) if per_beam else log_p
 
     def start_scoring(
@@ -223,7 +224,7 @@ class ScanModel(Pickled):
         Raises:
             TypeError, ValueError, MemoryError: see ``log_likelihood``.
         """
-        request = self._request(poses, ranges, out)._replace(before=before)
+        request = make_request(self._setting, poses, ranges, out, before=before)
         with self._lock, self._workspace:
             run(self._pipeline, request, self._workspace, self._last)
 
@@ -249,9 +250,9 @@ class ScanModel(Pickled):
         were not finite. NumPy arrays of few particles go to a GPU and back with one copy each way; elsewhere the bound
         call is the ordinary one, so that the same program runs on every backend.
 
-        Results have the bits of ``log_likelihood`` with the same poses on the device, but for scans in which bearings
-        repeat or, with a temperature below 1, no range depends on the pose, and for some of the beams by number with
-        ``specialize=False``: these agree to rounding.
+        Results have the bits of ``log_likelihood`` with the same poses on the device. Three cases agree only to
+        rounding: scans in which bearings repeat, scans of a temperature below 1 in which no range depends on the pose,
+        and ``beams=`` as a number with ``specialize=False``.
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array as ``log_likelihood`` takes it.
@@ -266,7 +267,7 @@ class ScanModel(Pickled):
         return bind(self._pipeline, self._lock, self.log_likelihood, poses, ranges, out)
 
     def explain(self, *, measure: bool = False) -> str:
-        """Report what this scene leaves out, what it keeps, and what could go, each with the reason.
+        """Report the parts that this scene leaves out, keeps, and could leave out, each with the reason.
 
         Readings and map are those of the last call.
 
@@ -302,7 +303,7 @@ class ScanModel(Pickled):
         if measure:
             with self._lock:
                 savings = measured_savings(
-                    lambda poses, ranges: self._request(poses, ranges, None), self._pipeline, self._last, plan,
+                    functools.partial(make_request, self._setting), self._pipeline, self._last, plan,
                     self.scanner.count,
                 )  # fmt: skip
             plan = dataclasses.replace(plan, measured=savings)
@@ -318,7 +319,7 @@ class ScanModel(Pickled):
 
     @abstractmethod
     def _notes(self) -> tuple[str, list[Omission], list[Note], list[Note]]:
-        """Return the title of the report, and what is left out, kept, and could go."""
+        """Return the report's title, and the parts that are left out, kept, and removable."""
 
     def prepare(self, poses: AnyArray) -> None:
         """Make the map's table for a cloud of (N, 3) poses now; ``log_likelihood`` does it otherwise.
@@ -331,15 +332,6 @@ class ScanModel(Pickled):
         if checked.count:
             with self._lock:
                 checked.window(self._pipeline.map, (0, checked.count))
-
-    def _request(
-        self, poses: AnyArray, ranges: AnyArray, out: object, *, per_beam: bool = False, known: Known | None = None
-    ) -> Request:
-        """Check the arguments of a call."""
-        return make_request(
-            poses, ranges, out, scanner=self.scanner, backend=self._setting.backend, real=self._setting.real,
-            per_beam=per_beam, known=known,
-        )  # fmt: skip
 
     def _weights_note(self) -> str:
         return "" if self.compat is None else f" with the weights of {self._setting.weights.name} (no likelihood)"

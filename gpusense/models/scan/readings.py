@@ -20,7 +20,7 @@ from gpusense.world.range_causes import NoReturn
 from gpusense.world.scanner import Scanner
 
 _INT = np.dtype(np.int32)
-# The kernel places readings by whole groups of work-items, so that those of poses begin with a group.
+# The kernel places readings by whole groups of work-items, so that the work-items of poses begin with a new group.
 _GROUP = 64
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from gpusense.backends.workspace import Workspace
 from gpusense.models.poses import Frame, Part, place
-from gpusense.models.run import Piece, run_pieces
+from gpusense.models.run import Piece, chunk_of, run_pieces
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.readings import Readings
@@ -16,7 +16,7 @@ from gpusense.models.scan.request import Request
 from gpusense.world.range_causes import NoReturn
 from gpusense.world.windows import whole
 
-_WIDE = frozenset({"WIDE"})
+_IN_LANES = frozenset({"IN_LANES"})
 
 
 @dataclass
@@ -55,7 +55,8 @@ def run(pipeline: ScanPipeline, request: Request, space: Workspace, last: LastCa
         last.scans = scans
         if not particles.count:
             continue
-        most = pipeline.chunk(scans.most_readings * pipeline.rays_each, per_beam=request.per_beam)
+        rays, kept = scans.most_readings * pipeline.rays_each, pipeline.kept_bytes(per_beam=request.per_beam)
+        most = chunk_of(pipeline.backend, rays, kept)
         run_pieces(space, particles, most, _Scorer(pipeline, request, particles, scans, space, last))
         if len(request.ranges) > 1:
             space.submit()
@@ -102,7 +103,7 @@ class _Scorer:
             )  # fmt: skip
         self._last.kernels = pipeline.kernel_names[scoring.tiles is not None]
         # Poses are placed in vectors, whatever scores them.
-        self._last.flags = (flags - _WIDE) | (scoring.flags & _WIDE)
+        self._last.flags = (flags - _IN_LANES) | (scoring.flags & _IN_LANES)
         if readings.scans > 1:
             self._last.together = max(self._last.together, readings.scans)
         if request.per_beam:

@@ -21,7 +21,7 @@ typedef struct {
 
 // Return the offset of end points in cells from the corners of the particles' cells, or with BILINEAR from their centres.
 void offsets_lanes(const Particles *particle, const real2 point, const real2 point_low, LanePair *x, LanePair *y) {
-#if CAREFUL
+#if TWO_PART_POINTS
     const real2 p = (real2)(point.x, point_low.x), q = (real2)(point.y, point_low.y);
     *x = careful_offset_lanes(particle->x, particle->x_low, particle->cos, particle->cos_low, p, particle->sin,
                               particle->sin_low, q, -1);
@@ -34,9 +34,9 @@ void offsets_lanes(const Particles *particle, const real2 point, const real2 poi
 }
 
 #if BILINEAR
-// Return the weighted sum of a and b; only weights and sums of SHARP have two parts.
+// Return the weighted sum of a and b; only weights and sums of EXACT_EXPONENT have two parts.
 LanePair between_lanes(const LanePair weight_a, const LanePair a, const LanePair weight_b, const LanePair b) {
-#if SHARP
+#if EXACT_EXPONENT
     return pair_sum_lanes(pair_product_lanes(weight_a, a), pair_product_lanes(weight_b, b));
 #else
     return (LanePair){weight_a.hi * a.hi + weight_b.hi * b.hi, 0};
@@ -45,7 +45,7 @@ LanePair between_lanes(const LanePair weight_a, const LanePair a, const LanePair
 
 // Return log p of distances from end points to the nearest obstacles: log_field of field_term.cl.
 lanes log_distance_lanes(const LanePair distance, global const real *terms) {
-#if SHARP
+#if EXACT_EXPONENT
     const LanePair square = pair_product_lanes(pair_product_lanes(distance, distance), (LanePair){terms[1], terms[5]});
 #else
     const LanePair square = {distance.hi * (distance.hi * terms[1]), 0};
@@ -55,7 +55,7 @@ lanes log_distance_lanes(const LanePair distance, global const real *terms) {
     lanes p = terms[2];
 #if HIT
     const lanes hit = terms[0] * exp_lanes(-exponent.hi);
-#if SHARP
+#if EXACT_EXPONENT
     p += hit > 0 ? hit * (1 - exponent.lo) : hit;
 #else
     p += hit;
@@ -184,7 +184,7 @@ kernel void score_field(ARGUMENTS) {
             ((real *)&particle->y)[i] = pose[n].y;
             ((real *)&particle->cos)[i] = pose[n].z;
             ((real *)&particle->sin)[i] = pose[n].w;
-#if CAREFUL
+#if TWO_PART_POINTS
             ((real *)&particle->x_low)[i] = pose_low[n].x;
             ((real *)&particle->y_low)[i] = pose_low[n].y;
             ((real *)&particle->cos_low)[i] = pose_low[n].z;
@@ -192,7 +192,7 @@ kernel void score_field(ARGUMENTS) {
 #endif
         }
         // Subtract half a cell: interpolation is between centres, and rounding to nearest must give the cell.
-#if CAREFUL
+#if TWO_PART_POINTS
 #if BILINEAR
         const LanePair x = two_sum_lanes(particle->x, (lanes)-0.5f), y = two_sum_lanes(particle->y, (lanes)-0.5f);
         particle->x = x.hi, particle->x_low = x.lo + particle->x_low;
@@ -209,7 +209,7 @@ kernel void score_field(ARGUMENTS) {
     real most[BLOCK_TERMS];
     for (int from = 0; from < all_readings; from += BLOCK_TERMS) {
         const int size = all_readings - from < BLOCK_TERMS ? all_readings - from : BLOCK_TERMS;
-#if CAREFUL
+#if TWO_PART_POINTS
 #if !BILINEAR
         // Rounding errors of an end point are at most 2.5 eps times its reading in cells, plus 0.7 eps.
         real least = 0.5f;
@@ -224,7 +224,7 @@ kernel void score_field(ARGUMENTS) {
         for (int v = 0; v * LANES < count; ++v) {
             const int first = begin + v * LANES, used = count - v * LANES < LANES ? count - v * LANES : LANES;
             lanes block = 0;
-#if CAREFUL
+#if TWO_PART_POINTS
 #if !BILINEAR
             EndPoints ends;
             if (find_cells(&ends, &all[v], point + from, size, window, least))

@@ -11,7 +11,7 @@ lanes log_one_plus_lanes(const lanes x) {
 LanePair shape_exponent_lanes(const LanePair t, const lanes power, const lanes rate) {
 #if STUDENT
     const lanes more = rate * t.hi;
-#if SHARP
+#if EXACT_EXPONENT
     const LanePair product = two_product_lanes(power, log_one_plus_lanes(more));
     const lanes low = two_product_lanes(rate, t.hi).lo + rate * t.lo;
     return (LanePair){product.hi, product.lo + power * (low / (1 + more))};

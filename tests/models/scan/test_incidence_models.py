@@ -79,7 +79,7 @@ def test_equal_bins_are_the_plain_model(weights, backend):
         plain = model_of(backend, incidence=None, parameters=parameters, precision=precision)
         found, parts = model.log_likelihood(poses, z, per_beam=True)
         expected, plain_parts = plain.log_likelihood(poses, z, per_beam=True)
-        if "WIDE" in plain._last.flags:
+        if "IN_LANES" in plain._last.flags:
             # Functions of vectors may round otherwise.
             assert (np.abs(parts - plain_parts) <= 2 * per_beam(plain_parts, precision)).all()
             assert (np.abs(found - expected) <= 2 * per_scan(plain_parts, precision)).all()
@@ -91,7 +91,7 @@ def test_tiles_and_orders_change_nothing(as_gpu, backend, monkeypatch):
     _, poses, _ = place()
     model, z = model_of(as_gpu(False, scalar=True)), a_scan()
     one_by_one, parts = model.log_likelihood(poses, z, per_beam=True)
-    assert "WIDE" not in model._last.flags
+    assert "IN_LANES" not in model._last.flags
     for least in (tiles.LEAST_ORDERED, (1, 1)):
         monkeypatch.setattr(tiles, "LEAST_ORDERED", least)
         tiled = model_of(as_gpu(True))

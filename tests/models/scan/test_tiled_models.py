@@ -230,7 +230,7 @@ def test_end_points_on_edges_of_cells(resolution, quarter_turns, as_gpu):
     model = gs.LikelihoodFieldModel(grid, scanner, backend=as_gpu())
     poses = lattice(resolution, quarter_turns)
     found = model.log_likelihood(poses, z)
-    assert {"QUICK"} <= code_of(model)
+    assert {"ROUNDED_CELLS"} <= code_of(model)
     together, parts = model.log_likelihood(poses, z, per_beam=True)
     assert differing(found, together) == 0
     truth = gs.LikelihoodFieldModel(grid, scanner, backend=as_gpu(), precision="float64")

@@ -37,7 +37,7 @@ KERNELS: dict[str, Kernel] = {
     ),
     "cast_ranges": kernel(
         "ranges", "ray particle", *_CAST, *POSES, "real2 ray [rays]", "out real ranges [particles * rays]", WINDOW,
-        "int particles", "int rays", *_CASTING, in_lanes=True,
+        "int particles", "int rays", *_CASTING, in_lanes=True, lanes_group=8,
     ),
     "score_beams": kernel(
         "beam", "particle", *_CAST, *_NORMALS, *POSES, _CONES, "int first [rays + 1]", "real reading [readings]",

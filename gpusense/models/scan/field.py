@@ -203,7 +203,7 @@ class LikelihoodFieldModel(ScanModel):
             could_go.append(Note("interpolation", "interpolation='nearest' has one look-up in place of four"))
             if "EXACT_EXPONENT" in pipeline.components:
                 kept.append(Note("exponents in two parts", f"the hit density's peak is above {HIGH_PEAK:g} / m"))
-            if "LINEAR" not in pipeline.components:
+            if p.z_rand and "LINEAR" not in pipeline.components:
                 kept.append(Note("log-domain sum", "z_rand does not bound the mixture from below"))
         if pipeline.log_table:
             omissions.append(

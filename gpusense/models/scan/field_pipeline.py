@@ -94,6 +94,7 @@ class FieldPipeline(ScanPipeline):
             FLOAT64=not self.careful, TWO_PART_POINTS=self.careful, ALL_READINGS=everything, BILINEAR=bilinear,
             LOG_TABLE=self.log_table, CUBES=cubes, HIT=p.z_hit > 0 or everything, LINEAR=density.is_linear(self.real),
             EXACT_EXPONENT=not self.log_table and (density.is_sharp or everything),
+            RAND=p.z_rand > 0 or everything,
         )  # fmt: skip
         return flags | density.flags, density.terms(self.real)
 

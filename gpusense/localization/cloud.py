@@ -196,9 +196,9 @@ class Cloud(Particles):
         if self.backend.info.kind != "gpu":
             return self.estimate(count)[:MOMENTS]
         out, poses, weight = self.backend.blank(ESTIMATE, _DOUBLE), self.poses[self.places.shown], self.places.weight
-        for again in (0, 1):
+        for second_pass in (0, 1):
             # The second pass is right for any headings.
-            self.backend.run(self.sums.estimate(poses, self.weights[weight], out, count, again))
+            self.backend.run(self.sums.estimate(poses, self.weights[weight], out, count, second_pass))
         return self._lent(out, (MOMENTS,))
 
     def particles(self, count: int) -> Any:
@@ -212,13 +212,13 @@ class Cloud(Particles):
         numbers = self._estimate(count, 0)
         return self._estimate(count, 1) if numbers[WIDE_HEADINGS] else numbers
 
-    def _estimate(self, count: int, again: int) -> np.ndarray:
+    def _estimate(self, count: int, second_pass: int) -> np.ndarray:
         """Return the numbers after a pass of the estimate."""
         shown, weight = self.places.shown, self.places.weight
         # Clouds that change their size seldom ask twice for the same.
         self._estimates.run(
-            (shown, weight, count, again),
-            lambda: self.sums.estimate(self.poses[shown], self.weights[weight], self.estimated, count, again),
+            (shown, weight, count, second_pass),
+            lambda: self.sums.estimate(self.poses[shown], self.weights[weight], self.estimated, count, second_pass),
         )
         return self._read(self.estimated, ESTIMATE)
 

@@ -26,7 +26,7 @@ from gpusense.interface.constants import (
     STATE,
 )
 from gpusense.localization.particles import Places
-from gpusense.reference.rungs import left_of
+from gpusense.reference.tempering import left_of
 
 # Lowest depth of a ladder: distances of a million deviations differ by 2^-39 on its last rung.
 _DEEPEST = LOWEST**5

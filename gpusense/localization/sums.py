@@ -124,14 +124,15 @@ class Sums:
                          fan=reduction_fans(blocks)[0], drawn=drawn, stage=stage, **numbers),
         )  # fmt: skip
 
-    def estimate(self, poses: Buffer, weight: Buffer, estimate: Buffer, count: int, again: int = 0) -> Program:
+    def estimate(self, poses: Buffer, weight: Buffer, estimate: Buffer, count: int, second_pass: int = 0) -> Program:
         """Return the launches that write the estimate of a cloud, or those of its second pass."""
         info, block = self._backend.info, block_of(count)
         # A work-item of a kernel in vectors takes all lanes.
         lanes = ESTIMATE_LANES if info.kind == "cpu" or info.lanes > 1 else 1
         blocks, each = -(-count // block), ESTIMATE_LANES // lanes
         program = self.launch("sum_poses", blocks * each, poses=poses, weight=weight, estimate=estimate,
-                              sums=self.rows, particles=count, block=block, lanes=lanes, again=again)  # fmt: skip
+                              sums=self.rows, particles=count, block=block, lanes=lanes,
+                              second_pass=second_pass)  # fmt: skip
         # finish_estimate adds up the groups; on GPUs one more join is faster.
         fans = (each, *reduction_fans(blocks)) if each > 1 else reduction_fans(blocks)[:-1]
         source, target, groups = self.rows, self._joined, blocks * each
@@ -140,7 +141,7 @@ class Sums:
             program += launches
             source, target = target, source
         return program + self.launch("finish_estimate", 1, poses=poses, sums=source, estimate=estimate,
-                                     groups=groups, again=again)  # fmt: skip
+                                     groups=groups, second_pass=second_pass)  # fmt: skip
 
     def _weight_totals(self, blocks: int) -> Program:
         """Return the launches that add up the rows of weights of groups, and of all groups."""

@@ -143,15 +143,15 @@ class Tracker:
         self.cloud.move(self.settings(motion, []), motion.kind)
         self.shown, self.pending = self.cloud.count, following
 
-    def weigh(self, given: list[SensorReadings], *, again: bool = False) -> None:
+    def weigh(self, given: list[SensorReadings], *, corrected_before: bool = False) -> None:
         """Run the motion, and correct the particles by readings of sensors.
 
         Args:
             given: Indices of sensors with their readings.
-            again: Whether the particles were corrected before, so that some may be copies.
+            corrected_before: Whether the particles were corrected before, so that some may be copies.
         """
         chosen, motion = self.options, STILL if self.pending is None else self.pending
-        self.distinct = self._distinct_share() if self.pending is None and again else 1.0
+        self.distinct = self._distinct_share() if self.pending is None and corrected_before else 1.0
         drawn = self.cloud.count if chosen.least == chosen.most else self._wanted()
         settings = self.settings(motion, [index for index, _ in given])
         self.shown, self.pending = self.cloud.count, None

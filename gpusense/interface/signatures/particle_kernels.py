@@ -50,11 +50,11 @@ KERNELS: dict[str, Kernel] = {
     ),
     "sum_poses": kernel(
         "estimate", "group", "double poses [3 * particles]", "double weight [particles]", "double estimate [11]",
-        "out double sums [13]", "int particles", "int block", "int lanes", "int again", group=16,
+        "out double sums [13]", "int particles", "int block", "int lanes", "int second_pass", group=16,
     ),
     "finish_estimate": kernel(
         "estimate", "whole", "double poses [3]", "double sums [13 * groups]", "out double estimate [11]", "int groups",
-        "int again", group=1,
+        "int second_pass", group=1,
     ),
     "normalize_weights": kernel(
         "estimate", "pose", "double weight [particles]", "double estimate [11]", "out double share [particles]",

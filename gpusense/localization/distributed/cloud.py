@@ -35,7 +35,7 @@ from gpusense.localization.particles import Places, Stage
 from gpusense.localization.sums import reduction_fans
 from gpusense.reference.draws import mark_of
 from gpusense.reference.estimate import finish_estimate
-from gpusense.reference.rungs import column_of, left_of, possible_of, rung_of, set_stage
+from gpusense.reference.tempering import column_of, left_of, possible_of, rung_of, set_stage
 from gpusense.reference.weighing import join_rows
 
 _PLAIN = frozenset[str]()
@@ -204,15 +204,15 @@ class SplitCloud(FilterCloud):
         asked = [(shown, 1 if index == holder else 0) for index in range(self._size)]
         first = self._team.each("poses", asked)[holder][0]
         buffers = shown, self.places.weight
-        for again in (0, 1):
-            reference = result[:3].copy() if again else first
+        for second_pass in (0, 1):
+            reference = result[:3].copy() if second_pass else first
             table = np.concatenate(
                 self._team.each("sum_poses", [(buffers, part.size, part.block, reference) for part in parts])
             )
             for fan in reduction_fans(len(table)):
                 sums, table = table.reshape(-1), np.empty((-(-len(table) // fan), ESTIMATE_SUMS))
                 join_rows(_PLAIN, sums, table.reshape(-1), len(sums) // ESTIMATE_SUMS, ESTIMATE_SUMS, fan)
-            finish_estimate(_PLAIN, first, table.reshape(-1), result, 1, again)
+            finish_estimate(_PLAIN, first, table.reshape(-1), result, 1, second_pass)
             if not result[WIDE_HEADINGS]:
                 break
         return result

@@ -32,7 +32,7 @@ from gpusense.localization.distributed.parts import Marks, Part, Piece, SensorRe
 from gpusense.localization.distributed.shard_pool import ShardPool
 from gpusense.localization.particles import Places, Stage
 from gpusense.localization.sensors import Sensor
-from gpusense.reference.rungs import left_of, rung_of
+from gpusense.reference.tempering import left_of, rung_of
 
 # Units in the last place within which the product of two numbers reaches a neighbour of another product.
 _UNITS = 16
@@ -291,7 +291,7 @@ class Shard:
         self._backend.run(
             cloud.sums.launch("sum_poses", blocks, poses=cloud.poses[buffers[0]], weight=cloud.weights[buffers[1]],
                               estimate=cloud.estimated, sums=cloud.sums.rows, particles=count, block=block,
-                              lanes=ESTIMATE_LANES, again=1),
+                              lanes=ESTIMATE_LANES, second_pass=1),
         )  # fmt: skip
         yield
         return self._read(cloud.sums.rows, blocks * ESTIMATE_SUMS).reshape(blocks, ESTIMATE_SUMS)

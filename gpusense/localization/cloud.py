@@ -209,18 +209,27 @@ class Cloud(Particles):
 
     def estimate(self, count: int) -> np.ndarray:
         """Return the kernels' estimate of the shown particles: mean, covariance, sum of weights."""
-        numbers = self._estimate(count, 0)
-        return self._estimate(count, 1) if numbers[WIDE_HEADINGS] else numbers
+        return self._figures(count)[2, :ESTIMATE]
 
-    def _estimate(self, count: int, again: int) -> np.ndarray:
-        """Return the numbers after a pass of the estimate."""
+    def estimate_and_summary(self, count: int) -> tuple[np.ndarray, Summary]:
+        """See FilterCloud.estimate_and_summary; one copy brings both to the host."""
+        figures = self._figures(count)
+        return figures[2, :ESTIMATE], summary_of(figures[self.places.state])
+
+    def _figures(self, count: int) -> np.ndarray:
+        """Return both states and the estimate as rows."""
+        figures = self._estimated(count, 0)
+        return self._estimated(count, 1) if figures[2, WIDE_HEADINGS] else figures
+
+    def _estimated(self, count: int, again: int) -> np.ndarray:
+        """Return both states, and the estimate after a pass."""
         shown, weight = self.places.shown, self.places.weight
         # Clouds that change their size seldom ask twice for the same.
         self._estimates.run(
             (shown, weight, count, again),
             lambda: self.sums.estimate(self.poses[shown], self.weights[weight], self.estimated, count, again),
         )
-        return self._read(self.estimated, ESTIMATE)
+        return self._read(self.figures, 3 * self.stride).reshape(3, self.stride)[:, :STATE]
 
     def host_poses(self, index: int, count: int) -> np.ndarray:
         """Return a copy of the poses of a buffer."""

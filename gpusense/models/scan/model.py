@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import threading
 from abc import abstractmethod
@@ -24,6 +25,7 @@ from gpusense.models.run import finish
 from gpusense.models.scan.binding import bind
 from gpusense.models.scan.bound import BoundCall
 from gpusense.models.scan.differentiable import Differentiable, is_recorded, log_likelihood_of
+from gpusense.models.scan.packed_call import ShortCalls
 from gpusense.models.scan.pipeline import ModelContext, ScanPipeline
 from gpusense.models.scan.request import Known, Request, make_request
 from gpusense.models.scan.rules import Beams, Rules, check_beams
@@ -82,7 +84,30 @@ class ScanModel(Pickled):
         self._workspace = Workspace(device)
         # Threads may share a model: its buffers serve one call at a time.
         self._lock = threading.Lock()
-        self._last = LastCall()
+        self._last_call = LastCall()
+
+    @functools.cached_property
+    def _short(self) -> ShortCalls | None:
+        """Calls of few particles that repeat a size; None where there are none."""
+        return ShortCalls.of(self._pipeline)
+
+    @property
+    def _last(self) -> LastCall:
+        """The last call; a short one is repeated as one of any size, since only those report what they leave out."""
+        call = None if self._short is None else self._short.last
+        if call is not None:
+            poses, ranges = (array.copy() for array in call.arrays)
+            request = self._request(poses, ranges, None)
+            with self._lock, self._workspace:
+                self._run(request)
+                finish(self._workspace, request.poses.on_device)
+        return self._last_call
+
+    def _run(self, request: Request) -> None:
+        """Start the launches of a request that is not short, while the model is locked."""
+        if self._short is not None:
+            self._short.last = None
+        run(self._pipeline, request, self._workspace, self._last_call)
 
     def __repr__(self) -> str:
         count, used = self.scanner.count, self._setting.rules.choice.most
@@ -202,9 +227,14 @@ class ScanModel(Pickled):
             calls = self._differentiable(ranges)
             if calls is not None:
                 return cast(np.ndarray, log_likelihood_of(poses, ranges, calls))
+        if self._short is not None and not per_beam:
+            with self._lock:
+                found = self._short.score(poses, ranges, out)
+            if found is not None:
+                return found
         request = self._request(poses, ranges, out, per_beam=per_beam)
         with self._lock, self._workspace:
-            run(self._pipeline, request, self._workspace, self._last)
+            self._run(request)
             finish(self._workspace, request.poses.on_device)
         log_p = request.result.array()
         return (log_p, request.result_parts()) if per_beam else log_p
@@ -225,7 +255,7 @@ class ScanModel(Pickled):
         """
         request = self._request(poses, ranges, out)._replace(before=before)
         with self._lock, self._workspace:
-            run(self._pipeline, request, self._workspace, self._last)
+            self._run(request)
 
     def finish_scoring(self) -> None:
         """Wait for calls that ``start_scoring`` has begun.

@@ -227,14 +227,14 @@ class ScanModel(Pickled):
             calls = self._differentiable(ranges)
             if calls is not None:
                 return cast(np.ndarray, log_likelihood_of(poses, ranges, calls))
-        if self._short is not None and not per_beam:
+        if self._short is not None:
             with self._lock:
-                found = self._short.score(poses, ranges, out)
+                found = self._short.score(poses, ranges, out, per_beam=per_beam)
             if found is not None:
                 return found
         request = self._request(poses, ranges, out, per_beam=per_beam)
         with self._lock, self._workspace:
-            self._run(request)
+            run(self._pipeline, request, self._workspace, self._last_call)
             finish(self._workspace, request.poses.on_device)
         log_p = request.result.array()
         return (log_p, request.result_parts()) if per_beam else log_p

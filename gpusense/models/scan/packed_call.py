@@ -175,16 +175,17 @@ class ShortCalls:
         certain = pipeline.specialize and pipeline.rules.separate and pipeline.setting.possible
         return ShortCalls(pipeline) if certain else None
 
-    def score(self, poses: Any, ranges: Any, out: Any) -> np.ndarray | None:
+    def score(self, poses: Any, ranges: Any, out: Any, *, per_beam: bool) -> np.ndarray | None:
         """Score poses by the readings of a scan; None where that is left to another call.
 
         Args:
             poses: Poses as ``log_likelihood`` takes them.
             ranges: Its readings.
             out: Its array for the result, or None.
+            per_beam: Whether the log-likelihoods of the readings are requested.
         """
         self.last = None
-        if type(poses) is not np.ndarray or type(ranges) is not np.ndarray:
+        if per_beam or type(poses) is not np.ndarray or type(ranges) is not np.ndarray:
             return None
         pipeline, count = self._pipeline, len(poses) if poses.ndim else 0
         if poses.shape != (count, 3) or ranges.shape != (pipeline.scanner.count,):

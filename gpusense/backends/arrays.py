@@ -221,7 +221,7 @@ def like(poses: object, result: np.ndarray) -> Any:
     return _converted(poses, result)
 
 
-def check_out(out: object, shape: tuple[int, ...], real: np.dtype, poses: object, backend: Backend) -> Any:
+def check_out(out: object, shape: tuple[int, ...], real: np.dtype, backend: Backend, *, device_poses: bool) -> Any:
     """Return the memory of ``out=``: a NumPy array, or a flat buffer on the device; None where ``out`` is None.
 
     Raises:
@@ -230,7 +230,7 @@ def check_out(out: object, shape: tuple[int, ...], real: np.dtype, poses: object
     """
     if out is None:
         return None
-    if on_device(out) != on_device(poses):
+    if on_device(out) != device_poses:
         raise TypeError("out: must be in the memory where the poses are, got one that is not")
     if on_device(out):
         adopted = _adopt(out, backend, "out", in_place=True)

@@ -23,14 +23,14 @@ _ROUND = 256
 
 
 def chunk_of(backend: Backend, beams: int, itemsize: float = 0) -> int:
-    """Return the particles of one launch.
+    """Return the most particles of one launch.
 
     Args:
         backend: The device.
-        beams: Beams of each particle.
+        beams: Beams of each particle; 0 counts as 1.
         itemsize: Bytes of a result per particle and beam.
     """
-    chunk = CHUNK
+    chunk, beams = CHUNK, max(beams, 1)
     if itemsize:
         chunk = min(chunk, int(CHUNK_BYTES // (beams * itemsize)))
     if backend.info.kind == "cpu":

@@ -154,7 +154,7 @@ class PointModel(Pickled):
         backend, space, real = self._backend, self._workspace, self._real
         checked = Poses(poses, backend)
         count, on_device = checked.count, checked.on_device
-        result = Result(poses, out, (count,), real, backend)
+        result = Result(poses, out, (count,), real, backend, on_device=on_device)
 
         def score(piece: Piece) -> None:
             with space.result("log_p", result.flat, piece.begin, piece.count, real) as log_p:
@@ -174,9 +174,9 @@ class PointModel(Pickled):
             if program is None and not on_device:
                 result.flat[:] = 0
             else:
-                run_pieces(space, Piece(0, count, count), chunk_of(backend, max(items, 1), itemsize), score)
+                run_pieces(space, Piece(0, count, count), chunk_of(backend, items, itemsize), score)
             finish(space, on_device)
-        return result.array()
+        return result.user_array()
 
     def _relative(self, poses: Poses, part: Part, kernel: str, numbers: dict[str, float]) -> tuple[Buffer, Program]:
         """Return the places or residuals of some poses, and the launch of the file ``relative`` that computes them.

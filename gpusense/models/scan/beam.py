@@ -265,11 +265,11 @@ class BeamModel(ScanModel):
             self._mixtures, mixture.cosines, table, self.scanner.range_max, self._setting.real, seed=seed, step=step,
             per_scan=shape[-1],
         )  # fmt: skip
-        result = Result(poses, out, (*shape, self.scanner.count), self._setting.real, self._setting.backend)
-        pipeline = self._beam_pipeline
+        pipeline, shape = self._beam_pipeline, (*shape, self.scanner.count)
+        result = Result(poses, out, shape, pipeline.real, pipeline.backend, on_device=checked.on_device)
         cones = dataclasses.replace(pipeline.cones, incidence=drawing.bins > 1)
         self._caster.draw(checked, pipeline.cone_vectors, result.flat, cones, drawing)
-        return result.array()
+        return result.user_array()
 
     def _notes(self) -> tuple[str, list[Omission], list[Note], list[Note]]:
         return scene_notes(

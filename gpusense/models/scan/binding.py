@@ -73,7 +73,8 @@ class _HostCall(BoundCall):
 
     def __init__(self, pipeline: ScanPipeline, score: Callable[..., Any], poses: Any, ranges: Any, out: Any) -> None:
         backend, real, beams = pipeline.backend, pipeline.real, pipeline.scanner.count
-        if arrays.on_device(poses):
+        on_device = arrays.on_device(poses)
+        if on_device:
             count = arrays.adopt_poses(poses, backend, "poses")[1]
         else:
             count = _shape_of("poses", poses, ("N", 3))[0]
@@ -81,7 +82,7 @@ class _HostCall(BoundCall):
             arrays.adopt_readings(ranges, backend, beams, in_place=False)
         else:
             _shape_of("ranges", ranges, (beams,))
-        self.out = Result(poses, out, (count,), real, backend).array()
+        self.out = Result(poses, out, (count,), real, backend, on_device=on_device).user_array()
         self.pipeline, self.arrays, self._score = pipeline, (poses, ranges), score
 
     def __call__(self, stream: Any = None) -> Any:

@@ -21,7 +21,7 @@ from gpusense.backends.workspace import POSE_STATUS, Workspace
 from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.interface.launches import Program
 from gpusense.models.poses import Poses
-from gpusense.models.run import finish
+from gpusense.models.run import chunk_of, finish
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.readings import Readings, device_readings
 from gpusense.world.windows import Corners
@@ -113,8 +113,8 @@ class DeviceCall(BoundCall):
         self._poses.hull = corners
         count = self._poses.count
         adopted = arrays.adopt_readings(ranges, backend, pipeline.scanner.count, in_place=True)
-        result = Result(poses, out, (count,), real, backend)
-        self._log_p, self.out = result.flat, result.array()
+        result = Result(poses, out, (count,), real, backend, on_device=True)
+        self._log_p, self.out = result.flat, result.user_array()
         # The owners of the memory that is read and written.
         self._owners = (poses, ranges, adopted, self.out)
         # Private buffers: other calls of the model may come between.
@@ -124,7 +124,8 @@ class DeviceCall(BoundCall):
         self._readings = self._placed_readings(adopted, adopted.dtype if limits is None else limits)
         # Pieces begin where parts of buffers can.
         whole = max(backend.alignment // _INT.itemsize, 1)
-        chunk = pipeline.chunk(self._readings.readings * pipeline.rays_each)
+        rays = self._readings.readings * pipeline.rays_each
+        chunk = chunk_of(backend, rays, pipeline.kept_bytes())
         self._chunk = -(-chunk // whole) * whole
         # The program for the map as it is, by the version of its table.
         self._programs = ProgramCache[RecordedProgram](1)

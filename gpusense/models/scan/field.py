@@ -19,6 +19,7 @@ from gpusense.models.scan.differentiable import Differentiable
 from gpusense.models.scan.field_gradient import gradients, in_world
 from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.model import ScanModel
+from gpusense.models.scan.request import make_request
 from gpusense.models.scan.rules import Beams
 from gpusense.world.compat import Peer, check_weights, choose
 from gpusense.world.grid import OccupancyGrid
@@ -127,7 +128,7 @@ class LikelihoodFieldModel(ScanModel):
                 "interpolation: must be 'bilinear' for gradients, got a field with 'nearest': pass "
                 "LikelihoodFieldParameters(interpolation='bilinear')"
             )
-        request = self._request(poses, ranges, None)
+        request = make_request(self._setting, poses, ranges)
         with self._lock, self._workspace:
             numbers = gradients(self._field_pipeline, request, self._workspace)
             finish(self._workspace, request.poses.on_device)

@@ -10,7 +10,7 @@ from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import launch
 from gpusense.interface.signatures.rows import LANES
 from gpusense.interface.structs import ScanBatch, Score
-from gpusense.models.run import Piece, run_pieces
+from gpusense.models.run import Piece, chunk_of, run_pieces
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.readings import Readings, placing_launches
@@ -25,7 +25,7 @@ def gradients(pipeline: FieldPipeline, request: Request, space: Workspace) -> np
     result = np.zeros((request.scans * request.per_scan, GRADIENT_NUMBERS), pipeline.real)
     for particles, scans in pipeline.groups(request):
         if particles.count:
-            most = pipeline.chunk(4 * scans.most_readings)
+            most = chunk_of(pipeline.backend, 4 * scans.most_readings, pipeline.kept_bytes())
             run_pieces(space, particles, most, _Gradient(pipeline, request, particles, scans, space, result))
     return result
 

@@ -16,8 +16,9 @@ from gpusense.interface.launches import Program, launch
 from gpusense.interface.structs import Score
 from gpusense.models.poses import PlacedPoses
 from gpusense.models.scan.classed import ClassedScans
-from gpusense.models.scan.pipeline import ModelContext, ScanLaunch, ScanPipeline, Tiles
+from gpusense.models.scan.pipeline import ScanLaunch, ScanPipeline, Tiles
 from gpusense.models.scan.readings import Readings, Sensing
+from gpusense.models.scan.rules import ModelContext
 from gpusense.models.scan.tiles import ENOUGH_SHORT, all_within, spread_of, sum_launch
 from gpusense.tables.field import RING, FieldTable
 from gpusense.tables.reachable import ReachableMap

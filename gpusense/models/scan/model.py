@@ -26,9 +26,9 @@ from gpusense.models.scan.binding import bind
 from gpusense.models.scan.bound import BoundCall
 from gpusense.models.scan.differentiable import Differentiable, is_recorded, log_likelihood_of
 from gpusense.models.scan.packed_call import ShortCalls
-from gpusense.models.scan.pipeline import ModelContext, ScanPipeline
-from gpusense.models.scan.request import Known, Request, make_request
-from gpusense.models.scan.rules import Beams, Rules, check_beams
+from gpusense.models.scan.pipeline import ScanPipeline
+from gpusense.models.scan.request import Request, make_request
+from gpusense.models.scan.rules import Beams, ModelContext, Rules, check_beams
 from gpusense.models.scan.savings import measured_savings, sources_of
 from gpusense.models.scan.scoring import LastCall, run
 from gpusense.world.compat import Peer, choose
@@ -97,7 +97,7 @@ class ScanModel(Pickled):
         call = None if self._short is None else self._short.last
         if call is not None:
             poses, ranges = (array.copy() for array in call.arrays)
-            request = self._request(poses, ranges, None)
+            request = make_request(self._setting, poses, ranges)
             with self._lock, self._workspace:
                 self._run(request)
                 finish(self._workspace, request.poses.on_device)
@@ -232,11 +232,11 @@ class ScanModel(Pickled):
                 found = self._short.score(poses, ranges, out, per_beam=per_beam)
             if found is not None:
                 return found
-        request = self._request(poses, ranges, out, per_beam=per_beam)
+        request = make_request(self._setting, poses, ranges, out, per_beam=per_beam)
         with self._lock, self._workspace:
             run(self._pipeline, request, self._workspace, self._last_call)
             finish(self._workspace, request.poses.on_device)
-        log_p = request.result.array()
+        log_p = request.result.user_array()
         return (log_p, request.result_parts()) if per_beam else log_p
 
     def start_scoring(
@@ -253,7 +253,7 @@ class ScanModel(Pickled):
         Raises:
             TypeError, ValueError, MemoryError: see ``log_likelihood``.
         """
-        request = self._request(poses, ranges, out)._replace(before=before)
+        request = make_request(self._setting, poses, ranges, out, before=before)
         with self._lock, self._workspace:
             self._run(request)
 
@@ -332,7 +332,7 @@ class ScanModel(Pickled):
         if measure:
             with self._lock:
                 savings = measured_savings(
-                    lambda poses, ranges: self._request(poses, ranges, None), self._pipeline, self._last, plan,
+                    functools.partial(make_request, self._setting), self._pipeline, self._last, plan,
                     self.scanner.count,
                 )  # fmt: skip
             plan = dataclasses.replace(plan, measured=savings)
@@ -361,15 +361,6 @@ class ScanModel(Pickled):
         if checked.count:
             with self._lock:
                 checked.window(self._pipeline.map, (0, checked.count))
-
-    def _request(
-        self, poses: AnyArray, ranges: AnyArray, out: object, *, per_beam: bool = False, known: Known | None = None
-    ) -> Request:
-        """Check the arguments of a call."""
-        return make_request(
-            poses, ranges, out, scanner=self.scanner, backend=self._setting.backend, real=self._setting.real,
-            per_beam=per_beam, known=known,
-        )  # fmt: skip
 
     def _weights_note(self) -> str:
         return "" if self.compat is None else f" with the weights of {self._setting.weights.name} (no likelihood)"

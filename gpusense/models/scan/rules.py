@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpusense._util.checks import integer, show
+from gpusense.backends import Backend
+from gpusense.world.likelihood import Likelihood
 from gpusense.world.plausible import FirstScans
 from gpusense.world.scanner import Reading, Scanner
 
@@ -117,6 +119,31 @@ def choose_beams(kinds: np.ndarray, beams: Beams, informative_max: bool) -> np.n
     """Return whether each reading is used: all, an even choice of ``beams`` informative ones, or those of indices."""
     informative = (kinds == Reading.HIT) | ((kinds == Reading.MAX) & informative_max)
     return BeamChoice.of(beams, len(kinds)).used(informative)
+
+
+@dataclass(frozen=True)
+class ModelContext:
+    """The device, and the rules for readings, of a scan model.
+
+    Attributes:
+        backend: The device.
+        real: Precision.
+        rules: How readings are classed; they hold the scanner.
+        weights: The book's likelihood, or the program whose weights are reproduced.
+        cubes: Whether the model sums cubes of densities, in place of logarithms.
+        temperature: Multiplies the sum over readings.
+        constant_term: The first term of that sum.
+        possible: Whether some range is possible at some pose.
+    """
+
+    backend: Backend
+    real: np.dtype
+    rules: Rules
+    weights: Likelihood
+    cubes: bool
+    temperature: float
+    constant_term: float
+    possible: bool
 
 
 def check_beams(beams: Beams, count: int) -> Beams:

@@ -9,7 +9,7 @@ import numpy as np
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.terms import log_weight
 from gpusense.models.poses import Frame, Part, place
-from gpusense.models.run import Piece, run_pieces
+from gpusense.models.run import Piece, chunk_of, run_pieces
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.readings import Readings
@@ -55,7 +55,8 @@ def run(pipeline: ScanPipeline, request: Request, space: Workspace, last: LastCa
         last.scans = scans
         if not particles.count:
             continue
-        most = pipeline.chunk(scans.most_readings * pipeline.rays_each, per_beam=request.per_beam)
+        rays, kept = scans.most_readings * pipeline.rays_each, pipeline.kept_bytes(per_beam=request.per_beam)
+        most = chunk_of(pipeline.backend, rays, kept)
         run_pieces(space, particles, most, _Scorer(pipeline, request, particles, scans, space, last))
         if len(request.ranges) > 1:
             space.submit()

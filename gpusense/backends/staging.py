@@ -21,7 +21,7 @@ from gpusense.backends import helpers
 # Bytes of a slot, slots, and slots that the threads fill or empty while the device works on the others.
 SLOT, SLOTS, _AHEAD = 4 << 20, 16, 8
 # Least bytes of a copy for which pieces pay, and of a piece.
-LEAST, _LEAST_PIECE = 2 << 20, 512 << 10
+LEAST, _LEAST_PIECE = 8 << 20, 1 << 20
 # Threads below which a driver's own copy is faster.
 _LEAST_THREADS = 4
 

@@ -147,21 +147,12 @@ class Particles:
         self.weights = [make(capacity, _DOUBLE) for _ in range(4)]
         self.log_p = [make(capacity, precision) for _ in range(sensors)]
         self.score, self.ends = backend.empty(capacity, _DOUBLE), backend.empty(capacity, _DOUBLE)
-        self.sums = Sums(backend, capacity)
+        self.sums, self.estimated = Sums(backend, capacity), backend.empty(ESTIMATE, _DOUBLE)
         self.settings = backend.empty(SETTINGS, _DOUBLE)
-        # The estimate and both states lie side by side, so that one copy brings all to the host.
-        self.figures = backend.upload(np.zeros(3 * self.stride))
-        parts = [backend.part(self.figures, n * self.stride, STATE, _DOUBLE) for n in range(3)]
-        self.estimated, self.states = parts[2], parts[:2]
+        self.states = [backend.upload(np.zeros(STATE)) for _ in range(2)]
         self.pool, self.pool_size = backend.upload(np.zeros(3)), 0
         # Cumulative numbers of certain copies.
         self._copies = backend.empty(capacity, _DOUBLE) if residual else None
-
-    @property
-    def stride(self) -> int:
-        """Numbers between the beginnings of the states, where the device can address them."""
-        size = max(self.backend.alignment, 256) // _DOUBLE.itemsize
-        return -(-max(STATE, ESTIMATE) // size) * size
 
     @property
     def blocks(self) -> int:

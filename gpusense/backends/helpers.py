@@ -28,7 +28,7 @@ def pool(process: int) -> concurrent.futures.ThreadPoolExecutor:
 
 
 def finish(helpers: Sequence[concurrent.futures.Future[Any]]) -> None:
-    """Cancel helpers that have not begun, and wait for the others even when interrupted."""
+    """Cancel helpers that have not begun, and wait for running helpers even when interrupted."""
     interrupted: BaseException | None = None
     for helper in helpers:
         helper.cancel()

@@ -80,7 +80,7 @@ class ChangingProgram:
             arguments = list(fixed)
             for place, name in places:
                 arguments[place] = changing[name]
-            # A backend that watches another one sees each launch here.
+            # A backend that watches another backend sees each launch here.
             compiled(kernel, flags)(size, *arguments)
 
 

@@ -15,7 +15,7 @@ from gpusense.localization.tracker import Tracker
 from gpusense.localization.verdict import Verdict
 from gpusense.localization.words import word_of
 
-# Most particles whose spread is counted one by one; of more, and of narrow clouds, a normal density is taken.
+# Most particles whose spread is counted one by one; larger and narrow clouds are approximated by a normal density.
 _MOST_LOOKED_AT = 100_000
 
 

@@ -1,4 +1,4 @@
-"""Probability that a pose is far off if the particles, or a covariance, are right: what the spread alone says."""
+"""Probability that a pose is far off, by the spread of the particles or by a covariance alone."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)
 
 
 def deviations(covariance: Floats) -> tuple[float, float]:
-    """Return the largest deviation of the position along any direction [m], and that of the heading [rad]."""
+    """Return the largest standard deviation of the position over directions [m], and that of the heading [rad]."""
     # Numbers of Python: arrays of nine take several times as long.
     (xx, xy, xt), (yx, yy, yt), (tx, ty, tt) = covariance.tolist()
     if not all(map(math.isfinite, (xx, xy, xt, yx, yy, yt, tx, ty, tt))):
@@ -32,7 +32,7 @@ def deviations(covariance: Floats) -> tuple[float, float]:
 
 
 def is_wide(covariance: Floats) -> bool:
-    """Tell whether the deviation of the position is above half a metre, or that of the heading above 0.25 rad."""
+    """Return whether the position deviates by more than half a metre, or the heading by more than 0.25 rad."""
     position, heading = deviations(covariance)
     return position > WIDE or heading > WIDE_TURN
 

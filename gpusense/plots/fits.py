@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from gpusense.learning.beam.incidence import IncidenceFit
 
-# Cells of the histograms over (z, z*), and of those over z.
+# Cells of the histograms over (z, z*) and over z.
 _CELLS, _BARS = 200, 80
 # Largest number of readings drawn one by one; more are thinned.
 _DRAWN = 10_000

@@ -19,8 +19,9 @@ a reading of exactly range_max as ``z_hit exp(...) + z_max``, and a longer one a
 +inf; its likelihood field leaves out both. Beluga: a reading outside [range_min, range_max] is left out, +inf too. Its
 beam model scores a reading of exactly range_max as ``z_hit p_hit + z_max``; its likelihood field takes it for a range.
 
-*Cells.* 0 is free, 100 is occupied, and all others, -1 and those of maps in mode ``scale``, are neither: they stop the
-beams of the beam models and are no obstacles of the likelihood fields. ``occupied_threshold`` has no effect.
+*Cells.* 0 is free and 100 is occupied. All other values (-1, and intermediate ones of maps in mode ``scale``) are
+neither: they stop beams in the beam models but are no obstacles in the likelihood fields. ``occupied_threshold`` has no
+effect.
 
 *Beams* of the beam models follow Bresenham's lines, see ``gpusense.casters.Bresenham``. amcl's look one cell beyond the
 ray's end, and distances between cells may exceed range_max; the map's edge stops them, and a particle off the map has

@@ -84,7 +84,7 @@ class FieldDensity:
         return sums_linearly(self.rand, self.peak, real)
 
     def terms(self, real: np.dtype) -> np.ndarray:
-        """Return the numbers of the kernel file ``field_term``: those of a sum of densities, or of logarithms.
+        """Return the numbers of the kernel file ``field_term``, for a sum of densities or of logarithms.
 
         Raises:
             ValueError: sigma_hit is too small or too large for the precision.

@@ -1,9 +1,9 @@
 """Densities of a correct range on the host: the one home of each, with its numbers for kernels.
 
 A hit of scale sigma has the density ``exp(-E(u)) / (width sigma)`` at u = (z - mean) / sigma; it is symmetric and falls
-with |u|. Models truncate it to [0, range_max] or not, weigh it, and mix it with other causes. Everything that a model,
-a table, a search, a picture, a simulation or a fit needs of it comes from :class:`HitShape`; kernels have E in their
-file ``hit_shape`` and get all other numbers from here.
+with |u|. Models truncate it to [0, range_max] or not, weigh it, and mix it with other causes. Models, tables, searches,
+pictures, simulations and fits get all that they need from :class:`HitShape`. Kernels have E in their file ``hit_shape``
+and get all other numbers from here.
 
 A shape is registered in :data:`SHAPES` under its name, the value of ``hit=`` in the parameters of scan models.
 CONTRIBUTING.md has the recipe for another one.

@@ -1,4 +1,4 @@
-"""Tables of the mass and of the quantiles of hits whose kernels have no formula of them.
+"""Tables of mass and quantiles for hit shapes whose kernels have no closed form.
 
 A table has cells of equal width in the logarithmic coordinate log(1 + b), b = u / sqrt 2 for a distance of u scales, or
 -log(1 - 2 m) for a mass m between the mean and a distance. In each cell it has the numbers of a polynomial in the share

@@ -44,7 +44,7 @@ def part_of(buffer: Buffer, first: int, size: int, alignment: int) -> Buffer:
         return buffer
     if isinstance(buffer, SHARED):
         return SharedPart(buffer, first, size)
-    # A part has no parts of its own.
+    # A part cannot be divided into further parts.
     whole: Any = buffer.get_info(cl.mem_info.ASSOCIATED_MEMOBJECT)
     if whole is not None:
         begin: Any = buffer.get_info(cl.mem_info.OFFSET)

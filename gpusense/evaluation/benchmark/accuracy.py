@@ -102,7 +102,7 @@ class Truth:
         return self._fine[name]
 
     def log_p(self, problem: str) -> Floats:
-        """Return (M,) log-likelihoods of a problem's model; the problem ``"ranges"`` has those of the beam model."""
+        """Return (M,) log-likelihoods of a problem's model; for the problem ``"ranges"``, of the beam model."""
         return self.field if problem == "field" else self.beam
 
     @functools.cached_property
@@ -126,8 +126,8 @@ def temperature_of(log_p: Floats) -> float:
 def factor_for(log_p: Floats, size: float, most: float = MOST_FACTOR) -> float:
     """Find the largest factor of log-likelihoods at which the effective sample size is at least ``size``.
 
-    The effective sample size falls as the factor rises. Weights that are less sharp than the exact ones, such as sums
-    of cubes, are compared with them at the factor that gives both the same effective sample size.
+    The effective sample size falls as the factor rises. Weights flatter than the exact ones, such as sums of cubes, are
+    compared at the factor that makes the effective sample sizes equal.
 
     Args:
         log_p: (M,) log-likelihoods, finite.

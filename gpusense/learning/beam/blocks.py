@@ -1,8 +1,8 @@
 """Scatter of the likelihood's gradient over blocks of readings, for standard errors of correlated readings.
 
 Errors within a scan and between neighbouring scans are correlated. The inverse of the observed information H then is
-not the covariance of the parameters. With G_b the gradient of the log-likelihood of block b, and blocks independent of
-each other, it is
+not the covariance of the parameters. With G_b the gradient of the log-likelihood of block b, and independent blocks, it
+is
 
     H^-1 (sum_b G_b G_b') H^-1,
 

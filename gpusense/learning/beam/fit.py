@@ -58,8 +58,8 @@ def fit_beam_parameters(
 ) -> BeamFit:
     """Fit the parameters of the beam model by maximum likelihood (book section 6.3.3, table 6.2).
 
-    Readings are classified as by :func:`gpusense.classify`: missing ones are left out, "no return" has probability
-    z_max, all others have the mixture's density. The device computes the sums over all pairs.
+    Readings are classified as by :func:`gpusense.classify`: missing readings are left out, "no return" has probability
+    z_max, and ranges have the mixture's density. The device computes the sums over all pairs.
 
     Args:
         ranges: Readings z of any shape [m].
@@ -73,7 +73,8 @@ def fit_beam_parameters(
             out; shapes beyond their bounds are clamped. The status says if a start from the readings is better.
         backend: The device, see :func:`gpusense.devices`.
         precision: ``"float64"`` or ``"float32"``; None is float64 if the device has it.
-        max_iterations: Most iterations of the method; None is 500 of EM, 60 of the book's, 1000 of the others.
+        max_iterations: Most iterations of the method; None is 500 for ``"em"``, 60 for ``"em-book"``, 1000 for the
+            rest.
         tolerance: The method has converged once it expects to gain less than ``tolerance`` [nats].
         restarts: Number of additional random starts; the best result is returned.
         seed: Seed of the random starts and of ``"genetic"``.
@@ -85,7 +86,7 @@ def fit_beam_parameters(
             are also fitted. All parameters are then fitted together on the host, from the fit with a normal.
         responsibilities: Whether to also return each reading's probabilities of the four causes.
         blocks: Integer label of each reading's block, of the same shape, or None. Readings of different blocks are
-            independent; those of one block (a scan, or several neighbouring ones) need not be. Standard errors are
+            independent; readings of one block (a scan, or several neighbouring scans) need not be. Standard errors are
             then computed over blocks.
         sigma_bounds: Smallest and largest sigma_hit [m]. None is from the step that readings are rounded to, divided by
             sqrt(12), or else 1e-6 range_max, to range_max.

@@ -31,7 +31,7 @@ from gpusense.world.scanner import Reading
 _SHARES, _ITERATIONS = (0.02, 0.3, 0.7, 0.95), 200
 # Readings from which on a table of masses is faster than the formula.
 _MANY = 2000
-# Share of a coordinate of the shape by which its derivative is taken.
+# Relative step of numerical derivatives by a coordinate of the shape.
 _SHAPE_STEP = 1e-4
 _TOP, _RAND, _SHORT, _SIGMA, _GROWTH, _RATE, _BIAS = range(7)
 

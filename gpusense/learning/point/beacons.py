@@ -131,9 +131,8 @@ def fit_beacon_parameters(
 ) -> PointFit[BeaconParameters]:
     """Fit the parameters of ranges to beacons to readings at known poses, by maximum likelihood.
 
-    The likelihood is that of :class:`BeaconModel`: deviations, weights and offsets are fitted; the degrees of freedom
-    of a Student t are given. Starts come from the median and the densest part of the residuals, which outliers hardly
-    move.
+    The likelihood is :class:`BeaconModel`'s. Deviations, weights and offsets are fitted; the degrees of freedom of a
+    Student t are fixed. Starts come from the median and the densest part of the residuals, which outliers hardly move.
 
     Args:
         poses: (S, 3) robot poses [m, m, rad], or (F, 3) with ``ids``.

@@ -91,8 +91,8 @@ class BeaconModel(PointModel):
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
-            ranges: (F,) ranges [m], of all M beacons or of those in ``ids``. NaN, and values outside [0, range_max],
-                are missing and add 0.
+            ranges: (F,) ranges [m] to all M beacons, or to the beacons in ``ids``. NaN, and values outside [0,
+                range_max], are missing and add 0.
             ids: None, or (F,) indices of the beacons that the ranges belong to; one may have several.
             out: The array for the result, in the memory of the poses.
 
@@ -203,7 +203,7 @@ class BeaconModel(PointModel):
         return f"ranges to beacons, {p.kind}", omissions + relative_omissions(p.mount, self.precision)
 
     def _prepare(self, ranges: object, ids: object) -> tuple[np.ndarray, list[Omission]]:
-        """Return the (F, BEACON) numbers of the valid ranges, and the omissions of the others."""
+        """Return the (F, BEACON) numbers of the valid ranges, and the omissions of the invalid ranges."""
         p = self.parameters
         on_host = arrays.copied_to_host(ranges, self._backend, "ranges")
         index = self._indices(ids)
@@ -264,7 +264,7 @@ def _normal(sigma: float, log_share: Decimal | float) -> tuple[Decimal, Decimal 
 
 
 def _log_t_peak(nu: int) -> Decimal:
-    """Return the log of the peak of a Student t of scale 1, by the recurrence of its ratio of gamma functions."""
+    """Return the log peak of a Student t density of scale 1, by a recurrence for its ratio of gamma functions."""
     ratio = 1 / PI.sqrt() if nu % 2 else PI.sqrt() / 2
     for n in range(2 - nu % 2, nu, 2):
         ratio = ratio * (n + 1) / n

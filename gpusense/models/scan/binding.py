@@ -134,7 +134,7 @@ class _StagedCall(BoundCall):
                 if self._packed.score(self._poses, self._ranges, self.out):
                     return self.out
         except MemoryError:
-            # The whole table of a map that has changed; the ordinary call needs only a part of it.
+            # This call would need the whole table of a changed map; the ordinary call needs only a part.
             pass
         # Its message names the pose that is not finite.
         return self._host()

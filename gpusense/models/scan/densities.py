@@ -280,7 +280,7 @@ def _log_tail(u: Floats, a: Floats, w: Floats, sigma: Floats) -> Floats:
 def _arrays(*values: ArrayLike) -> tuple[Floats, ...]:
     """Broadcast arguments to one shape and dtype: float32 if the widest array is float32, else float64.
 
-    Python numbers take the dtype of the others.
+    Python numbers take the dtype of the arrays.
     """
     arrays = [value if isinstance(value, int | float) else np.asarray(value) for value in values]
     kind = np.result_type(*arrays)

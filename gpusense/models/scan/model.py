@@ -279,9 +279,9 @@ class ScanModel(Pickled):
         were not finite. NumPy arrays of few particles go to a GPU and back with one copy each way; elsewhere the bound
         call is the ordinary one, so that the same program runs on every backend.
 
-        Results have the bits of ``log_likelihood`` with the same poses on the device, but for scans in which bearings
-        repeat or, with a temperature below 1, no range depends on the pose, and for some of the beams by number with
-        ``specialize=False``: these agree to rounding.
+        Results have the bits of ``log_likelihood`` with the same poses on the device. Three cases agree only to
+        rounding: scans in which bearings repeat, scans of a temperature below 1 in which no range depends on the pose,
+        and ``beams=`` as a number with ``specialize=False``.
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array as ``log_likelihood`` takes it.
@@ -296,7 +296,7 @@ class ScanModel(Pickled):
         return bind(self._pipeline, self._lock, self.log_likelihood, poses, ranges, out)
 
     def explain(self, *, measure: bool = False) -> str:
-        """Report what this scene leaves out, what it keeps, and what could go, each with the reason.
+        """Report the parts that this scene leaves out, keeps, and could leave out, each with the reason.
 
         Readings and map are those of the last call.
 
@@ -348,7 +348,7 @@ class ScanModel(Pickled):
 
     @abstractmethod
     def _notes(self) -> tuple[str, list[Omission], list[Note], list[Note]]:
-        """Return the title of the report, and what is left out, kept, and could go."""
+        """Return the report's title, and the parts that are left out, kept, and removable."""
 
     def prepare(self, poses: AnyArray) -> None:
         """Make the map's table for a cloud of (N, 3) poses now; ``log_likelihood`` does it otherwise.

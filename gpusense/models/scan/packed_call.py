@@ -44,7 +44,7 @@ def is_short(count: int, readings: int) -> bool:
 
 
 def host_task(pipeline: ScanPipeline) -> str:
-    """Return the preparation of a scan that only the host can do; empty where the device can do all of it."""
+    """Return the preparation that only the host can do, as a clause; empty where the device can do all of it."""
     if pipeline.setting.weights.is_peer:
         return "the host classes the readings for another program's weights"
     if not pipeline.backend.info.float64:

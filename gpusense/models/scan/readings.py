@@ -19,7 +19,7 @@ from gpusense.models.scan.rules import BeamChoice, Beams
 from gpusense.world.scanner import Scanner
 
 _INT = np.dtype(np.int32)
-# The kernel places readings by whole groups of work-items, so that those of poses begin with a group.
+# The kernel places readings by whole groups of work-items, so that the work-items of poses begin with a new group.
 _GROUP = 64
 
 

@@ -23,7 +23,7 @@ class BeamChoice:
 
     Attributes:
         columns: Beams that may be used.
-        most: Readings of them that are used at most; of more an even choice.
+        most: Most readings that are used; of more, an even choice.
         every: Whether all beams are used.
     """
 
@@ -116,7 +116,7 @@ class Rules:
 
 
 def choose_beams(kinds: np.ndarray, beams: Beams, informative_max: bool) -> np.ndarray:
-    """Return whether each reading is used: all, an even choice of ``beams`` informative ones, or those of indices."""
+    """Return whether each reading is used: all, an even choice of ``beams`` informative ones, or chosen indices."""
     informative = (kinds == Reading.HIT) | ((kinds == Reading.MAX) & informative_max)
     return BeamChoice.of(beams, len(kinds)).used(informative)
 

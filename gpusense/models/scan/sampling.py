@@ -30,7 +30,7 @@ class Drawing:
     """The numbers by which readings are drawn.
 
     Attributes:
-        mixture: Numbers of the mixtures, for each bin of angles of incidence, then tables of the shape of hits.
+        mixture: Numbers of the mixture for each bin of angles of incidence, then the tables of the hit shape.
         edges: Cosines between these bins, in the model's precision.
         chances: Cumulative probabilities of a table of a sensor; one number without a table.
         cells: Bins of a range in the table; 0 without one.

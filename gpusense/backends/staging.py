@@ -7,16 +7,18 @@ other slots. New result arrays gain most, since the threads also share the page 
 
 from __future__ import annotations
 
-import concurrent.futures
 import os
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gpusense.backends import helpers
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
 
 # Bytes of a slot, slots, and slots that the threads fill or empty while the device works on the others.
 SLOT, SLOTS, _AHEAD = 4 << 20, 16, 8
@@ -79,7 +81,7 @@ class Staging:
         """Copy an array by a function, where that pays and no other thread has the slots."""
         if array.nbytes < LEAST or helpers.threads() < _LEAST_THREADS or not self._lock.acquire(blocking=False):
             return False
-        started: list[concurrent.futures.Future[None]] = []
+        started: list[Future[None]] = []
         try:
             if not self._slots:
                 self._slots = list(self._make(SLOTS, SLOT))

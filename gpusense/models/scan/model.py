@@ -8,7 +8,7 @@ import math
 import threading
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, Literal, cast, overload
+from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
 import numpy as np
 
@@ -22,19 +22,19 @@ from gpusense.models.arguments import check_scene, map_words, real_dtype
 from gpusense.models.pickled import Pickled
 from gpusense.models.poses import Poses
 from gpusense.models.run import finish
-from gpusense.models.scan.binding import bind
-from gpusense.models.scan.bound import BoundCall
 from gpusense.models.scan.differentiable import Differentiable, is_recorded, log_likelihood_of
-from gpusense.models.scan.packed_call import ShortCalls
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.request import Request, make_request
 from gpusense.models.scan.rules import Beams, ModelContext, Rules, check_beams
-from gpusense.models.scan.savings import measured_savings, sources_of
 from gpusense.models.scan.scoring import LastCall, run
 from gpusense.world.compat import Peer, choose
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
+
+if TYPE_CHECKING:
+    from gpusense.models.scan.bound import BoundCall
+    from gpusense.models.scan.packed_call import ShortCalls
 
 
 class ScanModel(Pickled):
@@ -89,6 +89,10 @@ class ScanModel(Pickled):
     @functools.cached_property
     def _short(self) -> ShortCalls | None:
         """Calls of few particles that repeat a size; None where there are none."""
+        if not self.backend.replays:
+            return None
+        from gpusense.models.scan.packed_call import ShortCalls
+
         return ShortCalls.of(self._pipeline)
 
     @property
@@ -293,6 +297,9 @@ class ScanModel(Pickled):
             ValueError: a wrong shape.
             MemoryError: the device cannot hold the map's table, or the buffers of a call.
         """
+        # Few programs bind calls.
+        from gpusense.models.scan.binding import bind
+
         return bind(self._pipeline, self._lock, self.log_likelihood, poses, ranges, out)
 
     def explain(self, *, measure: bool = False) -> str:
@@ -330,6 +337,8 @@ class ScanModel(Pickled):
         title, omissions, kept, could_go = self._notes()
         plan = self._plan(title, omissions, kept, could_go)
         if measure:
+            from gpusense.models.scan.savings import measured_savings
+
             with self._lock:
                 savings = measured_savings(
                     functools.partial(make_request, self._setting), self._pipeline, self._last, plan,
@@ -344,6 +353,8 @@ class ScanModel(Pickled):
         Returns:
             OpenCL C, Warp's Python or NumPy's by the names of the kernels; empty before the first call.
         """
+        from gpusense.models.scan.savings import sources_of
+
         return sources_of(self._setting.backend, self._last)
 
     @abstractmethod

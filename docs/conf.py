@@ -68,6 +68,8 @@ sphinx_gallery_conf = {
 html_theme = "furo"
 html_title = f"gpusense {version}"
 html_extra_path = ["front"]
+html_static_path = ["static"]
+html_css_files = ["site.css"]
 html_copy_source = False
 
 
@@ -75,6 +77,12 @@ def mark_reports(app: Any, name: str, source: list[str]) -> None:
     """Say that a report or a note stands in no table of contents; pages link to it."""
     if name.startswith(("bench/results/", "docs/notes/")):
         source[0] = f"---\norphan: true\n---\n{source[0]}"
+
+
+def keep_colons(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Begin the text of an attribute with an empty line: else napoleon takes words before a colon for its type."""
+    if what in ("attribute", "property"):
+        lines.insert(0, "")
 
 
 def open_figures(app: Any, doctree: nodes.document) -> None:
@@ -93,6 +101,8 @@ def setup(app: Any) -> None:
     write_figures(figures)
     (figures / "error-vs-time.html").write_text(interactive(), encoding="utf-8")
     app.connect("source-read", mark_reports)
+    # Before napoleon reads docstrings.
+    app.connect("autodoc-process-docstring", keep_colons, priority=100)
     # Before Sphinx collects the files to be downloaded.
     app.connect("doctree-read", open_figures, priority=100)
     # Devices' memory of the tour's programs is freed before the interpreter ends.

@@ -91,7 +91,7 @@ def check_yaml(text: str | bytes) -> None:
 
 
 def _events(text: str | bytes) -> Iterator[Any]:
-    """Return the events of a document; some versions of the parser have a bound of nesting of their own."""
+    """Return the events of a document; some versions of the parser also limit the nesting."""
     import yaml
 
     try:

@@ -85,7 +85,7 @@ def _adopt(array: Any, backend: Backend, name: str, *, in_place: bool = False) -
 
 
 def host_poses(array: object, name: str, scans: int | None = None) -> tuple[np.ndarray, Bounds]:
-    """Return (N, 3) poses in host memory, or those of S scans one after the other, and their bounds.
+    """Return (N, 3) poses in host memory, or the poses of S scans in sequence, and their bounds.
 
     The poses are C-contiguous float64 numbers. NaN and infinities are found by the bounds, which calls need anyway.
 
@@ -202,7 +202,7 @@ def lent(poses: object, backend: Backend, buffer: Buffer, shape: tuple[int, ...]
 
 
 def _converted(poses: object, result: Any) -> object:
-    """Return an array of Warp, pyopencl or NumPy as one of the library of the poses."""
+    """Convert an array of Warp, pyopencl or NumPy to the library of the poses."""
     library = sys.modules.get(type(poses).__module__.partition(".")[0])
     if library is None:
         return result

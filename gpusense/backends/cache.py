@@ -128,7 +128,7 @@ def discard_entry(key: str) -> None:
 
 
 def _write(folder: Path, name: str, data: bytes) -> None:
-    """Write an entry by rename, and evict others where the folder holds too much.
+    """Write an entry by rename, and evict old entries where the folder exceeds its limit.
 
     Raises:
         OSError: the folder does not take it, or something else than a file is in its place.

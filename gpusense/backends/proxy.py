@@ -11,7 +11,7 @@ from gpusense.backends.info import BackendInfo
 
 
 class Proxy(Backend):
-    """A backend that forwards every method to another one: the base of backends that watch or count.
+    """Base of backends that watch or count: it forwards every method to another backend.
 
     Launches of programs and recordings all go through ``compile``, so a subclass that overrides it sees each launch.
     """

@@ -12,7 +12,7 @@ from gpusense.backends.base import Backend
 
 
 class Result:
-    """The memory of a result: that of ``out=``, or new memory where the poses are.
+    """The memory of a result: the array ``out=``, or new memory where the poses are.
 
     Args:
         poses: The poses as the user passed them, which determine the library of the result.

@@ -64,7 +64,7 @@ class Layout(argparse.RawDescriptionHelpFormatter):
 def _short_warnings() -> Iterator[None]:
     """Print a warning as one line, without the place in the source that raised it, and once.
 
-    Python's own memory of warnings is lost where a library changes the filters, as some do when they are imported.
+    Python forgets which warnings it has shown where a library changes the filters, as some do on import.
     """
     shown: set[tuple[str, type[Warning]]] = set()
 
@@ -139,7 +139,7 @@ def _settle() -> None:
 
 
 def _dispatch(argv: list[str]) -> int:
-    # Import only the chosen command, so that an import error in another one does not affect it.
+    # Import only the chosen command, so that an import error in another command does not affect it.
     names = (argv[0],) if argv and argv[0] in COMMANDS else COMMANDS
     parser = _build(names)
     try:

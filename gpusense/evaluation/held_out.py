@@ -86,7 +86,7 @@ def compare_held_out(
 
     All likelihoods are those of the book's normalised mixture, not the weights that these programs compute. Where the
     fitted parameters make a held-out reading impossible, a row of softened parameters follows, and gains refer to it.
-    The fit by angles of incidence is another row, whose gain is negative where it is better; it is softened likewise.
+    The fit by angles of incidence is another row, softened in the same way; its gain is negative where it is better.
 
     Args:
         fitted: Parameters fitted without ``data``.
@@ -125,7 +125,7 @@ def _row(
     baseline: Floats,
     place: NDArray[np.intp],
 ) -> HeldOut:
-    """Return the score of one set of parameters from log p of the readings, of the baseline, and their blocks."""
+    """Return the score of a set of parameters from the readings' log p, the baseline's log p, and their blocks."""
     with np.errstate(invalid="ignore"):
         gain = np.where(baseline == log_p, 0.0, baseline - log_p)
     impossible = int(np.count_nonzero(np.isneginf(log_p)))
@@ -179,7 +179,7 @@ def log_densities(parameters: BeamParameters, data: RangeData) -> Floats:
 
 
 def block_mean(values: Floats, block: NDArray[np.int64]) -> tuple[float, float]:
-    """Return the mean of all values and its standard error, that of a ratio of sums over blocks.
+    """Return the mean of all values and its standard error, as of a ratio of sums over blocks.
 
     The standard error is NaN for fewer than 2 blocks, or where a value is not finite.
     """

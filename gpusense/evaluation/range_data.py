@@ -61,7 +61,7 @@ class RangeData:
         return RangeData(*parts, self.range_max, self.range_min)
 
     def halves(self) -> tuple[RangeData, RangeData]:
-        """Split the data into blocks 0, 2, 4, ... and blocks 1, 3, 5, ....
+        """Split the data into even and odd blocks.
 
         Raises:
             ValueError: there is only one block.

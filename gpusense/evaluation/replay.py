@@ -52,7 +52,7 @@ class Launch:
 
 
 class Recorder(Proxy):
-    """A backend that forwards every call to another one and records scoring launches.
+    """A backend that forwards every call to another backend and records scoring launches.
 
     Pass it to a model as ``backend=``. Score with ``per_beam=True`` and few particles: every argument is copied.
     """

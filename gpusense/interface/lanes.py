@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-# Flags with which a kernel has no body in lanes, and the sets of flags of which it needs one.
+# Flags with which a kernel has no body in lanes; sets of flags, at least one of which it requires.
 _SCALAR = frozenset({"FLOAT64", "ALL_READINGS", "EXACT_EXPONENT", "CUBES"})
 _NEVER: dict[str, frozenset[str]] = {
     "cast_ranges": frozenset(),

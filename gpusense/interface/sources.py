@@ -21,6 +21,11 @@ typedef {real}2 real2;
 typedef {real}4 real4;
 #define FLOAT64 {float64}
 #define SPLITTER ((real){splitter})
+#if defined(__FMA__) || defined(__ARM_FEATURE_FMA) || defined({fast_fma})
+#define FUSES 1
+#else
+#define FUSES 0
+#endif
 """
 _HEAD = re.compile(r"^kernel void (\w+)\(ARGUMENTS\)", re.MULTILINE)
 _WORD = re.compile(r"\w+")
@@ -29,6 +34,8 @@ _REQUIRES = re.compile(r"^// requires: (.*)$", re.MULTILINE)
 
 def prelude(*, float64: bool, doubles: bool = False) -> str:
     """Return the head of every program: it forbids contraction and defines ``real``.
+
+    FUSES says whether the device multiplies and adds at once; elsewhere ``fma`` is a call.
 
     Args:
         float64: Whether ``real`` is float64.
@@ -39,6 +46,7 @@ def prelude(*, float64: bool, doubles: bool = False) -> str:
         real="double" if float64 else "float",
         float64=int(float64),
         splitter="134217729" if float64 else "4097",
+        fast_fma="FP_FAST_FMA" if float64 else "FP_FAST_FMAF",
     )
 
 

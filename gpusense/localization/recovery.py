@@ -14,7 +14,7 @@ from gpusense.localization.rival_search import can_search
 from gpusense.localization.tracker import Tracker
 from gpusense.localization.verdict import Verdict
 
-# Makes the seed of a rival from that of its filter.
+# Turns the filter's seed into the rival's seed.
 _RIVAL = 0x9E3779B97F4A7C15
 # Probability that another place is right above which a rival is searched for; more than before the first scan.
 _DOUBT = 0.2

@@ -26,7 +26,7 @@ def write_bag(path: Path, scans: Iterable[Scan], *, first: bool) -> None:
 
     Args:
         path: The bag: a file of ROS 1, or a folder of ROS 2 (sqlite3), which must not exist.
-        scans: Scans whose odometry is that of the robot; their poses are not written.
+        scans: Scans with the robot's odometry; their poses are not written.
         first: Whether the bag is one of ROS 1.
 
     Raises:

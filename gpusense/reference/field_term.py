@@ -61,7 +61,8 @@ def log_field(flags: frozenset[str], distance: Pair, terms: np.ndarray) -> np.nd
     """Return log p of distances from end points to the nearest obstacle."""
     exponent, low = field_exponent(flags, distance, terms)
     if "LINEAR" not in flags:
-        return np.logaddexp((terms[0] - exponent) + (terms[4] - low), terms[2])
+        hit = (terms[0] - exponent) + (terms[4] - low)
+        return np.logaddexp(hit, terms[2]) if "RAND" in flags else hit
     p = np.full(exponent.shape, terms[2])
     if "HIT" in flags:
         p += terms[0] * np.exp(-exponent) * (1 - low)

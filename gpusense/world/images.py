@@ -316,7 +316,7 @@ def _steps(maxval: int) -> NDArray[np.uint32]:
 
 
 def _greys(values: NDArray[Any], steps: NDArray[np.uint32]) -> NDArray[np.uint8]:
-    """Return the (h, w) greys of (h, w, C) channels: the luma in 16 bits, rounded half up, of which 8 bits are kept."""
+    """Return (h, w) greys of (h, w, C) channels: the luma in 16 bits, rounded half up, then scaled to 8."""
     if values.shape[2] == 1:
         return mapped(values[:, :, 0], (steps // 257).astype(np.uint8))
     luma = np.full(values.shape[:2], 500, np.uint32)

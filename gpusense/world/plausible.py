@@ -82,7 +82,7 @@ def look_at_scanner(range_max: float, mount: tuple[float, float, float]) -> None
 
 
 def look_at_grid(resolution: float, origin: tuple[float, float, float]) -> None:
-    """Warn of cells larger than those of maps for robots, and of an origin in degrees."""
+    """Warn of cells larger than robots' maps have, and of an origin in degrees."""
     if resolution > _LARGEST_CELL:
         _notice(
             f"resolution: is {resolution:.6g} m, the side of a cell: is it in centimetres or millimetres? Maps for "

@@ -41,7 +41,7 @@ real2 field_exponent(const real2 distance, global const real *terms) {
     return shape_exponent(field_square(distance, terms), terms[6], terms[7]);
 }
 
-// Return log p of the distance from an end point to the nearest obstacle.
+// Return log p of the distance from an end point to the nearest obstacle. Without random readings it is that of a hit.
 real log_field(const real2 distance, global const real *terms) {
     const real2 exponent = field_exponent(distance, terms);
 #if LINEAR
@@ -52,8 +52,12 @@ real log_field(const real2 distance, global const real *terms) {
     return log(p);
 #else
     const real hit = (terms[0] - exponent.x) + (terms[4] - exponent.y);
+#if RAND
     const real largest = fmax(hit, terms[2]);
     return largest + log(exp(hit - largest) + exp(terms[2] - largest));
+#else
+    return hit;
+#endif
 #endif
 }
 #endif

@@ -33,6 +33,7 @@ def functions(flags):
     LINEAR = "LINEAR" in flags
     LOG_TABLE = "LOG_TABLE" in flags
     EXACT_EXPONENT = "EXACT_EXPONENT" in flags
+    RAND = "RAND" in flags
     ZERO, ONE = real(0.0), real(1.0)
     SHIFT = real(0.5 if BILINEAR else 0.0)
 
@@ -88,8 +89,11 @@ def functions(flags):
         def log_field(distance: vec2, terms: wp.array(dtype=real)):
             exponent = field_exponent(distance, terms)
             hit = (terms[0] - exponent.x) + (terms[4] - exponent.y)
-            largest = wp.max(hit, terms[2])
-            return largest + wp.log(wp.exp(hit - largest) + wp.exp(terms[2] - largest))
+            if RAND:
+                largest = wp.max(hit, terms[2])
+                return largest + wp.log(wp.exp(hit - largest) + wp.exp(terms[2] - largest))
+            else:
+                return hit
 
     # Return the term of one reading. The table holds log densities, or cubes of densities (CUBES), or, where it is
     # interpolated, capped distances in metres.

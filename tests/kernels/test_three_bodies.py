@@ -78,7 +78,7 @@ ON_PURPOSE = [
     Purpose("ray", "start_casts", REFERENCE_ONLY, ARRAYS),
     Purpose("rectangles", "reached _runs longest _quadrants", REFERENCE_ONLY, ARRAYS),
     Purpose("relative", "pair_sum_float64", (OPENCL,), FLOAT64),
-    Purpose("rungs", "eight_at sum_eight sum_before", KERNELS_ONLY, EIGHT),
+    Purpose("tempering", "eight_at sum_eight sum_before", KERNELS_ONLY, EIGHT),
     Purpose("segments", "add_row", KERNELS_ONLY, "points come one after another, added by rotations"),
     Purpose("segments", "with_point", (WARP,), "OpenCL's functions take pointers to rows"),
     Purpose("segments", "running_costs rows_of _solve", REFERENCE_ONLY, ARRAYS),

@@ -79,4 +79,4 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "site" / "index.html").is_file()
-    assert Path(tmp_path, "site", "docs", "lectures", "10_bayes_filter.html").is_file()
+    assert Path(tmp_path, "site", "docs", "lectures", "11_bayes_filter.html").is_file()

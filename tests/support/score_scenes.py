@@ -74,9 +74,9 @@ FIELDS = {
     "log table": ("LOG_TABLE", "LINEAR", "HIT"),
     "nearest": ("LINEAR", "HIT"),
     "nearest without hit": ("LINEAR",),
-    "nearest in the log domain": ("HIT",),
+    "nearest, hits alone": ("HIT",),
     "bilinear": ("BILINEAR", "LINEAR", "HIT"),
-    "bilinear in the log domain": ("BILINEAR", "HIT"),
+    "bilinear in the log domain": ("BILINEAR", "HIT", "RAND"),
 }
 
 

@@ -40,8 +40,8 @@ _ROUNDED_DIVISION = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
 def _binary_cache(info: BackendInfo, device: cl.Device) -> BinaryCache | None:
     """Return the cache of programs; None for PoCL, whose kernels are kept one by one.
 
-    For a binary, PoCL would compile all kernels of the program, wanted or not, for work-groups of any size, which takes
-    three times as long as everything else.
+    For a binary, PoCL would compile every kernel of the program for work-groups of any size, which takes three times as
+    long as everything else.
     """
     return None if pocl.is_pocl(device) else BinaryCache(info)
 

@@ -53,7 +53,7 @@ def slots_of(queue: cl.CommandQueue, number: int, size: int) -> list[OpenCLSlot]
         mapped: Any = cl.enqueue_map_buffer(queue, buffer, access, 0, (number * size,), np.uint8)
     memory: np.ndarray = mapped[0]
     slots = [OpenCLSlot(queue, memory[first : first + size]) for first in range(0, number * size, size)]
-    # The first slot goes with the others.
+    # All slots are freed together.
     weakref.finalize(slots[0], _unmap, queue, memory)
     return slots
 

@@ -196,7 +196,7 @@ class WarpBackend(ProcessBound, Backend):
         except IndexError:
             queue = CallQueue(self._device, SCALARS)
         if not queue.settled:
-            # An error ended the last call of this queue, parts of which may be under way.
+            # An error ended this queue's last call; parts of it may still be running.
             self._wait()
         queue.begin()
         self._thread.queue = queue

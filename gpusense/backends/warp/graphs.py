@@ -1,6 +1,6 @@
 """CUDA graphs: a call that repeats an earlier one, to the last pointer and number, is one start.
 
-A graph keeps pointers and numbers, so steps of equal keys need no more than the graph of the first ones.
+A graph keeps pointers and numbers, so steps with equal keys use the first one's graph.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from gpusense.backends.warp.steps import Step, as_graph, one_by_one, start_each
 
 _LOG = logging.getLogger("gpusense")
 
-# Graphs, keys of calls that were started once, and keys of calls that the driver does not capture, which are kept.
+# Most graphs; most keys of calls that were started once, and of calls that the driver does not capture.
 _MOST_GRAPHS, _MOST_SEEN = 256, 512
 # The least recently used graph is evicted after this number of calls without it, in multiples of ``_MOST_GRAPHS``: a
 # capture takes longer than the starts that it replaces.

@@ -30,7 +30,7 @@ _LOG = logging.getLogger("gpusense")
 def initialize() -> None:
     """Start Warp without its greeting and without its warning that there is no CUDA driver.
 
-    Where Warp's own folder of kernels cannot be made, which would end the run, this process's folder takes its place.
+    Where Warp cannot make its folder of kernels, which would end the run, this process's folder is used.
     """
     with settings(kernels=False), _filtered_stderr():
         try:

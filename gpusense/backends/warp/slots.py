@@ -38,7 +38,7 @@ class WarpSlot(Slot):
         self._busy = True
 
     def _part_of(self, buffer: wp.array, first: int, size: int) -> wp.array:
-        """Return bytes of a buffer, which has more of them than an array of Warp may hold numbers."""
+        """Return some bytes of a buffer that has more bytes than a Warp array may have elements."""
         return wp.array(ptr=buffer.ptr + first, dtype=wp.uint8, shape=(size,), device=self._device)
 
 

@@ -12,7 +12,7 @@ from gpusense.evaluation.benchmark.profiles import error_of, label, setting
 
 ALL = "all maps"
 NEEDS = {"ranges": "rays", "beam": "beam model", "field": "likelihood field"}
-# By need: its measures as (place in a point, cloud or "" for all, text, unit); the first one is that of its limit.
+# Measures of each need as (place in a point, cloud or "" for all, text, unit); the limit applies to the first.
 MODEL_MEASURES = {
     "rays": (
         (("ranges", "wrong_1"), "", "rays wrong by more than a cell", "share"),
@@ -55,7 +55,8 @@ class Row:
         device: Title of the device.
         scene: Name of the map; ``ALL`` for the worst error and the mean time of all.
         method, setting, precision, code: As in the reports.
-        seconds: Time of a call, a step or a match: of a processor its own time over all cores, of a GPU the least.
+        seconds: Time of a call, a step or a match: on a processor its CPU time over all cores, on a GPU the least
+            elapsed time.
         quartiles: Quartiles of the elapsed times [s]; geometric means over the maps.
         errors: By the text of the measure.
         units: Their units.
@@ -151,7 +152,7 @@ def mean(numbers: Iterable[float]) -> float:
 
 
 def seconds_of(point: Mapping[str, Any]) -> float | None:
-    """Return the time of a point: the processor's own on a processor, the least elapsed one on a GPU."""
+    """Return the time of a point: CPU time on a processor, least elapsed time on a GPU."""
     name = "call_min_s" if point["kind"] == "gpu" else "processor_s"
     value = (point["time"] or {}).get(name)
     return float(value) if value else None
@@ -160,8 +161,8 @@ def seconds_of(point: Mapping[str, Any]) -> float | None:
 def model_rows(report: Mapping[str, Any]) -> list[Row]:
     """Return the rows of a report of ``gpusense bench``, for each map and for all together.
 
-    A method that failed in a scene has no row of it, nor of all maps. A scene where every method was left out, such as
-    one after the deadline of a quick run, does not count.
+    A method that failed in a scene has neither a row for it nor one for all maps. A scene where every method was left
+    out, such as one after the deadline of a quick run, does not count.
     """
     titles, origin = titles_of(report["points"], report["machine"], report.get("devices", ())), origin_of(report)
     groups: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}

@@ -27,7 +27,7 @@ KERNELS: dict[str, Kernel] = {
     "count_unseen": kernel(
         "landmark_unseen", "particle", "real4 landmark [landmarks]", _BUCKETS, *PLACED,
         "int which [particles * features]", "out real log_p [particles]", "Buckets buckets", "int particles",
-        "int features", "SensorView view", lanes_group=16,
+        "int features", "SensorView view", in_lanes=True,
     ),
     "place_relative": kernel(
         "relative", "particle", "coordinate poses [particles * 3]", "out real4 place [particles]",

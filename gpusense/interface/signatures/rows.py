@@ -1,4 +1,4 @@
-"""Arguments and launch shapes of kernels, and what rows of several kinds of kernel share."""
+"""Arguments and launch shapes of kernels, and arguments that several rows share."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Argument:
 
 @dataclass(frozen=True)
 class Kernel:
-    """A kernel: the concept (file) it belongs to, what one work-item is, its arguments, and its work-group size.
+    """A kernel: its concept (file), the object that a work-item takes, its arguments, and its work-group size.
 
     A global size's first axis is rounded up to whole groups; the heavier a work-item, the smaller its group. Where a
     kernel is compiled with IN_LANES, its groups have ``lanes_group`` work-items, and with ``in_lanes`` each of them

@@ -8,7 +8,7 @@ from gpusense.interface.signatures.rows import PLACED, POSES, WINDOW, Kernel, ke
 # Normals of the map's walls and of a ring of cells around it; not read without INCIDENCE.
 _NORMALS = ("real2 normals [(window.rows + 2) * (window.cols + 2)]",)
 _CONES = "real2 ray [rays * cone.rays]"
-# A map as a caster has it: what an entry is, and how many there are, is the caster's.
+# A map's table for a caster, which defines its entries and their number.
 _CAST = ("entry map_table [map]",)
 _CASTING = ("Caster caster", "RangeScale scale")
 # Poses on their way into a window of the grid.
@@ -37,7 +37,7 @@ KERNELS: dict[str, Kernel] = {
     ),
     "cast_ranges": kernel(
         "ranges", "ray particle", *_CAST, *POSES, "real2 ray [rays]", "out real ranges [particles * rays]", WINDOW,
-        "int particles", "int rays", *_CASTING, in_lanes=True,
+        "int particles", "int rays", *_CASTING, in_lanes=True, lanes_group=8,
     ),
     "score_beams": kernel(
         "beam", "particle", *_CAST, *_NORMALS, *POSES, _CONES, "int first [rays + 1]", "real reading [readings]",

@@ -1,4 +1,4 @@
-"""Shards of a filter, in this process or in others, that run the same method each with its own arguments."""
+"""Teams of shards, in this process or in worker processes; all shards of a team run the same method."""
 
 from __future__ import annotations
 

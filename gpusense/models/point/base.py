@@ -137,7 +137,7 @@ class PointModel(Pickled):
         itemsize: float = 0,
         after: Callable[[Part], None] = lambda part: None,
     ) -> Any:
-        """Return log p of each pose by programs over parts of them; 0 without a program.
+        """Return log p of each pose, computed in parts; 0 without a program.
 
         Args:
             poses: (N, 3) poses.

@@ -267,7 +267,7 @@ def _kept(value: Any) -> Any:
 
 
 def sample_outline(outline: object, segments: object, spacing: float) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the radius around the points of an outline, the (Q, 2) points, and the (B + 1,) starts of its segments.
+    """Return the contact radius around an outline's points, the (Q, 2) points, and (B + 1,) starts of segments.
 
     Raises:
         TypeError: not numbers, or segments of a polygon that are no integers.

@@ -171,7 +171,7 @@ class BeamModel(ScanModel):
         return self._caster.table_bytes
 
     def update_map(self, cells: ArrayLike, region: Sequence[int]) -> None:
-        """Replace cells of the map; afterwards every result is that of a model of the changed grid.
+        """Replace cells of the map; later results equal those of a model made with the changed grid.
 
         The exact caster updates only the affected part of its table; see ``RayCaster.update_map``.
 
@@ -236,7 +236,7 @@ class BeamModel(ScanModel):
             poses: (N, 3) robot poses in the world [m, m, rad], or (S, N, 3) of S scans; arrays of other libraries as
                 in ``log_likelihood``.
             seed: Seed of the random numbers, 0 to 2^64 - 1.
-            step: Step of a run, or that of the first of S scans, 0 to 2^31 - 1: other steps have other numbers.
+            step: Step of a run, or of the first of S scans, 0 to 2^31 - 1; each step has other random numbers.
             out: The array for the readings, as in ``log_likelihood``.
 
         Returns:

@@ -33,7 +33,7 @@ def scene_notes(
     discrete: bool,
     weights_note: str,
 ) -> tuple[str, list[Omission], list[Note], list[Note]]:
-    """Return the title of the report, what is left out, kept, and could go; readings and map as of the last call.
+    """Return the report's title and the parts left out, kept, and removable, as of the last call.
 
     Args:
         pipeline: The stages of the model.

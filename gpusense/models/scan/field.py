@@ -145,7 +145,7 @@ class LikelihoodFieldModel(ScanModel):
         )  # fmt: skip
 
     def update_map(self, cells: ArrayLike, region: Sequence[int]) -> None:
-        """Replace cells of the map; afterwards every result is that of a model of the changed grid.
+        """Replace cells of the map; later results equal those of a model made with the changed grid.
 
         Only distances within ``max_distance`` of a changed obstacle are computed again.
 
@@ -203,7 +203,7 @@ class LikelihoodFieldModel(ScanModel):
             could_go.append(Note("interpolation", "interpolation='nearest' has one look-up in place of four"))
             if "EXACT_EXPONENT" in pipeline.components:
                 kept.append(Note("exponents in two parts", f"the hit density's peak is above {HIGH_PEAK:g} / m"))
-            if "LINEAR" not in pipeline.components:
+            if p.z_rand and "LINEAR" not in pipeline.components:
                 kept.append(Note("log-domain sum", "z_rand does not bound the mixture from below"))
         if pipeline.log_table:
             omissions.append(

@@ -57,7 +57,7 @@ class _Gradient:
         mount_x, mount_y = (value / resolution for value in pipeline.scanner.mount[:2])
         flags = (pipeline.components | readings.flags) - _OTHERS
         flags, per_scan = with_lanes_flag(backend.info.lanes, "field_gradient", flags), piece.count // readings.scans
-        # Vectors of particles hold those of one scan.
+        # The particles of a vector belong to one scan.
         size = readings.scans * -(-per_scan // LANES) * LANES if "IN_LANES" in flags else piece.count
         given = readings.arguments
         gradient = launch(

@@ -94,6 +94,7 @@ class FieldPipeline(ScanPipeline):
             FLOAT64=not self.careful, TWO_PART_POINTS=self.careful, ALL_READINGS=everything, BILINEAR=bilinear,
             LOG_TABLE=self.log_table, CUBES=cubes, HIT=p.z_hit > 0 or everything, LINEAR=density.is_linear(self.real),
             EXACT_EXPONENT=not self.log_table and (density.is_sharp or everything),
+            RAND=p.z_rand > 0 or everything,
         )  # fmt: skip
         return flags | density.flags, density.terms(self.real)
 
@@ -180,7 +181,7 @@ class FieldPipeline(ScanPipeline):
         """See ScanPipeline.numbers; blocks of readings have a guard each on the device."""
         readings = scoring.readings
         score = Score(readings.constant_term, self.setting.temperature)
-        # Bound of the errors of products of rounded factors and of their sums: 3.12 eps of the longest, 1.5 eps.
+        # Error bounds: products of rounded factors err by at most 3.12 eps of the longest, their sums by 1.5 eps.
         return dict(score=score, guard=self.guard * readings.reach) if scoring.tiles is None else dict(score=score)
 
     def score_launches(self, scoring: ScanLaunch) -> Program:
@@ -193,7 +194,7 @@ class FieldPipeline(ScanPipeline):
             parts=parts.buffer, **readings.arguments,
         )  # fmt: skip
         if scoring.tiles is None:
-            # Vectors of particles hold those of one scan.
+            # The particles of a vector belong to one scan.
             grouped = readings.scans * -(-scoring.batch.per_scan // _GROUP) * _GROUP
             size = grouped if "IN_LANES" in scoring.flags else count
             common |= self.numbers(scoring)

@@ -26,7 +26,7 @@ ilanes whole_cells_lanes(const LanePair offset, LanePair *rest, LanePair *to_nex
 #if EXACT_EXPONENT
     const LanePair past = two_sum_lanes(offset.hi - to_lanes(nearest), offset.lo);
     const LanePair less = {past.hi < 0 ? past.hi : -past.hi, past.hi < 0 ? past.lo : -past.lo};
-    const LanePair other = pair_sum_lanes((LanePair){1, 0}, less);
+    const LanePair sum = ordered_sum_lanes((lanes)1, less.hi), other = ordered_sum_lanes(sum.hi, sum.lo + less.lo);
 #else
     const lanes left = (offset.hi - to_lanes(nearest)) + offset.lo;
     const LanePair past = {left, 0}, other = {left < 0 ? 1 + left : 1 - left, 0};

@@ -34,7 +34,16 @@ void offsets_lanes(const Particles *particle, const real2 point, const real2 poi
 }
 
 #if BILINEAR
-// Return the weighted sum of a and b; only weights and sums of EXACT_EXPONENT have two parts.
+// Return the weighted sum of distances of one part; only weights and sums of EXACT_EXPONENT have two.
+LanePair between_cells_lanes(const LanePair weight_a, const lanes a, const LanePair weight_b, const lanes b) {
+#if EXACT_EXPONENT
+    return pair_sum_lanes(pair_times_lanes(weight_a, a), pair_times_lanes(weight_b, b));
+#else
+    return (LanePair){weight_a.hi * a + weight_b.hi * b, 0};
+#endif
+}
+
+// Return the weighted sum of a and b.
 LanePair between_lanes(const LanePair weight_a, const LanePair a, const LanePair weight_b, const LanePair b) {
 #if EXACT_EXPONENT
     return pair_sum_lanes(pair_product_lanes(weight_a, a), pair_product_lanes(weight_b, b));
@@ -63,44 +72,105 @@ lanes log_distance_lanes(const LanePair distance, global const real *terms) {
 #endif
     return log_lanes(p);
 #else
-    const lanes hit = (terms[0] - exponent.hi) + (terms[4] - exponent.lo), random = terms[2];
+    const lanes hit = (terms[0] - exponent.hi) + (terms[4] - exponent.lo);
+#if RAND
+    const lanes random = terms[2];
     const lanes largest = hit > random ? hit : random;
     const lanes sum = largest + log_lanes(exp_lanes(hit - largest) + exp_lanes(random - largest));
     return largest == -INFINITY ? largest : sum;
+#else
+    return hit;
+#endif
 #endif
 }
 
-// Return log p of one beam. Both cells of the ring hold the same value, so the four cells are neighbours even beyond an
-// edge.
-lanes log_field_lanes(global const real *table, const Particles *particle, const real2 point, const real2 point_low,
-                      global const real *terms, const Window window) {
+// End points of a block of beams between four cell centres: the cell of the first, and the place between them.
+typedef struct {
+    ilanes cell[BLOCK_TERMS];
+    lanes rest_x[BLOCK_TERMS], rest_y[BLOCK_TERMS], to_next_x[BLOCK_TERMS], to_next_y[BLOCK_TERMS];
+#if EXACT_EXPONENT
+    lanes rest_x_low[BLOCK_TERMS], rest_y_low[BLOCK_TERMS], to_next_x_low[BLOCK_TERMS], to_next_y_low[BLOCK_TERMS];
+#endif
+} EndPoints;
+
+// Find the places of a block's end points. Both cells of the ring hold the same value, so the four cells are neighbours
+// even beyond an edge.
+void find_places(EndPoints *ends, const Particles *particle, global const real2 *point, global const real2 *point_low,
+                 const int size, const Window window) {
     const int stride = window.cols + 2 * FIELD_RING;
-    LanePair x, y, rest_x, rest_y, to_next_x, to_next_y;
-    offsets_lanes(particle, point, point_low, &x, &y);
-    const ilanes to_col = whole_cells_lanes(x, &rest_x, &to_next_x);
-    const ilanes to_row = whole_cells_lanes(y, &rest_y, &to_next_y);
-    const ilanes c = within_lanes(particle->col + to_col, stride - 2);
-    const ilanes r = within_lanes(particle->row + to_row, window.rows + 2 * FIELD_RING - 2);
-    const ilanes index = r * stride + c;
-    const lane_int *at = (const lane_int *)&index;
-    global const real *right = table + 1, *above = table + stride, *opposite = above + 1;
-    const LanePair a = {GATHER_AT(lanes, table, at), 0}, b = {GATHER_AT(lanes, right, at), 0};
-    const LanePair d = {GATHER_AT(lanes, above, at), 0}, e = {GATHER_AT(lanes, opposite, at), 0};
-    const LanePair low = between_lanes(to_next_x, a, rest_x, b), high = between_lanes(to_next_x, d, rest_x, e);
-    return log_distance_lanes(between_lanes(to_next_y, low, rest_y, high), terms);
+    for (int k = 0; k < size; ++k) {
+        LanePair x, y, rest_x, rest_y, to_next_x, to_next_y;
+        offsets_lanes(particle, point[k], point_low[k], &x, &y);
+        const ilanes to_col = whole_cells_lanes(x, &rest_x, &to_next_x);
+        const ilanes to_row = whole_cells_lanes(y, &rest_y, &to_next_y);
+        const ilanes c = within_lanes(particle->col + to_col, stride - 2);
+        const ilanes r = within_lanes(particle->row + to_row, window.rows + 2 * FIELD_RING - 2);
+        ends->cell[k] = r * stride + c;
+        ends->rest_x[k] = rest_x.hi, ends->rest_y[k] = rest_y.hi;
+        ends->to_next_x[k] = to_next_x.hi, ends->to_next_y[k] = to_next_y.hi;
+#if EXACT_EXPONENT
+        ends->rest_x_low[k] = rest_x.lo, ends->rest_y_low[k] = rest_y.lo;
+        ends->to_next_x_low[k] = to_next_x.lo, ends->to_next_y_low[k] = to_next_y.lo;
+#endif
+    }
+}
+
+// Interpolate the distances of a block's end points; those of EXACT_EXPONENT have two parts. distance_low may be distance.
+void interpolate(lanes *distance, lanes *distance_low, const EndPoints *ends, global const real *table, const int size,
+                 const Window window) {
+    global const real *above = table + window.cols + 2 * FIELD_RING;
+    for (int k = 0; k < size; ++k) {
+        const lane_int *at = (const lane_int *)&ends->cell[k];
+        lanes a, b, d, e;
+        gather_pairs(table, at, &a, &b);
+        gather_pairs(above, at, &d, &e);
+#if EXACT_EXPONENT
+        const LanePair rest_x = {ends->rest_x[k], ends->rest_x_low[k]}, rest_y = {ends->rest_y[k], ends->rest_y_low[k]};
+        const LanePair to_next_x = {ends->to_next_x[k], ends->to_next_x_low[k]};
+        const LanePair to_next_y = {ends->to_next_y[k], ends->to_next_y_low[k]};
+#else
+        const LanePair rest_x = {ends->rest_x[k], 0}, rest_y = {ends->rest_y[k], 0};
+        const LanePair to_next_x = {ends->to_next_x[k], 0}, to_next_y = {ends->to_next_y[k], 0};
+#endif
+        const LanePair low = between_cells_lanes(to_next_x, a, rest_x, b);
+        const LanePair high = between_cells_lanes(to_next_x, d, rest_x, e);
+        const LanePair found = between_lanes(to_next_y, low, rest_y, high);
+        distance_low[k] = found.lo;
+        distance[k] = found.hi;
+    }
 }
 #elif FLOAT64
-// Return the numbers in the cells of one beam's end points.
-lanes look_up_lanes(global const real *table, const Particles *particle, const real2 point, const Window window) {
-    const int stride = window.cols + 2 * FIELD_RING;
-    LanePair x, y, rest, to_next;
-    offsets_lanes(particle, point, point, &x, &y);
-    const ilanes c = within_lanes(particle->col + whole_cells_lanes(x, &rest, &to_next), stride - 1);
-    const ilanes r = within_lanes(particle->row + whole_cells_lanes(y, &rest, &to_next),
-                                  window.rows + 2 * FIELD_RING - 1);
-    const ilanes index = r * stride + c;
-    const lane_int *at = (const lane_int *)&index;
-    return GATHER_AT(lanes, table, at);
+// Cells of a block's end points. Their coordinates are whole numbers of float64, which every processor clamps and
+// multiplies fast.
+typedef struct {
+    int8 cell[BLOCK_TERMS];
+} EndPoints;
+
+// Return the whole cells below offsets: whole_cells_lanes, as whole numbers.
+lanes cells_below(const lanes offset) {
+    const lanes up = offset + 0.5, near = (up + LANE_INTEGERS) - LANE_INTEGERS;
+    const lanes nearest = near > up ? near - 1 : near;
+    return (offset - nearest) + EDGE < 0 ? nearest - 1 : nearest;
+}
+
+// Clamp whole numbers to [0, last].
+lanes held_lanes(const lanes i, const lanes last) {
+    const lanes raised = i > 0 ? i : (lanes)0;
+    return raised < last ? raised : last;
+}
+
+// Find the cells of a block's end points.
+void find_cells(EndPoints *ends, const Particles *particle, global const real2 *point, const int size,
+                const Window window) {
+    const real stride = window.cols + 2 * FIELD_RING;
+    const lanes last_col = stride - 1, last_row = window.rows + 2 * FIELD_RING - 1;
+    const lanes col = to_lanes(particle->col), row = to_lanes(particle->row);
+    for (int k = 0; k < size; ++k) {
+        LanePair x, y;
+        offsets_lanes(particle, point[k], point[k], &x, &y);
+        const lanes c = held_lanes(col + cells_below(x.hi), last_col), r = held_lanes(row + cells_below(y.hi), last_row);
+        ends->cell[k] = convert_int8_rtz(r * stride + c);
+    }
 }
 #else
 // End points of a block of beams: nearest cells, and the distances from the centres of these cells.
@@ -224,22 +294,35 @@ kernel void score_field(ARGUMENTS) {
         for (int v = 0; v * LANES < count; ++v) {
             const int first = begin + v * LANES, used = count - v * LANES < LANES ? count - v * LANES : LANES;
             lanes block = 0;
-#if TWO_PART_POINTS
-#if !BILINEAR
+#if BILINEAR
+            EndPoints ends;
+            lanes distance[BLOCK_TERMS];
+            find_places(&ends, &all[v], point + from, point_low + from, size, window);
+#if EXACT_EXPONENT
+            lanes distance_low[BLOCK_TERMS];
+            interpolate(distance, distance_low, &ends, table, size, window);
+#else
+            interpolate(distance, distance, &ends, table, size, window);
+#endif
+#elif FLOAT64
+            EndPoints ends;
+            find_cells(&ends, &all[v], point + from, size, window);
+#else
             EndPoints ends;
             if (find_cells(&ends, &all[v], point + from, size, window, least))
                 refine_cells(&ends, most, first, used, pose_cell, pose, pose_low, point + from, point_low + from, size,
                              window, guard);
 #pragma unroll 4
 #endif
-#endif
             for (int k = 0; k < size; ++k) {
 #if BILINEAR
-                const lanes term = log_field_lanes(table, &all[v], point[from + k], point_low[from + k], terms, window);
-#elif FLOAT64
-                const lanes term = look_up_lanes(table, &all[v], point[from + k], window);
+#if EXACT_EXPONENT
+                const lanes term = log_distance_lanes((LanePair){distance[k], distance_low[k]}, terms);
 #else
-                const lane_int *at = (const lane_int *)&ends.cell[k];
+                const lanes term = log_distance_lanes((LanePair){distance[k], 0}, terms);
+#endif
+#else
+                const int *at = (const int *)&ends.cell[k];
                 const lanes term = GATHER_AT(lanes, table, at);
 #endif
 #if PER_BEAM

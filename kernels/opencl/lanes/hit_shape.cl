@@ -40,8 +40,17 @@ lanes half_mass_lanes(const lanes b, global const real *terms, const ilanes plac
     const lanes held = inside ? at : (lanes)0;
     const ilanes cell = to_ilanes(held), first = place + cell * TABLE_POWERS;
     const lanes share = held - to_lanes(cell);
-    lanes mass = GATHER(lanes, (terms + (TABLE_POWERS - 1)), first);
-    for (int i = TABLE_POWERS - 2; i >= 0; --i) mass = mass * share + GATHER(lanes, (terms + i), first);
+    const lane_int *from = (const lane_int *)&first;
+    lanes mass, lower;
+    gather_pairs(terms + (TABLE_POWERS - 2), from, &lower, &mass);
+    mass = mass * share + lower;
+    for (int i = TABLE_POWERS - 4; i >= 0; i -= 2) {
+        lanes higher;
+        gather_pairs(terms + i, from, &lower, &higher);
+        mass = (mass * share + higher) * share + lower;
+    }
+    // An odd number of powers leaves the lowest.
+    if (TABLE_POWERS % 2 == 1) mass = mass * share + GATHER_AT(lanes, terms, from);
     return inside ? mass : (lanes)0.5;
 }
 #endif

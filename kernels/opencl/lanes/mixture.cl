@@ -35,7 +35,7 @@ lanes mean_range_lanes(const lanes expected, global const real *terms, const ila
 LanePair hit_scale_lanes(const lanes expected, global const real *terms, const ilanes bin_at) {
 #if GROWTH
 #if EXACT_EXPONENT
-    const LanePair growth = pair_product_lanes((LanePair){TERM(12), TERM(13)}, (LanePair){expected, 0});
+    const LanePair growth = pair_times_lanes((LanePair){TERM(12), TERM(13)}, expected);
     const LanePair x = pair_sum_lanes((LanePair){1, 0}, growth);
     const lanes y = 1 / x.hi;
     const LanePair back = two_product_lanes(y, x.hi);

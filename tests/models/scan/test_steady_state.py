@@ -125,6 +125,8 @@ def call_of(what: str, device, precision: str):
         # On GPUs also how near to an edge an end point of each block of readings may be.
         counts = (2 * BEAMS, 2 * BEAMS, *([BLOCKS] if device.info.kind == "gpu" else []))
         copied = (lambda n: [24 * n, *scan_uploads(device, size, *counts)], lambda n: [size * n])
+    # Calls that repeat a size stay ordinary ones.
+    model._short = None
     return model.log_likelihood, *copied
 
 

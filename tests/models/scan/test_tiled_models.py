@@ -165,6 +165,7 @@ def test_in_pieces(chunk, ordered, as_gpu, monkeypatch):
         return [*(model.log_likelihood(poses, z) for model in models), *parts, caster.cast(poses, scanner.bearings)]
 
     whole = results()
+    monkeypatch.setattr(run, "CHUNK_SHARE", 1 << 62)
     for size in (16, 33, 117):
         monkeypatch.setattr(run, chunk, size if chunk == "CHUNK" else size * BEAMS * 4)
         for found, right in zip(results(), whole, strict=True):

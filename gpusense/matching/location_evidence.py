@@ -52,7 +52,7 @@ def explained_logs(evidence: np.ndarray) -> np.ndarray:
 
 
 def rival_odds(gap_and_ahead: np.ndarray) -> float:
-    """Return the logarithm of the odds of the first mode against another one."""
+    """Return the log odds of the first mode against another mode."""
     gap, ahead = gap_and_ahead
     return math.inf if math.isinf(gap) else float(_RIVAL_WEIGHTS[0] * gap + _RIVAL_WEIGHTS[1] * ahead)
 

@@ -1,13 +1,14 @@
-"""Directions of a pose that the pairs of a match observe, tested against what noise makes up.
+"""Directions of a pose that the pairs of a match observe, tested against spurious information from noise.
 
 The information of Gauss-Newton counts errors of the lines as information: in a corridor, noise turns lines, and turned
 lines seem to constrain the position along it. Where a direction v is not observed, all of v' I v is such a sum of
-squares. Its mean is v' S v, where S is what the variance of the points makes up, and it scatters like a chi-squared
-variable with as many degrees of freedom as there are lines without a common point. So the generalised eigenvalues of
-I v = lambda S v decide: lambda is 1 in the mean where nothing is observed, whatever the units of the coordinates, and
-a direction counts as observed above the quantile of lambda with the probability FALSE_ALARM of a false one.
+squares. Its mean is v' S v, where S is the spurious information due to the variance of the points, and it scatters like
+a chi-squared variable with as many degrees of freedom as there are lines without a common point. So the generalised
+eigenvalues of I v = lambda S v decide: lambda is 1 in the mean where nothing is observed, whatever the units of the
+coordinates, and a direction counts as observed above the quantile of lambda with the probability FALSE_ALARM of a false
+one.
 
-A lost direction is lost in all coordinates: the information of the others is that with the position along it unknown
+A lost direction affects all coordinates: the remaining information assumes that the position along it is unknown
 (Schur's complement). Where translations alone explain what is lost, as along a corridor, the heading stays observed.
 """
 

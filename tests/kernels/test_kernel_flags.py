@@ -115,7 +115,7 @@ def test_flags_that_are_off_leave_no_trace_in_opencl(
     assert "#if" not in source.split("#line 1", 1)[1]
 
 
-@pytest.mark.sampled(0.25)
+@pytest.mark.sampled(0.12)
 @traces
 def test_flags_that_are_off_leave_no_trace_in_warp(
     kernel: str, flag: str, beside: tuple[str, ...], opencl: str, warp: str, needs: Callable[[str], str]

@@ -5,10 +5,10 @@
 
 *Rates*: one EM iteration (M-step and the passes over the pairs that it tries) on --pairs pairs of a typical scene,
 without the second derivatives and with them, the upload, and a whole fit from its own start, of a normal and of a
-Student t to readings of it, as the best and the median of several runs; one pass, and what of it are the kernel, waited for, and the copy of its rows, the rest being
-their sum on the host, and in brackets a pass without lanes where the device has some; beside them the NumPy reference
-on the same pairs (a part of them where it is slow, said so), whose sums each backend's must match: *error* is the
-largest difference of the fitted parameters, relative, in float64.
+Student t to readings of it, as the best and the median of several runs; one pass, and what of it are the kernel, waited
+for, and the copy of its rows, the rest being their sum on the host, and in brackets a pass without lanes where the
+device has some; beside them the NumPy reference on the same pairs (a part of them where it is slow, said so), whose
+sums each backend's must match: *error* is the largest difference of the fitted parameters, relative, in float64.
 
 *Scenes*, on the last backend: fifty with known parameters, from mild to stiff. Parameters whose standard error is
 below 30 % of them are identified. Of these: how many lie within 3 standard errors of the truth; the largest fall of the

@@ -69,9 +69,9 @@ def match_scan(
             window, without refinement, by branch and bound.
         backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
-        noise: Standard deviation of ranges [m]; errors beyond some three of them lose their weight. ``"auto"``: that of
-            each match, from the scans' own deviations from straight walls, at least that of the steps in which ranges
-            come, and 1 cm; see the field ``noise`` of the result.
+        noise: Standard deviation of ranges [m]; errors beyond some three of them lose their weight. ``"auto"``:
+            estimated for each match from the scans' deviations from straight walls; at least 1 cm, and at least the
+            rounding error of ranges that come in steps. See the field ``noise`` of the result.
         capture: Farthest distance between paired points at the start [m]: the error of a good guess.
         window: Half widths of the search: distance from the guess [m], and turn [rad].
         temperature: In (0, 1]: multiplies the information, for errors that the scans do not show, such as motion during

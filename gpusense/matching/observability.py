@@ -124,7 +124,7 @@ def _lost_basis(
     total: np.ndarray, made_up: np.ndarray, critical: np.ndarray, least: np.ndarray, vectors: np.ndarray,
     lost: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Return (S, 3, 3) lost directions in columns, others 0; translations first, where they are lost by themselves."""
+    """Return (S, 3, 3) lost directions in columns, further columns 0; first pure translations that are lost."""
     values, plane = _generalised(total[:, :2, :2], made_up[:, :2, :2])
     slides = _is_lost(values, plane, critical, least)
     basis = np.where(lost[:, None, :], vectors, 0.0)

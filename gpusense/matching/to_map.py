@@ -258,7 +258,7 @@ def _joint(field: np.ndarray, own: np.ndarray, bias: float, lever: np.ndarray) -
 
 
 _LOCK = threading.Lock()
-# The last matchers; each keeps its map alive, so that an id stays its own.
+# The last matchers; each keeps its map alive, so that no other map takes its id.
 _KEPT: dict[tuple[object, ...], MapMatcher] = {}
 _MOST_KEPT = 4
 

@@ -6,7 +6,7 @@ pictures, simulations and fits get all that they need from :class:`HitShape`. Ke
 and get all other numbers from here.
 
 A shape is registered in :data:`SHAPES` under its name, the value of ``hit=`` in the parameters of scan models.
-CONTRIBUTING.md has the recipe for another one.
+CONTRIBUTING.md has the recipe for another shape.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ from packaging.requirements import Requirement
 from support.paths import ROOT
 
 import gpusense as gs
+from gpusense.commands.cli import COMMANDS
 from gpusense.localization import nav2, nav2_start
 
 SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -34,6 +35,12 @@ def code_spans(text):
 def test_citation_has_the_version():
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert citation["version"] == gs.__version__ and citation["license"] == PROJECT["license"]
+
+
+def test_getting_started_lists_every_command():
+    page = (ROOT / "docs" / "getting-started.md").read_text(encoding="utf-8")
+    listed = re.findall(r"^\| `gpusense ([\w-]+)", page, re.MULTILINE)
+    assert sorted(listed) == sorted(COMMANDS)
 
 
 def test_the_picture_of_the_rooms_has_their_order():

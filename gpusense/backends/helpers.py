@@ -5,11 +5,13 @@ NumPy and Warp release Python's lock while they work on large arrays, so the thr
 
 from __future__ import annotations
 
-import concurrent.futures
 import functools
 import os
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future, ThreadPoolExecutor
 
 # Prefix of the names of the threads. They never wait for a device.
 HELPERS = "gpusense pieces"
@@ -22,19 +24,26 @@ def threads() -> int:
 
 
 @functools.cache
-def pool(process: int) -> concurrent.futures.ThreadPoolExecutor:
+def pool(process: int) -> ThreadPoolExecutor:
     """Return the threads of a process, one fewer than it has processors: the calling thread works as well."""
-    return concurrent.futures.ThreadPoolExecutor(max(threads() - 1, 1), HELPERS)
+    # Calls of few particles, and most processes, need no threads.
+    from concurrent.futures import ThreadPoolExecutor
+
+    return ThreadPoolExecutor(max(threads() - 1, 1), HELPERS)
 
 
-def finish(helpers: Sequence[concurrent.futures.Future[Any]]) -> None:
+def finish(helpers: Sequence[Future[Any]]) -> None:
     """Cancel helpers that have not begun, and wait for running helpers even when interrupted."""
+    if not helpers:
+        return
+    from concurrent.futures import wait
+
     interrupted: BaseException | None = None
     for helper in helpers:
         helper.cancel()
     while any(not helper.done() for helper in helpers):
         try:
-            concurrent.futures.wait(helpers)
+            wait(helpers)
         except KeyboardInterrupt as error:
             interrupted = error
     if interrupted is not None:

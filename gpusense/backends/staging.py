@@ -7,21 +7,23 @@ other slots. New result arrays gain most, since the threads also share the page 
 
 from __future__ import annotations
 
-import concurrent.futures
 import os
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gpusense.backends import helpers
 
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+
 # Bytes of a slot, slots, and slots that the threads fill or empty while the device works on the others.
 SLOT, SLOTS, _AHEAD = 4 << 20, 16, 8
 # Least bytes of a copy for which pieces pay, and of a piece.
-LEAST, _LEAST_PIECE = 2 << 20, 512 << 10
+LEAST, _LEAST_PIECE = 8 << 20, 1 << 20
 # Threads below which a driver's own copy is faster.
 _LEAST_THREADS = 4
 
@@ -79,7 +81,7 @@ class Staging:
         """Copy an array by a function, where that pays and no other thread has the slots."""
         if array.nbytes < LEAST or helpers.threads() < _LEAST_THREADS or not self._lock.acquire(blocking=False):
             return False
-        started: list[concurrent.futures.Future[None]] = []
+        started: list[Future[None]] = []
         try:
             if not self._slots:
                 self._slots = list(self._make(SLOTS, SLOT))

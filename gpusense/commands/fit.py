@@ -99,8 +99,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Fit the parameters, print the result and write the files; after Ctrl-C print the best parameters so far."""
     _check_sources(args)
-    if args.incidence and args.hit != "normal":
-        raise ValueError(f"--hit: must be normal with --incidence, got {args.hit}")
     data, motion, partial = _read(args), _motion(args), PartialFit()
     try:
         result = _fit(args, data, motion, partial)
@@ -177,7 +175,7 @@ def _fit(args: argparse.Namespace, data: RangeData, motion: MotionFit | None, pa
     if data.incidence is not None and args.incidence:
         incidence = fit_incidence_parameters(
             data.ranges, data.expected, data.incidence, **sensor, bins=args.incidence, range_bias=args.range_bias,
-            blocks=blocks,
+            hit=args.hit, blocks=blocks,
         )  # fmt: skip
     compared = []
     if rest is not None:

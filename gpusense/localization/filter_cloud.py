@@ -84,7 +84,7 @@ class Contents(NamedTuple):
         """Return the buffers that take these particles without overwriting the kept ones, and the array for each.
 
         Args:
-            now: The others; those at the beginning of the call.
+            now: The buffers at the beginning of the call, which are kept.
 
         Returns:
             Names of buffers are "poses" and "weights".
@@ -219,6 +219,10 @@ class FilterCloud(ABC):
     @abstractmethod
     def summary(self) -> Summary:
         """Return the state after the last correction."""
+
+    def estimate_and_summary(self, count: int) -> tuple[np.ndarray, Summary]:
+        """Return both at once, which may take one copy to the host."""
+        return self.estimate(count), self.summary()
 
     @abstractmethod
     def particles(self, count: int) -> Any:

@@ -88,7 +88,7 @@ class Rival:
         return self, self._tracker, self._tracker.cloud
 
     def state(self) -> tuple[dict[str, Any], Contents, dict[str, Any]]:
-        """Return the rival as plain data: its own, its particles and their memory."""
+        """Return the rival as plain data: its state, its particles and their memory."""
         return plain_state(self, without=("_tracker", "_search")), *self._tracker.state()
 
     def restore(self, state: tuple[dict[str, Any], Contents, dict[str, Any]]) -> None:

@@ -60,9 +60,12 @@ def mass_tables(shapes: Sequence[HitShape], terms: list[np.ndarray], real: np.dt
     return [table for _, table in tables.values()]
 
 
+@functools.lru_cache(maxsize=32)
 def mass_table(shape: HitShape, real: np.dtype) -> np.ndarray:
-    """Return the masses between the mean and a distance, by log(1 + b)."""
-    return _table(lambda at: shape.half_mass(_ROOT_TWO * np.expm1(at)), real)
+    """Return the masses between the mean and a distance, by log(1 + b); the table is kept, and read-only."""
+    table = _table(lambda at: shape.half_mass(_ROOT_TWO * np.expm1(at)), real)
+    table.flags.writeable = False
+    return table
 
 
 def looked_up(table: Floats, at: Floats) -> Floats:

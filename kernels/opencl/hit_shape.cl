@@ -33,6 +33,15 @@ real shape_weight(const real t, const real power, const real rate) {
 #endif
 }
 
+// Return -E''(t) over the square of the weight.
+real shape_bend(const real power) {
+#if STUDENT
+    return 1 / power;
+#else
+    return 0;
+#endif
+}
+
 #if MASS_TABLE
 // Return the mass between the mean and a distance.
 real half_mass(const real b, global const real *table) {

@@ -53,6 +53,14 @@ def functions(flags):
         else:
             return ONE
 
+    # Return -E''(t) over the square of the weight.
+    @wp.func
+    def shape_bend(power: real):
+        if STUDENT:
+            return ONE / power
+        else:
+            return ZERO
+
     # Return the mass between the mean and a distance; the table begins at a place of the terms.
     @wp.func
     def half_mass(b: real, terms: wp.array(dtype=real), place: wp.int32):
@@ -67,4 +75,4 @@ def functions(flags):
             mass = mass * share + number_at(terms, first + TABLE_POWERS - 2 - i)
         return mass
 
-    return SimpleNamespace(shape_exponent=shape_exponent, shape_weight=shape_weight, half_mass=half_mass)
+    return SimpleNamespace(**locals())

@@ -89,7 +89,7 @@ TRACES = [
     ("score_field", "TWO_PART_POINTS", ("LOG_TABLE",), r"\bcareful_offset\(", r"careful_offset_\d+\("),
     ("score_field", "BILINEAR", ("LINEAR",), r"\bbilinear\(", r"bilinear_\d+\("),
     ("score_field", "ALL_READINGS", ("LOG_TABLE",), r"\bisnan\(", r"\bwp::isnan\("),
-    ("e_step", "INFORMATION", ("HIT", "SHORT", "RAND"), r"\bsums\[39\]", r"\bvec_t<40\b"),
+    ("e_step", "INFORMATION", ("HIT", "SHORT", "RAND"), r"\bsums\[38\]", r"\bvec_t<39\b"),
     ("score_field", "PER_BEAM", ("LOG_TABLE",), r"\bparts\[\(long\)n \* readings", r"array_store\(var_parts\b"),
 ]
 traces = pytest.mark.parametrize(
@@ -111,10 +111,11 @@ def test_flags_that_are_off_leave_no_trace_in_opencl(
     assert re.search(opencl, without_comments(assemble(file, frozenset({flag, *beside}))), re.MULTILINE)
     source = assemble(file, frozenset(beside))
     assert not re.search(opencl, without_comments(source), re.MULTILINE)
-    assert "#if" not in source
+    # The head asks the compiler whether the device fuses.
+    assert "#if" not in source.split("#line 1", 1)[1]
 
 
-@pytest.mark.sampled(0.25)
+@pytest.mark.sampled(0.12)
 @traces
 def test_flags_that_are_off_leave_no_trace_in_warp(
     kernel: str, flag: str, beside: tuple[str, ...], opencl: str, warp: str, needs: Callable[[str], str]
@@ -175,8 +176,14 @@ def test_cuda_code_places_poses_by_rounded_operations(
     precision: type, needs: Callable[[str], str], tmp_path: Path
 ) -> None:
     needs("warp")
-    operations = cuda_operations("place_poses", scene_flags(precision, "TWO_PART_POINTS", "HUGE_HEADINGS"), tmp_path)
-    assert {"div.rn.f64"} <= operations <= {f"{name}.rn.f64" for name in ("mul", "add", "sub", "div")}
+    places = (tmp_path / "ordinary", tmp_path / "huge")
+    ordinary, huge = (
+        cuda_operations("place_poses", scene_flags(precision, "TWO_PART_POINTS", *names), place)
+        for names, place in zip(((), ("HUGE_HEADINGS",)), places, strict=True)
+    )
+    assert {"div.rn.f64"} <= ordinary <= {f"{name}.rn.f64" for name in ("mul", "add", "sub", "div")}
+    # Reducing a huge heading takes the rounding errors of products.
+    assert huge - ordinary == {"fma.rn.f64"}
 
 
 def test_cuda_code_of_a_block_of_the_field_loads_as_little_as_can_be(

@@ -34,6 +34,7 @@ SMALL = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("selection", ["opencl"])
 def test_scaling_runs(selection: str, needs: Callable[[str], str], tmp_path: Path) -> None:
     report = run_script("speed/scaling.py", "--backend", needs(selection), *SMALL, output=tmp_path / "small")
@@ -55,6 +56,7 @@ def test_scaling_runs(selection: str, needs: Callable[[str], str], tmp_path: Pat
     assert drawn.stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_sizes_that_do_not_fit_are_listed(needs: Callable[[str], str], tmp_path: Path) -> None:
     arguments = [*SMALL, "--particles", "100,100000000", "--longest", "1e-9"]
     report = run_script("speed/scaling.py", "--backend", needs("opencl"), *arguments, output=tmp_path / "none")
@@ -229,6 +231,7 @@ def test_bits_of_trees_are_compared(needs: Callable[[str], str], tmp_path: Path)
     assert done.returncode == 1 and "1 results of" in done.stdout
 
 
+@pytest.mark.slow
 def test_map_memory_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     arguments = ["--backend", needs("opencl"), "--backend", "numpy", "--side", "300", "--scans", "5"]
     rows = run_script("speed/map_memory.py", *arguments, output=tmp_path / "memory")["rows"]
@@ -335,6 +338,7 @@ def test_runs_among_landmarks(needs: Callable[[str], str], data_dir: Path, tmp_p
         assert row["filter"]["error_median"] < 0.2
 
 
+@pytest.mark.slow
 def test_offsets_of_beacons_run(data_dir: Path, tmp_path: Path) -> None:
     arguments = ("--data", str(data_dir), "--set", "simulated")
     report = run_script("studies/beacon_offsets.py", *arguments, output=tmp_path / "beacon_offsets")
@@ -343,6 +347,7 @@ def test_offsets_of_beacons_run(data_dir: Path, tmp_path: Path) -> None:
     assert each["nees"] < 3 < each["raw"] and each["held_out"] > common["held_out"] > none["held_out"]
 
 
+@pytest.mark.slow
 def test_figures_of_the_discrete_model_are_drawn(tmp_path: Path) -> None:
     arguments = ["--figures", str(tmp_path / "drawn"), "--most", "64"]
     report = run_script("accuracy/discrete_convergence.py", *arguments, output=tmp_path / "discrete")
@@ -419,6 +424,7 @@ def test_split_filters_are_measured(tmp_path: Path) -> None:
     assert row["equal"] and row["difference"] == 0 and row["one_ms"] > 0 and row["split_ms"] > 0
 
 
+@pytest.mark.slow
 def test_sweeps_are_measured(tmp_path: Path) -> None:
     small = ["--workers", "1", "--jobs", "2", "--particles", "20", "--beams", "11", "--scans", "2", "--repeats", "2"]
     report = run_script("speed/sweeps.py", *small, output=tmp_path / "sweeps")

@@ -24,6 +24,7 @@ from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.models.scan.mixture import mixture_of
 from gpusense.reference.mixture import log_density
 from gpusense.world.parameters import BeamParameters
+from gpusense.world.range_causes import NoReturn
 from gpusense.world.scanner import Reading, Scanner, classify
 
 Floats = NDArray[np.float64]
@@ -301,7 +302,9 @@ def score_ranges(
     """
     kinds, p, limit = classify(readings, scanner), parameters, scanner.range_max
     hit = np.flatnonzero(kinds == Reading.HIT)
-    log_p = np.full(len(ranges), np.count_nonzero(kinds == Reading.MAX) * math.log(p.z_max) if p.z_max > 0 else 0.0)
+    log_p = np.full(
+        len(ranges), np.count_nonzero(kinds == Reading.MAX) * NoReturn(p.z_max).number if p.z_max > 0 else 0.0
+    )
     flags, terms = mixture_of((p,), limit, np.dtype(np.float64), specialize=True, max_depends=False)
     for begin in range(0, len(ranges), _PIECE):
         expected = np.clip(np.asarray(ranges[begin : begin + _PIECE, hit], np.float64), 0, limit)

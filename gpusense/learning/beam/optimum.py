@@ -81,7 +81,7 @@ class Search:
     def _others(self, start: Point) -> list[Value]:
         problem = self.problem
         points = choose_starts(problem.pairs, problem.bounds, start.weights > 0, problem.fit_bias)
-        values = [problem.value(point) for point in points]
+        values = [problem.value(replace(point, shape=start.shape)) for point in points]
         return [value for value in values if math.isfinite(value.objective)]
 
     def _climb(self, start: Point, causes: NDArray[np.bool_]) -> Climb:

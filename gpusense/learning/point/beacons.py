@@ -17,6 +17,7 @@ from gpusense.learning.point.report import report
 from gpusense.learning.point.result import PointFit
 from gpusense.learning.point.search import maximize
 from gpusense.world.hit_shapes import NORMAL, StudentHit
+from gpusense.world.range_causes import RandomDensity
 from gpusense.world.sensor_parameters import MOST_DEGREES, BeaconParameters
 
 BiasKind = Literal["none", "common", "each"]
@@ -77,7 +78,10 @@ class _Beacons(Problem):
         first = truncated(
             residual, mean, self.range_max, math.exp(theta[0]), NORMAL if self.nu is None else StudentHit(self.nu)
         )
-        parts = [((1 - rand) * (1 - share), first[0]), (rand, np.full(len(mean), -math.log(self.range_max)))]
+        parts = [
+            ((1 - rand) * (1 - share), first[0]),
+            (rand, np.full(len(mean), RandomDensity(self.range_max).log_peak(1.0))),
+        ]
         hits = [first]
         if self.kind == "mixture":
             hits.append(truncated(residual, mean, self.range_max, math.exp(theta[2]), NORMAL))

@@ -178,7 +178,7 @@ class SplitCloud(FilterCloud):
         return pieces
 
     def _marks(self, own: np.ndarray, drawn: list[Part]) -> list[tuple[float, float]] | None:
-        """Return the lowest and the highest mark that each shard draws at; None where each copies its own particles."""
+        """Return the lowest and the highest mark of each shard's draws; None where each draws from its part alone."""
         total, whole = float(own[TOTAL]), drawn[0].whole
         if not total > 0.0 and whole != self.count:
             raise RuntimeError("the weights of all particles are 0, so their number cannot change")

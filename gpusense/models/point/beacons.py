@@ -18,11 +18,11 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission, share
-from gpusense.interface.terms import log_weight
 from gpusense.models.point.base import PointModel, rand_omission, relative_omissions
 from gpusense.models.point.pairs import DIGITS, PI, exact, log_of, total, two_parts
 from gpusense.models.point.sampling import BEACONS, draws_at, mounted, normal_within, within
 from gpusense.models.poses import Part, Poses
+from gpusense.world.range_causes import RandomDensity
 from gpusense.world.sensor_parameters import BeaconParameters
 
 
@@ -160,7 +160,7 @@ class BeaconModel(PointModel):
             (kind, u), (heavy, _) = draws.uniform(BEACONS + f), draws.uniform(BEACONS + f, 1)
             mean = np.hypot(*(antenna - self.xy[j]).T) + self._bias[j]
             hit = self._hits(u, heavy, mean)
-            ranges[:, f] = np.where(kind * (p.z_hit + p.z_rand) < p.z_hit, hit, u * p.range_max)
+            ranges[:, f] = np.where(kind * (p.z_hit + p.z_rand) < p.z_hit, hit, RandomDensity(p.range_max).drawn(u))
         return draws.reshaped(ranges)
 
     def _hits(self, u: np.ndarray, heavy: np.ndarray, mean: np.ndarray) -> np.ndarray:
@@ -232,7 +232,7 @@ class BeaconModel(PointModel):
         self._check_scale("sigma_range", p.sigma_range)
         self._check_scale("range_max", p.range_max)
         self._check_scale("bias", max(float(np.abs(self._bias).max(initial=0.0)), 1.0), "its size ")
-        random = log_weight(p.z_rand) - math.log(p.range_max)
+        random = RandomDensity(p.range_max).log_peak(p.z_rand)
         rest: list[Any] = [0.0] * 6
         series = np.zeros(1)
         with localcontext(prec=DIGITS):

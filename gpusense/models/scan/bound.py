@@ -24,6 +24,7 @@ from gpusense.models.poses import Poses
 from gpusense.models.run import chunk_of, finish
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.readings import Readings, device_readings
+from gpusense.world.windows import Corners
 
 _INT = np.dtype(np.int32)
 
@@ -90,6 +91,7 @@ class DeviceCall(BoundCall):
         poses, ranges, out: See ``ScanModel.bind``.
         status: A shared buffer for the non-finite flag, which its owner inspects; None for a private one.
         limits: The type to which the scanner's limits are rounded; None for the type of the ranges.
+        corners: Corners of the box of the poses, where their owner knows them: the map's table may be cropped then.
     """
 
     waits = False
@@ -103,10 +105,12 @@ class DeviceCall(BoundCall):
         out: Any,
         status: Buffer | None = None,
         limits: np.dtype | None = None,
+        corners: Corners | None = None,
     ) -> None:
         backend, real = pipeline.backend, pipeline.real
         self._pipeline, self._lock = pipeline, lock
         self._poses = Poses(poses, backend, in_place=True)
+        self._poses.hull = corners
         count = self._poses.count
         adopted = arrays.adopt_readings(ranges, backend, pipeline.scanner.count, in_place=True)
         result = Result(poses, out, (count,), real, backend, on_device=True)
@@ -138,8 +142,15 @@ class DeviceCall(BoundCall):
             return program.recording.explain()
         return "nothing is recorded: the map has changed, and its new table did not fit the device"
 
-    def begin(self) -> None:
-        """Start the recording, as part of this thread's batch."""
+    def begin(self, corners: Corners | None = None) -> None:
+        """Start the recording, as part of this thread's batch.
+
+        Args:
+            corners: Corners of the box of the poses, where their owner knows them.
+        """
+        if corners is not None:
+            self._poses.hull = corners
+            self._pipeline.map.ensure(corners)
         self._pipeline.backend.replay(self._current().recording)
 
     @property

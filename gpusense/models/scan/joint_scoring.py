@@ -11,7 +11,6 @@ from gpusense.models.poses import Poses
 from gpusense.models.run import finish_all
 from gpusense.models.scan.model import ScanModel
 from gpusense.models.scan.request import make_request
-from gpusense.models.scan.scoring import run
 
 
 def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out: Any = None) -> list[Any]:
@@ -66,7 +65,7 @@ def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out
         # Left first: the batch is started before an error abandons its memory.
         stack.enter_context(chosen[0]._workspace)
         for model, request in zip(chosen, requests, strict=True):
-            run(model._pipeline, request, model._workspace, model._last)
+            model._run(request)
             model._workspace.submit()
         on_device = {id(model) for model, request in zip(chosen, requests, strict=True) if request.poses.on_device}
         finish_all([(model._workspace, key in on_device) for key, model in different])

@@ -8,7 +8,7 @@ import math
 import threading
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, Literal, cast, overload
+from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
 import numpy as np
 
@@ -22,18 +22,19 @@ from gpusense.models.arguments import check_scene, map_words, real_dtype
 from gpusense.models.pickled import Pickled
 from gpusense.models.poses import Poses
 from gpusense.models.run import finish
-from gpusense.models.scan.binding import bind
-from gpusense.models.scan.bound import BoundCall
 from gpusense.models.scan.differentiable import Differentiable, is_recorded, log_likelihood_of
 from gpusense.models.scan.pipeline import ScanPipeline
-from gpusense.models.scan.request import make_request
+from gpusense.models.scan.request import Request, make_request
 from gpusense.models.scan.rules import Beams, ModelContext, Rules, check_beams
-from gpusense.models.scan.savings import measured_savings, sources_of
 from gpusense.models.scan.scoring import LastCall, run
 from gpusense.world.compat import Peer, choose
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
+
+if TYPE_CHECKING:
+    from gpusense.models.scan.bound import BoundCall
+    from gpusense.models.scan.packed_call import ShortCalls
 
 
 class ScanModel(Pickled):
@@ -83,7 +84,34 @@ class ScanModel(Pickled):
         self._workspace = Workspace(device)
         # Threads may share a model: its buffers serve one call at a time.
         self._lock = threading.Lock()
-        self._last = LastCall()
+        self._last_call = LastCall()
+
+    @functools.cached_property
+    def _short(self) -> ShortCalls | None:
+        """Calls of few particles that repeat a size; None where there are none."""
+        if not self.backend.replays:
+            return None
+        from gpusense.models.scan.packed_call import ShortCalls
+
+        return ShortCalls.of(self._pipeline)
+
+    @property
+    def _last(self) -> LastCall:
+        """The last call; a short one is repeated as one of any size, since only those report what they leave out."""
+        call = None if self._short is None else self._short.last
+        if call is not None:
+            poses, ranges = (array.copy() for array in call.arrays)
+            request = make_request(self._setting, poses, ranges)
+            with self._lock, self._workspace:
+                self._run(request)
+                finish(self._workspace, request.poses.on_device)
+        return self._last_call
+
+    def _run(self, request: Request) -> None:
+        """Start the launches of a request that is not short, while the model is locked."""
+        if self._short is not None:
+            self._short.last = None
+        run(self._pipeline, request, self._workspace, self._last_call)
 
     def __repr__(self) -> str:
         count, used = self.scanner.count, self._setting.rules.choice.most
@@ -203,9 +231,14 @@ class ScanModel(Pickled):
             calls = self._differentiable(ranges)
             if calls is not None:
                 return cast(np.ndarray, log_likelihood_of(poses, ranges, calls))
+        if self._short is not None:
+            with self._lock:
+                found = self._short.score(poses, ranges, out, per_beam=per_beam)
+            if found is not None:
+                return found
         request = make_request(self._setting, poses, ranges, out, per_beam=per_beam)
         with self._lock, self._workspace:
-            run(self._pipeline, request, self._workspace, self._last)
+            run(self._pipeline, request, self._workspace, self._last_call)
             finish(self._workspace, request.poses.on_device)
         log_p = request.result.user_array()
         return (log_p, request.result_parts()) if per_beam else log_p
@@ -226,7 +259,7 @@ class ScanModel(Pickled):
         """
         request = make_request(self._setting, poses, ranges, out, before=before)
         with self._lock, self._workspace:
-            run(self._pipeline, request, self._workspace, self._last)
+            self._run(request)
 
     def finish_scoring(self) -> None:
         """Wait for calls that ``start_scoring`` has begun.
@@ -264,6 +297,9 @@ class ScanModel(Pickled):
             ValueError: a wrong shape.
             MemoryError: the device cannot hold the map's table, or the buffers of a call.
         """
+        # Few programs bind calls.
+        from gpusense.models.scan.binding import bind
+
         return bind(self._pipeline, self._lock, self.log_likelihood, poses, ranges, out)
 
     def explain(self, *, measure: bool = False) -> str:
@@ -301,6 +337,8 @@ class ScanModel(Pickled):
         title, omissions, kept, could_go = self._notes()
         plan = self._plan(title, omissions, kept, could_go)
         if measure:
+            from gpusense.models.scan.savings import measured_savings
+
             with self._lock:
                 savings = measured_savings(
                     functools.partial(make_request, self._setting), self._pipeline, self._last, plan,
@@ -315,6 +353,8 @@ class ScanModel(Pickled):
         Returns:
             OpenCL C, Warp's Python or NumPy's by the names of the kernels; empty before the first call.
         """
+        from gpusense.models.scan.savings import sources_of
+
         return sources_of(self._setting.backend, self._last)
 
     @abstractmethod

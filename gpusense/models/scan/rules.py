@@ -12,6 +12,7 @@ from gpusense._util.checks import integer, show
 from gpusense.backends import Backend
 from gpusense.world.likelihood import Likelihood
 from gpusense.world.plausible import FirstScans
+from gpusense.world.range_causes import NoReturn
 from gpusense.world.scanner import Reading, Scanner
 
 Beams = int | Sequence[int] | np.ndarray | None
@@ -112,7 +113,7 @@ class Rules:
     @functools.cached_property
     def log_max(self) -> float:
         """Log of the probability of a max reading that counts; 0 where none does."""
-        return float(np.log(self.z_max)) if self.z_max > 0 else 0.0
+        return float(NoReturn(self.z_max).log_mass) if self.z_max > 0 else 0.0
 
 
 def choose_beams(kinds: np.ndarray, beams: Beams, informative_max: bool) -> np.ndarray:

@@ -77,6 +77,21 @@ def mark_reports(app: Any, name: str, source: list[str]) -> None:
         source[0] = f"---\norphan: true\n---\n{source[0]}"
 
 
+# A character for private use, in place of the colons of an attribute's text while napoleon reads it.
+COLON = "\ue000"
+
+
+def hide_colons(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Replace colons in the first line of an attribute's text: napoleon takes words before one for a type."""
+    if what in ("attribute", "property") and lines:
+        lines[0] = lines[0].replace(": ", f"{COLON} ")
+
+
+def show_colons(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Put hidden colons back."""
+    lines[:] = [line.replace(COLON, ":") for line in lines]
+
+
 def open_figures(app: Any, doctree: nodes.document) -> None:
     """Let links to files of ``docs/front`` open them: they lie at the root of the site, and are no downloads."""
     root = "../" * app.env.docname.count("/")
@@ -93,6 +108,9 @@ def setup(app: Any) -> None:
     write_figures(figures)
     (figures / "error-vs-time.html").write_text(interactive(), encoding="utf-8")
     app.connect("source-read", mark_reports)
+    # Before and after napoleon reads docstrings.
+    app.connect("autodoc-process-docstring", hide_colons, priority=100)
+    app.connect("autodoc-process-docstring", show_colons, priority=900)
     # Before Sphinx collects the files to be downloaded.
     app.connect("doctree-read", open_figures, priority=100)
     # Devices' memory of the tour's programs is freed before the interpreter ends.

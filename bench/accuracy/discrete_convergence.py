@@ -1,6 +1,6 @@
 """Draw rows of the discrete model, and measure how fast it tends to continuous densities as bins shrink.
 
-    python bench/accuracy/discrete_convergence.py           # docs/img/discrete_*.png, and the table of docs/sonar.md
+    python bench/accuracy/discrete_convergence.py           # docs/img/discrete_*.png, and the table of bench/RESULTS.md
     python bench/accuracy/discrete_convergence.py --figures DIRECTORY --most 512
 
 *Convergence*: the largest difference of densities (probability over width) from the continuous model, over readings and

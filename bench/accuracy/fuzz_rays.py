@@ -21,21 +21,7 @@ from gpusense.backends import get_backend
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from common import differing_bits, make_parser, parse, publish, table
-
-
-def draw_grid(rng: np.random.Generator) -> gs.OccupancyGrid:
-    """Draw a map to trip over."""
-    rows, cols = (int(n) for n in np.ceil(10 ** rng.uniform(0, 2.7, 2)))
-    density = rng.choice([0.0, 0.002, 0.02, 0.2, 0.7, 1.0], p=[0.05, 0.3, 0.3, 0.2, 0.1, 0.05])
-    cells = np.where(rng.random((rows, cols)) < density, 100, 0)
-    cells[rng.random((rows, cols)) < 0.02] = -1
-    if rng.random() < 0.5:
-        wall = np.arange(min(rows, cols))
-        cells[wall, wall if rng.random() < 0.5 else cols - 1 - wall] = 100
-    resolution = float(rng.choice([1e-3, 0.05, 0.1, 1.0, 100.0]))
-    far = rng.random() < 0.3
-    origin = (*rng.uniform(-5e6, 5e6, 2), rng.uniform(-3, 3)) if far else (0.0, 0.0, float(rng.choice([0.0, 0.7])))
-    return gs.OccupancyGrid(cells, resolution, origin)
+from trees.cases import draw_grid
 
 
 def draw_poses(rng: np.random.Generator, grid: gs.OccupancyGrid, count: int) -> np.ndarray:

@@ -99,7 +99,9 @@ def sources(folder: Path = RESULTS) -> list[Source]:
             if not report["commit"] or report["commit"].endswith("+"):
                 raise ValueError(f"{file.name}: {commit_trouble(report['commit'] or '')}")
             points = report["points" if kind == "models" else "rows"]
-            named = titles_of((p for p in points if p["backend"] != "outside"), report["machine"])
+            named = titles_of(
+                (p for p in points if p["backend"] != "outside"), report["machine"], report.get("devices", ())
+            )
             found.append(Source(file.name, kind, report, tuple(named.values())))
     kinds = [(source.kind, title) for source in found for title in source.titles]
     twice = {name for name in kinds if kinds.count(name) > 1}

@@ -1,6 +1,6 @@
 """Count the machine instructions of the code that Warp makes of a kernel for a CUDA device; no GPU is needed.
 
-    python bench/speed/cuda_code.py field_blocks --flags LOG_TABLE,CAREFUL,QUICK,INSIDE --terms 16
+    python bench/speed/cuda_code.py field_blocks --flags LOG_TABLE,TWO_PART_POINTS,ROUNDED_CELLS,INSIDE --terms 16
 
 Prints all instructions by kind, and those of the longest stretch without branches: the body of an unrolled loop, which
 computes --terms readings. Needs NVIDIA's ``nvdisasm`` (from PyPI: nvidia-cuda-nvdisasm; part of CUDA's tools).

@@ -4,7 +4,8 @@ Match a scan to an earlier one
 
 How did the robot move between two scans? ``gs.match_scan`` lays the second over the first: points to lines, with a
 covariance that is wide where the scans say little, and a status that says so (book section 6.5 matches maps; Censi,
-ICRA 2008, is the source of this method). **Try:** a guess of (1.5, 0, 1), from which no match is found, and read
+ICRA 2008, is the source of this method). Right: in a map the gradient of the likelihood field points to the pose from
+positions around it (book section 6.4). **Try:** a guess of (1.5, 0, 1), from which no match is found, and read
 ``match.explain()``.
 """
 
@@ -32,10 +33,22 @@ def points(ranges, pose=(0.0, 0.0, 0.0)):
     return pose[0] + (ranges * np.cos(angles))[hit], pose[1] + (ranges * np.sin(angles))[hit]
 
 
-figure, panels = plt.subplots(1, 2, figsize=(11, 5), sharex=True, sharey=True, layout="constrained")
-for ax, pose, title in zip(panels, (guess, match.pose), ("at the guess", "matched"), strict=True):
+# The gradient of the likelihood field at positions around the true one, at the true heading.
+field = gs.LikelihoodFieldModel(
+    grid, scanner, gs.LikelihoodFieldParameters(sigma_hit=0.15, interpolation="bilinear"), temperature=0.1
+)
+dx, dy = np.meshgrid(np.linspace(-0.4, 0.4, 13), np.linspace(-0.4, 0.4, 13))
+around = run.poses[11] + np.column_stack([dx.ravel(), dy.ravel(), np.zeros(dx.size)])
+log_p, gradient, _ = field.gradient(around, second)
+
+figure, panels = plt.subplots(1, 3, figsize=(14, 4.5), layout="constrained")
+for ax, pose, title in zip(panels, (guess, match.pose), ("at the guess", "matched"), strict=False):
     ax.plot(*points(first), "o", ms=4, color="#0072b2", label="first scan")
     ax.plot(*points(second, pose), ".", ms=4, color="#d55e00", label="second scan")
     ax.set(title=title, xlabel="x [m]", ylabel="y [m]", aspect="equal", xlim=(-3, 8), ylim=(-5, 3))
     ax.legend()
+image = panels[2].pcolormesh(dx, dy, log_p.reshape(dx.shape) - log_p.max(), cmap="cividis", shading="nearest")
+panels[2].quiver(dx, dy, *gradient[:, :2].T, color="#d55e00", pivot="tail")
+panels[2].set(title="gradient in a map", xlabel="x from the truth [m]", ylabel="y from the truth [m]", aspect="equal")
+figure.colorbar(image, ax=panels[2], label="log p below its maximum [nats]", shrink=0.8)
 plt.show()

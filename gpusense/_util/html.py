@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import struct
 import zlib
@@ -31,6 +30,8 @@ def card(
     """
     parts = [f"<b>{_text(title)}</b>"]
     if picture:
+        import base64
+
         code = base64.b64encode(picture).decode("ascii")
         parts.append(f'<br><img alt="{_text(title)}" src="data:image/png;base64,{code}">')
     lines = [f"<tr>{''.join(f'<th>{_text(name)}</th>' for name in head)}</tr>"] if head else []

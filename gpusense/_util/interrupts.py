@@ -36,7 +36,7 @@ def undisturbed(work: Callable[[], object]) -> None:
 def deliver_later(number: int) -> None:
     """Send a signal to the main thread once it has left its destructor, or the hook that reports errors of one.
 
-    Signals are handled between the lines of the main thread, which are those of the destructor still.
+    Python handles signals between bytecodes of the main thread, which may still be the destructor's.
     """
     # Without the wait for the start of a Thread.
     _thread.start_new_thread(_deliver, (number,))

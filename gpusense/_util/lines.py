@@ -57,7 +57,7 @@ def numbered_lines(file: Path) -> Iterator[tuple[int, bytes]]:
 
 
 def _bounds(file: Path, compressed: bool) -> tuple[float, float]:
-    """Return the most lines and bytes of a file; those of a plain file are in it."""
+    """Return limits of a compressed file's lines and bytes; infinite ones for a plain file."""
     if not compressed:
         return float("inf"), float("inf")
     size = file.stat().st_size

@@ -1,4 +1,4 @@
-"""Pictures of results: a result names its picture, and the root of the package, which knows all rooms, who draws it."""
+"""Pictures of results: a result names its picture, and the package's root maps names to drawing functions."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Folders in which other users cannot replace files, and bounded reads of regular files.
 
-Code that is loaded from a folder is as trustworthy as whoever can write there. That is the owner of the folder, those
-whom its mode lets write, and those who can rename one of the folders above it. Systems without owners, such as Windows,
-keep the folders of users apart by other rules; there only the kind of a folder is checked.
+Code that is loaded from a folder is as trustworthy as whoever can write there. Writers are the folder's owner, users
+whom its mode lets write, and users who can rename a folder above it. Systems without such owners, as Windows, protect
+users' folders by other rules; there only the kind of a folder is checked.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import os
 import stat
 from pathlib import Path
 
-# Permission of the group and of others to write.
+# Write permission of the group and of other users.
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 _HAS_OWNERS = hasattr(os, "geteuid")
 
@@ -25,7 +25,7 @@ def make_private(folder: Path) -> None:
     """Make a folder and those above it, each for this user alone where it is absent, and check it.
 
     Args:
-        folder: As for :func:`check_private`. Nothing is made where others could replace it.
+        folder: As for :func:`check_private`. Nothing is made where another user could replace it.
 
     Raises:
         UnsafeFolderError: as of :func:`check_private`.
@@ -48,8 +48,8 @@ def check_private(folder: Path) -> None:
         folder: An absolute path without symbolic links above it, as of ``os.path.realpath``.
 
     Raises:
-        UnsafeFolderError: it is no real directory, is not this user's, lets others write, or a folder above it lets
-            others rename what is in there.
+        UnsafeFolderError: it is no real directory, has another owner, is writable by other users, or a folder above it
+            lets them rename it.
         OSError: it is absent.
     """
     status = os.lstat(folder)
@@ -77,10 +77,10 @@ def _check_parents(folder: Path) -> None:
 
 
 def _check_parent(folder: Path, child: str) -> None:
-    """Check that only this user and root can rename what other users do not own in a folder.
+    """Check that in a folder only this user and root can rename the files of these two.
 
     Raises:
-        UnsafeFolderError: others can.
+        UnsafeFolderError: other users can.
     """
     status = os.stat(folder)
     if not _is_trusted(status.st_uid):
@@ -138,7 +138,8 @@ def read_regular(path: Path, most: int, *, touch: bool = False, head: int | None
     Raises:
         OSError: it is absent, is no regular file of this user, or is larger.
     """
-    # Opening some devices has effects, so the kind is looked at before; and after, as only that is the file's own.
+    # Opening some devices has effects, so the kind is checked before; only a check afterwards is of the opened file
+    # itself.
     _check_regular(os.lstat(path), path, most)
     flags = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
     with os.fdopen(os.open(path, os.O_RDONLY | flags), "rb") as file:

@@ -7,6 +7,7 @@ names the libraries whose arrays have neither.
 from __future__ import annotations
 
 import math
+import os
 import sys
 from typing import Any
 
@@ -14,13 +15,16 @@ import numpy as np
 
 from gpusense._util import checks, masks
 from gpusense._util.checks import check_gradients, shape_text, show
+from gpusense.backends import helpers
 from gpusense.backends.base import Adopted, Backend, Buffer
 from gpusense.backends.registry import entry_of_array, selection_for
 
 # DLPack's numbers for memory that the processor reads: host memory, also pinned for CUDA or ROCm.
 _HOST = (1, 3, 11)
-# Poses in a block whose bounds are computed together.
-_BLOCK = 8192
+# Poses that make a row whose numbers are reduced side by side, and poses below which they are transposed instead.
+_WIDTH, _FEW = 256, 1 << 14
+# Least poses whose bounds are worth a thread, and most threads: more wait for one another.
+_SHARE, _MOST_SHARES = 1 << 16, 8
 
 Bounds = tuple[tuple[float, ...], tuple[float, ...]]
 """The least and the largest x, y and theta of poses."""
@@ -81,7 +85,7 @@ def _adopt(array: Any, backend: Backend, name: str, *, in_place: bool = False) -
 
 
 def host_poses(array: object, name: str, scans: int | None = None) -> tuple[np.ndarray, Bounds]:
-    """Return (N, 3) poses in host memory, or those of S scans one after the other, and their bounds.
+    """Return (N, 3) poses in host memory, or the poses of S scans in sequence, and their bounds.
 
     The poses are C-contiguous float64 numbers. NaN and infinities are found by the bounds, which calls need anyway.
 
@@ -104,19 +108,42 @@ def host_poses(array: object, name: str, scans: int | None = None) -> tuple[np.n
 def bounds_of(poses: np.ndarray) -> Bounds:
     """Return the least and the largest of each column of (N, 3) poses, 0 for no poses; NaN where a column holds one.
 
-    Columns of three are slow to reduce; rows are not. Blocks that fit the nearest cache are transposed one by one.
+    Columns of three are slow to reduce; rows are not. Few poses are transposed. Of many, each 256 neighbours are a row,
+    and rows are reduced one after the other, by several threads where there are very many.
     """
-    if not len(poses):
+    count = len(poses)
+    if not count:
         return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    lows, highs = [], []
-    for begin in range(0, len(poses), _BLOCK):
-        rows = np.ascontiguousarray(poses[begin : begin + _BLOCK].T)
-        lows.append(np.minimum.reduce(rows, axis=1))
-        highs.append(np.maximum.reduce(rows, axis=1))
-    # minimum.reduce and maximum.reduce keep NaN.
-    low = lows[0] if len(lows) == 1 else np.minimum.reduce(lows)
-    high = highs[0] if len(highs) == 1 else np.maximum.reduce(highs)
+    if count < 2 * _SHARE:
+        low, high = _bounds_of_few(poses) if count < _FEW else _bounds_of_many(poses)
+    else:
+        step = max(-(-count // min(helpers.threads(), _MOST_SHARES)), _SHARE)
+        started = [
+            helpers.pool(os.getpid()).submit(_bounds_of_many, poses[begin : begin + step])
+            for begin in range(step, count, step)
+        ]
+        try:
+            parts = [_bounds_of_many(poses[:step]), *(one.result() for one in started)]
+        finally:
+            helpers.finish(started)
+        low = np.minimum.reduce([part[0] for part in parts])
+        high = np.maximum.reduce([part[1] for part in parts])
+    # Both keep NaN.
     return tuple(low.tolist()), tuple(high.tolist())
+
+
+def _bounds_of_few(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the largest of each column."""
+    rows = np.ascontiguousarray(poses.T)
+    return np.minimum.reduce(rows, axis=1), np.maximum.reduce(rows, axis=1)
+
+
+def _bounds_of_many(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the largest of each column of ``_WIDTH`` poses or more."""
+    rows = len(poses) // _WIDTH
+    body, rest = poses[: rows * _WIDTH].reshape(rows, 3 * _WIDTH), poses[rows * _WIDTH :]
+    low, high = np.minimum.reduce(body, axis=0).reshape(-1, 3), np.maximum.reduce(body, axis=0).reshape(-1, 3)
+    return _bounds_of_few(np.concatenate([low, rest]))[0], _bounds_of_few(np.concatenate([high, rest]))[1]
 
 
 def adopt_poses(
@@ -175,7 +202,7 @@ def lent(poses: object, backend: Backend, buffer: Buffer, shape: tuple[int, ...]
 
 
 def _converted(poses: object, result: Any) -> object:
-    """Return an array of Warp, pyopencl or NumPy as one of the library of the poses."""
+    """Convert an array of Warp, pyopencl or NumPy to the library of the poses."""
     library = sys.modules.get(type(poses).__module__.partition(".")[0])
     if library is None:
         return result
@@ -194,7 +221,7 @@ def like(poses: object, result: np.ndarray) -> Any:
     return _converted(poses, result)
 
 
-def check_out(out: object, shape: tuple[int, ...], real: np.dtype, poses: object, backend: Backend) -> Any:
+def check_out(out: object, shape: tuple[int, ...], real: np.dtype, backend: Backend, *, device_poses: bool) -> Any:
     """Return the memory of ``out=``: a NumPy array, or a flat buffer on the device; None where ``out`` is None.
 
     Raises:
@@ -203,7 +230,7 @@ def check_out(out: object, shape: tuple[int, ...], real: np.dtype, poses: object
     """
     if out is None:
         return None
-    if on_device(out) != on_device(poses):
+    if on_device(out) != device_poses:
         raise TypeError("out: must be in the memory where the poses are, got one that is not")
     if on_device(out):
         adopted = _adopt(out, backend, "out", in_place=True)

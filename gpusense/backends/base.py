@@ -87,6 +87,10 @@ class Backend(ABC):
         Without ``wait`` the array must stay alive, and is not filled, until ``synchronize`` has returned.
         """
 
+    def empty_result(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+        """Return a new host array for a result; large ones have the memory of earlier results that are gone."""
+        return np.empty(shape, dtype)
+
     @abstractmethod
     def part(self, buffer: Buffer, first: int, count: int, dtype: np.dtype) -> Buffer:
         """Return ``count`` numbers of a buffer from number ``first`` on as ``dtype``, without a copy.

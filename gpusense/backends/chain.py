@@ -70,8 +70,8 @@ class Chain:
     def report(self, chosen: Device, held: list[str]) -> None:
         """Leave in the list of this choice's warnings those to be shown, with one line about all failures.
 
-        Where NumPy is chosen although there are faster backends, that line is said in every process, and stands alone:
-        NumPy compiles nothing, so other warnings mean nothing. Else a verdict is reported by the process that makes it.
+        Where NumPy is chosen although faster backends are installed, every process prints this line, alone: NumPy
+        compiles nothing, so other warnings mean nothing. Else a verdict is reported by the process that makes it.
         """
         if chosen.selection == _LAST:
             if self.failures:

@@ -144,7 +144,7 @@ def run_text(arguments: list[str], job: dict[str, Any], variables: dict[str, str
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End the child, if it still runs, and its own children."""
+    """End the child, if it still runs, and the child's children."""
     if process.poll() is None:
         with contextlib.suppress(OSError):
             if hasattr(os, "killpg"):

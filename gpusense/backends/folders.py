@@ -1,9 +1,9 @@
-"""Folders for compiled kernels: where the user or the system wants them, and within it one that is gpusense's own.
+"""Folders for compiled kernels: a place that the user or the system chooses, and a folder of gpusense's in it.
 
 The place is ``$GPUSENSE_CACHE_DIR``, else ``$XDG_CACHE_HOME/gpusense``, else the system's place for caches:
 ``~/.cache/gpusense`` on Linux, ``~/Library/Caches/gpusense`` on macOS, and below ``%LOCALAPPDATA%`` on Windows.
-``GPUSENSE_CACHE=off`` switches the cache off. A place may hold files of others: gpusense reads, writes and deletes
-only in the folder ``gpusense-kernels`` there, which carries a marker file. Kernels are code, so it must be this
+``GPUSENSE_CACHE=off`` switches the cache off. A place may hold files of other programs: gpusense reads, writes and
+deletes only in the folder ``gpusense-kernels`` there, which has a marker file. Kernels are code, so it must be this
 user's, and no other user may write in it or rename a folder above it, whichever variable chose the place.
 """
 
@@ -71,7 +71,7 @@ def temporary_place() -> Place | None:
 
 
 def own_folder(place: Path) -> Path:
-    """Return gpusense's own folder in a place, made where it is absent.
+    """Return gpusense's folder in a place; make it where it is absent.
 
     Raises:
         UnsafeFolderError: another user could change it, or it holds files and no marker.
@@ -118,10 +118,10 @@ def _user() -> int:
 
 
 def _mark(folder: Path) -> None:
-    """Write the marker of a folder that is empty; of another one, check that it is there.
+    """Write the marker of an empty folder; check that any other folder has it.
 
-    A process may be killed, or another one may look, between any two steps. So files come after a whole marker only,
-    and a marker that was begun is completed by whoever finds nothing else.
+    Between any two steps this process may be killed, or another process may look. So files come after a whole marker
+    only, and a marker that was begun is completed by whoever finds nothing else.
 
     Raises:
         UnsafeFolderError: the folder holds something and no marker.

@@ -13,7 +13,7 @@ class BackendInfo:
     Attributes:
         selection: The selection string of this device, such as ``"opencl:0:0"``.
         backend: ``"numpy"``, ``"opencl"`` or ``"warp"``.
-        name: The device's own name.
+        name: The device's name.
         kind: ``"cpu"`` or ``"gpu"``.
         driver: Version of the driver or library that compiles for it.
         memory: Bytes of device memory.

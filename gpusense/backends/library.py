@@ -55,7 +55,7 @@ class Library(ABC):
         return ""
 
     def renew(self) -> None:  # noqa: B027
-        """Make verdicts anew that concern no single device, such as those on the loading of drivers."""
+        """Renew verdicts that concern no single device, such as verdicts on the loading of drivers."""
 
     # ---- children that prove devices
 

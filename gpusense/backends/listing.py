@@ -22,8 +22,7 @@ class Device:
         name: The name of the device, or of the absent part.
         kind: ``"cpu"``, ``"gpu"`` or ``"simulator"``.
         available: Whether a model can run on it.
-        reason: Why not, with the remedy; empty where it is available. Where only some kernels can run, why the others
-            cannot.
+        reason: Why not, with the remedy; empty where it is available. Where only some kernels can run, the reason.
         selection: The value of ``backend=``; empty where it is absent.
         driver: The name and version of the compiler's driver; empty where kernels are not compiled.
         lanes: Particles or beams that one work-item computes at once; 1 leaves that to the compiler.
@@ -145,7 +144,7 @@ def _listed(library: Library) -> tuple[list[tuple[BackendInfo, Any]], str]:
     try:
         return library.list_devices(), ""
     except Exception as error:
-        # A library's own errors have any class.
+        # Libraries raise errors of any class.
         return [], one_line(error)
 
 

@@ -80,7 +80,7 @@ class ChangingProgram:
             arguments = list(fixed)
             for place, name in places:
                 arguments[place] = changing[name]
-            # A backend that watches another one sees each launch here.
+            # A backend that watches another backend sees each launch here.
             compiled(kernel, flags)(size, *arguments)
 
 
@@ -130,7 +130,7 @@ class RepeatedPrograms:
         recording = self._programs.get(key)
         if recording is not None:
             self._backend.check_process()
-            recording()
+            self._backend.replay(recording)
             return
         program = make()
         self._backend.run(program)

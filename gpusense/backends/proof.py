@@ -2,8 +2,8 @@
 
 A compiler that does not know a processor aborts, hangs or makes wrong code, in the process that calls it. So the first
 time that a device, its driver, the processor and this version of gpusense are met, a child computes a small scene and
-compares it with NumPy. A family of kernels that fails is not used: vectors give way to narrower ones and then to scalar
-kernels, float64 is called absent, and where scalar kernels fail the device is unusable. The verdict is kept in the
+compares it with NumPy. A family of kernels that fails is not used: lanes are replaced by narrower ones and then by
+scalar kernels, float64 counts as absent, and a device whose scalar kernels fail is unusable. The verdict is kept in the
 cache, and so are the programs that the child compiled. ``GPUSENSE_PROOF=off`` trusts every driver. Where no child can
 be started, a device without a kept verdict is trusted, and the log says so.
 """
@@ -55,7 +55,7 @@ class Verdict:
         float64: Whether float64 kernels were proved.
         reason: The failures, empty where nothing failed.
         remedy: The remedy for them.
-        rate: Calls of a scan per second, by which devices of one class are compared; 0 where it was not measured.
+        rate: Calls of a scan per second, by which devices of one class are ranked; 0 where not measured.
         passing: Whether the failure is one of the machine's state, without a proof; such a verdict is not kept.
     """
 
@@ -83,7 +83,7 @@ def unusable(reason: str, *, passing: bool = False) -> Verdict:
 
 
 def verdict_on(info: BackendInfo, *, setup: Any = None, anew: bool = False) -> Verdict:
-    """Return the verdict on a device: the kept one, or a child's where there is none or it is to be made ``anew``.
+    """Return the verdict on a device: the cached verdict; without one, or with ``anew``, a child's.
 
     Args:
         info: The device.

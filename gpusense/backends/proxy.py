@@ -11,7 +11,7 @@ from gpusense.backends.info import BackendInfo
 
 
 class Proxy(Backend):
-    """A backend that forwards every method to another one: the base of backends that watch or count.
+    """Base of backends that watch or count: it forwards every method to another backend.
 
     Launches of programs and recordings all go through ``compile``, so a subclass that overrides it sees each launch.
     """
@@ -40,6 +40,10 @@ class Proxy(Backend):
     def download(self, buffer: Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
         """See Backend.download."""
         return self._backend.download(buffer, out, wait=wait)
+
+    def empty_result(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+        """See Backend.empty_result."""
+        return self._backend.empty_result(shape, dtype)
 
     def part(self, buffer: Buffer, first: int, count: int, dtype: np.dtype) -> Buffer:
         """See Backend.part."""

@@ -28,7 +28,7 @@ class Entry:
         module: The module that holds its ``LIBRARY``.
         install: The command that installs the library.
         selections: Its selection strings, as messages list them.
-        speed: Rank of each kind of its devices among those of all backends; 0 is the fastest.
+        speed: Rank of each kind of its devices among the devices of all backends; 0 is the fastest.
         by_name: Whether a part of a device's or driver's name selects a device.
         compiles: Whether a driver compiles its kernels, and so must be proved.
         queue: The objects other than strings that select its devices, as messages name them; empty where none do.
@@ -112,7 +112,7 @@ def load(entry: Entry) -> tuple[Library | None, str]:
 
 
 def remedy(entry: Entry) -> str:
-    """Return the command that installs what a backend needs and is absent; empty where all is installed."""
+    """Return the command that installs the missing requirements of a backend; empty where none is missing."""
     absent = [name for name in entry.install.split()[2:] if not _is_installed(name) and _has_wheel(name)]
     return f"pip install {' '.join(absent)}" if absent else ""
 

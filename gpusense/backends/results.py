@@ -12,7 +12,7 @@ from gpusense.backends.base import Backend
 
 
 class Result:
-    """The memory of a result: that of ``out=``, or new memory where the poses are.
+    """The memory of a result: the array ``out=``, or new memory where the poses are.
 
     Args:
         poses: The poses as the user passed them, which determine the library of the result.
@@ -20,6 +20,7 @@ class Result:
         shape: Its shape.
         real: Its precision.
         backend: The device.
+        on_device: Whether the poses are on it.
 
     Attributes:
         flat: A flat NumPy array, or a buffer on the device.
@@ -28,19 +29,21 @@ class Result:
         TypeError, ValueError: ``out`` breaks its rules.
     """
 
-    def __init__(self, poses: Any, out: Any, shape: tuple[int, ...], real: np.dtype, backend: Backend) -> None:
+    def __init__(
+        self, poses: Any, out: Any, shape: tuple[int, ...], real: np.dtype, backend: Backend, *, on_device: bool
+    ) -> None:
         self._poses, self._out, self._shape, self._real, self._backend = poses, out, shape, real, backend
-        self._on_device = type(poses) is not np.ndarray and arrays.on_device(poses)
+        self._on_device = on_device
         if out is not None:
-            self.flat = arrays.check_out(out, shape, real, poses, backend)
-        elif self._on_device:
+            self.flat = arrays.check_out(out, shape, real, backend, device_poses=on_device)
+        elif on_device:
             self.flat = backend.blank(math.prod(shape), real)
         else:
-            self.flat = np.empty(shape, real)
-        if not self._on_device:
+            self.flat = backend.empty_result(shape, real)
+        if not on_device:
             self.flat = self.flat.reshape(-1)
 
-    def array(self) -> Any:
+    def user_array(self) -> Any:
         """Return ``out``, or the result as an array of the library of the poses."""
         if self._out is not None:
             return self._out

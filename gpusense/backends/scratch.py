@@ -2,8 +2,8 @@
 
 Drivers do not check the files in their folders: one that another process left half-written, or that a disk has damaged,
 ends the run. So every process begins with an empty folder, and only files whose checksums hold are copied into
-it (see :mod:`gpusense.backends.cache`). Only this user may change it. Its name, owner and lock file tell it from
-folders of others, which are never removed.
+it (see :mod:`gpusense.backends.cache`). Only this user may change it. Its name, owner and lock file distinguish it from
+other folders, which are never removed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from gpusense.backends import folders
 _PREFIX = "gpusense-run-"
 _NAME = re.compile(rf"{_PREFIX}[a-z0-9_]{{8}}")
 _LOCK_FILE = "lock"
-# Bytes that must be free: kernels of a long run, with room for the compiler's own files.
+# Bytes that must be free: kernels of a long run, with room for the compiler's temporary files.
 _NEEDED = 16 << 20
 # Seconds after which a folder whose lock is free belongs to a process that was killed.
 _STALE = 600
@@ -78,7 +78,7 @@ def _candidates() -> Iterator[tuple[str, Callable[[], Path]]]:
 
 
 def _own_folder(place: folders.Place) -> Path:
-    """Return gpusense's folder in a place; report a place that is not safe, as what is compiled is not kept there.
+    """Return gpusense's folder in a place; report a place that is not safe, since compiled kernels are not kept there.
 
     Raises:
         OSError: there is none.
@@ -94,7 +94,7 @@ def _make(parent: Path, *, executable: bool) -> Path:
     """Make a folder below ``parent`` that other processes do not remove while this one lives.
 
     Raises:
-        OSError: it takes no files, has too little room, others could replace it, or no code may run from it.
+        OSError: it is not writable, has too little room, could be replaced by other users, or no code may run from it.
     """
     folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=parent))
     with contextlib.ExitStack() as failing:

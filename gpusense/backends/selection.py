@@ -96,7 +96,7 @@ def forget() -> None:
 
 
 def _circumstances() -> tuple[Any, ...]:
-    """Return what the meaning of a selection string depends on: the process, and variables of the environment.
+    """Return the key on which the meaning of a selection string depends: the process, and environment variables.
 
     To look up a variable that is not set takes ``os.environ`` more than a microsecond, its dictionary a tenth of one.
     """
@@ -263,7 +263,7 @@ def _choose(entry: Entry, rest: str, present: list[Device], absent: list[Device]
 def _named(part: str, present: list[Device]) -> list[Device]:
     """Return the devices with a part of a name: first those with it in both the device's and the driver's name.
 
-    So ``"intel"`` on a processor of Intel's means Intel's driver rather than another one.
+    So ``"intel"`` on an Intel processor selects Intel's driver rather than another driver.
     """
     if re.fullmatch(r"[\d:]+", part):
         return []

@@ -1,10 +1,10 @@
 """Loops: places that are seen again are found, matched, checked against one another, and closed.
 
 Candidates are key scans that show the same cells of the plane. Each is matched in a window of three deviations of the
-expected drift, which is that of the pose graph so far. A closure is taken where its p_right is high, it agrees with the
-drift, and other matches of the same passages agree with it (see ``agreement``). Small drifts are closed first, which
-makes the larger ones smaller. Where the chain is broken between two places, or they are farther apart than
-the drift allows, a group of matches that agree is needed; a break that is closed so is none any more.
+expected drift in the pose graph so far. A closure is taken where its p_right is high, it agrees with the drift, and
+other matches of the same passages agree with it (see ``agreement``). Small drifts are closed first, which makes the
+larger ones smaller. Where the chain is broken between two places, or they are farther apart than the drift allows, a
+group of matches that agree is needed. A break that is closed is none any more.
 """
 
 from __future__ import annotations
@@ -251,6 +251,6 @@ def _level_of(drift: Floats) -> Integers:
 
 
 def _deviations(covariances: Floats) -> Floats:
-    """Return the largest deviations of the position and that of the heading, (L, 2)."""
+    """Return the largest deviation of the position, and the deviation of the heading, (L, 2)."""
     place = np.linalg.eigvalsh(covariances[:, :2, :2])[:, -1]
     return np.sqrt(np.maximum(np.stack([place, covariances[:, 2, 2]], axis=1), 0.0))

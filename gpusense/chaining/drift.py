@@ -28,10 +28,11 @@ class Drift:
 
     Args:
         solution: The poses and links.
-        most: Most poses whose joint covariance is kept, at least 3; others have that of the nearest one before.
+        most: Most poses whose joint covariance is kept, at least 3; another pose takes the covariance of the nearest
+            kept one before it.
 
     Attributes:
-        anchors: (A,) numbers of these poses, ascending.
+        anchors: (A,) numbers of the kept poses, ascending.
     """
 
     def __init__(self, solution: Solution, most: int = _ANCHORS) -> None:

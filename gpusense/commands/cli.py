@@ -64,7 +64,7 @@ class Layout(argparse.RawDescriptionHelpFormatter):
 def _short_warnings() -> Iterator[None]:
     """Print a warning as one line, without the place in the source that raised it, and once.
 
-    Python's own memory of warnings is lost where a library changes the filters, as some do when they are imported.
+    Python forgets which warnings it has shown where a library changes the filters, as some do on import.
     """
     shown: set[tuple[str, type[Warning]]] = set()
 
@@ -91,8 +91,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments after the program's name; ``sys.argv[1:]`` by default.
 
     Returns:
-        The exit code: 0 success, 2 bad input, 130 interrupted, 143 terminated, 129 after the end of the terminal, 141
-        when the reader of standard output is gone, or the command's own.
+        The exit code: 0 success, 2 bad input, 130 interrupted, 143 terminated, 129 after a hang-up of the terminal, 141
+        when the reader of standard output is gone, or a code of the command.
     """
     for stream in (sys.stdout, sys.stderr):
         # A device's name may have characters outside the terminal's encoding.
@@ -139,7 +139,7 @@ def _settle() -> None:
 
 
 def _dispatch(argv: list[str]) -> int:
-    # Import only the chosen command, so that an import error in another one does not affect it.
+    # Import only the chosen command, so that an import error in another command does not affect it.
     names = (argv[0],) if argv and argv[0] in COMMANDS else COMMANDS
     parser = _build(names)
     try:

@@ -22,7 +22,7 @@ from gpusense.world.scanner import Scanner
 SIZE, BEAMS, FIELD_OF_VIEW, RANGE_MAX, SIGMA_XY, SIGMA_THETA = (30.0, 20.0), 180, 270.0, 15.0, 0.5, 0.3
 BEAM, FIELD = "beam model", "likelihood field"
 PRECISION: Precision = "float32"
-# Largest number of particles of the reference; total time of repeated calls [s]; largest number of repeated calls.
+# Most particles of the reference; total time of repeated calls [s]; most repeated calls.
 REFERENCE_PARTICLES, PATIENCE, REPETITIONS = 10_000, 4.0, 3
 
 Model = BeamModel | LikelihoodFieldModel

@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the devices; absent ones come with the reason and the remedy."""
+    """Print the devices; for absent devices, also the reason and the remedy."""
     from gpusense.backends import devices
 
     listed = devices(anew=args.prove)
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _with_failures(listed: list[Device]) -> list[Device]:
-    """Return the devices, of which those that ``"auto"`` has tried in vain are unusable, for the reason that it met."""
+    """Return the devices; devices that ``"auto"`` has tried in vain count as unusable, with the reason."""
     from gpusense.backends import default_failures
 
     reasons = {selection: reason for selection, reason in default_failures() if selection}

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from gpusense._util.typing import CasterName
-from gpusense.commands.arguments import add_backend, add_json, add_seed, positive_number, whole_number
+from gpusense.commands.arguments import add_backend, add_json, add_seed, whole_number
 from gpusense.commands.model_options import add_model, add_parameters, parameters_of
 from gpusense.commands.output import print_json
-from gpusense.commands.scans import add_log, read_scan
+from gpusense.commands.scans import add_log, add_range_max, read_scan
 from gpusense.evaluation.machine import machine
 
 if TYPE_CHECKING:
@@ -48,8 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--map", type=Path, metavar="YAML", help="a map_server map (default: the building of 'gpusense demo')")
     add_log(parser, "a log with scans, of the robot in the map", required=False)
     add("--scan", type=whole_number(low=0), metavar="I", help="index of the log's scan (default: 0)")
-    add("--range-max", type=positive_number, metavar="M",
-        help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')")  # fmt: skip
+    add_range_max(parser)
     add("--beams", type=whole_number(low=1), metavar="B", help="thin the scan evenly to B beams (default: all)")
     add_model(parser)
     add("--caster", choices=get_args(CasterName), help="method of the expected ranges; beam model only")

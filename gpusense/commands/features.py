@@ -12,7 +12,7 @@ import numpy as np
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import add_backend, add_json, output_path, positive_number, whole_number
 from gpusense.commands.output import print_json
-from gpusense.commands.scans import add_log, add_reference, read_scans
+from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
@@ -50,11 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="KIND", help="line, corner, door, hallway, pole, reflector (default: all)")  # fmt: skip
     add("--noise", type=positive_number, metavar="M",
         help="standard deviation of ranges [m] (default: that of each scan)")  # fmt: skip
-    add("--every", type=whole_number(low=1), default=1, metavar="E", help="every E-th scan (default: 1)")
-    add("--offset", type=whole_number(low=0), default=0, metavar="O", help="index of the first scan (default: 0)")
-    add("--limit", type=whole_number(low=1), metavar="S", help="largest number of scans (default: all)")
-    add("--range-max", type=positive_number, metavar="M",
-        help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')")  # fmt: skip
+    add_choice(parser)
     add("--least", type=whole_number(low=1), default=2, metavar="N",
         help="least scans that show a landmark (default: %(default)s)")  # fmt: skip
     add_backend(parser)
@@ -67,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Extract the features and print their numbers; after Ctrl-C those so far."""
+    """Extract the features and print their numbers; after Ctrl-C, the features so far."""
     if (args.log is None) == (args.map_in is None):
         raise ValueError("--log: must be given, or else --map-in, and not both")
     if args.map_in is not None:
@@ -129,7 +125,7 @@ def _of_map(args: argparse.Namespace) -> int:
 def _report(
     args: argparse.Namespace, scans: list[tuple[int, Scan]], parts: list[Features], posed: bool, seconds: float
 ) -> None:
-    """Print and write the features of all scans, or of those before an interrupt."""
+    """Print and write the features of all scans, or of the scans before an interrupt."""
     from gpusense.features.landmarks import map_features
     from gpusense.features.result import joined
 

@@ -14,7 +14,7 @@ from gpusense._util.progress import progress
 from gpusense.commands.arguments import add_backend, add_json, add_seed, check_writer, positive_number, whole_number
 from gpusense.commands.fit_results import FitResult, PartialFit
 from gpusense.commands.output import print_json, print_table
-from gpusense.commands.scans import add_log, add_reference, options_named, read_scans
+from gpusense.commands.scans import add_choice, add_log, add_reference, options_named, read_scans
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
@@ -75,12 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--pairs", type=Path, metavar="CSV",
         help="a file of columns separated by commas instead: reading [m], expected range [m] and, optionally, angle of "
         "incidence [rad]; needs --range-max")  # fmt: skip
-    add("--every", type=whole_number(low=1), default=1, metavar="E",
-        help="every E-th scan or pair, from --offset on; '--every 2 --offset 1' are the odd ones")  # fmt: skip
-    add("--offset", type=whole_number(low=0), default=0, metavar="O", help="index of the first one (default: 0)")
-    add("--limit", type=whole_number(low=1), metavar="S", help="largest number of scans or pairs (default: all)")
-    add("--range-max", type=positive_number, metavar="M",
-        help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')")  # fmt: skip
+    add_choice(parser, "scan or pair", "scans or pairs")
     add("--range-min", type=positive_number, metavar="M", help="readings below this are missing [m] (default: none)")
     add("--method", choices=("em", "em-book", "gradient", "hill_climb", "genetic"), default="em",
         help="optimiser; em-book is table 6.2 as printed (default: %(default)s)")  # fmt: skip
@@ -104,8 +99,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Fit the parameters, print the result and write the files; after Ctrl-C print the best parameters so far."""
     _check_sources(args)
-    if args.incidence and args.hit != "normal":
-        raise ValueError(f"--hit: must be normal with --incidence, got {args.hit}")
     data, motion, partial = _read(args), _motion(args), PartialFit()
     try:
         result = _fit(args, data, motion, partial)
@@ -182,7 +175,7 @@ def _fit(args: argparse.Namespace, data: RangeData, motion: MotionFit | None, pa
     if data.incidence is not None and args.incidence:
         incidence = fit_incidence_parameters(
             data.ranges, data.expected, data.incidence, **sensor, bins=args.incidence, range_bias=args.range_bias,
-            blocks=blocks,
+            hit=args.hit, blocks=blocks,
         )  # fmt: skip
     compared = []
     if rest is not None:
@@ -227,7 +220,7 @@ def _document(args: argparse.Namespace, result: FitResult, files: list[Path]) ->
 
 
 def _doubt(parameters: BeamParameters, what: str) -> None:
-    """Say on standard error where readings are not near their expected ranges, and what may be wrong."""
+    """Warn on standard error if readings are far from their expected ranges, with likely causes."""
     z_hit, sigma_hit = parameters.z_hit, parameters.sigma_hit
     if z_hit < _LEAST_HIT or sigma_hit > _MOST_DEVIATION:
         found = f"z_hit {z_hit:.2f}, sigma_hit {sigma_hit:.2f} m"

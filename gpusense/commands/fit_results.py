@@ -1,4 +1,4 @@
-"""Results of ``gpusense fit``: whole ones, and those before an interrupt."""
+"""Results of ``gpusense fit``: complete ones, and partial ones after an interrupt."""
 
 from __future__ import annotations
 

@@ -8,14 +8,14 @@ from pathlib import Path
 
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import (
-    BACKEND_HELP,
+    add_backend,
     add_json,
     output_path,
     positive_number,
     whole_number,
 )
 from gpusense.commands.output import print_json, print_table
-from gpusense.commands.scans import add_log, read_scan
+from gpusense.commands.scans import add_log, add_range_max, read_scan
 from gpusense.commands.signals import code_of, word_of
 from gpusense.evaluation.machine import machine
 
@@ -54,14 +54,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--beams", type=whole_number(low=1), metavar="B", help="thin the scan evenly to B beams (default: all)")
     add("--temperature", type=positive_number, default=1.0, metavar="T",
         help="factor of log-likelihoods in (0, 1] (default: %(default)s, the plain product over beams)")  # fmt: skip
-    add("--range-max", type=positive_number, metavar="M",
-        help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')")  # fmt: skip
-    add("--backend", default="auto", metavar="DEVICE", help=f"{BACKEND_HELP} (default: auto)")
+    add_range_max(parser)
+    add_backend(parser)
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compute and draw the likelihoods, after Ctrl-C those so far."""
+    """Compute and draw the likelihoods; after Ctrl-C, the tiles so far."""
     from gpusense.matching.pose_likelihood import prepare_tiles
     from gpusense.models.scan.beam import BeamModel
     from gpusense.models.scan.field import LikelihoodFieldModel

@@ -19,7 +19,7 @@ from gpusense.commands.arguments import (
     positive_number,
     whole_number,
 )
-from gpusense.commands.scans import add_log
+from gpusense.commands.scans import add_choice, add_log
 from gpusense.localization.defaults import DEFAULTS
 
 if TYPE_CHECKING:
@@ -98,11 +98,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"anywhere, or neither (default: {DEFAULTS.recovery})")  # fmt: skip
     add("--beam-skip", type=positive_number, metavar="P",
         help="leave out beams, such as of people, that less than this share of the particles explains")  # fmt: skip
-    add("--every", type=whole_number(low=1), default=1, metavar="E", help="every E-th scan, from --offset on")
-    add("--offset", type=whole_number(low=0), default=0, metavar="O", help="index of the first scan (default: 0)")
-    add("--limit", type=whole_number(low=1), metavar="S", help="largest number of scans (default: all)")
-    add("--range-max", type=positive_number, metavar="M",
-        help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')")  # fmt: skip
+    add_choice(parser)
     add_backend(parser)
     add_seed(parser)
     add_json(parser)
@@ -116,7 +112,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Localise, and print the results; after Ctrl-C those so far."""
+    """Localise, and print the results; after Ctrl-C, the results so far."""
     from gpusense.commands.localize_report import report
     from gpusense.commands.localize_setup import make_filter, read_chosen, read_parameters, start_of
     from gpusense.evaluation.tracking import Track, follow, start

@@ -26,7 +26,7 @@ _NO_NUMBER = ("rank_histogram", "verdict", "evidence")
 def report(
     args: argparse.Namespace, pf: ParticleFilter, track: Track, chosen: int, recording: Recording | None
 ) -> dict[str, Any]:
-    """Write the files, and print the results of all scans, or of those before an interrupt.
+    """Write the files, and print the results of all scans, or of the scans before an interrupt.
 
     Args:
         args: Options of the command.
@@ -70,7 +70,7 @@ def report(
 
 
 def _left_out(track: Track) -> int:
-    """Return how many scans there are before the filter has converged, and say so where there are any."""
+    """Return the number of scans before the filter has converged, and print it unless it is 0."""
     first = len(track.poses) if track.converged is None else track.converged
     if first:
         rule = f"the first {first} of {len(track.poses)} scans, before the verdict is 'tracking', are left out"

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def read_parameters(args: argparse.Namespace) -> Localization:
-    """Read ``--parameters``, and say what of a file of nav2 has no effect.
+    """Read ``--parameters``, and print which parameters of a nav2 file have no effect.
 
     Raises:
         ValueError: the file breaks its format.
@@ -87,7 +87,7 @@ def start_of(args: argparse.Namespace, nav2: Nav2Options | None) -> tuple[Any, A
 
 
 def make_filter(args: argparse.Namespace, grid: OccupancyGrid, steps: list[Step], read: Localization) -> ParticleFilter:
-    """Make the filter, with a model for each laser; options of the command line come before those of the file.
+    """Make the filter, with a model for each laser; options of the command line override the file.
 
     Raises:
         ValueError: an option breaks its rule, or the backend is absent.

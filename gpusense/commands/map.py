@@ -9,16 +9,15 @@ from typing import TYPE_CHECKING, Literal
 
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import (
-    BACKEND_HELP,
+    add_backend,
     add_json,
     number,
     output_path,
     positive_number,
-    whole_number,
 )
 from gpusense.commands.map_chain import add_chain, chain_log, check_chain, document, is_chained, words, write_chain
 from gpusense.commands.output import print_json
-from gpusense.commands.scans import add_log, add_reference, read_scans_of_lasers, scanners_of
+from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans_of_lasers, scanners_of
 from gpusense.commands.signals import code_of, word_of
 from gpusense.evaluation.machine import machine
 from gpusense.world.map_greys import MODES
@@ -73,20 +72,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--resolution", type=positive_number, default=0.05, metavar="M", help="side of a cell [m] (default: 0.05)")
     add("--range-limit", type=positive_number, metavar="M",
         help="longer ranges clear cells up to it and mark no obstacle [m] (default: none)")  # fmt: skip
-    add("--range-max", type=positive_number, metavar="M",
-        help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')")  # fmt: skip
     add("--clear-max", action="store_true", help="clear cells along 'no return' readings, up to --range-limit")
     add("--p-hit", type=number, default=0.85, metavar="P", help="occupancy after one hit (default: %(default)s)")
     add("--p-miss", type=number, default=0.45, metavar="P", help="occupancy after one miss (default: %(default)s)")
-    add("--every", type=whole_number(low=1), default=1, metavar="E", help="every E-th scan (default: 1)")
-    add("--offset", type=whole_number(low=0), default=0, metavar="O", help="index of the first scan (default: 0)")
-    add("--limit", type=whole_number(low=1), metavar="S", help="largest number of scans (default: all)")
-    add("--backend", default="auto", metavar="DEVICE", help=f"{BACKEND_HELP} (default: auto)")
+    add_choice(parser)
+    add_backend(parser)
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Build and write the map, after Ctrl-C that of the scans so far."""
+    """Build and write the map; after Ctrl-C, the map of the scans so far."""
     from gpusense.evaluation.scoring import check_poses
     from gpusense.mapping.build import MapBuilder
 
@@ -137,7 +132,7 @@ def _report(
     args: argparse.Namespace, builder: MapBuilder, grid: OccupancyGrid, image: Path, scans: tuple[int, int],
     chained: ChainedScans | None,
 ) -> None:  # fmt: skip
-    """Print what was made."""
+    """Print a summary of the map."""
     rows, cols = grid.shape
     free, occupied = int(grid.free.sum()), int(grid.occupied.sum())
     if args.json:

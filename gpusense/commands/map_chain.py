@@ -86,7 +86,7 @@ def is_chained(args: argparse.Namespace, scans: Scans) -> bool:
 
 
 def chain_log(args: argparse.Namespace, scans: Scans, sensor: list[int]) -> ChainedScans:
-    """Chain the scans of lasers; after Ctrl-C those so far."""
+    """Chain the scans of lasers; after Ctrl-C, the scans so far."""
     from gpusense.chaining.chain import Chainer
 
     readings = [scan.ranges for _, scan in scans]

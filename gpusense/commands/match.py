@@ -18,10 +18,9 @@ from gpusense.commands.arguments import (
     not_negative_number,
     output_path,
     positive_number,
-    whole_number,
 )
 from gpusense.commands.output import print_json
-from gpusense.commands.scans import add_log, add_reference, read_scans, scan_times
+from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans, scan_times
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
@@ -63,11 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="method of match_scan (default: %(default)s)")  # fmt: skip
     add("--noise", type=positive_number, metavar="M",
         help="standard deviation of ranges [m] (default: that of match_scan)")  # fmt: skip
-    add("--every", type=whole_number(low=1), default=1, metavar="E", help="every E-th scan (default: 1)")
-    add("--offset", type=whole_number(low=0), default=0, metavar="O", help="index of the first scan (default: 0)")
-    add("--limit", type=whole_number(low=1), metavar="S", help="largest number of scans (default: all)")
-    add("--range-max", type=positive_number, metavar="M",
-        help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')")  # fmt: skip
+    add_choice(parser)
     add_backend(parser)
     add_seed(parser)
     add_json(parser)
@@ -80,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Match the scans and print the results; after Ctrl-C those so far."""
+    """Match the scans and print the results; after Ctrl-C, the results so far."""
     from gpusense.evaluation.matching import match_log
     from gpusense.world.map_files import read_map
 
@@ -113,7 +108,7 @@ def _report(
     parts: list[LogMatches],
     seconds: float,
 ) -> None:
-    """Print and write the results of all matches, or of those before an interrupt."""
+    """Print and write the results of all matches, or of the matches before an interrupt."""
     from gpusense.evaluation.matching import joined, summary
 
     matches = joined(parts)

@@ -85,7 +85,7 @@ def _content(path: Path) -> dict[Any, Any]:
 
 
 def _made(path: Path, name: str, values: Any, make: Any) -> Any:
-    """Return what is made of a mapping of a file.
+    """Build an object from a mapping of a file.
 
     Raises:
         ValueError: it is no mapping, or a parameter breaks its rule.

@@ -1,4 +1,4 @@
-"""The scans of a log that a command takes: their laser, and their poses, its own or those of a trajectory."""
+"""The scans of a log for a command: the choice of lasers, and poses from the log or from a trajectory."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpusense.commands.arguments import finite_number
+from gpusense.commands.arguments import finite_number, positive_number, whole_number
 
 if TYPE_CHECKING:
     from gpusense.logs import Scan
@@ -41,6 +41,24 @@ def add_log(parser: argparse.ArgumentParser, what: str, *, required: bool = True
         add("--topic", metavar="NAME", help=f"laser: {names}")
     add("--mount", type=finite_number, nargs=3, metavar=("X", "Y", "THETA"),
         help="pose of a bag's laser on the robot [m, m, rad] (default: by the bag's fixed transforms)")  # fmt: skip
+
+
+def add_choice(parser: argparse.ArgumentParser, what: str = "scan", several: str = "scans") -> None:
+    """Add the options that choose among the scans of a log, and ``--range-max``."""
+    add = parser.add_argument
+    add("--every", type=whole_number(low=1), default=1, metavar="E",
+        help=f"every E-th {what}, from --offset on; '--every 2 --offset 1' are the odd ones (default: 1)")  # fmt: skip
+    add("--offset", type=whole_number(low=0), default=0, metavar="O", help=f"index of the first {what} (default: 0)")
+    add("--limit", type=whole_number(low=1), metavar="S", help=f"largest number of {several} (default: all)")
+    add_range_max(parser)
+
+
+def add_range_max(parser: argparse.ArgumentParser) -> None:
+    """Add ``--range-max``, from which on readings are "no return"."""
+    parser.add_argument(
+        "--range-max", type=positive_number, metavar="M",
+        help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')",
+    )  # fmt: skip
 
 
 def add_reference(parser: argparse.ArgumentParser) -> None:
@@ -148,7 +166,7 @@ def scanners_of(scans: list[tuple[int, Scan]], sensor: list[int]) -> dict[str, A
 
 
 def _referenced(args: argparse.Namespace, scans: list[Scan]) -> list[tuple[int, Scan]]:
-    """Return those scans of which the trajectory of ``--reference`` has the pose, with their numbers."""
+    """Return the scans whose pose the trajectory of ``--reference`` has, with their numbers."""
     from gpusense.evaluation.trajectory_files import poses_at, read_tum
 
     poses = poses_at([scan.time for scan in scans], *read_tum(args.reference))

@@ -16,12 +16,11 @@ from gpusense.commands.arguments import (
     add_temperature,
     not_negative_number,
     output_path,
-    positive_number,
     whole_number,
 )
 from gpusense.commands.model_options import add_model, add_parameters, parameters_of
 from gpusense.commands.output import TableStream
-from gpusense.commands.scans import add_log, add_reference, read_scans
+from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans
 from gpusense.commands.score_report import number_text, pose_name, print_report
 
 if TYPE_CHECKING:
@@ -78,12 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="deviation of the particles around the logged pose, in x and in y [m] (default: %(default)s)")  # fmt: skip
     add("--sigma-heading", type=not_negative_number, default=0.25, metavar="RAD",
         help="deviation of their heading [rad] (default: %(default)s)")  # fmt: skip
-    add("--every", type=whole_number(low=1), default=1, metavar="E",
-        help="every E-th scan, from --offset on; '--every 2 --offset 1' are the odd ones (default: 1)")  # fmt: skip
-    add("--offset", type=whole_number(low=0), default=0, metavar="O", help="index of the first scan (default: 0)")
-    add("--limit", type=whole_number(low=1), metavar="S", help="largest number of scans (default: all)")
-    add("--range-max", type=positive_number, metavar="M",
-        help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')")  # fmt: skip
+    add_choice(parser)
     add("--beams", type=whole_number(low=1), metavar="B", help="thin each scan evenly to B beams (default: all)")
     add_temperature(parser, "auto: calibrated from the chosen scans")
     add_parameters(parser)
@@ -94,7 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Score the scans and print the results; after Ctrl-C those so far."""
+    """Score the scans and print the results; after Ctrl-C, the results so far."""
     from gpusense.evaluation.fitness import FitnessOfLog
     from gpusense.evaluation.scoring import LogScoring, ParticleSampler
     from gpusense.world.map_files import read_map

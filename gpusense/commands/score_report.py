@@ -23,7 +23,7 @@ def print_report(
     fitness: Fitness,
     chosen: int,
 ) -> None:
-    """Print the results of all scans, or of those before an interrupt."""
+    """Print the results of all scans, or of the scans before an interrupt."""
     if args.json:
         more = {
             "scans_chosen": chosen,
@@ -41,7 +41,7 @@ def print_report(
 
 
 def pose_name(args: argparse.Namespace) -> str:
-    """Return what the report calls the pose of a scan, which is the log's or that of ``--reference``."""
+    """Return the report's name of a scan's pose, which comes from the log or from ``--reference``."""
     return "logged pose" if args.reference is None else "reference pose"
 
 

@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compare the backends and print a table of the differences; after Ctrl-C of those so far."""
+    """Compare the backends and print a table of the differences; after Ctrl-C, the differences so far."""
     return _run_stiff(args) if args.stiff else _run_pairs(args)
 
 
@@ -105,7 +105,7 @@ def _run_stiff(args: argparse.Namespace) -> int:
 
 
 def _kept(stop: KeyboardInterrupt, results: Sequence[object]) -> KeyboardInterrupt:
-    """Return what has stopped the comparisons, to be raised after those so far are printed.
+    """Return the interrupt that stopped the comparisons, to be raised once the results so far are printed.
 
     Raises:
         KeyboardInterrupt: there is none.

@@ -1,7 +1,7 @@
-"""Signals that end a command: it keeps what it has computed, says so in one line, and leaves no unfinished file.
+"""Signals that end a command, which keeps its results so far, reports this in a line, and leaves no unfinished file.
 
-Ctrl-C, the end of a terminal and the signal by which containers and ``timeout`` end a program are exceptions alike.
-Only the command line installs handlers, in the main thread, and puts the old ones back.
+Ctrl-C, a hang-up of the terminal, and the signal by which containers and ``timeout`` end a program all raise
+exceptions. Only the command line installs handlers, in the main thread, and puts the old ones back.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def stopping() -> Iterator[None]:
             before_hook(lost)
 
     before_hook = sys.unraisablehook
-    # A program that calls the command line may have handlers of its own.
+    # A program that calls the command line may have installed handlers.
     usual = (signal.SIG_DFL, signal.default_int_handler)
     numbers = [number for name in _WORDS if signal.getsignal(number := getattr(signal, name)) in usual]
     before = {}

@@ -94,7 +94,7 @@ def _memory(text: str) -> int:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the jobs, and print a summary; after Ctrl-C of those so far."""
+    """Run the jobs, and print a summary; after Ctrl-C, of the jobs so far."""
     from gpusense.sweeps.plan import read_plan
 
     jobs = read_plan(args.plan)
@@ -146,7 +146,7 @@ def _swept(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Sweep:
                     sys.stderr.write(f"gpusense: job {row['key']} failed: {row['error']}\n")
             step(f"{row['model']} {Path(row['log']).name}, {failures} failed")
 
-        # The device of workers that have none of their own.
+        # The default device of workers.
         backend = args.device[0] if args.device else "auto"
         try:
             return run_jobs(

@@ -24,8 +24,8 @@ _Box = tuple[float, float, float, float]  # x0, y0, x1, y1
 def building(seed: int = 0, size: tuple[float, float] = (30.0, 20.0), resolution: float = 0.05) -> OccupancyGrid:
     """Generate a floor of an office building.
 
-    It has a corridor, rooms with doors on both sides, a hall with pillars, and furniture. Cells outside the walls are
-    unknown, and so are those of a room whose door is shut. The corridor's western end is open.
+    It has a corridor, rooms with doors on both sides, a hall with pillars, and furniture. Cells outside the walls and
+    in rooms with shut doors are unknown. The corridor's western end is open.
 
     Args:
         seed: Seed of the random numbers: the same seed generates the same building.

@@ -1,7 +1,7 @@
 """Whether estimated poses are as certain as they say: coverage, interval width, NEES and ranks.
 
-A calibrated filter has the share p of the true poses in its regions of probability p, a normalised error squared (NEES)
-with the quantiles of chi-square with 3 degrees of freedom, and ranks of the truth that are uniform. Regions are
+For a calibrated filter, regions of probability p contain the share p of the true poses, the normalised squared error
+(NEES) has the quantiles of chi-square with 3 degrees of freedom, and ranks of the truth are uniform. Regions are
 ellipsoids of the mean and the covariance; ranks (Talagrand, rank histograms) use the particles themselves.
 """
 

@@ -104,7 +104,7 @@ class Floor:
 
 
 def corner_between(p: Floats, q: Floats) -> list[float]:
-    """Return vertex, bisector and opening angle on the left of walls p and q, of which q begins where p ends."""
+    """Return vertex, bisector and opening angle to the left of walls p and q, where q begins at the end of p."""
     one, two = p[2:] - p[:2], q[2:] - q[:2]
     before, after = math.atan2(one[1], one[0]), math.atan2(two[1], two[0])
     opening = math.pi - math.remainder(after - before, 2 * math.pi)

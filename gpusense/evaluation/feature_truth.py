@@ -1,4 +1,4 @@
-"""True features of a scan of a floor: those that a scan shows well, and those that it may show."""
+"""True features of a scan of a floor: clearly visible ones, and possibly visible ones."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gpusense.evaluation.feature_scenes import Floats, Floor, corner_between
 
 # A run of beams on a wall is seen well from this number and length on [m].
 WELL_POINTS, WELL_LENGTH = 10, 0.5
-# Least turn of a corner, and share of the beams of a door that go through by _DEEP [m].
+# Least turn of a corner; share of a door's beams that pass through it by at least _DEEP [m].
 _TURN, _SHARE, _DEEP = math.radians(30), 0.5, 0.5
 # Hallways in which the robot sees this many widths of both walls.
 _WIDTHS, _WIDEST = 2.3, 3.0
@@ -23,8 +23,8 @@ class Truth:
     """Features of one scan, in the robot's frame.
 
     Attributes:
-        required: Rows of what is seen well by kind: a pose (3) and a size.
-        allowed: Rows of all that exists; lines are ends x, y, x, y in place of pose and size.
+        required: Clearly visible features by kind: rows of a pose (3) and a size.
+        allowed: All features by kind; lines have ends x, y, x, y in place of pose and size.
         runs: (first beam, number of beams, wall) of each run of beams on a wall.
     """
 

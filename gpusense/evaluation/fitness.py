@@ -22,8 +22,8 @@ from gpusense.logs import Scan
 _RANDOM, _STREAM = 64, 1
 # Least share of the random poses that a logged pose excels: 1/2 by chance.
 LEAST_BETTER = 0.9
-# Right poses excel a share b of random ones with the density EXCELS b^(EXCELS - 1), wrong ones with the density 1; the
-# log-likelihood ratio is limited.
+# The share b of random poses that score lower has the density EXCELS b^(EXCELS - 1) at right poses, and 1 at wrong
+# poses; the log-likelihood ratio is limited.
 _EXCELS, _LIMIT = 20, 3.0
 
 

@@ -25,8 +25,8 @@ _WINDOW = 5.0
 class DriftingOdometry:
     """Odometry motion model with a random walk in addition, whose variance grows with time.
 
-    The scans of such runs come at irregular times, and the heading of an odometer drifts without a turn too.
-    ``predict`` takes the odometry before and after the step, and its duration [s].
+    The scans of such runs come at irregular times, and an odometer's heading drifts even without a turn. ``predict``
+    takes the odometry before and after the step, and its duration [s].
 
     Attributes:
         alpha: (4,) noise as of :class:`OdometryMotion`.
@@ -63,8 +63,7 @@ class DriftingOdometry:
 def heading_drift(run: LandmarkRun) -> float:
     """Measure the random walk of the odometer's heading against logged poses [rad / sqrt(s)].
 
-    It is the root of the mean of error^2 / time over all pairs of scans about 5 s apart, or over the whole of a shorter
-    run.
+    It is the root mean of error^2 / time over all pairs of scans about 5 s apart, or over a whole shorter run.
     """
     ends = np.searchsorted(run.time, run.time + min(_WINDOW, float(run.time[-1] - run.time[0])))
     begins = np.flatnonzero((ends < len(run.time)) & (ends > np.arange(len(run.time))))

@@ -127,7 +127,7 @@ def match_log(
 
 
 def trajectory(matches: LogMatches, first: Floats) -> Floats:
-    """Return (S + 1, 3) poses of scans that were matched one to the next, or (S, 3) of those matched to a map.
+    """Return (S + 1, 3) poses of scans matched in sequence, or (S, 3) poses of scans matched to a map.
 
     A match that did not converge is replaced by its guess.
 

@@ -21,8 +21,8 @@ def named_world(name: str, seed: int = 0) -> OccupancyGrid:
         name: ``"office"``, a floor of rooms with furniture on both sides of a corridor (:func:`building`);
             ``"corridor"``, 40 m long without any feature but its ends and two doors; ``"hall"``, 30 x 20 m with rows
             of shelves that look alike; ``"twins"``, two rooms that are equal after half a turn, but for one pillar.
-        seed: Seed of the random numbers of what differs from seed to seed: rooms and furniture, places of doors,
-            shelves that are missing, the place of the pillar.
+        seed: Seed of the random parts: rooms and furniture, positions of doors, missing shelves, the position of the
+            pillar.
 
     Returns:
         A grid with its origin at (0, 0, 0) and cells of 0.05 m that are 0, 100 or -1.

@@ -52,7 +52,7 @@ class Launch:
 
 
 class Recorder(Proxy):
-    """A backend that forwards every call to another one and records scoring launches.
+    """A backend that forwards every call to another backend and records scoring launches.
 
     Pass it to a model as ``backend=``. Score with ``per_beam=True`` and few particles: every argument is copied.
     """
@@ -86,7 +86,7 @@ class Recorder(Proxy):
         # A kernel reads these arguments only where the flags are set. The map's table stays on the device.
         needed = {
             "parts": {"PER_BEAM"} & flags,
-            "pose_low": {"CAREFUL"} & flags,
+            "pose_low": {"TWO_PART_POINTS"} & flags,
             "sensor": {"SENSOR_TABLE"} & flags,
             "normals": {"INCIDENCE"} & flags,
             "map_table": {},
@@ -109,7 +109,7 @@ class Recorder(Proxy):
         by_name = {argument.name: value for argument, value in passed.items()}
         shape = values["particles"], values["rays"]
         outputs = {name: self._backend.empty(shape[0] * shape[1], real) for name in ("ranges", "incidence")}
-        kernel = "cast_echoes" if "ECHO" in flags else "cast_ranges"
+        kernel = "cast_echoes" if "CONES" in flags else "cast_ranges"
         arguments = [outputs.get(argument.name, by_name.get(argument.name)) for argument in KERNELS[kernel].arguments]
         self._backend.compile(kernel, flags)(shape[::-1], *arguments)
         ranges = self._backend.download(outputs["ranges"], np.empty(shape, real))
@@ -191,6 +191,6 @@ def _replay_field(launch: Launch, values: dict[str, Any], shift: tuple[float, fl
     low = values.get("pose_low", np.zeros((count, 4))) + np.array([*shift, 0.0, 0.0])
     single_scan = {"start": None, "constant_terms": None}
     arguments = {**values, **single_scan, "pose_low": low, "log_p": np.empty(count), "parts": parts}
-    flags = launch.flags | {"FLOAT64", "PER_BEAM", "CAREFUL"}
+    flags = launch.flags | {"FLOAT64", "PER_BEAM", "TWO_PART_POINTS"}
     field_kernels.score_field(flags, *(arguments[argument.name] for argument in KERNELS["score_field"].arguments))
     return parts.reshape(count, readings)

@@ -1,7 +1,7 @@
 """Score the scans of a log for clouds of particles and rank the logged poses, on one backend or several.
 
-Per scan the particles are the logged pose, half of the others around it, and the other half uniform over the map's
-free cells. The logged pose is ranked among them. The weighted mean excludes it, since it would bias the mean.
+The particles of a scan are the logged pose, poses around it, and as many poses uniform over the map's free cells. The
+logged pose is ranked among them. The weighted mean excludes it, since it would bias the mean.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class ParticleSampler:
         particles: Number of particles, at least 2.
         sigma_position: Deviation of the particles around the logged pose, in x and in y, >= 0 [m].
         sigma_heading: Deviation of their headings, >= 0 [rad].
-        seed: Seed; each scan has a random stream of its own, so its particles do not depend on the chosen scans.
+        seed: Seed; each scan has a separate random stream, so its particles do not depend on the chosen scans.
     """
 
     particles: int = 20_000
@@ -115,14 +115,14 @@ class BackendScore:
 
     @property
     def particle_beams_per_second(self) -> float | None:
-        """Return evaluated readings per second, without the first scan, which compiles, if there are others."""
+        """Return evaluated readings per second; of several scans the first, which compiles, is left out."""
         steady = self.scans[1:] or self.scans
         seconds = sum(scan.seconds for scan in steady)
         return self.particles * sum(scan.beams for scan in steady) / seconds if seconds > 0 else None
 
 
 def score_scan(index: int, poses: Floats, log_p: Array, beams: int, seconds: float) -> ScanScore:
-    """Rank the logged pose among a scan's particles and compute the weighted mean of the others.
+    """Rank the logged pose among a scan's particles and compute the weighted mean of the remaining particles.
 
     Args:
         index: Index of the scan in its log.
@@ -196,7 +196,7 @@ def chosen_scans(
         offset: Index of the first scan.
         limit: Largest number of scans; None for all.
         topic: The laser, see :func:`gpusense.logs.merge.read_laser`; None for the only or main one.
-        mount: Pose of a bag's laser on the robot [m, m, rad]; None for that of the bag's transforms.
+        mount: Pose of a bag's laser on the robot [m, m, rad]; None takes the mount from the bag's transforms.
 
     Raises:
         ValueError: the log breaks its format, or no scan is chosen.
@@ -239,7 +239,7 @@ def with_one_scanner(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]
     """Return numbered scans of a log, which must have one scanner.
 
     Raises:
-        ValueError: a scan has another one.
+        ValueError: a scan has another scanner.
     """
     for index, scan in scans:
         if scan.scanner != scans[0][1].scanner:

@@ -179,7 +179,7 @@ def _tables(backend: Backend, scene: Scene) -> tuple[Results, list[Check]]:
 
 
 def _ranges(backend: Backend, scene: Scene, precision: Precision, *, sonar: bool) -> Results:
-    """Compute expected ranges and, for the ring of sonars, those of cones and angles of incidence."""
+    """Compute expected ranges and, for the ring of sonars, ranges of cones and angles of incidence."""
     caster = RayCaster(scene.grid, scene.scanner.range_max, backend=backend, precision=precision)
     ranges, angles = TOLERANCES[f"{precision} ranges"], TOLERANCES[f"{precision} angles of incidence"]
     results: Results = {ranges.name: (caster.cast(scene.poses, scene.scanner.bearings), ranges)}

@@ -16,7 +16,7 @@ from gpusense.logs.merge import read_lasers
 from gpusense.world.scanner import Scanner
 
 Floats = NDArray[np.float64]
-# Logged poses are those of the odometry where no step of one differs from that of the other by more [m, rad].
+# Logged poses count as copied odometry where no step differs by more than this [m, rad].
 _SAME = 1e-4
 _LEAST_KNOWN = 3
 
@@ -125,7 +125,7 @@ def references_to_learn_from(steps: Sequence[Step]) -> tuple[list[Pose], list[Po
 
 
 def with_references(steps: Sequence[Step], times: Floats, poses: Floats) -> list[Step]:
-    """Return steps whose references are those of a trajectory at the times of the scans.
+    """Return steps with references from a trajectory at the times of the scans.
 
     Args:
         steps: Steps.

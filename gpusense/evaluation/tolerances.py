@@ -224,7 +224,7 @@ def per_scan(parts: ArrayLike, dtype: DTypeLike, *, fixed: float = 0.0, temperat
 
     BLOCK_TERMS terms are added plainly, with an error of (BLOCK_TERMS - 1) / 2 eps of the sum of their magnitudes.
     Blocks are added with compensation, with the square of a plain sum's relative error. The final sum and its product
-    with the temperature round once each. float64 has a wider rule of its own.
+    with the temperature round once each. float64 has a separate, wider rule.
 
     Args:
         parts: (..., K) log-likelihoods of the beams before the temperature.

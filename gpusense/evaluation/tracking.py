@@ -57,7 +57,7 @@ class Track:
 
     @property
     def verdict(self) -> Word:
-        """Most frequent verdict of the last tenth of the scans, at most 10 of them; the worse of equal ones."""
+        """Most frequent verdict of the last tenth of the scans, at most 10; in a tie, the worse verdict."""
         tail = self.verdicts[-min(max(len(self.verdicts) // 10, 1), _TAIL) :]
         return max(WORDS, key=lambda word: (tail.count(word), WORDS.index(word)))
 
@@ -195,7 +195,7 @@ def _median(shares: Sequence[float]) -> float | None:
 
 
 def _errors(differences: Floats, references: Floats, poses: Floats) -> dict[str, Any]:
-    """Return figures of the errors of (S, 3) poses: of each, and of the way from one to the next."""
+    """Return statistics of the errors of (S, 3) poses, and of the motions between successive poses."""
     position, heading = np.hypot(*differences[:, :2].T), np.abs(differences[:, 2])
     step = np.zeros((1, 3))
     if len(poses) > 1:

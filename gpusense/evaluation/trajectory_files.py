@@ -75,7 +75,7 @@ def _rows(path: Path, lines: Iterator[tuple[int, bytes]]) -> Iterator[list[float
 
 
 def read_tum(path: Path) -> tuple[Floats, Floats]:
-    """Read a TUM trajectory: times (T,) [s] and poses (T, 3), the headings those of the quaternions.
+    """Read a TUM trajectory: times (T,) [s] and poses (T, 3), with headings from the quaternions.
 
     Raises:
         ValueError: a line has not eight finite numbers, there is none, a quaternion is 0, a coordinate is over 1e9 m,

@@ -18,6 +18,7 @@ from gpusense.models.scan.beam import BeamModel
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.hit_shapes import shape_of
 from gpusense.world.parameters import BeamParameters
+from gpusense.world.range_causes import RandomDensity, ShortDensity
 from gpusense.world.scanner import Scanner
 
 Floats = NDArray[np.float64]
@@ -188,9 +189,8 @@ def sample_readings(expected: ArrayLike, range_max: float, parameters: BeamParam
     mean, sigma = np.clip(z + p.range_bias, 0, limit), p.sigma_hit + p.sigma_growth * z
     u = rng.random(z.shape)
     hit = mean + sigma * shape_of(p).drawn(u, mean / sigma, (limit - mean) / sigma)
-    decay = np.maximum(p.lambda_short * z, 1e-12)  # below, the exponential is uniform to rounding
-    short = -np.log1p(u * np.expm1(-decay)) / decay * z
-    drawn = np.choose(kind, [np.clip(hit, 0, limit), np.minimum(short, z), np.inf, u * limit])
+    short = ShortDensity(p.lambda_short).drawn(u, z)
+    drawn = np.choose(kind, [np.clip(hit, 0, limit), short, np.inf, RandomDensity(limit).drawn(u)])
     # Rounding must not turn a range into "no return".
     return np.where(np.isinf(drawn), drawn, np.minimum(drawn, np.nextafter(limit, 0)))
 

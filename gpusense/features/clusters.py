@@ -1,4 +1,4 @@
-"""Landmarks of features that have a place: those of one kind, direction and size near one another are one."""
+"""Landmarks from features with a position: nearby features of one kind, direction and size form one landmark."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from gpusense.features.segments import Segments
 _NARROWEST, _WIDEST = 0.5, 2.0
 # Both sides are of one wall up to this [m] and [rad], and this many deviations.
 _ASIDE, _PARALLEL, _DEVIATIONS = 0.03, math.radians(4), 3.0
-# Least length of a wall [m] and of its other side, and most uncertainty of a jamb across and along the wall [m].
+# Least length of a wall [m] and of its other side; largest uncertainty of a jamb across and along the wall [m].
 _WALL, _OTHER, _VAGUE, _COARSE = 0.5, 0.1, 0.08, 0.4
 # Uncertainty of a jamb at grazing incidence in deviations of ranges, as a step of beams.
 _REVEAL = 4.0
@@ -34,7 +34,7 @@ class _Gaps:
     Attributes:
         before: (D,) segment before the gap.
         after: (D,) segment after it.
-        wall: (D,) the one of them whose line is that of the wall.
+        wall: (D,) the one of both segments that lies on the wall.
         other: (D,) the other one: a part of the wall, or the leaf of a door.
         ends: (D, 4) places of both jambs along the wall, and the steps of beams there [m].
     """
@@ -111,7 +111,7 @@ def _is_wide(segments: Segments, straight: np.ndarray, gaps: _Gaps) -> np.ndarra
 
 
 def _one_each(segments: Segments, gaps: _Gaps, sure: np.ndarray) -> np.ndarray:
-    """Return the doors of which no other one overlaps, or that have long walls on both sides or are narrower."""
+    """Return one of each set of overlapping doors: one with long walls on both sides, or else the narrowest."""
     wall, ends = gaps.wall, gaps.ends
     order = np.lexsort((ends[:, 1] - ends[:, 0], ~sure, segments.scan[wall]))
     middle = segments.place(wall, ends[:, :2].mean(axis=1))

@@ -64,7 +64,7 @@ class FeatureMap:
         return len(self.count)
 
     def landmarks(self, kinds: str | Sequence[str] = LANDMARK_KINDS) -> LandmarkMap:
-        """Return a map of the landmarks of some kinds, with the signatures of :attr:`gpusense.Features.signatures`.
+        """Return a map of the landmarks of some kinds, with signatures as in :attr:`gpusense.Features.signatures`.
 
         Raises:
             TypeError: not names of kinds.

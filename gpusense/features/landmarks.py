@@ -1,4 +1,4 @@
-"""Maps of landmarks and lines from features: of scans along a trajectory, and of an occupancy grid."""
+"""Maps of landmarks and lines, from features of scans along a trajectory or from an occupancy grid."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def map_features(
 
     Features of one kind, direction and size are one landmark where they are within four deviations of one another.
     Its position is the mean of theirs, weighted by their information. Lines are one where they are within four
-    deviations in direction and across, and overlap or nearly so. Hallways have no place of their own.
+    deviations in direction and across, and overlap or nearly so. Hallways have no position.
 
     Args:
         features: Features of S scans.

@@ -1,4 +1,4 @@
-"""Lines of a map: those of scans that agree in direction and offset, and overlap or nearly so, are one."""
+"""Lines of a map: lines of scans that agree in direction and offset, and overlap or nearly do, become one."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class _Pieces:
 
 
 def lines_of(features: Features, poses: Floats, spread: Floats, least: int) -> FeatureMap:
-    """Return the lines of a map from those of scans.
+    """Merge lines of scans into the lines of a map.
 
     Args:
         features: Features of the kind "line".

@@ -1,4 +1,4 @@
-"""Poles: round objects in front of what is behind them, such as columns, posts, legs and cylindrical reflectors."""
+"""Poles: round objects in front of their background, such as columns, posts, legs and cylindrical reflectors."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _covariance(circle: np.ndarray) -> np.ndarray:
 def _objects(
     segments: Segments, beams: Beams, noise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return first points, numbers of points and scans of objects in front of others, and bearings of their edges."""
+    """Return first points, numbers of points, scans and bearings of both edges of objects in the foreground."""
     points = segments.points
     total = len(points.point)
     scan = np.repeat(np.arange(len(noise)), points.counts)
@@ -110,7 +110,7 @@ def _runs(
 
 
 def _cost_of_lines(segments: Segments, first: np.ndarray, count: np.ndarray, scan: np.ndarray) -> np.ndarray:
-    """Return the cost of the lines in each object, with what further lines fit of noise, and 1 for each other point."""
+    """Return the cost of each object's lines: residuals, a penalty for each further line, 1 for each other point."""
     total = segments.points.counts[scan]
     cost = np.zeros(len(first))
     head, tail = np.searchsorted(segments.scan, scan), np.searchsorted(segments.scan, scan, side="right")

@@ -1,4 +1,4 @@
-"""Reflectors: cylinders that shine, short runs of beams that come back far brighter than the others of their scan."""
+"""Reflectors: bright cylinders, seen as short runs of beams far brighter than the rest of their scan."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from gpusense.features.result import Found, nothing
 from gpusense.world.scanner import Reading, Scanner, classes
 
-# Intensity of a bright beam and of the brightest one of a reflector, in medians of its scan.
+# Least intensity of a bright beam, and of a reflector's brightest beam, in medians of the scan.
 _BRIGHT, _BRIGHTEST = 2.0, 3.0
 # Least beams, largest width [m], and largest step of ranges between neighbours [m].
 _LEAST_BEAMS, _WIDEST, _STEP = 2, 0.4, 0.2

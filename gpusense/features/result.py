@@ -38,8 +38,8 @@ class Features:
             the scanner on its left. Corner: vertex and bisector into the free space. Door: centre and direction
             across, away from the scanner. Hallway: point of the axis abreast of the robot and direction of the axis,
             within pi / 2 of the robot's. Pole and reflector: centre and 0.
-        covariance: (F, 3, 3) of the pose; infinite in every coordinate in which a direction lies that is not
-            observed: along a line and the axis of a hallway, and the heading of a pole or reflector.
+        covariance: (F, 3, 3) of the pose; infinite in each unobserved coordinate: along a line or a hallway's axis, and
+            the heading of a pole or reflector.
         information: (F, 3, 3) inverse of the covariance, finite: exactly 0 along directions that are not observed.
         size: (F,) length of a line [m], opening angle of the free space in a corner [rad], width of a door and of a
             hallway [m], radius of a pole and of a reflector [m].
@@ -152,7 +152,7 @@ def across_lines(lines: Features) -> Floats:
 
 
 def joined(parts: Sequence[Features], scans: int) -> Features:
-    """Return the features of several calls, each of ``scans`` scans but for the last, as those of one."""
+    """Join the features of several calls, each of ``scans`` scans except the last."""
     values = {one.name: np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(Features)}
     values["scan"] = np.concatenate([part.scan + scans * number for number, part in enumerate(parts)])
     return Features(**values)
@@ -188,7 +188,7 @@ def check_kinds(name: str, kinds: str | Sequence[str]) -> tuple[str, ...]:
 
 @dataclass
 class Found:
-    """Features of one kind: what is observed of them.
+    """Observed quantities of features of one kind.
 
     Attributes:
         scan: (F,) index of the scan.

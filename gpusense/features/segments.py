@@ -13,9 +13,9 @@ from gpusense.matching.points import GAP, ScanPoints
 _FULL_TURN = 2 * math.pi
 # Two lines must lower the cost of one by this to be two [squares of deviations].
 PENALTY = 25.0
-# Degrees of freedom with which the noise of a scan counts in that of its segments.
+# Degrees of freedom with which a scan's noise counts in the noise of each segment.
 _PRIOR = 20.0
-# Least noise of ranges [m]: that of a covariance.
+# Least noise of ranges in a covariance [m].
 LEAST_NOISE = 2e-4
 
 
@@ -154,7 +154,7 @@ def _described(
 def _variances(
     noise: np.ndarray, scan: np.ndarray, count: np.ndarray, cost: np.ndarray, valid: np.ndarray
 ) -> np.ndarray:
-    """Return the variance of ranges (G,): that of all good segments of a scan, and a segment's own residuals."""
+    """Return the variance of ranges (G,), from the good segments of the scan and the residuals of each segment."""
     free = np.maximum(count - 2, 0)
     squares = noise[scan] ** 2 * np.where(valid, cost, 0)
     good = valid & (count >= 6)

@@ -13,7 +13,7 @@ ALL_BINS = BINS**3
 STRETCH = 16
 # Kernel file heading: up to this heading [rad] the counts of quarter turns have 20 bits.
 LARGEST_HEADING = 1048576.0
-# Kernel file scan: max readings are left out, part of the constant term, or evaluated like others.
+# Kernel file scan: max readings are left out, are part of the constant term, or are evaluated like ranges.
 MAX_LEFT_OUT, MAX_FIXED, MAX_PLACED = range(3)
 # Kernel file end_point: cells around a field's window that hold the outside.
 FIELD_RING = 2
@@ -63,7 +63,7 @@ DEPTH = 60
 # last two are 0 where all particles are here.
 FIRST, WHOLE, DRAWN = 61, 62, 63
 SETTINGS = 64
-# Streams of random numbers within a step; a stage of a correction has DRAW_STREAMS of its own.
+# Streams of random numbers within a step; each stage of a correction has DRAW_STREAMS further streams.
 MOTION_STREAM, DRAW_STREAM, DRAW_STREAMS = 0, 16, 4
 # Kernel file sampling: its stream of random numbers, one further for each beam; numbers of a mixture; numbers of its
 # settings by place. DRAW_SEED takes 2 places.
@@ -76,7 +76,7 @@ RUNGS = 8
 WEIGHT_SUMS = 2 * RUNGS + 1
 # Share of the temperature on the last rung.
 LOWEST = 0.5 ** (RUNGS - 1)
-# The state of a filter: numbers of each stage of a correction, and those that last.
+# The state of a filter: numbers of each stage of a correction, then numbers that persist.
 LEFT, TOTAL, SAMPLE_SIZE, RESAMPLED, DEGENERATE, RUNG = range(6)
 STAGE = 8
 EVIDENCE, SLOW, FAST, INJECTED = 48, 49, 50, 51

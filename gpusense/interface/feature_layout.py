@@ -26,7 +26,7 @@ FEATURE = 29
 # factor of the angle in the second exponent, and the places of its ends along it, from the foot of the normal [m].
 MIXED_SCALE, MIXED_SCALE_LOW, FIRST_END, LAST_END = SIGNATURE_SCALE, SIGNATURE_SCALE_LOW, UPPER, UPPER_LOW
 
-# Arcs of i / 8, of a quarter and of half a turn, as sums of two float64 numbers.
+# Angles: i / 8, a quarter and half a turn, as sums of two float64 numbers.
 ARC_STEPS = 8
 ARCS = (
     (0.0, 0.0),

@@ -1,9 +1,9 @@
-"""The flag of kernels in vectors, which compute several particles or beams at once on devices that ask for lanes."""
+"""The flag of kernels in lanes, which compute several particles or beams at once on devices that ask for them."""
 
 from __future__ import annotations
 
-# Flags with which a kernel has no body in vectors, and the sets of flags of which it needs one.
-_SCALAR = frozenset({"FLOAT64", "ALL_READINGS", "SHARP", "CUBES"})
+# Flags with which a kernel has no body in lanes; sets of flags, at least one of which it requires.
+_SCALAR = frozenset({"FLOAT64", "ALL_READINGS", "EXACT_EXPONENT", "CUBES"})
 _NEVER: dict[str, frozenset[str]] = {
     "cast_ranges": frozenset(),
     "e_step": _SCALAR - {"FLOAT64"},
@@ -34,8 +34,8 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
 
 
 def with_lanes_flag(lanes: int, kernel: str, flags: frozenset[str] | set[str]) -> frozenset[str]:
-    """Return the flags of a launch, with WIDE where the device asks for lanes and the kernel has a body in vectors."""
+    """Return the flags of a launch, with IN_LANES where device and kernel compute in lanes."""
     never = _NEVER.get(kernel, _SCALAR)
     if lanes == 1 or flags & never or not any(needed <= flags for needed in _NEEDED.get(kernel, ())):
         return frozenset(flags)
-    return frozenset(flags) | {"WIDE"}
+    return frozenset(flags) | {"IN_LANES"}

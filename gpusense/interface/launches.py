@@ -34,7 +34,7 @@ class Launch(NamedTuple):
     arguments: tuple[Any, ...]
 
     def places(self, names: Container[str]) -> list[tuple[int, str]]:
-        """Return the positions and names of those arguments of a set of names that the kernel has."""
+        """Return the positions and names of the kernel's arguments that are in a set of names."""
         return [(place, name) for place, name in enumerate(_names(self.kernel)) if name in names]
 
     def without(self, names: Container[str]) -> Launch:

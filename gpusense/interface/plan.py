@@ -39,7 +39,7 @@ class Note:
 
 @dataclass(frozen=True)
 class Plan:
-    """The code of a model, the parts that it leaves out, those that it keeps, and those that could go.
+    """The flags of a model's code, and the parts that are left out, kept, and removable.
 
     Attributes:
         title: The model and its device.
@@ -87,7 +87,7 @@ def share(part: float, whole: float) -> str:
 
 
 def component_notes(components: Iterable[tuple[str, float, str]]) -> tuple[list[Omission], list[Note]]:
-    """Return the components of a mixture whose weight is 0, and the others.
+    """Return the components of a mixture with weight 0, and with a weight above 0.
 
     Args:
         components: (parameter, its weight, cost of its component per particle-beam).
@@ -119,7 +119,7 @@ def launch_omissions(code: frozenset[str], least_ordered: tuple[int, int] | None
             or a model puts none in order.
     """
     omissions = [ORDINARY_HEADINGS] if code and "HUGE_HEADINGS" not in code else []
-    if "QUICK" in code:
+    if "ROUNDED_CELLS" in code:
         omissions.append(
             Omission(
                 "guard of each end point",

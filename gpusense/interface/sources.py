@@ -21,6 +21,11 @@ typedef {real}2 real2;
 typedef {real}4 real4;
 #define FLOAT64 {float64}
 #define SPLITTER ((real){splitter})
+#if defined(__FMA__) || defined(__ARM_FEATURE_FMA) || defined({fast_fma})
+#define FUSES 1
+#else
+#define FUSES 0
+#endif
 """
 _HEAD = re.compile(r"^kernel void (\w+)\(ARGUMENTS\)", re.MULTILINE)
 _WORD = re.compile(r"\w+")
@@ -29,6 +34,8 @@ _REQUIRES = re.compile(r"^// requires: (.*)$", re.MULTILINE)
 
 def prelude(*, float64: bool, doubles: bool = False) -> str:
     """Return the head of every program: it forbids contraction and defines ``real``.
+
+    FUSES says whether the device multiplies and adds at once; elsewhere ``fma`` is a call.
 
     Args:
         float64: Whether ``real`` is float64.
@@ -39,6 +46,7 @@ def prelude(*, float64: bool, doubles: bool = False) -> str:
         real="double" if float64 else "float",
         float64=int(float64),
         splitter="134217729" if float64 else "4097",
+        fast_fma="FP_FAST_FMA" if float64 else "FP_FAST_FMAF",
     )
 
 
@@ -79,15 +87,15 @@ def _with_parameters(text: str, file: str) -> str:
 def required_files(name: str, flags: frozenset[str] = frozenset()) -> list[str]:
     """List the files of a kernel file's program, the file itself last.
 
-    With ``WIDE``, ``lanes/<name>`` takes the place of ``<name>`` where there is such a file. Names in ``// requires:``
-    are taken as they stand, so a file in lanes names files of both folders. ``caster`` stands for the caster of the
+    With ``IN_LANES``, ``lanes/<name>`` replaces ``<name>`` where there is such a file. Names in ``// requires:`` are
+    taken as they stand, so a file in lanes names files of both folders. ``caster`` stands for the caster of the
     flags, and ``lanes/caster`` for its body in lanes or, where it has none, for ``lanes/other_caster``.
     """
     return _with_requirements(f"lanes/{name}" if _in_lanes(name, flags) else name, flags)
 
 
 def _in_lanes(name: str, flags: frozenset[str]) -> bool:
-    return "WIDE" in flags and has_opencl_source(f"lanes/{name}")
+    return "IN_LANES" in flags and has_opencl_source(f"lanes/{name}")
 
 
 def _with_requirements(name: str, flags: frozenset[str]) -> list[str]:
@@ -173,7 +181,7 @@ def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
     if any({"caster", "lanes/caster"} & set(_requirements(needed)) for needed in files):
         words |= casters.FLAGS.keys()
     if _in_lanes(file, flags):
-        words.add("WIDE")
+        words.add("IN_LANES")
     unknown = flags - FLAGS.keys()
     if unknown:
         raise ValueError(f"flags: must be among {sorted(FLAGS)}, got {sorted(unknown)}")

@@ -27,7 +27,7 @@ class Window(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """A grid's frame in the world, and the scanner's place on the robot [m]; yaw is that of the grid."""
+    """A grid's frame in the world, with the grid's yaw, and the scanner's position on the robot [m]."""
 
     origin_x: double
     origin_y: double
@@ -39,7 +39,7 @@ class Frame(NamedTuple):
 
 
 class Caster(NamedTuple):
-    """The knobs of casters; each reads its own."""
+    """The knobs of all casters; each caster reads its fields."""
 
     bins: int
     slack: real
@@ -62,7 +62,7 @@ class Cone(NamedTuple):
 
 
 class MixtureTables(NamedTuple):
-    """Bins of the angle of incidence, each with terms of its own, and the cells of a table of log densities."""
+    """Bins of the angle of incidence, each with separate terms, and the cells of a table of log densities."""
 
     incidence_bins: int
     cells: int
@@ -77,7 +77,7 @@ class Score(NamedTuple):
 
 
 class ScanBatch(NamedTuple):
-    """Particles of each scan, and those of earlier launches."""
+    """Particles of each scan, and particles of earlier launches."""
 
     per_scan: int
     ahead: int

@@ -8,12 +8,13 @@ import numpy as np
 
 # Above this peak [1/m] the rounding errors of an exponent may exceed the tolerance beside a log density near 0.
 HIGH_PEAK = 64.0
-# A density in a linear sum must be far above the underflow of the others, with or without denormals.
+# A density in a linear sum must be far above the size at which the other densities underflow, with or without
+# denormals.
 _SMALLEST_DENSITY = {np.dtype(np.float32): 1e-30, np.dtype(np.float64): 1e-290}
 
 
 def sums_linearly(rand: float, peak: float, real: np.dtype) -> bool:
-    """Return whether densities are summed: the uniform one is large enough beside the peak of the others."""
+    """Return whether densities are summed: the uniform density is large enough relative to the other peaks."""
     return rand >= _SMALLEST_DENSITY[real] * max(peak, 1.0)
 
 

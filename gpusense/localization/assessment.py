@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gpusense.localization.estimates import Estimate, clustered
+from gpusense.localization.estimates import Estimate, clustered, covariance_of
 from gpusense.localization.recovery import Recovery
 from gpusense.localization.rival import evidence_of
 from gpusense.localization.spread import is_apart, is_narrow, is_wide, share_off, share_off_of
@@ -15,7 +15,7 @@ from gpusense.localization.tracker import Tracker
 from gpusense.localization.verdict import Verdict
 from gpusense.localization.words import word_of
 
-# Most particles whose spread is counted one by one; of more, and of narrow clouds, a normal density is taken.
+# Most particles whose spread is counted one by one; larger and narrow clouds are approximated by a normal density.
 _MOST_LOOKED_AT = 100_000
 
 
@@ -32,8 +32,8 @@ def estimate_of(
         method: "mean", "cluster" or "best".
     """
     cloud, shown = tracker.cloud, tracker.shown
-    pose, covariance = tracker.mean_and_covariance()
-    summary = cloud.summary()
+    numbers, summary = cloud.estimate_and_summary(shown)
+    pose, covariance = numbers[:3].copy(), covariance_of(numbers)
     if method == "best":
         pose = tracker.host_particles()[int(np.argmax(cloud.host_weights(shown)))]
     elif method == "cluster":

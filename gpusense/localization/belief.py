@@ -1,7 +1,7 @@
 """Belief that a localiser follows a wrong pose: a hidden Markov model of two states, right and wrong.
 
-The states are "right", the robot is where the localiser's distribution says, and "wrong", it is elsewhere. The prior
-probability of "wrong" is ``START``. From one scan to the next a right pose goes wrong, by a silent divergence or
+The two states are "right" (the robot is where the localiser's distribution says) and "wrong" (it is elsewhere). The
+prior probability of "wrong" is ``START``. From one scan to the next a right pose goes wrong, by a silent divergence or
 because the robot is carried away, with probability ``1 - exp(-(PER_SCAN n + PER_METRE d))`` after n scans and d metres,
 and a wrong one becomes right with probability ``FOUND`` a scan. While the distribution is so wide that it has several
 places, both happen with probability ``WIDE`` a scan.
@@ -16,8 +16,8 @@ the exact increment of the log odds is then
 so a robot that stands gains next to nothing from its hundredth scan, and a change is seen at once (Hamilton, "A new
 approach to the economic analysis of nonstationary time series", *Econometrica* 57 (1989), treats such regimes).
 
-A place that was searched for, as after a start anywhere, was chosen because the scans agree with it, so that this
-agreement is no evidence any more: it counts as that of the scan before. A contradiction counts in full.
+A search, as after a start anywhere, chooses a place because the scans agree with it. This agreement is therefore no new
+evidence: it counts as repeated from the scan before. A contradiction counts in full.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-# Prior probability of "wrong" for a start at a pose; rates of going wrong, of being found again, of both while wide.
+# Prior probability of "wrong" after a start at a pose. Rates of becoming wrong per scan and per metre, of becoming
+# right again, and of both while the distribution is wide.
 START = 0.1
 PER_SCAN, PER_METRE, FOUND, WIDE = 1e-3, 2e-3, 0.003, 0.05
-# Correlation of the ratios of two scans at one place, and the way in which it falls to 1 / e [m, rad].
+# Correlation of the ratios of two scans at one place, and the distance and turn over which it falls to 1 / e [m, rad].
 STAYS, LENGTH, TURN = 0.95, 2.0, 1.0
 # Searches on a right map of which one finds a wrong place; wrong places that count.
 MISSES, MOST_PLACES = 8, 2

@@ -1,4 +1,4 @@
-"""The cloud of a filter: its particles, the steps that change them, and what of it crosses to the host.
+"""The particle cloud of a filter on one device: its steps, and the numbers that it copies to the host.
 
 A correction has stages until no temperature is left. On a GPU motion, scores and weights of a stage are one recorded
 program.
@@ -7,7 +7,7 @@ program.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import numpy as np
@@ -32,7 +32,7 @@ class Cloud(Particles):
         capacity: Most particles.
         sensors: Most sensors of a correction.
         precision: Of their log-likelihoods.
-        residual: Whether draws are those of residual resampling.
+        residual: Whether to draw by residual resampling.
     """
 
     def __init__(
@@ -169,7 +169,7 @@ class Cloud(Particles):
         recorded = self._recordings.items()
         return recorded[-1][1].recording.explain() if recorded else "launches one by one"
 
-    # ---- what crosses to the host
+    # ---- copies to the host
 
     def summary(self) -> Summary:
         """Return the state after the last correction."""
@@ -196,9 +196,9 @@ class Cloud(Particles):
         if self.backend.info.kind != "gpu":
             return self.estimate(count)[:MOMENTS]
         out, poses, weight = self.backend.blank(ESTIMATE, _DOUBLE), self.poses[self.places.shown], self.places.weight
-        for again in (0, 1):
+        for second_pass in (0, 1):
             # The second pass is right for any headings.
-            self.backend.run(self.sums.estimate(poses, self.weights[weight], out, count, again))
+            self.backend.run(self.sums.estimate(poses, self.weights[weight], out, count, second_pass))
         return self._lent(out, (MOMENTS,))
 
     def particles(self, count: int) -> Any:
@@ -209,18 +209,37 @@ class Cloud(Particles):
 
     def estimate(self, count: int) -> np.ndarray:
         """Return the kernels' estimate of the shown particles: mean, covariance, sum of weights."""
-        numbers = self._estimate(count, 0)
-        return self._estimate(count, 1) if numbers[WIDE_HEADINGS] else numbers
+        numbers = np.empty(ESTIMATE)
+        self._estimate(count, (self.estimated, numbers))
+        return numbers
 
-    def _estimate(self, count: int, again: int) -> np.ndarray:
-        """Return the numbers after a pass of the estimate."""
-        shown, weight = self.places.shown, self.places.weight
-        # Clouds that change their size seldom ask twice for the same.
-        self._estimates.run(
-            (shown, weight, count, again),
-            lambda: self.sums.estimate(self.poses[shown], self.weights[weight], self.estimated, count, again),
-        )
-        return self._read(self.estimated, ESTIMATE)
+    def estimate_and_summary(self, count: int) -> tuple[np.ndarray, Summary]:
+        """See FilterCloud.estimate_and_summary; there is one wait for both."""
+        numbers, state = np.empty(ESTIMATE), np.empty(STATE)
+        self._estimate(count, (self.estimated, numbers), (self.states[self.places.state], state))
+        return numbers, summary_of(state)
+
+    def _estimate(self, count: int, *copies: tuple[Buffer, np.ndarray]) -> None:
+        """Copy buffers to arrays after the launches of the estimate, which is the first of them."""
+        self._estimate_pass(count, 0, copies)
+        if copies[0][1][WIDE_HEADINGS]:
+            self._estimate_pass(count, 1, copies)
+
+    def _estimate_pass(self, count: int, second_pass: int, copies: Sequence[tuple[Buffer, np.ndarray]]) -> None:
+        """Run a pass of the estimate, and copy; where the device has graphs, all of it is one."""
+        shown, weight, backend = self.places.shown, self.places.weight, self.backend
+        backend.begin_batch()
+        try:
+            # Clouds that change their size seldom ask twice for the same.
+            self._estimates.run(
+                (shown, weight, count, second_pass),
+                lambda: self.sums.estimate(self.poses[shown], self.weights[weight], self.estimated, count, second_pass),
+            )
+            for buffer, array in copies:
+                backend.download(buffer, array, wait=False)
+            backend.synchronize()
+        finally:
+            backend.end_batch()
 
     def host_poses(self, index: int, count: int) -> np.ndarray:
         """Return a copy of the poses of a buffer."""
@@ -231,7 +250,7 @@ class Cloud(Particles):
         return self._read(self.weights[self.places.weight], count)
 
     def contents(self, count: int) -> Contents:
-        """Return a copy of all particles, given the number of the shown ones."""
+        """Return a copy of all particles, ``count`` of which are shown."""
         places, weighed = self.places, self.places.shown != self.places.next
         return Contents(
             self.host_poses(places.shown, count), self.host_weights(count),

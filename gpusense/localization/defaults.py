@@ -19,7 +19,7 @@ class Defaults(NamedTuple):
         share: Least effective sample size of a stage, as a share of the particles, where they lie together.
         enough: Effective sample size that is enough for a stage of any number of particles that lie together.
         share_apart: Least share where they lie apart, and among landmarks, so that no peak wins by chance.
-        jitter: Share of the difference of two particles by which a drawn one moves between stages.
+        jitter: Factor of the difference of two particles by which a drawn particle is jittered between stages.
         farthest: Largest such difference [m].
         farthest_turn: Largest such difference of headings [rad].
         wide_scans: Corrections after a start anywhere on the map that use a lower temperature.

@@ -18,9 +18,10 @@ from gpusense.localization.verdict import sightings
 Floats = NDArray[np.float64]
 Cause = Literal["none", "people", "start", "mount", "map", "unknown"]
 
-# Poses that are tried elsewhere; the best of them that are refined, the refinements of each, and how far they reach.
+# Poses tried elsewhere on the map; how many of the best are refined; refinements of each, and their largest
+# displacement.
 _TRIED, _REFINED, _AROUND, _REACH = 8192, 12, 64, (0.4, 0.4, 0.2)
-# A pose explains a scan where at least this share of the beams that meet walls agree, and of all that tell anything.
+# A pose explains a scan if at least these shares agree: of the beams that meet walls, and of all informative beams.
 _FITS, _FITS_OF_ALL = 0.85, 0.6
 # Another mount is a cause from this angle on [rad]; steps in which it is tried.
 _LEAST_TURN, _TURNS = math.radians(20), 72
@@ -47,9 +48,9 @@ class Diagnosis:
         turned: Angle by which the scanner seems to be turned against its mount [rad]; pi with ``mirrored`` for one that
             is upside down; None where the mount fits or no other one does.
         mirrored: Whether the readings seem to run the other direction.
-        cause: Likely cause: "none", nothing contradicts the pose; "people", beams are short only; "start", the robot is
-            elsewhere on this map; "mount", the scanner is mounted otherwise; "map", no place of the map explains the
-            scan; "unknown".
+        cause: Likely cause: "none" (nothing contradicts the pose), "people" (some beams are short, none long), "start"
+            (the robot is elsewhere on this map), "mount" (the scanner has another mount), "map" (no place of the map
+            explains the scan) or "unknown".
 
     Example:
         >>> import gpusense as gs

@@ -10,7 +10,7 @@ from gpusense._util.html import card, pose_rows
 from gpusense.localization.pose_algebra import mean_pose, wrap_angle
 from gpusense.localization.words import LOST, Word
 
-# Bins of which neighbours belong to a cluster [m, rad].
+# Bins of positions and headings [m, rad]; neighbouring bins belong to one cluster.
 _BIN, _BIN_TURN = 0.5, 0.35
 
 
@@ -25,8 +25,8 @@ class Estimate:
         p_lost: Probability that the pose is off by more than 1 m or 0.5 rad; see ``docs/localization.md``.
         verdict: "tracking"; "uncertain", where the particles are spread wide or over several places, or p_lost is above
             0.1; or "lost", where scans or features contradict the pose and p_lost is above 0.5.
-        explained: Share of the beams of the last scan that agree with the map at the pose, of those that the map could
-            explain; NaN without one.
+        explained: Among the beams of the last scan that the map could explain, the share that agrees with it at the
+            pose; NaN without one.
         temperature: Of the first sensor.
         used: Share of the temperature that the stages of the last correction used: less than 1 where even the last
             stage would have left too few particles.

@@ -1,9 +1,10 @@
 """Whether a filter is lost among landmarks: how much better its particles predict features than poses anywhere.
 
-Before each correction, log of the mean likelihood of the features over the particles is compared with the larger of two
-chances: the mean over poses anywhere among the landmarks, and features that are all false positives. The difference, in
-nats for each feature, is the logarithm of a Bayes factor (Jeffreys 1961). A filter that follows the robot gains several
-nats; one on a wrong map, or at a wrong place, gains none, and noise that was fitted to a wrong map cannot hide it.
+Before each correction, the mean likelihood of the features over the particles is compared with the larger of two
+alternatives: the mean over poses anywhere among the landmarks, and the likelihood that all features are false
+positives. The difference, in nats for each feature, is the logarithm of a Bayes factor (Jeffreys 1961). A filter that
+follows the robot gains several nats; one on a wrong map, or at a wrong place, gains none, and noise that was fitted to
+a wrong map cannot hide it.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ class Gains(NamedTuple):
     recent: tuple[tuple[float, int], ...] = ()
 
     def added(self, gain: float, count: int) -> Gains:
-        """Return the gains with those of a scan more."""
+        """Return the gains with one more scan added."""
         return Gains((*self.recent, (gain, count))[-MEMORY:])
 
     @property

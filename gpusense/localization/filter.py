@@ -34,7 +34,7 @@ class ParticleFilter(Whole):
     then resamples and jitters (annealing). So a few hundred particles track a precise scanner.
 
     Args:
-        models: A measurement model, or several of one device: of scans, landmarks, beacons, positions, headings,
+        models: A measurement model, or several models on one device: scans, landmarks, beacons, positions, headings,
             contacts. Each with temperature 1.
         motion: :class:`OdometryMotion`, :class:`OmniMotion` or :class:`VelocityMotion`.
         particles: Their number, or (least, most): as many as KLD sampling asks for (Fox 2001).
@@ -47,9 +47,9 @@ class ParticleFilter(Whole):
         recovery: "sensor": where scans contradict the pose, a rival cloud begins where the scan is likely (sensor
             resetting, Lenser and Veloso 2000) and takes over once later scans prefer it; "augmented": inject uniform
             particles where the scans' likelihood drops (*Probabilistic Robotics* table 8.3); None: neither.
-        beam_skip: None, or a share of the particles in (0, 1): a beam that fewer of them explain is left out, such as
-            one of a person. A scan of which most beams would be left out is used as a whole, and so is each scan while
-            the particles lie apart. Each correction then asks 100 particles on the host first.
+        beam_skip: None, or a share of the particles in (0, 1): a beam that a smaller share explains is left out, such
+            as one that hits a person. A scan that would lose most of its beams is used as a whole, as is every scan
+            while the particles are spread out. Each correction then first asks 100 particles on the host.
 
     Attributes:
         motion: The motion model.
@@ -163,9 +163,9 @@ class ParticleFilter(Whole):
         """Draw particles from a likelihood over poses.
 
         Args:
-            likelihood: The result of :func:`pose_likelihood`, or an object with ``log_p``, an array of M
-                log-likelihoods of any shape, and ``positions``, (M, 3) poses in the same order. Particles are spread
-                over the cells of its ``resolution`` [m] and the gaps of its ``headings``, if it has these.
+            likelihood: The result of :func:`pose_likelihood`, or an object with ``log_p`` (M log-likelihoods, an array
+                of any shape) and ``positions`` ((M, 3) poses in the same order). Particles are spread over the cells of
+                its ``resolution`` [m] and the gaps of its ``headings``, if it has these.
             particles: Their number; the filter's (most) by default.
 
         Raises:
@@ -189,7 +189,7 @@ class ParticleFilter(Whole):
         """Move the particles: by the odometry before and after the step, or what the motion model takes.
 
         Args:
-            *motion: Of odometry, (3,) and (3,) poses in the frame of the odometer; of velocities, (v, w) and seconds.
+            *motion: For odometry two (3,) poses in the odometer's frame; for velocities (v, w) and a duration [s].
 
         Raises:
             RuntimeError: the filter is not initialised.
@@ -209,7 +209,7 @@ class ParticleFilter(Whole):
 
     @settled
     def flush(self) -> None:
-        """Run the motion of the last ``predict`` now, as a step of its own; the next correction does it otherwise."""
+        """Run the motion of the last ``predict`` now; otherwise the next correction runs it."""
         if self._parts.tracker.pending is not None:
             self._move()
 
@@ -219,7 +219,7 @@ class ParticleFilter(Whole):
 
     @whole
     def correct(self, readings: Any) -> None:
-        """Weigh the particles by readings, and draw new ones where it is due.
+        """Weigh the particles by readings, and resample where the effective sample size is low.
 
         Args:
             readings: The reading of the filter's only model, or a mapping from models to their readings. Where

@@ -26,7 +26,7 @@ from gpusense.interface.constants import (
     STATE,
 )
 from gpusense.localization.particles import Places
-from gpusense.reference.rungs import left_of
+from gpusense.reference.tempering import left_of
 
 # Lowest depth of a ladder: distances of a million deviations differ by 2^-39 on its last rung.
 _DEEPEST = LOWEST**5
@@ -81,10 +81,10 @@ class Contents(NamedTuple):
         return len(self.poses if self.next_poses is None else self.next_poses)
 
     def places_and_arrays(self, now: Places) -> tuple[Places, list[tuple[str, int, np.ndarray]]]:
-        """Return the buffers of these particles, which leave others as they are, and the array that each takes.
+        """Return the buffers that take these particles without overwriting the kept ones, and the array for each.
 
         Args:
-            now: The others; those at the beginning of the call.
+            now: The buffers at the beginning of the call, which are kept.
 
         Returns:
             Names of buffers are "poses" and "weights".
@@ -127,7 +127,7 @@ def summary_of(numbers: np.ndarray) -> Summary:
         used += float(own[RUNG])
         if own[LEFT] == 0.0:
             break
-        # Each copy moves by the difference of two others: m parents have at most m^3 distinct copies.
+        # Each copy moves by the difference of two other parents, so m parents have at most m^3 distinct copies.
         distinct = min(distinct, float(own[SAMPLE_SIZE]) ** 3)
         stage += 1
     size = min(float(own[SAMPLE_SIZE]), distinct)
@@ -219,6 +219,10 @@ class FilterCloud(ABC):
     @abstractmethod
     def summary(self) -> Summary:
         """Return the state after the last correction."""
+
+    def estimate_and_summary(self, count: int) -> tuple[np.ndarray, Summary]:
+        """Return both at once, which may take one copy to the host."""
+        return self.estimate(count), self.summary()
 
     @abstractmethod
     def particles(self, count: int) -> Any:

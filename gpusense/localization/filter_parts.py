@@ -49,7 +49,7 @@ class FilterParts:
         self.last: dict[int, tuple[Any, ...]] = {}
 
     def keep(self) -> None:
-        """Note what the call that begins must leave as it is."""
+        """Record the buffers that the beginning call must not overwrite."""
         self.tracker.keep()
         self.recovery.keep()
 
@@ -122,7 +122,7 @@ class FilterParts:
             verdict.predicted(*tracker.moved_particles(), everything)
         if share is not None:
             given = skipping.skipped(self.sensors, given, tracker.moved_particles(), verdict.anywhere, share)
-        tracker.weigh(given, again=bool(self.last))
+        tracker.weigh(given, corrected_before=bool(self.last))
         # The caller may write the next readings to the same arrays.
         self.last = {index: tuple(map(_copied, reading)) for index, reading in everything.items()}
         verdict.corrected()

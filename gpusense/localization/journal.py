@@ -1,14 +1,14 @@
 """State of a filter on the host: it changes as a whole or not at all, and is copied to and from plain data.
 
 Python may raise KeyboardInterrupt between any two lines. A call that changes a filter first keeps all of the filter's
-attributes in a journal, and drops it at its end by one assignment. If the call does not come to its end, the journal
-puts the attributes back, at once or, if another interrupt prevents that, before the next call. Buffers on a device
-need no copy: a step writes those that the attributes do not name yet.
+attributes in a journal, and drops it at its end by one assignment. If the call is interrupted, the journal restores the
+attributes: at once or, if another interrupt prevents that, before the next call. Buffers on a device need no copy: a
+step writes those that the attributes do not name yet.
 
-State are the attributes in ``MEMORY`` of a class, of which those in ``PARTS`` hold state themselves; of classes of this
-package without it, all attributes. Dictionaries,
-lists and queues are kept by their items, objects of this package by their own attributes, and everything else, arrays
-included, by identity: arrays of state are replaced, and never written.
+A class lists its state in ``MEMORY``, and in ``PARTS`` the attributes that hold state themselves. In a class of this
+package without ``MEMORY`` all attributes are state. Dictionaries, lists and queues are saved item by item, objects of
+this package attribute by attribute, everything else by identity. Arrays belong to the last group, so arrays of state
+are replaced and never written.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import numpy as np
 
 _PACKAGE = "gpusense.localization."
 _PLAIN = (bool, int, float, str, np.generic)
-# Sensors are state of the filter, and not of others that know them.
+# Sensors are state of the filter alone, though other parts refer to them.
 _SENSORS = "_sensors"
 # Containers whose items are state.
 _CONTAINERS = (dict, list, deque)
@@ -122,7 +122,7 @@ class Journal:
 
 
 class Whole:
-    """Base of objects whose calls change all of their state or none.
+    """Base of objects whose calls change their whole state or nothing.
 
     Calls of several threads wait for one another.
     """
@@ -134,7 +134,7 @@ class Whole:
         self._calls = threading.RLock()
 
     def _keep(self) -> None:
-        """Note what the call that begins must leave as it is."""
+        """Record the buffers that the beginning call must not overwrite."""
 
     def _changing(self) -> tuple[Any, ...]:
         """Return the objects whose state a call may change: this one and its parts."""
@@ -248,7 +248,7 @@ def _plain(value: Any) -> Any:
 
 
 def set_state(owner: Any, values: Mapping[str, Any]) -> None:
-    """Set the state of an object to that of ``plain_state``."""
+    """Set the state of an object from the result of ``plain_state``."""
     for name, value in values.items():
         setattr(owner, name, _merged(vars(owner).get(name), value))
 

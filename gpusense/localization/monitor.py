@@ -30,8 +30,8 @@ class PoseVerdict:
         p_lost: Probability that the pose is off by more than 1 m or 0.5 rad.
         verdict: "tracking"; "uncertain", where the covariance is wide or p_lost is above 0.1; or "lost", where readings
             contradict the pose and p_lost is above 0.5.
-        explained: Share of the beams that agree with the map at the pose, of those that the map could explain; NaN
-            without one.
+        explained: Among the beams that the map could explain, the share that agrees with it at the pose; NaN without
+            one.
 
     Example:
         >>> import gpusense as gs

@@ -110,12 +110,12 @@ class OdometryMotion:
             sign; the tracks of such a log are lost at 0.
         least: Standard deviations of translation and turns that are always added [m, rad]: wheels that slip, a robot
             that is pushed.
-        systematic: Errors that repeat, and are corrected before noise is added: share of the translation that the
-            odometer misses, share of the turns that it misses, and turn for each metre [rad/m], as of wheels of
-            unequal radius (Borenstein and Feng 1996).
-        sideways: Variance of a translation to the side per squared turn [m^2/rad^2]: of a robot that slips as it turns,
-            or whose odometer reports another point than its centre of rotation. 0 is the book's model, which moves no
-            robot to the side.
+        systematic: Systematic errors, corrected before noise is added: the shares of translations and of turns that the
+            odometer misses, and a turn for each metre [rad/m], as by wheels of unequal radius (Borenstein and Feng
+            1996).
+        sideways: Variance of a sideways translation per squared turn [m^2/rad^2], for a robot that slips as it turns,
+            or whose odometer reports a point other than its centre of rotation. 0 is the book's model, which has no
+            sideways motion.
 
     Raises:
         TypeError, ValueError: a number is missing, negative or not finite.

@@ -43,9 +43,9 @@ _LEAST, _MOST, _FAR = 0.002, 0.1, 9.0
 _CLEAR = 0.05
 # Longest lag of the autocorrelation, and the largest inflation.
 _LAGS, _MOST_INFLATION = 10, 10.0
-# Deviation of the systematic error before there is data, of each of its three parts; rounds of the fit.
+# Prior deviation of each of the three parts of the systematic error; rounds of the fit.
 _PRIOR, _ROUNDS = 0.1, 3
-# Defaults of the variances, the deviation of their logarithms, and steps that the default of the reverse counts as.
+# Defaults of the variances, prior deviation of their logarithms, and steps that the default of ``reverse`` counts as.
 _DEFAULT = np.array([*DEFAULTS.alpha, DEFAULTS.sideways, *(value**2 for value in DEFAULTS.least)])
 _PRIOR_LOG, _PRIOR_STEPS = math.log(10), 25
 # A variance is determined where the deviation of its logarithm is at most this share of the prior's.
@@ -66,9 +66,9 @@ class MotionFit:
         travelled: Sum of the translations of the steps [m].
         turned: Sum of their turns [rad].
         log_errors: (7,) standard errors of the logarithms of alpha1 to alpha4, ``sideways`` and the squares of
-            ``least``, if steps err independently; 2.3, a factor of ten, where the log tells nothing.
-        undetermined: Names of those that the log does not determine, whose logarithm has an error above 1.15: each is
-            the default, or less where the log excludes that much.
+            ``least``, if steps err independently; 2.3, a factor of ten, where the log holds no information.
+        undetermined: Names of the parameters that the log does not determine, with an error of the logarithm above
+            1.15. Each is the default, or less where the log excludes the default.
 
     Example:
         >>> import gpusense as gs
@@ -101,9 +101,9 @@ class MotionFit:
 def fit_odometry_motion(odometry: AnyArray, poses: AnyArray, *, systematic: bool = True) -> MotionFit:
     """Fit the noise of :class:`OdometryMotion` to a log with reference poses.
 
-    The noise is that of one step of ``odometry``, and depends on its length: pass the steps that a filter will take,
-    all of them. Reference poses may be known at some only. A variance that the log does not determine is at most the
-    default of :class:`OdometryMotion`, and is in ``undetermined``.
+    The fitted noise holds for one step of ``odometry`` and depends on the step's length, so pass every step that a
+    filter will take. Reference poses may be known at some only. A variance that the log does not determine is at most
+    the default of :class:`OdometryMotion`, and is in ``undetermined``.
 
     Args:
         odometry: (M, 3) poses of the odometer, M > 2 [m, m, rad].
@@ -174,7 +174,7 @@ def _references(poses: AnyArray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _reverse(turns: np.ndarray, reference: np.ndarray, at: np.ndarray) -> tuple[int, int]:
-    """Turn the translations around that fit better so; return the number of steps that could, and of those that do.
+    """Reverse the translations that fit better reversed; return the numbers of steps tested and reversed.
 
     A reverse shows only where a step has a reference before and after it.
     """
@@ -187,7 +187,7 @@ def _reverse(turns: np.ndarray, reference: np.ndarray, at: np.ndarray) -> tuple[
 
 
 def _start(alpha: float) -> np.ndarray:
-    """Return variances to begin a search with: four of alpha, to the side, and the least ones [m^2, rad^2]."""
+    """Return variances to begin a search with: alpha1 to alpha4, ``sideways``, and ``least`` [m^2, rad^2]."""
     return np.array([alpha] * 5 + list(_DEFAULT[5:]))
 
 
@@ -220,7 +220,7 @@ def _limited(logs: np.ndarray) -> np.ndarray:
 
 
 def _systematic(noise: np.ndarray, errors: Errors, before: np.ndarray) -> np.ndarray:
-    """Return what is to be added to the systematic error (3,), given the variances.
+    """Return the correction (3,) of the systematic error for given variances.
 
     It is by least squares, reweighted for the t density, around the error that is already corrected.
     """

@@ -131,7 +131,7 @@ class Nav2Options:
     def make_filter(self, models: Any, **options: Any) -> ParticleFilter:
         """Make a particle filter with the motion, the number of particles, the recovery and the skipping of beams.
 
-        Recovery is "augmented", with gpusense's own rates, where both of ``recovery`` are positive.
+        Recovery is "augmented", with gpusense's rates, where both of ``recovery`` are positive.
 
         Args:
             models: A measurement model, or several.
@@ -168,7 +168,7 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str |
     Raises:
         FileNotFoundError: The file is missing.
         TypeError: A value has the wrong type; the message names the parameter.
-        ValueError: A value breaks its rule, or the file holds no parameters of such a node, or those of several.
+        ValueError: A value breaks its rule, or the file holds parameters of no such node, or of several.
 
     Example:
         >>> import gpusense as gs
@@ -226,7 +226,7 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str |
 
 
 def has_parameters(content: Mapping[Any, Any]) -> bool:
-    """Return whether the content of a file has parameters of a node of ROS, or those of amcl themselves."""
+    """Return whether a file's content is parameters by ROS nodes, or amcl's parameters without a node."""
     return any(key in content for key in _DEFAULTS) or any(True for _ in nodes_of(content))
 
 

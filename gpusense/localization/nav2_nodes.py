@@ -13,7 +13,7 @@ FITTED = ("beam_model", "incidence_model", "odometry_motion")
 
 
 def parameters_of(content: Mapping[str, Any], name: str, node: str | None, known: Collection[str]) -> dict[str, Any]:
-    """Return the parameters of a node by dotted names, with those of ``/**`` that it lacks, as in ROS.
+    """Return the parameters of a node by dotted names; as in ROS, ``/**`` supplies the parameters that the node lacks.
 
     A mapping within the parameters has the parameters of a dotted name: ``initial_pose: {x: 1}`` is
     ``initial_pose.x: 1``.

@@ -1,4 +1,4 @@
-"""Find the start of a robot in the parameters of nav2_amcl's node, and its covariance in those of Beluga's."""
+"""Find the initial pose in the parameters of nav2_amcl's node, and the initial covariance in those of Beluga's node."""
 
 from __future__ import annotations
 

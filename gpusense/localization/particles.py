@@ -123,7 +123,7 @@ class Particles:
         capacity: Most particles.
         sensors: Most sensors of a correction.
         precision: Of their log-likelihoods.
-        residual: Whether draws are those of residual resampling.
+        residual: Whether to draw by residual resampling.
 
     Attributes:
         count: Particles of the next step.
@@ -179,7 +179,7 @@ class Particles:
         return dict(particles=self.count, block=self.block)
 
     def numbers(self, stage: Stage) -> dict[str, Any]:
-        """Return what weights are made of, by the names of arguments."""
+        """Return the arguments of launches that make weights, by name."""
         return dict(score=self.score, before=self.weights[stage.before], settings=self.settings,
                     state=self.states[stage.state], blocks=self.blocks, **self.sizes())  # fmt: skip
 

@@ -1,7 +1,7 @@
 """Beams of a scan against the map at one pose: which agree, which end too early, and which pass through walls.
 
-Each judged beam is walked through the cells of the map with two companions that start beside it and spread apart, so
-that a pose a little off, the edge of a door or a grazed wall decides nothing. A beam
+Each judged beam is traced through the map with two companion rays that start beside it and diverge, so that a slightly
+wrong pose, the edge of a door or a grazed wall decides nothing. A beam
 
 - **agrees** where its reading lies between the walls that the three rays meet, within a tolerance;
 - **passes through** where all three meet a wall well before the reading: no person or box makes a beam longer;
@@ -67,7 +67,7 @@ class Passages(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """Beams of the scans of one moment, by what they tell.
+    """Counts of the beams of simultaneous scans, by their evidence.
 
     Attributes:
         agree: Agreeing beams.
@@ -126,7 +126,7 @@ def passages(
     first, unknown, tolerance, limit = walk
     wall = first < np.inf
     before, after = reading - tolerance, reading + tolerance
-    # A ray knows nothing of what is behind the first unknown cell.
+    # A ray gives no evidence beyond the first unknown cell.
     blind = unknown < np.minimum(first, np.where(returned, before, reading))
     within = returned & (reading <= limit)
     beam_agrees = (first[0] >= before) & (first[0] <= after) & ~blind[0]
@@ -201,7 +201,7 @@ def _first_cells(
     value = np.full(len(ray), -1, np.int8)
     np.copyto(value, cells.take(place, mode="clip"), where=within)
     wall = value >= grid.occupied_threshold
-    # Between two cells that share a corner only, both others may be walls.
+    # Where two successive cells share only a corner, both cells beside the corner may be walls.
     corner = np.flatnonzero((column[1:] != column[:-1]) & (row[1:] != row[:-1]))
     corner = corner[(number[corner + 1] > 0) & within[corner + 1] & within[corner]]
     one, two = row[corner + 1] * columns + column[corner], row[corner] * columns + column[corner + 1]

@@ -31,7 +31,7 @@ def compose_poses(first: AnyArray, second: AnyArray) -> np.ndarray:
 
     Args:
         first: (..., 3) poses [m, m, rad].
-        second: (..., 3) poses, of a shape that broadcasts with that of ``first``.
+        second: (..., 3) poses that broadcast with ``first``.
 
     Raises:
         TypeError, ValueError: not poses.
@@ -74,7 +74,7 @@ def pose_difference(before: AnyArray, after: AnyArray) -> np.ndarray:
 
     Args:
         before: (..., 3) poses [m, m, rad].
-        after: (..., 3) poses, of a shape that broadcasts with that of ``before``.
+        after: (..., 3) poses that broadcast with ``before``.
 
     Raises:
         TypeError, ValueError: not poses.

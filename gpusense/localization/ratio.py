@@ -1,15 +1,15 @@
 """Log-likelihood ratio of "the pose is wrong" against "the pose is right" of one scan.
 
-A short beam tells next to nothing: people and furniture shorten beams at right poses as often as walls do at wrong
-ones. Of the beams that meet a mapped wall, T pass through it and A agree with it, C of them to within a few
-centimetres: where a filter has fitted a wrong pose to a scan, beams agree, but not as closely. On a wrong map many
-beams, N, end in unknown cells or off the map and tell nothing. With n = A + S + T beams that tell anything, S of them
-short, and f(a, b) = log((a + 1/2) / (b + 1/2)),
+A short beam is hardly evidence: people and furniture shorten beams at right poses as often as walls do at wrong poses.
+Of the beams that meet a mapped wall, T pass through it and A agree with it, C of them to within a few centimetres.
+Where a filter has fitted a wrong pose to a scan, beams also agree, but less closely. On a wrong map many beams, N, end
+in unknown cells or off the map and tell nothing. With n = A + S + T informative beams, S of them short, and f(a, b) =
+log((a + 1/2) / (b + 1/2)),
 
     r = n / (n + FEW) (BIAS + SLOPE f(T, A) + BLUNT f(A - C, C) + NOTHING f(N, n)),
 
 within LIMITS: no agreement excludes that another place looks alike. A pose inside of solid cells adds SOLID, one in
-unknown cells UNKNOWN. The coefficients are those of a logistic regression on some 450 simulated runs: people, moved and
+unknown cells UNKNOWN. The coefficients come from a logistic regression on some 450 simulated runs: people, moved and
 new furniture, glass, wrong maps, 16 to 360 beams and kidnapping, half of the weight for right poses and half for wrong
 ones. 200 other runs (``bench/studies/verdict_fit.py``) give 3.03, 1.42, 0.63 and 0.44. BIAS is lower by CAUTION, since
 false alarms cost more: it was chosen on the tuning half of the recorded logs, as nothing else was.
@@ -26,7 +26,7 @@ from gpusense.localization.passages import Passages, counts_of
 
 BIAS, SLOPE, BLUNT, NOTHING, FEW = 3.34, 1.74, 0.48, 0.58, 4.0
 CAUTION, SOLID, UNKNOWN, LIMITS = 0.9, 2.0, 1.0, (-4.0, 5.0)
-# Share of a feature's gain that counts, since features of a scan and of the next one are dependent; its limit.
+# Share of a feature's gain that counts, since features of successive scans are dependent; its limit.
 _OF_GAIN, _LIMIT_OF_GAIN = 0.25, 3.0
 
 
@@ -54,7 +54,7 @@ def _odds(one: int, other: int) -> float:
 
 
 def explained_of_scan(scans: Sequence[Passages]) -> float:
-    """Return the share of the beams that agree, of those that the map could explain; NaN without any."""
+    """Return the share that agrees among the beams that the map could explain; NaN without any."""
     counts = counts_of(scans)
     return counts.agree / counts.telling if counts.telling else math.nan
 

@@ -14,7 +14,7 @@ from gpusense.localization.rival_search import can_search
 from gpusense.localization.tracker import Tracker
 from gpusense.localization.verdict import Verdict
 
-# Makes the seed of a rival from that of its filter.
+# Turns the filter's seed into the rival's seed.
 _RIVAL = 0x9E3779B97F4A7C15
 # Probability that another place is right above which a rival is searched for; more than before the first scan.
 _DOUBT = 0.2
@@ -51,7 +51,7 @@ class Recovery:
         return (self,) if self.rival is None else (self, *self.rival.changing())
 
     def keep(self) -> None:
-        """Note what the call that begins must leave as it is."""
+        """Record the buffers that the beginning call must not overwrite."""
         if self.rival is not None:
             self.rival.keep()
 

@@ -2,17 +2,17 @@
 
 Sensor resetting (Lenser and Veloso, "Sensor resetting localization for poorly modelled mobile robots" (2000)) and
 augmented MCL (*Probabilistic Robotics* table 8.3) mix new poses into the particles at once. A person in front of the
-scanner then costs a sound track, since a pose that was chosen for a scan explains that scan. Here new poses are a cloud
-of their own, which moves with the same odometry and is corrected by the same readings. With p(z_t | z_1 .. z_t-1) of
+scanner then costs a sound track, since a pose that was chosen for a scan explains that scan. Here the new poses form a
+separate cloud, which moves with the same odometry and is corrected by the same readings. With p(z_t | z_1 .. z_t-1) of
 each cloud, the mean likelihood of its predicted particles, the logarithm of the Bayes factor
 
     B = sum over later scans t of log p_rival(z_t | ...) - log p_filter(z_t | ...)
 
 counts for the rival (Kass and Raftery, "Bayes factors" (1995)); the scan by which the rival was chosen does not. The
 rival replaces the particles once B exceeds ``WIN``, after ``SCANS`` scans if it lies together, and after ``APART`` ones
-if several places are as likely, provided that the beams that meet walls speak for it. Until then the estimate is that
-of the particles, and the probability that the rival is right adds to that of being lost. A rival that ends at the pose
-of the particles, falls behind, or has not won after ``LONGEST`` scans is given up.
+if several places are as likely, provided that the beams that meet walls speak for it. Until then the particles give the
+estimate, and the probability that the rival is right adds to the probability of being lost. A rival that ends at the
+pose of the particles, falls behind, or has not won after ``LONGEST`` scans is given up.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from gpusense.localization.spread import FAR, FAR_TURN, deviations
 from gpusense.localization.tracker import Tracker
 from gpusense.localization.verdict import sightings
 
-# Logarithm of the Bayes factor that wins, and that ends a rival that falls behind; scans that a rival needs to win if
-# it lies together, and if it has several places; scans after which one that neither wins nor loses is given up.
+# Log Bayes factors at which a rival wins, and at which a losing rival ends; scans that a converged rival needs to win,
+# and one with several places; scans after which an undecided rival is given up.
 WIN, LOSE, SCANS, APART, LONGEST = 7.0, -7.0, 3, 8, 15
 # Scans after which a rival with several places is given up where the beams that meet walls contradict the best one.
 SETTLES = 5
@@ -63,7 +63,7 @@ class Rival:
     """The rival of a filter.
 
     Args:
-        tracker: Particles of its own with the sensors of the filter.
+        tracker: A second set of particles with the filter's sensors.
 
     Attributes:
         active: Whether there is a rival now.
@@ -75,12 +75,12 @@ class Rival:
         self.active, self.log_odds = False, PRIOR
         self._scans, self._place = 0, np.zeros(3)
         self._prior, self._settled = PRIOR, False
-        # Weighted sums of the ratios of wrong against right, of the rival and of the particles, and of the weights.
+        # Weighted sums of the log-likelihood ratios of the rival and of the particles, and the sum of the weights.
         self._ratios = np.zeros(3)
         self._search = RivalSearch(tracker.sensors)
 
     def keep(self) -> None:
-        """Note what the call that begins must leave as it is."""
+        """Record the buffers that the beginning call must not overwrite."""
         self._tracker.keep()
 
     def changing(self) -> tuple[Any, ...]:
@@ -88,7 +88,7 @@ class Rival:
         return self, self._tracker, self._tracker.cloud
 
     def state(self) -> tuple[dict[str, Any], Contents, dict[str, Any]]:
-        """Return the rival as plain data: its own, its particles and their memory."""
+        """Return the rival as plain data: its state, its particles and their memory."""
         return plain_state(self, without=("_tracker", "_search")), *self._tracker.state()
 
     def restore(self, state: tuple[dict[str, Any], Contents, dict[str, Any]]) -> None:
@@ -166,7 +166,7 @@ class Rival:
         gain = self.log_odds - self._prior
         together = deviations(own)[0] < _TOGETHER
         if not together:
-            # The mean of several places is none of them.
+            # The mean of several places is not one of them.
             poses, weights = self._tracker.host_particles(), self._tracker.host_weights()
             self._place, own = poses[int(np.argmax(weights))], np.zeros((3, 3))
         self._compare(own, pose, covariance, dict(readings))

@@ -26,11 +26,12 @@ from gpusense.models.landmark.base import FeatureModel
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.world.parameters import LikelihoodFieldParameters
 
-# Candidates of each search on a map, and the effective number of them that begin a rival; beams of a scan for it.
+# Candidates of each search on a map; effective number of candidates from which a rival begins; beams of a scan in a
+# search.
 _CANDIDATES, _EFFECTIVE, _BEAMS = 40, 5, 60
 # Covariance of a candidate: half the distances between poses of the search.
 _SPREAD_OF_POSE = np.diag([0.05**2, 0.05**2, 0.025**2])
-# Parameters of the field of a search: wider than those of the filter, since poses of the search lie apart.
+# Field parameters of a search, wider than the filter's, since a search tries poses farther apart.
 _FIELD = LikelihoodFieldParameters(z_hit=0.7, z_max=0.0, z_rand=0.3, sigma_hit=0.15)
 # Random poses, and the effective number of them that begin a rival.
 _TRIES, _CHOSEN = 20_000, 100

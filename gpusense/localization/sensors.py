@@ -73,12 +73,12 @@ class Sensor:
         return self._correlation.temperature(self.beams) if isinstance(chosen, str) else chosen
 
     def restart(self) -> None:
-        """Forget how many scans there were: the next one follows none."""
+        """Reset the count of scans: the next scan is treated as the first."""
         self._seen, self._learned = 0, -1
 
     @property
     def due(self) -> bool:
-        """Whether the last scan of those that were counted is one to learn from: often at first, seldom later."""
+        """Whether to learn from the last counted scan: often at first, seldom later."""
         return self._seen <= DEFAULTS.calibrations or self._seen % 10 <= 1
 
     def count(self) -> None:
@@ -86,7 +86,7 @@ class Sensor:
         self._seen += 1
 
     def correlate(self, pose: np.ndarray, covariance: np.ndarray, reading: tuple[Any, ...]) -> None:
-        """Learn how much beams are worth from the scan that was counted last, at the estimated pose."""
+        """Learn the correlation of beams from the last counted scan, at the estimated pose."""
         axes, scanner = axes_of(covariance), self.model.scanner
         parts = self.parts(poses_around(pose, axes), reading)
         # Another object, as it is part of the state.
@@ -111,7 +111,7 @@ class Sensor:
         before: Callable[[], None] | None = None,
         timed: bool = False,
     ) -> None:
-        """Write the log-likelihoods of poses on the device; those of scans are there once its work has ended.
+        """Write the log-likelihoods of poses on the device; those of scans are complete once the device has finished.
 
         Args:
             poses: (N, 3) poses on the device.

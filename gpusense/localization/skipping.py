@@ -3,8 +3,8 @@
 nav2_amcl has the idea as ``do_beamskip``. There a particle explains a beam whose end is within 0.5 m of a wall. Here it
 explains one as in the verdict (:mod:`gpusense.localization.verdict`), so any model of scans can skip. Two faults of
 nav2's are absent: beams that do not exist are not counted as skipped, and where too many would be, the scan is used as
-a whole with the log-likelihoods of all its beams. So is each scan while the particles lie apart: then most beams are
-explained by few particles, and these are the right ones.
+a whole with the log-likelihoods of all its beams. Scans are also used as a whole while the particles are spread out:
+then few particles, the right ones, explain most beams.
 """
 
 from __future__ import annotations

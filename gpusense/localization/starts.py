@@ -1,4 +1,4 @@
-"""First particles, and those of a reset: drawn on the host by the reference of the kernels' generator.
+"""Particles of starts and resets, drawn on the host by the reference of the kernels' generator.
 
 So they are equal on every backend. Sensor resetting: Lenser and Veloso, *Sensor resetting localization for poorly
 modelled mobile robots* (2000).
@@ -171,7 +171,7 @@ def with_likely_poses(
     temperature: float | str,
     key: Key,
 ) -> np.ndarray:
-    """Return particles half of which are drawn around the likeliest of other poses.
+    """Replace half of the particles by draws around the likeliest of other poses, and return all.
 
     Args:
         poses: (N, 3) particles.

@@ -26,7 +26,7 @@ class FilterState:
     """State of a :class:`ParticleFilter`: particles, weights, step, options, and all that it has learned.
 
     It holds no device and no models, and can be pickled. A filter with the same models and options takes it over by
-    ``restore``, and then continues with the bits of the one that it is of.
+    ``restore`` and continues with the same bits as the original.
 
     Attributes:
         options: Keyword arguments of the filter's constructor.
@@ -83,7 +83,7 @@ def model_names(sensors: Sequence[Sensor]) -> tuple[str, ...]:
 def memory_of(
     tracker: Tracker, verdict: Verdict, recovery: Recovery, readings: Mapping[int, tuple[Any, ...]]
 ) -> dict[str, Any]:
-    """Return what a filter remembers beside its particles, as plain data with arrays in host memory."""
+    """Return the filter's state other than particles, as plain data with arrays in host memory."""
     return {
         "tracker": plain_state(tracker), "verdict": plain_state(verdict), "recovery": recovery.state(),
         "sensors": [plain_state(sensor) for sensor in tracker.sensors],
@@ -117,7 +117,7 @@ def readings_on_host(readings: Mapping[int, tuple[Any, ...]], backend: Backend) 
 
 
 def check_state(state: object, options: dict[str, Any], models: tuple[str, ...]) -> FilterState:
-    """Check that a state is of a filter with these options and models; the motion model may be another one.
+    """Check that a state is of a filter with these options and models; the motion model may differ.
 
     Raises:
         TypeError: it is none.

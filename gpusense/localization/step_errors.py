@@ -1,8 +1,8 @@
 """Errors of an odometer between reference poses, and the covariance that the odometry model predicts for them.
 
 Between two references lie one or more steps. The difference of reference and odometry is, to first order, the sum of
-the errors of the steps in between, each carried to the end of the gap: a turn moves the end by its distance from there.
-So the covariance is linear in the variances of the model: the sum of each times a matrix of the path.
+the errors of the steps in between, each carried to the end of the gap: a turn displaces the end by the angle times its
+distance. So the covariance is linear in the model's variances: a sum of variances times matrices of the path.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Errors(NamedTuple):
 
     Attributes:
         residual: (G, 3) errors.
-        basis: (7, G, 3, 3) covariance that a unit of each variance of ``NOISES`` gives.
+        basis: (7, G, 3, 3) covariance for a unit of each variance of ``NOISES``.
         design: (G, 3, 3) errors for a unit of each part of the systematic error.
     """
 
@@ -35,7 +35,7 @@ class Errors(NamedTuple):
     design: np.ndarray
 
     def covariances(self, noise: np.ndarray) -> np.ndarray:
-        """Return the (G, 3, 3) covariances that variances (7,) give."""
+        """Return the (G, 3, 3) covariances for (7,) variances."""
         count = len(self.residual)
         return (noise @ self.basis.reshape(len(NOISES), count * 9)).reshape(count, 3, 3)
 
@@ -70,7 +70,7 @@ def errors_of(turns: np.ndarray, references: np.ndarray, at: np.ndarray) -> Erro
     steps = slice(at[0], at[-1])
     gap = np.repeat(np.arange(len(moved)), np.diff(at))
     axis = (path[at[:-1], 2] + turn)[gap]
-    # From the end of a step to that of its gap: a turn moves the latter to the side of this line.
+    # Line from the end of a step to the end of its gap: a turn displaces the gap's end perpendicular to it.
     lever = _turned((path[at[1:]][gap] - path[1:][steps])[:, :2], -axis)
     carry = np.zeros((len(gap), 3, 3))
     carry[:, :2, 0] = _turned(np.tile((1.0, 0.0), (len(gap), 1)), way[steps] - axis)

@@ -1,8 +1,8 @@
-"""Sums over the particles of a filter: of blocks, of groups of blocks, and of all.
+"""Sums over a filter's particles: first over blocks, then over groups of blocks, then over all.
 
-A work-item adds up a block, so blocks, their number in a group and the number of groups are alike: the cube root of the
-number of particles. Small clouds have one group. GPUs take smaller blocks of weights, and more of them, since sums of
-weights are exact. Sums of poses have the same blocks everywhere, of which work-items of GPUs take single lanes.
+A work-item adds up a block. Particles per block, blocks per group and groups are all about the cube root of the number
+of particles. Small clouds have one group. GPUs use more and smaller blocks of weights, since sums of weights are exact.
+Sums of poses have the same blocks on every device; on GPUs a work-item adds one lane of a block.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from gpusense.interface.launches import Program, launch
 
 _DOUBLE = np.dtype(np.float64)
 _PLAIN = frozenset[str]()
-# Particles of a vector of float64, the fewest of a block, and the most blocks of a cloud with one group.
+# Particles in a float64 vector; fewest particles of a block; most blocks of a cloud with one group.
 _VECTOR, _LEAST, MOST_BLOCKS = 8, 8, 128
 
 
@@ -71,7 +71,7 @@ class Sums:
         return (launch(kernel, with_lanes_flag(self._backend.info.lanes, kernel, _PLAIN), (size,), **arguments),)
 
     def highest(self, blocks: int) -> tuple[Program, Buffer, int]:
-        """Return the launches that find the largest score of each group; their results, and the number of them."""
+        """Return the launches that find the largest score of each group, their buffer of results, and its length."""
         fan, *groups_of = reduction_fans(blocks)
         if not groups_of:
             return (), self.largest, blocks
@@ -124,14 +124,15 @@ class Sums:
                          fan=reduction_fans(blocks)[0], drawn=drawn, stage=stage, **numbers),
         )  # fmt: skip
 
-    def estimate(self, poses: Buffer, weight: Buffer, estimate: Buffer, count: int, again: int = 0) -> Program:
+    def estimate(self, poses: Buffer, weight: Buffer, estimate: Buffer, count: int, second_pass: int = 0) -> Program:
         """Return the launches that write the estimate of a cloud, or those of its second pass."""
         info, block = self._backend.info, block_of(count)
         # A work-item of a kernel in vectors takes all lanes.
         lanes = ESTIMATE_LANES if info.kind == "cpu" or info.lanes > 1 else 1
         blocks, each = -(-count // block), ESTIMATE_LANES // lanes
         program = self.launch("sum_poses", blocks * each, poses=poses, weight=weight, estimate=estimate,
-                              sums=self.rows, particles=count, block=block, lanes=lanes, again=again)  # fmt: skip
+                              sums=self.rows, particles=count, block=block, lanes=lanes,
+                              second_pass=second_pass)  # fmt: skip
         # finish_estimate adds up the groups; on GPUs one more join is faster.
         fans = (each, *reduction_fans(blocks)) if each > 1 else reduction_fans(blocks)[:-1]
         source, target, groups = self.rows, self._joined, blocks * each
@@ -140,7 +141,7 @@ class Sums:
             program += launches
             source, target = target, source
         return program + self.launch("finish_estimate", 1, poses=poses, sums=source, estimate=estimate,
-                                     groups=groups, again=again)  # fmt: skip
+                                     groups=groups, second_pass=second_pass)  # fmt: skip
 
     def _weight_totals(self, blocks: int) -> Program:
         """Return the launches that add up the rows of weights of groups, and of all groups."""

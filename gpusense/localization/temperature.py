@@ -5,17 +5,17 @@ many neighbours. Let s_k be the score of beam k, the gradient of its log-likelih
 of the negative second derivatives, and J the variance of the sum of the s_k. A likelihood has J = H (Bartlett's second
 identity). One with a temperature T has T^2 J = T H on average, so T = tr(P H) / tr(P J) (Pauli, Racugno and Ventura,
 "Bayesian composite marginal likelihoods" (2011); Ribatet, Cooley and Davison, "Bayesian inference from composite
-likelihoods" (2012)). P is the covariance of the pose: directions count by what is unknown of them.
+likelihoods" (2012)). P is the covariance of the pose, so uncertain directions count more.
 
-J is measured. B, the sum of s_k s_k', is that of independent beams. Blocks of neighbours with scores g_b and sums B_b
-have the variance B_b under independence. A fit to the scan takes B_b B^-1 of the sum of all scores away from each, and
-leaves B_b - B_b B^-1 B_b. The ratio of the measured variance to this one, F_n for n blocks, is 1 for independent beams
-at any n, and the inflation of the variance for beams whose correlation is shorter than a block. Four blocks are the
-longest that leave a degree of freedom.
+J is measured. B, the sum of s_k s_k', is the variance for independent beams. Blocks of neighbours with scores g_b and
+sums B_b have the variance B_b under independence. A fit to the scan takes B_b B^-1 of the sum of all scores away from
+each, and leaves B_b - B_b B^-1 B_b. The ratio of the measured variance to this one, F_n for n blocks, is 1 for
+independent beams at any n, and the inflation of the variance for beams whose correlation is shorter than a block. Four
+blocks are the longest that leave a degree of freedom.
 
 Errors of maps are correlated over any length, so the variance still grows from blocks to the whole scan. Let it grow by
 x each time that blocks are four times as long (method of aggregated variance: Beran, *Statistics for Long-Memory
-Processes* (1994), section 4.4). The fit takes away what is common to all blocks, so that of the inflations V, x V and
+Processes* (1994), section 4.4). The fit removes the part that all blocks share, so that of the inflations V, x V and
 x^2 V of sixteenths, quarters and the whole
 
     F_16 = (V - x^2 V / 16) / (1 - 1 / 16) and F_4 = (x V - x^2 V / 4) / (1 - 1 / 4) are seen.
@@ -44,7 +44,7 @@ INDEPENDENT_AT_FIRST = 10.0
 INDEPENDENT_AT_LEAST, _LARGEST_REPEAT, _LARGEST_GROWTH = 1.0, 0.9, 5 / 3
 # Scans whose weight has fallen to 1 / e; least scans from which to judge; least beams of a scan.
 _MEMORY, _LEAST_SCANS, _FEWEST = 40, 5, 8
-# Blocks of a scan: long ones, short ones, and those that are compared from scan to scan.
+# Blocks of a scan: long, short, and compared from scan to scan.
 _LONG, _SHORT, _SECTORS = 4, 16, 8
 # Least and largest steps [m], and radians that count as a metre.
 _STEPS, _TURN = (1e-4, 0.1), 0.25
@@ -73,7 +73,7 @@ def poses_around(pose: np.ndarray, axes: np.ndarray) -> np.ndarray:
 
 
 class _Scores(NamedTuple):
-    """Scores (3, K) of beams along the axes, their curvature, and the scores' change (3,) by which a fit is made."""
+    """Scores (3, K) of beams along the axes, their curvature, and the change (3,) of the scores by a fit."""
 
     each: np.ndarray
     curvature: float
@@ -99,7 +99,7 @@ def _scores_of(parts: np.ndarray) -> _Scores:
 
 
 class BeamCorrelation:
-    """Running variance of the scores of scans: how many independent beams they are worth.
+    """Running variance of the scores of scans, which yields the effective number of independent beams.
 
     Attributes:
         scans: Scans added.
@@ -108,7 +108,8 @@ class BeamCorrelation:
 
     def __init__(self) -> None:
         self.scans, self.beams = 0, 0.0
-        # Curvature, variance of independent beams, variance of long blocks and as it would be, that of short blocks.
+        # Curvature; variance for independent beams; variance of long blocks, measured and for independent beams; the
+        # same two of short blocks.
         self._sums = np.zeros(6)
         # Products and squares of consecutive scans; share of a pose's information that a scan brings.
         self._products, self._pairs, self._gain = np.zeros(2), 0, 0.0
@@ -150,7 +151,7 @@ class BeamCorrelation:
     def _follow(
         self, scores: _Scores, axes: np.ndarray, directions: np.ndarray, used: np.ndarray, follows: bool
     ) -> None:
-        """Compare a scan's blocks of beams of the same directions with those of the last scan."""
+        """Compare a scan's blocks with the last scan's blocks in the same directions."""
         # Sectors of the world, an eighth of a scan wide, and a whole number of them around.
         ahead = np.sort(np.mod(directions, 2 * np.pi))
         gap = float(np.diff(ahead, append=ahead[0] + 2 * np.pi).max())
@@ -178,7 +179,7 @@ class BeamCorrelation:
 
     @property
     def kept(self) -> float:
-        """Share f of what is known of a pose that comes from before the scan, 0 to 1."""
+        """Share f of the information on a pose that precedes the scan, 0 to 1."""
         return 1 - self._gain if self.scans else 0.0
 
     @property
@@ -192,7 +193,7 @@ class BeamCorrelation:
         return float(max(quarters * 3 * growth / (5 - 2 * growth), 1.0))
 
     def temperature(self, beams: int) -> float:
-        """Return the temperature of a sensor of ``beams`` beams: that of the data, or a first one before there is any.
+        """Return the temperature of a sensor with ``beams`` beams: from its scans, or an initial one before the first.
 
         Args:
             beams: Beams that a scan uses.
@@ -244,8 +245,8 @@ def _parts(model: Any, poses: np.ndarray, ranges: AnyArray) -> np.ndarray:
 def calibrate_temperature(model: Any, scans: AnyArray, poses: AnyArray) -> float:
     """Return the temperature that a log calls for, where each scan is judged by itself.
 
-    A filter with ``temperature="auto"`` measures the same of its own scans, and lowers it further where errors repeat
-    from scan to scan.
+    A filter with ``temperature="auto"`` measures this from its scans, and lowers it further where errors repeat from
+    scan to scan.
 
     Args:
         model: A :class:`BeamModel` or :class:`LikelihoodFieldModel`.

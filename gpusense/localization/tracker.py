@@ -1,6 +1,6 @@
 """Particles that follow the robot: their motion, their weighing, and the numbers of each step.
 
-A filter has a tracker, and the rival of its particles is another one.
+A filter has one tracker for its particles and another for the rival.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Tracker:
         started: Whether there are particles.
         step: Number of the last step.
         pending: The motion that the next step begins with.
-        shown: Number of the particles that are shown, those of the last step.
+        shown: Number of shown particles, those of the last step.
         wide: Corrections left at a low temperature.
         together: Whether the particles lie together, as far as is known.
         pool: Poses that recovery injects: their number, and half widths of the box around each.
@@ -61,7 +61,7 @@ class Tracker:
         self.pool: tuple[int, starts.Spread] = 0, (0.0, 0.0, 0.0)
 
     def keep(self) -> None:
-        """Note the particles that the call that begins must leave as they are."""
+        """Record the buffers that the beginning call must not overwrite."""
         self.cloud.kept = self.cloud.places
 
     # ---- particles
@@ -86,7 +86,7 @@ class Tracker:
             self.pool = len(pool), spread
 
     def random_poses(self, count: int) -> np.ndarray:
-        """Return poses anywhere in the free space, the same ones each time; around the particles without a grid."""
+        """Return poses in free space, or around the particles without a grid; the same in every call."""
         try:
             pool, spread = starts.free_pool(self._models, None)
         except ValueError:
@@ -138,20 +138,20 @@ class Tracker:
             self.move(motion)
 
     def move(self, following: SampledMotion | None) -> None:
-        """Run the pending motion; another one follows it."""
+        """Run the pending motion; ``following`` becomes pending."""
         motion = STILL if self.pending is None else self.pending
         self.cloud.move(self.settings(motion, []), motion.kind)
         self.shown, self.pending = self.cloud.count, following
 
-    def weigh(self, given: list[SensorReadings], *, again: bool = False) -> None:
+    def weigh(self, given: list[SensorReadings], *, corrected_before: bool = False) -> None:
         """Run the motion, and correct the particles by readings of sensors.
 
         Args:
             given: Indices of sensors with their readings.
-            again: Whether the particles were corrected before, so that some may be copies.
+            corrected_before: Whether the particles were corrected before, so that some may be copies.
         """
         chosen, motion = self.options, STILL if self.pending is None else self.pending
-        self.distinct = self._distinct_share() if self.pending is None and again else 1.0
+        self.distinct = self._distinct_share() if self.pending is None and corrected_before else 1.0
         drawn = self.cloud.count if chosen.least == chosen.most else self._wanted()
         settings = self.settings(motion, [index for index, _ in given])
         self.shown, self.pending = self.cloud.count, None
@@ -197,7 +197,7 @@ class Tracker:
 
 
 def _due_of(sensors: Sequence[Sensor], given: Sequence[SensorReadings]) -> list[tuple[Sensor, tuple[Any, ...]]]:
-    """Count the scans of a correction; return those to learn from, with their sensors."""
+    """Count the scans of a correction; return the scans to learn from, with their sensors."""
     due = []
     for index, reading in given:
         sensor = sensors[index]

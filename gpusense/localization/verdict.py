@@ -5,8 +5,8 @@ right (:mod:`gpusense.localization.belief`), and s the share of the particles, o
 
     p_lost = W + (1 - W) s.
 
-W comes from the scans (:mod:`gpusense.localization.ratio`), s from the spread. Models without a map, of positions or
-headings, give no evidence: their W stays at the prior and its rates, so for them W is left out.
+W comes from the scans (:mod:`gpusense.localization.ratio`), s from the spread. Models of positions or headings have no
+map and give no evidence: W would stay at the prior and its rates, so it is left out.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from gpusense.models.landmark.base import FeatureModel
 
 # Random poses.
 _RANDOM = 64
-# A pose that is sure, with at most this belief that it is wrong, is judged anew after a way [m] or a turn [rad], which
-# bring new evidence, after some corrections, or where readings are less likely than those before by so much [nats].
+# A pose with at most this belief that it is wrong is judged again after this distance [m], this turn [rad], this number
+# of corrections, or a drop of the readings' log-likelihood by this much [nats].
 _SURE, _WAY, _TURNED, _SELDOM, _DROP = 0.05, 0.25, 0.25, 10, 3.0
 # Corrections after which a filter judges without being asked, where its pose is not sure.
 _INTERVAL = 5
@@ -137,7 +137,7 @@ class Verdict:
         return self.state.corrections % (_SELDOM if self.state.belief.wrong <= _SURE else _INTERVAL) == 0
 
     def doubt(self) -> None:
-        """Begin anew with a pose that was just searched for: that scans chose it is no evidence."""
+        """Restart with a pose that a search has just found; the scans that chose it are no evidence."""
         places = self.state.places + 1
         self.state = self.state._replace(belief=Belief.anywhere(after=places - 1), judged=-1, places=places)
 
@@ -164,7 +164,7 @@ class Verdict:
             pose: (3,) estimated pose.
             covariance: (3, 3) its covariance.
             readings: Last readings by the index of their sensor.
-            evidence: log p(last readings | earlier ones) of the particles; -inf judges in any case.
+            evidence: log p(last readings | earlier readings) of the particles; -inf judges in any case.
 
         Returns:
             Share of the beams that the pose explains; NaN without beams.

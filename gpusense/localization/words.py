@@ -17,7 +17,7 @@ def word_of(p_lost: float, wrong: float, *, wide: bool, apart: bool) -> Word:
         p_lost: The probability.
         wrong: Probability that another place is right, by the scans.
         wide: Whether the distribution is too wide for a pose that is tracked.
-        apart: Whether it is so wide that it has several places, none of which scans can contradict.
+        apart: Whether it covers several places, so that scans cannot contradict one of them.
     """
     if wrong > LOST and not apart:
         return "lost"

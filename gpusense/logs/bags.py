@@ -1,7 +1,7 @@
 """Open rosbags through the library rosbags and yield messages of known types, with errors that name file and place.
 
-A bag's own message definitions are never used, because a library would turn them into code: messages are decoded by the
-layouts that come with rosbags, and by one that is given here.
+A bag's message definitions are never used, because a library would turn them into code: messages are decoded by the
+layouts that come with rosbags, and by one that is defined here.
 """
 
 from __future__ import annotations
@@ -108,10 +108,10 @@ def _open(path: Path) -> Iterator[tuple[Any, Any]]:
 
 
 def _opened(kind: Any, path: Path) -> Any:
-    """Return an open reader of a bag; of one that is cut off, with a warning, of its messages up to there."""
-    mended = uncut(path)
-    if mended is not None:
+    """Return an open reader of a bag; for a truncated bag, with a warning, of its messages up to the cut."""
+    repaired = uncut(path)
+    if repaired is not None:
         warnings.warn(f"{path}: the bag is cut off; it is read up to there", stacklevel=2)
-    reader = kind(mended or path)
+    reader = kind(repaired or path)
     reader.open()
     return reader

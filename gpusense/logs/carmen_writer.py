@@ -23,12 +23,12 @@ _EVEN = 1e-9
 def write_carmen(path: Path, scans: Iterable[Scan]) -> None:
     """Write scans as messages ODOM and ROBOTLASER1, compressed where the name ends in ``.gz``.
 
-    Readings have four decimals; no return is the scanner's ``range_max``. A scan without a pose has that of its
+    Readings have four decimals; no return is the scanner's ``range_max``. A scan without a pose is written with its
     odometry. The format has no mount and no missing readings.
 
     Args:
         path: The file.
-        scans: Scans whose poses are those of the laser.
+        scans: Scans with poses of the laser.
 
     Raises:
         ValueError: a scanner has a mount or bearings in uneven steps, or a reading is NaN.
@@ -61,7 +61,7 @@ def _numbers(values: Iterable[float], decimals: int) -> str:
 
 
 def _within(scan: Scan) -> Iterable[float]:
-    """Return readings of which those below range_max stay below it when they are rounded."""
+    """Return readings such that a range below range_max stays below it when it is rounded."""
     if np.isnan(scan.ranges).any():
         raise ValueError(f"ranges: must be no NaN in a CARMEN log, got one in the scan at {scan.time}")
     limit, unit = scan.scanner.range_max, 10.0**-_READING
@@ -84,5 +84,5 @@ def _geometry(scanner: Scanner) -> str:
     view = float(bearings[-1]) - first if len(bearings) else 0.0
     step = view / max(len(bearings) - 1, 1)
     if np.abs(bearings - (first + step * np.arange(len(bearings)))).max(initial=0.0) > _EVEN:
-        raise ValueError("bearings: must have even steps in a CARMEN log, got others")
+        raise ValueError("bearings: must have even steps in a CARMEN log, got uneven ones")
     return f"0 {first!r} {view!r} {step!r} {scanner.range_max!r} 0.0 0"

@@ -1,7 +1,8 @@
 """Bags that are cut off: of a recorder that was killed, a disk that was full, a copy that was interrupted.
 
-Such a bag has no index, or one of a longer file. A new one is made of its messages up to the cut, in a temporary folder
-that goes at the end of the process. Nothing is allocated on the word of a header: lengths are compared with the file.
+Such a bag has no index, or one of a longer file. A new bag is made of its messages up to the cut, in a temporary folder
+that is deleted at the end of the process. Nothing is allocated on the word of a header: lengths are compared with the
+file.
 
 Formats: https://wiki.ros.org/Bags/Format/2.0, https://mcap.dev/spec, https://www.sqlite.org/fileformat.html.
 """
@@ -22,7 +23,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 _MCAP, _ROS1, _SQLITE = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n", b"SQLite format 3\0"
-# Kinds of records of MCAP: header, schema, channel, message, chunk; those of ROS 1: message, chunk, connection.
+# Kinds of records in MCAP: header, schema, channel, message, chunk; in ROS 1: message, chunk, connection.
 _M_HEADER, _M_SCHEMA, _M_CHANNEL, _M_MESSAGE, _M_CHUNK = 1, 3, 4, 5, 6
 _R_MESSAGE, _R_CHUNK, _R_CONNECTION = 2, 5, 7
 # Most bytes of a chunk after decompression; recorders make chunks of about a megabyte.
@@ -39,7 +40,7 @@ class _Record(NamedTuple):
 
 
 def uncut(path: Path) -> Path | None:
-    """Return a bag of the messages up to the cut of one that is cut off; None for another one.
+    """Return a bag of the messages up to the cut of one that is cut off; None for any other kind.
 
     Args:
         path: The bag: a file, or a folder with ``metadata.yaml``.

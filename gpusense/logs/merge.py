@@ -29,7 +29,7 @@ def read_laser(
         topic: Topic of the laser in a ROS bag; ``"front"`` or ``"rear"`` for a CARMEN log. None is the laser that
             ``read_log`` takes.
         range_max: Readings of at least this are "no return" [m]; None for the log's.
-        mount: Pose of a bag's laser on the robot [m, m, rad]; None for that of the bag's transforms.
+        mount: Pose of a bag's laser on the robot [m, m, rad]; None takes the mount from the bag's transforms.
 
     Raises:
         FileNotFoundError: The log is missing.

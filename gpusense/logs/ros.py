@@ -11,7 +11,7 @@ tf2_msgs/TFMessage             fixed transforms from the robot's base to the las
 
 All other messages are skipped without being decoded; the message definitions that a bag brings are not used.
 
-* Times are those of the header, or of the log where the header has none. Odometry is interpolated at a scan's time,
+* Times come from the header, or from the log where the header has none. Odometry is interpolated at a scan's time,
   headings along the shorter arc; before the first and after the last message it is the nearest one's. A log without
   odometry has (0, 0, 0). ``Scan.pose`` is None.
 * The robot's base is the child frame of odometry, else ``base_footprint`` or ``base_link``. Without a chain of
@@ -20,8 +20,8 @@ All other messages are skipped without being decoded; the message definitions th
 * A last beam that points where the first one does is dropped. A reading of exactly 0 becomes NaN, as it means "none" to
   all drivers. Other readings are those of the message: infinities are "no return", NaN is missing (REP-117).
 * Some lasers change the number and bearings of their beams from scan to scan. All scans then share one scanner with
-  bearings in steps of 0.25 degrees all round, on which each reading takes the nearest place; the others are NaN, which
-  models leave out. Bearings move by 0.125 degrees at most.
+bearings every 0.25 degrees all round. Each reading takes the nearest bearing; the remaining readings are NaN, which
+models leave out. Bearings move by 0.125 degrees at most.
 """
 
 from __future__ import annotations

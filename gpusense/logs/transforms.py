@@ -110,7 +110,7 @@ def check_mount(scans: Sequence[Scan]) -> str | None:
 
 
 def _pairs(scans: Sequence[Scan]) -> list[tuple[Scan, Scan]]:
-    """Return pairs of scans of which the second is some way ahead of the first, with nearly the same heading."""
+    """Return pairs of scans, the second some distance ahead of the first with nearly the same heading."""
     pairs, first = [], 0
     for k in range(1, len(scans)):
         x, y, theta = np.subtract(scans[k].odometry, scans[first].odometry)
@@ -124,7 +124,7 @@ def _pairs(scans: Sequence[Scan]) -> list[tuple[Scan, Scan]]:
 
 
 def _gap(first: Scan, second: Scan, turn: float) -> float:
-    """Return the median distance of the second scan's end points from those of the first, by odometry."""
+    """Return the median distance of the second scan's end points from the first scan's, by odometry."""
     from scipy.spatial import KDTree
 
     points = [_end_points(scan, turn) for scan in (first, second)]

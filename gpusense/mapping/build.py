@@ -98,7 +98,7 @@ def build_map(
 
 
 class MapBuilder:
-    """Builds a map in steps, after each of which the map so far can be read; see :func:`build_map`.
+    """Builds a map incrementally; the map so far can be read at any time. See :func:`build_map`.
 
     Counts take eight bytes a cell, the map itself one. So large maps are built in bands of rows, each from all scans
     that meet it.
@@ -194,7 +194,7 @@ class MapBuilder:
 
     @property
     def rays(self) -> int:
-        """Rays that have been counted; those beside the map are not."""
+        """Rays that have been counted; rays beside the map are not."""
         return self._rays + (0 if self._counts is None else self._counts.rays)
 
     @property

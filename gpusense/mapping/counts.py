@@ -81,7 +81,7 @@ class BandCounts:
             yield slice(first, first + size), hits, misses
 
     def occupancies(self, out: np.ndarray, model: tuple[float, float, float]) -> None:
-        """Write the occupancies of the band's cells into the (H, W) int8 cells of the map; those without a ray stay.
+        """Write the occupancies of the band's cells into the (H, W) int8 cells of the map; cells without a ray stay.
 
         Args:
             out: The cells.

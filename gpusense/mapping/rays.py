@@ -209,5 +209,5 @@ def extent(boxes: np.ndarray, resolution: float) -> tuple[tuple[float, float, fl
 
 
 def batches(scans: np.ndarray, each: int) -> list[np.ndarray]:
-    """Return the scans of each launch, of those with these indices."""
+    """Split the scans with these indices into launches."""
     return [scans[first : first + each] for first in range(0, len(scans), each)]

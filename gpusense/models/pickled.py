@@ -1,4 +1,4 @@
-"""Copies and pickles of models: they hold the arguments of the constructor, and nothing of a device."""
+"""Copies and pickles of models: the constructor's arguments, without any state of a device."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from gpusense.backends.base import Backend
 
 
 class Pickled(ABC):
-    """Base of objects that copies and pickles make anew by their constructor.
+    """Base of objects whose copies and pickles call the constructor again.
 
-    A pickle names the device as the constructor was asked for it: "auto" may be another one on another machine. A queue
+    A pickle keeps the constructor's selection string, so "auto" may choose another device on another machine. A queue
     is replaced by the selection string of its device. A copy is on the same device.
     """
 

@@ -42,10 +42,15 @@ class Poses:
         scans: None, or S of (S, N, 3) poses of S scans, one after the other.
         in_place: An array on the device must be used without a copy, now and later.
 
+    Attributes:
+        hull: Corners of the box of poses on the device, where their owner knows them; only the table follows from them.
+
     Raises:
         TypeError: not numbers, or an array that this device cannot read.
         ValueError: another shape, or, of arrays that are not on the device, a value that is not finite.
     """
+
+    hull: Corners | None = None
 
     def __init__(
         self, poses: object, backend: Backend, name: str = "poses", *, scans: int | None = None, in_place: bool = False
@@ -74,7 +79,7 @@ class Poses:
 
     def window(self, table: ReachableMap, part: Part) -> tuple[Buffer, Window]:
         """Return the map's table for some poses, and its window."""
-        return table.ensure(self.corners(part))
+        return table.ensure(self.hull if self.host is None else self.corners(part))
 
     @property
     def flags(self) -> frozenset[str]:
@@ -208,7 +213,7 @@ def place(
 
 @functools.cache
 def _precision_flags(double: bool, careful: bool) -> frozenset[str]:
-    return flags_if(FLOAT64=double, CAREFUL=careful)
+    return flags_if(FLOAT64=double, TWO_PART_POINTS=careful)
 
 
 def pose_status(space: Workspace) -> Buffer:

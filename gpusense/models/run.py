@@ -12,8 +12,9 @@ from gpusense.tables.reachable import TableMemoryError
 
 # Most particles of one launch: they fill a device and fit its memory (44 bytes each).
 CHUNK = 1 << 20
-# Most bytes of a result with a number per particle and beam.
-CHUNK_BYTES = 320 << 20
+# Most bytes of a result with a number per particle and beam; on a GPU a share of its memory, where that is more. More
+# particles in one order read more of the same cache lines.
+CHUNK_BYTES, CHUNK_SHARE = 320 << 20, 32
 # Most particle-beams of one launch on a processor: a call can be interrupted between launches, every few seconds.
 CHUNK_WORK = 1 << 24
 # Least particles of a piece that is tried again after one that does not fit.
@@ -23,16 +24,18 @@ _ROUND = 256
 
 
 def chunk_of(backend: Backend, beams: int, itemsize: float = 0) -> int:
-    """Return the particles of one launch.
+    """Return the most particles of one launch.
 
     Args:
         backend: The device.
-        beams: Beams of each particle.
+        beams: Beams of each particle; 0 counts as 1.
         itemsize: Bytes of a result per particle and beam.
     """
-    chunk = CHUNK
+    chunk, beams = CHUNK, max(beams, 1)
     if itemsize:
-        chunk = min(chunk, int(CHUNK_BYTES // (beams * itemsize)))
+        info = backend.info
+        largest = max(CHUNK_BYTES, info.memory // CHUNK_SHARE) if info.kind == "gpu" else CHUNK_BYTES
+        chunk = min(chunk, int(largest // (beams * itemsize)))
     if backend.info.kind == "cpu":
         chunk = min(chunk, CHUNK_WORK // beams)
     chunk = max(chunk, 1)

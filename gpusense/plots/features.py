@@ -1,4 +1,4 @@
-"""Draw features of scans, and landmarks that were made of them."""
+"""Draw features of scans, and landmarks made from them."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def draw_landmarks(ax: Axes, landmarks: FeatureMap) -> None:
     """Draw landmarks at their places in the world, with their directions.
 
     Args:
-        ax: Axes to draw onto, such as those of :func:`draw_map`.
+        ax: Axes to draw onto, for example from :func:`draw_map`.
         landmarks: The landmarks.
 
     Example:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gpusense.evaluation.range_data import RangeData
 from gpusense.plots.drawing import BEAM, FRAME, ROBOT, new_figure
 from gpusense.world.parameters import BeamParameters
+from gpusense.world.range_causes import NoReturn, RandomDensity
 from gpusense.world.scanner import Reading
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
     from gpusense.learning.beam.incidence import IncidenceFit
 
-# Cells of the histograms over (z, z*), and of those over z.
+# Cells of the histograms over (z, z*) and over z.
 _CELLS, _BARS = 200, 80
 # Largest number of readings drawn one by one; more are thinned.
 _DRAWN = 10_000
@@ -117,7 +118,7 @@ def _density_panel(ax: Axes, data: RangeData, parameters: BeamParameters, distan
         lw=1.2,
         label="fitted p(z | z*)",
     )
-    lowest = min(0.3 / (max(total, 1) * wide), 0.5 * parameters.z_rand / data.range_max or math.inf)
+    lowest = min(0.3 / (max(total, 1) * wide), 0.5 * RandomDensity(data.range_max).peak(parameters.z_rand) or math.inf)
     ax.set(yscale="log", ylim=(max(lowest, 1e-6), None), xlabel="reading z [m]",
            title=f"z* = {distance:.2f} +- {width:.2f} m; no return: {none / max(total, 1):.3f}, "
            f"fitted {parameters.z_max:.3f}")  # fmt: skip
@@ -163,7 +164,7 @@ def surface_figure(data: RangeData, parameters: BeamParameters) -> Figure:
     low = max(low, float(finite.max()) - 25) if len(finite) else low
     image = ax.imshow(np.maximum(log_p, low), origin="lower", extent=(0, top, 0, top), aspect="auto", cmap="magma")
     figure.colorbar(image, ax=ax, label="log p(z | z*) [log 1/m]", extend="min")
-    none = f"log z_max = {math.log(parameters.z_max):.2f}" if parameters.z_max > 0 else "z_max = 0"
+    none = f"log z_max = {NoReturn(parameters.z_max).number:.2f}" if parameters.z_max > 0 else "z_max = 0"
     ax.set(xlabel="expected range z* [m]", ylabel="reading z [m]", title=f"The fitted density; no return: {none}")
     return figure
 

@@ -37,8 +37,8 @@ def triangulate(
         bearings: (M,) directions to the beacons in the robot's frame, counter-clockwise from straight ahead [rad], any
             real numbers.
         heading: The robot's heading in the world [rad], or None if unknown.
-        sigma: Standard deviation of the bearings [rad], one or (M,), > 0. None if unknown: the covariance is then that
-            of sigma = 1 rad, to be multiplied by the variance.
+        sigma: Standard deviation of the bearings [rad], one or (M,), > 0. None if unknown: the covariance is then for
+            sigma = 1 rad, to be multiplied by the variance.
         weights: (M,) factors >= 0 of the squared residuals; 0 leaves a beacon out. By default 1.
         loss: "linear", "soft_l1", "huber", "cauchy" or "arctan", as in ``scipy.optimize.least_squares``. It is ignored
             for only as many bearings as unknowns.
@@ -95,8 +95,8 @@ def triangulate_triangle(xy: ArrayLike, bearings: ArrayLike, *, sigma: ArrayLike
         xy: (3, 2) positions of the beacons [m].
         bearings: (3,) directions to the beacons in the robot's frame, counter-clockwise from straight ahead [rad], any
             real numbers.
-        sigma: Standard deviation of the bearings [rad], one or (3,), > 0. None if unknown: the covariance is then that
-            of sigma = 1 rad, to be multiplied by the variance.
+        sigma: Standard deviation of the bearings [rad], one or (3,), > 0. None if unknown: the covariance is then for
+            sigma = 1 rad, to be multiplied by the variance.
 
     Returns:
         One pose (1, 3) with status "unique" or "at a beacon", or no pose with status "circle", "in line", "coincident"

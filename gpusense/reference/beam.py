@@ -98,7 +98,7 @@ def score_beams(
     for begin in range(0, particles, block):
         end = min(begin + block, particles)
         bin_terms = terms
-        if "ECHO" in flags:
+        if "CONES" in flags:
             t, cosine, _ = echoes(
                 flags, map_table, normals, window, pose_cell[begin:end], pose[begin:end], ray, rays, cone, scale.limit,
                 caster,

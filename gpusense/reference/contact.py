@@ -82,7 +82,7 @@ def score_contact(
 ) -> None:
     """Sum log p over segments; segment s has the points start[s] to start[s + 1] - 1."""
     total = np.zeros(particles, terms.dtype)
-    sensor_pose, low = pose[:particles, None], pose_low[: particles if "CAREFUL" in flags else 1, None]
+    sensor_pose, low = pose[:particles, None], pose_low[: particles if "TWO_PART_POINTS" in flags else 1, None]
     for s in range(segments):
         nearest = np.full(particles, NO_OBSTACLE, np.int32)
         for i in range(start[s], start[s + 1]):

@@ -45,11 +45,6 @@ def distance_lines(
     _lines(along, lines, length, line_stride, step)[...] = np.where(nearest < length, nearest, NO_OBSTACLE)
 
 
-def parabola(i: np.ndarray, j: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Return the squared distance from cell i to the obstacle nearest to cell j across the lines."""
-    return (i - j) * (i - j) + across * across
-
-
 def distance_envelope(
     flags: frozenset[str],
     along: np.ndarray,

@@ -43,11 +43,11 @@ def whole_cells(flags: frozenset[str], offset: Pair) -> tuple[np.ndarray, Pair, 
     nearest = np.floor(np.where(np.isfinite(offset[0]), offset[0], 0) + real(0.5))
     zero = np.zeros_like(nearest)
     past = (offset[0] - nearest) + offset[1], zero
-    if "SHARP" in flags:
+    if "EXACT_EXPONENT" in flags:
         past = two_sum(offset[0] - nearest, offset[1])
     sign = np.where(past[0] < 0, real(1), real(-1))
     other = 1 + sign * past[0], zero
-    if "SHARP" in flags:
+    if "EXACT_EXPONENT" in flags:
         other = pair_sum((np.ones_like(nearest), zero), (sign * past[0], sign * past[1]))
     below = past[0] + real(EDGE) < 0
     rest = np.where(below, other[0], past[0]), np.where(below, other[1], past[1])
@@ -75,7 +75,7 @@ def end_point(
     shift = real(0.5) if "BILINEAR" in flags else real(0)
     cos, sin = pose[..., 2], pose[..., 3]
     p, q = point[..., 0], point[..., 1]
-    if "CAREFUL" in flags:
+    if "TWO_PART_POINTS" in flags:
         c, s = (cos, pose_low[..., 2]), (sin, pose_low[..., 3])
         u, v = (p, point_low[..., 0]), (q, point_low[..., 1])
         (frac_x, low_x), (frac_y, low_y) = two_sum(pose[..., 0], -shift), two_sum(pose[..., 1], -shift)

@@ -1,7 +1,7 @@
 """Weighted mean, circular in the heading, and covariance of a cloud of particles.
 
 Sums are relative to the first particle. While no heading is farther than a right angle from the first one, covariances
-follow from them; otherwise a second pass (again) is relative to the mean. Mardia and Jupp, *Directional Statistics*
+follow from them; otherwise a second pass is relative to the mean. Mardia and Jupp, *Directional Statistics*
 (2000), section 2.2. In a block of particles every eighth one belongs to a lane; the lanes are summed in the order of
 their particles, and then added one after the other.
 """
@@ -27,14 +27,14 @@ def sum_poses(
     particles: int,
     block: int,
     lanes: int,
-    again: int,
+    second_pass: int,
 ) -> None:
     """Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings.
 
     A row of sums takes ``lanes`` lanes of a block.
     """
     pose, w = poses[: 3 * particles].reshape(-1, 3), weight[:particles]
-    reference = estimate[:3] if again else pose[0].copy()
+    reference = estimate[:3] if second_pass else pose[0].copy()
     x, y = pose[:, 0] - reference[0], pose[:, 1] - reference[1]
     angle = wrap_once(pose[:, 2] - reference[2])
     cosine, sine = cos_sin(angle)
@@ -53,14 +53,14 @@ def sum_poses(
 
 
 def finish_estimate(
-    flags: frozenset[str], poses: np.ndarray, sums: np.ndarray, estimate: np.ndarray, groups: int, again: int
+    flags: frozenset[str], poses: np.ndarray, sums: np.ndarray, estimate: np.ndarray, groups: int, second_pass: int
 ) -> None:
     """Write the mean pose, the covariance about it, and whether headings ask for a second pass; or the second pass."""
     total = np.cumsum(sums[: groups * ESTIMATE_SUMS].reshape(groups, ESTIMATE_SUMS), axis=0)[-1]
     weight = total[0] if total[0] > 0.0 else 1.0
     x, y, angle = total[1] / weight, total[2] / weight, total[5] / weight
-    mean = 0.0 if again else float(angle_of(total[3], total[4]))
-    if not again:
+    mean = 0.0 if second_pass else float(angle_of(total[3], total[4]))
+    if not second_pass:
         estimate[0], estimate[1], estimate[2] = poses[0] + x, poses[1] + y, wrap_once(poses[2] + mean)
         estimate[9] = weight
         estimate[WIDE_HEADINGS] = total[12] > 0.0 or abs(mean) > math.pi / 2

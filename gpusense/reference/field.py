@@ -81,7 +81,7 @@ def score_field(
     points = point[None, :readings]
     for begin in range(0, particles, block):
         part = slice(begin, min(begin + block, particles))
-        low = pose_low[part, None] if "CAREFUL" in flags else pose_low[None, :1]
+        low = pose_low[part, None] if "TWO_PART_POINTS" in flags else pose_low[None, :1]
         term = reading_value(
             flags, table, pose_cell[part, None], pose[part, None], low, points, point_low[None, :readings], terms,
             window,

@@ -86,7 +86,7 @@ def field_gradient(
     for begin in range(0, particles, block):
         part = slice(begin, min(begin + block, particles))
         at = pose[part, None]
-        low = pose_low[part, None] if "CAREFUL" in flags else pose_low[None, :1]
+        low = pose_low[part, None] if "TWO_PART_POINTS" in flags else pose_low[None, :1]
         end = end_point(flags, at, low, to, to_low)
         col, row = end.col + pose_cell[part, None, 0], end.row + pose_cell[part, None, 1]
         pair, slope_x, slope_y = distance_slope(flags, table, col, row, end, window)

@@ -16,7 +16,7 @@ from gpusense.reference.hit_shape import shape_exponent
 
 def between(flags: frozenset[str], weight_a: Pair, a: Pair, weight_b: Pair, b: Pair) -> Pair:
     """Return the weighted sum of a and b, all of two parts. No term is negative, so small values keep their digits."""
-    if "SHARP" in flags:
+    if "EXACT_EXPONENT" in flags:
         return pair_sum(pair_product(weight_a, a), pair_product(weight_b, b))
     return weight_a[0] * a[0] + weight_b[0] * b[0], np.zeros_like(weight_a[0])
 
@@ -47,7 +47,7 @@ def field_square(flags: frozenset[str], distance: Pair, terms: np.ndarray) -> Pa
     hit). hit is the peak of its density, z_hit / (sigma sqrt(2 pi)) for a normal, and rand is z_rand / range_max, or
     their logarithms in the log domain.
     """
-    if "SHARP" in flags:
+    if "EXACT_EXPONENT" in flags:
         return pair_product(pair_product(distance, distance), (terms[1], terms[5]))
     return distance[0] * (distance[0] * terms[1]), np.zeros_like(distance[0])
 
@@ -61,7 +61,8 @@ def log_field(flags: frozenset[str], distance: Pair, terms: np.ndarray) -> np.nd
     """Return log p of distances from end points to the nearest obstacle."""
     exponent, low = field_exponent(flags, distance, terms)
     if "LINEAR" not in flags:
-        return np.logaddexp((terms[0] - exponent) + (terms[4] - low), terms[2])
+        hit = (terms[0] - exponent) + (terms[4] - low)
+        return np.logaddexp(hit, terms[2]) if "RAND" in flags else hit
     p = np.full(exponent.shape, terms[2])
     if "HIT" in flags:
         p += terms[0] * np.exp(-exponent) * (1 - low)

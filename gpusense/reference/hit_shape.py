@@ -20,7 +20,7 @@ def shape_exponent(flags: frozenset[str], t: Pair, numbers: np.ndarray) -> Pair:
         return t
     power, rate = numbers
     more = rate * t[0]
-    if "SHARP" not in flags:
+    if "EXACT_EXPONENT" not in flags:
         return power * np.log1p(more), np.zeros_like(more)
     exact = two_product(rate, t[0])
     high, low = two_product(power, np.log1p(more))
@@ -35,6 +35,11 @@ def shape_weight(flags: frozenset[str], t: np.ndarray, numbers: np.ndarray) -> n
     return power * rate / (1 + rate * t)
 
 
+def shape_bend(flags: frozenset[str], square: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """Return -E''(t) over the weight, times u^2, from the weight times u^2."""
+    return square * (1 / numbers[0]) if "STUDENT" in flags else np.zeros_like(square)
+
+
 def half_mass(flags: frozenset[str], b: np.ndarray, numbers: np.ndarray) -> np.ndarray:
     """Return the mass between the mean and a distance; kernels need no formula of it."""
     if "STUDENT" not in flags:
@@ -43,6 +48,8 @@ def half_mass(flags: frozenset[str], b: np.ndarray, numbers: np.ndarray) -> np.n
     half_dof = np.asarray(power, np.float64) - 0.5
     with np.errstate(over="ignore", invalid="ignore"):
         ratio = np.asarray(rate, np.float64) * np.square(np.asarray(b, np.float64))
-        share = np.where(np.isinf(ratio), 1, ratio / (1 + ratio))
-    near, far = betainc(0.5, half_dof, share), betainc(half_dof, 0.5, 1 / (1 + ratio))
-    return np.where(ratio < 1, 0.5 * near, 0.5 - 0.5 * far).astype(b.dtype)
+        share, is_near = ratio / (1 + ratio), ratio < 1
+    mass, half_dof = np.empty_like(ratio), np.broadcast_to(half_dof, ratio.shape)
+    mass[is_near] = 0.5 * betainc(0.5, half_dof[is_near], share[is_near])
+    mass[~is_near] = 0.5 - 0.5 * betainc(half_dof[~is_near], 0.5, 1 / (1 + ratio[~is_near]))
+    return mass.astype(b.dtype)

@@ -1,16 +1,19 @@
 """Sums over pairs of reading and expected range from which the beam model's parameters are learned (book table 6.2).
 
-``terms`` (12,) are the mixture's ten in the log domain, range_bias and 1 / sigma. A pair whose reading is NaN is
-padding. The mean of p_hit is z* + range_bias, clamped to [0, range_max]; obstacles of p_short lie before z*. r are the
-responsibilities e_hit, e_short and e_rand of the book. With u = (z - mean) / sigma, the distances x_0 = mean / sigma
-and x_1 = (range_max - mean) / sigma to the ends, phi the normal density, M the mass between them and
+``terms`` are the mixture's in the log domain; 1 / sigma, and sigma times the peak of an untruncated hit, replace the
+first two numbers for last_range. A pair whose reading is NaN is padding. The mean of p_hit is z* + range_bias, clamped
+to [0, range_max]; obstacles of p_short lie before z*. r are the responsibilities e_hit, e_short and e_rand of the book.
+With u = (z - mean) / sigma, the distances x_0 = mean / sigma and x_1 = (range_max - mean) / sigma to the ends, phi the
+untruncated density, W = E' the weight of the shape of a hit (1 for a normal), B = -E'' / W^2 (0 for a normal), M the
+mass between the ends and
 
-    T = (x_0 phi_0 + x_1 phi_1) / M,    P = (phi_1 - phi_0) / M,
-    Q = (x_1^2 phi_1 - x_0^2 phi_0) / M + P T,    U = (x_0^3 phi_0 + x_1^3 phi_1) / M,
+    T = (x_0 phi_0 + x_1 phi_1) / M,    P = (phi_1 - phi_0) / M,    V = (W_0 x_0 phi_0 + W_1 x_1 phi_1) / M,
+    Q = (W_1 x_1^2 phi_1 - W_0 x_0^2 phi_0) / M + P T,    U = (W_0 x_0^3 phi_0 + W_1 x_1^3 phi_1) / M,
 
 log p_hit has the derivatives, by log sigma (s) and by the mean in units of sigma (m),
 
-    h_s = u^2 - 1 + T,  h_m = u + P,  h_ss = -2 u^2 - T + U + T^2,  h_sm = -2 u - P + Q,  h_mm = -1 + T + P^2
+    h_s = W u^2 - 1 + T,  h_m = W u + P,
+    h_ss = W u^2 (B W u^2 - 2) - T + U + T^2,  h_sm = W u (B W u^2 - 2) - P + Q,  h_mm = W (B W u^2 - 1) + V + P^2
 
 and log p_short, by log lambda with x = lambda z*, f = x / (1 - exp(-x)) and v = f - x,
 
@@ -19,27 +22,19 @@ and log p_short, by log lambda with x = lambda z*, f = x / (1 - exp(-x)) and v =
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.reference.error_free import add_term
-from gpusense.reference.mixture import hit_mass, log_hit, log_short, short_factor
-
-ROOT_2PI = math.sqrt(2 * math.pi)
-
-
-def hit_mean(expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """Return the mean of p_hit."""
-    return np.minimum(np.maximum(expected + terms[10], 0), terms[6])
+from gpusense.reference.hit_shape import shape_bend, shape_exponent, shape_weight
+from gpusense.reference.mixture import hit_offset, log_hit, log_short, mass_within, mean_range, short_factor
 
 
 def responsibilities(
     flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return log p(z | z*) and the responsibilities of hit, short and rand, 0 where the density is 0."""
-    hit, shorter = log_hit(flags, z, hit_mean(expected, terms), terms), log_short(z, expected, terms)
+    hit, shorter = log_hit(flags, z, expected, terms), log_short(z, expected, terms)
     largest = np.maximum(np.maximum(hit, shorter), terms[5])
     shift = np.where(np.isinf(largest), 0, largest)
     p_hit, p_short, p_rand = np.exp(hit - shift), np.exp(shorter - shift), np.exp(terms[5] - shift)
@@ -47,33 +42,45 @@ def responsibilities(
     return largest + np.log(p), p_hit / p, p_short / p, p_rand / p
 
 
+def hit_phi(flags: frozenset[str], x: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """Return the untruncated density of a hit at a distance of x scales, times sigma."""
+    t = terms.dtype.type(0.5) * x * x
+    density: np.ndarray = terms[15] * np.exp(-shape_exponent(flags, (t, np.zeros_like(t)), terms[17:19])[0])
+    return density
+
+
 def add_pair(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray, sums: np.ndarray) -> None:
     """Return the terms of pairs in the sums, (S, pairs).
 
-    log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm, r_hit h_mm, r_short s_ll; r_hit (z - z*)^2,
-    r_hit (z - z*), r_short z. INFORMATION: 1 where rand is the likeliest cause; the upper triangle of y y' with y =
-    (r_hit, r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2, r_hit h_s h_m, r_hit h_m^2, r_short s_l^2.
+    log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm, r_hit h_mm, r_short s_ll; r_hit W u^2, r_short
+    z. INFORMATION: 1 where rand is the likeliest cause; the upper triangle of y y' with y = (r_hit, r_short, r_rand,
+    r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2, r_hit h_s h_m, r_hit h_m^2, r_short s_l^2.
     """
     real = terms.dtype.type
     log_p, r_hit, r_short, r_rand = responsibilities(flags, z, expected, terms)
 
-    mean = hit_mean(expected, terms)
-    u, x_0, x_1 = (z - mean) * terms[11], mean * terms[11], (terms[6] - mean) * terms[11]
-    mass = hit_mass(mean, terms[2], terms[6])
+    mean, numbers, half = mean_range(flags, expected, terms), terms[17:19], real(0.5)
+    u, x_0, x_1 = hit_offset(flags, z, expected, terms)[0] * terms[14], mean * terms[14], (terms[6] - mean) * terms[14]
+    weight = shape_weight(flags, half * u * u, numbers)
+    pull = weight * u
+    square = pull * u
+    mass = mass_within(flags, mean, terms[2], terms)
     near = mass < 1
-    phi_0 = np.where(near, np.exp(real(-0.5) * x_0 * x_0) / (real(ROOT_2PI) * mass), 0)
-    phi_1 = np.where(near, np.exp(real(-0.5) * x_1 * x_1) / (real(ROOT_2PI) * mass), 0)
+    phi_0, phi_1 = (np.where(near, hit_phi(flags, x, terms) / mass, 0) for x in (x_0, x_1))
+    pull_0, pull_1 = (shape_weight(flags, half * x * x, numbers) * x * phi for x, phi in ((x_0, phi_0), (x_1, phi_1)))
     t, p = x_0 * phi_0 + x_1 * phi_1, phi_1 - phi_0
-    q = x_1 * x_1 * phi_1 - x_0 * x_0 * phi_0 + p * t
-    w = x_0 * x_0 * x_0 * phi_0 + x_1 * x_1 * x_1 * phi_1
+    q = x_1 * pull_1 - x_0 * pull_0 + p * t
+    w = x_0 * x_0 * pull_0 + x_1 * x_1 * pull_1
+    bend = shape_bend(flags, square, numbers)
     hit = r_hit > 0
     # A mean that is clamped does not move with the bias.
     moved = hit & (mean == expected + terms[10])
-    h_s = np.where(hit, u * u - 1 + t, 0)
-    h_m = np.where(moved, u + p, 0)
-    h_ss = np.where(hit, -2 * u * u - t + w + t * t, 0)
-    h_sm = np.where(moved, -2 * u - p + q, 0)
-    h_mm = np.where(moved, -1 + t + p * p, 0)
+    square = np.where(hit, square, 0)
+    h_s = np.where(hit, square - 1 + t, 0)
+    h_m = np.where(moved, pull + p, 0)
+    h_ss = np.where(hit, square * (bend - 2) - t + w + t * t, 0)
+    h_sm = np.where(moved, pull * (bend - 2) - p + q, 0)
+    h_mm = np.where(moved, weight * (bend - 1) + pull_0 + pull_1 + p * p, 0)
 
     x = terms[4] * expected
     f = short_factor(x)
@@ -81,10 +88,9 @@ def add_pair(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: 
     s_l = np.where(r_short > 0, 1 - v - terms[4] * z, 0)
     s_ll = np.where(r_short > 0, v * (f - 1) - terms[4] * z, 0)
 
-    off = z - expected
     added = [log_p, r_hit, r_short, r_rand]
     added += [r_hit * h_s, r_hit * h_m, r_short * s_l, r_hit * h_ss, r_hit * h_sm, r_hit * h_mm, r_short * s_ll]
-    added += [r_hit * off * off, r_hit * off, r_short * z]
+    added += [r_hit * square, r_short * z]
     if "INFORMATION" in flags:
         added.append(((r_rand > r_hit) & (r_rand > r_short)).astype(real))
         y = (r_hit, r_short, r_rand, r_hit * h_s, r_hit * h_m, r_short * s_l)
@@ -107,7 +113,7 @@ def e_step(
     width: int,
 ) -> None:
     """Sum over blocks of pairs; pair k of a block is pair block * across + k * along."""
-    count = 40 if "INFORMATION" in flags else 14
+    count = 39 if "INFORMATION" in flags else 13
     total = (np.zeros((count, blocks), terms.dtype), np.zeros((count, blocks), terms.dtype))
     starts = np.arange(blocks) * across
     for first in range(0, readings, BLOCK_TERMS):

@@ -64,7 +64,7 @@ def hit_scale(flags: frozenset[str], expected: np.ndarray, terms: np.ndarray) ->
     one, none = np.ones_like(expected), np.zeros_like(expected)
     if "GROWTH" not in flags:
         return one, none
-    if "SHARP" not in flags:
+    if "EXACT_EXPONENT" not in flags:
         return one / (one + terms[12] * expected), none
     growth = pair_product((terms[12] + none, terms[13] + none), (expected, none))
     x = pair_sum((one, none), growth)
@@ -83,7 +83,7 @@ def normal_exponent(
     """
     off, off_low = hit_offset(flags, z, expected, terms)
     scale = hit_scale(flags, expected, terms)
-    if "SHARP" not in flags:
+    if "EXACT_EXPONENT" not in flags:
         scaled = off * scale[0]
         return scaled * (scaled * terms[1]), np.zeros_like(off)
     square, square_low = two_product(off, off)

@@ -67,7 +67,7 @@ def place_pose(
         pose_cell[:, axis] = cell[axis]
     for column in range(4):
         pose[:, column] = rounded[column]
-        if "CAREFUL" in flags:
+        if "TWO_PART_POINTS" in flags:
             pose_low[:, column] = exact[column] - rounded[column]
 
 

@@ -22,7 +22,6 @@ LONGEST = 255
 # The entry of an occupied cell; the ring has 0.
 OCCUPIED = 1
 RECTANGLE_REACH = 254
-STACK = 256
 
 
 def padded(row: np.ndarray, col: np.ndarray, cols: int) -> np.ndarray:

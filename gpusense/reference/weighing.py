@@ -19,7 +19,7 @@ from gpusense.interface.constants import (
     TEMPERATURE,
     WEIGHT_SUMS,
 )
-from gpusense.reference.rungs import largest_of, left_of, possible_of, rung_of, set_stage, tempered
+from gpusense.reference.tempering import largest_of, left_of, possible_of, rung_of, set_stage, tempered
 
 
 def add_scores(

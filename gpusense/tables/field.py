@@ -129,7 +129,7 @@ class FieldTable:
     def _density_of(self, rows: int, cols: int) -> np.ndarray | None:
         """Return the cell values of the squared distances 0, 1, ... and infinity; None if there are too many.
 
-        The largest squared distance is that of the map's diagonal or of ``max_distance``, whichever is smaller.
+        The largest squared distance is the map's diagonal or ``max_distance``, squared, whichever is smaller.
         """
         reach, diagonal = self._parameters.max_distance / self._resolution, rows * rows + cols * cols
         farthest = diagonal if reach * reach >= diagonal else math.floor(reach * reach) + 1

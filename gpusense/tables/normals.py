@@ -1,7 +1,7 @@
 """Normals of a map's walls, for angles of incidence.
 
-The outline of a wall is followed from side to side of its cells. Where it is straight, the normal is that of a line
-through the sides on the cell's piece of the outline, which ends at corners (``outlines``).
+The outline of a wall is followed from side to side of its cells. Where the outline is straight, the normal is
+perpendicular to a line through the sides of the cell's piece of outline, which ends at corners (``outlines``).
 
 Elsewhere, on tight bends and in clutter, the occupied cells within RADIUS cells of a cell have a mean and a covariance.
 A wall is long and thin, so its normal is the direction of least variance. Where the variance is alike in all
@@ -41,14 +41,14 @@ _OPPOSITE = -0.5
 def surface_normals(grid: OccupancyGrid, *, unknown: Space = "free", outside: Space = "free") -> np.ndarray:
     """Compute the normals of a map's walls.
 
-    The face of a cell that a beam hits does not have the direction of a slanted wall. A cell's normal is therefore that
-    of a line through up to 17 sides of the wall's cells around it. The line ends at corners, so normals are right up to
-    the cell next to a corner: within 4 cells of one they are off by 2 degrees in the mean. Elsewhere on straight
-    walls they are off by 0.8 degrees at any angle, and by 5 at most. A cell in a corner has the normal of one wall, or
-    one between both. Where the outline is not straight, the normal is the direction of least variance (principal
-    components) of the occupied cells within 4 cells, or without one, as at posts, the direction in which occupied cells
-    become fewer. A cell has no normal if fewer than two other occupied cells are nearby, if there is no such direction
-    either, or if no free cell touches one of its sides.
+    The face of a cell that a beam hits does not have the direction of a slanted wall. A cell's normal is therefore
+    perpendicular to a line through up to 17 sides of the surrounding wall cells. The line ends at corners, so normals
+    are right up to the cell next to a corner: within 4 cells of one they are off by 2 degrees in the mean. Elsewhere on
+    straight walls they are off by 0.8 degrees at any angle, and by 5 at most. A cell in a corner has the normal of one
+    wall, or one between both. Where the outline is not straight, the normal is the direction of least variance
+    (principal components) of the occupied cells within 4 cells, or without one, as at posts, the direction in which
+    occupied cells become fewer. A cell has no normal if fewer than two other occupied cells are nearby, if there is no
+    such direction either, or if no free cell touches one of its sides.
 
     Args:
         grid: The map.
@@ -80,7 +80,7 @@ def surface_normals(grid: OccupancyGrid, *, unknown: Space = "free", outside: Sp
 
 
 def normal_table(obstacles: np.ndarray, window: Window, outside: str, real: np.dtype) -> np.ndarray:
-    """Compute normals of a window of a map and of a ring around it, in the layout of the kernel file ``echo``.
+    """Compute normals in a window of a map and the ring around it, in the layout of the kernel file ``echo``.
 
     Args:
         obstacles: (H, W) bool, the whole map.

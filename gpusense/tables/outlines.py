@@ -22,7 +22,7 @@ class Span:
 
     Attributes:
         count: Sides of a window.
-        least: Fewest of them on either side of the one in question.
+        least: Fewest sides before and after the side in question.
         residual: Largest mean square distance of their middles to the line [cells^2].
         advance: The outline must turn at the window's nearer end: the next CORNER sides advance by less than this
             along the line [cells]. None for windows that need no corner.

@@ -19,8 +19,9 @@ a reading of exactly range_max as ``z_hit exp(...) + z_max``, and a longer one a
 +inf; its likelihood field leaves out both. Beluga: a reading outside [range_min, range_max] is left out, +inf too. Its
 beam model scores a reading of exactly range_max as ``z_hit p_hit + z_max``; its likelihood field takes it for a range.
 
-*Cells.* 0 is free, 100 is occupied, and all others, -1 and those of maps in mode ``scale``, are neither: they stop the
-beams of the beam models and are no obstacles of the likelihood fields. ``occupied_threshold`` has no effect.
+*Cells.* 0 is free and 100 is occupied. All other values (-1, and intermediate ones of maps in mode ``scale``) are
+neither: they stop beams in the beam models but are no obstacles in the likelihood fields. ``occupied_threshold`` has no
+effect.
 
 *Beams* of the beam models follow Bresenham's lines, see ``gpusense.casters.Bresenham``. amcl's look one cell beyond the
 ray's end, and distances between cells may exceed range_max; the map's edge stops them, and a particle off the map has
@@ -49,6 +50,7 @@ from gpusense.world.grid import OccupancyGrid
 from gpusense.world.likelihood import Likelihood
 from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 from gpusense.world.peer_weights import BeamWeights, FieldWeights
+from gpusense.world.range_causes import RandomDensity
 from gpusense.world.scanner import Scanner
 
 _OCCUPIED, _UNKNOWN = 100, -1
@@ -124,7 +126,7 @@ class Amcl(Peer):
     outside = "occupied"
 
     def readings(self, ranges: np.ndarray, scanner: Scanner, field: bool) -> np.ndarray:
-        """Convert readings to the peer's classes: NaN and inf are left out, all others are ranges.
+        """Convert readings to the peer's classes: NaN and inf are left out, all other readings are ranges.
 
         Args:
             ranges: Readings of any shape and value [m].
@@ -229,12 +231,13 @@ class Beluga(Peer):
 
     def beyond(self, p: LikelihoodFieldParameters, range_max: float) -> float:
         """See Peer.beyond."""
-        return float(np.float32(1 / range_max))
+        return float(np.float32(RandomDensity(range_max).peak(1)))
 
     def overlay(self, p: LikelihoodFieldParameters, range_max: float) -> float:
         """Return the density of OVERLAID cells, that of a squared distance computed from ``1 / range_max``."""
         farthest = np.float32(p.max_distance * p.max_distance)
-        share = (1 / range_max - p.z_rand / range_max) / _amplitude(p) if p.z_hit > 0 else 0.0
+        rand = RandomDensity(range_max)
+        share = (rand.peak(1) - rand.peak(p.z_rand)) / _amplitude(p) if p.z_hit > 0 else 0.0
         # Without a share of the normal density there is no such distance.
         background = np.float32(-2 * p.sigma_hit * p.sigma_hit * math.log(share)) if share > 0 else farthest
         return float(_normalised(np.minimum(background, farthest), p, range_max))
@@ -289,7 +292,7 @@ def _beside(free: np.ndarray) -> np.ndarray:
 def _unnormalised(distance: np.ndarray, p: LikelihoodFieldParameters, range_max: float) -> np.ndarray:
     """Return nav2_amcl's density at distances [m]."""
     normal = np.exp(-(distance * distance) / (2 * p.sigma_hit * p.sigma_hit))
-    return np.asarray(p.z_hit * normal + p.z_rand / range_max)
+    return np.asarray(p.z_hit * normal + RandomDensity(range_max).peak(p.z_rand))
 
 
 def _amplitude(p: LikelihoodFieldParameters) -> float:
@@ -299,4 +302,4 @@ def _amplitude(p: LikelihoodFieldParameters) -> float:
 def _normalised(squared: np.ndarray, p: LikelihoodFieldParameters, range_max: float) -> np.ndarray:
     """Return Beluga's density at squared distances [m^2], rounded to float32."""
     normal = np.exp(-np.asarray(squared, np.float64) / (2 * p.sigma_hit * p.sigma_hit))
-    return np.asarray((_amplitude(p) * normal + p.z_rand / range_max).astype(np.float32), np.float64)
+    return np.asarray((_amplitude(p) * normal + RandomDensity(range_max).peak(p.z_rand)).astype(np.float32), np.float64)

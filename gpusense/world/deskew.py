@@ -137,7 +137,7 @@ def still_readings(ranges: Floats, scanner: Scanner, motion: Floats) -> Floats:
 
 
 def _resampled(measured: Floats, value: Floats, hit: NDArray[np.bool], wanted: Floats) -> Floats:
-    """Return the readings at the wanted bearings from those at the measured ones.
+    """Interpolate readings from the measured to the wanted bearings.
 
     A straight line through points at ranges a and b, and bearings 0 and t, has 1 / r = (sin(t - u) / a + sin(u) / b) /
     sin(t) at the bearing u.

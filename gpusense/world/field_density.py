@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from gpusense.interface.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
 from gpusense.world.hit_shapes import HitShape, shape_of
 from gpusense.world.parameters import LikelihoodFieldParameters
+from gpusense.world.range_causes import NoReturn, RandomDensity
 
 Floats = NDArray[np.float64]
 
@@ -67,12 +68,12 @@ class FieldDensity:
     @property
     def rand(self) -> float:
         """Density of random readings [1/m], with their weight."""
-        return self.parameters.z_rand / self.range_max
+        return RandomDensity(self.range_max).peak(self.parameters.z_rand)
 
     @property
     def log_rand(self) -> float:
         """Logarithm of ``rand``."""
-        return log_weight(self.parameters.z_rand) - math.log(self.range_max)
+        return RandomDensity(self.range_max).log_peak(self.parameters.z_rand)
 
     @property
     def is_sharp(self) -> bool:
@@ -84,13 +85,13 @@ class FieldDensity:
         return sums_linearly(self.rand, self.peak, real)
 
     def terms(self, real: np.dtype) -> np.ndarray:
-        """Return the numbers of the kernel file ``field_term``: those of a sum of densities, or of logarithms.
+        """Return the numbers of the kernel file ``field_term``, for a sum of densities or of logarithms.
 
         Raises:
             ValueError: sigma_hit is too small or too large for the precision.
         """
         hit, rand = (self.peak, self.rand) if self.is_linear(real) else (self.log_peak, self.log_rand)
-        terms = rounded_terms([hit, self.rate, rand, log_weight(self.parameters.z_max)], real)
+        terms = rounded_terms([hit, self.rate, rand, NoReturn(self.parameters.z_max).number], real)
         return np.append(terms, np.array(self.shape.numbers, real))
 
     def capped(self, distance: Floats) -> Floats:

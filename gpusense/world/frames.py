@@ -16,7 +16,6 @@ import numpy as np
 from gpusense.interface import structs
 from gpusense.reference import placement
 from gpusense.reference.heading import cos_sin
-from gpusense.world.grid import OccupancyGrid
 
 Mount = tuple[float, float, float]
 
@@ -37,7 +36,7 @@ class Cells(Protocol):
         """Numbers of rows and columns."""
 
 
-_CAREFUL = frozenset({"CAREFUL"})
+_IN_TWO_PARTS = frozenset({"TWO_PART_POINTS"})
 
 
 @dataclass(frozen=True)
@@ -62,15 +61,6 @@ def split(values: np.ndarray, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
     """
     high = values.astype(real)
     return high, (values - high).astype(real)
-
-
-def to_grid(grid: OccupancyGrid, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Convert world coordinates [m] to column and row coordinates of the grid's frame [cells], float64."""
-    yaw = grid.origin[2]
-    if yaw != 0.0:
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        x, y = cos * x + sin * y, cos * y - sin * x
-    return x / grid.resolution, y / grid.resolution
 
 
 @functools.lru_cache(maxsize=256)
@@ -99,7 +89,7 @@ def place_poses(poses: np.ndarray, grid: Cells, mount: Mount, real: np.dtype) ->
     pose_status = np.zeros(2, np.int32)
     with np.errstate(all="ignore"):
         placement.place_poses(
-            _CAREFUL, np.ascontiguousarray(poses, np.float64), placed.cell, placed.pose, placed.low, pose_status,
+            _IN_TWO_PARTS, np.ascontiguousarray(poses, np.float64), placed.cell, placed.pose, placed.low, pose_status,
             frame_of(grid, mount), structs.Window(0, 0, *grid.shape), count,
         )  # fmt: skip
     return placed

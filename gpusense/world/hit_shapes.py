@@ -1,12 +1,12 @@
 """Densities of a correct range on the host: the one home of each, with its numbers for kernels.
 
 A hit of scale sigma has the density ``exp(-E(u)) / (width sigma)`` at u = (z - mean) / sigma; it is symmetric and falls
-with |u|. Models truncate it to [0, range_max] or not, weigh it, and mix it with other causes. Everything that a model,
-a table, a search, a picture, a simulation or a fit needs of it comes from :class:`HitShape`; kernels have E in their
-file ``hit_shape`` and get all other numbers from here.
+with |u|. Models truncate it to [0, range_max] or not, weigh it, and mix it with other causes. Models, tables, searches,
+pictures, simulations and fits get all that they need from :class:`HitShape`. Kernels have E in their file ``hit_shape``
+and get all other numbers from here.
 
 A shape is registered in :data:`SHAPES` under its name, the value of ``hit=`` in the parameters of scan models.
-CONTRIBUTING.md has the recipe for another one.
+CONTRIBUTING.md has the recipe for another shape.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, Self, TypeAlias
+from typing import Any, ClassVar, Literal, Self, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,7 @@ class HitShape(ABC):
         flags: Flags of the kernels that evaluate it.
         tabulated: Whether kernels look up the mass in a table, which the host makes of ``half_mass``.
         fitted: Names of the parameters that a fit finds beside the scale.
-        limits: (P, 2) smallest and largest coordinates of a fit, one for each of them.
+        limits: (P, 2) smallest and largest coordinate of a fit; P is 0 or 1.
         starts: (S, P + 1) coordinates from which a fit starts, and the factor of a normal's scale there.
     """
 
@@ -56,6 +56,11 @@ class HitShape(ABC):
     def at(cls, coordinates: Floats) -> Self:
         """Make the shape at coordinates of a fit."""
         return cls()
+
+    @property
+    def coordinates(self) -> Floats:
+        """The (P,) coordinates at which ``at`` makes this shape."""
+        return np.zeros(0)
 
     def values(self) -> dict[str, float]:
         """Return the values of the fitted parameters by name."""
@@ -192,6 +197,11 @@ class StudentHit(HitShape):
         """See HitShape.at."""
         return cls(min(max(1 / float(coordinates[0]), LEAST_DOF), MOST_DOF))
 
+    @property
+    def coordinates(self) -> Floats:
+        """See HitShape.coordinates."""
+        return np.array([1 / self.dof])
+
     def values(self) -> dict[str, float]:
         """See HitShape.values."""
         return {"hit_dof": self.dof}
@@ -271,6 +281,11 @@ NORMAL = NormalHit()
 SHAPE_PARAMETERS = ("hit", *dict.fromkeys(name for shape in SHAPES.values() for name in shape.fitted))
 
 
+def name_of(shape: HitShape) -> HitName:
+    """Return the name of a shape, as parameters have it."""
+    return cast("HitName", next(name for name, kind in SHAPES.items() if kind is type(shape)))
+
+
 def shape_of(parameters: Any) -> HitShape:
-    """Return the shape of the hits of parameters of a scan model."""
+    """Return the hit shape of a scan model's parameters."""
     return SHAPES[parameters.hit].of(parameters)

@@ -1,4 +1,4 @@
-"""Tables of the mass and of the quantiles of hits whose kernels have no formula of them.
+"""Tables of mass and quantiles for hit shapes whose kernels have no closed form.
 
 A table has cells of equal width in the logarithmic coordinate log(1 + b), b = u / sqrt 2 for a distance of u scales, or
 -log(1 - 2 m) for a mass m between the mean and a distance. In each cell it has the numbers of a polynomial in the share
@@ -60,9 +60,12 @@ def mass_tables(shapes: Sequence[HitShape], terms: list[np.ndarray], real: np.dt
     return [table for _, table in tables.values()]
 
 
+@functools.lru_cache(maxsize=32)
 def mass_table(shape: HitShape, real: np.dtype) -> np.ndarray:
-    """Return the masses between the mean and a distance, by log(1 + b)."""
-    return _table(lambda at: shape.half_mass(_ROOT_TWO * np.expm1(at)), real)
+    """Return the masses between the mean and a distance, by log(1 + b); the table is kept, and read-only."""
+    table = _table(lambda at: shape.half_mass(_ROOT_TWO * np.expm1(at)), real)
+    table.flags.writeable = False
+    return table
 
 
 def looked_up(table: Floats, at: Floats) -> Floats:

@@ -58,9 +58,9 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
     P6), PNG (1 to 16 bits; grey, palette or colour, with or without alpha) or uncompressed BMP. Of a 16-bit value the
     grey keeps the upper 8 bits of its fraction of white. Three images differ from nav2's: a 16-bit PNG with colours or
     alpha counts with its upper 8 bits only, the transparent colour of an 8-bit RGB PNG is unknown, and a PGM may have
-    any maximum. Memory is allocated only after the file has been seen to hold the pixels that its header claims, at
-    most 2^29, and their memory to be there: a byte for each cell, and for PNG and BMP one more for each grey pixel, two
-    for 16 bits, or four for a colour.
+    any maximum. Memory is allocated only after the file has proved to hold the pixels that its header claims (at most
+    2^29), and enough memory is free: a byte for each cell, and for PNG and BMP one more for each grey pixel, two for 16
+    bits, or four for a colour.
 
     A file ``.dat`` or ``.dat.gz`` has a line for each x with the probabilities that the cells are free, or -1 for
     unknown, and possibly a header with the resolution, else 0.1 m; its cells are ``round(100 (1 - p))``.

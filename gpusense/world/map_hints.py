@@ -1,4 +1,4 @@
-"""Find what a user meant who names the image of a map in place of its YAML file."""
+"""Find the YAML file that a user meant by naming the map's image."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def check_no_image(file: Path) -> None:
 
 
 def _yaml_files(image: Path) -> Iterator[Path]:
-    """Yield the YAML files in the folder of an image that name it, first those of its own name."""
+    """Yield the YAML files in an image's folder that name the image, those with the same stem first."""
     named = [image.with_suffix(suffix) for suffix in (".yaml", ".yml")]
     others = sorted(path for path in image.parent.glob("*.y*ml") if path not in named)[:_MOST]
     for path in (*named, *others):

@@ -1,7 +1,7 @@
 """Notice values that are legal but cannot be meant: degrees for radians, millimetres for metres, places off the map.
 
-Such values compute as semantics demand. A warning names the likely cause, once: geometry is looked at where it is made,
-readings in the first scans of a scanner.
+Such values compute as semantics demand. A warning names the likely cause, once. Geometry is checked when it is made,
+readings in a scanner's first scans.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def look_at_scanner(range_max: float, mount: tuple[float, float, float]) -> None
 
 
 def look_at_grid(resolution: float, origin: tuple[float, float, float]) -> None:
-    """Warn of cells larger than those of maps for robots, and of an origin in degrees."""
+    """Warn of cells larger than robots' maps have, and of an origin in degrees."""
     if resolution > _LARGEST_CELL:
         _notice(
             f"resolution: is {resolution:.6g} m, the side of a cell: is it in centimetres or millimetres? Maps for "

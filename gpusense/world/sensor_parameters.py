@@ -200,7 +200,7 @@ class BumperParameters(_Parameters):
 
 @dataclass(frozen=True)
 class LineParameters(_Parameters):
-    """Parameters of the line model. Deviations are those of the map and of the model; features may bring their own.
+    """Parameters of the line model. Deviations are noise of map and model; features may add their covariance.
 
     Raises:
         TypeError: A value is not a real number.

@@ -81,10 +81,6 @@ class Window(structs.Window):
         return array[self.row : self.row + self.rows, self.col : self.col + self.cols]
 
 
-# The name that other rooms still import.
-Region = Window
-
-
 def box(cells: np.ndarray) -> Window | None:
     """Return the smallest window that holds all True cells of an (H, W) array; None without any."""
     rows, cols = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))

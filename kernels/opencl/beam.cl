@@ -68,7 +68,7 @@ kernel void score_beams(ARGUMENTS) {
     int impossible = 0;
 #endif
     for (int r = 0; r < size; ++r) {
-#if ECHO
+#if CONES
         const Echo echo = nearest_echo(map_table, normals, window, pose_cell[n], pose[n], ray + r * cone.rays, cone,
                                        ray_limit(reading[r], terms, scale), caster);
         const real t = echo.t;
@@ -146,7 +146,7 @@ kernel void beam_tiles(ARGUMENTS) {
 #else
     for (int r = tile_ray(item, spread); r < size; r += tile_step(spread)) {
 #endif
-#if ECHO
+#if CONES
         const Echo echo = nearest_echo(map_table, normals, window, cell, sensor_pose, ray + r * cone.rays, cone,
                                        ray_limit(reading[r], terms, scale), caster);
         const real t = echo.t;

@@ -61,7 +61,7 @@ kernel void score_contact(ARGUMENTS) {
     if (n >= particles) return;
     const int2 cell = pose_cell[n];
     const real4 sensor_pose = pose[n];
-#if CAREFUL
+#if TWO_PART_POINTS
     const real4 low = pose_low[n];
 #else
     const real4 low = 0;

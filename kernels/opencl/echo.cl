@@ -4,7 +4,7 @@
 // 1.
 // requires: caster mixture
 
-#if ECHO
+#if CONES
 // Distance in cells, and cosine and sine of the angle of incidence. Without a return these are limit, 2 and 0: 2 is
 // more than any cosine, so that the first bin can be for such beams alone.
 typedef struct {

@@ -15,7 +15,7 @@ int field_cell(const int col, const int row, const Window window) {
     return r * (window.cols + 2 * FIELD_RING) + c;
 }
 
-#if CAREFUL
+#if TWO_PART_POINTS
 // Return frac + a b + sign c d to about twice the working precision; every factor is a sum of two numbers.
 real2 careful_offset(const real2 frac, const real2 a, const real2 b, const real2 c, const real2 d, const real sign) {
     const real2 ab = two_product(a.x, b.x), cd = two_product(c.x, d.x);
@@ -34,7 +34,7 @@ real2 careful_offset(const real2 frac, const real2 a, const real2 b, const real2
 // edge counts as on it, so that end points on edges fall into the same cell in every precision.
 int whole_cells(const real2 offset, real2 *rest, real2 *to_next) {
     const int nearest = floor_int(offset.x + (real)0.5);
-#if SHARP
+#if EXACT_EXPONENT
     const real2 past = two_sum(offset.x - (real)nearest, offset.y);
     const real2 other = pair_sum((real2)(1, 0), past.x < 0 ? past : -past);
 #else
@@ -61,7 +61,7 @@ EndPoint end_point(const real4 pose, const real4 pose_low, const real2 point, co
     EndPoint end;
     real2 x = (real2)((pose.x - shift) + (pose.z * point.x - pose.w * point.y), 0);
     real2 y = (real2)((pose.y - shift) + (pose.w * point.x + pose.z * point.y), 0);
-#if CAREFUL
+#if TWO_PART_POINTS
 #if !BILINEAR
     const int2 near = (int2)(floor_int(x.x), floor_int(y.x));
     const real2 left = (real2)(x.x - (real)near.x, y.x - (real)near.y);
@@ -80,7 +80,7 @@ EndPoint end_point(const real4 pose, const real4 pose_low, const real2 point, co
     return end;
 }
 
-#if QUICK
+#if ROUNDED_CELLS
 // Return the largest distance from a cell's centre at which rounding certainly gives the cell: half a cell less the
 // rounding errors of an end point. guard bounds them for rounded products, with 3.12 eps of the reading and 1.5 eps
 // altogether. Here products are not rounded, since GPUs fuse them, and the errors are 2 eps and 1.6 eps.

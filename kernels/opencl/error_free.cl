@@ -14,9 +14,11 @@ real high_half(const real a) {
     return scaled - (scaled - a);
 }
 
-// Return a * b = product.x + product.y exactly, short of overflow and underflow.
+// Return a * b = product.x + product.y exactly, short of overflow and underflow: by a fused multiply-add where the
+// device has one.
 real2 two_product(const real a, const real b) {
     const real product = a * b;
+    if (FUSES) return (real2)(product, fma(a, b, -product));
     const real a_high = high_half(a), b_high = high_half(b);
     const real a_low = a - a_high, b_low = b - b_high;
     const real error = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low;

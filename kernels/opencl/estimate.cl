@@ -1,6 +1,6 @@
 // Weighted mean, circular in the heading, and covariance of a cloud of particles.
 // Sums are relative to the first particle. While no heading is farther than a right angle from the first one, covariances
-// follow from them; otherwise a second pass (again) is relative to the mean. Mardia and Jupp, "Directional Statistics"
+// follow from them; otherwise a second pass is relative to the mean. Mardia and Jupp, "Directional Statistics"
 // (2000), section 2.2. In a block of particles every eighth one belongs to a lane; the lanes are summed in the order of
 // their particles, and then added one after the other.
 // requires: motion
@@ -15,7 +15,7 @@
 kernel void sum_poses(ARGUMENTS) {
     const int i = get_global_id(0), each = ESTIMATE_LANES / lanes, begin = i / each * block, first = i % each * lanes;
     if (begin >= particles) return;
-    global const double *reference = again ? estimate : poses;
+    global const double *reference = second_pass ? estimate : poses;
     const double x0 = reference[0], y0 = reference[1], theta0 = reference[2];
     const int end = min(begin + block, particles);
     double total[ESTIMATE_SUMS];
@@ -49,8 +49,8 @@ kernel void finish_estimate(ARGUMENTS) {
     }
     const double weight = total[0] > 0.0 ? total[0] : 1.0;
     const double x = total[1] / weight, y = total[2] / weight, angle = total[5] / weight;
-    const double mean = again ? 0.0 : angle_of(total[3], total[4]);
-    if (!again) {
+    const double mean = second_pass ? 0.0 : angle_of(total[3], total[4]);
+    if (!second_pass) {
         estimate[0] = poses[0] + x, estimate[1] = poses[1] + y, estimate[2] = wrap_once(poses[2] + mean);
         estimate[9] = weight;
         estimate[WIDE_HEADINGS] = total[12] > 0.0 || fabs(mean) > RIGHT_ANGLE ? 1.0 : 0.0;

@@ -15,8 +15,8 @@ kernel void fill_field(ARGUMENTS) {
     table[begin + (long)j * stride + i] = inside ? density[min(squared[(long)row * cols + col], cap)] : beyond;
 }
 
-// Score scans: one work-item takes a particle. QUICK changes this kernel in Warp alone, on processors, whose compiler
-// makes vector code of loops.
+// Score scans: one work-item takes a particle. ROUNDED_CELLS changes this kernel in Warp alone, on processors, whose
+// compiler makes vector code of loops.
 kernel void score_field(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;
@@ -30,7 +30,7 @@ kernel void score_field(ARGUMENTS) {
     const real constant_term = score.constant_term;
 #endif
     const int2 origin = pose_cell[n];
-#if CAREFUL
+#if TWO_PART_POINTS
     const real4 low = pose_low[n];
 #else
     const real4 low = (real4)(0);
@@ -73,12 +73,12 @@ kernel void field_blocks(ARGUMENTS) {
 #endif
     const int2 origin = pose_cell[n];
     const real4 sensor_pose = pose[n];
-#if CAREFUL
+#if TWO_PART_POINTS
     const real4 low = pose_low[n];
 #else
     const real4 low = (real4)(0);
 #endif
-#if QUICK
+#if ROUNDED_CELLS
     const int2 from = table_origin(origin, window.cols);
     const real4 lowered = sensor_pose - (real4)(0.5f, 0.5f, 0, 0);
     const real far = terms[3];
@@ -86,7 +86,7 @@ kernel void field_blocks(ARGUMENTS) {
     for (int block = (item / GROUP) & ((1 << spread) - 1); block * BLOCK_TERMS < size; block += 1 << spread) {
         const int begin = block * BLOCK_TERMS, end = min(begin + BLOCK_TERMS, size);
         real sum = 0;
-#if QUICK
+#if ROUNDED_CELLS
         real worst = 0;
         const real sure = rounding_margin(guard[block]);
         if (begin + BLOCK_TERMS <= size) {

@@ -48,7 +48,7 @@ kernel void field_gradient(ARGUMENTS) {
 #endif
     const int2 origin = pose_cell[n];
     const real4 at = pose[n];
-#if CAREFUL
+#if TWO_PART_POINTS
     const real4 low = pose_low[n];
 #else
     const real4 low = (real4)(0);

@@ -5,7 +5,7 @@
 #if BILINEAR
 // Return the weighted sum of a and b, all of two parts. No term is negative, so small values keep their digits.
 real2 between(const real2 weight_a, const real2 a, const real2 weight_b, const real2 b) {
-#if SHARP
+#if EXACT_EXPONENT
     return pair_sum(pair_product(weight_a, a), pair_product(weight_b, b));
 #else
     return (real2)(weight_a.x * a.x + weight_b.x * b.x, 0);
@@ -29,7 +29,7 @@ real2 bilinear(global const real *table, const int2 cell, const EndPoint end, co
 // the peak of its density, z_hit / (sigma sqrt(2 pi)) for a normal, and rand is z_rand / range_max, or their logarithms
 // in the log domain.
 real2 field_square(const real2 distance, global const real *terms) {
-#if SHARP
+#if EXACT_EXPONENT
     return pair_product(pair_product(distance, distance), (real2)(terms[1], terms[5]));
 #else
     return (real2)(distance.x * (distance.x * terms[1]), 0);
@@ -41,7 +41,7 @@ real2 field_exponent(const real2 distance, global const real *terms) {
     return shape_exponent(field_square(distance, terms), terms[6], terms[7]);
 }
 
-// Return log p of the distance from an end point to the nearest obstacle.
+// Return log p of the distance from an end point to the nearest obstacle. Without random readings it is that of a hit.
 real log_field(const real2 distance, global const real *terms) {
     const real2 exponent = field_exponent(distance, terms);
 #if LINEAR
@@ -52,8 +52,12 @@ real log_field(const real2 distance, global const real *terms) {
     return log(p);
 #else
     const real hit = (terms[0] - exponent.x) + (terms[4] - exponent.y);
+#if RAND
     const real largest = fmax(hit, terms[2]);
     return largest + log(exp(hit - largest) + exp(terms[2] - largest));
+#else
+    return hit;
+#endif
 #endif
 }
 #endif
@@ -80,7 +84,7 @@ real reading_value(global const real *table, const int2 origin, const real4 pose
 #endif
 }
 
-#if QUICK
+#if ROUNDED_CELLS
 // Return the term of a reading by rounding alone. worst becomes the distance of the end point from the cell's centre,
 // if that is larger. A missing or max reading has no cell: the sensor's cell is read and not used. The term of a max
 // reading is far.

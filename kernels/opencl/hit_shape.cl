@@ -13,7 +13,7 @@
 real2 shape_exponent(const real2 t, const real power, const real rate) {
 #if STUDENT
     const real more = rate * t.x;
-#if SHARP
+#if EXACT_EXPONENT
     const real2 product = two_product(power, log1p(more));
     return (real2)(product.x, product.y + power * ((two_product(rate, t.x).y + rate * t.y) / (1 + more)));
 #else
@@ -30,6 +30,15 @@ real shape_weight(const real t, const real power, const real rate) {
     return power * rate / (1 + rate * t);
 #else
     return 1;
+#endif
+}
+
+// Return -E''(t) over the weight, times u^2, from the weight times u^2.
+real shape_bend(const real square, const real power) {
+#if STUDENT
+    return square * (1 / power);
+#else
+    return 0;
 #endif
 }
 

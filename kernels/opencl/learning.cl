@@ -1,32 +1,28 @@
 // Sums over pairs of reading and expected range from which the beam model's parameters are learned (book table 6.2).
-// terms[12] = the mixture's ten in the log domain, range_bias and 1 / sigma. A pair whose reading is NaN is padding.
-// The mean of p_hit is z* + range_bias, clamped to [0, range_max]; obstacles of p_short lie before z*. r are the
-// responsibilities e_hit, e_short and e_rand of the book. With u = (z - mean) / sigma, the distances x_0 = mean / sigma
-// and x_1 = (range_max - mean) / sigma to the ends, phi the normal density, M the mass between them and
-//     T = (x_0 phi_0 + x_1 phi_1) / M,    P = (phi_1 - phi_0) / M,
-//     Q = (x_1^2 phi_1 - x_0^2 phi_0) / M + P T,    U = (x_0^3 phi_0 + x_1^3 phi_1) / M,
+// terms are the mixture's in the log domain; 1 / sigma, and sigma times the peak of an untruncated hit, replace the first
+// two numbers for last_range. A pair whose reading is NaN is padding. The mean of p_hit is z* + range_bias, clamped to
+// [0, range_max]; obstacles of p_short lie before z*. r are the responsibilities e_hit, e_short and e_rand of the book.
+// With u = (z - mean) / sigma, the distances x_0 = mean / sigma and x_1 = (range_max - mean) / sigma to the ends, phi the
+// untruncated density, W = E' the weight of the shape of a hit (1 for a normal), B = -E'' / W^2 (0 for a normal), M the
+// mass between the ends and
+//     T = (x_0 phi_0 + x_1 phi_1) / M,    P = (phi_1 - phi_0) / M,    V = (W_0 x_0 phi_0 + W_1 x_1 phi_1) / M,
+//     Q = (W_1 x_1^2 phi_1 - W_0 x_0^2 phi_0) / M + P T,    U = (W_0 x_0^3 phi_0 + W_1 x_1^3 phi_1) / M,
 // log p_hit has the derivatives, by log sigma (s) and by the mean in units of sigma (m),
-//     h_s = u^2 - 1 + T,  h_m = u + P,  h_ss = -2 u^2 - T + U + T^2,  h_sm = -2 u - P + Q,  h_mm = -1 + T + P^2
+//     h_s = W u^2 - 1 + T,  h_m = W u + P,
+//     h_ss = W u^2 (B W u^2 - 2) - T + U + T^2,  h_sm = W u (B W u^2 - 2) - P + Q,  h_mm = W (B W u^2 - 1) + V + P^2
 // and log p_short, by log lambda with x = lambda z*, f = x / (1 - exp(-x)) and v = f - x,
 //     s_l = 1 - v - lambda z,  s_ll = v (f - 1) - lambda z.
 // requires: mixture error_free
 
-#define ROOT_2PI ((real)2.5066282746310002)
 #if INFORMATION
-#define SUMS 40
+#define SUMS 39
 #else
-#define SUMS 14
+#define SUMS 13
 #endif
-
-// Return the mean of p_hit.
-real hit_mean(const real expected, global const real *terms) {
-    const real mean = expected + terms[10];
-    return mean < 0 ? 0 : mean > terms[6] ? terms[6] : mean;
-}
 
 // Return log p(z | z*) and the responsibilities of hit, short and rand, 0 where the density is 0.
 real4 responsibilities(const real z, const real expected, global const real *terms) {
-    const real hit = log_hit(z, hit_mean(expected, terms), terms), shorter = log_short(z, expected, terms);
+    const real hit = log_hit(z, expected, terms), shorter = log_short(z, expected, terms);
     const real largest = fmax(fmax(hit, shorter), terms[5]);
     if (isinf(largest)) return (real4)(largest, 0, 0, 0);
     const real p_hit = exp(hit - largest), p_short = exp(shorter - largest), p_rand = exp(terms[5] - largest);
@@ -34,31 +30,42 @@ real4 responsibilities(const real z, const real expected, global const real *ter
     return (real4)(largest + log(p), p_hit / p, p_short / p, p_rand / p);
 }
 
+// Return the untruncated density of a hit at a distance of x scales, times sigma.
+real hit_phi(const real x, global const real *terms) {
+    const real2 t = (real2)((real)0.5 * x * x, 0);
+    return terms[15] * exp(-shape_exponent(t, terms[17], terms[18]).x);
+}
+
 // Add the terms of a pair to the sums. They are log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm,
-// r_hit h_mm, r_short s_ll; r_hit (z - z*)^2, r_hit (z - z*), r_short z. INFORMATION: 1 where rand is the likeliest
-// cause; the upper triangle of y y' with y = (r_hit, r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2,
-// r_hit h_s h_m, r_hit h_m^2, r_short s_l^2.
+// r_hit h_mm, r_short s_ll; r_hit W u^2, r_short z. INFORMATION: 1 where rand is the likeliest cause; the upper triangle
+// of y y' with y = (r_hit, r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2, r_hit h_s h_m, r_hit h_m^2,
+// r_short s_l^2.
 void add_pair(const real z, const real expected, global const real *terms, real *sums) {
     const real4 r = responsibilities(z, expected, terms);
-    real h_s = 0, h_m = 0, h_ss = 0, h_sm = 0, h_mm = 0, s_l = 0, s_ll = 0;
+    real square = 0, h_s = 0, h_m = 0, h_ss = 0, h_sm = 0, h_mm = 0, s_l = 0, s_ll = 0;
     if (r.y > 0) {
-        const real mean = hit_mean(expected, terms), u = (z - mean) * terms[11];
-        const real x_0 = mean * terms[11], x_1 = (terms[6] - mean) * terms[11];
-        real t = 0, p = 0, q = 0, w = 0;
-        const real mass = hit_mass(mean, terms[2], terms[6]);
+        const real mean = mean_range(expected, terms), u = hit_offset(z, expected, terms).x * terms[14];
+        const real x_0 = mean * terms[14], x_1 = (terms[6] - mean) * terms[14];
+        const real weight = shape_weight((real)0.5 * u * u, terms[17], terms[18]), pull = weight * u;
+        square = pull * u;
+        real t = 0, p = 0, v = 0, q = 0, w = 0;
+        const real mass = mass_within(mean, terms[2], terms);
         if (mass < 1) {
-            const real phi_0 = exp((real)-0.5 * x_0 * x_0) / (ROOT_2PI * mass);
-            const real phi_1 = exp((real)-0.5 * x_1 * x_1) / (ROOT_2PI * mass);
+            const real phi_0 = hit_phi(x_0, terms) / mass, phi_1 = hit_phi(x_1, terms) / mass;
+            const real pull_0 = shape_weight((real)0.5 * x_0 * x_0, terms[17], terms[18]) * x_0 * phi_0;
+            const real pull_1 = shape_weight((real)0.5 * x_1 * x_1, terms[17], terms[18]) * x_1 * phi_1;
             t = x_0 * phi_0 + x_1 * phi_1;
             p = phi_1 - phi_0;
-            q = x_1 * x_1 * phi_1 - x_0 * x_0 * phi_0 + p * t;
-            w = x_0 * x_0 * x_0 * phi_0 + x_1 * x_1 * x_1 * phi_1;
+            v = pull_0 + pull_1;
+            q = x_1 * pull_1 - x_0 * pull_0 + p * t;
+            w = x_0 * x_0 * pull_0 + x_1 * x_1 * pull_1;
         }
-        h_s = u * u - 1 + t;
-        h_m = u + p;
-        h_ss = -2 * u * u - t + w + t * t;
-        h_sm = -2 * u - p + q;
-        h_mm = -1 + t + p * p;
+        const real bend = shape_bend(square, terms[17]);
+        h_s = square - 1 + t;
+        h_m = pull + p;
+        h_ss = square * (bend - 2) - t + w + t * t;
+        h_sm = pull * (bend - 2) - p + q;
+        h_mm = weight * (bend - 1) + v + p * p;
         // A mean that is clamped does not move with the bias.
         if (mean != expected + terms[10]) h_m = h_sm = h_mm = 0;
     }
@@ -67,7 +74,6 @@ void add_pair(const real z, const real expected, global const real *terms, real 
         s_l = 1 - v - terms[4] * z;
         s_ll = v * (f - 1) - terms[4] * z;
     }
-    const real off = z - expected;
     sums[0] += r.x;
     sums[1] += r.y;
     sums[2] += r.z;
@@ -79,19 +85,18 @@ void add_pair(const real z, const real expected, global const real *terms, real 
     sums[8] += r.y * h_sm;
     sums[9] += r.y * h_mm;
     sums[10] += r.z * s_ll;
-    sums[11] += r.y * off * off;
-    sums[12] += r.y * off;
-    sums[13] += r.z * z;
+    sums[11] += r.y * square;
+    sums[12] += r.z * z;
 #if INFORMATION
-    sums[14] += r.w > r.y && r.w > r.z ? 1 : 0;
+    sums[13] += r.w > r.y && r.w > r.z ? 1 : 0;
     const real y[6] = {r.y, r.z, r.w, r.y * h_s, r.y * h_m, r.z * s_l};
-    int place = 15;
+    int place = 14;
     for (int i = 0; i < 6; ++i)
         for (int j = i; j < 6; ++j) sums[place++] += y[i] * y[j];
-    sums[36] += r.y * h_s * h_s;
-    sums[37] += r.y * h_s * h_m;
-    sums[38] += r.y * h_m * h_m;
-    sums[39] += r.z * s_l * s_l;
+    sums[35] += r.y * h_s * h_s;
+    sums[36] += r.y * h_s * h_m;
+    sums[37] += r.y * h_m * h_m;
+    sums[38] += r.z * s_l * s_l;
 #endif
 }
 

@@ -68,7 +68,7 @@ real2 hit_offset(const real z, const real expected, global const real *terms) {
 // Return sigma_hit / sigma at a range as a sum of two numbers.
 real2 hit_scale(const real expected, global const real *terms) {
 #if GROWTH
-#if SHARP
+#if EXACT_EXPONENT
     const real2 growth = pair_product((real2)(terms[12], terms[13]), (real2)(expected, 0));
     const real2 x = pair_sum((real2)(1, 0), growth);
     const real y = 1 / x.x;
@@ -86,7 +86,7 @@ real2 hit_scale(const real expected, global const real *terms) {
 // large and nearly cancel; the second part keeps the digits that remain.
 real2 normal_exponent(const real z, const real expected, global const real *terms) {
     const real2 off = hit_offset(z, expected, terms);
-#if SHARP
+#if EXACT_EXPONENT
     real2 square = two_product(off.x, off.x);
 #if BIAS
     square.y += 2 * off.x * off.y;

@@ -73,7 +73,7 @@ void place_pose(const int particle, global const coordinate *poses, global int2 
     rounded_y = rounded_y < BELOW_ONE ? rounded_y : BELOW_ONE;
     const real4 rounded = (real4)(rounded_x, rounded_y, (real)cosine, (real)sine);
     pose[particle] = rounded;
-#if CAREFUL
+#if TWO_PART_POINTS
     pose_low[particle] = (real4)((real)(x - rounded.x), (real)(y - rounded.y), (real)(cosine - rounded.z),
                                  (real)(sine - rounded.w));
 #endif

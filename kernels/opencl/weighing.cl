@@ -4,7 +4,7 @@
 // SHARE of that before is taken; what is left of b belongs to the next stage of the correction (annealing: Neal,
 // "Annealed importance sampling", 2001). Weights are rounded to integers below 2^53 / N, so that sums of them are exact
 // in any order.
-// requires: rungs
+// requires: tempering
 
 // Rows that a work-item reads before it adds any up.
 #define ROWS_AT_ONCE 16

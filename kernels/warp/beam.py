@@ -39,7 +39,7 @@ def make(name, flags):
     LINEAR = "LINEAR" in flags
     ORDERED = "ORDERED" in flags
     STRANDED = "STRANDED" in flags
-    ECHO = "ECHO" in flags
+    CONES = "CONES" in flags
     INCIDENCE = "INCIDENCE" in flags
     SCANS = "SCANS" in flags
     nearest_echo = echo.functions(flags).nearest_echo
@@ -122,7 +122,7 @@ def make(name, flags):
             limit = scale.limit
             if STOPS:
                 limit = ray_limit(number_at(reading, readings_before + r), terms, scale)
-            if ECHO:
+            if CONES:
                 heard = nearest_echo(
                     map_table, normals, window, cell, sensor_pose, ray, (before + r) * cone.rays, cone, limit,
                     caster,
@@ -195,7 +195,7 @@ def make(name, flags):
             limit = scale.limit
             if STOPS:
                 limit = ray_limit(number_at(reading, readings_before + r), terms, scale)
-            if ECHO:
+            if CONES:
                 heard = nearest_echo(
                     map_table, normals, window, cell, sensor_pose, ray, (before + r) * cone.rays, cone, limit,
                     caster,

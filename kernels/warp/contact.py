@@ -32,7 +32,7 @@ def make(name, flags):
     two_sum, two_product, pair_product = exact.two_sum, exact.two_product, exact.pair_product
     bounded_square, either = logs.bounded_square, logs.either
     find_end_point = end_point.functions(flags).end_point
-    CAREFUL = "CAREFUL" in flags
+    TWO_PART_POINTS = "TWO_PART_POINTS" in flags
     ZERO, HALF, ONE, TWO = real(0.0), real(0.5), real(1.0), real(2.0)
     HIGH_PART = real(4096.0)
     # Gap in cells where there is no obstacle.
@@ -95,7 +95,7 @@ def make(name, flags):
             return
         sensor_pose = pose[n]
         low = vec4()
-        if CAREFUL:
+        if TWO_PART_POINTS:
             low = pose_low[n]
         total = real(0.0)
         s = int(0)

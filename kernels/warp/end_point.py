@@ -31,9 +31,9 @@ def functions(flags):
     exact = error_free.functions(flags)
     two_sum, two_product, pair_sum = exact.two_sum, exact.two_product, exact.pair_sum
     BILINEAR = "BILINEAR" in flags
-    CAREFUL = "CAREFUL" in flags
+    TWO_PART_POINTS = "TWO_PART_POINTS" in flags
     INSIDE = "INSIDE" in flags
-    SHARP = "SHARP" in flags
+    EXACT_EXPONENT = "EXACT_EXPONENT" in flags
     one = "double" if "FLOAT64" in flags else "float"
     ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
     MINUS_ONE = real(-1.0)
@@ -62,13 +62,13 @@ def functions(flags):
     def whole_cells(offset: vec2):
         nearest = wp.floor(offset.x + HALF)
         past = vec2((offset.x - nearest) + offset.y, ZERO)
-        if SHARP:
+        if EXACT_EXPONENT:
             past = two_sum(offset.x - nearest, offset.y)
         size = past
         if past.x < ZERO:
             size = -past
         other = vec2(ONE - size.x, ZERO)
-        if SHARP:
+        if EXACT_EXPONENT:
             other = pair_sum(vec2(ONE, ZERO), -size)
         rest = past
         to_next = other
@@ -95,7 +95,7 @@ def functions(flags):
         end = EndPoint()
         x = vec2((pose.x - shift) + (pose.z * point.x - pose.w * point.y), ZERO)
         y = vec2((pose.y - shift) + (pose.w * point.x + pose.z * point.y), ZERO)
-        if CAREFUL:
+        if TWO_PART_POINTS:
             if BILINEAR:
                 pass
             else:

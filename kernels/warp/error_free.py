@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .prelude import precision
+from .prelude import exact_fma, fuses, precision
 
 # Sums over beams add the terms of a block plainly, then the sum of the block to a compensated total. The accuracy is
 # nearly that of compensating every term, the cost nearly that of compensating none.
@@ -24,6 +24,7 @@ def functions(flags):
     """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
+    multiply_add = exact_fma(real)
     SPLITTER = real(134217729.0 if "FLOAT64" in flags else 4097.0)
 
     # Return a + b = sum.x + sum.y exactly.
@@ -39,10 +40,13 @@ def functions(flags):
         scaled = SPLITTER * a
         return scaled - (scaled - a)
 
-    # Return a * b = product.x + product.y exactly, short of overflow and underflow.
+    # Return a * b = product.x + product.y exactly, short of overflow and underflow: by a fused multiply-add where the
+    # device has one.
     @wp.func
     def two_product(a: real, b: real):
         product = a * b
+        if fuses():
+            return vec2(product, multiply_add(a, b, -product))
         a_high = high_half(a)
         b_high = high_half(b)
         a_low = a - a_high

@@ -1,7 +1,7 @@
 """Weighted mean, circular in the heading, and covariance of a cloud of particles.
 
 Sums are relative to the first particle. While no heading is farther than a right angle from the first one, covariances
-follow from them; otherwise a second pass (again) is relative to the mean. Mardia and Jupp, *Directional Statistics*
+follow from them; otherwise a second pass is relative to the mean. Mardia and Jupp, *Directional Statistics*
 (2000), section 2.2. In a block of particles every eighth one belongs to a lane; the lanes are summed in the order of
 their particles, and then added one after the other.
 """
@@ -29,7 +29,7 @@ def make(name, flags):
     # Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings: one work-item takes
     # a number of lanes of a block.
     @kernel(flags)
-    def sum_poses(poses, weight, estimate, sums, particles, block, lanes, again):
+    def sum_poses(poses, weight, estimate, sums, particles, block, lanes, second_pass):
         i = wp.tid()
         each = ESTIMATE_LANES / lanes
         begin = i / each * block
@@ -39,7 +39,7 @@ def make(name, flags):
         x0 = poses[0]
         y0 = poses[1]
         theta0 = poses[2]
-        if again != 0:
+        if second_pass != 0:
             x0 = estimate[0]
             y0 = estimate[1]
             theta0 = estimate[2]
@@ -73,7 +73,7 @@ def make(name, flags):
     # Write the mean pose and the covariance about it from the sums of all groups, and whether headings ask for a
     # second pass; that pass writes the covariance only. One work-item takes all.
     @kernel(flags)
-    def finish_estimate(poses, sums, estimate, groups, again):
+    def finish_estimate(poses, sums, estimate, groups, second_pass):
         i = wp.tid()
         if i > 0:
             return
@@ -86,7 +86,7 @@ def make(name, flags):
         y = total[2] / weight
         angle = total[5] / weight
         mean = ZERO + ZERO
-        if again == 0:
+        if second_pass == 0:
             mean = angle_of(total[3], total[4])
             estimate[0] = poses[0] + x
             estimate[1] = poses[1] + y

@@ -29,10 +29,10 @@ def make(name, flags):
     end_point, rounded_cell = ends.end_point, ends.rounded_cell
     table_origin, table_cell, rounding_margin = ends.table_origin, ends.table_cell, ends.rounding_margin
     add_term = error_free.functions(flags).add_term
-    CAREFUL = "CAREFUL" in flags
+    TWO_PART_POINTS = "TWO_PART_POINTS" in flags
     CUBES = "CUBES" in flags
     PER_BEAM = "PER_BEAM" in flags
-    QUICK = "QUICK" in flags
+    ROUNDED_CELLS = "ROUNDED_CELLS" in flags
     SCANS = "SCANS" in flags
     ZERO, HALF = real(0.0), real(0.5)
     # Constants of loops that Warp shall unroll.
@@ -68,7 +68,7 @@ def make(name, flags):
         origin = pose_cell[n]
         sensor_pose = pose[n]
         sensor_low = vec4()
-        if CAREFUL:
+        if TWO_PART_POINTS:
             sensor_low = pose_low[n]
         begin = int(0)
         size = readings
@@ -82,7 +82,7 @@ def make(name, flags):
         block = real(0.0)
         # While loops show the compiler that indices are not negative; range would cost a tenth on processors.
         k = int(0)
-        if QUICK:
+        if ROUNDED_CELLS:
             # First all cells of a block, then all look-ups. On processors the first loop becomes vector code and takes
             # a third of the time; with points read as vec2, or a maximum in place of a count, it would not.
             lowered = sensor_pose - vec4(HALF, HALF, ZERO, ZERO)
@@ -119,7 +119,7 @@ def make(name, flags):
             while k < size:
                 to = point[begin + k]
                 to_low = vec2()
-                if CAREFUL:
+                if TWO_PART_POINTS:
                     to_low = point_low[begin + k]
                 term = reading_value(table, origin, sensor_pose, sensor_low, to, to_low, terms, window, guard)
                 if PER_BEAM:
@@ -153,9 +153,9 @@ def make(name, flags):
         origin = cell_at(pose_cell, n)
         sensor_pose = pose_at(pose, n)
         sensor_low = vec4()
-        if CAREFUL:
+        if TWO_PART_POINTS:
             sensor_low = pose_at(pose_low, n)
-        if QUICK:
+        if ROUNDED_CELLS:
             lowered = sensor_pose - vec4(HALF, HALF, ZERO, ZERO)
             start_cell = table_origin(origin, window.cols)
             far = number_at(terms, 3)
@@ -173,7 +173,7 @@ def make(name, flags):
             end = wp.min(begin + BLOCK_TERMS, before + size)
             total = real(0.0)
             block_guard = number_at(guard, guards + block)
-            if QUICK:
+            if ROUNDED_CELLS:
                 sure = rounding_margin(block_guard)
                 worst = real(0.0)
                 if begin + BLOCK_TERMS <= end:
@@ -214,7 +214,7 @@ def make(name, flags):
                 k = begin
                 while k < end:
                     to_low = vec2()
-                    if CAREFUL:
+                    if TWO_PART_POINTS:
                         to_low = point_at(point_low, k)
                     to = point_at(point, k)
                     total += reading_value(

@@ -77,7 +77,7 @@ def make(name, flags):
     end_point = end_points.functions(flags).end_point
     add_term = error_free.functions(flags).add_term
     Sums = wp.types.vector(length=9, dtype=real)
-    CAREFUL = "CAREFUL" in flags
+    TWO_PART_POINTS = "TWO_PART_POINTS" in flags
     ALL_READINGS = "ALL_READINGS" in flags
     SCANS = "SCANS" in flags
     ZERO, HALF, TWO = real(0.0), real(0.5), real(2.0)
@@ -103,7 +103,7 @@ def make(name, flags):
         origin = pose_cell[n]
         at = pose[n]
         low = vec4()
-        if CAREFUL:
+        if TWO_PART_POINTS:
             low = pose_low[n]
         total = vec2(constant_term, ZERO)
         sums = Sums()
@@ -117,7 +117,7 @@ def make(name, flags):
                     total = add_term(total, terms[3])
             if used:
                 to_low = vec2()
-                if CAREFUL:
+                if TWO_PART_POINTS:
                     to_low = point_low[begin + k]
                 end = end_point(at, low, to, to_low, HALF, guard)
                 slope = distance_slope(table, origin + end.cell, end, window)

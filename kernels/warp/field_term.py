@@ -32,14 +32,15 @@ def functions(flags):
     HIT = "HIT" in flags
     LINEAR = "LINEAR" in flags
     LOG_TABLE = "LOG_TABLE" in flags
-    SHARP = "SHARP" in flags
+    EXACT_EXPONENT = "EXACT_EXPONENT" in flags
+    RAND = "RAND" in flags
     ZERO, ONE = real(0.0), real(1.0)
     SHIFT = real(0.5 if BILINEAR else 0.0)
 
     # Return the weighted sum of a and b, all of two parts. No term is negative, so small values keep their digits.
     @wp.func
     def between(weight_a: vec2, a: vec2, weight_b: vec2, b: vec2):
-        if SHARP:
+        if EXACT_EXPONENT:
             return pair_sum(pair_product(weight_a, a), pair_product(weight_b, b))
         else:
             return vec2(weight_a.x * a.x + weight_b.x * b.x, ZERO)
@@ -61,7 +62,7 @@ def functions(flags):
     # their logarithms in the log domain.
     @wp.func
     def field_square(distance: vec2, terms: wp.array(dtype=real)):
-        if SHARP:
+        if EXACT_EXPONENT:
             return pair_product(pair_product(distance, distance), vec2(terms[1], terms[5]))
         else:
             return vec2(distance.x * (distance.x * terms[1]), ZERO)
@@ -88,8 +89,11 @@ def functions(flags):
         def log_field(distance: vec2, terms: wp.array(dtype=real)):
             exponent = field_exponent(distance, terms)
             hit = (terms[0] - exponent.x) + (terms[4] - exponent.y)
-            largest = wp.max(hit, terms[2])
-            return largest + wp.log(wp.exp(hit - largest) + wp.exp(terms[2] - largest))
+            if RAND:
+                largest = wp.max(hit, terms[2])
+                return largest + wp.log(wp.exp(hit - largest) + wp.exp(terms[2] - largest))
+            else:
+                return hit
 
     # Return the term of one reading. The table holds log densities, or cubes of densities (CUBES), or, where it is
     # interpolated, capped distances in metres.

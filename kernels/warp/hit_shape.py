@@ -23,7 +23,7 @@ def functions(flags):
     two_product = error_free.functions(flags).two_product
     log_one_plus = log_terms.functions(flags).log_one_plus
     number_at = reader(real)
-    SHARP = "SHARP" in flags
+    EXACT_EXPONENT = "EXACT_EXPONENT" in flags
     STUDENT = "STUDENT" in flags
     TABLE_CELLS = wp.constant(1024 if "FLOAT64" in flags else 256)
     TABLE_PER_LOG = real(27.0 if "FLOAT64" in flags else 16.0)
@@ -37,7 +37,7 @@ def functions(flags):
             more = rate * t.x
             log_more = log_one_plus(more)
             exponent = vec2(power * log_more, ZERO)
-            if SHARP:
+            if EXACT_EXPONENT:
                 product = two_product(power, log_more)
                 exact = two_product(rate, t.x)
                 exponent = vec2(product.x, product.y + power * ((exact.y + rate * t.y) / (ONE + more)))
@@ -53,6 +53,14 @@ def functions(flags):
         else:
             return ONE
 
+    # Return -E''(t) over the weight, times u^2, from the weight times u^2.
+    @wp.func
+    def shape_bend(square: real, power: real):
+        if STUDENT:
+            return square * (ONE / power)
+        else:
+            return ZERO
+
     # Return the mass between the mean and a distance; the table begins at a place of the terms.
     @wp.func
     def half_mass(b: real, terms: wp.array(dtype=real), place: wp.int32):
@@ -67,4 +75,4 @@ def functions(flags):
             mass = mass * share + number_at(terms, first + TABLE_POWERS - 2 - i)
         return mass
 
-    return SimpleNamespace(shape_exponent=shape_exponent, shape_weight=shape_weight, half_mass=half_mass)
+    return SimpleNamespace(**locals())

@@ -1,16 +1,19 @@
 """Sums over pairs of reading and expected range from which the beam model's parameters are learned (book table 6.2).
 
-terms[12] = the mixture's ten in the log domain, range_bias and 1 / sigma. A pair whose reading is NaN is padding. The
-mean of p_hit is z* + range_bias, clamped to [0, range_max]; obstacles of p_short lie before z*. r are the
-responsibilities e_hit, e_short and e_rand of the book. With u = (z - mean) / sigma, the distances x_0 = mean / sigma
-and x_1 = (range_max - mean) / sigma to the ends, phi the normal density, M the mass between them and
+``terms`` are the mixture's in the log domain; 1 / sigma, and sigma times the peak of an untruncated hit, replace the
+first two numbers for last_range. A pair whose reading is NaN is padding. The mean of p_hit is z* + range_bias, clamped
+to [0, range_max]; obstacles of p_short lie before z*. r are the responsibilities e_hit, e_short and e_rand of the book.
+With u = (z - mean) / sigma, the distances x_0 = mean / sigma and x_1 = (range_max - mean) / sigma to the ends, phi the
+untruncated density, W = E' the weight of the shape of a hit (1 for a normal), B = -E'' / W^2 (0 for a normal), M the
+mass between the ends and
 
-    T = (x_0 phi_0 + x_1 phi_1) / M,    P = (phi_1 - phi_0) / M,
-    Q = (x_1^2 phi_1 - x_0^2 phi_0) / M + P T,    U = (x_0^3 phi_0 + x_1^3 phi_1) / M,
+    T = (x_0 phi_0 + x_1 phi_1) / M,    P = (phi_1 - phi_0) / M,    V = (W_0 x_0 phi_0 + W_1 x_1 phi_1) / M,
+    Q = (W_1 x_1^2 phi_1 - W_0 x_0^2 phi_0) / M + P T,    U = (W_0 x_0^3 phi_0 + W_1 x_1^3 phi_1) / M,
 
 log p_hit has the derivatives, by log sigma (s) and by the mean in units of sigma (m),
 
-    h_s = u^2 - 1 + T,  h_m = u + P,  h_ss = -2 u^2 - T + U + T^2,  h_sm = -2 u - P + Q,  h_mm = -1 + T + P^2
+    h_s = W u^2 - 1 + T,  h_m = W u + P,
+    h_ss = W u^2 (B W u^2 - 2) - T + U + T^2,  h_sm = W u (B W u^2 - 2) - P + Q,  h_mm = W (B W u^2 - 1) + V + P^2
 
 and log p_short, by log lambda with x = lambda z*, f = x / (1 - exp(-x)) and v = f - x,
 
@@ -22,7 +25,7 @@ import math
 
 import warp as wp
 
-from . import error_free
+from . import error_free, hit_shape
 from . import mixture as mixture_file
 from .prelude import kernel, precision
 
@@ -31,29 +34,25 @@ from .prelude import kernel, precision
 def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     types = precision(flags)
-    real, vec4 = types.real, types.vec4
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
     INFORMATION = "INFORMATION" in flags
-    SUMS = 40 if INFORMATION else 14
+    SUMS = 39 if INFORMATION else 13
     sums_type = wp.types.vector(length=SUMS, dtype=real)
     vec6 = wp.types.vector(length=6, dtype=real)
     mixture = mixture_file.functions(flags)
-    log_hit, log_short = mixture.log_hit, mixture.log_short
-    hit_mass, short_factor = mixture.hit_mass, mixture.short_factor
+    log_hit, log_short, short_factor = mixture.log_hit, mixture.log_short, mixture.short_factor
+    mean_range, hit_offset, mass_within = mixture.mean_range, mixture.hit_offset, mixture.mass_within
+    shape = hit_shape.functions(flags)
+    shape_exponent, shape_weight, shape_bend = shape.shape_exponent, shape.shape_weight, shape.shape_bend
     BLOCK_TERMS = error_free.BLOCK_TERMS
     ZERO, ONE = real(0.0), real(1.0)
-    MINUS_ONE, MINUS_TWO, MINUS_HALF = real(-1.0), real(-2.0), real(-0.5)
-    ROOT_2PI = real(2.5066282746310002)
+    HALF, TWO = real(0.5), real(2.0)
     NOTHING = real(math.nan)
-
-    # Return the mean of p_hit.
-    @wp.func
-    def hit_mean(expected: real, terms: wp.array(dtype=real)):
-        return wp.min(wp.max(expected + terms[10], ZERO), terms[6])
 
     # Return log p(z | z*) and the responsibilities of hit, short and rand, 0 where the density is 0.
     @wp.func
     def responsibilities(z: real, expected: real, terms: wp.array(dtype=real)):
-        hit = log_hit(z, hit_mean(expected, terms), terms)
+        hit = log_hit(z, expected, terms)
         shorter = log_short(z, expected, terms)
         largest = wp.max(wp.max(hit, shorter), terms[5])
         if wp.isinf(largest):
@@ -64,14 +63,21 @@ def make(name, flags):
         p = p_hit + p_short + p_rand
         return vec4(largest + wp.log(p), p_hit / p, p_short / p, p_rand / p)
 
+    # Return the untruncated density of a hit at a distance of x scales, times sigma.
+    @wp.func
+    def hit_phi(x: real, terms: wp.array(dtype=real)):
+        t = vec2(HALF * x * x, ZERO)
+        return terms[15] * wp.exp(-shape_exponent(t, terms[17], terms[18]).x)
+
     # Add the terms of a pair to the sums. They are log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm,
-    # r_hit h_mm, r_short s_ll; r_hit (z - z*)^2, r_hit (z - z*), r_short z. INFORMATION: 1 where rand is the likeliest
-    # cause; the upper triangle of y y' with y = (r_hit, r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit
-    # h_s^2, r_hit h_s h_m, r_hit h_m^2, r_short s_l^2.
+    # r_hit h_mm, r_short s_ll; r_hit W u^2, r_short z. INFORMATION: 1 where rand is the likeliest cause; the upper
+    # triangle of y y' with y = (r_hit, r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2, r_hit h_s h_m,
+    # r_hit h_m^2, r_short s_l^2.
     @wp.func
     def add_pair(z: real, expected: real, terms: wp.array(dtype=real), before: sums_type):
         sums = before
         r = responsibilities(z, expected, terms)
+        square = real(0.0)
         h_s = real(0.0)
         h_m = real(0.0)
         h_ss = real(0.0)
@@ -80,27 +86,35 @@ def make(name, flags):
         s_l = real(0.0)
         s_ll = real(0.0)
         if r[1] > ZERO:
-            mean = hit_mean(expected, terms)
-            u = (z - mean) * terms[11]
-            x_0 = mean * terms[11]
-            x_1 = (terms[6] - mean) * terms[11]
+            mean = mean_range(expected, terms)
+            u = hit_offset(z, expected, terms).x * terms[14]
+            x_0 = mean * terms[14]
+            x_1 = (terms[6] - mean) * terms[14]
+            weight = shape_weight(HALF * u * u, terms[17], terms[18])
+            pull = weight * u
+            square = pull * u
             t = real(0.0)
             p = real(0.0)
+            v_0 = real(0.0)
             q = real(0.0)
             w = real(0.0)
-            mass = hit_mass(mean, terms[2], terms[6])
+            mass = mass_within(mean, terms[2], terms)
             if mass < ONE:
-                phi_0 = wp.exp(MINUS_HALF * x_0 * x_0) / (ROOT_2PI * mass)
-                phi_1 = wp.exp(MINUS_HALF * x_1 * x_1) / (ROOT_2PI * mass)
+                phi_0 = hit_phi(x_0, terms) / mass
+                phi_1 = hit_phi(x_1, terms) / mass
+                pull_0 = shape_weight(HALF * x_0 * x_0, terms[17], terms[18]) * x_0 * phi_0
+                pull_1 = shape_weight(HALF * x_1 * x_1, terms[17], terms[18]) * x_1 * phi_1
                 t = x_0 * phi_0 + x_1 * phi_1
                 p = phi_1 - phi_0
-                q = x_1 * x_1 * phi_1 - x_0 * x_0 * phi_0 + p * t
-                w = x_0 * x_0 * x_0 * phi_0 + x_1 * x_1 * x_1 * phi_1
-            h_s = u * u - ONE + t
-            h_m = u + p
-            h_ss = MINUS_TWO * u * u - t + w + t * t
-            h_sm = MINUS_TWO * u - p + q
-            h_mm = MINUS_ONE + t + p * p
+                v_0 = pull_0 + pull_1
+                q = x_1 * pull_1 - x_0 * pull_0 + p * t
+                w = x_0 * x_0 * pull_0 + x_1 * x_1 * pull_1
+            bend = shape_bend(square, terms[17])
+            h_s = square - ONE + t
+            h_m = pull + p
+            h_ss = square * (bend - TWO) - t + w + t * t
+            h_sm = pull * (bend - TWO) - p + q
+            h_mm = weight * (bend - ONE) + v_0 + p * p
             # A mean that is clamped does not move with the bias.
             if mean != expected + terms[10]:
                 h_m = ZERO
@@ -112,7 +126,6 @@ def make(name, flags):
             v = f - x
             s_l = ONE - v - terms[4] * z
             s_ll = v * (f - ONE) - terms[4] * z
-        off = z - expected
         sums[0] += r[0]
         sums[1] += r[1]
         sums[2] += r[2]
@@ -124,14 +137,13 @@ def make(name, flags):
         sums[8] += r[1] * h_sm
         sums[9] += r[1] * h_mm
         sums[10] += r[2] * s_ll
-        sums[11] += r[1] * off * off
-        sums[12] += r[1] * off
-        sums[13] += r[2] * z
+        sums[11] += r[1] * square
+        sums[12] += r[2] * z
         if INFORMATION:
             if r[3] > r[1] and r[3] > r[2]:
-                sums[14] += ONE
+                sums[13] += ONE
             y = vec6(r[1], r[2], r[3], r[1] * h_s, r[1] * h_m, r[2] * s_l)
-            place = int(15)
+            place = int(14)
             i = int(0)
             while i < 6:
                 j = i
@@ -140,10 +152,10 @@ def make(name, flags):
                     place += 1
                     j += 1
                 i += 1
-            sums[36] += r[1] * h_s * h_s
-            sums[37] += r[1] * h_s * h_m
-            sums[38] += r[1] * h_m * h_m
-            sums[39] += r[2] * s_l * s_l
+            sums[35] += r[1] * h_s * h_s
+            sums[36] += r[1] * h_s * h_m
+            sums[37] += r[1] * h_m * h_m
+            sums[38] += r[2] * s_l * s_l
         return sums
 
     # Sum over blocks of pairs: one work-item takes a block. Pair k of a block is pair block * across + k * along.

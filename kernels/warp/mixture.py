@@ -31,7 +31,7 @@ def functions(flags):
     shape = hit_shape.functions(flags)
     shape_exponent, half_mass = shape.shape_exponent, shape.half_mass
     MASS_TABLE = "MASS_TABLE" in flags
-    SHARP = "SHARP" in flags
+    EXACT_EXPONENT = "EXACT_EXPONENT" in flags
     BIAS = "BIAS" in flags
     GROWTH = "GROWTH" in flags
     at = reader(real)
@@ -107,7 +107,7 @@ def functions(flags):
     def hit_scale(expected: real, terms: wp.array(dtype=real)):
         scale = vec2(ONE, ZERO)
         if GROWTH:
-            if SHARP:
+            if EXACT_EXPONENT:
                 growth = pair_product(vec2(at(terms, 12), at(terms, 13)), vec2(expected, ZERO))
                 x = pair_sum(vec2(ONE, ZERO), growth)
                 y = ONE / x.x
@@ -122,7 +122,7 @@ def functions(flags):
     @wp.func
     def normal_exponent(z: real, expected: real, terms: wp.array(dtype=real)):
         off = hit_offset(z, expected, terms)
-        if SHARP:
+        if EXACT_EXPONENT:
             square = two_product(off.x, off.x)
             if BIAS:
                 square = vec2(square.x, square.y + TWO * off.x * off.y)

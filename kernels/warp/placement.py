@@ -30,7 +30,7 @@ def functions(flags):
     real, vec4 = types.real, types.vec4
     cos_sin = heading.functions(flags & {"HUGE_HEADINGS"}).cos_sin
     coordinate = wp.float32 if "POSES_FLOAT32" in flags else wp.float64
-    CAREFUL = "CAREFUL" in flags
+    TWO_PART_POINTS = "TWO_PART_POINTS" in flags
     BELOW_ONE = real(1.0 - (2.0**-53 if "FLOAT64" in flags else 2.0**-24))
 
     # Place a sensor: a pose times the scanner's mount, without its yaw, which belongs to the bearings. pose_low gets
@@ -86,7 +86,7 @@ def functions(flags):
         # A fraction just below 1 may round to 1, which would be the next cell.
         rounded = vec4(wp.min(real(x), BELOW_ONE), wp.min(real(y), BELOW_ONE), real(cosine), real(sine))
         pose[particle] = rounded
-        if CAREFUL:
+        if TWO_PART_POINTS:
             pose_low[particle] = vec4(
                 real(x - wp.float64(rounded.x)),
                 real(y - wp.float64(rounded.y)),

@@ -173,6 +173,28 @@ def fused(real):
     return multiply_add
 
 
+# Return whether the device multiplies and adds at once, which is known when the code is compiled.
+@wp.func_native("""
+#if defined(__CUDA_ARCH__) || defined(__FMA__) || defined(__ARM_FEATURE_FMA)
+return true;
+#else
+return false;
+#endif
+""")
+def fuses() -> bool: ...
+
+
+@functools.cache
+def exact_fma(real):
+    """Make a function of (a, b, c) that returns a b + c with one rounding; on some processors a slow call."""
+    name = "__builtin_fma" if real == wp.float64 else "__builtin_fmaf"
+
+    @wp.func_native(f"#if defined(__CUDA_ARCH__)\nreturn fma(a, b, c);\n#else\nreturn {name}(a, b, c);\n#endif\n")
+    def multiply_add(a: real, b: real, c: real) -> real: ...
+
+    return multiply_add
+
+
 # Return the number of bits that are set.
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)

@@ -12,7 +12,7 @@ import functools
 import warp as wp
 
 from .prelude import kernel, loader, writer
-from .rungs import (
+from .tempering import (
     DEPTH,
     NEVER,
     RUNGS,

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -245,3 +246,10 @@ def test_work_on_a_processor_is_cut_into_pieces_that_can_be_interrupted():
     assert run.chunk_of(device, 1 << 17) == run.CHUNK_WORK >> 17 == 128
     assert run.chunk_of(device, 1 << 30) == 1
     assert run.chunk_of(device, 4, 8) <= run.CHUNK_BYTES // 32
+
+
+@pytest.mark.parametrize("memory", [4 << 30, 64 << 30])
+def test_results_of_a_gpu_are_cut_by_its_memory(memory):
+    device = SimpleNamespace(info=SimpleNamespace(kind="gpu", memory=memory))
+    most = max(run.CHUNK_BYTES, memory // 32)
+    assert run.chunk_of(device, 4096, 4) == most // (4096 * 4) // 256 * 256

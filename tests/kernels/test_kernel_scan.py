@@ -62,7 +62,7 @@ def placed(
     return reference
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize(("precision", "single"), [(np.float32, True), (np.float32, False), (np.float64, False)])
 @pytest.mark.parametrize("end_points", [True, False], ids=["end points", "rays"])
 def test_readings_are_placed_as_the_host_prepares_them(
@@ -142,7 +142,7 @@ def test_poses_are_placed_along_with_readings(precision: type, device: Backend) 
     poses[7, 1] = np.nan
     frame = frame_of(grid, (0.1, -0.2, 0.0)), Window(0, 0, *grid.shape), count
     outputs = [np.full((count, 2), 77, np.int32), *np.full((2, count, 4), 77, precision), np.zeros(2, np.int32)]
-    flags = scene_flags(precision, "CAREFUL")
+    flags = scene_flags(precision, "TWO_PART_POINTS")
     alone, _ = on_both(device, "place_poses", flags, (count,), poses, *outputs, *frame)
     room = [np.zeros(2 * beams, precision) for _ in range(5)]
     readings = (rng.uniform(0, RANGE, beams), np.arange(beams, dtype=np.int32), np.ones((beams, 2)))

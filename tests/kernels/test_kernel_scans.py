@@ -53,7 +53,7 @@ def field(names: tuple[str, ...]) -> tuple[list[np.ndarray], frozenset[str], Win
     rows, cols = scene["table"].shape
     return (
         given,
-        scene_flags(REAL, "LOG_TABLE", "LINEAR", "HIT", "CAREFUL", "SCANS", *names),
+        scene_flags(REAL, "LOG_TABLE", "LINEAR", "HIT", "TWO_PART_POINTS", "SCANS", *names),
         Window(0, 0, rows - 4, cols - 4),
     )
 
@@ -76,7 +76,7 @@ def test_fields_of_scans(ahead: int, device: Backend) -> None:
 
 
 @pytest.mark.parametrize("spread", [0, 2])
-@pytest.mark.parametrize("names", [(), ("QUICK",)])
+@pytest.mark.parametrize("names", [(), ("ROUNDED_CELLS",)])
 def test_blocks_of_fields_of_scans(names: tuple[str, ...], spread: int, device: Backend) -> None:
     given, flags, window = field(names)
     most = int(np.diff(START).max())

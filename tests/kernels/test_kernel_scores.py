@@ -37,7 +37,7 @@ BEAMS = [*((name, *case) for name in MIXTURES for case in (((), np.float32), (FU
 BEAMS += [(name, *case) for name in ("book", "hit and short") for case in (((), np.float64), (FULL, np.float32))]
 
 
-@pytest.mark.sampled(0.3)
+@pytest.mark.sampled(0.2)
 @pytest.mark.parametrize(("name", "names", "real"), BEAMS)
 def test_beams_agree_with_the_reference(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:
     occupied = GRIDS["rooms"]
@@ -101,7 +101,7 @@ def score_field(device: Backend, flags: frozenset[str], scene: dict[str, np.ndar
     )  # fmt: skip
 
 
-@pytest.mark.sampled(0.35)
+@pytest.mark.sampled(0.2)
 @pytest.mark.parametrize(("name", "names", "real"), FIELD_SCENES)
 def test_fields_agree_with_the_reference(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:
     flags = scene_flags(real, "PER_BEAM", *FIELDS[name], *names)
@@ -123,16 +123,16 @@ def test_quick_cells_change_no_bit(device: Backend) -> None:
     for readings in (1, 16, 17, whole["parts"].shape[1]):
         scene = whole | {name: whole[name][:readings] for name in ("point", "point_low")}
         scene["parts"] = np.full((count, readings), np.nan, np.float32)
-        plain = scene_flags(np.float32, *FIELDS["log table"], "CAREFUL")
+        plain = scene_flags(np.float32, *FIELDS["log table"], "TWO_PART_POINTS")
         _, expected = score_field(device, plain, scene, -2.5, 0.75)
-        _, found = score_field(device, plain | {"QUICK"}, scene, -2.5, 0.75)
+        _, found = score_field(device, plain | {"ROUNDED_CELLS"}, scene, -2.5, 0.75)
         assert differing(found["log_p"], expected["log_p"]) == 0
 
 
 def test_an_impossible_end_point_makes_the_scan_impossible(device: Backend) -> None:
     scene = field_scene("log table", np.float32, all_readings=False)
     scene["table"][5:9] = -np.inf
-    flags = frozenset({"LOG_TABLE", "LINEAR", "HIT", "CAREFUL"})
+    flags = frozenset({"LOG_TABLE", "LINEAR", "HIT", "TWO_PART_POINTS"})
     reference, found = score_field(device, flags, scene, 0.0, 1.0)
     assert np.isneginf(reference["log_p"]).any()
     assert not np.isnan(found["log_p"]).any()

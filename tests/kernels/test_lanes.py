@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections import defaultdict
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,25 +14,11 @@ from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import beam_tolerance, differing
 from gpusense.interface.kernel_files import opencl_names, opencl_source
 from gpusense.interface.lanes import with_lanes_flag
-from gpusense.interface.signatures import KERNELS, LANES, lanes_of
+from gpusense.interface.signatures import KERNELS, LANES
 from gpusense.interface.sources import assemble, relevant, required_files
 
 RANGE = 9.0
 KINDS = ("cast_ranges", "score_beams", "score_field")
-
-
-@pytest.fixture
-def device(needs):
-    """Return a function that opens the OpenCL device with a number of lanes."""
-    backend = get_backend(needs("opencl"))
-    before = backend.info
-
-    def ask(lanes: int):
-        backend.info = dataclasses.replace(before, kind="cpu", lanes=lanes)
-        return backend
-
-    yield ask
-    backend.info = before
 
 
 def scene(particles: int, beams: int):
@@ -64,30 +49,15 @@ def results(device, particles: int, beams: int, outside: str):
     return found
 
 
-@pytest.fixture
-def compiled(device, monkeypatch):
-    """Record the lanes of every kernel that is compiled, by its name."""
-    backend, found = device(1), defaultdict(set)
-    kind = type(backend)
-    compile_ = kind.compile
-
-    def record(backend, kernel, flags):
-        found[kernel].add(lanes_of(flags))
-        return compile_(backend, kernel, flags)
-
-    monkeypatch.setattr(kind, "compile", record)
-    return found
-
-
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("outside", ["free", "occupied"])
 @pytest.mark.parametrize(("particles", "beams"), [(1, 1), (15, 15), (16, 16), (17, 33), (63, 40), (130, 200)])
-def test_lanes_have_the_bits_of_one(particles, beams, outside, device, compiled):
-    one = results(device(1), particles, beams, outside)
-    assert all(compiled[kernel] == {1} for kernel in KINDS)
-    compiled.clear()
-    found = results(device(LANES), particles, beams, outside)
-    assert all(compiled[kernel] == {LANES} for kernel in KINDS)
+def test_lanes_have_the_bits_of_one(particles, beams, outside, in_lanes, compiled_lanes):
+    one = results(in_lanes(1), particles, beams, outside)
+    assert all(compiled_lanes[kernel] == {1} for kernel in KINDS)
+    compiled_lanes.clear()
+    found = results(in_lanes(LANES), particles, beams, outside)
+    assert all(compiled_lanes[kernel] == {LANES} for kernel in KINDS)
     for name in ("ranges", "field log p", "field parts"):
         assert differing(found[name], one[name]) == 0, name
     # Drivers have elementary functions of their own for vectors.
@@ -143,14 +113,14 @@ FIELD_OPTIONS = {
 }
 
 
-@pytest.mark.sampled(0.1)
+@pytest.mark.sampled(0.05)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize(
     ("kind", "option"),
     [(gs.BeamModel, name) for name in BEAM_OPTIONS] + [(gs.LikelihoodFieldModel, name) for name in FIELD_OPTIONS],
 )
 @pytest.mark.parametrize("bearings", ["each once", "some often"])
-def test_every_option_has_a_body_in_lanes(kind, option, precision, bearings, device, compiled):
+def test_every_option_has_a_body_in_lanes(kind, option, precision, bearings, in_lanes, compiled_lanes):
     """No option leaves the lanes; each has the scalar kernel's values, those of a particle in any lane included."""
     options = (BEAM_OPTIONS if kind is gs.BeamModel else FIELD_OPTIONS)[option]
     grid, scanner, poses, z = scene(70, 67)
@@ -160,11 +130,11 @@ def test_every_option_has_a_body_in_lanes(kind, option, precision, bearings, dev
     kernel = "score_beams" if kind is gs.BeamModel else "score_field"
     found = {}
     for lanes in (1, LANES):
-        model = kind(grid, scanner, **options, precision=precision, backend=device(lanes))
-        compiled.clear()
+        model = kind(grid, scanner, **options, precision=precision, backend=in_lanes(lanes))
+        compiled_lanes.clear()
         found[lanes] = model.log_likelihood(poses, z)
         several = model.log_likelihood(np.stack([poses[:33], poses[33:66]]), np.stack([z, z[::-1]]))
-        assert compiled[kernel] == {lanes if option != "everything" or kind is gs.BeamModel else 1}
+        assert compiled_lanes[kernel] == {lanes if option != "everything" or kind is gs.BeamModel else 1}
         assert differing(several[0], found[lanes][:33]) == 0
         if "compat" not in options:
             one, parts = model.log_likelihood(poses, z, per_beam=True)
@@ -180,11 +150,11 @@ def test_every_option_has_a_body_in_lanes(kind, option, precision, bearings, dev
         assert allowed.difference(found[LANES, "parts"][possible], found[1, "parts"][possible]) <= allowed.value
 
 
-def test_a_particle_does_not_depend_on_its_lane(device):
+def test_a_particle_does_not_depend_on_its_lane(in_lanes):
     grid, scanner, poses, z = scene(140, 200)
     smooth = gs.LikelihoodFieldParameters(interpolation="bilinear")
     for make, *parameters in ((gs.BeamModel,), (gs.LikelihoodFieldModel,), (gs.LikelihoodFieldModel, smooth)):
-        model = make(grid, scanner, *parameters, backend=device(LANES))
+        model = make(grid, scanner, *parameters, backend=in_lanes(LANES))
         together = model.log_likelihood(poses, z)
         assert differing(model.log_likelihood(poses[::-1], z)[::-1], together) == 0
         pieces = [model.log_likelihood(poses[i : i + 3], z) for i in range(0, len(poses), 3)]
@@ -192,7 +162,7 @@ def test_a_particle_does_not_depend_on_its_lane(device):
 
 
 @pytest.mark.parametrize("resolution", [1e-4, 1e-3, 0.05, 3.0])
-def test_end_points_next_to_edges_and_far_away(resolution, device):
+def test_end_points_next_to_edges_and_far_away(resolution, in_lanes):
     """Readings of up to 2^20 cells, most of them whole, at headings of quarter turns and nearly so."""
     rng = np.random.default_rng(5)
     grid = gs.OccupancyGrid(rng.choice([0, 100], (90, 70), p=[0.9, 0.1]), resolution)
@@ -207,7 +177,7 @@ def test_end_points_next_to_edges_and_far_away(resolution, device):
             sigma_hit=2 * resolution, max_distance=6 * resolution, interpolation=interpolation
         )
         found = [
-            gs.LikelihoodFieldModel(grid, scanner, parameters, backend=device(lanes)).log_likelihood(
+            gs.LikelihoodFieldModel(grid, scanner, parameters, backend=in_lanes(lanes)).log_likelihood(
                 poses, z, per_beam=True
             )
             for lanes in (1, LANES)
@@ -224,39 +194,50 @@ def test_only_scenes_that_have_such_kernels_get_them():
     info = get_backend("numpy").info
     wide = dataclasses.replace(info, lanes=LANES)
     assert with_lanes_flag(info.lanes, "cast_ranges", set()) == frozenset()
-    assert with_lanes_flag(wide.lanes, "cast_ranges", set()) == {"WIDE"}
+    assert with_lanes_flag(wide.lanes, "cast_ranges", set()) == {"IN_LANES"}
     for flags in ({"FLOAT64"}, {"LOOKUP"}, {"MARCH", "ORIGINS_OUTSIDE"}):
-        assert with_lanes_flag(wide.lanes, "cast_ranges", flags) == {*flags, "WIDE"}
-    for flags in (set(), {"HIT"}, {"HIT", "LINEAR"}, {"HIT", "SHARP", "ECHO", "INCIDENCE"}, {"CUBES", "ALL_READINGS"}):
-        assert with_lanes_flag(wide.lanes, "score_beams", flags) == {*flags, "WIDE"}
-    for flags in ({"BILINEAR"}, {"BILINEAR", "LINEAR", "SHARP"}, {"LOG_TABLE", "CAREFUL"}, {"LOG_TABLE", "FLOAT64"}):
-        assert with_lanes_flag(wide.lanes, "score_field", flags) == {*flags, "WIDE"}
+        assert with_lanes_flag(wide.lanes, "cast_ranges", flags) == {*flags, "IN_LANES"}
+    for flags in (
+        set(),
+        {"HIT"},
+        {"HIT", "LINEAR"},
+        {"HIT", "EXACT_EXPONENT", "CONES", "INCIDENCE"},
+        {"CUBES", "ALL_READINGS"},
+    ):
+        assert with_lanes_flag(wide.lanes, "score_beams", flags) == {*flags, "IN_LANES"}
+    for flags in (
+        {"BILINEAR"},
+        {"BILINEAR", "LINEAR", "EXACT_EXPONENT"},
+        {"LOG_TABLE", "TWO_PART_POINTS"},
+        {"LOG_TABLE", "FLOAT64"},
+    ):
+        assert with_lanes_flag(wide.lanes, "score_field", flags) == {*flags, "IN_LANES"}
     assert with_lanes_flag(wide.lanes, "score_field", {"ALL_READINGS"}) == {"ALL_READINGS"}
-    for flag in ("FLOAT64", "SHARP"):
+    for flag in ("FLOAT64", "EXACT_EXPONENT"):
         assert with_lanes_flag(wide.lanes, "field_gradient", {"LINEAR", flag}) == {"LINEAR", flag}
     assert with_lanes_flag(wide.lanes, "beam_tiles", {"LINEAR"}) == {"LINEAR"}
 
 
 def test_programs_in_lanes_begin_in_their_folder():
     for file in {row.file for row in KERNELS.values()}:
-        scalar, wide = required_files(file), required_files(file, frozenset({"WIDE"}))
+        scalar, wide = required_files(file), required_files(file, frozenset({"IN_LANES"}))
         assert not any(name.startswith("lanes/") for name in scalar)
         assert scalar[-1] == file
         if f"lanes/{file}" in opencl_names():
             assert wide[-1] == f"lanes/{file}"
             assert "lanes/types" in wide
             assert file not in wide or "kernel void" not in opencl_source(file)
-            assert "WIDE" in relevant(file, frozenset({"WIDE"}))
-            assert f'#line 1 "lanes/{file}.cl"' in assemble(file, frozenset({"WIDE"}))
+            assert "IN_LANES" in relevant(file, frozenset({"IN_LANES"}))
+            assert f'#line 1 "lanes/{file}.cl"' in assemble(file, frozenset({"IN_LANES"}))
         else:
             assert wide == scalar
-            assert "WIDE" not in relevant(file, frozenset({"WIDE"}))
+            assert "IN_LANES" not in relevant(file, frozenset({"IN_LANES"}))
 
 
 def test_scalar_files_hold_nothing_of_vectors():
     for name in opencl_names():
         text = opencl_source(name)
-        assert "WIDE" not in text.replace("WIDE_", "")
+        assert "IN_LANES" not in text.replace("WIDE_HEADINGS", "")
         if not name.startswith("lanes/"):
             assert "lanes" not in text.split("// requires:")[-1].splitlines()[0]
 

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections import defaultdict
 from typing import Any
 
 import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import beam_tolerance, differing
 from gpusense.interface.lanes import with_lanes_flag
-from gpusense.interface.signatures import LANES, lanes_of
+from gpusense.interface.signatures import LANES
 
 PARTICLES = 75
 NAN = math.nan
@@ -38,34 +35,6 @@ LANDMARKS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "negative in a field of view": ({"field_of_view": 3.0, "sigma_signature": 0.5}, {"negative": True}),
     "no false positives": ({"z_detect": 1.0, "z_false": 0.0, "sigma_signature": 0.5}, {"negative": True}),
 }  # fmt: skip
-
-
-@pytest.fixture
-def device(needs):
-    """Return a function that opens the OpenCL device with a number of lanes."""
-    backend = get_backend(needs("opencl"))
-    before = backend.info
-
-    def ask(lanes: int):
-        backend.info = dataclasses.replace(before, kind="cpu", lanes=lanes)
-        return backend
-
-    yield ask
-    backend.info = before
-
-
-@pytest.fixture
-def compiled(device, monkeypatch):
-    """Record the lanes of every kernel that is compiled, by its name."""
-    found, kind = defaultdict(set), type(device(1))
-    compile_ = kind.compile
-
-    def record(backend, kernel, flags):
-        found[kernel].add(lanes_of(flags))
-        return compile_(backend, kernel, flags)
-
-    monkeypatch.setattr(kind, "compile", record)
-    return found
 
 
 def landmarks(side: float) -> gs.LandmarkMap:
@@ -97,20 +66,20 @@ def assert_no_particle_depends_on_its_lane(call, poses: np.ndarray) -> None:
     assert differing(np.concatenate(pieces), together) == 0
 
 
-@pytest.mark.sampled(0.15)
+@pytest.mark.sampled(0.1)
 @pytest.mark.parametrize("side", [9.0, 90.0])
 @pytest.mark.parametrize("name", LANDMARKS)
-def test_landmarks(name, side, device, compiled):
+def test_landmarks(name, side, in_lanes, compiled_lanes):
     changes, options = LANDMARKS[name]
     p, world, poses = gs.LandmarkParameters(**{"range_max": 12.0, **changes}), landmarks(side), cloud(side)
     known, found = [3, 4, -1, 8, 10, 59], {}
     for lanes in (1, LANES):
-        model = gs.LandmarkModel(world, p, backend=device(lanes), **options)
-        compiled.clear()
+        model = gs.LandmarkModel(world, p, backend=in_lanes(lanes), **options)
+        compiled_lanes.clear()
         found[lanes] = [model.log_likelihood(poses, FEATURES), model.log_likelihood(poses, FEATURES, known),
                         *model.associate(poses, FEATURES)]  # fmt: skip
-        assert compiled["score_features"] == {lanes}
-        assert compiled["count_unseen"] == ({lanes} if model.negative else set())
+        assert compiled_lanes["score_features"] == {lanes}
+        assert compiled_lanes["count_unseen"] == ({lanes} if model.negative else set())
     assert_no_particle_depends_on_its_lane(lambda some: model.log_likelihood(some, FEATURES), poses)
     for wide, one in zip(found[LANES], found[1], strict=True):
         if one.dtype == np.int32:
@@ -119,12 +88,12 @@ def test_landmarks(name, side, device, compiled):
             assert_alike(wide, one, len(FEATURES))
 
 
-def test_unseen_landmarks_have_the_bits_of_one(device):
+def test_unseen_landmarks_have_the_bits_of_one(in_lanes):
     """With no features that could be landmarks, log p is the count of unseen ones alone."""
     p, poses = gs.LandmarkParameters(range_max=12.0, field_of_view=3.0), cloud(30.0)
     found = []
     for lanes in (1, LANES):
-        model = gs.LandmarkModel(landmarks(30.0), p, negative=True, backend=device(lanes))
+        model = gs.LandmarkModel(landmarks(30.0), p, negative=True, backend=in_lanes(lanes))
         found.append(model.log_likelihood(poses, [(3.0, 0.2)]))
     counts = [np.round(np.diff(np.sort(one))[np.diff(np.sort(one)) > 0.5], 4) for one in found]
     assert len(counts[0]) > 3 and np.array_equal(*counts)
@@ -141,15 +110,15 @@ def test_unseen_landmarks_have_the_bits_of_one(device):
         {"nu": 7, "sigma_range": 5.0, "sigma_heavy": 50.0},
     ],
 )
-def test_beacons(kind, changes, device, compiled):
+def test_beacons(kind, changes, in_lanes, compiled_lanes):
     p = gs.BeaconParameters(kind=kind, **{"range_max": 30.0, **changes})
     xy, ranges, poses = np.array([(0, 0), (8, 1), (-3, 7), (20, -20)]), [3.0, 7.5, 0.0, 8.9], cloud(9.0)
     found = {}
     for lanes in (1, LANES):
-        model = gs.BeaconModel(xy, p, backend=device(lanes))
-        compiled.clear()
+        model = gs.BeaconModel(xy, p, backend=in_lanes(lanes))
+        compiled_lanes.clear()
         found[lanes] = model.log_likelihood(poses, ranges)
-        assert compiled["score_beacons"] == {lanes}
+        assert compiled_lanes["score_beacons"] == {lanes}
     assert_no_particle_depends_on_its_lane(lambda some: model.log_likelihood(some, ranges), poses)
     assert_alike(found[LANES], found[1], len(ranges))
 
@@ -160,7 +129,7 @@ SQUARE = np.array([(0.2, 0.25), (-0.2, 0.25), (-0.2, -0.25), (0.2, -0.25)])
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("outline", ["circle", "square"])
 @pytest.mark.parametrize("changes", [{}, {"sigma": 0.01, "p_contact": 1.0, "p_false": 0.0}, {"sigma": 1e5}])
-def test_bumpers(outline, changes, device, compiled):
+def test_bumpers(outline, changes, in_lanes, compiled_lanes):
     """Poses on edges of cells, off the map, and in walls; contact that is certain either way."""
     rng = np.random.default_rng(5)
     grid = gs.OccupancyGrid(rng.choice([0, 100], (37, 53), p=[0.97, 0.03]), 0.25, (3.0, -2.0, 0.3))
@@ -172,18 +141,18 @@ def test_bumpers(outline, changes, device, compiled):
     shape, parts, pressed = (SQUARE, [0, 1, -1, 1], [True, False]) if outline == "square" else (0.3, None, True)
     found = {}
     for lanes in (1, LANES):
-        model = gs.BumperModel(grid, shape, gs.BumperParameters(**changes), segments=parts, backend=device(lanes))
-        compiled.clear()
+        model = gs.BumperModel(grid, shape, gs.BumperParameters(**changes), segments=parts, backend=in_lanes(lanes))
+        compiled_lanes.clear()
         found[lanes] = model.log_likelihood(poses, pressed)
-        assert compiled["score_contact"] == {lanes}
+        assert compiled_lanes["score_contact"] == {lanes}
     assert_no_particle_depends_on_its_lane(lambda some: model.log_likelihood(some, pressed), poses)
     assert_alike(found[LANES], found[1], 2)
 
 
 def test_float64_and_lines_have_no_vectors():
     for kernel in ("score_features", "count_unseen", "score_beacons", "score_contact"):
-        assert with_lanes_flag(LANES, kernel, {"RANGE", "BEARING"}) == {"RANGE", "BEARING", "WIDE"}
+        assert with_lanes_flag(LANES, kernel, {"RANGE", "BEARING"}) == {"RANGE", "BEARING", "IN_LANES"}
         assert with_lanes_flag(LANES, kernel, {"RANGE", "FLOAT64"}) == {"RANGE", "FLOAT64"}
     assert with_lanes_flag(LANES, "score_features", {"RANGE", "LINE"}) == {"RANGE", "LINE"}
     for flag in ("SIGNATURE", "FIELD", "MARGINAL", "PER_BEAM"):
-        assert "WIDE" in with_lanes_flag(LANES, "score_features", {"BEARING", flag})
+        assert "IN_LANES" in with_lanes_flag(LANES, "score_features", {"BEARING", flag})

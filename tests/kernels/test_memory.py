@@ -66,7 +66,7 @@ for kind in ("cpu", "gpu"):
 pretend("cpu")
 odd = np.array([[0.1, 0.2, 3e7], [np.nan, 0, 0], [0, np.inf, 0], [0, 0, -np.inf], [1e300, -1e300, 1e300],
                 [0.3, 0.3, -9]])
-for dtype, careful in itertools.product((np.float32, np.float64), ((), ("CAREFUL",))):
+for dtype, careful in itertools.product((np.float32, np.float64), ((), ("TWO_PART_POINTS",))):
     with np.errstate(over="ignore"):
         poses = np.ascontiguousarray(odd.astype(dtype))
     flags = frozenset({"HUGE_HEADINGS", *careful, *(("POSES_FLOAT32",) if dtype == np.float32 else ())})
@@ -150,7 +150,7 @@ if BACKEND.startswith("opencl"):
                       for kind in (gs.BeamModel, gs.LikelihoodFieldModel)]
             scores = [model.log_likelihood(many, readings, per_beam=True) for model in models]
             if b == BACKEND:
-                wrong += sum("WIDE" not in model._last.flags for model in models)
+                wrong += sum("IN_LANES" not in model._last.flags for model in models)
             results.append((gs.RayCaster(grid, 1.0, backend=b, outside=outside).cast(many, turns), *scores))
         wrong += np.count_nonzero(results[0][0] != results[1][0])
         for found, right in zip(results[0][1:], results[1][1:]):

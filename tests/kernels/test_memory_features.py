@@ -71,7 +71,7 @@ if BACKEND.startswith("opencl"):
                     lambda model: model.log_likelihood(poses, given, partners and partners[:len(given)]))
         model = gs.LandmarkModel(landmarks, backend=device)
         model.log_likelihood(poses, features[:, :2], partners)
-        wrong += "WIDE" not in model.explain()
+        wrong += "IN_LANES" not in model.explain()
     device.info = before
 
 huge = poses.copy()

@@ -27,7 +27,7 @@ lanes = (before.lanes, 8, 16) if BACKEND.startswith("opencl") else (before.lanes
 
 
 def noted(kernel, flags):
-    launched.update({kernel, kernel + " WIDE"} if "WIDE" in flags else {kernel})
+    launched.update({kernel, kernel + " IN_LANES"} if "IN_LANES" in flags else {kernel})
     return compiled(kernel, flags)
 
 
@@ -99,7 +99,7 @@ both[0].info = before
 # A kernel that was never launched, in vectors where it has them, would be no proof.
 for room in (mapping_kernels, matching_kernels, particle_kernels, search_kernels):
     for name, row in room.KERNELS.items():
-        needed = {name, name + " WIDE"} if row.wide and BACKEND.startswith("opencl") else {name}
+        needed = {name, name + " IN_LANES"} if row.in_lanes and BACKEND.startswith("opencl") else {name}
         if needed - launched:
             sys.exit(f"never launched: {needed - launched}")
 print("wrong", wrong, "worst", worst)

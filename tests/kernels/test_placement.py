@@ -163,7 +163,7 @@ def rounded(poses: np.ndarray, given_as: str) -> np.ndarray:
 
 
 def launch(
-    backend: Backend, given_poses: np.ndarray, grid: gs.OccupancyGrid, mount, real: str, names=("CAREFUL",)
+    backend: Backend, given_poses: np.ndarray, grid: gs.OccupancyGrid, mount, real: str, names=("TWO_PART_POINTS",)
 ) -> dict[str, np.ndarray]:
     """Return the kernel's outputs on a device."""
     count, dtype = len(given_poses), np.dtype(real)
@@ -175,7 +175,7 @@ def launch(
     blanks = {
         "pose_cell": np.full((count, 2), 77, np.int32),
         "pose": np.full((count, 4), 77, dtype),
-        "pose_low": np.full((count, 4) if "CAREFUL" in names else (1, 4), 77, dtype),
+        "pose_low": np.full((count, 4) if "TWO_PART_POINTS" in names else (1, 4), 77, dtype),
         "pose_status": np.zeros(2, np.int32),
     }
     buffers = {name: backend.upload(blank) for name, blank in blanks.items()}
@@ -202,7 +202,7 @@ def device(request, needs) -> Backend:
 def test_every_device_gives_the_bits_of_the_reference(name, real, given_as, device):
     poses = rounded(poses_of(name), given_as)
     scene = grid_of(name), FRAMES[name][2], real
-    for names in ((), ("CAREFUL",)):
+    for names in ((), ("TWO_PART_POINTS",)):
         expected = launch(get_backend("numpy"), poses, *scene, names)
         assert_same(launch(device, poses, *scene, names), expected)
         assert (expected["pose_low"] == 77).all() == (not names)
@@ -332,8 +332,8 @@ def test_float64_is_switched_on_where_a_file_uses_it():
     assert pragma in assemble("placement", frozenset())
     assert pragma not in assemble("ranges", frozenset())
     assert pragma in assemble("ranges", frozenset({"FLOAT64"}))
-    flags = frozenset({"CAREFUL", "POSES_FLOAT32", "FLOAT64", "HIT", "ORIGINS_OUTSIDE"})
-    assert relevant("placement", flags) == {"CAREFUL", "POSES_FLOAT32", "FLOAT64"}
+    flags = frozenset({"TWO_PART_POINTS", "POSES_FLOAT32", "FLOAT64", "HIT", "ORIGINS_OUTSIDE"})
+    assert relevant("placement", flags) == {"TWO_PART_POINTS", "POSES_FLOAT32", "FLOAT64"}
 
 
 def test_a_device_without_float64_cannot_place_poses(needs):

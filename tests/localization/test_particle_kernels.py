@@ -180,12 +180,12 @@ def run_step(selection, count, flags=PLAIN, *, lanes=True, draws=c.SYSTEMATIC, l
         program += sums.launch("draw_particles", count, source=on[source], target=on[target], weight=on["weight"],
                                ends=on["ends"], copies=on["copies"], state=on["state"], pool=on["pool"],
                                after=on["before"], particles=count, drawn=count, stage=stage, **step)  # fmt: skip
-    for again in (0, 1):
-        program += sums.estimate(on["a"], on["weight"], on["estimate"], count, again)
+    for second_pass in (0, 1):
+        program += sums.estimate(on["a"], on["weight"], on["estimate"], count, second_pass)
     program += sums.launch("normalize_weights", count, weight=on["weight"], estimate=on["estimate"], share=on["share"],
                            particles=count)  # fmt: skip
     if not lanes:
-        program = [one._replace(flags=one.flags - {"WIDE"}) for one in program]
+        program = [one._replace(flags=one.flags - {"IN_LANES"}) for one in program]
     device.run(tuple(program))
     found = {name: device.download(on[name], np.empty_like(values)) for name, values in buffers.items()}
     device.synchronize()
@@ -242,8 +242,8 @@ def test_estimates_have_the_same_bits_where_work_items_take_single_lanes(backend
     for kind, lanes in (("cpu", device.info.lanes), ("gpu", 1)):
         monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind=kind, lanes=lanes))
         estimate = device.upload(np.full(c.ESTIMATE, np.nan))
-        for again in (0, 1):
-            device.run(sums.estimate(*cloud, estimate, count, again))
+        for second_pass in (0, 1):
+            device.run(sums.estimate(*cloud, estimate, count, second_pass))
             found.append(device.download(estimate, np.empty(c.ESTIMATE)))
     assert np.isfinite(found).all() and np.array_equal(found[:2], found[2:])
 
@@ -307,7 +307,7 @@ def test_headings_are_wrapped_after_any_move_with_the_same_bits(backend, deviati
         "move_particles", count, source=on, settings=step, target=on, particles=count, kind=kind
     )
     if not lanes:
-        program = tuple(one._replace(flags=one.flags - {"WIDE"}) for one in program)
+        program = tuple(one._replace(flags=one.flags - {"IN_LANES"}) for one in program)
     device.run(program)
     assert np.array_equal(device.download(on, np.empty(3 * count)), expected)
 

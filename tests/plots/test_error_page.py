@@ -128,6 +128,13 @@ def test_devices_of_one_title_are_told_apart() -> None:
     assert {row.device for row in rows if row.outside} == {"2 cores of an X, PoCL, opencl:0:0"}
 
 
+def test_a_title_names_the_runtime_of_a_processor() -> None:
+    points = [made_point(backend=name, device=device) for name, device in (("opencl:0:0", "X"), ("opencl:1:0", "X"))]
+    devices = [{"selection": "opencl:0:0", "driver": "Intel(R) OpenCL 1"}, {"selection": "opencl:1:0", "driver": "A"}]
+    rows = model_rows(report_of(points=points, devices=devices))
+    assert {row.device for row in rows} == {"2 cores of an X, Intel's OpenCL", "2 cores of an X, OpenCL"}
+
+
 # ---- the page
 
 

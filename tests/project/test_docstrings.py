@@ -3,6 +3,7 @@
 import doctest
 import inspect
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -36,7 +37,8 @@ def test_a_public_name_has_a_short_example(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_examples_of_a_public_name_run(name: str) -> None:
+def test_the_examples_of_a_public_name_run(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # examples write files
     for test in examples_of(name):
         report: list[str] = []
         result = doctest.DocTestRunner(verbose=False).run(test, out=report.append)

@@ -188,11 +188,11 @@ def test_the_check_finds_paths_that_are_gone(name, text, gone):
 
 def test_the_check_finds_links_that_lead_nowhere():
     text = (
-        "[a](casters.md) [b](none.md) [c](../README.md#nowhere) [d](#here) ![e](img/none.png) [f](https://a.org/x.md)\n"
+        "[a](models.md) [b](none.md) [c](../README.md#nowhere) [d](#here) ![e](img/none.png) [f](https://a.org/x.md)\n"
         "[g](#code-and-more) `[h](none.md)` [i]: gone.md\n## Here\n## `Code` and more\n[j]: away.md\n"
         "```\n[k](none.md)\n```\n"
     )
     assert anchors(text) == {"here", "code-and-more"} and anchors("# A\n# A\n") == {"a", "a-1"}
-    assert broken_links("docs/casters.md", text.replace("(#here)", "()").replace("(#code-and-more)", "()")) == [
-        f"docs/casters.md: {target}" for target in ("none.md", "../README.md#nowhere", "img/none.png", "away.md")
+    assert broken_links("docs/models.md", text.replace("(#here)", "()").replace("(#code-and-more)", "()")) == [
+        f"docs/models.md: {target}" for target in ("none.md", "../README.md#nowhere", "img/none.png", "away.md")
     ]

@@ -11,6 +11,7 @@ from gpusense.learning.beam.options import make_bounds
 from gpusense.learning.beam.pairs import make_pairs
 from gpusense.learning.beam.point import Point, first_guess, random_start
 from gpusense.learning.beam.problem import NO_PRIOR, Prior, Problem
+from gpusense.world.hit_shapes import NORMAL, HitShape
 from gpusense.world.parameters import BeamParameters
 
 RANGE_MAX = 10.0
@@ -48,5 +49,5 @@ def starts(z: np.ndarray, expected: np.ndarray, range_max: float, count: int) ->
     return [random_start(guess, bounds, rng).parameters() for _ in range(count)]
 
 
-def point(*weights: float, sigma: float, rate: float, bias: float = 0.0) -> Point:
-    return Point(np.array(weights), sigma, rate, bias)
+def point(*weights: float, sigma: float, rate: float, bias: float = 0.0, shape: HitShape = NORMAL) -> Point:
+    return Point(np.array(weights), sigma, rate, bias, shape)

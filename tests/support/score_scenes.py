@@ -44,7 +44,7 @@ def mixture(name: str, real: type, *, z_max: float) -> tuple[set[str], np.ndarra
         flags.add("SINGLE")
     head = np.array([z_hit / (sigma * np.sqrt(2 * np.pi)), z_short, z_rand / range_max])
     if head[0] > 64:
-        flags.add("SHARP")
+        flags.add("EXACT_EXPONENT")
     if head[2] >= (1e-290 if real is np.float64 else 1e-30):
         flags.add("LINEAR")
     else:
@@ -74,9 +74,9 @@ FIELDS = {
     "log table": ("LOG_TABLE", "LINEAR", "HIT"),
     "nearest": ("LINEAR", "HIT"),
     "nearest without hit": ("LINEAR",),
-    "nearest in the log domain": ("HIT",),
+    "nearest, hits alone": ("HIT",),
     "bilinear": ("BILINEAR", "LINEAR", "HIT"),
-    "bilinear in the log domain": ("BILINEAR", "HIT"),
+    "bilinear in the log domain": ("BILINEAR", "HIT", "RAND"),
 }
 
 
@@ -125,11 +125,15 @@ def field_scene(name: str, real: type, *, all_readings: bool) -> dict[str, np.nd
     }
 
 
-# As models have them: float32 is careful, float64 needs no second look.
+# As models have them: float32 has end points in two parts, float64 needs none.
 FIELD_SCENES = [
-    *((name, names, np.float32) for name in FIELDS for names in (("CAREFUL",), ("ALL_READINGS", "CAREFUL"))),
+    *(
+        (name, names, np.float32)
+        for name in FIELDS
+        for names in (("TWO_PART_POINTS",), ("ALL_READINGS", "TWO_PART_POINTS"))
+    ),
     *((name, names, np.float64) for name in FIELDS for names in ((), ("ALL_READINGS",))),
-    ("log table", ("CAREFUL", "QUICK"), np.float32),
+    ("log table", ("TWO_PART_POINTS", "ROUNDED_CELLS"), np.float32),
 ]
 
 

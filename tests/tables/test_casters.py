@@ -27,7 +27,7 @@ from gpusense.tables.directional import directional_table
 from gpusense.tables.rectangles import sectors_of
 from gpusense.world import windows
 
-DOCS = ROOT / "docs" / "casters.md"
+DOCS = ROOT / "docs" / "speed.md"
 KINDS = [
     *(make() for name, make in casters.CASTERS.items() if name != "lookup"),
     *(

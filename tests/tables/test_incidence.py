@@ -161,7 +161,7 @@ def test_the_cell_is_the_one_where_the_walk_ends(family, backend):
         angles = rng.uniform(0, math.pi, (rows + 2, cols + 2))
         walls = np.pad(scene.occupied, 1, constant_values=scene.outside_occupied)
         table = np.where(walls[..., None], np.stack([np.cos(angles), np.sin(angles)], axis=-1), 0).astype(real)
-        flags = {"ECHO", "INCIDENCE", "ORIGINS_OUTSIDE"} | ({"FLOAT64"} if real == np.float64 else set())
+        flags = {"CONES", "INCIDENCE", "ORIGINS_OUTSIDE"} | ({"FLOAT64"} if real == np.float64 else set())
         flags |= {"OUTSIDE_OCCUPIED"} if scene.outside_occupied else set()
         buffers = [device.empty(count, real) for _ in range(2)]
         pose = np.concatenate([scene.frac, scene.direction], axis=1).astype(real)

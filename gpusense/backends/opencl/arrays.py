@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+import sys
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyopencl as cl
-import pyopencl.array
 
 from gpusense._util.checks import show
 from gpusense.backends.base import Adopted, Buffer
 from gpusense.backends.opencl.memory import SHARED, SharedPart, driver_errors
+
+if TYPE_CHECKING:
+    import pyopencl.array
 
 
 def check_in_order(queue: cl.CommandQueue, name: str) -> None:
@@ -26,7 +29,8 @@ def check_in_order(queue: cl.CommandQueue, name: str) -> None:
 
 def is_array(candidate: object) -> bool:
     """Return whether an object is an array of pyopencl."""
-    return isinstance(candidate, pyopencl.array.Array)
+    module = sys.modules.get("pyopencl.array")
+    return module is not None and isinstance(candidate, module.Array)
 
 
 def alignment_of(device: cl.Device) -> int:
@@ -44,7 +48,7 @@ def part_of(buffer: Buffer, first: int, size: int, alignment: int) -> Buffer:
         return buffer
     if isinstance(buffer, SHARED):
         return SharedPart(buffer, first, size)
-    # A part has no parts of its own.
+    # A part cannot be divided into further parts.
     whole: Any = buffer.get_info(cl.mem_info.ASSOCIATED_MEMOBJECT)
     if whole is not None:
         begin: Any = buffer.get_info(cl.mem_info.OFFSET)
@@ -106,4 +110,7 @@ def adopted(array: Any, queue: cl.CommandQueue, selection: str, name: str, *, in
 
 def lent(buffer: cl.Buffer, queue: cl.CommandQueue, shape: tuple[int, ...], dtype: np.dtype) -> pyopencl.array.Array:
     """See Backend.lend."""
+    # Takes a while, and NumPy arrays do not need it.
+    import pyopencl.array
+
     return pyopencl.array.Array(queue, shape, dtype, data=buffer if math.prod(shape) else None)

@@ -22,6 +22,9 @@ from gpusense.backends.opencl.devices import shares_memory
 from gpusense.backends.opencl.launch import Launch
 from gpusense.backends.opencl.memory import SHARED, DeviceBuffer, SharedBuffer, driver_errors, raise_clearly
 from gpusense.backends.opencl.replay import OpenCLRecording
+from gpusense.backends.opencl.slots import slots_of
+from gpusense.backends.recycled import ResultMemory
+from gpusense.backends.staging import Staging
 from gpusense.interface.launches import Program
 from gpusense.interface.signatures import KERNELS
 from gpusense.interface.sources import assemble, relevant, uses_double, with_places
@@ -37,8 +40,8 @@ _ROUNDED_DIVISION = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
 def _binary_cache(info: BackendInfo, device: cl.Device) -> BinaryCache | None:
     """Return the cache of programs; None for PoCL, whose kernels are kept one by one.
 
-    For a binary, PoCL would compile all kernels of the program, wanted or not, for work-groups of any size, which takes
-    three times as long as everything else.
+    For a binary, PoCL would compile every kernel of the program for work-groups of any size, which takes three times as
+    long as everything else.
     """
     return None if pocl.is_pocl(device) else BinaryCache(info)
 
@@ -59,6 +62,10 @@ class OpenCLBackend(ProcessBound, Backend):
         self._context = cl.Context([device]) if queue is None else queue.context
         self._queue = cl.CommandQueue(self._context) if queue is None else queue
         self._shared = shares_memory(device)
+        self._results = ResultMemory() if info.kind == "gpu" else None
+        # Large copies; only where they were measured.
+        staged = info.kind == "gpu" and not self._shared and "NVIDIA" in device.vendor
+        self._staging = Staging(functools.partial(slots_of, self._queue)) if staged else None
         # Numbers of commands that were queued, and that are known to have ended. Garbage may be collected anywhere.
         self._count = threading.RLock()
         self._queued = self._ended = 0
@@ -93,6 +100,8 @@ class OpenCLBackend(ProcessBound, Backend):
                 if self._ended != self._queued:
                     self.synchronize()
                 buffer.bytes[: array.nbytes] = array.reshape(-1).view(np.uint8)
+                return buffer
+            if self._staging is not None and self._staging.upload(array, buffer):
                 return buffer
             with driver_errors():
                 blocking = wait or _SLOW[0] < array.nbytes <= _SLOW[1]
@@ -143,9 +152,15 @@ class OpenCLBackend(ProcessBound, Backend):
                     self.synchronize()
                 out.reshape(-1).view(np.uint8)[:] = buffer.bytes[: out.nbytes]
                 return out
+            if self._staging is not None and self._staging.download(buffer, out):
+                return out
             with driver_errors():
                 cl.enqueue_copy(self._queue, out, buffer, is_blocking=wait)
         return out
+
+    def empty_result(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+        """See Backend.empty_result."""
+        return np.empty(shape, dtype) if self._results is None else self._results.empty(shape, dtype)
 
     def part(self, buffer: Buffer, first: int, count: int, dtype: np.dtype) -> Buffer:
         """See Backend.part."""

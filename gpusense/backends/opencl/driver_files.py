@@ -1,7 +1,7 @@
 """The files of the OpenCL drivers of this machine.
 
-A driver is a library that an ``.icd`` file names. The loader inside pyopencl's wheel reads the system's files,
-``/etc/OpenCL/vendors`` or ``$OCL_ICD_VENDORS``, and those beside pyopencl, where PoCL's wheel has its own.
+A driver is a library that an ``.icd`` file names. The loader inside pyopencl's wheel reads the system's files
+(``/etc/OpenCL/vendors`` or ``$OCL_ICD_VENDORS``) and the files beside pyopencl, where PoCL's wheel puts its file.
 
 Intel's runtime for processors comes as a wheel too, but its ``.icd`` file names a folder that exists on no user's
 machine. A new ``.icd`` file takes its place, in a folder with the system's. Loading the library by its path would need
@@ -37,7 +37,7 @@ class Driver:
 
 
 def installed() -> tuple[tuple[Driver, ...], bool]:
-    """Return the drivers of this machine, and whether the loader finds all of them by itself."""
+    """Return the drivers of this machine, and whether the loader finds all of them unaided."""
     present = _registered()
     intel = _intel(present)
     return (tuple(present), True) if intel is None else ((*present, intel), False)

@@ -60,7 +60,8 @@ class Choice:
 
 
 _lock = threading.RLock()
-# The choice of this process: a parent's, or that of a trial. Once drivers are loaded it does not change.
+# The choice of drivers in this process: the parent's, or the result of a trial. Once drivers are loaded it does not
+# change.
 _choice: Choice | None = None
 _loaded = False
 # Whether the program had loaded PoCL before.
@@ -123,7 +124,7 @@ def renew() -> None:
 
 
 def _chosen(*, anew: bool = False) -> Choice:
-    """Return the choice by the kept verdict, or by a child's where there is none or it is made ``anew``."""
+    """Return the choice by the cached verdict; without one, or with ``anew``, by a child's verdict."""
     drivers, by_itself = driver_files.installed()
     wanted = None if by_itself else drivers
     if not child.can_start() or not _loader():
@@ -241,7 +242,7 @@ def _variables(drivers: tuple[Driver, ...] | None, *, kernels: bool = True) -> d
     for i, driver in enumerate(drivers):
         # The loader takes files in the order of the folder. The number keeps files of one name apart.
         (folder / f"{i}-{driver.file.stem}.icd").write_text(driver.library + "\n", encoding="utf-8")
-    # With this home the loader finds nothing beside pyopencl; those drivers are in the folder too.
+    # With this home the loader finds no files beside pyopencl; the folder has those drivers as well.
     return variables | {"OCL_ICD_VENDORS": str(folder), "PYOPENCL_HOME": str(folder)}
 
 

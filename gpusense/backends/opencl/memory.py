@@ -64,7 +64,7 @@ def raise_clearly(error: cl.Error) -> NoReturn:
     if any(code in str(error) for code in _OUT_OF_MEMORY):
         raise MemoryError(f"the OpenCL device is out of memory: {error}") from error
     if any(code in str(error) for code in _LOST):
-        raise RuntimeError(f"the OpenCL device is no longer available, make the model anew: {error}") from error
+        raise RuntimeError(f"the OpenCL device is no longer available, make a new model: {error}") from error
     raise error
 
 

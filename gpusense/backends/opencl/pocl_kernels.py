@@ -29,7 +29,7 @@ class PoclKernels:
     """The compiled kernels of this process.
 
     Attributes:
-        changed: Programs of which kernels were compiled since the last :meth:`save`, by the keys of their entries.
+        changed: Programs with kernels compiled since the last :meth:`save`, by the keys of their entries.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -6,6 +6,7 @@ kernels unpack ``wp.tid()`` in that order.
 
 from __future__ import annotations
 
+import functools
 import inspect
 import threading
 from typing import Any
@@ -16,6 +17,8 @@ import warp as wp
 from gpusense.backends.base import Adopted, Backend
 from gpusense.backends.info import BackendInfo, ProcessBound
 from gpusense.backends.recording import Recording
+from gpusense.backends.recycled import ResultMemory
+from gpusense.backends.staging import Staging
 from gpusense.backends.warp.arrays import adopted, has_protocol
 from gpusense.backends.warp.graphs import GraphCache
 from gpusense.backends.warp.launch import SCALARS, Launch, host_view
@@ -23,6 +26,7 @@ from gpusense.backends.warp.pieces import SharedLaunch, shared
 from gpusense.backends.warp.queue import CallQueue
 from gpusense.backends.warp.recording import WarpRecording
 from gpusense.backends.warp.settings import LOCK, initialize, load, settings
+from gpusense.backends.warp.slots import slots_of
 from gpusense.interface.kernel_files import warp_module
 from gpusense.interface.launches import Program
 from gpusense.interface.signatures import KERNELS, Kernel
@@ -42,6 +46,9 @@ class WarpBackend(ProcessBound, Backend):
         self.info = info
         self._device = wp.get_device(device)
         self._graphs = GraphCache(self._device)
+        self._results = ResultMemory() if info.kind == "gpu" else None
+        # Large copies; None on the processor, whose memory is the host's.
+        self._staging = Staging(functools.partial(slots_of, self._device)) if self._device.is_cuda else None
         # The queue of each thread that has a batch, and the queues that no call uses.
         self._thread = threading.local()
         self._queues: list[CallQueue] = []
@@ -60,6 +67,9 @@ class WarpBackend(ProcessBound, Backend):
                 if not wait and queue.upload(array, buffer):
                     return buffer
                 self._flush(queue)
+            if self._staging is not None and self._staging.upload(array, buffer):
+                # Page-locked memory holds the numbers until the device has read them.
+                return buffer
             wp.copy(buffer, host_view(array), count=array.size)
             if wait:
                 # The copy returns while the device still reads page-locked host memory.
@@ -91,10 +101,16 @@ class WarpBackend(ProcessBound, Backend):
                 if not wait and queue.download(buffer, out):
                     return out
                 self._flush(queue)
+            if self._staging is not None and self._staging.download(buffer, out):
+                return out
             wp.copy(host_view(out), buffer, count=out.size)
             if wait:
                 self._wait()
         return out
+
+    def empty_result(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+        """See Backend.empty_result."""
+        return np.empty(shape, dtype) if self._results is None else self._results.empty(shape, dtype)
 
     def part(self, buffer: wp.array, first: int, count: int, dtype: np.dtype) -> wp.array:
         """See Backend.part."""
@@ -180,7 +196,7 @@ class WarpBackend(ProcessBound, Backend):
         except IndexError:
             queue = CallQueue(self._device, SCALARS)
         if not queue.settled:
-            # An error ended the last call of this queue, parts of which may be under way.
+            # An error ended this queue's last call; parts of it may still be running.
             self._wait()
         queue.begin()
         self._thread.queue = queue

@@ -1,6 +1,6 @@
 """CUDA graphs: a call that repeats an earlier one, to the last pointer and number, is one start.
 
-A graph keeps pointers and numbers, so steps of equal keys need no more than the graph of the first ones.
+A graph keeps pointers and numbers, so steps with equal keys use the first one's graph.
 """
 
 from __future__ import annotations
@@ -12,11 +12,12 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
+from gpusense.backends.helpers import HELPERS
 from gpusense.backends.warp.steps import Step, as_graph, one_by_one, start_each
 
 _LOG = logging.getLogger("gpusense")
 
-# Graphs, keys of calls that were started once, and keys of calls that the driver does not capture, which are kept.
+# Most graphs; most keys of calls that were started once, and of calls that the driver does not capture.
 _MOST_GRAPHS, _MOST_SEEN = 256, 512
 # The least recently used graph is evicted after this number of calls without it, in multiples of ``_MOST_GRAPHS``: a
 # capture takes longer than the starts that it replaces.
@@ -25,8 +26,6 @@ _STALE = 16
 _MOST_STEPS = 64
 # Captures that fail one after the other until no more are tried.
 _MOST_FAILURES = 3
-# Prefix of the names of threads that share launches on the processor.
-HELPERS = "gpusense pieces"
 # Reasons for calls without a graph.
 FIRST = "a graph is captured when it is started again"
 SHORT = "a graph would save nothing"

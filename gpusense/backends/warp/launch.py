@@ -132,7 +132,7 @@ def _instance(declared: Any, value: Any) -> Any:
 
 
 def _view(buffer: wp.array, width: int) -> wp.array:
-    """Return the buffer's memory as numbers or vectors: a view that does not own it, and that the buffer keeps."""
+    """Return a view of the buffer's memory as numbers or vectors; the buffer keeps the view alive."""
     views = buffer.__dict__.setdefault("_gpusense_views", {})
     if width not in views:
         dtype = buffer.dtype if width == 1 else _VECTORS[buffer.dtype, width]

@@ -7,15 +7,13 @@ and its kernels keep no state. A particle's result does not depend on the piece.
 
 from __future__ import annotations
 
-import concurrent.futures
 import contextlib
-import functools
 import math
 import os
 import threading
 from typing import Any
 
-from gpusense.backends.warp.graphs import HELPERS
+from gpusense.backends import helpers
 from gpusense.backends.warp.launch import Launch, LaunchStep, slice_of
 from gpusense.interface.signatures import Argument, Kernel
 
@@ -29,7 +27,7 @@ _PIECES = 2
 
 def shared(launch: Launch, row: Kernel) -> Launch | SharedLaunch:
     """Return the launch, cut into pieces where several threads may share it."""
-    return launch if _threads() == 1 or not _independent(row) else SharedLaunch(launch, row)
+    return launch if helpers.threads() == 1 or not _independent(row) else SharedLaunch(launch, row)
 
 
 def _shared_axis(row: Kernel) -> str | None:
@@ -46,18 +44,6 @@ def _independent(row: Kernel) -> bool:
     """Return whether each work-item writes only to the rows of its particle or block."""
     axis = _shared_axis(row)
     return axis is not None and all(_has_rows(argument, axis) for argument in row.arguments if argument.output)
-
-
-@functools.cache
-def _threads() -> int:
-    """Return the number of processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-@functools.cache
-def _pool(process: int) -> concurrent.futures.ThreadPoolExecutor:
-    """Return the threads of a process for all launches; the calling thread works as well."""
-    return concurrent.futures.ThreadPoolExecutor(_threads() - 1, HELPERS)
 
 
 class SharedLaunch:
@@ -78,7 +64,7 @@ class SharedLaunch:
         """See Launcher.__call__."""
         particles = size[self._axis]
         work = particles * max((int(arguments[i]) for i in self._work), default=1)
-        count = min(_PIECES * _threads(), work // _PIECE_WORK, particles)
+        count = min(_PIECES * helpers.threads(), work // _PIECE_WORK, particles)
         if count < 2:
             self._launch(size, *arguments)
             return
@@ -98,19 +84,19 @@ class SharedLaunch:
                     (*size[: self._axis], count, *size[self._axis + 1 :]), *self._piece(arguments, rows, begin, count)
                 )
 
-        helpers = []
+        started = []
         # Where the system starts no more threads, the present ones do the work.
         with contextlib.suppress(RuntimeError):
-            for _ in range(min(_threads(), count) - 1):
-                helpers.append(_pool(os.getpid()).submit(pieces))
+            for _ in range(min(helpers.threads(), count) - 1):
+                started.append(helpers.pool(os.getpid()).submit(pieces))
         try:
             pieces()
         finally:
             # No thread may write any more when this returns, not even after an error: further pieces are dropped.
             with lock:
                 begins = iter(())
-            _finish(helpers)
-        for helper in helpers:
+            helpers.finish(started)
+        for helper in started:
             if not helper.cancelled():
                 helper.result()
 
@@ -140,17 +126,3 @@ class SharedLaunch:
         for i, each in rows:
             cut[i] = slice_of(arguments[i], begin * each, count * each)
         return cut
-
-
-def _finish(helpers: list[concurrent.futures.Future[None]]) -> None:
-    """Cancel helpers that have not begun, and wait for the others even when interrupted."""
-    interrupted: BaseException | None = None
-    for helper in helpers:
-        helper.cancel()
-    while any(not helper.done() for helper in helpers):
-        try:
-            concurrent.futures.wait(helpers)
-        except KeyboardInterrupt as error:
-            interrupted = error
-    if interrupted is not None:
-        raise interrupted

@@ -30,7 +30,7 @@ _LOG = logging.getLogger("gpusense")
 def initialize() -> None:
     """Start Warp without its greeting and without its warning that there is no CUDA driver.
 
-    Where Warp's own folder of kernels cannot be made, which would end the run, this process's folder takes its place.
+    Where Warp cannot make its folder of kernels, which would end the run, this process's folder is used.
     """
     with settings(kernels=False), _filtered_stderr():
         try:
@@ -88,7 +88,7 @@ def load(module: wp.Module, device: wp.Device, group: int) -> None:
     """Compile a module for a device, or take its code from the cache; within :func:`settings`.
 
     Raises:
-        Exception: Warp's own, where the module does not compile.
+        Exception: Warp's errors, where the module does not compile.
     """
     name = module.get_module_identifier(block_dim=group)
     host = fingerprint() if device.is_cpu else f"{device.arch}"

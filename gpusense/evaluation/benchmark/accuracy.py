@@ -24,6 +24,7 @@ from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.models.scan.mixture import mixture_of
 from gpusense.reference.mixture import log_density
 from gpusense.world.parameters import BeamParameters
+from gpusense.world.range_causes import NoReturn
 from gpusense.world.scanner import Reading, Scanner, classify
 
 Floats = NDArray[np.float64]
@@ -102,7 +103,7 @@ class Truth:
         return self._fine[name]
 
     def log_p(self, problem: str) -> Floats:
-        """Return (M,) log-likelihoods of a problem's model; the problem ``"ranges"`` has those of the beam model."""
+        """Return (M,) log-likelihoods of a problem's model; for the problem ``"ranges"``, of the beam model."""
         return self.field if problem == "field" else self.beam
 
     @functools.cached_property
@@ -126,8 +127,8 @@ def temperature_of(log_p: Floats) -> float:
 def factor_for(log_p: Floats, size: float, most: float = MOST_FACTOR) -> float:
     """Find the largest factor of log-likelihoods at which the effective sample size is at least ``size``.
 
-    The effective sample size falls as the factor rises. Weights that are less sharp than the exact ones, such as sums
-    of cubes, are compared with them at the factor that gives both the same effective sample size.
+    The effective sample size falls as the factor rises. Weights flatter than the exact ones, such as sums of cubes, are
+    compared at the factor that makes the effective sample sizes equal.
 
     Args:
         log_p: (M,) log-likelihoods, finite.
@@ -301,7 +302,9 @@ def score_ranges(
     """
     kinds, p, limit = classify(readings, scanner), parameters, scanner.range_max
     hit = np.flatnonzero(kinds == Reading.HIT)
-    log_p = np.full(len(ranges), np.count_nonzero(kinds == Reading.MAX) * math.log(p.z_max) if p.z_max > 0 else 0.0)
+    log_p = np.full(
+        len(ranges), np.count_nonzero(kinds == Reading.MAX) * NoReturn(p.z_max).number if p.z_max > 0 else 0.0
+    )
     flags, terms = mixture_of((p,), limit, np.dtype(np.float64), specialize=True, max_depends=False)
     for begin in range(0, len(ranges), _PIECE):
         expected = np.clip(np.asarray(ranges[begin : begin + _PIECE, hit], np.float64), 0, limit)

@@ -183,8 +183,8 @@ def front(listed: Sequence[Entry]) -> list[Entry]:
 def choose(listed: Sequence[Entry], error: float | None, seconds: float | None) -> Entry | None:
     """Choose the entry for a largest error and a longest time.
 
-    With a largest error the fastest of those within both limits is chosen; of equally fast ones the most exact. With a
-    longest time alone the most exact within it is chosen; of equally exact ones the fastest.
+    With a largest error, the fastest method within both limits is chosen; of equally fast methods, the most exact. With
+    a longest time alone, the most exact method within it is chosen; of equally exact methods, the fastest.
 
     Args:
         listed: Entries of one device and one measure.
@@ -233,7 +233,8 @@ def answers(points: Sequence[Mapping[str, Any]], wish: Wish) -> list[str]:
 
     Args:
         points: Points of a report.
-        wish: The limits; problems without a limit of their unit take that of ``DEFAULTS``, or only the time's.
+        wish: The limits; a problem without a limit in its unit takes the limit of ``DEFAULTS``, or only the limit of
+            time.
     """
     lines: list[str] = []
     for problem in dict.fromkeys(point["problem"] for point in points):

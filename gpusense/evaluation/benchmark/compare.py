@@ -32,7 +32,7 @@ class Comparison:
         less_exact: Points with an error that grew, and points that no longer work.
         untimed: Number of points whose times are not comparable: another device or number of particles.
         compared: Number of points in both reports.
-        gone: Number of points of the old report that the new one lacks.
+        gone: Number of points that only the old report has.
         others: Scenes of one name whose map, scan or particles differ; their points are not compared.
     """
 

@@ -36,7 +36,7 @@ _ALONE = sys.getrefcount(_LIST[0])
 
 
 class Meter(Proxy):
-    """A backend that forwards every call to another one, counts bytes, sums seconds and records launches.
+    """A backend that forwards every call to another backend, counts bytes, sums seconds and records launches.
 
     Pass it to a model as ``backend=``. Seconds and launches are recorded between :meth:`begin` and :meth:`end` only.
     """

@@ -12,7 +12,7 @@ from gpusense.evaluation.benchmark.profiles import error_of, label, setting
 
 ALL = "all maps"
 NEEDS = {"ranges": "rays", "beam": "beam model", "field": "likelihood field"}
-# By need: its measures as (place in a point, cloud or "" for all, text, unit); the first one is that of its limit.
+# Measures of each need as (place in a point, cloud or "" for all, text, unit); the limit applies to the first.
 MODEL_MEASURES = {
     "rays": (
         (("ranges", "wrong_1"), "", "rays wrong by more than a cell", "share"),
@@ -55,7 +55,8 @@ class Row:
         device: Title of the device.
         scene: Name of the map; ``ALL`` for the worst error and the mean time of all.
         method, setting, precision, code: As in the reports.
-        seconds: Time of a call, a step or a match: of a processor its own time over all cores, of a GPU the least.
+        seconds: Time of a call, a step or a match: on a processor its CPU time over all cores, on a GPU the least
+            elapsed time.
         quartiles: Quartiles of the elapsed times [s]; geometric means over the maps.
         errors: By the text of the measure.
         units: Their units.
@@ -100,9 +101,11 @@ class Row:
         )  # fmt: skip
 
 
-def title_of(point: Mapping[str, Any], machine: Mapping[str, Any]) -> str:
+def title_of(point: Mapping[str, Any], machine: Mapping[str, Any], driver: str = "") -> str:
     """Name the device of a point: its library, and the processor with its cores or the GPU."""
     library = {"opencl": "OpenCL", "warp:cuda": "CUDA", "warp:cpu": "Warp"}
+    if driver.startswith("Intel"):
+        library["opencl"] = "Intel's OpenCL"
     prefix = next((name for name in ("warp:cuda", "warp:cpu", "opencl") if point["backend"].startswith(name)), "")
     if point["kind"] == "gpu":
         return f"{point['device']}, {library[prefix]}"
@@ -111,16 +114,24 @@ def title_of(point: Mapping[str, Any], machine: Mapping[str, Any]) -> str:
     return f"{cores} core{'s' * (cores > 1)} of an {machine['processor']}, {made}"
 
 
-def titles_of(points: Iterable[Mapping[str, Any]], machine: Mapping[str, Any]) -> dict[str, str]:
+def titles_of(
+    points: Iterable[Mapping[str, Any]], machine: Mapping[str, Any], devices: Iterable[Mapping[str, Any]] = ()
+) -> dict[str, str]:
     """Return a title for each device of some points, by its selection string; of equal titles, each names its device.
 
     Other implementations, whose selection string is ``"outside"``, have the title of the first processor.
+
+    Args:
+        points: The points of a report.
+        machine: Its machine.
+        devices: Its devices, whose drivers tell the OpenCL runtimes of one processor apart.
     """
+    drivers = {device["selection"]: device["driver"] for device in devices}
     first: dict[str, Mapping[str, Any]] = {}
     for point in points:
         first.setdefault(point["backend"], point)
     outside = first.pop("outside", None)
-    plain = {name: title_of(point, machine) for name, point in first.items()}
+    plain = {name: title_of(point, machine, drivers.get(name, "")) for name, point in first.items()}
     alike = list(plain.values())
     titles = {name: f"{title}, {name}" if alike.count(title) > 1 else title for name, title in plain.items()}
     if outside is not None:
@@ -141,7 +152,7 @@ def mean(numbers: Iterable[float]) -> float:
 
 
 def seconds_of(point: Mapping[str, Any]) -> float | None:
-    """Return the time of a point: the processor's own on a processor, the least elapsed one on a GPU."""
+    """Return the time of a point: CPU time on a processor, least elapsed time on a GPU."""
     name = "call_min_s" if point["kind"] == "gpu" else "processor_s"
     value = (point["time"] or {}).get(name)
     return float(value) if value else None
@@ -150,10 +161,10 @@ def seconds_of(point: Mapping[str, Any]) -> float | None:
 def model_rows(report: Mapping[str, Any]) -> list[Row]:
     """Return the rows of a report of ``gpusense bench``, for each map and for all together.
 
-    A method that failed in a scene has no row of it, nor of all maps. A scene where every method was left out, such as
-    one after the deadline of a quick run, does not count.
+    A method that failed in a scene has neither a row for it nor one for all maps. A scene where every method was left
+    out, such as one after the deadline of a quick run, does not count.
     """
-    titles, origin = titles_of(report["points"], report["machine"]), origin_of(report)
+    titles, origin = titles_of(report["points"], report["machine"], report.get("devices", ())), origin_of(report)
     groups: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
     everywhere: dict[tuple[str, ...], set[tuple[str, str]]] = {}
     for point in report["points"]:

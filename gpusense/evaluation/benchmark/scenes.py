@@ -39,7 +39,7 @@ RECORDED = {
 }
 """Recorded maps by the name of their scene: files below the folder in the variable GPUSENSE_DATA."""
 
-# Width and height of the generated maps [m], and those of a quick run.
+# Width and height of the generated maps, in full and in quick runs [m].
 _SIZES = {"building": (50.0, 50.0), "clutter": (50.0, 50.0)}
 _QUICK_SIZES = {"building": (20.0, 14.0), "clutter": (15.0, 15.0)}
 GENERATED = tuple(_SIZES)

@@ -44,7 +44,7 @@ def read_report(path: Path) -> dict[str, Any]:
 
 
 def _check_arguments(where: str, arguments: Mapping[str, Any]) -> None:
-    """Check the numbers that are defaults of the next run; None stands for the device's own.
+    """Check the numbers that are defaults of the next run; None means the default of the device.
 
     Raises:
         ValueError: one is something else, or out of its bounds.

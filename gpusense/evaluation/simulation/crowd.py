@@ -30,7 +30,7 @@ class _Person:
 
 
 class Crowd:
-    """People who come, walk and go.
+    """People who appear, walk and leave.
 
     Args:
         people: How many there are at any time, at most.

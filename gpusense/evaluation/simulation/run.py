@@ -102,7 +102,8 @@ def simulate_run(
     Args:
         grid: The map that the robot has.
         scanner: The geometry of its laser, mount and cones included.
-        scans: Number of scans T, at least 1; None for 200, or those of ``path``, of which it takes the first ones.
+        scans: Number of scans T, at least 1; None for 200 or, with ``path``, for all of its poses; a number takes its
+            first poses.
         world: The world as it is; None for the map with the changes below. A world that is another building makes
             ``grid`` a wrong map; the path is then planned in the world alone.
         path: (T, 3) true poses of the robot in place of a planned path [m, m, rad].
@@ -145,7 +146,7 @@ def simulate_run(
     room = checks.real("clearance", clearance, low=0)
     rates = checks.real("step", step, above=0), checks.real("turn", turn, above=0)
     _check_kinds(grid, scanner, world, parameters, motion)
-    # Each part has random numbers of its own: people do not change the odometry.
+    # Each part has a separate random stream: people do not change the odometry.
     streams = np.random.SeedSequence(checks.integer("seed", seed, low=0)).spawn(6)
     changing, driving, slipping, walking, reading, glazing = (np.random.default_rng(one) for one in streams)
     true = world

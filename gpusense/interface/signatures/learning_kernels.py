@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from gpusense.interface.constants import MIXTURE_TERMS
 from gpusense.interface.signatures.rows import Kernel, kernel
 
-# Readings and expected ranges to learn from, in blocks of one length.
-_PAIRS = ("real reading [blocks * readings]", "real expected [blocks * readings]")
+# Readings and expected ranges to learn from, in blocks of one length, and the mixture.
+_PAIRS = ("real reading [blocks * readings]", "real expected [blocks * readings]", f"real terms [{MIXTURE_TERMS}]")
 
 KERNELS: dict[str, Kernel] = {
     "e_step": kernel(
-        "learning", "block", *_PAIRS, "real terms [12]", "out real sums [blocks * width]", "int blocks", "int readings",
+        "learning", "block", *_PAIRS, "out real sums [blocks * width]", "int blocks", "int readings",
         "int across", "int along", "int width",
     ),
     "pair_causes": kernel(
-        "learning", "block", *_PAIRS, "real terms [12]", "out real4 causes [blocks * readings]", "int blocks",
+        "learning", "block", *_PAIRS, "out real4 causes [blocks * readings]", "int blocks",
         "int readings", "int across", "int along",
     ),
 }  # fmt: skip

@@ -14,12 +14,12 @@ KERNELS: dict[str, Kernel] = {
         "real2 point [readings]", "real2 point_low [readings]", "real terms [8]", "int start [scans + 1]",
         "real constant_terms [scans]", f"out real gradient [{GRADIENT_NUMBERS} * particles]", WINDOW,
         "int particles", "int readings", "real guard", "real mount_x", "real mount_y", "real resolution",
-        "Score score", "ScanBatch batch", wide=True,
+        "Score score", "ScanBatch batch", in_lanes=True,
     ),
     "fit_lines": kernel(
         "lines", "beam scan", *_POINTS, "int which [chosen]", "out real4 line [points]", "int scans", "int points",
-        "int chosen", "int reach", "int most", "real ratio", "real slack", "real width", "real gap", wide=True,
-        wide_group=8,
+        "int chosen", "int reach", "int most", "real ratio", "real slack", "real width", "real gap", in_lanes=True,
+        lanes_group=8,
     ),
     "match_scans": kernel(
         "icp", "item", *_POINTS, "real4 line [points]", "int2 pair [pairs]", "real4 guess [pairs * starts]",

@@ -7,11 +7,12 @@ from gpusense.interface.signatures.rows import Kernel, kernel
 _SETTINGS, _STATE = "double settings [64]", "double state [64]"
 _SCORE, _BEFORE = "double score [particles]", "double before [particles]"
 _LARGEST, _SUMS = "double largest [groups]", "double sums [17 * blocks]"
-# Work-items read numbers of others, so launches on a processor must not be cut: no axis is called particle or block.
+# Work-items read results of other work-items, so launches on a processor must not be split: no axis is named particle
+# or block.
 KERNELS: dict[str, Kernel] = {
     "move_particles": kernel(
         "motion", "pose", "double source [3 * particles]", _SETTINGS, "out double target [3 * particles]",
-        "int particles", "int kind", wide=True,
+        "int particles", "int kind", in_lanes=True,
     ),
     "add_scores": kernel(
         "weighing", "group", "real log_p [particles]", _SETTINGS, f"out {_SCORE}", "out double largest [particles]",
@@ -45,15 +46,15 @@ KERNELS: dict[str, Kernel] = {
     "draw_particles": kernel(
         "drawing", "pose", "double source [3 * particles]", "double weight [particles]", "double ends [particles]",
         "double copies [particles]", _SETTINGS, _STATE, "double pool [3]", "out double target [3 * drawn]",
-        "out double after [drawn]", "int particles", "int drawn", "int stage", wide=True,
+        "out double after [drawn]", "int particles", "int drawn", "int stage", in_lanes=True,
     ),
     "sum_poses": kernel(
         "estimate", "group", "double poses [3 * particles]", "double weight [particles]", "double estimate [11]",
-        "out double sums [13]", "int particles", "int block", "int lanes", "int again", group=16,
+        "out double sums [13]", "int particles", "int block", "int lanes", "int second_pass", group=16,
     ),
     "finish_estimate": kernel(
         "estimate", "whole", "double poses [3]", "double sums [13 * groups]", "out double estimate [11]", "int groups",
-        "int again", group=1,
+        "int second_pass", group=1,
     ),
     "normalize_weights": kernel(
         "estimate", "pose", "double weight [particles]", "double estimate [11]", "out double share [particles]",

@@ -16,7 +16,7 @@ KERNELS: dict[str, Kernel] = {
     "score_features": kernel(
         "landmark_score", "particle", *_LANDMARKS, _BUCKETS, *PLACED, *_FEATURES, "int partner [features]",
         *_MIXTURE, *_FEATURE_RESULT, "Buckets buckets", "int landmarks", "int particles", "int features",
-        "real share", "Score score", wide=True,
+        "real share", "Score score", in_lanes=True,
     ),
     "joint_features": kernel(
         "landmark_joint", "particle", *_LANDMARKS, *PLACED, *_FEATURES, *_MIXTURE,
@@ -27,7 +27,7 @@ KERNELS: dict[str, Kernel] = {
     "count_unseen": kernel(
         "landmark_unseen", "particle", "real4 landmark [landmarks]", _BUCKETS, *PLACED,
         "int which [particles * features]", "out real log_p [particles]", "Buckets buckets", "int particles",
-        "int features", "SensorView view", wide_group=16,
+        "int features", "SensorView view", in_lanes=True,
     ),
     "place_relative": kernel(
         "relative", "particle", "coordinate poses [particles * 3]", "out real4 place [particles]",
@@ -49,12 +49,12 @@ KERNELS: dict[str, Kernel] = {
     "score_beacons": kernel(
         "beacons", "particle", "real4 place [particles]", "real beacon [7 * beacons]", "real terms [12]",
         "real series [count]", "out real log_p [particles]", "int particles", "int beacons", "int count", "int kind",
-        "real temperature", wide=True,
+        "real temperature", in_lanes=True,
     ),
     "score_contact": kernel(
         "contact", "particle", "int table [(window.rows + 4) * (window.cols + 4)]", *PLACED,
         "real2 point [points]", "real2 point_low [points]", "int start [segments + 1]", "int pressed [segments]",
         "real terms [10]", "out real log_p [particles]", WINDOW, "int particles", "int segments",
-        "real guard", "real temperature", wide=True,
+        "real guard", "real temperature", in_lanes=True,
     ),
 }  # fmt: skip

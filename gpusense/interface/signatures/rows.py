@@ -1,4 +1,4 @@
-"""Arguments and launch shapes of kernels, and what rows of several kinds of kernel share."""
+"""Arguments and launch shapes of kernels, and arguments that several rows share."""
 
 from __future__ import annotations
 
@@ -67,20 +67,20 @@ class Argument:
 
 @dataclass(frozen=True)
 class Kernel:
-    """A kernel: the concept (file) it belongs to, what one work-item is, its arguments, and its work-group size.
+    """A kernel: its concept (file), the object that a work-item takes, its arguments, and its work-group size.
 
     A global size's first axis is rounded up to whole groups; the heavier a work-item, the smaller its group. Where a
-    kernel is compiled for several lanes (WIDE), its groups have ``wide_group`` work-items, and with ``wide`` each of
-    them takes as many neighbours of the first axis as there are lanes. ``apart`` says that no two of its arrays share
-    memory, so a compiler need not read arguments again after a write.
+    kernel is compiled with IN_LANES, its groups have ``lanes_group`` work-items, and with ``in_lanes`` each of them
+    takes as many neighbours of the first axis as there are lanes. ``apart`` says that no two of its arrays share
+    memory, so a compiler need not reload arguments after a write.
     """
 
     file: str
     launch: tuple[str, ...]
     arguments: tuple[Argument, ...]
     group: int
-    wide: bool = False
-    wide_group: int = 1
+    in_lanes: bool = False
+    lanes_group: int = 1
     apart: bool = False
 
 
@@ -90,7 +90,7 @@ LANES = 16
 
 def lanes_of(flags: frozenset[str]) -> int:
     """How many particles or beams a work-item computes at once."""
-    return LANES if "WIDE" in flags else 1
+    return LANES if "IN_LANES" in flags else 1
 
 
 def kernel(
@@ -98,8 +98,8 @@ def kernel(
     launch: str,
     *rows: str,
     group: int = 64,
-    wide: bool = False,
-    wide_group: int = 1,
+    in_lanes: bool = False,
+    lanes_group: int = 1,
     apart: bool = False,
 ) -> Kernel:
     """Return the kernel whose arguments are rows such as ``"out real parts [particles * features]"``."""
@@ -108,7 +108,7 @@ def kernel(
         head, _, shape = row.partition("[")
         *output, kind, name = head.split()
         arguments.append(Argument(name, kind, shape.rstrip("]") if shape else None, output == ["out"]))
-    return Kernel(file, tuple(launch.split()), tuple(arguments), group, wide, wide_group, apart)
+    return Kernel(file, tuple(launch.split()), tuple(arguments), group, in_lanes, lanes_group, apart)
 
 
 WINDOW = "Window window"

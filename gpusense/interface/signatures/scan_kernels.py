@@ -8,7 +8,7 @@ from gpusense.interface.signatures.rows import PLACED, POSES, WINDOW, Kernel, ke
 # Normals of the map's walls and of a ring of cells around it; not read without INCIDENCE.
 _NORMALS = ("real2 normals [(window.rows + 2) * (window.cols + 2)]",)
 _CONES = "real2 ray [rays * cone.rays]"
-# A map as a caster has it: what an entry is, and how many there are, is the caster's.
+# A map's table for a caster, which defines its entries and their number.
 _CAST = ("entry map_table [map]",)
 _CASTING = ("Caster caster", "RangeScale scale")
 # Poses on their way into a window of the grid.
@@ -29,7 +29,7 @@ _SCORE = ("Score score", "ScanBatch batch")
 _FIELD_TABLE = "real table [(window.rows + 4) * (window.cols + 4)]"
 
 KERNELS: dict[str, Kernel] = {
-    "place_poses": kernel("placement", "particle", *_GIVEN, *_FRAME, wide=True),
+    "place_poses": kernel("placement", "particle", *_GIVEN, *_FRAME, in_lanes=True),
     "place_inputs": kernel(
         "scan", "item", *_GIVEN, "measured ranges [scan]", "int beam [beams]", "double vector [2 * each * beams]",
         "out real2 point [places * each]", "out real2 point_low [places]", "out real reading [places]",
@@ -37,12 +37,12 @@ KERNELS: dict[str, Kernel] = {
     ),
     "cast_ranges": kernel(
         "ranges", "ray particle", *_CAST, *POSES, "real2 ray [rays]", "out real ranges [particles * rays]", WINDOW,
-        "int particles", "int rays", *_CASTING, wide=True,
+        "int particles", "int rays", *_CASTING, in_lanes=True, lanes_group=8,
     ),
     "score_beams": kernel(
         "beam", "particle", *_CAST, *_NORMALS, *POSES, _CONES, "int first [rays + 1]", "real reading [readings]",
         *_TERMS, *_SCANS, *_RESULT, WINDOW, "int particles", "int rays", "int readings", "MixtureTables tables",
-        "Cone cone", *_CASTING, *_SCORE, wide_group=16,
+        "Cone cone", *_CASTING, *_SCORE, lanes_group=16,
     ),
     "cast_tiles": kernel(
         "ranges", "item", *_CAST, *POSES, "int order [particles]", "real2 ray [rays]",
@@ -90,6 +90,6 @@ KERNELS: dict[str, Kernel] = {
     ),
     "score_field": kernel(
         "field", "particle", _FIELD_TABLE, *PLACED, *_POINTS, *_SCANS, *_RESULT, WINDOW, "int particles",
-        "int readings", "real guard", *_SCORE, wide=True,
+        "int readings", "real guard", *_SCORE, in_lanes=True,
     ),
 }  # fmt: skip

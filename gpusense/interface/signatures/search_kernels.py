@@ -20,7 +20,7 @@ KERNELS: dict[str, Kernel] = {
     ),
     "shift_scores": kernel(
         "search", "col row item", _CELLS, *_POINTS, "out int score [items * height * width]", "ScoreTable scores",
-        "int items", "int height", "int width", wide=True,
+        "int items", "int height", "int width", in_lanes=True,
     ),
     "candidate_scores": kernel(
         "search", "candidate", _CELLS, *_POINTS, "int candidate [3 * candidates]", "out int score [candidates]",

@@ -1,8 +1,8 @@
 """Scatter of the likelihood's gradient over blocks of readings, for standard errors of correlated readings.
 
 Errors within a scan and between neighbouring scans are correlated. The inverse of the observed information H then is
-not the covariance of the parameters. With G_b the gradient of the log-likelihood of block b, and blocks independent of
-each other, it is
+not the covariance of the parameters. With G_b the gradient of the log-likelihood of block b, and independent blocks, it
+is
 
     H^-1 (sum_b G_b G_b') H^-1,
 
@@ -21,8 +21,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
 from gpusense.learning.beam.pairs import Pairs
-from gpusense.learning.beam.point import BIAS, HIT, MAX, RAND, RATE, SHORT, SIGMA, Floats, Point
+from gpusense.learning.beam.point import BIAS, FORM, HIT, MAX, RAND, RATE, SHORT, SIGMA, Floats, Point
 from gpusense.learning.beam.problem import Problem
+from gpusense.learning.point.densities import by_shape, truncated
+from gpusense.world.range_causes import ShortDensity
 from gpusense.world.scanner import Reading
 
 # Readings whose gradients are computed at once.
@@ -55,26 +57,26 @@ def count_blocks(pairs: Pairs) -> int:
 
 
 def block_scatter(problem: Problem, point: Point) -> Floats:
-    """Compute the (7, 7) scatter over blocks of the log-likelihood's gradient by the coordinates.
+    """Compute the scatter over blocks of the log-likelihood's gradient by the coordinates.
 
     The scatter is NaN for fewer than 2 blocks.
     """
     sums, counts = block_gradients(problem, point)
     blocks = int(np.count_nonzero(counts))
     if blocks < 2:
-        return np.full((7, 7), math.nan)
+        return np.full((sums.shape[1],) * 2, math.nan)
     off = sums[counts > 0] - sums.sum(axis=0) / blocks
     return (off.T @ off) * (blocks / (blocks - 1))
 
 
 def block_gradients(problem: Problem, point: Point) -> tuple[Floats, NDArray[np.intp]]:
-    """Return the (B, 7) gradient of each block's log-likelihood and the (B,) numbers of readings."""
+    """Return the gradient, a row for each block's log-likelihood, and the (B,) numbers of readings."""
     pairs = problem.pairs
     assert pairs.block is not None
     size = int(pairs.block.max(initial=-1)) + 1
     of_hits, of_max = pairs.block[pairs.places], pairs.block[pairs.kinds == Reading.MAX]
     counts = np.bincount(of_hits, minlength=size) + np.bincount(of_max, minlength=size)
-    sums = np.zeros((size, 7))
+    sums = np.zeros((size, FORM + len(point.shape.limits)))
     sums[:, MAX] = np.bincount(of_max, minlength=size)
     sums[:, : RAND + 1] -= counts[:, None] * point.weights
     causes = problem.device.causes(point)
@@ -97,19 +99,15 @@ def _terms(z: Floats, expected: Floats, parts: Floats, point: Point, range_max: 
         point: The parameters.
         range_max: Longest range [m].
     """
-    from scipy.special import ndtr
-
     hit, short, rand = parts.T
-    mean = np.clip(expected + point.bias, 0, range_max)
-    u, x_0, x_1 = (z - mean) / point.sigma, mean / point.sigma, (range_max - mean) / point.sigma
-    phi_0, phi_1 = (np.exp(-0.5 * x * x) / math.sqrt(2 * math.pi) for x in (x_0, x_1))
-    mass = ndtr(x_1) - ndtr(-x_0)
-    by_sigma = u * u - 1 + (x_0 * phi_0 + x_1 * phi_1) / mass
-    by_bias = np.where(mean == expected + point.bias, u + (phi_1 - phi_0) / mass, 0) / point.sigma
-    x = np.clip(point.rate * expected, 1e-9, 700.0)
-    by_rate = 1 - x / np.expm1(x) - point.rate * z
+    shape, mean = point.shape, np.clip(expected + point.bias, 0, range_max)
+    _, by_sigma, by_mean = truncated(z - mean, mean, range_max, point.sigma, shape)
+    by_bias = np.where(mean == expected + point.bias, by_mean, 0)
+    ends = (z - mean) / point.sigma, mean / point.sigma, (range_max - mean) / point.sigma
+    by_form = by_shape(*ends, shape.coordinates, shape.at, shape.limits)
+    by_rate = ShortDensity(point.rate).by_log_rate(z, expected)
     return {
         HIT: hit, SHORT: short, RAND: rand,
         SIGMA: np.where(hit > 0, hit * by_sigma, 0.0), BIAS: np.where(hit > 0, hit * by_bias, 0.0),
         RATE: np.where(short > 0, short * by_rate, 0.0),
-    }  # fmt: skip
+    } | {FORM + place: np.where(hit > 0, hit * each, 0.0) for place, each in enumerate(by_form)}  # fmt: skip

@@ -13,17 +13,17 @@ from gpusense.backends import Backend
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.signatures import LANES
-from gpusense.interface.terms import log_weight, rounded_terms
 from gpusense.learning.beam.pairs import Pairs
 from gpusense.learning.beam.point import Point
+from gpusense.models.scan.mixture import learning_terms
 
 # Length of a row of sums, without and with second derivatives; see kernels/opencl/learning.cl.
-_SUMS = {False: 14, True: 40}
+_SUMS = {False: 13, True: 39}
 # Most blocks per pass, fewest pairs per block, and most pairs in one buffer.
 _BLOCKS = {"cpu": 4096, "gpu": 32768}
 _SHORTEST = 16
 _CHUNK = 1 << 26
-_FLAGS = frozenset({"HIT", "SHORT", "RAND"})
+_FLAGS = frozenset({"HIT", "SHORT", "RAND", "BIAS"})
 
 
 @dataclass(frozen=True)
@@ -95,19 +95,18 @@ class DeviceSums:
         z, z_expected = (self._backend.upload(np.ascontiguousarray(row)) for row in padded)
         return _Chunk(z, z_expected, count, blocks, length, across, along)
 
+    def of(self, pairs: Pairs) -> DeviceSums:
+        """Return the sums over other pairs on the same device."""
+        return DeviceSums(self._backend, self.real, pairs)
+
     @property
     def selection(self) -> str:
         """The text that selects the device."""
         return self._backend.info.selection
 
     def terms(self, point: Point) -> NDArray[np.floating]:
-        """Return the (12,) terms of the kernels for a set of parameters."""
-        hit, short, top, rand = point.weights
-        log_scale = log_weight(hit) - math.log(point.sigma) - 0.5 * math.log(2 * math.pi)
-        shape = (0.5 / point.sigma / point.sigma, math.sqrt(0.5) / point.sigma)
-        heads = (log_weight(short), point.rate, log_weight(rand) - math.log(self._range_max))
-        terms = rounded_terms([log_scale, *shape, *heads, self._range_max, log_weight(top)], self.real)
-        return np.append(terms, np.array([point.bias, 1 / point.sigma]).astype(self.real))
+        """Return the terms of the kernels for a set of parameters."""
+        return learning_terms(point.parameters(), self._range_max, self.real)
 
     def sums(self, point: Point, *, information: bool = False) -> NDArray[np.float64]:
         """Sum over the hits, in a fixed order of addition.
@@ -117,10 +116,10 @@ class DeviceSums:
             information: Whether to also sum the terms of second derivatives.
 
         Returns:
-            (14,) or, with second derivatives, (40,) float64.
+            (13,) or, with second derivatives, (39,) float64.
         """
         width = _SUMS[information]
-        flags = self._flags | flags_if(INFORMATION=information)
+        flags = self._flags | point.shape.flags | flags_if(INFORMATION=information)
         total = np.zeros(width)
         self.passes += 1
         if not self._chunks:
@@ -143,7 +142,7 @@ class DeviceSums:
         terms = backend.upload(self.terms(point)) if self._chunks else None
         for chunk in self._chunks:
             out = backend.empty(4 * chunk.blocks * chunk.readings, self.real)
-            launch = backend.compile("pair_causes", self._flags)
+            launch = backend.compile("pair_causes", self._flags | point.shape.flags)
             launch((chunk.blocks,), chunk.reading, chunk.expected, terms, out, *chunk.layout)
             rows.append(backend.download(out, np.empty((chunk.count, 4), self.real)).astype(np.float64))
         return np.concatenate(rows)

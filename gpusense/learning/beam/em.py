@@ -3,12 +3,14 @@
 The book's M-step (table 6.2, lines 14 and 15) ignores that p_hit is truncated to [0, range_max] and p_short to [0, z*].
 It does not maximise the likelihood, which may fall. The exact M-step solves, for the responsibilities r,
 
-    sum r u^2 = sum r E[u^2]            sigma_hit: squares are as large as a truncated normal's, E[u^2] = 1 - T
+    sum r W u^2 = sum r (1 - T)         sigma_hit: weighted squares are as large as those of a truncated hit
     lambda sum r z = sum r (1 - v)      lambda_short: lengths are as large as a truncated exponential's
 
-(T, v: see ``gpusense.reference.learning``). The logarithms of both sides are nearly linear in log sigma and log lambda,
-so one Newton step of their difference is a good solution; without truncation it is exact and equals the book's. The
-step is halved until the log-likelihood does not fall: a generalised EM (Dempster, Laird and Rubin 1977, theorem 1).
+(W, T, v: see ``gpusense.reference.learning``). W is 1 for a normal. For Student's t it is the expected inverse variance
+of a reading that is normal with a random variance, the weight of its EM (Lange, Little and Taylor 1989). The logarithms
+of both sides are nearly linear in log sigma and log lambda, so one Newton step of their difference is a good solution;
+without truncation it is exact and equals the book's. The step is halved until the log-likelihood does not fall: a
+generalised EM (Dempster, Laird and Rubin 1977, theorem 1).
 
 EM is slow if causes are hard to distinguish. The same pass over the pairs yields the observed information, so that a
 Newton step of the log-likelihood itself is tried once EM gains little. It is accepted if the log-likelihood rises.
@@ -22,8 +24,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gpusense.learning.beam.point import BIAS, HIT, RATE, SHORT, SIGMA, Floats, Point
-from gpusense.learning.beam.problem import NOTHING, Problem, Value
+from gpusense.learning.beam.point import BIAS, FORM, HIT, RATE, SHORT, SIGMA, Floats, Point
+from gpusense.learning.beam.problem import NOTHING, SMALL_FORM, Problem, Value
 
 # Longest step of a log shape.
 _LONGEST = 2.0
@@ -59,20 +61,25 @@ def climb_em(problem: Problem, start: Point, *, max_iterations: int, tolerance: 
     """Climb until the remaining gain, estimated from the information matrix, is at most ``tolerance`` nats."""
     value = problem.value(start)
     trace = [value.objective]
-    newton, still = False, 0
+    # EM leaves the shape of hits as it is: Newton steps alone, as long as they gain.
+    has_form = bool(start.shape.limits)
+    newton, gains, still = has_form, False, 0
     for iteration in range(1, max_iterations + 1):
         before = value.objective
-        value = em_step(problem, value, second=newton)
+        if not (has_form and gains):
+            value = em_step(problem, value, second=newton)
         value = without_needless(problem, value)
         newton |= value.objective - before < _LITTLE or iteration >= _MANY
         left = math.inf
         if newton:
             if value.hessian is None:
                 value = problem.value(value.point, second=True)
+            old = value.objective
             value, left = newton_step(problem, value)
+            gains = value.objective - old > problem.noise(value)
         trace.append(value.objective)
         watch(iteration, value)
-        if left <= tolerance:
+        if left <= max(tolerance, problem.blur(value)):
             return Climb(value, trace, True)
         still = still + 1 if value.objective - before <= problem.noise(value) else 0
         if still == _STILL:
@@ -98,22 +105,22 @@ def _shaped(problem: Problem, point: Point, weights: Floats, step: Floats) -> Po
 
 
 def m_step(problem: Problem, value: Value) -> Floats:
-    """Compute the (7,) M-step of the shapes; a shape whose cause accounts for no reading stays."""
+    """Compute the M-step of sigma, rate and offset; a shape whose cause accounts for no reading stays."""
     sums, point, prior = value.sums, value.point, problem.prior
     free = problem.free(value)
-    step = np.zeros(7)
+    step = np.zeros(FORM + len(point.shape.limits))
     pseudo, pseudo_squares = prior.of_hits(point)
     if value.totals[HIT] > NOTHING:
-        squares = (sums[11] - 2 * point.bias * sums[12] + point.bias**2 * sums[1]) / point.sigma**2
+        squares = float(sums[11])
         likely = squares - sums[4]
         slope = -2 * squares - sums[7]
         step[SIGMA] = _log_step(squares + pseudo_squares, likely + pseudo, 2 + slope / max(likely + pseudo, 1e-300))
-        curve = sums[9] - pseudo
+        curve = sums[9] + prior.curve_of_bias(point) * point.sigma**2
         if free[BIAS] and curve < 0:
             step[BIAS] = -value.gradient[BIAS] * point.sigma**2 / curve
     if free[RATE] or value.totals[SHORT] > NOTHING:
         count = float(prior.counts[SHORT])
-        lengths = point.rate * sums[13]
+        lengths = point.rate * sums[12]
         likely = sums[6] + lengths
         slope = sums[10] + lengths
         step[RATE] = _log_step(
@@ -139,10 +146,11 @@ def newton_step(problem: Problem, value: Value) -> tuple[Value, float]:
     step, left = newton_direction(problem, value)
     if left <= 0:
         return value, 0.0
-    longest = float(np.abs(step[: RATE + 1]).max())
+    form = step[FORM:] / np.maximum(value.point.shape.coordinates, SMALL_FORM)
+    longest = float(np.abs(np.append(step[: RATE + 1], form)).max())
     scale = min(1.0, _LONGEST / max(longest, 1e-300))
     # Near the optimum the step is right even though its gain is less than rounding.
-    least = value.objective - (problem.noise(value) if left < _NEAR else 0.0)
+    least = value.objective - (problem.noise(value) if left < max(_NEAR, problem.blur(value)) else 0.0)
     for _ in range(5):
         candidate = problem.value(value.point.moved(scale * step, problem.bounds), second=True)
         if candidate.objective > least:
@@ -152,13 +160,13 @@ def newton_step(problem: Problem, value: Value) -> tuple[Value, float]:
 
 
 def newton_direction(problem: Problem, value: Value) -> tuple[Floats, float]:
-    """Return the (7,) Newton step, uphill even if the objective is not concave, and its predicted gain [nats].
+    """Return the Newton step, uphill even if the objective is not concave, and its predicted gain [nats].
 
     The gain is half the slope along the step.
     """
     assert value.hessian is not None
-    places = np.flatnonzero(problem.free(value))
-    step = np.zeros(7)
+    free = problem.free(value)
+    places, step = np.flatnonzero(free), np.zeros(len(free))
     if not len(places):
         return step, 0.0
     curve = -value.hessian[np.ix_(places, places)]

@@ -16,7 +16,6 @@ from gpusense._util.progress import progress as progress_bar
 from gpusense._util.typing import FitMethod, Precision
 from gpusense.backends import Selection
 from gpusense.learning.beam.blocks import check_blocks
-from gpusense.learning.beam.book import textbook_em
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.em import Climb, Watch, climb_em
 from gpusense.learning.beam.growth import fit_jointly
@@ -28,6 +27,8 @@ from gpusense.learning.beam.problem import NO_PRIOR, Prior, Problem, Value
 from gpusense.learning.beam.report import report
 from gpusense.learning.beam.result import BeamFit
 from gpusense.learning.beam.searches import climb_genetic, climb_gradient, climb_hill
+from gpusense.learning.beam.shapes import fit_shape
+from gpusense.learning.beam.textbook import textbook_em
 from gpusense.world.hit_shapes import SHAPES, HitName
 from gpusense.world.parameters import BeamParameters
 
@@ -58,8 +59,8 @@ def fit_beam_parameters(
 ) -> BeamFit:
     """Fit the parameters of the beam model by maximum likelihood (book section 6.3.3, table 6.2).
 
-    Readings are classified as by :func:`gpusense.classify`: missing ones are left out, "no return" has probability
-    z_max, all others have the mixture's density. The device computes the sums over all pairs.
+    Readings are classified as by :func:`gpusense.classify`: missing readings are left out, "no return" has probability
+    z_max, and ranges have the mixture's density. The device computes the sums over all pairs.
 
     Args:
         ranges: Readings z of any shape [m].
@@ -73,7 +74,8 @@ def fit_beam_parameters(
             out; shapes beyond their bounds are clamped. The status says if a start from the readings is better.
         backend: The device, see :func:`gpusense.devices`.
         precision: ``"float64"`` or ``"float32"``; None is float64 if the device has it.
-        max_iterations: Most iterations of the method; None is 500 of EM, 60 of the book's, 1000 of the others.
+        max_iterations: Most iterations of the method; None is 500 for ``"em"``, 60 for ``"em-book"``, 1000 for the
+            rest.
         tolerance: The method has converged once it expects to gain less than ``tolerance`` [nats].
         restarts: Number of additional random starts; the best result is returned.
         seed: Seed of the random starts and of ``"genetic"``.
@@ -82,10 +84,10 @@ def fit_beam_parameters(
         sigma_growth: Whether the deviation of correct ranges also grows with range: it is sigma_hit + sigma_growth z*.
             All parameters are then fitted together on the host, from the fit without growth.
         hit: Shape of correct ranges: ``"normal"``, or ``"student"``, a Student t whose degrees of freedom ``hit_dof``
-            are also fitted. All parameters are then fitted together on the host, from the fit with a normal.
+            are also fitted. All parameters are then fitted together by EM and Newton steps, from the fit with a normal.
         responsibilities: Whether to also return each reading's probabilities of the four causes.
         blocks: Integer label of each reading's block, of the same shape, or None. Readings of different blocks are
-            independent; those of one block (a scan, or several neighbouring ones) need not be. Standard errors are
+            independent; readings of one block (a scan, or several neighbouring scans) need not be. Standard errors are
             then computed over blocks.
         sigma_bounds: Smallest and largest sigma_hit [m]. None is from the step that readings are rounded to, divided by
             sqrt(12), or else 1e-6 range_max, to range_max.
@@ -127,8 +129,8 @@ def fit_beam_parameters(
     device = DeviceSums(*open_device(backend, precision), pairs)
     start = first_guess(pairs, bounds) if initial is None else start_of(initial, pairs, bounds)
     fit = fit_pairs(device, pairs, bounds, start, options, chosen=initial is not None)
-    if not sigma_growth and hit == "normal":
-        return fit
+    if not sigma_growth:
+        return fit if hit == "normal" else fit_shape(fit, device, pairs, bounds, options, hit)
     return fit_jointly(
         fit, pairs, bounds, options.tolerance, options.responsibilities, growth=bool(sigma_growth), hit=hit
     )
@@ -178,7 +180,7 @@ def fit_pairs(
 
 def _climb(options: Options, problem: Problem, start: Point, watch: Watch) -> Climb:
     settings = {"max_iterations": options.max_iterations, "tolerance": options.tolerance, "watch": watch}
-    match options.method:
+    match "em" if start.shape.limits else options.method:
         case "em":
             return climb_em(problem, start, **settings)  # type: ignore[arg-type]
         case "em-book":

@@ -1,6 +1,6 @@
-"""Fit the growth of the deviation with range, or another shape of hits, together with all other parameters.
+"""Fit the growth of the deviation with range, together with all other parameters and the shape of hits.
 
-A correct range has the scale ``sigma_hit + sigma_growth z*``. The device's sums have one deviation and normal hits, so
+A correct range has the scale ``sigma_hit + sigma_growth z*``. The device's sums have one deviation, so
 that this search computes every pair's log p and gradient on the host in NumPy, in float64: Newton steps within bounds
 from the normal fit without growth, with shares of its deviation turned into growth, and with the starts of the shape.
 No step lowers the likelihood.
@@ -18,21 +18,21 @@ from numpy.typing import NDArray
 from gpusense.learning.beam.pairs import Pairs
 from gpusense.learning.beam.point import Bounds, Floats
 from gpusense.learning.beam.result import BeamFit
-from gpusense.learning.point.densities import truncated
+from gpusense.learning.beam.shapes import without_ranges
+from gpusense.learning.point.densities import by_shape, truncated
 from gpusense.learning.point.problem import Problem, mix, of_weight
 from gpusense.learning.point.report import report
 from gpusense.learning.point.search import Climb, climb, maximize
 from gpusense.world.hit_shapes import SHAPES, HitName, HitShape
 from gpusense.world.hit_tables import TabulatedHit
 from gpusense.world.parameters import BeamParameters
+from gpusense.world.range_causes import NoReturn, RandomDensity, ShortDensity
 from gpusense.world.scanner import Reading
 
 # Shares of the deviation at the mean expected range that starts turn into growth; iterations of a search.
 _SHARES, _ITERATIONS = (0.02, 0.3, 0.7, 0.95), 200
 # Readings from which on a table of masses is faster than the formula.
 _MANY = 2000
-# Share of a coordinate of the shape by which its derivative is taken.
-_SHAPE_STEP = 1e-4
 _TOP, _RAND, _SHORT, _SIGMA, _GROWTH, _RATE, _BIAS = range(7)
 
 
@@ -96,16 +96,14 @@ class _Growing(Problem):
         """Return weights and densities of hit, short and rand, and the derivatives by the shapes."""
         z, expected = self.reading, self.expected
         sigma = math.exp(theta[_SIGMA]) + theta[_GROWTH] * expected
-        rate = math.exp(theta[_RATE])
+        obstacle = ShortDensity(math.exp(theta[_RATE]))
         moved = expected + (theta[_BIAS] if self.fit_bias else 0.0)
         mean = np.clip(moved, 0, self.range_max)
         hit = truncated(z - mean, mean, self.range_max, sigma, self._shape_of(self._shape_at(theta)))
-        x = np.clip(rate * expected, 1e-12, 700.0)
-        log_short = np.where(z <= expected, theta[_RATE] - rate * z - np.log(-np.expm1(-x)), -np.inf)
-        by_rate = 1 - x / np.expm1(x) - rate * z
+        log_short, by_rate = obstacle.log_pdf(z, expected), obstacle.by_log_rate(z, expected)
         rand, short = theta[_RAND], theta[_SHORT]
         weights = ((1 - rand) * (1 - short), (1 - rand) * short, rand)
-        densities = hit[0], log_short, np.full(len(z), -math.log(self.range_max))
+        densities = hit[0], log_short, np.full(len(z), RandomDensity(self.range_max).log_peak(1.0))
         return list(zip(weights, densities, strict=True)), hit, by_rate, np.where(mean == moved, 1.0, 0.0)
 
     def log_p(self, theta: Floats) -> tuple[Floats, Floats]:
@@ -126,25 +124,13 @@ class _Growing(Problem):
         gradient = np.where(self.none[:, None], 0.0, np.stack(columns, axis=1))
         gradient[self.none, _TOP] = 1 / max(top, 1e-300)
         with np.errstate(divide="ignore"):
-            return np.where(self.none, np.log(top), log_p + np.log1p(-top)), gradient
+            return np.where(self.none, NoReturn(top).log_mass, log_p + np.log1p(-top)), gradient
 
     def _by_shape(self, theta: Floats) -> list[Floats]:
         """Return the derivatives of the log density of hits by the coordinates of the shape, as differences."""
-        columns: list[Floats] = []
-        if not self.kind.limits:
-            return columns
         sigma, mean, u = self._hits_at(theta)
-        for place, (low, high) in enumerate(self.kind.limits):
-            at = self._shape_at(theta)
-            step = _SHAPE_STEP * min(at[place], 1.0)
-            ends = [np.where(np.arange(len(at)) == place, np.clip(at + each, low, high), at) for each in (-step, step)]
-            before, after = (
-                shape.log_pdf(u)
-                - np.log(shape.half_mass(mean / sigma) + shape.half_mass((self.range_max - mean) / sigma))
-                for shape in map(self._shape_of, ends)
-            )
-            columns.append((after - before) / (ends[1][place] - ends[0][place]))
-        return columns
+        ends = mean / sigma, (self.range_max - mean) / sigma
+        return by_shape(u, *ends, self._shape_at(theta), self._shape_of, self.kind.limits)
 
     def _hits_at(self, theta: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the scale and the mean of hits, and the distances of readings from it in scales."""
@@ -182,7 +168,7 @@ def fit_jointly(
     growth: bool,
     hit: HitName,
 ) -> BeamFit:
-    """Fit the growth of the deviation or the shape of hits as well, from a normal fit without growth.
+    """Fit the growth of the deviation, and the shape of hits, from a normal fit without growth.
 
     Args:
         fit: The fit.
@@ -195,11 +181,7 @@ def fit_jointly(
     """
     new = ("sigma_growth",) * growth + SHAPES[hit].fitted
     if not pairs.hits or not pairs.expected.any():
-        reason = "no range determines it"
-        return replace(
-            fit, parameters=fit.parameters.replace(hit=hit), status=f"{fit.status}; {', '.join(new)}: {reason}",
-            held=fit.held | dict.fromkeys(new, reason),
-        )  # fmt: skip
+        return without_ranges(fit, hit, growth)
     known = pairs.kinds != Reading.MISSING
     reading, expected = np.zeros(len(known)), np.full(len(known), 0.5 * pairs.range_max)
     reading[pairs.places], expected[pairs.places] = pairs.reading, pairs.expected

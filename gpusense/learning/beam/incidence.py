@@ -23,6 +23,8 @@ from gpusense.learning.beam.options import Callback, check_options, make_bounds,
 from gpusense.learning.beam.pairs import Pairs, make_pairs
 from gpusense.learning.beam.point import first_guess
 from gpusense.learning.beam.result import BeamFit
+from gpusense.learning.beam.shapes import fit_shape
+from gpusense.world.hit_shapes import SHAPES, HitName
 from gpusense.world.parameters import BeamParameters, IncidenceParameters
 from gpusense.world.scanner import Reading
 
@@ -141,6 +143,7 @@ def fit_incidence_parameters(
     restarts: int = 0,
     seed: int = 0,
     range_bias: bool = False,
+    hit: HitName = "normal",
     blocks: ArrayLike | None = None,
     sigma_bounds: tuple[float, float] | None = None,
     lambda_bounds: tuple[float, float] | None = None,
@@ -177,6 +180,7 @@ def fit_incidence_parameters(
         restarts: Number of additional random starts of each fit.
         seed: Seed of the random starts.
         range_bias: Whether to also fit an offset of correct ranges in each bin.
+        hit: Shape of correct ranges, the same in all bins.
         blocks: Integer label of each reading's block, for standard errors of correlated readings.
         sigma_bounds: Smallest and largest sigma_hit [m].
         lambda_bounds: Smallest and largest lambda_short [1/m].
@@ -210,6 +214,7 @@ def fit_incidence_parameters(
     options = check_options(
         method, max_iterations, tolerance, restarts, seed, range_bias, progress, callback, responsibilities=False
     )
+    checks.choice("hit", hit, tuple(SHAPES))
     surface = ~np.isnan(angles)
     if not ((pairs.kinds != Reading.MISSING) & surface).any():
         raise ValueError("incidence: some reading that is not missing must have an angle, got NaN beside all")
@@ -221,6 +226,8 @@ def fit_incidence_parameters(
     start = first_guess(surfaces, bounds) if initial is None else start_of(initial, surfaces, bounds)
     sums = DeviceSums(*device, surfaces)
     pooled = fit_pairs(sums, surfaces, bounds, start, options, chosen=initial is not None)
+    if hit != "normal":
+        pooled = fit_shape(pooled, sums, surfaces, bounds, options, hit)
     binned = Binned(device, bounds, options, pooled, strength)
     fits, counts = binned.fit_bins(pairs, surface, angles, edges)
     no_surface, no_surface_count = binned.fit_no_surface(pairs.subset(~surface))

@@ -34,7 +34,7 @@ class Binned:
         self._device, self._bounds, self._options, self._strength = device, bounds, options, strength
         self._start = Point.of(pooled.parameters)
         start = self._start
-        self._prior = Prior(strength * start.weights, start.sigma, start.rate, start.bias)
+        self._prior = Prior(strength * start.weights, start.sigma, start.rate, start.bias, start.shape)
 
     def fit_bins(
         self, pairs: Pairs, surface: NDArray[np.bool_], angles: NDArray[np.float64], edges: NDArray[np.float64]

@@ -3,7 +3,7 @@
 A search may end at a maximum that is not the highest, or drive the weight of a cause to 0, from where no small step
 leads back. Three checks follow each search that begins at a start of our choice:
 
-- A start that a search did not use, but whose likelihood is higher than the end of the search, is climbed from.
+- A start that was not used, but whose likelihood exceeds the search's end, begins another search.
 - A cause of weight 0 is given the weight of a hundredth of a reading, with each shape of a coarse list. If it then
   accounts for more than this, the likelihood rises with its weight (it is concave in the weight), and the search
   continues with this cause: the condition of optimality of Lindsay (1983) for the components of a mixture.
@@ -49,7 +49,7 @@ class Search:
     watch: Watch
 
     def from_readings(self, start: Point, more: list[Point], known: Point | None = None) -> Climb:
-        """Search from the likeliest start, and from others that turn out to be better.
+        """Search from the likeliest start, and from starts that exceed the result.
 
         Args:
             start: A start; starts of the same causes are chosen from the readings.
@@ -69,7 +69,7 @@ class Search:
         return best
 
     def from_user(self, start: Point, more: list[Point]) -> Climb:
-        """Search from a user's start and from others; a note reports a higher likelihood elsewhere."""
+        """Search from a user's start and further starts; a note reports a higher likelihood elsewhere."""
         ends = [self._climb(point, start.weights > 0) for point in (start, *more)]
         best = max(ends, key=_objective)
         best.notes += _lower([best.value.objective - end.value.objective for end in ends])
@@ -81,11 +81,11 @@ class Search:
     def _others(self, start: Point) -> list[Value]:
         problem = self.problem
         points = choose_starts(problem.pairs, problem.bounds, start.weights > 0, problem.fit_bias)
-        values = [problem.value(point) for point in points]
+        values = [problem.value(replace(point, shape=start.shape)) for point in points]
         return [value for value in values if math.isfinite(value.objective)]
 
     def _climb(self, start: Point, causes: NDArray[np.bool_]) -> Climb:
-        """Search from a start, and continue with those of some causes that the search left out too early."""
+        """Search from a start, and continue with causes that the search dropped too early."""
         causes = causes & possible_causes(self.problem.pairs)
         climb = self.method(self.problem, start, self.watch)
         for _ in range(_MOST):

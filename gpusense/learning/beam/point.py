@@ -2,7 +2,7 @@
 
 Coordinates are (log z_hit, log z_short, log z_max, log z_rand, log sigma_hit, log lambda_short, range_bias). Weights
 are renormalised after every step. Therefore the logarithm of the largest weight stays fixed, and the other weights move
-relative to it.
+relative to it. The coordinates of the shape of hits follow, where it has some.
 """
 
 from __future__ import annotations
@@ -10,16 +10,19 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gpusense.learning.beam.pairs import Pairs
+from gpusense.world.hit_shapes import NORMAL, HitShape, name_of, shape_of
 from gpusense.world.parameters import BeamParameters
 
 Floats = NDArray[np.float64]
 
-HIT, SHORT, MAX, RAND, SIGMA, RATE, BIAS = range(7)
+# FORM is the first coordinate of the shape of hits.
+HIT, SHORT, MAX, RAND, SIGMA, RATE, BIAS, FORM = range(8)
 NAMES = ("z_hit", "z_short", "z_max", "z_rand", "sigma_hit", "lambda_short", "range_bias")
 
 # Most readings used for a first guess.
@@ -35,27 +38,35 @@ class Point:
         sigma: sigma_hit [m].
         rate: lambda_short [1/m].
         bias: Offset of correct ranges [m].
+        shape: Shape of the density of correct ranges, of scale sigma.
     """
 
     weights: Floats
     sigma: float
     rate: float
     bias: float = 0.0
+    shape: HitShape = NORMAL
 
     @classmethod
     def of(cls, parameters: BeamParameters) -> Point:
         """Make the point of a set of parameters, with weights normalised to sum 1."""
         p = parameters
         weights = np.array([p.z_hit, p.z_short, p.z_max, p.z_rand])
-        return cls(weights / weights.sum(), p.sigma_hit, p.lambda_short, p.range_bias)
+        return cls(weights / weights.sum(), p.sigma_hit, p.lambda_short, p.range_bias, shape_of(p))
 
     def parameters(self) -> BeamParameters:
         """Return the parameters of the model."""
         hit, short, top, rand = self.weights.tolist()
-        return BeamParameters(hit, short, top, rand, self.sigma, self.rate, self.bias)
+        shape = dict[str, Any](hit=name_of(self.shape), **self.shape.values())
+        return BeamParameters(hit, short, top, rand, self.sigma, self.rate, self.bias, **shape)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters, in the order of the coordinates."""
+        return NAMES + self.shape.fitted
 
     def coordinates(self) -> Floats:
-        """Return the (7,) coordinates, see the module's docstring; -inf for a weight of 0."""
+        """Return the first (7,) coordinates, see the module's docstring; -inf for a weight of 0."""
         with np.errstate(divide="ignore"):
             return np.array([*np.log(self.weights), math.log(self.sigma), np.log(self.rate), self.bias])
 
@@ -70,8 +81,16 @@ class Point:
                 self.sigma * math.exp(min(step[SIGMA], 700)),
                 self.rate * math.exp(min(step[RATE], 700)),
                 self.bias + step[BIAS],
+                self.shape_moved(step[FORM:]),
             )
         )
+
+    def shape_moved(self, step: Floats) -> HitShape:
+        """Return the shape after a step in its coordinates, clamped to their limits."""
+        if not len(step):
+            return self.shape
+        low, high = np.array(self.shape.limits).T
+        return self.shape.at(np.clip(self.shape.coordinates + step, low, high))
 
 
 @dataclass(frozen=True)

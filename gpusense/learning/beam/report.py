@@ -14,14 +14,16 @@ from gpusense.learning.beam.em import Climb, Watch, climb_em
 from gpusense.learning.beam.optimum import Search
 from gpusense.learning.beam.options import Options
 from gpusense.learning.beam.pairs import Pairs
-from gpusense.learning.beam.point import BIAS, HIT, NAMES, RATE, SHORT, SIGMA, Point
+from gpusense.learning.beam.point import BIAS, FORM, HIT, NAMES, RATE, SHORT, SIGMA, Floats, Point
 from gpusense.learning.beam.problem import NOTHING, Problem, Value
 from gpusense.learning.beam.result import BeamFit
-from gpusense.learning.beam.uncertainty import standard_errors
+from gpusense.learning.information import errors_of
 from gpusense.world.scanner import Reading
 
 # Most iterations of the search for an offset that was not fitted.
 _JOINT = 500
+# Relative step of numerical derivatives by a coordinate of the shape of hits.
+_STEP = 1e-5
 # Standard errors over fewer blocks are rough.
 _FEW_BLOCKS = 10
 
@@ -39,7 +41,7 @@ def report(problem: Problem, climb: Climb, options: Options, start: Point) -> Be
         trace=np.array(climb.trace),
         converged=climb.converged,
         status=_status(problem, climb, value, errors, held),
-        standard_errors={name: errors[name] for name in NAMES[:BIAS]},
+        standard_errors={name: errors[name] for name in value.point.names if name != NAMES[BIAS]},
         held=held,
         range_bias=bias,
         range_bias_error=errors[NAMES[BIAS]],
@@ -49,7 +51,7 @@ def report(problem: Problem, climb: Climb, options: Options, start: Point) -> Be
         hits=pairs.hits,
         max_readings=pairs.max_readings,
         missing=pairs.missing,
-        outliers=round(float(value.sums[14])),
+        outliers=round(float(value.sums[13])),
         method=options.method,
         precision=device.real.name,
         device=device.selection,
@@ -65,14 +67,14 @@ def _status(problem: Problem, climb: Climb, value: Value, errors: dict[str, floa
     if not climb.converged and not notes:
         notes.append("did not converge")
     weights = value.point.weights
-    count = int((weights > 0).sum()) - 1 + int(weights[HIT] > 0)
+    count = int((weights > 0).sum()) - 1 + int(weights[HIT] > 0) * (1 + len(value.point.shape.limits))
     if problem.readings < count:
         readings = "1 reading" if problem.readings == 1 else f"{problem.readings} readings"
         notes.append(f"{readings} cannot determine {count} parameters")
     blocks = count_blocks(problem.pairs)
     if problem.pairs.block is not None and blocks < _FEW_BLOCKS:
         notes.append(f"standard errors are rough, from {blocks} {'block' if blocks == 1 else 'blocks'}")
-    for name in NAMES[:BIAS]:
+    for name in errors.keys() - {NAMES[BIAS]}:
         if errors[name] == math.inf:
             held[name] = "the readings do not determine it"
     notes += [f"{name}: {reason}" for name, reason in held.items()]
@@ -81,10 +83,51 @@ def _status(problem: Problem, climb: Climb, value: Value, errors: dict[str, floa
 
 def _errors(problem: Problem, value: Value) -> tuple[dict[str, float], dict[str, float]]:
     """Return standard errors by name: over blocks if there are any, and as if readings were independent."""
-    independent = standard_errors(problem, value)
+    independent = _standard_errors(problem, value)
     if problem.pairs.block is None:
         return dict(independent), independent
-    return standard_errors(problem, value, block_scatter(problem, value.point)), independent
+    return _standard_errors(problem, value, block_scatter(problem, value.point)), independent
+
+
+def _standard_errors(problem: Problem, value: Value, scatter: Floats | None = None) -> dict[str, float]:
+    """Compute the standard error of each parameter by name.
+
+    The covariance is the inverse of minus the second derivatives by the free coordinates, transformed to the parameters
+    by their derivatives. The error is NaN for a parameter that was not free (0, at a bound, or of a cause that accounts
+    for no reading), and infinite if the readings hold no information about it.
+
+    Args:
+        problem: The problem.
+        value: The optimum, with second derivatives.
+        scatter: Scatter of the gradient over blocks, see ``blocks``; None for independent readings.
+    """
+    assert value.hessian is not None
+    free = problem.free(value)
+    places = np.flatnonzero(free)
+    jacobian = _jacobian(value.point)
+    moved = np.append(value.point.weights > 0, free[4:])
+    if not (free[:4]).any():
+        # A single weight is 1 and has no error.
+        moved[:4] = False
+    errors = np.full(len(free), math.nan)
+    inner = None if scatter is None else scatter[np.ix_(places, places)]
+    errors[moved] = errors_of(-value.hessian[np.ix_(places, places)], jacobian[np.ix_(moved, places)], inner)
+    return dict(zip(value.point.names, errors.tolist(), strict=True))
+
+
+def _jacobian(point: Point) -> Floats:
+    """Return the derivatives of the parameters by the coordinates."""
+    shape = point.shape
+    count = FORM + len(shape.limits)
+    jacobian = np.zeros((count, count))
+    jacobian[:4, :4] = np.diag(point.weights) - np.outer(point.weights, point.weights)
+    jacobian[SIGMA, SIGMA], jacobian[RATE, RATE], jacobian[BIAS, BIAS] = point.sigma, point.rate, 1.0
+    for place, (low, high) in enumerate(shape.limits):
+        step = _STEP * shape.coordinates * (np.arange(len(shape.limits)) == place)
+        ends = [np.clip(shape.coordinates + sign * step, low, high) for sign in (-1, 1)]
+        before, after = (np.array(list(shape.at(end).values().values())) for end in ends)
+        jacobian[FORM:, FORM + place] = (after - before) / (ends[1] - ends[0])[place]
+    return jacobian
 
 
 def _held(problem: Problem, value: Value) -> dict[str, str]:
@@ -104,6 +147,11 @@ def _held(problem: Problem, value: Value) -> dict[str, str]:
         elif not free[place]:
             side, bound = ("lower", low) if shape <= low else ("upper", high)
             held[NAMES[place]] = f"at its {side} bound {bound:.3g}"
+    for place, name in enumerate(point.shape.fitted, FORM):
+        if value.totals[HIT] <= NOTHING:
+            held[name] = f"kept, since {NAMES[HIT]} accounts for no reading"
+        elif not free[place]:
+            held[name] = f"at its bound {point.shape.values()[name]:.3g}"
     return held
 
 
@@ -120,8 +168,11 @@ def _bias(problem: Problem, value: Value, climb: Climb, options: Options, start:
     if value.totals[HIT] <= NOTHING:
         return value.point.bias, math.nan, math.nan
     joint = Problem(problem.device, problem.pairs, problem.bounds, problem.prior, True)
-    search = Search(joint, partial(_climb_joint, options), lambda iteration, value: None)
-    best = search.from_readings(start, [], value.point)
+    if value.point.shape.limits:
+        best = _climb_joint(options, joint, value.point, lambda iteration, value: None)
+    else:
+        search = Search(joint, partial(_climb_joint, options), lambda iteration, value: None)
+        best = search.from_readings(start, [], value.point)
     if not best.converged:
         return math.nan, math.nan, math.nan
     errors, independent = _errors(joint, joint.value(best.value.point, second=True))

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from gpusense.learning.beam.pairs import Pairs
 from gpusense.learning.beam.point import HIT, MAX, RAND, SHORT, Bounds, Floats, Point
+from gpusense.world.range_causes import RandomDensity, ShortDensity
 
 # Readings in the sample, steps of each short run, and most starts that are returned.
 _SAMPLE, _STEPS, _MOST = 1000, 20, 4
@@ -142,7 +143,7 @@ def short_runs(
         if fit_bias:
             bias = np.clip((parts[0] * off).sum(axis=0) / hits, -bounds.bias, bounds.bias)
         sigma = np.clip(np.sqrt((parts[0] * (off - bias) ** 2).sum(axis=0) / hits), *bounds.sigma)
-        rate = _next_rate(parts[1], z, rate * expected, rate, bounds)
+        rate = _next_rate(parts[1], z, expected, rate, bounds)
     count = len(sample.reading)
     weights = np.where(used, weights * count + 0.5, 0.0)
     weights /= weights.sum(axis=1, keepdims=True)
@@ -150,19 +151,18 @@ def short_runs(
     return ends, total.sum(axis=0)
 
 
-def _next_rate(parts: Floats, z: Floats, x: Floats, rate: Floats, bounds: Bounds) -> Floats:
+def _next_rate(parts: Floats, z: Floats, expected: Floats, rate: Floats, bounds: Bounds) -> Floats:
     """Return lambda_short for which the lengths of short readings are as large as the truncated exponentials' means.
 
     Args:
         parts: (m, C) responsibilities of short readings.
         z: (m, 1) readings [m].
-        x: (m, C) lambda_short times the expected range.
+        expected: (m, 1) expected ranges [m].
         rate: (C,) lambda_short [1/m]; kept where no reading is short.
         bounds: Bounds of the shapes.
     """
-    x = np.clip(x, 1e-9, 700.0)
     lengths = (parts * z).sum(axis=0)
-    likely = (parts * (1 - x / np.expm1(x))).sum(axis=0)
+    likely = (parts * ShortDensity(rate).mean(expected)).sum(axis=0)
     known = (lengths > 0) & (likely > 0)
     with np.errstate(over="ignore"):
         return np.where(known, np.clip(likely / np.where(known, lengths, 1.0), *bounds.rate), rate)
@@ -175,11 +175,8 @@ def _log_components(sample: Sample, z: Floats, expected: Floats, sigma: Floats, 
     mean = np.clip(expected + bias, 0, sample.range_max)
     mass = ndtr((sample.range_max - mean) / sigma) - ndtr(-mean / sigma)
     hit = -0.5 * ((z - mean) / sigma) ** 2 - np.log(math.sqrt(2 * math.pi) * sigma * np.maximum(mass, 1e-300))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        short = np.log(rate) - rate * z - np.log(-np.expm1(-rate * expected))
-    short = np.where((z <= expected) & (expected > 0), short, -np.inf)
-    rand = np.full_like(hit, -math.log(sample.range_max))
-    return np.stack([hit, short, rand])
+    rand = np.full_like(hit, RandomDensity(sample.range_max).log_peak(1.0))
+    return np.stack([hit, ShortDensity(rate).log_pdf(z, expected), rand])
 
 
 def _different(one: Point, other: Point) -> bool:

@@ -18,14 +18,15 @@ from gpusense.learning.information import errors_of, scatter_of
 Floats = NDArray[np.float64]
 
 NAMES = ("lambda_short", "lambda_rand", "p_detect", "sigma_hit")
-# Steps of first and second central differences of the mean log-likelihood: rounding and truncation errors are alike.
+# Steps of first and second central differences of the mean log-likelihood, which balance rounding and truncation
+# errors.
 _FIRST, _SECOND = 1e-5, 1e-3
 # Largest gradient of the mean log-likelihood that counts as 0: it moves a parameter by less than a hundredth of the
 # standard error of ten million readings.
 _FLAT = 2e-6
 # Number of steps of the coarse search that precedes a search with many steps.
 _FEW = 100
-# Number of starts that are searched from, and of restarts of a search that ends before the gradient vanishes.
+# Starts that are searched from; restarts of a search that ends before the gradient vanishes.
 _BEST, _RESTARTS = 3, 3
 # Standard errors over fewer blocks are rough.
 _FEW_BLOCKS = 10
@@ -235,7 +236,7 @@ def _information(data: Counts, theta: Floats, places: NDArray[np.intp]) -> Float
 def _errors(information: Floats) -> Floats:
     """Return (m,) standard errors from the (m, m) information; NaN where a flat direction has a part.
 
-    Other parameters keep their standard errors: the flat directions are those of the matrix scaled to a diagonal of 1.
+    Other parameters keep their standard errors: flat directions are found in the matrix scaled to a diagonal of 1.
     """
     errors = np.full(len(information), np.nan)
     # Without influence of a parameter, differences are rounding errors only.

@@ -23,6 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfcx, logsumexp
 
+from gpusense.world.range_causes import RandomDensity, ShortDensity
+
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
@@ -124,7 +126,7 @@ def shared_causes(
         mass = np.stack([
             hit + _log_hits(bins, width, sigma_hit, rows),
             short + _log_decay(bins, lambda_short * width, rows),
-            np.full((len(rows), bins), rand - math.log(bins)),
+            np.full((len(rows), bins), rand + RandomDensity(bins).log_peak(1.0)),
         ])  # fmt: skip
         left = _tails(np.logaddexp.reduce(mass, axis=0), np.full((len(rows), 1), none))
         triggers = _ratio(mass, left[:, :-1])
@@ -202,11 +204,7 @@ def _log_h(x: Floats) -> Floats:
 
 def _log_decay(bins: int, decay: float, rows: Integers) -> Floats:
     """Return (rows, bins) log masses of an exponential that ends with the expected step; each row has the sum 1."""
-    step, steps = np.arange(bins), np.minimum(rows + 1, bins)[:, None]
-    if decay * bins < 1e-17:
-        return np.where(step < steps, -np.log(steps), -np.inf)
-    first = np.log(-np.expm1(-decay)) - np.log(-np.expm1(-decay * steps))
-    return np.where(step < steps, first - decay * step, -np.inf)
+    return ShortDensity(decay).log_mass(np.arange(bins), 1, np.minimum(rows + 1, bins)[:, None])
 
 
 def _tails(log_mass: Floats, log_none: Floats) -> Floats:

@@ -97,7 +97,7 @@ class DiscreteBeamModel(SensorTable):
             range_max: Readings of at least ``range_max`` are "no return", > 0 [m].
             bins: Number of steps along the beam, 1 to 4096.
             blocks: Integer label of each reading's block, of the same shape, or None. Readings of different blocks are
-                independent; those of one block (a scan) need not be. Standard errors are then computed over blocks.
+                independent; readings of one block (a scan) need not be. Standard errors are then computed over blocks.
 
         Returns:
             The model; its ``fit`` has standard errors and status.

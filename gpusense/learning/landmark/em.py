@@ -58,7 +58,7 @@ def first_guess(pairs: Pairs, initial: LandmarkParameters | None) -> Point:
         sigma = [float(np.clip(h / 10 if s is None else s, b, h)) for s, b, h in zip(start, low, high, strict=True)]
         z = min(max(initial.z_detect, 1e-6), 1 - 1e-6) if len(pairs.feature) else 0.0
         return Point((sigma[0], sigma[1], sigma[2]), z, (0.0, 0.0))
-    # Residuals across the line of sight are converted to metres, the unit of those along it.
+    # Residuals across the line of sight are converted to metres, the unit of residuals along it.
     distance = np.minimum(np.nan_to_num(pairs.means), pairs.limits.range_max)[:, RANGE]
     size = np.nan_to_num(pairs.residuals)
     size[:, 1] *= np.maximum(distance, 0.1)

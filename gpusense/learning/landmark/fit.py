@@ -154,7 +154,7 @@ def _sightings(
 
 
 def _count_detected(sightings: Sightings, landmarks: LandmarkMap, value: Value) -> tuple[int, float]:
-    """Return the number of landmarks in view, over all poses, and the expected number of detected ones."""
+    """Return the number of landmarks in view over all poses, and the expected number of detections."""
     pairs = sightings.pairs
     total = len(in_view(sightings.sensors, landmarks.xy, pairs.limits)[0])
     visible = pairs.in_view

@@ -100,7 +100,7 @@ class Pairs:
 
     @property
     def measured(self) -> tuple[bool, bool, bool]:
-        """Tell whether at least one pair has a residual of range, of bearing and of signature."""
+        """Return whether any pair has a residual of range, any of bearing, and any of signature."""
         measured: NDArray[np.bool] = np.any(~np.isnan(self.residuals), axis=0)
         return bool(measured[0]), bool(measured[1]), bool(measured[2])
 

@@ -17,6 +17,7 @@ from gpusense.learning.point.report import report
 from gpusense.learning.point.result import PointFit
 from gpusense.learning.point.search import maximize
 from gpusense.world.hit_shapes import NORMAL, StudentHit
+from gpusense.world.range_causes import RandomDensity
 from gpusense.world.sensor_parameters import MOST_DEGREES, BeaconParameters
 
 BiasKind = Literal["none", "common", "each"]
@@ -77,7 +78,10 @@ class _Beacons(Problem):
         first = truncated(
             residual, mean, self.range_max, math.exp(theta[0]), NORMAL if self.nu is None else StudentHit(self.nu)
         )
-        parts = [((1 - rand) * (1 - share), first[0]), (rand, np.full(len(mean), -math.log(self.range_max)))]
+        parts = [
+            ((1 - rand) * (1 - share), first[0]),
+            (rand, np.full(len(mean), RandomDensity(self.range_max).log_peak(1.0))),
+        ]
         hits = [first]
         if self.kind == "mixture":
             hits.append(truncated(residual, mean, self.range_max, math.exp(theta[2]), NORMAL))
@@ -131,9 +135,8 @@ def fit_beacon_parameters(
 ) -> PointFit[BeaconParameters]:
     """Fit the parameters of ranges to beacons to readings at known poses, by maximum likelihood.
 
-    The likelihood is that of :class:`BeaconModel`: deviations, weights and offsets are fitted; the degrees of freedom
-    of a Student t are given. Starts come from the median and the densest part of the residuals, which outliers hardly
-    move.
+    The likelihood is :class:`BeaconModel`'s. Deviations, weights and offsets are fitted; the degrees of freedom of a
+    Student t are fixed. Starts come from the median and the densest part of the residuals, which outliers hardly move.
 
     Args:
         poses: (S, 3) robot poses [m, m, rad], or (F, 3) with ``ids``.

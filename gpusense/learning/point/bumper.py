@@ -81,8 +81,8 @@ def fit_bumper_parameters(
 ) -> PointFit[BumperParameters]:
     """Fit the parameters of a bumper to readings at known poses, by maximum likelihood.
 
-    The likelihood is that of :class:`BumperModel`. The model's distances between outline and map are computed on the
-    device, the rest on the host.
+    The likelihood is :class:`BumperModel`'s. The model's distances between outline and map are computed on the device,
+    the rest on the host.
 
     Args:
         poses: (F, 3) robot poses (x, y, theta) in the world [m, m, rad].

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +12,10 @@ from numpy.typing import NDArray
 from gpusense.world.hit_shapes import HitShape
 
 Floats = NDArray[np.float64]
+Limits: TypeAlias = tuple[tuple[float, float], ...]
+
+# Relative step of numerical derivatives by a coordinate of the shape.
+_SHAPE_STEP = 1e-4
 
 _LOG_ROOT_TWO_PI = 0.5 * math.log(2 * math.pi)
 # Up to this deviation a wrapped normal is a sum of normals, beyond it a Fourier series, as in ``HeadingModel``.
@@ -39,6 +45,30 @@ def truncated(
     by_scale = u * pull - 1 + (x_0 * edges[0] + x_1 * edges[1]) / mass
     by_mean = (pull + np.where(near == mean, (edges[1] - edges[0]) / mass, 0)) / scale
     return log_p, by_scale, by_mean
+
+
+def by_shape(
+    u: Floats, near: Floats, far: Floats, at: Floats, make: Callable[[Floats], HitShape], limits: Limits
+) -> list[Floats]:
+    """Return the derivatives of the log density of truncated hits by the coordinates of their shape, as differences.
+
+    Args:
+        u: (n,) distances from the mean, in scales.
+        near: (n,) distances of the mean from 0, in scales.
+        far: (n,) distances of range_max from the mean, in scales.
+        at: (P,) coordinates.
+        make: Function that makes the shape at coordinates.
+        limits: (P, 2) limits of the coordinates.
+    """
+    columns: list[Floats] = []
+    for place, (low, high) in enumerate(limits):
+        step = _SHAPE_STEP * min(at[place], 1.0)
+        ends = [np.where(np.arange(len(at)) == place, np.clip(at + each, low, high), at) for each in (-step, step)]
+        before, after = (
+            shape.log_pdf(u) - np.log(shape.half_mass(near) + shape.half_mass(far)) for shape in map(make, ends)
+        )
+        columns.append((after - before) / (ends[1][place] - ends[0][place]))
+    return columns
 
 
 def wrapped_normal(residual: Floats, sigma: float) -> tuple[Floats, Floats, Floats]:

@@ -76,8 +76,8 @@ def fit_heading_parameters(
 ) -> PointFit[HeadingParameters]:
     """Fit the parameters of heading readings at known poses, by maximum likelihood.
 
-    The likelihood is that of :class:`HeadingModel`; deviation or concentration, weights and offset are fitted. Starts
-    are all round the circle.
+    The likelihood is :class:`HeadingModel`'s; deviation or concentration, weights and offset are fitted. Starts are all
+    round the circle.
 
     Args:
         poses: (F, 3) robot poses (x, y, theta) [m, m, rad].

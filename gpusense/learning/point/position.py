@@ -120,7 +120,7 @@ def fit_position_parameters(
 ) -> PointFit[PositionParameters]:
     """Fit the parameters of position fixes at known poses, by maximum likelihood.
 
-    The likelihood is that of :class:`PositionModel`.
+    The likelihood is :class:`PositionModel`'s.
 
     Args:
         poses: (F, 3) robot poses (x, y, theta) in the world [m, m, rad].

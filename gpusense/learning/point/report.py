@@ -64,7 +64,7 @@ def report(problem: Problem, end: Climb, parameters: P, blocks: Integers | None,
 
 
 def _list(names: list[str]) -> str:
-    """Return some names, and the number of the others."""
+    """Return the first names, and the number of further ones."""
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 

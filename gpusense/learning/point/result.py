@@ -24,7 +24,7 @@ class PointFit(Generic[P]):
 
     Attributes:
         parameters: The parameters.
-        log_likelihood: Log-likelihood of the readings, natural log: the sum over those of the model.
+        log_likelihood: Log-likelihood of the readings that the model evaluates, natural log.
         trace: (iterations + 1,) log-likelihood at the start and after each iteration.
         converged: Whether the search ended at an optimum; ``status`` gives the reason for False.
         status: Summary of the fit in words.

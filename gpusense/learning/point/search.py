@@ -1,8 +1,8 @@
 """Maximise a log-likelihood within bounds: Newton steps from the likeliest of several starts.
 
-A coordinate at a bound stays there while the gradient points outwards. In the others a step goes along the axes of the
-second derivatives, uphill along each of them, and is halved until the log-likelihood rises enough (Nocedal and Wright,
-*Numerical Optimization*, sections 3.4 and 16.7).
+A coordinate at a bound stays there while the gradient points outwards. In the remaining coordinates a step follows the
+eigenvectors of the second derivatives, uphill along each, and is halved until the log-likelihood rises enough (Nocedal
+and Wright, *Numerical Optimization*, sections 3.4 and 16.7).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Climb:
 
 
 def maximize(problem: Problem, max_iterations: int, tolerance: float, start: Floats | None = None) -> Climb:
-    """Search from the likeliest starts, on some of the readings if there are many, and then on all of them.
+    """Search from the likeliest starts: first on a subset of many readings, then on all.
 
     Args:
         problem: The problem.

@@ -35,7 +35,7 @@ from gpusense.localization.particles import Places, Stage
 from gpusense.localization.sums import reduction_fans
 from gpusense.reference.draws import mark_of
 from gpusense.reference.estimate import finish_estimate
-from gpusense.reference.rungs import column_of, left_of, possible_of, rung_of, set_stage
+from gpusense.reference.tempering import column_of, left_of, possible_of, rung_of, set_stage
 from gpusense.reference.weighing import join_rows
 
 _PLAIN = frozenset[str]()
@@ -46,15 +46,15 @@ _PARTICLE = 32
 class SplitCloud(FilterCloud):
     """Particles over several shards.
 
-    A stage of a correction has two exchanges, of the largest score and of the sums of integer weights, and a third one
-    of particles where it draws: without jitter each shard gets the parents of its own particles; with jitter, and in
-    residual resampling, all. Each call names the particles and buffers that it works on; shards remember none, and
-    their state is here.
+    Each stage of a correction exchanges the largest score, then the sums of integer weights. A stage that draws also
+    exchanges particles: without jitter each shard receives the parents that it draws; with jitter or residual
+    resampling it receives all parents. Each call names the particles and buffers that it works on; shards remember
+    none, and their state is here.
 
     Args:
         team: The shards.
         capacity: Most particles of the filter.
-        residual: Whether draws are those of residual resampling.
+        residual: Whether to draw by residual resampling.
 
     Attributes:
         exchanged: Bytes of particles that were handed to shards.
@@ -125,7 +125,7 @@ class SplitCloud(FilterCloud):
         self._set(stage.places, step.drawn, state)
 
     def _run(self, stage: Stage, step: Step, state: np.ndarray) -> None:
-        """Score and weigh the particles of a stage, and draw: those of the next step where nothing is left."""
+        """Score and weigh the particles of a stage, and draw; the last stage draws the particles of the next step."""
         number = stage.number
         each, totals, column, settings = self._weigh(stage, step, state)
         drawn = self._parts(self.count if state[number * STAGE + LEFT] > 0.0 else step.drawn)
@@ -178,7 +178,7 @@ class SplitCloud(FilterCloud):
         return pieces
 
     def _marks(self, own: np.ndarray, drawn: list[Part]) -> list[tuple[float, float]] | None:
-        """Return the lowest and the highest mark that each shard draws at; None where each copies its own particles."""
+        """Return the lowest and the highest mark of each shard's draws; None where each draws from its part alone."""
         total, whole = float(own[TOTAL]), drawn[0].whole
         if not total > 0.0 and whole != self.count:
             raise RuntimeError("the weights of all particles are 0, so their number cannot change")
@@ -195,7 +195,7 @@ class SplitCloud(FilterCloud):
         parts = zip(self._parts(self.count), self._team.devices, strict=True)
         return f"split: {', '.join(f'{part.size} on {name}' for part, name in parts)}"
 
-    # ---- what crosses to the host
+    # ---- copies to the host
 
     def estimate(self, count: int) -> np.ndarray:
         """See FilterCloud.estimate."""
@@ -204,15 +204,15 @@ class SplitCloud(FilterCloud):
         asked = [(shown, 1 if index == holder else 0) for index in range(self._size)]
         first = self._team.each("poses", asked)[holder][0]
         buffers = shown, self.places.weight
-        for again in (0, 1):
-            reference = result[:3].copy() if again else first
+        for second_pass in (0, 1):
+            reference = result[:3].copy() if second_pass else first
             table = np.concatenate(
                 self._team.each("sum_poses", [(buffers, part.size, part.block, reference) for part in parts])
             )
             for fan in reduction_fans(len(table)):
                 sums, table = table.reshape(-1), np.empty((-(-len(table) // fan), ESTIMATE_SUMS))
                 join_rows(_PLAIN, sums, table.reshape(-1), len(sums) // ESTIMATE_SUMS, ESTIMATE_SUMS, fan)
-            finish_estimate(_PLAIN, first, table.reshape(-1), result, 1, again)
+            finish_estimate(_PLAIN, first, table.reshape(-1), result, 1, second_pass)
             if not result[WIDE_HEADINGS]:
                 break
         return result

@@ -15,12 +15,12 @@ from gpusense.localization.filter import ParticleFilter
 
 
 class SplitParticleFilter(ParticleFilter):
-    """A particle filter over several devices, with the particles of a filter on one of them.
+    """A particle filter over several devices; its particles are the same as on one device.
 
-    Each device moves, scores, weighs and draws its share of the particles. Per stage of a correction the devices
-    exchange the largest score, sums of weights, and the parents of particles that others draw. Random numbers depend
-    on the index of a particle in the whole filter, and sums of weights are exact: particles and weights are those of
-    :class:`ParticleFilter` on one device of the same kind, to the bit where log-likelihoods are.
+    Each device moves, scores, weighs and draws its share of the particles. In each stage of a correction the devices
+    exchange the largest score, sums of weights, and parents that another device draws. Random numbers depend on a
+    particle's index in the whole filter, and sums of weights are exact. So particles and weights equal those of
+    :class:`ParticleFilter` on one device of the same kind; they have the same bits where log-likelihoods have.
 
     Args:
         make: Returns the models of a device, given its selection string. With ``executors`` it must be a function of a
@@ -70,7 +70,7 @@ class SplitParticleFilter(ParticleFilter):
         """Return room for the particles of each device."""
         make, devices, executors = self._make, self._devices, self._executors
         most, count, residual = self.options.most, len(devices), self.options.resampling == "residual"
-        # Parts are whole blocks, whose number does not always divide by that of the shards.
+        # Parts are whole blocks, and the number of blocks need not be a multiple of the number of shards.
         share = min(most, most // count + 3 * parts_of(most, count)[0].block)
         team: LocalTeam | RemoteTeam
         if executors is None:

@@ -35,7 +35,7 @@ class Part(NamedTuple):
 
 
 def parts_of(count: int, shards: int) -> list[Part]:
-    """Split particles into parts of whole blocks, so that sums over blocks are those of one device."""
+    """Split particles into parts of whole blocks, so that sums over blocks equal those on one device."""
     block = block_of(count)
     blocks = -(-count // block)
     ends = [min(blocks * shard // shards * block, count) for shard in range(shards + 1)]

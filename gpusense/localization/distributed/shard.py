@@ -32,7 +32,7 @@ from gpusense.localization.distributed.parts import Marks, Part, Piece, SensorRe
 from gpusense.localization.distributed.shard_pool import ShardPool
 from gpusense.localization.particles import Places, Stage
 from gpusense.localization.sensors import Sensor
-from gpusense.reference.rungs import left_of, rung_of
+from gpusense.reference.tempering import left_of, rung_of
 
 # Units in the last place within which the product of two numbers reaches a neighbour of another product.
 _UNITS = 16
@@ -46,7 +46,7 @@ class Shard:
     Args:
         models: The filter's models on this device.
         capacity: Most particles of the shard.
-        residual: Whether draws are those of residual resampling.
+        residual: Whether to draw by residual resampling.
     """
 
     def __init__(self, models: Sequence[Any], capacity: int, residual: bool) -> None:
@@ -56,7 +56,8 @@ class Shard:
         self._part = Part(0, 0, 0, 16)
         self._settings = np.zeros(0)
         self._pool, self._residual = ShardPool(self._backend), residual
-        # Ones, and numbers of a step whose only temperature is a sum of weights.
+        # Ones, and settings whose temperature is the offset to add: the launch ``add_scores`` then shifts cumulative
+        # weights.
         self._ones: tuple[Any, Any] | None = None
         self._recordings = ProgramCache[RecordedProgram](_MOST_RECORDED)
         self._timed = False
@@ -188,7 +189,7 @@ class Shard:
             self._backend.upload(totals, cloud.sums.totals)
             self._backend.run(cloud.setting(stage))
         yield
-        # The kernel knows the number of particles of the shard only: the state is that of the filter.
+        # The kernel knows only the shard's number of particles; the state must have that of the whole filter.
         self._backend.upload(state, cloud.states[stage.state])
         if marks is None or not part.size:
             return [(np.empty((0, 3)), np.empty(0))] * len(marks or ())
@@ -247,8 +248,8 @@ class Shard:
         Args:
             stage: The stage.
             drawn: Particles to draw.
-            pieces: Poses and cumulative weights of shards in their order; True for those that the device has taken, and
-                False to copy the own ones.
+            pieces: Poses and cumulative weights of shards in their order; True where the device has taken them, False
+                to draw from the shard's particles alone.
         """
         cloud, found = self._cloud, self._pool
         of: tuple[Any, Any, int] = cloud.poses[stage.source], cloud.ends, self._part.size
@@ -290,7 +291,7 @@ class Shard:
         self._backend.run(
             cloud.sums.launch("sum_poses", blocks, poses=cloud.poses[buffers[0]], weight=cloud.weights[buffers[1]],
                               estimate=cloud.estimated, sums=cloud.sums.rows, particles=count, block=block,
-                              lanes=ESTIMATE_LANES, again=1),
+                              lanes=ESTIMATE_LANES, second_pass=1),
         )  # fmt: skip
         yield
         return self._read(cloud.sums.rows, blocks * ESTIMATE_SUMS).reshape(blocks, ESTIMATE_SUMS)

@@ -36,7 +36,7 @@ class ShardPool:
         self._counted: tuple[int, Any, Any] = (0, None, None)
 
     def reserve(self, count: int, whole: int) -> None:
-        """Make room for a number of particles, of those of the whole filter."""
+        """Allocate buffers for ``count`` of the filter's ``whole`` particles."""
         self.count = count
         if count > self._capacity:
             self._capacity = count if count == whole else 2 * count
@@ -57,7 +57,7 @@ class ShardPool:
     def copies(self, state: Buffer, drawn: int, stage: int) -> tuple[Program, Buffer]:
         """Return the launches that count the certain copies of residual resampling, and the buffer of their results.
 
-        Each device counts those of all particles.
+        Each device counts the copies of all particles.
 
         Args:
             state: State of the filter.

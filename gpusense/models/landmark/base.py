@@ -31,7 +31,7 @@ from gpusense.world.windows import Window
 JOINT_FEATURES = 8
 JOINT_LANDMARKS = 1024
 _INT = np.dtype(np.int32)
-# Landmarks of a launch that cost what a reading of a scan does.
+# Landmarks of a launch that cost as much as one reading of a scan.
 _PER_READING = 8
 
 
@@ -151,13 +151,13 @@ class FeatureModel(PointModel):
         return which, parts
 
     def _partners(self, correspondence: ArrayLike | None) -> np.ndarray:
-        """Return the indices that features are drawn of: all of the map, or those of a correspondence."""
+        """Return the indices of the landmarks that are drawn: all, or those in a correspondence."""
         if correspondence is None:
             return np.arange(self._count)
         return check_correspondence(correspondence, np.size(correspondence), self._count)
 
     def _read(self, features: object) -> tuple[np.ndarray, np.ndarray]:
-        """Return features as ``_possible`` does; the first ones are looked at for angles in degrees."""
+        """Return features as ``_possible`` does; the first calls also check for angles in degrees."""
         full, impossible = self._possible(features)
         if not self._seen:
             self._seen = look_at_feature_angles(features, *self._angles)

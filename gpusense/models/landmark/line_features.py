@@ -83,7 +83,7 @@ class _Whitened:
 
 
 def _whitened(features: np.ndarray, p: LineParameters) -> _Whitened:
-    """Return the covariance of features: their own, and the model's at the middle of what is seen."""
+    """Return the covariance of features: the measured one plus the model's, at the middle of the visible part."""
     middle = 0.5 * (features[:, FIRST] + features[:, LAST])
     one = features[:, ANGLE_VARIANCE] + p.sigma_angle**2
     both = features[:, MIXED] + middle * p.sigma_angle**2
@@ -157,7 +157,7 @@ def _gate(
     The middle of such a line is in a disc around the foot of the feature's normal: some point of the feature between
     its ends is opposite to a point of the line.
     """
-    # The least mass of the distance is that of a line at the sensor or at range_max.
+    # The mass of the distance is least for a line at the sensor or at range_max.
     mass = np.vectorize(math.erf, otypes=[float])(p.range_max * numbers[:, at.RANGE_SPREAD])
     with np.errstate(divide="ignore"):
         highest = numbers[:, at.PEAK] - np.log(0.5 * mass)
@@ -177,7 +177,7 @@ def _gate(
 
 
 def _groups(kept: np.ndarray) -> np.ndarray:
-    """Return a group of each feature: those that overlap, directly or by way of others, have one group.
+    """Return the group of each feature; features that overlap, directly or through a chain, share a group.
 
     Features of one line overlap if projections of one on the other have a part in common, and their angles are alike.
     """

@@ -18,7 +18,7 @@ def draw_lines(
     draws: Draws, partners: NDArray[np.int64], lines: LineMap, p: LineParameters, mount: tuple[float, float, float], *,
     every: bool,
 ) -> Floats:  # fmt: skip
-    """Return (N, F, 4) angle, distance and ends of lines at poses, all NaN for what is not seen.
+    """Return (N, F, 4) angle, distance and ends of lines at poses, all NaN for lines that are not visible.
 
     Args:
         draws: Poses and their random numbers.
@@ -58,7 +58,7 @@ def _false_positives(u: Floats, v: Floats, w: Floats, x: Floats, p: LineParamete
 def _seen(
     place: Floats, turned: Floats, segment: Floats, normal: Floats, two_sided: bool, p: LineParameters
 ) -> tuple[Floats, NDArray[np.bool]]:
-    """Return (N, 4) a line of the map without noise from each place, and whether some of it is in view."""
+    """Return (N, 4) noise-free features of a map line at each pose, and whether part of the line is in view."""
     off = segment.reshape(2, 2) - place[:, None]
     distance = off[:, 0] @ normal
     sign = np.where(two_sided & (distance < 0), -1.0, 1.0)

@@ -28,11 +28,11 @@ from gpusense.world.sensor_parameters import LineParameters
 class LineModel(FeatureModel):
     """log p(f | x, m) of straight lines that a scan shows, by the walls that they may belong to.
 
-    A line is ``x cos(angle) + y sin(angle) = distance`` in the robot's frame; its angle is that of the normal away from
-    the scanner. Each adds ``log(z_detect p(f | j) + z_false / (2 pi range_max))`` with a normal density p(f | j) of
-    angle and distance; docs/landmarks.md defines it. A line may be a wall that it overlaps, when projected on it. The
-    places of the ends do not matter otherwise: a scan shows a wall only as far as it is in sight. The wall j is known
-    from ``correspondence``, or chosen by ``association``.
+    A line is ``x cos(angle) + y sin(angle) = distance`` in the robot's frame; its angle is the direction of the normal
+    that points away from the scanner. Each adds ``log(z_detect p(f | j) + z_false / (2 pi range_max))`` with a normal
+    density p(f | j) of angle and distance; docs/landmarks.md defines it. A line may be a wall that it overlaps, when
+    projected on it. The places of the ends do not matter otherwise: a scan shows a wall only as far as it is in sight.
+    The wall j is known from ``correspondence``, or chosen by ``association``.
 
     Args:
         lines: The map.
@@ -42,8 +42,8 @@ class LineModel(FeatureModel):
         association: The rule for lines without a known wall. ``"nearest"`` takes the likeliest wall of each;
             ``"sum"`` sums over all walls, each with the prior 1 / M; ``"joint"`` takes the likeliest assignment in
             which no two lines that overlap have the same wall, for at most 8 lines and 1024 walls.
-        mount: The frame of the lines (x, y, yaw) on the robot [m, m, rad]; those of ``extract_features`` are in the
-            robot's frame.
+        mount: Pose (x, y, yaw) of the features' frame on the robot [m, m, rad]; ``extract_features`` returns lines in
+            the robot's frame.
         temperature: In (0, 1]: multiplies the sum over lines.
         specialize: False leaves nothing out: same numbers, slower.
 

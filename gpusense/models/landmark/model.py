@@ -144,8 +144,8 @@ class LandmarkModel(FeatureModel):
     ) -> np.ndarray:
         """Draw features from p(f | x, m) at each pose, on the host in float64; see ``BeamModel.sample``.
 
-        Without ``correspondence`` this is what the sensor reports at a pose: of every landmark within range_max and the
-        field of view a feature, with probability p_detect. With it, a feature of each landmark that it names, detected
+        Without ``correspondence`` these are the sensor's reports at a pose: each landmark within range_max and the
+        field of view is detected with probability p_detect. With it, a feature of each landmark that it names, detected
         for certain. With probability z_false a feature is a false positive, uniform within the sensor's limits. Given
         their correspondence, features have the density of ``log_likelihood``.
 

@@ -10,7 +10,7 @@ import numpy as np
 from gpusense.world.landmarks import LandmarkMap
 from gpusense.world.parameters import LandmarkParameters
 
-# Deviations by which the span of signatures extends beyond those of the map.
+# Standard deviations by which the span of signatures extends beyond the map's signatures.
 _SPREAD = 4.0
 
 

@@ -318,7 +318,7 @@ class HeadingModel(PointModel):
             if p.kind == "von_mises":
                 from scipy.special import i0e
 
-                # A small kappa may underflow: its density is that of 0.
+                # A small kappa may underflow; its density then equals that of kappa = 0.
                 self._check_scale("kappa", 1 / math.sqrt(max(p.kappa, 1.0)), "1 / sqrt(kappa) ")
                 kind, scale = VON_MISES, (2 * exact(p.kappa)).sqrt()
                 peak = total(log_hit, -(2 * PI * exact(float(i0e(p.kappa)))).ln())

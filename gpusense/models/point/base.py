@@ -100,7 +100,7 @@ class PointModel(Pickled):
         return cast(Precision, self._real.name)
 
     def explain(self) -> str:
-        """Report what this scene leaves out, why, and the saving; readings and poses as of the last call."""
+        """Report the parts that the last call's readings and poses leave out, with reasons and savings."""
         name, omissions = self._describe()
         title = f"{name}, {self.precision}, {self.device.selection} ({self.device.name})"
         code = self._last_code or frozenset()
@@ -137,7 +137,7 @@ class PointModel(Pickled):
         itemsize: float = 0,
         after: Callable[[Part], None] = lambda part: None,
     ) -> Any:
-        """Return log p of each pose by programs over parts of them; 0 without a program.
+        """Return log p of each pose, computed in parts; 0 without a program.
 
         Args:
             poses: (N, 3) poses.
@@ -154,7 +154,7 @@ class PointModel(Pickled):
         backend, space, real = self._backend, self._workspace, self._real
         checked = Poses(poses, backend)
         count, on_device = checked.count, checked.on_device
-        result = Result(poses, out, (count,), real, backend)
+        result = Result(poses, out, (count,), real, backend, on_device=on_device)
 
         def score(piece: Piece) -> None:
             with space.result("log_p", result.flat, piece.begin, piece.count, real) as log_p:
@@ -174,9 +174,9 @@ class PointModel(Pickled):
             if program is None and not on_device:
                 result.flat[:] = 0
             else:
-                run_pieces(space, Piece(0, count, count), chunk_of(backend, max(items, 1), itemsize), score)
+                run_pieces(space, Piece(0, count, count), chunk_of(backend, items, itemsize), score)
             finish(space, on_device)
-        return result.array()
+        return result.user_array()
 
     def _relative(self, poses: Poses, part: Part, kernel: str, numbers: dict[str, float]) -> tuple[Buffer, Program]:
         """Return the places or residuals of some poses, and the launch of the file ``relative`` that computes them.

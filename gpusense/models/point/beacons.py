@@ -18,11 +18,11 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission, share
-from gpusense.interface.terms import log_weight
 from gpusense.models.point.base import PointModel, rand_omission, relative_omissions
 from gpusense.models.point.pairs import DIGITS, PI, exact, log_of, total, two_parts
 from gpusense.models.point.sampling import BEACONS, draws_at, mounted, normal_within, within
 from gpusense.models.poses import Part, Poses
+from gpusense.world.range_causes import RandomDensity
 from gpusense.world.sensor_parameters import BeaconParameters
 
 
@@ -91,8 +91,8 @@ class BeaconModel(PointModel):
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
-            ranges: (F,) ranges [m], of all M beacons or of those in ``ids``. NaN, and values outside [0, range_max],
-                are missing and add 0.
+            ranges: (F,) ranges [m] to all M beacons, or to the beacons in ``ids``. NaN, and values outside [0,
+                range_max], are missing and add 0.
             ids: None, or (F,) indices of the beacons that the ranges belong to; one may have several.
             out: The array for the result, in the memory of the poses.
 
@@ -160,7 +160,7 @@ class BeaconModel(PointModel):
             (kind, u), (heavy, _) = draws.uniform(BEACONS + f), draws.uniform(BEACONS + f, 1)
             mean = np.hypot(*(antenna - self.xy[j]).T) + self._bias[j]
             hit = self._hits(u, heavy, mean)
-            ranges[:, f] = np.where(kind * (p.z_hit + p.z_rand) < p.z_hit, hit, u * p.range_max)
+            ranges[:, f] = np.where(kind * (p.z_hit + p.z_rand) < p.z_hit, hit, RandomDensity(p.range_max).drawn(u))
         return draws.reshaped(ranges)
 
     def _hits(self, u: np.ndarray, heavy: np.ndarray, mean: np.ndarray) -> np.ndarray:
@@ -203,7 +203,7 @@ class BeaconModel(PointModel):
         return f"ranges to beacons, {p.kind}", omissions + relative_omissions(p.mount, self.precision)
 
     def _prepare(self, ranges: object, ids: object) -> tuple[np.ndarray, list[Omission]]:
-        """Return the (F, BEACON) numbers of the valid ranges, and the omissions of the others."""
+        """Return the (F, BEACON) numbers of the valid ranges, and the omissions of the invalid ranges."""
         p = self.parameters
         on_host = arrays.copied_to_host(ranges, self._backend, "ranges")
         index = self._indices(ids)
@@ -232,7 +232,7 @@ class BeaconModel(PointModel):
         self._check_scale("sigma_range", p.sigma_range)
         self._check_scale("range_max", p.range_max)
         self._check_scale("bias", max(float(np.abs(self._bias).max(initial=0.0)), 1.0), "its size ")
-        random = log_weight(p.z_rand) - math.log(p.range_max)
+        random = RandomDensity(p.range_max).log_peak(p.z_rand)
         rest: list[Any] = [0.0] * 6
         series = np.zeros(1)
         with localcontext(prec=DIGITS):
@@ -264,7 +264,7 @@ def _normal(sigma: float, log_share: Decimal | float) -> tuple[Decimal, Decimal 
 
 
 def _log_t_peak(nu: int) -> Decimal:
-    """Return the log of the peak of a Student t of scale 1, by the recurrence of its ratio of gamma functions."""
+    """Return the log peak of a Student t density of scale 1, by a recurrence for its ratio of gamma functions."""
     ratio = 1 / PI.sqrt() if nu % 2 else PI.sqrt() / 2
     for n in range(2 - nu % 2, nu, 2):
         ratio = ratio * (n + 1) / n

@@ -143,12 +143,12 @@ class BumperModel(PointModel):
         points = [self._backend.upload(each) for each in self._select(kept)] if not kept.all() else self._all_points
         start = np.concatenate([[0], np.cumsum(sizes[valid])]).astype(np.int32)
         known = states[valid].astype(np.int32)
-        flags = self._flags | flags_if(CAREFUL=self._real == np.float32)
+        flags = self._flags | flags_if(TWO_PART_POINTS=self._real == np.float32)
         flags = with_lanes_flag(self._backend.info.lanes, "score_contact", flags)
         window, space = self._window, self._workspace
 
         def program(some: Poses, part: Part, log_p: Buffer) -> Program:
-            frame, careful = Frame(window, self.grid, (0.0, 0.0, 0.0)), "CAREFUL" in flags
+            frame, careful = Frame(window, self.grid, (0.0, 0.0, 0.0)), "TWO_PART_POINTS" in flags
             placed = place(some, part, frame, self._backend, space, self._real, careful=careful)
             score = launch(
                 "score_contact", flags, (placed.count,), table=self._table, pose_cell=placed.cell, pose=placed.pose,
@@ -267,7 +267,7 @@ def _kept(value: Any) -> Any:
 
 
 def sample_outline(outline: object, segments: object, spacing: float) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the radius around the points of an outline, the (Q, 2) points, and the (B + 1,) starts of its segments.
+    """Return the contact radius around an outline's points, the (Q, 2) points, and (B + 1,) starts of segments.
 
     Raises:
         TypeError: not numbers, or segments of a polygon that are no integers.

@@ -27,7 +27,7 @@ def log_of(value: Decimal | float) -> Decimal | float:
 
 
 def total(*values: Decimal | float) -> Decimal | float:
-    """Return a sum of logarithms; -inf if one of them is."""
+    """Return a sum of logarithms; -inf if any term is -inf."""
     with localcontext(prec=DIGITS):
         return sum((Decimal(v) for v in values), Decimal(0)) if all(map(math.isfinite, values)) else -math.inf
 

@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 Distribution = Callable[[Floats], Floats]
 # Seeds are keys of Philox: two words of 32 bits.
 MOST_SEED, MOST_STEP = (1 << 64) - 1, (1 << 31) - 1
-# Streams of the models, each followed by those of its readings; scan models have 1 << 30.
+# First stream of each model, followed by the streams of its readings; scan models use stream 1 << 30.
 POSITION, HEADING, BEACONS, BUMPER, LANDMARKS, LINES = (n << 26 for n in range(1, 7))
 # Half widths [deviations] below which a density is uniform to rounding.
 _FLAT = 1e-7

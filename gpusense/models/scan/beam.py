@@ -171,7 +171,7 @@ class BeamModel(ScanModel):
         return self._caster.table_bytes
 
     def update_map(self, cells: ArrayLike, region: Sequence[int]) -> None:
-        """Replace cells of the map; afterwards every result is that of a model of the changed grid.
+        """Replace cells of the map; later results equal those of a model made with the changed grid.
 
         The exact caster updates only the affected part of its table; see ``RayCaster.update_map``.
 
@@ -236,7 +236,7 @@ class BeamModel(ScanModel):
             poses: (N, 3) robot poses in the world [m, m, rad], or (S, N, 3) of S scans; arrays of other libraries as
                 in ``log_likelihood``.
             seed: Seed of the random numbers, 0 to 2^64 - 1.
-            step: Step of a run, or that of the first of S scans, 0 to 2^31 - 1: other steps have other numbers.
+            step: Step of a run, or of the first of S scans, 0 to 2^31 - 1; each step has other random numbers.
             out: The array for the readings, as in ``log_likelihood``.
 
         Returns:
@@ -265,11 +265,11 @@ class BeamModel(ScanModel):
             self._mixtures, mixture.cosines, table, self.scanner.range_max, self._setting.real, seed=seed, step=step,
             per_scan=shape[-1],
         )  # fmt: skip
-        result = Result(poses, out, (*shape, self.scanner.count), self._setting.real, self._setting.backend)
-        pipeline = self._beam_pipeline
+        pipeline, shape = self._beam_pipeline, (*shape, self.scanner.count)
+        result = Result(poses, out, shape, pipeline.real, pipeline.backend, on_device=checked.on_device)
         cones = dataclasses.replace(pipeline.cones, incidence=drawing.bins > 1)
         self._caster.draw(checked, pipeline.cone_vectors, result.flat, cones, drawing)
-        return result.array()
+        return result.user_array()
 
     def _notes(self) -> tuple[str, list[Omission], list[Note], list[Note]]:
         return scene_notes(

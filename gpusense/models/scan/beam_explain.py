@@ -33,7 +33,7 @@ def scene_notes(
     discrete: bool,
     weights_note: str,
 ) -> tuple[str, list[Omission], list[Note], list[Note]]:
-    """Return the title of the report, what is left out, kept, and could go; readings and map as of the last call.
+    """Return the report's title and the parts left out, kept, and removable, as of the last call.
 
     Args:
         pipeline: The stages of the model.
@@ -93,12 +93,12 @@ def scene_notes(
 
 
 def _kept_of_mixture(pipeline: BeamPipeline, mixtures: Sequence[BeamParameters]) -> tuple[list[Note], list[Note]]:
-    """Return the parts of the density that its parameters need, and those that other parameters would leave out."""
+    """Return the parts of the density that its parameters need, and the parts that other parameters would leave out."""
     flags, kept, could_go = pipeline.mixture.flags, [], []
     peak = max(hit_peak(p) for p in mixtures)
     if "LINEAR" not in flags:
         kept.append(Note("log-domain sum", "z_rand does not bound the mixture from below"))
-    if "SHARP" in flags:
+    if "EXACT_EXPONENT" in flags:
         kept.append(Note("exponents in two parts", f"the hit density's peak is {peak:.4g} / m, above {HIGH_PEAK:g}"))
     if (hit := mixtures[0].hit) != "normal":
         kept.append(Note("shape of hits", f"hit = {hit!r}: a logarithm more, and masses from a table"))
@@ -133,7 +133,7 @@ def _mixture_omissions(pipeline: BeamPipeline, *, discrete: bool) -> list[Omissi
         for flag, name, cost in _MOMENTS
         if flag not in mixture.flags
     ]
-    if "SHARP" not in mixture.flags:
+    if "EXACT_EXPONENT" not in mixture.flags:
         why = f"the hit density's peak is at most {HIGH_PEAK:g} / m"
-        omissions.append(Omission("exponents in two parts", why, "37 operations", frozenset({"SHARP"})))
+        omissions.append(Omission("exponents in two parts", why, "37 operations", frozenset({"EXACT_EXPONENT"})))
     return omissions

@@ -18,8 +18,9 @@ from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.cones import Cones
 from gpusense.models.scan.map_caster import MapCaster
 from gpusense.models.scan.mixture import Mixture
-from gpusense.models.scan.pipeline import ModelContext, ScanLaunch, ScanPipeline, Tiles
+from gpusense.models.scan.pipeline import ScanLaunch, ScanPipeline, Tiles
 from gpusense.models.scan.readings import Readings, Sensing
+from gpusense.models.scan.rules import ModelContext
 from gpusense.models.scan.tiles import all_within, stranded, sum_launch, tiles_of
 from gpusense.world.frames import ray_vectors
 

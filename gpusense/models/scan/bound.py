@@ -21,9 +21,10 @@ from gpusense.backends.workspace import POSE_STATUS, Workspace
 from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.interface.launches import Program
 from gpusense.models.poses import Poses
-from gpusense.models.run import finish
+from gpusense.models.run import chunk_of, finish
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.readings import Readings, device_readings
+from gpusense.world.windows import Corners
 
 _INT = np.dtype(np.int32)
 
@@ -90,6 +91,7 @@ class DeviceCall(BoundCall):
         poses, ranges, out: See ``ScanModel.bind``.
         status: A shared buffer for the non-finite flag, which its owner inspects; None for a private one.
         limits: The type to which the scanner's limits are rounded; None for the type of the ranges.
+        corners: Corners of the box of the poses, where their owner knows them: the map's table may be cropped then.
     """
 
     waits = False
@@ -103,14 +105,16 @@ class DeviceCall(BoundCall):
         out: Any,
         status: Buffer | None = None,
         limits: np.dtype | None = None,
+        corners: Corners | None = None,
     ) -> None:
         backend, real = pipeline.backend, pipeline.real
         self._pipeline, self._lock = pipeline, lock
         self._poses = Poses(poses, backend, in_place=True)
+        self._poses.hull = corners
         count = self._poses.count
         adopted = arrays.adopt_readings(ranges, backend, pipeline.scanner.count, in_place=True)
-        result = Result(poses, out, (count,), real, backend)
-        self._log_p, self.out = result.flat, result.array()
+        result = Result(poses, out, (count,), real, backend, on_device=True)
+        self._log_p, self.out = result.flat, result.user_array()
         # The owners of the memory that is read and written.
         self._owners = (poses, ranges, adopted, self.out)
         # Private buffers: other calls of the model may come between.
@@ -120,7 +124,8 @@ class DeviceCall(BoundCall):
         self._readings = self._placed_readings(adopted, adopted.dtype if limits is None else limits)
         # Pieces begin where parts of buffers can.
         whole = max(backend.alignment // _INT.itemsize, 1)
-        chunk = pipeline.chunk(self._readings.readings * pipeline.rays_each)
+        rays = self._readings.readings * pipeline.rays_each
+        chunk = chunk_of(backend, rays, pipeline.kept_bytes())
         self._chunk = -(-chunk // whole) * whole
         # The program for the map as it is, by the version of its table.
         self._programs = ProgramCache[RecordedProgram](1)
@@ -137,8 +142,15 @@ class DeviceCall(BoundCall):
             return program.recording.explain()
         return "nothing is recorded: the map has changed, and its new table did not fit the device"
 
-    def begin(self) -> None:
-        """Start the recording, as part of this thread's batch."""
+    def begin(self, corners: Corners | None = None) -> None:
+        """Start the recording, as part of this thread's batch.
+
+        Args:
+            corners: Corners of the box of the poses, where their owner knows them.
+        """
+        if corners is not None:
+            self._poses.hull = corners
+            self._pipeline.map.ensure(corners)
         self._pipeline.backend.replay(self._current().recording)
 
     @property

@@ -1,4 +1,4 @@
-"""Ray casting on its own: expected ranges of poses and bearings."""
+"""Ray casting without a measurement model: expected ranges of poses and bearings."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ class RayCaster(Pickled):
         self._caster.prepare(Poses(poses, self._caster.backend))
 
     def update_map(self, cells: ArrayLike, region: Sequence[int]) -> None:
-        """Replace cells of the map; afterwards every range is that of a caster of the changed grid.
+        """Replace cells of the map; later ranges equal those of a caster made with the changed grid.
 
         The exact caster updates its table where rectangles can hold a changed obstacle, up to 254 cells away. Other
         casters make their tables anew with the next cast.

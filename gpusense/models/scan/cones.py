@@ -41,7 +41,7 @@ class Cones:
     def flags(self) -> frozenset[str]:
         """The kernels' flags."""
         incidence = self.incidence or self.critical > 0
-        return flags_if(ECHO=incidence or self.rays > 1, INCIDENCE=incidence)
+        return flags_if(CONES=incidence or self.rays > 1, INCIDENCE=incidence)
 
     def words(self, critical: float | None) -> str:
         """Return the words of a plan's title; ``critical`` is the largest angle that returns [rad]."""

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import erf, erfcx
 
 from gpusense.world.hit_shapes import NORMAL, SHAPES, HitShape, NormalHit
+from gpusense.world.range_causes import NoReturn, RandomDensity, ShortDensity
 
 Floats = NDArray[np.floating]
 
@@ -86,9 +87,8 @@ def log_hit(
 def log_short(z: ArrayLike, expected: ArrayLike, rate: ArrayLike) -> Any:
     """Return the log density of an exponential on [0, z*], renormalised (book equations 6.7 to 6.9).
 
-    With x = rate z*, ``log p = log(x / (1 - exp(-x))) - log z* - rate z`` for x <= 1 and ``log(rate / (1 - exp(-x))) -
-    rate z`` above, ``1 - exp(-x)`` being ``-expm1(-x)``: no difference of nearly equal numbers, and no two logarithms
-    that nearly cancel. The first factor is 1 at x = 0, so rate 0 is the uniform density 1 / z*.
+    See :meth:`gpusense.world.range_causes.ShortDensity.log_pdf` for its evaluation. Rate 0 is the uniform density
+    1 / z*.
 
     Args:
         z: Readings [m].
@@ -99,20 +99,13 @@ def log_short(z: ArrayLike, expected: ArrayLike, rate: ArrayLike) -> Any:
         Natural logarithms of densities [1/m] in the broadcast shape; -inf outside [0, z*] and where z* <= 0.
     """
     z, expected, rate = _arrays(z, expected, rate)
-    real = z.dtype.type
-    with np.errstate(all="ignore"):
-        x = rate * expected
-        rises = -np.expm1(-x)
-        factor = np.where(x > 0, x / rises, real(1))
-        log_p = np.where(x > 1, np.log(rate / rises), np.log(factor) - np.log(expected)) - rate * z
-    return _scalar(np.where((z < 0) | (z > expected) | (expected <= 0), real(-np.inf), log_p))
+    return _scalar(ShortDensity(rate).log_pdf(z, expected))
 
 
 def log_rand(z: ArrayLike, range_max: ArrayLike) -> Any:
     """Return the log density of the uniform distribution on [0, range_max) (book equation 6.11); -inf elsewhere."""
     z, range_max = _arrays(z, range_max)
-    flat = np.where(np.isnan(z), z, -np.log(range_max))
-    return _scalar(np.where((z < 0) | (z >= range_max), z.dtype.type(-np.inf), flat))
+    return _scalar(RandomDensity(range_max).log_pdf(z))
 
 
 def log_mixture(
@@ -171,7 +164,7 @@ def log_mixture(
         largest = parts.max(axis=0)
         shift = np.where(np.isneginf(largest), z.dtype.type(0), largest)
         continuous = shift + np.log(np.exp(parts - shift).sum(axis=0))
-        return _scalar(np.where(z >= range_max, np.log(top), np.where(np.isnan(z), z, continuous)))
+        return _scalar(np.where(z >= range_max, NoReturn(top).log_mass, np.where(np.isnan(z), z, continuous)))
 
 
 def naive_log_hit(z: ArrayLike, expected: ArrayLike, sigma: ArrayLike, range_max: ArrayLike) -> Any:
@@ -280,7 +273,7 @@ def _log_tail(u: Floats, a: Floats, w: Floats, sigma: Floats) -> Floats:
 def _arrays(*values: ArrayLike) -> tuple[Floats, ...]:
     """Broadcast arguments to one shape and dtype: float32 if the widest array is float32, else float64.
 
-    Python numbers take the dtype of the others.
+    Python numbers take the dtype of the arrays.
     """
     arrays = [value if isinstance(value, int | float) else np.asarray(value) for value in values]
     kind = np.result_type(*arrays)

@@ -89,7 +89,7 @@ def _jax_log_likelihood(jax: Any, poses: Any, calls: Differentiable) -> Any:
         log_p, gradient = calls.gradient(joined)
         return split(log_p.astype(real)), split(gradient.astype(real))
 
-    # vmap adds axes in front of those of the poses: one call scores all batches.
+    # vmap adds leading axes to the poses: one call scores all batches.
     def forward(at: Any) -> tuple[Any, Any]:
         return jax.pure_callback(both, (values, slopes), at, vmap_method="expand_dims")
 

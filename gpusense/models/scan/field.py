@@ -19,6 +19,7 @@ from gpusense.models.scan.differentiable import Differentiable
 from gpusense.models.scan.field_gradient import gradients, in_world
 from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.model import ScanModel
+from gpusense.models.scan.request import make_request
 from gpusense.models.scan.rules import Beams
 from gpusense.world.compat import Peer, check_weights, choose
 from gpusense.world.grid import OccupancyGrid
@@ -127,7 +128,7 @@ class LikelihoodFieldModel(ScanModel):
                 "interpolation: must be 'bilinear' for gradients, got a field with 'nearest': pass "
                 "LikelihoodFieldParameters(interpolation='bilinear')"
             )
-        request = self._request(poses, ranges, None)
+        request = make_request(self._setting, poses, ranges)
         with self._lock, self._workspace:
             numbers = gradients(self._field_pipeline, request, self._workspace)
             finish(self._workspace, request.poses.on_device)
@@ -144,7 +145,7 @@ class LikelihoodFieldModel(ScanModel):
         )  # fmt: skip
 
     def update_map(self, cells: ArrayLike, region: Sequence[int]) -> None:
-        """Replace cells of the map; afterwards every result is that of a model of the changed grid.
+        """Replace cells of the map; later results equal those of a model made with the changed grid.
 
         Only distances within ``max_distance`` of a changed obstacle are computed again.
 
@@ -200,18 +201,18 @@ class LikelihoodFieldModel(ScanModel):
         if bilinear:
             kept.append(Note("interpolation", "interpolation='bilinear'"))
             could_go.append(Note("interpolation", "interpolation='nearest' has one look-up in place of four"))
-            if "SHARP" in pipeline.components:
+            if "EXACT_EXPONENT" in pipeline.components:
                 kept.append(Note("exponents in two parts", f"the hit density's peak is above {HIGH_PEAK:g} / m"))
-            if "LINEAR" not in pipeline.components:
+            if p.z_rand and "LINEAR" not in pipeline.components:
                 kept.append(Note("log-domain sum", "z_rand does not bound the mixture from below"))
         if pipeline.log_table:
             omissions.append(
                 Omission("density per beam", "cells hold log densities (nearest)", "1 exp and 1 log per particle-beam")
             )
-        if "SHARP" not in pipeline.components:
+        if "EXACT_EXPONENT" not in pipeline.components:
             low = f"the hit density's peak is at most {HIGH_PEAK:g} / m"
             why = low if bilinear else "no density is evaluated"
-            sharp = frozenset({"SHARP"}) if bilinear else frozenset[str]()
+            sharp = frozenset({"EXACT_EXPONENT"}) if bilinear else frozenset[str]()
             omissions.append(Omission("exponents in two parts", why, "some 200 operations per particle-beam", sharp))
         if not bilinear:
             omissions.append(Omission("interpolation", "interpolation='nearest'", "3 of 4 look-ups"))

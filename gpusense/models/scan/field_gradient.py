@@ -10,7 +10,7 @@ from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import launch
 from gpusense.interface.signatures.rows import LANES
 from gpusense.interface.structs import ScanBatch, Score
-from gpusense.models.run import Piece, run_pieces
+from gpusense.models.run import Piece, chunk_of, run_pieces
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.readings import Readings, placing_launches
@@ -25,7 +25,7 @@ def gradients(pipeline: FieldPipeline, request: Request, space: Workspace) -> np
     result = np.zeros((request.scans * request.per_scan, GRADIENT_NUMBERS), pipeline.real)
     for particles, scans in pipeline.groups(request):
         if particles.count:
-            most = pipeline.chunk(4 * scans.most_readings)
+            most = chunk_of(pipeline.backend, 4 * scans.most_readings, pipeline.kept_bytes())
             run_pieces(space, particles, most, _Gradient(pipeline, request, particles, scans, space, result))
     return result
 
@@ -57,8 +57,8 @@ class _Gradient:
         mount_x, mount_y = (value / resolution for value in pipeline.scanner.mount[:2])
         flags = (pipeline.components | readings.flags) - _OTHERS
         flags, per_scan = with_lanes_flag(backend.info.lanes, "field_gradient", flags), piece.count // readings.scans
-        # Vectors of particles hold those of one scan.
-        size = readings.scans * -(-per_scan // LANES) * LANES if "WIDE" in flags else piece.count
+        # The particles of a vector belong to one scan.
+        size = readings.scans * -(-per_scan // LANES) * LANES if "IN_LANES" in flags else piece.count
         given = readings.arguments
         gradient = launch(
             "field_gradient", flags, (size,), table=table, pose_cell=placed.cell, pose=placed.pose,

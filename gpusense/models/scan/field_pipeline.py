@@ -16,8 +16,9 @@ from gpusense.interface.launches import Program, launch
 from gpusense.interface.structs import Score
 from gpusense.models.poses import PlacedPoses
 from gpusense.models.scan.classed import ClassedScans
-from gpusense.models.scan.pipeline import ModelContext, ScanLaunch, ScanPipeline, Tiles
+from gpusense.models.scan.pipeline import ScanLaunch, ScanPipeline, Tiles
 from gpusense.models.scan.readings import Readings, Sensing
+from gpusense.models.scan.rules import ModelContext
 from gpusense.models.scan.tiles import ENOUGH_SHORT, all_within, spread_of, sum_launch
 from gpusense.tables.field import RING, FieldTable
 from gpusense.tables.reachable import ReachableMap
@@ -90,9 +91,10 @@ class FieldPipeline(ScanPipeline):
         """Return flags of the mixture, and the numbers of the kernel file ``field``."""
         density, everything = FieldDensity(p, self.scanner.range_max), not self.specialize
         flags = flags_if(
-            FLOAT64=not self.careful, CAREFUL=self.careful, ALL_READINGS=everything, BILINEAR=bilinear,
+            FLOAT64=not self.careful, TWO_PART_POINTS=self.careful, ALL_READINGS=everything, BILINEAR=bilinear,
             LOG_TABLE=self.log_table, CUBES=cubes, HIT=p.z_hit > 0 or everything, LINEAR=density.is_linear(self.real),
-            SHARP=not self.log_table and (density.is_sharp or everything),
+            EXACT_EXPONENT=not self.log_table and (density.is_sharp or everything),
+            RAND=p.z_rand > 0 or everything,
         )  # fmt: skip
         return flags | density.flags, density.terms(self.real)
 
@@ -169,7 +171,7 @@ class FieldPipeline(ScanPipeline):
         flags = self.components | conditions
         if not tiled:
             flags = with_lanes_flag(self.backend.info.lanes, "score_field", flags | flags_if(PER_BEAM=per_beam))
-        return flags | flags_if(QUICK=self.quick and (tiled or self.backend.info.vector_loops))
+        return flags | flags_if(ROUNDED_CELLS=self.quick and (tiled or self.backend.info.vector_loops))
 
     def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
         """See ScanPipeline.layout."""
@@ -179,7 +181,7 @@ class FieldPipeline(ScanPipeline):
         """See ScanPipeline.numbers; blocks of readings have a guard each on the device."""
         readings = scoring.readings
         score = Score(readings.constant_term, self.setting.temperature)
-        # Bound of the errors of products of rounded factors and of their sums: 3.12 eps of the longest, 1.5 eps.
+        # Error bounds: products of rounded factors err by at most 3.12 eps of the longest, their sums by 1.5 eps.
         return dict(score=score, guard=self.guard * readings.reach) if scoring.tiles is None else dict(score=score)
 
     def score_launches(self, scoring: ScanLaunch) -> Program:
@@ -192,8 +194,9 @@ class FieldPipeline(ScanPipeline):
             parts=parts.buffer, **readings.arguments,
         )  # fmt: skip
         if scoring.tiles is None:
-            # Vectors of particles hold those of one scan.
-            size = readings.scans * -(-scoring.batch.per_scan // _GROUP) * _GROUP if "WIDE" in scoring.flags else count
+            # The particles of a vector belong to one scan.
+            grouped = readings.scans * -(-scoring.batch.per_scan // _GROUP) * _GROUP
+            size = grouped if "IN_LANES" in scoring.flags else count
             common |= self.numbers(scoring)
             return (
                 launch(

@@ -10,7 +10,7 @@ from gpusense._util import checks
 from gpusense.models.poses import Poses
 from gpusense.models.run import finish_all
 from gpusense.models.scan.model import ScanModel
-from gpusense.models.scan.scoring import run
+from gpusense.models.scan.request import make_request
 
 
 def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out: Any = None) -> list[Any]:
@@ -54,7 +54,7 @@ def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out
     for model, model_poses, model_ranges, model_out in zip(chosen, each_poses, each_ranges, each_out, strict=True):
         # Poses that several models share are checked once.
         shared = known.setdefault(id(model_poses), {})
-        requests.append(model._request(model_poses, model_ranges, model_out, known=shared))
+        requests.append(make_request(model._setting, model_poses, model_ranges, model_out, known=shared))
     # One order of locks, so that two such calls cannot deadlock.
     different = sorted({id(model): model for model in chosen}.items())
     with contextlib.ExitStack() as stack:
@@ -65,11 +65,11 @@ def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out
         # Left first: the batch is started before an error abandons its memory.
         stack.enter_context(chosen[0]._workspace)
         for model, request in zip(chosen, requests, strict=True):
-            run(model._pipeline, request, model._workspace, model._last)
+            model._run(request)
             model._workspace.submit()
         on_device = {id(model) for model, request in zip(chosen, requests, strict=True) if request.poses.on_device}
         finish_all([(model._workspace, key in on_device) for key, model in different])
-    return [request.result.array() for request in requests]
+    return [request.result.user_array() for request in requests]
 
 
 def _checked(models: object) -> list[ScanModel]:

@@ -165,7 +165,7 @@ class MapCaster:
             (N, K) expected ranges, or angles of incidence.
         """
         checked, rays = Poses(poses, self.backend), len(vectors)
-        result = Result(poses, out, (checked.count, rays), self.real, self.backend)
+        result = Result(poses, out, (checked.count, rays), self.real, self.backend, on_device=checked.on_device)
         if checked.count * rays:
             with self._lock, self._workspace:
                 ray = self._workspace.upload("ray", vectors.astype(self.real))
@@ -175,7 +175,7 @@ class MapCaster:
                     lambda piece: self._cast(checked, piece, ray, rays, result.flat, cones),
                 )  # fmt: skip
                 finish(self._workspace, checked.on_device)
-        return result.array()
+        return result.user_array()
 
     def draw(self, poses: Poses, vectors: np.ndarray, flat: Any, cones: Cones, drawing: Drawing) -> None:
         """Draw readings at S N poses into flat memory, in pieces that fit the device's memory.
@@ -243,7 +243,7 @@ class MapCaster:
             map_table=table, pose_cell=placed.cell, pose=placed.pose, ray=ray, window=window, particles=count,
             rays=rays, caster=self.method.struct(), scale=self.scale,
         )  # fmt: skip
-        if "ECHO" in flags:
+        if "CONES" in flags:
             heard = dict(
                 normals=self.normals(window, cones.flags), ranges=result, incidence=incidence, cone=cones.struct
             )

@@ -14,6 +14,7 @@ from gpusense.interface.terms import HIGH_PEAK, log_weight, rounded_terms, sums_
 from gpusense.world.hit_shapes import shape_of
 from gpusense.world.hit_tables import mass_tables
 from gpusense.world.parameters import BeamParameters
+from gpusense.world.range_causes import NoReturn, RandomDensity, ShortDensity
 from gpusense.world.sensor_table import SensorTable
 
 # Most bins of a sensor's table along each axis: 268 MB in float32.
@@ -103,7 +104,7 @@ def mixture_of(
     rand |= max_depends and not (hit or short)
     peaks, everything = [hit_peak(p) for p in kinds], not specialize
     linear = all(
-        sums_linearly(p.z_rand / range_max, max(peak, p.z_short * p.lambda_short), real)
+        sums_linearly(_rand(p, range_max), max(peak, ShortDensity(p.lambda_short).peak(p.z_short)), real)
         for p, peak in zip(kinds, peaks, strict=True)
     )
     ends = [_last_range(p, range_max, real, linear) for p in kinds]
@@ -111,11 +112,23 @@ def mixture_of(
     flags = flags_if(
         HIT=hit or everything, SHORT=short or everything, RAND=rand or everything,
         BIAS=everything or any(p.range_bias for p in kinds), GROWTH=everything or any(p.sigma_growth for p in kinds),
-        SINGLE=specialize and hit + short + rand == 1, SHARP=max(peaks) > HIGH_PEAK or everything, LINEAR=linear,
+        SINGLE=specialize and hit + short + rand == 1, EXACT_EXPONENT=max(peaks) > HIGH_PEAK or everything,
+        LINEAR=linear,
         STOPS=specialize and len(ends) == 1 and ends[0] is not None,
     )  # fmt: skip
     terms = [_terms(p, range_max, real, linear, end) for p, end in zip(kinds, ends, strict=True)]
     return flags | shape, np.concatenate([*terms, *mass_tables([shape_of(p) for p in kinds], terms, real)])
+
+
+def learning_terms(p: BeamParameters, range_max: float, real: np.dtype) -> np.ndarray:
+    """Return the numbers of the kernel file ``learning``, with the table of masses behind them.
+
+    Raises:
+        ValueError: a number is beyond what the precision can hold.
+    """
+    shape = shape_of(p)
+    terms = _terms(p, range_max, real, False, (1 / p.sigma_hit, 1 / shape.width, 0.0))
+    return np.concatenate([terms, *mass_tables([shape], [terms], real)])
 
 
 def _common_flags(kinds: Sequence[BeamParameters]) -> frozenset[str]:
@@ -142,7 +155,8 @@ def peer_mixture(
         raise ValueError(f"parameters: range_bias and sigma_growth must be 0 with compat, got {p}")
     flags = frozenset({"HIT", "SHORT", "RAND", "LINEAR", "CUBES"}) | flags_if(AMCL=amcl)
     hit = p.z_hit if amcl else hit_peak(p)
-    terms = [hit, *_shape(p), p.z_short, p.lambda_short, p.z_rand / range_max, range_max, p.z_max]
+    short = ShortDensity(p.lambda_short)
+    terms = [hit, *_shape(p), p.z_short, short.rate, _rand(p, range_max), range_max, NoReturn(p.z_max).weight]
     return flags, rounded_terms(terms, real)
 
 
@@ -158,7 +172,7 @@ def tabulated(p: BeamParameters, width: float, range_max: float, real: np.dtype)
     cells = max(round(range_max / width), 1)
     middle = (np.arange(cells) + 0.5) * (range_max / cells)
     expected = np.append(middle, range_max)
-    table = np.full((cells + 1, cells + 1), log_weight(p.z_max), real)
+    table = np.full((cells + 1, cells + 1), NoReturn(p.z_max).number, real)
     # In blocks of rows: temporary arrays take about forty numbers per density.
     for first in range(0, cells, 64):
         rows = slice(first, first + 64)
@@ -171,6 +185,11 @@ def hit_peak(p: BeamParameters) -> float:
     return shape_of(p).peak(p.z_hit, p.sigma_hit)
 
 
+def _rand(p: BeamParameters, range_max: float) -> float:
+    """Return the density of random readings times their weight [1/m]."""
+    return RandomDensity(range_max).peak(p.z_rand)
+
+
 def _shape(p: BeamParameters) -> tuple[float, float]:
     return 0.5 / p.sigma_hit / p.sigma_hit, math.sqrt(0.5) / p.sigma_hit
 
@@ -179,11 +198,12 @@ def _terms(
     p: BeamParameters, range_max: float, real: np.dtype, linear: bool, end: tuple[float, float, float] | None
 ) -> np.ndarray:
     if linear:
-        head = (hit_peak(p), p.z_short, p.z_rand / range_max)
+        head = (hit_peak(p), p.z_short, _rand(p, range_max))
     else:
         log_scale = log_weight(p.z_hit) - math.log(p.sigma_hit) - shape_of(p).log_width
-        head = (log_scale, log_weight(p.z_short), log_weight(p.z_rand) - math.log(range_max))
-    terms = [head[0], *_shape(p), head[1], p.lambda_short, head[2], range_max, log_weight(p.z_max)]
+        head = (log_scale, log_weight(p.z_short), RandomDensity(range_max).log_peak(p.z_rand))
+    rate, top = ShortDensity(p.lambda_short).rate, NoReturn(p.z_max).number
+    terms = [head[0], *_shape(p), head[1], rate, head[2], range_max, top]
     # The last number is the place of the table of masses.
     rest = [*(end or (0, 0, 0)), *shape_of(p).numbers, 0]
     return np.concatenate([rounded_terms(terms, real), _moments(p, real), np.array(rest, real)])
@@ -200,10 +220,10 @@ def _last_range(p: BeamParameters, range_max: float, real: np.dtype, linear: boo
     Returns:
         None where there is no such range below range_max for some reading.
     """
-    rand, digits = p.z_rand / range_max, np.finfo(real).nmant
+    rand, digits = _rand(p, range_max), np.finfo(real).nmant
     if not rand or (p.z_short and not (linear and p.lambda_short)):
         return None
-    least = (digits + 9) * math.log(2) / p.lambda_short if p.z_short else 0.0
+    least = ShortDensity(p.lambda_short).settled(digits + 9) if p.z_short else 0.0
     offset, slope = 0.0, 1.0
     if p.z_hit:
         widest = p.sigma_hit + p.sigma_growth * range_max

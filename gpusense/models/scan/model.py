@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import threading
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, Literal, cast, overload
+from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
 import numpy as np
 
@@ -21,18 +22,19 @@ from gpusense.models.arguments import check_scene, map_words, real_dtype
 from gpusense.models.pickled import Pickled
 from gpusense.models.poses import Poses
 from gpusense.models.run import finish
-from gpusense.models.scan.binding import bind
-from gpusense.models.scan.bound import BoundCall
 from gpusense.models.scan.differentiable import Differentiable, is_recorded, log_likelihood_of
-from gpusense.models.scan.pipeline import ModelContext, ScanPipeline
-from gpusense.models.scan.request import Known, Request, make_request
-from gpusense.models.scan.rules import Beams, Rules, check_beams
-from gpusense.models.scan.savings import measured_savings, sources_of
+from gpusense.models.scan.pipeline import ScanPipeline
+from gpusense.models.scan.request import Request, make_request
+from gpusense.models.scan.rules import Beams, ModelContext, Rules, check_beams
 from gpusense.models.scan.scoring import LastCall, run
 from gpusense.world.compat import Peer, choose
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
+
+if TYPE_CHECKING:
+    from gpusense.models.scan.bound import BoundCall
+    from gpusense.models.scan.packed_call import ShortCalls
 
 
 class ScanModel(Pickled):
@@ -82,7 +84,34 @@ class ScanModel(Pickled):
         self._workspace = Workspace(device)
         # Threads may share a model: its buffers serve one call at a time.
         self._lock = threading.Lock()
-        self._last = LastCall()
+        self._last_call = LastCall()
+
+    @functools.cached_property
+    def _short(self) -> ShortCalls | None:
+        """Calls of few particles that repeat a size; None where there are none."""
+        if not self.backend.replays:
+            return None
+        from gpusense.models.scan.packed_call import ShortCalls
+
+        return ShortCalls.of(self._pipeline)
+
+    @property
+    def _last(self) -> LastCall:
+        """The last call; a short one is repeated as one of any size, since only those report what they leave out."""
+        call = None if self._short is None else self._short.last
+        if call is not None:
+            poses, ranges = (array.copy() for array in call.arrays)
+            request = make_request(self._setting, poses, ranges)
+            with self._lock, self._workspace:
+                self._run(request)
+                finish(self._workspace, request.poses.on_device)
+        return self._last_call
+
+    def _run(self, request: Request) -> None:
+        """Start the launches of a request that is not short, while the model is locked."""
+        if self._short is not None:
+            self._short.last = None
+        run(self._pipeline, request, self._workspace, self._last_call)
 
     def __repr__(self) -> str:
         count, used = self.scanner.count, self._setting.rules.choice.most
@@ -202,11 +231,16 @@ class ScanModel(Pickled):
             calls = self._differentiable(ranges)
             if calls is not None:
                 return cast(np.ndarray, log_likelihood_of(poses, ranges, calls))
-        request = self._request(poses, ranges, out, per_beam=per_beam)
+        if self._short is not None:
+            with self._lock:
+                found = self._short.score(poses, ranges, out, per_beam=per_beam)
+            if found is not None:
+                return found
+        request = make_request(self._setting, poses, ranges, out, per_beam=per_beam)
         with self._lock, self._workspace:
-            run(self._pipeline, request, self._workspace, self._last)
+            run(self._pipeline, request, self._workspace, self._last_call)
             finish(self._workspace, request.poses.on_device)
-        log_p = request.result.array()
+        log_p = request.result.user_array()
         return (log_p, request.result_parts()) if per_beam else log_p
 
     def start_scoring(
@@ -223,9 +257,9 @@ class ScanModel(Pickled):
         Raises:
             TypeError, ValueError, MemoryError: see ``log_likelihood``.
         """
-        request = self._request(poses, ranges, out)._replace(before=before)
+        request = make_request(self._setting, poses, ranges, out, before=before)
         with self._lock, self._workspace:
-            run(self._pipeline, request, self._workspace, self._last)
+            self._run(request)
 
     def finish_scoring(self) -> None:
         """Wait for calls that ``start_scoring`` has begun.
@@ -249,9 +283,9 @@ class ScanModel(Pickled):
         were not finite. NumPy arrays of few particles go to a GPU and back with one copy each way; elsewhere the bound
         call is the ordinary one, so that the same program runs on every backend.
 
-        Results have the bits of ``log_likelihood`` with the same poses on the device, but for scans in which bearings
-        repeat or, with a temperature below 1, no range depends on the pose, and for some of the beams by number with
-        ``specialize=False``: these agree to rounding.
+        Results have the bits of ``log_likelihood`` with the same poses on the device. Three cases agree only to
+        rounding: scans in which bearings repeat, scans of a temperature below 1 in which no range depends on the pose,
+        and ``beams=`` as a number with ``specialize=False``.
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array as ``log_likelihood`` takes it.
@@ -263,10 +297,13 @@ class ScanModel(Pickled):
             ValueError: a wrong shape.
             MemoryError: the device cannot hold the map's table, or the buffers of a call.
         """
+        # Few programs bind calls.
+        from gpusense.models.scan.binding import bind
+
         return bind(self._pipeline, self._lock, self.log_likelihood, poses, ranges, out)
 
     def explain(self, *, measure: bool = False) -> str:
-        """Report what this scene leaves out, what it keeps, and what could go, each with the reason.
+        """Report the parts that this scene leaves out, keeps, and could leave out, each with the reason.
 
         Readings and map are those of the last call.
 
@@ -300,9 +337,11 @@ class ScanModel(Pickled):
         title, omissions, kept, could_go = self._notes()
         plan = self._plan(title, omissions, kept, could_go)
         if measure:
+            from gpusense.models.scan.savings import measured_savings
+
             with self._lock:
                 savings = measured_savings(
-                    lambda poses, ranges: self._request(poses, ranges, None), self._pipeline, self._last, plan,
+                    functools.partial(make_request, self._setting), self._pipeline, self._last, plan,
                     self.scanner.count,
                 )  # fmt: skip
             plan = dataclasses.replace(plan, measured=savings)
@@ -314,11 +353,13 @@ class ScanModel(Pickled):
         Returns:
             OpenCL C, Warp's Python or NumPy's by the names of the kernels; empty before the first call.
         """
+        from gpusense.models.scan.savings import sources_of
+
         return sources_of(self._setting.backend, self._last)
 
     @abstractmethod
     def _notes(self) -> tuple[str, list[Omission], list[Note], list[Note]]:
-        """Return the title of the report, and what is left out, kept, and could go."""
+        """Return the report's title, and the parts that are left out, kept, and removable."""
 
     def prepare(self, poses: AnyArray) -> None:
         """Make the map's table for a cloud of (N, 3) poses now; ``log_likelihood`` does it otherwise.
@@ -331,15 +372,6 @@ class ScanModel(Pickled):
         if checked.count:
             with self._lock:
                 checked.window(self._pipeline.map, (0, checked.count))
-
-    def _request(
-        self, poses: AnyArray, ranges: AnyArray, out: object, *, per_beam: bool = False, known: Known | None = None
-    ) -> Request:
-        """Check the arguments of a call."""
-        return make_request(
-            poses, ranges, out, scanner=self.scanner, backend=self._setting.backend, real=self._setting.real,
-            per_beam=per_beam, known=known,
-        )  # fmt: skip
 
     def _weights_note(self) -> str:
         return "" if self.compat is None else f" with the weights of {self._setting.weights.name} (no likelihood)"

@@ -9,12 +9,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Iterable, Iterator
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.launches import Program
@@ -24,40 +22,14 @@ from gpusense.models.run import Piece, chunk_of
 from gpusense.models.scan.classed import ClassedScans, class_scans
 from gpusense.models.scan.readings import Readings, Sensing, placing_launches
 from gpusense.models.scan.request import Request
-from gpusense.models.scan.rules import Rules
+from gpusense.models.scan.rules import ModelContext
 from gpusense.models.scan.tiles import Order, Parts, order_of
 from gpusense.tables.reachable import ReachableMap
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.likelihood import Likelihood
 
 # Rays times particles of one scan up to which several scans share their launches, by kind of device. Above, a scan's
 # launches fill the device for longer than it takes to start them.
 TOGETHER = {"gpu": 1 << 22, "cpu": 1 << 20}
-
-
-@dataclass(frozen=True)
-class ModelContext:
-    """The device, and the rules for readings, of a scan model.
-
-    Attributes:
-        backend: The device.
-        real: Precision.
-        rules: How readings are classed; they hold the scanner.
-        weights: The book's likelihood, or the program whose weights are reproduced.
-        cubes: Whether the model sums cubes of densities, in place of logarithms.
-        temperature: Multiplies the sum over readings.
-        constant_term: The first term of that sum.
-        possible: Whether some range is possible at some pose.
-    """
-
-    backend: Backend
-    real: np.dtype
-    rules: Rules
-    weights: Likelihood
-    cubes: bool
-    temperature: float
-    constant_term: float
-    possible: bool
 
 
 class Tiles(NamedTuple):
@@ -198,13 +170,13 @@ class ScanPipeline(ABC):
         if request.scans < 2 or request.per_beam or not self.setting.possible:
             return False
         rays = max(self.scanner.count * self.rays_each, 1)
-        most = min(TOGETHER[self.backend.info.kind] // rays, self.chunk(rays))
+        most = min(TOGETHER[self.backend.info.kind] // rays, chunk_of(self.backend, rays, self.kept_bytes()))
         return request.per_scan <= most
 
-    def chunk(self, rays: int, *, per_beam: bool = False) -> int:
-        """Return the particles of one launch with a number of rays each."""
+    def kept_bytes(self, *, per_beam: bool = False) -> float:
+        """Return the bytes that a launch keeps for each particle and ray."""
         kept = 1.0 if per_beam else self.kept_parts if self.backend.info.kind == "gpu" else 0.0
-        return chunk_of(self.backend, max(rays, 1), self.real.itemsize * kept)
+        return self.real.itemsize * kept
 
     # ---- readings
 
@@ -226,7 +198,7 @@ class ScanPipeline(ABC):
 
     def place(self, poses: Poses, part: Part, space: Workspace) -> tuple[PlacedPoses, Buffer]:
         """Place some poses in a window of the map; also return the map's table for it."""
-        table, window = self.map.ensure(poses.corners(part))
+        table, window = self.map.ensure(poses.corners(part) or poses.hull)
         frame = Frame(window, self.map.grid, self._mount)
         return place(poses, part, frame, self.backend, space, self.real, careful=self.careful), table
 

@@ -16,10 +16,11 @@ from gpusense.interface.launches import Program, launch
 from gpusense.interface.structs import ReadingRules
 from gpusense.models.poses import PlacedPoses
 from gpusense.models.scan.rules import BeamChoice, Beams
+from gpusense.world.range_causes import NoReturn
 from gpusense.world.scanner import Scanner
 
 _INT = np.dtype(np.int32)
-# The kernel places readings by whole groups of work-items, so that those of poses begin with a group.
+# The kernel places readings by whole groups of work-items, so that the work-items of poses begin with a new group.
 _GROUP = 64
 
 
@@ -173,7 +174,7 @@ def device_readings(
         filled, ranges=ranges, beam=space.upload("beam", columns.astype(_INT)),
         vector=space.upload("vector", sensing.vectors[columns]), head=-(-max(len(columns), 1) // _GROUP) * _GROUP,
         rules=ReadingRules(
-            nearest, farthest, float(np.log(sensing.z_max)) if kind == MAX_FIXED else 0.0, sensing.top,
+            nearest, farthest, float(NoReturn(sensing.z_max).log_mass) if kind == MAX_FIXED else 0.0, sensing.top,
             sensing.guard_scale, len(columns), each, places, chosen, kind, int(sensing.possible),
         ),
     )  # fmt: skip

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gpusense.backends import Backend, arrays
+from gpusense.backends import arrays
 from gpusense.backends.results import Result
 from gpusense.models.poses import Poses
 from gpusense.models.scan.classed import check_ranges
-from gpusense.world.scanner import Scanner
+from gpusense.models.scan.rules import ModelContext
 
 _FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
 # Poses that several models share, checked once, by the number of scans.
@@ -55,31 +55,30 @@ class Request(NamedTuple):
 
 
 def make_request(
+    setting: ModelContext,
     poses: Any,
     ranges: Any,
-    out: Any,
+    out: Any = None,
     *,
-    scanner: Scanner,
-    backend: Backend,
-    real: np.dtype,
     per_beam: bool = False,
     known: Known | None = None,
+    before: Callable[[], None] | None = None,
 ) -> Request:
     """Check the arguments of a call.
 
     Args:
+        setting: The model's device, precision and scanner.
         poses: (N, 3), or (S, N, 3).
         ranges: (K,), or (S, K).
         out: None, or the array for the result.
-        scanner: The scanner of the readings.
-        backend: The device.
-        real: Precision of the result.
         per_beam: Whether the log-likelihoods of the readings are requested.
         known: Poses that were checked before.
+        before: See Request.
 
     Raises:
         TypeError, ValueError: an argument breaks its rule.
     """
+    backend, real, scanner = setting.backend, setting.real, setting.rules.scanner
     beams = scanner.count
     if type(ranges) is np.ndarray and ranges.shape == (beams,) and ranges.dtype in _FLOATS:
         readings: np.ndarray = ranges
@@ -94,6 +93,6 @@ def make_request(
         scans = len(readings)
         checked = known[scans] = known.get(scans) or Poses(poses, backend, scans=scans)
         shape = (scans, checked.count // scans if scans else np.shape(poses)[1])
-    result = Result(poses, out, shape, real, backend)
+    result = Result(poses, out, shape, real, backend, on_device=checked.on_device)
     parts = np.zeros((len(readings), shape[-1], beams if per_beam else 0), real)
-    return Request(readings, checked, shape, result, parts, per_beam and beams > 0)
+    return Request(readings, checked, shape, result, parts, per_beam and beams > 0, before)

@@ -9,7 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpusense._util.checks import integer, show
+from gpusense.backends import Backend
+from gpusense.world.likelihood import Likelihood
 from gpusense.world.plausible import FirstScans
+from gpusense.world.range_causes import NoReturn
 from gpusense.world.scanner import Reading, Scanner
 
 Beams = int | Sequence[int] | np.ndarray | None
@@ -21,7 +24,7 @@ class BeamChoice:
 
     Attributes:
         columns: Beams that may be used.
-        most: Readings of them that are used at most; of more an even choice.
+        most: Most readings that are used; of more, an even choice.
         every: Whether all beams are used.
     """
 
@@ -110,13 +113,38 @@ class Rules:
     @functools.cached_property
     def log_max(self) -> float:
         """Log of the probability of a max reading that counts; 0 where none does."""
-        return float(np.log(self.z_max)) if self.z_max > 0 else 0.0
+        return float(NoReturn(self.z_max).log_mass) if self.z_max > 0 else 0.0
 
 
 def choose_beams(kinds: np.ndarray, beams: Beams, informative_max: bool) -> np.ndarray:
-    """Return whether each reading is used: all, an even choice of ``beams`` informative ones, or those of indices."""
+    """Return whether each reading is used: all, an even choice of ``beams`` informative ones, or chosen indices."""
     informative = (kinds == Reading.HIT) | ((kinds == Reading.MAX) & informative_max)
     return BeamChoice.of(beams, len(kinds)).used(informative)
+
+
+@dataclass(frozen=True)
+class ModelContext:
+    """The device, and the rules for readings, of a scan model.
+
+    Attributes:
+        backend: The device.
+        real: Precision.
+        rules: How readings are classed; they hold the scanner.
+        weights: The book's likelihood, or the program whose weights are reproduced.
+        cubes: Whether the model sums cubes of densities, in place of logarithms.
+        temperature: Multiplies the sum over readings.
+        constant_term: The first term of that sum.
+        possible: Whether some range is possible at some pose.
+    """
+
+    backend: Backend
+    real: np.dtype
+    rules: Rules
+    weights: Likelihood
+    cubes: bool
+    temperature: float
+    constant_term: float
+    possible: bool
 
 
 def check_beams(beams: Beams, count: int) -> Beams:

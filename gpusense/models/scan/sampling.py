@@ -19,6 +19,7 @@ from gpusense.models.poses import Poses
 from gpusense.world.hit_shapes import HitShape, shape_of
 from gpusense.world.hit_tables import mass_table, quantile_table
 from gpusense.world.parameters import BeamParameters
+from gpusense.world.range_causes import ShortDensity
 from gpusense.world.sensor_table import SensorTable
 
 # Seeds are keys of Philox: two words of 32 bits.
@@ -30,7 +31,7 @@ class Drawing:
     """The numbers by which readings are drawn.
 
     Attributes:
-        mixture: Numbers of the mixtures, for each bin of angles of incidence, then tables of the shape of hits.
+        mixture: Numbers of the mixture for each bin of angles of incidence, then the tables of the hit shape.
         edges: Cosines between these bins, in the model's precision.
         chances: Cumulative probabilities of a table of a sensor; one number without a table.
         cells: Bins of a range in the table; 0 without one.
@@ -128,11 +129,13 @@ def drawing_of(
 
 
 def mixture_numbers(mixtures: tuple[BeamParameters, ...]) -> np.ndarray:
-    """Return the numbers of mixtures as kernels take them, and behind them the tables of their shapes of hits."""
+    """Return the mixtures' numbers as kernels take them, followed by the tables of their hit shapes."""
     names = (
-        "z_hit", "z_short", "z_max", "z_rand", "sigma_hit", "sigma_growth", "range_bias", "lambda_short",
+        "z_hit", "z_short", "z_max", "z_rand", "sigma_hit", "sigma_growth", "range_bias",
     )  # fmt: skip
-    numbers = np.array([[*(getattr(p, name) for name in names), 0.0] for p in mixtures])
+    numbers = np.array(
+        [[*(getattr(p, name) for name in names), ShortDensity(p.lambda_short).rate, 0.0] for p in mixtures]
+    )
     tables: dict[HitShape, np.ndarray] = {}
     begin = numbers.size
     for row, shape in zip(numbers, map(shape_of, mixtures), strict=True):

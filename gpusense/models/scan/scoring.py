@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpusense.backends.workspace import Workspace
-from gpusense.interface.terms import log_weight
 from gpusense.models.poses import Frame, Part, place
-from gpusense.models.run import Piece, run_pieces
+from gpusense.models.run import Piece, chunk_of, run_pieces
 from gpusense.models.scan.classed import ClassedScans
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.readings import Readings
 from gpusense.models.scan.request import Request
+from gpusense.world.range_causes import NoReturn
 from gpusense.world.windows import whole
 
-_WIDE = frozenset({"WIDE"})
+_IN_LANES = frozenset({"IN_LANES"})
 
 
 @dataclass
@@ -55,7 +55,8 @@ def run(pipeline: ScanPipeline, request: Request, space: Workspace, last: LastCa
         last.scans = scans
         if not particles.count:
             continue
-        most = pipeline.chunk(scans.most_readings * pipeline.rays_each, per_beam=request.per_beam)
+        rays, kept = scans.most_readings * pipeline.rays_each, pipeline.kept_bytes(per_beam=request.per_beam)
+        most = chunk_of(pipeline.backend, rays, kept)
         run_pieces(space, particles, most, _Scorer(pipeline, request, particles, scans, space, last))
         if len(request.ranges) > 1:
             space.submit()
@@ -102,14 +103,14 @@ class _Scorer:
             )  # fmt: skip
         self._last.kernels = pipeline.kernel_names[scoring.tiles is not None]
         # Poses are placed in vectors, whatever scores them.
-        self._last.flags = (flags - _WIDE) | (scoring.flags & _WIDE)
+        self._last.flags = (flags - _IN_LANES) | (scoring.flags & _IN_LANES)
         if readings.scans > 1:
             self._last.together = max(self._last.together, readings.scans)
         if request.per_beam:
             each = np.empty((piece.count, len(scans.readings)), pipeline.real)
             rows = self._rows(piece)
             rows[:, scans.columns] = pipeline.backend.download(pipeline.parts(scoring).buffer, each)
-            rows[:, scans.left_out.constant_max] = log_weight(pipeline.rules.z_max)
+            rows[:, scans.left_out.constant_max] = NoReturn(pipeline.rules.z_max).number
 
     def _fill(self, piece: Piece, scans: ClassedScans, value: float) -> None:
         """Set log-likelihoods that do not depend on the poses; device poses are inspected all the same."""
@@ -125,8 +126,8 @@ class _Scorer:
         if request.per_beam:
             rows, finite = self._rows(piece), np.isfinite(scans.readings)
             rows[:, scans.columns[finite]] = -np.inf
-            rows[:, scans.columns[~finite]] = log_weight(pipeline.rules.z_max)
-            rows[:, scans.left_out.constant_max] = log_weight(pipeline.rules.z_max)
+            rows[:, scans.columns[~finite]] = NoReturn(pipeline.rules.z_max).number
+            rows[:, scans.left_out.constant_max] = NoReturn(pipeline.rules.z_max).number
 
     def _rows(self, piece: Piece) -> np.ndarray:
         """Return the rows of a piece of one scan in the parts of the request."""

@@ -79,7 +79,7 @@ def order_of(space: Workspace, placed: PlacedPoses, rays: int, real: np.dtype) -
 
 
 def spread_of(items: int, groups: int, enough: int) -> int:
-    """Return log2 of the number of parts into which the work of each of ``items`` work-items is split.
+    """Return log2 of the number of parts into which each of ``items`` work-items is split.
 
     Args:
         items: Work-items before the split.

@@ -1,6 +1,10 @@
 // Beam model of a whole scan, LANES rays at once: score_beams of beam.cl, with sums in the same order.
 // requires: error_free lanes/returns lanes/mixture lanes/sensor_table
 
+// Vectors of a particle's rays that are cast before their densities are computed. A cast ends by a branch that processors
+// cannot foresee; the densities that follow one another have none, so that processors compute several at once.
+#define VECTORS 4
+
 // Return the distances in cells to which the rays of readings are cast.
 lanes ray_limit_lanes(const lanes z, global const real *terms, const RangeScale scale) {
 #if STOPS
@@ -75,59 +79,66 @@ kernel void score_beams(ARGUMENTS) {
     real2 total = (real2)(constant_term, 0);
     real4 strands = 0;
     ilanes impossible = 0;
-    for (int k = 0; k < count; k += LANES) {
-        const int left = count - k;
-        const lanes z = load_some(reading + k, left);
+    for (int from = 0; from < count; from += VECTORS * LANES) {
+        const int until = count - from < VECTORS * LANES ? count : from + VECTORS * LANES;
+        EchoLanes echo[VECTORS];
+        for (int k = from, v = 0; k < until; k += LANES, ++v) {
 #if SHARED_RAYS
-        // Readings of the same ray are neighbours, so those of a vector have rays of two vectors at most.
-        int at[LANES];
-        for (int i = 0; i < LANES; ++i) {
-            while (first[r + 1] - begin <= k + i && k + i < count) ++r;
-            at[i] = r;
-        }
-        for (; returns.cast <= r; returns.cast += LANES) {
-            const EchoLanes new = nearest_echo_lanes(map_table, normals, window, pose_cell[n], pose[n], ray,
-                                                     returns.cast, size, cone, scale.limit, caster);
-            store_lanes(new.t, (returns.cast / LANES) % 2, returns.t);
-            store_lanes(new.cosine, (returns.cast / LANES) % 2, returns.cosine);
-        }
-        real t[LANES], cosine[LANES];
-        for (int i = 0; i < LANES; ++i) {
-            t[i] = returns.t[at[i] % (2 * LANES)];
-            cosine[i] = returns.cosine[at[i] % (2 * LANES)];
-        }
-        const EchoLanes echo = {load_lanes(0, t), load_lanes(0, cosine)};
+            // Readings of the same ray are neighbours, so those of a vector have rays of two vectors at most.
+            int at[LANES];
+            for (int i = 0; i < LANES; ++i) {
+                while (first[r + 1] - begin <= k + i && k + i < count) ++r;
+                at[i] = r;
+            }
+            for (; returns.cast <= r; returns.cast += LANES) {
+                const EchoLanes new = nearest_echo_lanes(map_table, normals, window, pose_cell[n], pose[n], ray,
+                                                         returns.cast, size, cone, scale.limit, caster);
+                store_lanes(new.t, (returns.cast / LANES) % 2, returns.t);
+                store_lanes(new.cosine, (returns.cast / LANES) % 2, returns.cosine);
+            }
+            real t[LANES], cosine[LANES];
+            for (int i = 0; i < LANES; ++i) {
+                t[i] = returns.t[at[i] % (2 * LANES)];
+                cosine[i] = returns.cosine[at[i] % (2 * LANES)];
+            }
+            echo[v] = (EchoLanes){load_lanes(0, t), load_lanes(0, cosine)};
 #else
-        const EchoLanes echo = nearest_echo_lanes(map_table, normals, window, pose_cell[n], pose[n], ray, k, size,
-                                                  cone, ray_limit_lanes(z, terms, scale), caster);
+            const lanes limit = ray_limit_lanes(load_some(reading + k, count - k), terms, scale);
+            echo[v] = nearest_echo_lanes(map_table, normals, window, pose_cell[n], pose[n], ray, k, size, cone, limit,
+                                         caster);
 #endif
-        lanes term = reading_term_lanes(z, echo, terms, edges, sensor, tables, scale);
-        real values[LANES];
-        if (left < LANES) {
-            store_lanes(term, 0, values);
-            for (int i = left; i < LANES; ++i) values[i] = 0;
-            term = load_lanes(0, values);
         }
+        for (int k = from, v = 0; k < until; k += LANES, ++v) {
+            const int left = count - k;
+            const lanes z = load_some(reading + k, left);
+            lanes term = reading_term_lanes(z, echo[v], terms, edges, sensor, tables, scale);
+            real values[LANES];
+            if (left < LANES) {
+                store_lanes(term, 0, values);
+                for (int i = left; i < LANES; ++i) values[i] = 0;
+                term = load_lanes(0, values);
+            }
 #if PER_BEAM
-        store_lanes(term, 0, values);
-        for (int i = 0; i < LANES && i < left; ++i) parts[(long)n * readings + k + i] = values[i];
+            store_lanes(term, 0, values);
+            for (int i = 0; i < LANES && i < left; ++i) parts[(long)n * readings + k + i] = values[i];
 #endif
 #if !LINEAR
-        const ilanes never = term == -INFINITY;
-        impossible |= never;
-        term = never ? (lanes)0 : term;
+            const ilanes never = term == -INFINITY;
+            impossible |= never;
+            term = never ? (lanes)0 : term;
 #endif
 #if FLOAT64
-        strands += term.lo;
-        strands += term.hi;
-        if ((k + LANES) % BLOCK_TERMS == 0 || left <= LANES) {
-            total = add_strands(total, strands);
-            strands = 0;
-        }
+            strands += term.lo;
+            strands += term.hi;
+            if ((k + LANES) % BLOCK_TERMS == 0 || left <= LANES) {
+                total = add_strands(total, strands);
+                strands = 0;
+            }
 #else
-        strands = ((term.lo.lo + term.lo.hi) + term.hi.lo) + term.hi.hi;
-        total = add_strands(total, strands);
+            strands = ((term.lo.lo + term.lo.hi) + term.hi.lo) + term.hi.hi;
+            total = add_strands(total, strands);
 #endif
+        }
     }
     const real sum = total.x + total.y;
 #if CUBES

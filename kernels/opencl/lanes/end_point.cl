@@ -7,7 +7,7 @@ ilanes within_lanes(const ilanes i, const int last) {
     return raised < last ? raised : (ilanes)last;
 }
 
-#if CAREFUL
+#if TWO_PART_POINTS
 // Return frac + a b + sign c d to about twice the working precision; every factor is a sum of two numbers.
 LanePair careful_offset_lanes(const lanes frac, const lanes frac_low, const lanes a, const lanes a_low, const real2 b,
                               const lanes c, const lanes c_low, const real2 d, const real sign) {
@@ -23,10 +23,10 @@ ilanes whole_cells_lanes(const LanePair offset, LanePair *rest, LanePair *to_nex
     const lanes up = offset.hi + (real)0.5;
     ilanes nearest = to_ilanes(up);
     nearest += to_lanes(nearest) > up;
-#if SHARP
+#if EXACT_EXPONENT
     const LanePair past = two_sum_lanes(offset.hi - to_lanes(nearest), offset.lo);
     const LanePair less = {past.hi < 0 ? past.hi : -past.hi, past.hi < 0 ? past.lo : -past.lo};
-    const LanePair other = pair_sum_lanes((LanePair){1, 0}, less);
+    const LanePair sum = ordered_sum_lanes((lanes)1, less.hi), other = ordered_sum_lanes(sum.hi, sum.lo + less.lo);
 #else
     const lanes left = (offset.hi - to_lanes(nearest)) + offset.lo;
     const LanePair past = {left, 0}, other = {left < 0 ? 1 + left : 1 - left, 0};

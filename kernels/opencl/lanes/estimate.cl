@@ -11,7 +11,7 @@ double sum_in_order(const doubles a) { return ((((((a.s0 + a.s1) + a.s2) + a.s3)
 kernel void sum_poses(ARGUMENTS) {
     const int b = get_global_id(0), begin = b * block;
     if (begin >= particles) return;
-    global const double *reference = again ? estimate : poses;
+    global const double *reference = second_pass ? estimate : poses;
     const double x0 = reference[0], y0 = reference[1], theta0 = reference[2];
     const int end = min(begin + block, particles);
     const choices lane = (choices)(0, 1, 2, 3, 4, 5, 6, 7);

@@ -1,154 +1,11 @@
-// Likelihood field of LANES particles at once: score_field of field.cl. Look-ups have the bits of the scalar kernel;
-// interpolation takes exp and log of vectors, which may differ in the last bit.
-// requires: lanes/end_point lanes/math lanes/hit_shape
+// Likelihood field of LANES particles at once: score_field of field.cl.
+// requires: lanes/field_term
 
 // Particles of a work-item, in vectors. They share each block of beams: while a robot is tracked, its end points lie in
 // few cells of the table. There is a work-item for each 16 particles; the first of ITEMS does the work of all of them.
 #define TOGETHER 64
 #define ITEMS 4
 #define VECTORS (TOGETHER / LANES)
-
-// Adding and subtracting ROUND_INT rounds to nearest; the bits of the sum, less ROUND_BITS, are the integer.
-#define ROUND_INT 12582912.0f
-#define ROUND_BITS 0x4b400000
-
-// Poses of LANES particles: cells of the padded table, fractions of a cell, and directions. Low parts are those of
-// float32.
-typedef struct {
-    ilanes col, row;
-    lanes x, y, cos, sin, x_low, y_low, cos_low, sin_low;
-} Particles;
-
-// Return the offset of end points in cells from the corners of the particles' cells, or with BILINEAR from their centres.
-void offsets_lanes(const Particles *particle, const real2 point, const real2 point_low, LanePair *x, LanePair *y) {
-#if CAREFUL
-    const real2 p = (real2)(point.x, point_low.x), q = (real2)(point.y, point_low.y);
-    *x = careful_offset_lanes(particle->x, particle->x_low, particle->cos, particle->cos_low, p, particle->sin,
-                              particle->sin_low, q, -1);
-    *y = careful_offset_lanes(particle->y, particle->y_low, particle->sin, particle->sin_low, p, particle->cos,
-                              particle->cos_low, q, 1);
-#else
-    *x = (LanePair){particle->x + (particle->cos * point.x - particle->sin * point.y), 0};
-    *y = (LanePair){particle->y + (particle->sin * point.x + particle->cos * point.y), 0};
-#endif
-}
-
-#if BILINEAR
-// Return the weighted sum of a and b; only weights and sums of SHARP have two parts.
-LanePair between_lanes(const LanePair weight_a, const LanePair a, const LanePair weight_b, const LanePair b) {
-#if SHARP
-    return pair_sum_lanes(pair_product_lanes(weight_a, a), pair_product_lanes(weight_b, b));
-#else
-    return (LanePair){weight_a.hi * a.hi + weight_b.hi * b.hi, 0};
-#endif
-}
-
-// Return log p of distances from end points to the nearest obstacles: log_field of field_term.cl.
-lanes log_distance_lanes(const LanePair distance, global const real *terms) {
-#if SHARP
-    const LanePair square = pair_product_lanes(pair_product_lanes(distance, distance), (LanePair){terms[1], terms[5]});
-#else
-    const LanePair square = {distance.hi * (distance.hi * terms[1]), 0};
-#endif
-    const LanePair exponent = shape_exponent_lanes(square, terms[6], terms[7]);
-#if LINEAR
-    lanes p = terms[2];
-#if HIT
-    const lanes hit = terms[0] * exp_lanes(-exponent.hi);
-#if SHARP
-    p += hit > 0 ? hit * (1 - exponent.lo) : hit;
-#else
-    p += hit;
-#endif
-#endif
-    return log_lanes(p);
-#else
-    const lanes hit = (terms[0] - exponent.hi) + (terms[4] - exponent.lo), random = terms[2];
-    const lanes largest = hit > random ? hit : random;
-    const lanes sum = largest + log_lanes(exp_lanes(hit - largest) + exp_lanes(random - largest));
-    return largest == -INFINITY ? largest : sum;
-#endif
-}
-
-// Return log p of one beam. Both cells of the ring hold the same value, so the four cells are neighbours even beyond an
-// edge.
-lanes log_field_lanes(global const real *table, const Particles *particle, const real2 point, const real2 point_low,
-                      global const real *terms, const Window window) {
-    const int stride = window.cols + 2 * FIELD_RING;
-    LanePair x, y, rest_x, rest_y, to_next_x, to_next_y;
-    offsets_lanes(particle, point, point_low, &x, &y);
-    const ilanes to_col = whole_cells_lanes(x, &rest_x, &to_next_x);
-    const ilanes to_row = whole_cells_lanes(y, &rest_y, &to_next_y);
-    const ilanes c = within_lanes(particle->col + to_col, stride - 2);
-    const ilanes r = within_lanes(particle->row + to_row, window.rows + 2 * FIELD_RING - 2);
-    const ilanes index = r * stride + c;
-    const lane_int *at = (const lane_int *)&index;
-    global const real *right = table + 1, *above = table + stride, *opposite = above + 1;
-    const LanePair a = {GATHER_AT(lanes, table, at), 0}, b = {GATHER_AT(lanes, right, at), 0};
-    const LanePair d = {GATHER_AT(lanes, above, at), 0}, e = {GATHER_AT(lanes, opposite, at), 0};
-    const LanePair low = between_lanes(to_next_x, a, rest_x, b), high = between_lanes(to_next_x, d, rest_x, e);
-    return log_distance_lanes(between_lanes(to_next_y, low, rest_y, high), terms);
-}
-#elif FLOAT64
-// Return the numbers in the cells of one beam's end points.
-lanes look_up_lanes(global const real *table, const Particles *particle, const real2 point, const Window window) {
-    const int stride = window.cols + 2 * FIELD_RING;
-    LanePair x, y, rest, to_next;
-    offsets_lanes(particle, point, point, &x, &y);
-    const ilanes c = within_lanes(particle->col + whole_cells_lanes(x, &rest, &to_next), stride - 1);
-    const ilanes r = within_lanes(particle->row + whole_cells_lanes(y, &rest, &to_next),
-                                  window.rows + 2 * FIELD_RING - 1);
-    const ilanes index = r * stride + c;
-    const lane_int *at = (const lane_int *)&index;
-    return GATHER_AT(lanes, table, at);
-}
-#else
-// End points of a block of beams: nearest cells, and the distances from the centres of these cells.
-typedef struct {
-    ilanes cell[BLOCK_TERMS], off[BLOCK_TERMS];
-} EndPoints;
-
-// Find the cells of a block's end points by rounding; return whether a distance from a centre exceeds least.
-int find_cells(EndPoints *ends, const Particles *particle, global const real2 *point, const int size,
-               const Window window, const real least) {
-    const int stride = window.cols + 2 * FIELD_RING;
-    const lanes x = particle->x, y = particle->y, cos = particle->cos, sin = particle->sin;
-    const ilanes col = particle->col, row = particle->row;
-    global const real *to = (global const real *)point;
-    ilanes worst = 0;
-    for (int k = 0; k < size; ++k) {
-        const lanes at_x = x + (cos * to[2 * k] - sin * to[2 * k + 1]), near_x = at_x + ROUND_INT;
-        const lanes at_y = y + (sin * to[2 * k] + cos * to[2 * k + 1]), near_y = at_y + ROUND_INT;
-        const ilanes off_x = size_bits(at_x - (near_x - ROUND_INT));
-        const ilanes off_y = size_bits(at_y - (near_y - ROUND_INT));
-        const ilanes off = off_x > off_y ? off_x : off_y;
-        const ilanes c = within_lanes(as_ilanes(near_x) - ROUND_BITS + col, stride - 1);
-        const ilanes r = within_lanes(as_ilanes(near_y) - ROUND_BITS + row, window.rows + 2 * FIELD_RING - 1);
-        ends->cell[k] = r * stride + c;
-        ends->off[k] = off;
-        worst = worst > off ? worst : off;
-    }
-    return any_lane(worst > as_int(least));
-}
-
-// Recompute the cells of end points whose distance from the centre exceeds most, with twice the digits.
-__attribute__((noinline)) void refine_cells(EndPoints *ends, const real *most, const int first, const int count,
-                                            global const int2 *pose_cell, global const real4 *pose,
-                                            global const real4 *pose_low, global const real2 *point,
-                                            global const real2 *point_low, const int size, const Window window,
-                                            const real guard) {
-    for (int k = 0; k < size; ++k) {
-        if (!any_lane(ends->off[k] > as_int(most[k]))) continue;
-        int *cell = (int *)&ends->cell[k], *off = (int *)&ends->off[k];
-        for (int i = 0; i < count; ++i) {
-            if (off[i] <= as_int(most[k])) continue;
-            const int n = first + i;
-            const EndPoint end = end_point(pose[n], pose_low[n], point[k], point_low[k], 0, guard);
-            cell[i] = field_cell(pose_cell[n].x + end.cell.x, pose_cell[n].y + end.cell.y, window);
-        }
-    }
-}
-#endif
 
 // Score scans: one work-item takes TOGETHER particles, and the beams block by block.
 kernel void score_field(ARGUMENTS) {
@@ -184,7 +41,7 @@ kernel void score_field(ARGUMENTS) {
             ((real *)&particle->y)[i] = pose[n].y;
             ((real *)&particle->cos)[i] = pose[n].z;
             ((real *)&particle->sin)[i] = pose[n].w;
-#if CAREFUL
+#if TWO_PART_POINTS
             ((real *)&particle->x_low)[i] = pose_low[n].x;
             ((real *)&particle->y_low)[i] = pose_low[n].y;
             ((real *)&particle->cos_low)[i] = pose_low[n].z;
@@ -192,7 +49,7 @@ kernel void score_field(ARGUMENTS) {
 #endif
         }
         // Subtract half a cell: interpolation is between centres, and rounding to nearest must give the cell.
-#if CAREFUL
+#if TWO_PART_POINTS
 #if BILINEAR
         const LanePair x = two_sum_lanes(particle->x, (lanes)-0.5f), y = two_sum_lanes(particle->y, (lanes)-0.5f);
         particle->x = x.hi, particle->x_low = x.lo + particle->x_low;
@@ -209,7 +66,7 @@ kernel void score_field(ARGUMENTS) {
     real most[BLOCK_TERMS];
     for (int from = 0; from < all_readings; from += BLOCK_TERMS) {
         const int size = all_readings - from < BLOCK_TERMS ? all_readings - from : BLOCK_TERMS;
-#if CAREFUL
+#if TWO_PART_POINTS
 #if !BILINEAR
         // Rounding errors of an end point are at most 2.5 eps times its reading in cells, plus 0.7 eps.
         real least = 0.5f;
@@ -224,22 +81,35 @@ kernel void score_field(ARGUMENTS) {
         for (int v = 0; v * LANES < count; ++v) {
             const int first = begin + v * LANES, used = count - v * LANES < LANES ? count - v * LANES : LANES;
             lanes block = 0;
-#if CAREFUL
-#if !BILINEAR
+#if BILINEAR
+            EndPoints ends;
+            lanes distance[BLOCK_TERMS];
+            find_places(&ends, &all[v], point + from, point_low + from, size, window);
+#if EXACT_EXPONENT
+            lanes distance_low[BLOCK_TERMS];
+            interpolate(distance, distance_low, &ends, table, size, window);
+#else
+            interpolate(distance, distance, &ends, table, size, window);
+#endif
+#elif FLOAT64
+            EndPoints ends;
+            find_cells(&ends, &all[v], point + from, size, window);
+#else
             EndPoints ends;
             if (find_cells(&ends, &all[v], point + from, size, window, least))
                 refine_cells(&ends, most, first, used, pose_cell, pose, pose_low, point + from, point_low + from, size,
                              window, guard);
 #pragma unroll 4
 #endif
-#endif
             for (int k = 0; k < size; ++k) {
 #if BILINEAR
-                const lanes term = log_field_lanes(table, &all[v], point[from + k], point_low[from + k], terms, window);
-#elif FLOAT64
-                const lanes term = look_up_lanes(table, &all[v], point[from + k], window);
+#if EXACT_EXPONENT
+                const lanes term = log_distance_lanes((LanePair){distance[k], distance_low[k]}, terms);
 #else
-                const lane_int *at = (const lane_int *)&ends.cell[k];
+                const lanes term = log_distance_lanes((LanePair){distance[k], 0}, terms);
+#endif
+#else
+                const int *at = (const int *)&ends.cell[k];
                 const lanes term = GATHER_AT(lanes, table, at);
 #endif
 #if PER_BEAM

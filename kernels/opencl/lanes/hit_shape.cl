@@ -11,7 +11,7 @@ lanes log_one_plus_lanes(const lanes x) {
 LanePair shape_exponent_lanes(const LanePair t, const lanes power, const lanes rate) {
 #if STUDENT
     const lanes more = rate * t.hi;
-#if SHARP
+#if EXACT_EXPONENT
     const LanePair product = two_product_lanes(power, log_one_plus_lanes(more));
     const lanes low = two_product_lanes(rate, t.hi).lo + rate * t.lo;
     return (LanePair){product.hi, product.lo + power * (low / (1 + more))};
@@ -32,6 +32,15 @@ lanes shape_weight_lanes(const lanes t, const lanes power, const lanes rate) {
 #endif
 }
 
+// Return -E''(t) over the weights, times u^2, from the weights times u^2.
+lanes shape_bend_lanes(const lanes square, const real power) {
+#if STUDENT
+    return square * (1 / power);
+#else
+    return 0;
+#endif
+}
+
 #if MASS_TABLE
 // Return the masses between the mean and distances; the tables begin at places.
 lanes half_mass_lanes(const lanes b, global const real *terms, const ilanes place) {
@@ -40,8 +49,17 @@ lanes half_mass_lanes(const lanes b, global const real *terms, const ilanes plac
     const lanes held = inside ? at : (lanes)0;
     const ilanes cell = to_ilanes(held), first = place + cell * TABLE_POWERS;
     const lanes share = held - to_lanes(cell);
-    lanes mass = GATHER(lanes, (terms + (TABLE_POWERS - 1)), first);
-    for (int i = TABLE_POWERS - 2; i >= 0; --i) mass = mass * share + GATHER(lanes, (terms + i), first);
+    const lane_int *from = (const lane_int *)&first;
+    lanes mass, lower;
+    gather_pairs(terms + (TABLE_POWERS - 2), from, &lower, &mass);
+    mass = mass * share + lower;
+    for (int i = TABLE_POWERS - 4; i >= 0; i -= 2) {
+        lanes higher;
+        gather_pairs(terms + i, from, &lower, &higher);
+        mass = (mass * share + higher) * share + lower;
+    }
+    // An odd number of powers leaves the lowest.
+    if (TABLE_POWERS % 2 == 1) mass = mass * share + GATHER_AT(lanes, terms, from);
     return inside ? mass : (lanes)0.5;
 }
 #endif

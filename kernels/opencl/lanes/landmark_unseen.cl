@@ -8,38 +8,73 @@ lanes offset_to_lanes(const lanes landmark, const lanes landmark_low, const real
     return sum.hi + (sum.lo + (landmark_low - place_low));
 }
 
-// Add log_missed to log_p for every landmark in view that belongs to no feature. One work-item takes a particle.
+// Where a particle's sensor is, the axis of its view, and the buckets in its range: first and last column, then row.
+typedef struct {
+    real4 place;
+    real cosine, sine;
+    int4 buckets;
+} Viewer;
+
+// Return the viewer of a particle.
+Viewer viewer_of(const int2 cell, const real4 high, const real4 low, const Buckets buckets, const SensorView view) {
+    Viewer viewer;
+    viewer.place = sensor_place(cell, high, low, buckets.size);
+    viewer.cosine = high.z * view.axis_cosine - high.w * view.axis_sine;
+    viewer.sine = high.w * view.axis_cosine + high.z * view.axis_sine;
+    viewer.buckets = (int4)(bucket_at(viewer.place.x - view.range_max, buckets.size, buckets.cols),
+                            bucket_at(viewer.place.x + view.range_max, buckets.size, buckets.cols),
+                            bucket_at(viewer.place.z - view.range_max, buckets.size, buckets.rows),
+                            bucket_at(viewer.place.z + view.range_max, buckets.size, buckets.rows));
+    return viewer;
+}
+
+// Return the lanes of landmarks in view that belong to no feature, as -1; indices are those of the landmarks.
+ilanes unseen_lanes(const Viewer *viewer, const LanePlace at, const ilanes index, global const int *which,
+                    const int features, const SensorView view) {
+    const lanes x = offset_to_lanes(at.x.hi, at.y.hi, viewer->place.x, viewer->place.y);
+    const lanes y = offset_to_lanes(at.x.lo, at.y.lo, viewer->place.z, viewer->place.w);
+    const lanes d = sqrt(x * x + y * y);
+    ilanes missed = (d <= view.range_max) & (viewer->cosine * x + viewer->sine * y >= view.least * d);
+    for (int k = 0; k < features; ++k) missed &= index != which[k];
+    return missed;
+}
+
+// Add log_missed to log_p for every landmark in view that belongs to no feature. One work-item takes LANES particles.
+// Neighbours that look into the same buckets, as all do around a tracked pose, share each vector of landmarks.
 kernel void count_unseen(ARGUMENTS) {
-    const int n = get_global_id(0);
-    if (n >= particles) return;
-    const real4 sensor_pose = pose[n], place = sensor_place(pose_cell[n], sensor_pose, pose_low[n], buckets.size);
-    const real cosine = sensor_pose.z * view.axis_cosine - sensor_pose.w * view.axis_sine;
-    const real sine = sensor_pose.w * view.axis_cosine + sensor_pose.z * view.axis_sine;
-    const int left = bucket_at(place.x - view.range_max, buckets.size, buckets.cols);
-    const int right = bucket_at(place.x + view.range_max, buckets.size, buckets.cols);
-    const int high = bucket_at(place.z + view.range_max, buckets.size, buckets.rows);
+    const int first = LANES * get_global_id(0), own = min(LANES, particles - first);
     const int count = start[buckets.rows * buckets.cols];
     const ilanes lane = (ilanes)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-    ilanes unseen = 0;
-    for (int row = bucket_at(place.z - view.range_max, buckets.size, buckets.rows); row <= high; ++row) {
-        // Whole rows follow one another.
-        const int whole = left == 0 && right == buckets.cols - 1, until = whole ? high : row;
-        const int last = start[until * buckets.cols + right + 1];
-        for (int j = start[row * buckets.cols + left]; j < last; j += LANES) {
-            // A landmark has its low parts behind both coordinates.
-            const LanePlace at = load_places(landmark, j, count);
-            const lanes x = offset_to_lanes(at.x.hi, at.y.hi, place.x, place.y);
-            const lanes y = offset_to_lanes(at.x.lo, at.y.lo, place.z, place.w);
-            const lanes d = sqrt(x * x + y * y);
-            const ilanes index = lane + j;
-            ilanes missed = (index < last) & (d <= view.range_max) & (cosine * x + sine * y >= view.least * d);
-            if (!any_lane(missed)) continue;
-            for (int k = 0; k < features; ++k) missed &= index != which[(long)n * features + k];
-            unseen -= missed;
-        }
-        row = until;
+    Viewer viewer[LANES];
+    ilanes unseen[LANES];
+    for (int i = 0; i < own; ++i) {
+        viewer[i] = viewer_of(pose_cell[first + i], pose[first + i], pose_low[first + i], buckets, view);
+        unseen[i] = 0;
     }
-    int total = 0;
-    for (int i = 0; i < LANES; ++i) total += ((const int *)&unseen)[i];
-    if (total > 0) log_p[n] += total * view.log_missed;
+    for (int from = 0, until; from < own; from = until) {
+        const int4 seen = viewer[from].buckets;
+        for (until = from + 1; until < own; ++until) {
+            const int4 same = viewer[until].buckets == seen;
+            if (!(same.x & same.y & same.z & same.w)) break;
+        }
+        for (int row = seen.z; row <= seen.w; ++row) {
+            // Whole rows follow one another.
+            const int whole = seen.x == 0 && seen.y == buckets.cols - 1, to = whole ? seen.w : row;
+            const int last = start[to * buckets.cols + seen.y + 1];
+            for (int j = start[row * buckets.cols + seen.x]; j < last; j += LANES) {
+                // A landmark has its low parts behind both coordinates.
+                const LanePlace at = load_places(landmark, j, count);
+                const ilanes index = lane + j, there = index < last;
+                for (int i = from; i < until; ++i)
+                    unseen[i] -= there & unseen_lanes(&viewer[i], at, index, which + (long)(first + i) * features,
+                                                      features, view);
+            }
+            row = to;
+        }
+    }
+    for (int i = 0; i < own; ++i) {
+        int total = 0;
+        for (int k = 0; k < LANES; ++k) total += ((const int *)&unseen[i])[k];
+        if (total > 0) log_p[first + i] += total * view.log_missed;
+    }
 }

@@ -13,6 +13,7 @@ lanes cast_ray_lanes(global const entry *map_table, const Window window, const i
     const ilanes bin = angle_bin_lanes(dx, dy, caster.bins);
     global const entry *here = map_table + ((long)cell.y * window.cols + cell.x) * caster.bins;
     const ilanes part = GATHER(ilanes, here, bin);
-    const lanes t = to_lanes(part) * (limit / (real)65535);
+    const real unit = limit.s0 / (real)65535;
+    const lanes t = to_lanes(part) * unit;
     return ((part == 65535) | (t >= limit)) ? limit : t;
 }

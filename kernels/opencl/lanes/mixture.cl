@@ -34,8 +34,8 @@ lanes mean_range_lanes(const lanes expected, global const real *terms, const ila
 // Return sigma_hit / sigma at ranges, as sums of two numbers.
 LanePair hit_scale_lanes(const lanes expected, global const real *terms, const ilanes bin_at) {
 #if GROWTH
-#if SHARP
-    const LanePair growth = pair_product_lanes((LanePair){TERM(12), TERM(13)}, (LanePair){expected, 0});
+#if EXACT_EXPONENT
+    const LanePair growth = pair_times_lanes((LanePair){TERM(12), TERM(13)}, expected);
     const LanePair x = pair_sum_lanes((LanePair){1, 0}, growth);
     const lanes y = 1 / x.hi;
     const LanePair back = two_product_lanes(y, x.hi);
@@ -59,7 +59,7 @@ LanePair normal_exponent_lanes(const lanes z, const lanes expected, const lanes 
     off.hi = clamped ? z - mean : off.hi;
     off.lo = clamped ? (lanes)0 : off.lo;
 #endif
-#if SHARP
+#if EXACT_EXPONENT
     LanePair square = two_product_lanes(off.hi, off.hi);
 #if BIAS
     square.lo += 2 * off.hi * off.lo;
@@ -142,7 +142,7 @@ lanes log_density_lanes(const lanes z, const lanes expected, global const real *
 #else
     const lanes mass = mass_within_lanes(mean, TERM(2), terms, bin_at, &within);
 #endif
-#if SHARP
+#if EXACT_EXPONENT
     // Where the density underflows, the second part may be anything.
     hit = hit > 0 ? hit * (1 - exponent.lo) : hit;
 #endif

@@ -103,7 +103,7 @@ void place_lanes(global const coordinate *poses, global int2 *pose_cell, global 
         const real4 rounded = (real4)(LANE(float, rounded_x, i), LANE(float, rounded_y, i),
                                       LANE(float, rounded_cosine, i), LANE(float, rounded_sine, i));
         pose[begin + i] = rounded;
-#if CAREFUL
+#if TWO_PART_POINTS
         pose_low[begin + i] = (real4)((real)(LANE(double, x, i) - rounded.x), (real)(LANE(double, y, i) - rounded.y),
                                       (real)(LANE(double, cosine, i) - rounded.z),
                                       (real)(LANE(double, sine, i) - rounded.w));

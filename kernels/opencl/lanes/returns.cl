@@ -59,7 +59,7 @@ EchoLanes nearest_echo_lanes(global const entry *map_table, global const real2 *
                              const int2 cell, const real4 pose, global const real2 *ray, const int first,
                              const int count, const Cone cone, const lanes limit, const Caster caster) {
     lanes x, y;
-#if ECHO
+#if CONES
     EchoLanes echo = {limit, 2};
     for (int i = 0; i < cone.rays; ++i) {
         load_ray_lanes(ray + i, first, count, cone.rays, &x, &y);

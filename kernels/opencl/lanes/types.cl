@@ -18,6 +18,9 @@ typedef long lane_int;
     ((type)(table[i.s0], table[i.s1], table[i.s2], table[i.s3], table[i.s4], table[i.s5], table[i.s6], table[i.s7]))
 #define GATHER_AT(type, table, i)                                                                                        \
     ((type)(table[i[0]], table[i[1]], table[i[2]], table[i[3]], table[i[4]], table[i[5]], table[i[6]], table[i[7]]))
+// Number and next one at half of the places.
+#define PAIRS(table, i)                                                                                                  \
+    ((lanes)(vload2(0, table + i[0]), vload2(0, table + i[1]), vload2(0, table + i[2]), vload2(0, table + i[3])))
 // 1.5 * 2^52 and its bits: a sum of it and an integer has the integer in its last bits. Not every processor converts
 // vectors of 64 bits.
 #define LANE_INTEGERS 6755399441055744.0
@@ -63,6 +66,11 @@ typedef int lane_int;
 #define GATHER_AT(type, table, i)                                                                                        \
     ((type)(table[i[0]], table[i[1]], table[i[2]], table[i[3]], table[i[4]], table[i[5]], table[i[6]], table[i[7]],      \
             table[i[8]], table[i[9]], table[i[10]], table[i[11]], table[i[12]], table[i[13]], table[i[14]], table[i[15]]))
+// Number and next one at half of the places, each pair by one load.
+#define PAIR(table, at) as_long(vload2(0, table + at))
+#define PAIRS(table, i)                                                                                                  \
+    as_float16((long8)(PAIR(table, i[0]), PAIR(table, i[1]), PAIR(table, i[2]), PAIR(table, i[3]), PAIR(table, i[4]),    \
+                       PAIR(table, i[5]), PAIR(table, i[6]), PAIR(table, i[7])))
 
 // Return whether a comparison holds in any lane.
 int any_lane(const ilanes holds) {
@@ -82,6 +90,13 @@ real sum_lanes(const lanes a) {
 // Return the bits of the absolute values; as integers they have the order of the values.
 ilanes size_bits(const lanes a) { return as_ilanes(a) & 0x7fffffff; }
 #endif
+
+// Read a number and the next one at each of LANES places.
+void gather_pairs(global const real *numbers, const lane_int *at, lanes *first, lanes *second) {
+    const lanes low = PAIRS(numbers, at), high = PAIRS(numbers, (at + LANES / 2));
+    *first = (lanes)(low.even, high.even);
+    *second = (lanes)(low.odd, high.odd);
+}
 
 // Return the vector of numbers in memory, the last of count standing in for those beyond it.
 lanes load_some(global const real *numbers, const int count) {

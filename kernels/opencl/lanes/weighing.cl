@@ -1,5 +1,5 @@
 // Weights of 8 particles at once: weighing.cl. Sums of integer weights are exact in any order.
-// requires: rungs lanes/elementary
+// requires: tempering lanes/elementary
 
 // Return the likelihoods of scores relative to the largest on the last rung; 1 where none is possible or nothing is left.
 doubles tempered_lanes(const doubles score, const double largest, const double left) {

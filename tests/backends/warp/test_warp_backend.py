@@ -130,11 +130,12 @@ def test_the_cache_can_be_switched_off(needs: Callable[[str], str], tmp_path: Pa
 @pytest.fixture
 def field_launch(warp_backend: Backend, monkeypatch: pytest.MonkeyPatch):
     """Return a launcher of the field's scores that three threads share, and a function that runs one on particles."""
+    from gpusense.backends import helpers
     from gpusense.backends.warp import backend as _warp
     from gpusense.backends.warp import pieces as _warp_pieces
 
-    monkeypatch.setattr(_warp_pieces, "_threads", lambda: 3)
-    _warp_pieces._pool.cache_clear()
+    monkeypatch.setattr(helpers, "threads", lambda: 3)
+    helpers.pool.cache_clear()
     monkeypatch.setattr(_warp_pieces, "_PIECE_WORK", 50)
     rng = np.random.default_rng(0)
     particles, readings, rows, cols = 61, 20, 30, 40
@@ -150,7 +151,7 @@ def field_launch(warp_backend: Backend, monkeypatch: pytest.MonkeyPatch):
         np.zeros(6, np.float32),
     )
     backend = _warp.WarpBackend(warp_backend.info, "cpu")
-    flags = frozenset({"LOG_TABLE", "CAREFUL", "PER_BEAM"})
+    flags = frozenset({"LOG_TABLE", "TWO_PART_POINTS", "PER_BEAM"})
     launch = backend.compile("score_field", flags)
     assert isinstance(launch, _warp_pieces.SharedLaunch)
     nowhere = np.zeros(1, np.int32), np.zeros(1, np.float32)
@@ -165,7 +166,7 @@ def field_launch(warp_backend: Backend, monkeypatch: pytest.MonkeyPatch):
         return backend.download(log_p, found[0]), backend.download(parts, found[1])
 
     yield launch, run
-    _warp_pieces._pool.cache_clear()
+    helpers.pool.cache_clear()
 
 
 @pytest.mark.parametrize("count", [1, 4, 5, 6, 60, 61])

@@ -3,35 +3,60 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 
 import mpmath as mp
 import numpy as np
 import pytest
+from scipy import stats
+from scipy.integrate import quad
 from support.kernel_scenes import PRECISIONS
 from support.learning_data import RANGE_MAX, TYPICAL, draw, point, problem_of
 
 from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import TOLERANCES, per_beam
-from gpusense.learning.beam.point import BIAS, Point
+from gpusense.learning.beam.point import BIAS, FORM, SIGMA, Point
 from gpusense.learning.beam.problem import Prior
 from gpusense.models.scan.densities import log_mixture
+from gpusense.world.hit_shapes import StudentHit
 
 POINTS = {
     "ordinary": point(0.6, 0.2, 0.05, 0.15, sigma=0.2, rate=0.4),
     "truncated": point(0.5, 0.3, 0.1, 0.1, sigma=4.0, rate=0.05, bias=0.03),
     "hardly short": point(0.8, 1e-6, 0.1, 0.1 - 1e-6, sigma=0.05, rate=1e-3, bias=-0.02),
     "steep": point(0.3, 0.3, 0.2, 0.2, sigma=0.01, rate=40.0),
+    "student": point(0.6, 0.2, 0.05, 0.15, sigma=0.2, rate=0.4, bias=0.01, shape=StudentHit(3.0)),
+    "truncated student": point(0.5, 0.3, 0.1, 0.1, sigma=3.0, rate=0.05, bias=0.03, shape=StudentHit(1.0 / 0.7)),
 }
 PAIRS = ([4.1, 2.0, 9.9, 0.3, 7.0, np.inf, 5.0, np.inf, np.nan], [4.0, 6.0, 9.5, 0.4, 9.9, 8.0, 5.0, 1.0, 3.0])
 PRIOR = Prior(np.array([3.0, 2.0, 1.0, 0.5]), 0.3, 0.7, 0.01)
 
 
+def density_of_hit(u: mp.mpf, form: mp.mpf | None) -> mp.mpf:
+    """Return the density of a hit of scale 1: a normal, or Student's t with 1 / form degrees of freedom."""
+    if form is None:
+        return mp.npdf(u)
+    n = 1 / form
+    return mp.gamma((n + 1) / 2) / mp.gamma(n / 2) / mp.sqrt(n * mp.pi) * (1 + u * u / n) ** (-(n + 1) / 2)
+
+
+def mass_of_hit(low: mp.mpf, high: mp.mpf, form: mp.mpf | None) -> mp.mpf:
+    """Return its mass between two places."""
+    if form is None:
+        return mp.ncdf(high) - mp.ncdf(low)
+    below, above = (
+        mp.sign(u) * mp.betainc(mp.mpf(1) / 2, 1 / form / 2, 0, u * u / (1 / form + u * u), regularized=True) / 2
+        for u in (low, high)
+    )
+    return above - below
+
+
 def exact_objective(z: list[float], expected: list[float], prior: Prior | None, x: list[mp.mpf]) -> mp.mpf:
-    """Return log-likelihood and log prior by mpmath, from coordinates (log weights, log sigma, log rate, bias)."""
+    """Return log-likelihood and prior at (log weights, log sigma, log rate, bias, form), by mpmath."""
     total = sum(mp.exp(log) for log in x[:4])
     hit, short, top, rand = (mp.exp(log) / total for log in x[:4])
-    sigma, rate, bias = mp.exp(x[4]), mp.exp(x[5]), x[6]
+    sigma, rate, bias, form = mp.exp(x[4]), mp.exp(x[5]), x[6], x[7] if len(x) > 7 else None
     found = mp.mpf(0)
     for reading, ahead in zip(map(mp.mpf, z), map(mp.mpf, expected), strict=True):
         if mp.isnan(reading):
@@ -40,8 +65,8 @@ def exact_objective(z: list[float], expected: list[float], prior: Prior | None, 
             found += mp.log(top)
             continue
         mean = ahead + bias
-        mass = mp.ncdf((RANGE_MAX - mean) / sigma) - mp.ncdf(-mean / sigma)
-        p = hit * mp.npdf(reading, mean, sigma) / mass + rand / RANGE_MAX
+        mass = mass_of_hit(-mean / sigma, (RANGE_MAX - mean) / sigma, form)
+        p = hit * density_of_hit((reading - mean) / sigma, form) / sigma / mass + rand / RANGE_MAX
         if reading <= ahead:
             p += short * rate * mp.exp(-rate * reading) / -mp.expm1(-rate * ahead)
         found += mp.log(p)
@@ -62,10 +87,10 @@ def test_derivatives_are_those_of_the_log_likelihood(name: str, prior: Prior | N
     problem = problem_of(np.array(z), np.array(expected), **({} if prior is None else {"prior": prior}))
     value = problem.value(at, second=True)
     x = [mp.log(mp.mpf(float(weight))) for weight in at.weights]
-    x += [mp.log(mp.mpf(at.sigma)), mp.log(mp.mpf(at.rate)), mp.mpf(at.bias)]
+    x += [mp.log(mp.mpf(at.sigma)), mp.log(mp.mpf(at.rate)), mp.mpf(at.bias), *map(mp.mpf, at.shape.coordinates)]
     with mp.workdps(50):
         exact = float(exact_objective(z, expected, prior, x))
-        gradient, hessian = np.empty(7), np.empty((7, 7))
+        gradient, hessian = np.empty(len(x)), np.empty((len(x), len(x)))
 
         def along(*places: int) -> mp.mpf:
             def moved(*steps: mp.mpf) -> mp.mpf:
@@ -76,7 +101,7 @@ def test_derivatives_are_those_of_the_log_likelihood(name: str, prior: Prior | N
 
             return mp.diff(moved, (0,) * len(places), (1,) * len(places), h=mp.mpf(10) ** -15)
 
-        for i in range(7):
+        for i in range(len(x)):
             gradient[i] = along(i)
             for j in range(i):
                 hessian[i, j] = hessian[j, i] = along(i, j)
@@ -88,10 +113,15 @@ def test_derivatives_are_those_of_the_log_likelihood(name: str, prior: Prior | N
     assert value.hessian is not None
     assert value.objective == pytest.approx(exact, rel=1e-13, abs=1e-13)
     # Sums of seven pairs lose a few eps of their largest terms, which grow with 1 / sigma^2 for the bias.
-    unit = np.where(np.arange(7) == BIAS, 1 / at.sigma, 1.0)
-    assert np.abs((value.gradient - gradient) / unit).max() < 1e-11 * (1 + np.abs(gradient / unit).max())
+    unit = np.where(np.arange(len(x)) == BIAS, 1 / at.sigma, 1.0)
+    off = np.abs((value.gradient - gradient) / unit)
+    assert off[:FORM].max() < 1e-11 * (1 + np.abs(gradient / unit).max())
     scaled = np.outer(unit, unit)
-    assert np.abs((value.hessian - hessian) / scaled).max() < 1e-11 * (1 + np.abs(hessian / scaled).max())
+    bent = np.abs((value.hessian - hessian) / scaled)
+    assert bent[:FORM, :FORM].max() < 1e-11 * (1 + np.abs(hessian / scaled).max())
+    # Derivatives by the shape are differences.
+    assert off[FORM:].max(initial=0) < 1e-5 * (1 + np.abs(gradient / unit).max())
+    assert bent[FORM:].max(initial=0) < 1e-5 * (1 + np.abs(hessian / scaled).max())
 
 
 def alike(found: np.ndarray, truth: np.ndarray, precision: type) -> bool:
@@ -102,10 +132,40 @@ def alike(found: np.ndarray, truth: np.ndarray, precision: type) -> bool:
     return bool((np.abs(found - truth[: len(found)]) <= tolerance.value * scale).all())
 
 
+def test_pseudo_readings_of_a_student_are_distributed_as_its_density() -> None:
+    prior = Prior(np.array([3.0, 0.0, 0.0, 0.0]), 0.3, 1.0, 0.01, StudentHit(2.5))
+    at = point(1.0, 0.0, 0.0, 0.0, sigma=0.2, rate=1.0, bias=0.05, shape=StudentHit(4.0))
+
+    def value(sigma: float, bias: float) -> float:
+        law = stats.t(2.5, prior.bias, prior.sigma)
+
+        def density(x: float) -> float:
+            return float(law.pdf(x) * stats.t.logpdf(x, 4.0, bias, sigma))
+
+        parts = [quad(density, low, high, epsabs=1e-12, limit=200)[0]
+                 for low, high in itertools.pairwise((-np.inf, -5, 0, 0.1, 5, np.inf))]  # fmt: skip
+        return 3.0 * sum(parts)
+
+    assert prior.value(at) == pytest.approx(value(0.2, 0.05), rel=1e-8)
+    first, second = prior.derivatives(at)
+    step = 1e-3
+    for place, moved in ((SIGMA, lambda s: (0.2 * np.exp(s), 0.05)), (BIAS, lambda s: (0.2, 0.05 + 0.2 * s))):
+        unit = 1.0 if place == SIGMA else 0.2
+        before, after = (value(*moved(sign * step)) for sign in (-1, 1))
+        assert first[place] * unit == pytest.approx((after - before) / (2 * step), rel=1e-4)
+        bend = (after - 2 * value(0.2, 0.05) + before) / step**2
+        assert second[place, place] * unit**2 == pytest.approx(bend, rel=1e-2)
+    # The density is highest where it is that of the pseudo-readings.
+    same = point(1.0, 0.0, 0.0, 0.0, sigma=0.3, rate=1.0, bias=0.01, shape=StudentHit(2.5))
+    np.testing.assert_allclose(prior.derivatives(same)[0], 0, atol=1e-7)
+    assert prior.of_hits(same) == (3.0, pytest.approx(3.0))
+
+
+@pytest.mark.parametrize("name", ["ordinary", "student"])
 @pytest.mark.parametrize("precision", PRECISIONS)
-def test_sums_are_alike_on_every_backend(precision: type, backend: str) -> None:
+def test_sums_are_alike_on_every_backend(precision: type, name: str, backend: str) -> None:
     z, expected = draw(TYPICAL, 3001, 3)
-    at = POINTS["ordinary"]
+    at = POINTS[name]
     truth = problem_of(z, expected).device.sums(at, information=True)
     found = problem_of(z, expected, backend=backend, real=precision).device.sums(
         at, information=precision is np.float64

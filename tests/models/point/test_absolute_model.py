@@ -129,7 +129,7 @@ def test_explain_names_what_is_left_out():
     assert "about 24 look-ups" in left_out(round_one)["points of the outline"]
     square.log_likelihood(POSES, [True, None])
     assert "1 of 2 are nan or None" in left_out(square)["missing readings"]
-    assert "points of the outline" not in left_out(square) and "CAREFUL" in square.explain()
+    assert "points of the outline" not in left_out(square) and "TWO_PART_POINTS" in square.explain()
 
 
 def test_the_heading_that_explain_names_is_where_other_turns_begin_to_count():

@@ -12,7 +12,7 @@ from support.array_libraries import to_device
 from support.scan_calls import BEAM, FIELD, GRID, NEAR, cloud, mixed
 
 import gpusense as gs
-from gpusense.models.scan import binding
+from gpusense.models.scan import binding, packed_call
 
 ONE_BY_ONE = "3 launches one by one: "
 
@@ -176,7 +176,7 @@ def test_a_table_that_does_not_fit(batching, monkeypatch):
     def full(*arguments, **options):
         raise MemoryError
 
-    monkeypatch.setattr(binding, "DeviceCall", full)
+    monkeypatch.setattr(packed_call, "DeviceCall", full)
     assert ordinary(batching[0], cloud(1), mixed(1)) == "the table of the whole map does not fit the device"
 
 

@@ -11,15 +11,17 @@ from support.scan_calls import BEAM, BEAMS, CASES, COUNT, FIELD, GRID, MODELS, N
 
 import gpusense as gs
 from gpusense.evaluation.tolerances import differing
-from gpusense.models.scan import binding
+from gpusense.models.scan import binding, packed_call
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.25)
 @pytest.mark.parametrize("case", CASES)
 def test_short_calls_of_the_host_are_one_graph(case, batching, monkeypatch):
     """Copies there and back and all launches; the bits are those of the ordinary call."""
     device, started = batching
     model = CASES[case](backend=device)
+    # Ordinary calls of any size.
+    model._short = None
     beams = model.scanner.count
     for real in (np.float32, np.float64):
         poses, ranges = cloud(0).astype(real), np.zeros(beams, real)
@@ -44,6 +46,39 @@ def test_short_calls_of_the_host_are_one_graph(case, batching, monkeypatch):
             call()
     poses[3, 1] = 1.0
     assert differing(call(), model.log_likelihood(poses, ranges)) == 0
+
+
+@pytest.mark.sampled(0.5)
+@pytest.mark.parametrize("case", CASES)
+def test_ordinary_calls_that_repeat_a_size(case, batching):
+    """They become one graph without another bit, error or report; maps, tables, sizes and types may change."""
+    device, started = batching
+    model, plain = (CASES[case](backend=device) for _ in range(2))
+    plain._short = None
+    beams = model.scanner.count
+    short = model._short is not None
+    assert short == (model._setting.rules.separate and model._setting.rules.specialize and model._setting.possible)
+    for real in (np.float32, np.float64):
+        out = np.zeros(COUNT, model.precision)
+        for seed, scan in enumerate((*SCANS, *SCANS[:2])):
+            poses, ranges = cloud(seed).astype(real), scan[:beams].astype(real)
+            if seed == 3:
+                model.log_likelihood(poses + 4.0, ranges)
+            expected, before = plain.log_likelihood(poses, ranges), len(started)
+            found = model.log_likelihood(poses, ranges, out=out if seed % 2 else None)
+            assert differing(found, expected) == 0, (seed, real)
+            assert (found is out) == bool(seed % 2) and len(started) - before <= 1
+        assert (model._short is not None and model._short.last is not None) == short
+        assert model.explain() == plain.explain() and model.sources() == plain.sources()
+    for place in ((5, 6), (30, 30)):
+        for one in (model, plain):
+            one.update_map(np.full((2, 3), 100), place)
+        assert differing(model.log_likelihood(poses, ranges), plain.log_likelihood(poses, ranges)) == 0
+    poses[3, 1] = np.nan
+    with pytest.raises(ValueError, match="poses: every value must be finite, got nan at index"):
+        model.log_likelihood(poses, ranges)
+    with pytest.raises(ValueError, match="out: shape must be"):
+        model.log_likelihood(cloud(1), ranges, out=np.zeros(3, model.precision))
 
 
 # Limits that float32 rounds, one up and one down, and readings beside them.
@@ -74,9 +109,9 @@ def test_calls_that_are_not_short_take_the_ordinary_path(batching, monkeypatch):
         call = model.bind(poses, ranges)
         assert type(call) is binding._HostCall
         assert differing(np.asarray(call()), model.log_likelihood(poses, ranges)) == 0
-    for name, value in (("_MOST_CELLS", 10), ("DeviceCall", refuse_memory)):
+    for module, name, value in ((binding, "_MOST_CELLS", 10), (packed_call, "DeviceCall", refuse_memory)):
         with monkeypatch.context() as patch:
-            patch.setattr(binding, name, value)
+            patch.setattr(module, name, value)
             assert type(model.bind(cloud(1), mixed(1))) is binding._HostCall
     assert type(BEAM(GRID, NEAR, backend=device, compat="beluga").bind(cloud(1), mixed(1))) is binding._HostCall
 

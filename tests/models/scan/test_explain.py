@@ -160,7 +160,7 @@ def test_measured_savings(backend):
         )
     assert sum("; measured " in line for line in timed) >= 2
     # The model is as it was.
-    assert "SHARP" not in model.explain().splitlines()[1]
+    assert "EXACT_EXPONENT" not in model.explain().splitlines()[1]
     np.testing.assert_array_equal(model.log_likelihood(poses, z), before)
 
 

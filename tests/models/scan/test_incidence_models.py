@@ -48,6 +48,7 @@ def brute_force(model: gs.BeamModel, poses: np.ndarray, z: np.ndarray) -> np.nda
     return found
 
 
+@pytest.mark.sampled(0.4)
 @pytest.mark.parametrize("no_surface", [None, P(0.05, 0.05, 0.8, 0.1, 0.3, 0.2)])
 def test_every_beam_has_the_parameters_of_its_angle(no_surface, backend):
     _, poses, _ = place()
@@ -66,6 +67,7 @@ def test_every_beam_has_the_parameters_of_its_angle(no_surface, backend):
         assert (" and for none" in model.explain()) == (no_surface is not None)
 
 
+@pytest.mark.sampled(0.4)
 @on_every_backend(
     on_warp=lambda weights: weights != (1, 0, 0, 0), weights=[(0.7, 0.1, 0.1, 0.1), (1, 0, 0, 0), (0.5, 0.5, 0, 0)]
 )
@@ -79,7 +81,7 @@ def test_equal_bins_are_the_plain_model(weights, backend):
         plain = model_of(backend, incidence=None, parameters=parameters, precision=precision)
         found, parts = model.log_likelihood(poses, z, per_beam=True)
         expected, plain_parts = plain.log_likelihood(poses, z, per_beam=True)
-        if "WIDE" in plain._last.flags:
+        if "IN_LANES" in plain._last.flags:
             # Functions of vectors may round otherwise.
             assert (np.abs(parts - plain_parts) <= 2 * per_beam(plain_parts, precision)).all()
             assert (np.abs(found - expected) <= 2 * per_scan(plain_parts, precision)).all()
@@ -91,7 +93,7 @@ def test_tiles_and_orders_change_nothing(as_gpu, backend, monkeypatch):
     _, poses, _ = place()
     model, z = model_of(as_gpu(False, scalar=True)), a_scan()
     one_by_one, parts = model.log_likelihood(poses, z, per_beam=True)
-    assert "WIDE" not in model._last.flags
+    assert "IN_LANES" not in model._last.flags
     for least in (tiles.LEAST_ORDERED, (1, 1)):
         monkeypatch.setattr(tiles, "LEAST_ORDERED", least)
         tiled = model_of(as_gpu(True))

@@ -113,7 +113,7 @@ def assert_as_one_by_one(model: Any, poses: np.ndarray, z: np.ndarray) -> None:
 
 
 # Warp's kernels have the other models' flags in the same places.
-@pytest.mark.sampled(0.2)
+@pytest.mark.sampled(0.1)
 @on_every_backend(name=MODELS, gpu=(False, True), on_warp=lambda name, gpu: MODELS[name][1])
 def test_bits_are_those_of_single_calls(name, gpu, as_gpu, monkeypatch):
     device = as_gpu(gpu)
@@ -170,6 +170,7 @@ def test_scans_with_readings_share_one_set_of_launches(kind, gpu, as_gpu, monkey
 
 def test_threads_that_share_a_launch_find_each_particles_scan(needs, monkeypatch):
     """Pieces of a launch on Warp's processor begin and end within scans."""
+    from gpusense.backends import helpers
     from gpusense.backends.warp import pieces as _warp_pieces
 
     model = field()(backend=get_backend(needs("warp:cpu")))
@@ -178,7 +179,7 @@ def test_threads_that_share_a_launch_find_each_particles_scan(needs, monkeypatch
     cut: list[int] = []
     piece = _warp_pieces.SharedLaunch._piece
     monkeypatch.setattr(_warp_pieces, "_PIECE_WORK", 50)
-    monkeypatch.setattr(_warp_pieces, "_threads", lambda: 5)
+    monkeypatch.setattr(helpers, "threads", lambda: 5)
     monkeypatch.setattr(
         _warp_pieces.SharedLaunch, "_piece", lambda self, *given: cut.append(given[2]) or piece(self, *given)
     )

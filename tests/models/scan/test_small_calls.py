@@ -16,6 +16,14 @@ from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.tolerances import differing
 from gpusense.models import run
 from gpusense.models.scan import model as model_module
+from gpusense.models.scan.packed_call import ShortCalls
+
+
+@pytest.fixture(autouse=True)
+def no_short_calls(monkeypatch):
+    """Calls that repeat a size stay ordinary ones; test_bound_host.py has the others."""
+    monkeypatch.setattr(ShortCalls, "of", staticmethod(lambda pipeline: None))
+
 
 # ---- processors: memory of host and device
 

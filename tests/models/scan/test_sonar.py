@@ -115,7 +115,7 @@ def test_scores_are_the_mixture_at_what_a_sonar_hears(incidence, backend):
     whole = gs.BeamModel(grid, scanner, specialize=False, **options).log_likelihood(poses, z)
     assert (np.abs(whole - truth.sum(axis=1)) <= 3 * per_scan(truth, "float32")).all()
     title = model.explain().splitlines()[0]
-    assert "cones of 7 rays, no return beyond 0.6 rad of incidence" in title and "ECHO" in model.explain()
+    assert "cones of 7 rays, no return beyond 0.6 rad of incidence" in title and "CONES" in model.explain()
 
 
 def test_tiles_and_shared_cones_change_nothing(as_gpu, backend, monkeypatch):
@@ -129,7 +129,7 @@ def test_tiles_and_shared_cones_change_nothing(as_gpu, backend, monkeypatch):
     monkeypatch.setattr(tiles, "LEAST_ORDERED", (1, 1))
     model = gs.BeamModel(grid, scanner, backend=as_gpu())
     assert differing(model.log_likelihood(poses, z), expected) == 0
-    assert {"SHARED_RAYS", "ECHO", "INCIDENCE"} <= model._last.flags
+    assert {"SHARED_RAYS", "CONES", "INCIDENCE"} <= model._last.flags
     alone = gs.BeamModel(grid, ring(**SONAR), backend=as_gpu(False, scalar=True)).log_likelihood(
         poses, a_scan(), per_beam=True
     )[1]
@@ -151,7 +151,7 @@ def test_a_cone_of_one_ray_is_a_laser(backend):
         one = gs.BeamModel(grid, ring(**options), backend=backend)
         assert differing(one.expected_ranges(poses), laser.expected_ranges(poses)) == 0
         assert differing(one.log_likelihood(poses, a_scan()), laser.log_likelihood(poses, a_scan())) == 0
-        assert "ECHO" not in one._last.flags
+        assert "CONES" not in one._last.flags
 
 
 def test_more_rays_never_lengthen_the_nearest_of_all():

@@ -61,6 +61,6 @@ def book_step(problem: Problem, value: Value) -> Point:
     """Compute lines 10 to 15 of table 6.2; NaN for 0 / 0."""
     sums = value.sums
     with np.errstate(all="ignore"):
-        sigma = math.sqrt(float(sums[11] / sums[1 + HIT])) if sums[1 + HIT] > 0 else math.nan
-        rate = float(sums[1 + SHORT] / sums[13]) if sums[13] > 0 else math.nan
+        sigma = value.point.sigma * math.sqrt(float(sums[11] / sums[1 + HIT])) if sums[1 + HIT] > 0 else math.nan
+        rate = float(sums[1 + SHORT] / sums[12]) if sums[12] > 0 else math.nan
     return replace(value.point, weights=value.totals / problem.total, sigma=sigma, rate=rate)

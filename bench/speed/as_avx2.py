@@ -1,0 +1,62 @@
+"""Run a script with PoCL as it is on a processor without AVX-512, at this processor's speed.
+
+    python bench/speed/as_avx2.py bench/speed/whole_calls.py --backend opencl --calls 200
+    python bench/speed/as_avx2.py bench/speed/options.py --backend opencl
+
+PoCL's compiler asks the processor by the instruction ``xgetbv`` for the registers that the system keeps. In a copy of
+PoCL's wheel these three bytes, ``0f 01 d0``, are ``push 7; pop rax``: registers of AVX, but not of AVX-512. Kernels are
+then compiled for ``haswell``, as ``gpusense backends`` shows. Code that PoCL does not compile, such as numba's, keeps
+AVX-512. emulated_processors.py has other processors, whose speed says nothing.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+PACKAGES = ("pyopencl", "pocl_binary_distribution")
+# The register's number, 0, is set by ``xor ecx, ecx``; elsewhere the same bytes are no instruction.
+SET, READ, CLAIM = b"\x31\xc9", b"\x0f\x01\xd0", b"\x6a\x07\x58"
+
+
+def copy_driver(folder: Path) -> Path:
+    """Copy PoCL's wheel without AVX-512, and return the file that names the driver.
+
+    Raises:
+        FileNotFoundError: there is no such wheel.
+        ValueError: its compiler does not ask in the known way.
+    """
+    for package in PACKAGES:
+        spec = importlib.util.find_spec(package)
+        if spec is None or not spec.submodule_search_locations:
+            raise FileNotFoundError(f"{package}: must be installed from its wheel")
+        libraries = Path(next(iter(spec.submodule_search_locations))) / ".libs"
+        shutil.copytree(libraries, folder / package / ".libs")
+    (driver,) = (folder / PACKAGES[0] / ".libs").glob("libpocl*.so*")
+    code = driver.read_bytes()
+    if SET + READ not in code:
+        raise ValueError(f"{driver.name}: must ask for registers by xgetbv, got another PoCL than version 3's wheel")
+    driver.write_bytes(code.replace(SET + READ, SET + CLAIM))
+    named = folder / "pocl.icd"
+    named.write_text(f"{driver}\n")
+    return named
+
+
+def main() -> int:
+    """Run a script, and return its exit code."""
+    if len(sys.argv) < 2 or sys.argv[1].startswith("-"):
+        print(__doc__)
+        return 2
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        places = {"OCL_ICD_VENDORS": str(copy_driver(folder)), "GPUSENSE_CACHE_DIR": str(folder / "cache")}
+        return subprocess.run([sys.executable, *sys.argv[1:]], env=os.environ | places, check=False).returncode
+
+
+if __name__ == "__main__":
+    sys.exit(main())

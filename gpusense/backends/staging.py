@@ -1,0 +1,139 @@
+"""Large copies between host arrays and a GPU: in pieces, through page-locked memory, by several threads.
+
+A driver copies ordinary host memory with one thread, at a fraction of the speed at which the device reads and writes
+page-locked memory. Here several threads copy pieces between the array and page-locked slots, while the device copies
+other slots. New result arrays gain most, since the threads also share the page faults of their memory.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gpusense.backends import helpers
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+
+# Bytes of a slot, slots, and slots that the threads fill or empty while the device works on the others.
+SLOT, SLOTS, _AHEAD = 4 << 20, 16, 8
+# Least bytes of a copy for which pieces pay, and of a piece.
+LEAST, _LEAST_PIECE = 8 << 20, 1 << 20
+# Threads below which a driver's own copy is faster.
+_LEAST_THREADS = 4
+
+
+class Slot(ABC):
+    """A piece of page-locked memory.
+
+    Attributes:
+        bytes: It as an array of the host.
+    """
+
+    bytes: np.ndarray
+
+    @abstractmethod
+    def to_device(self, buffer: Any, first: int, size: int) -> None:
+        """Start to copy ``size`` bytes of the slot into a buffer, from its byte ``first`` on."""
+
+    @abstractmethod
+    def to_host(self, buffer: Any, first: int, size: int) -> None:
+        """Start to copy ``size`` bytes of a buffer, from its byte ``first`` on, into the slot."""
+
+    @abstractmethod
+    def wait(self) -> None:
+        """Wait until the last copy of the slot has ended."""
+
+
+class Staging:
+    """Slots of a device, which serve one copy at a time.
+
+    Args:
+        make: Allocates the slots, given their number and bytes, when they are needed first.
+    """
+
+    def __init__(self, make: Callable[[int, int], Sequence[Slot]]) -> None:
+        self._make, self._slots = make, list[Slot]()
+        self._lock = threading.Lock()
+
+    def upload(self, array: np.ndarray, buffer: Any) -> bool:
+        """Copy a C-contiguous array to the head of a buffer; the array may change afterwards.
+
+        Returns:
+            False where a plain copy is better, and nothing was copied.
+        """
+        return self._run(array, buffer, _send)
+
+    def download(self, buffer: Any, out: np.ndarray) -> bool:
+        """Copy the head of a buffer into a C-contiguous array, which is full on return.
+
+        Returns:
+            False where a plain copy is better, and nothing was copied.
+        """
+        return self._run(out, buffer, _receive)
+
+    def _run(self, array: np.ndarray, buffer: Any, copy: Callable[..., None]) -> bool:
+        """Copy an array by a function, where that pays and no other thread has the slots."""
+        if array.nbytes < LEAST or helpers.threads() < _LEAST_THREADS or not self._lock.acquire(blocking=False):
+            return False
+        started: list[Future[None]] = []
+        try:
+            if not self._slots:
+                self._slots = list(self._make(SLOTS, SLOT))
+            copy(self._slots, array.reshape(-1).view(np.uint8), buffer, started)
+        finally:
+            # No thread may use slots or array any more, not even after an error.
+            try:
+                helpers.finish(started)
+            finally:
+                self._lock.release()
+        return True
+
+
+def _pieces(size: int) -> list[tuple[int, int]]:
+    """Return the first byte and the bytes of each piece."""
+    piece = min(max(-(-size // SLOTS), _LEAST_PIECE), SLOT)
+    return [(first, min(piece, size - first)) for first in range(0, size, piece)]
+
+
+def _send(slots: Sequence[Slot], source: np.ndarray, buffer: Any, started: list[Any]) -> None:
+    """Copy an array to a device."""
+    pool, pieces = helpers.pool(os.getpid()), _pieces(source.size)
+
+    def fill(number: int) -> None:
+        (first, size), slot = pieces[number], slots[number % len(slots)]
+        slot.wait()
+        started.append(pool.submit(np.copyto, slot.bytes[:size], source[first : first + size]))
+
+    for number in range(min(_AHEAD, len(pieces))):
+        fill(number)
+    for number, (first, size) in enumerate(pieces):
+        if number + _AHEAD < len(pieces):
+            fill(number + _AHEAD)
+        started[number].result()
+        slots[number % len(slots)].to_device(buffer, first, size)
+
+
+def _receive(slots: Sequence[Slot], out: np.ndarray, buffer: Any, started: list[Any]) -> None:
+    """Copy from a device to an array."""
+    pool, pieces = helpers.pool(os.getpid()), _pieces(out.size)
+    for slot, piece in zip(slots, pieces, strict=False):
+        # The device may still read what an earlier call has sent.
+        slot.wait()
+        slot.to_host(buffer, *piece)
+    for number, (first, size) in enumerate(pieces):
+        slot = slots[number % len(slots)]
+        slot.wait()
+        started.append(pool.submit(np.copyto, out[first : first + size], slot.bytes[:size]))
+        # The slot of an earlier piece takes a later one.
+        emptied = number - _AHEAD
+        if emptied >= 0 and emptied + len(slots) < len(pieces):
+            started[emptied].result()
+            slots[emptied % len(slots)].to_host(buffer, *pieces[emptied + len(slots)])
+    for helper in started:
+        helper.result()

@@ -27,7 +27,6 @@ import itertools
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +37,6 @@ from gpusense.backends import Backend, get_backend
 from gpusense.evaluation.benchmark.accuracy import factor_for, posterior_errors, temperature_of
 from gpusense.evaluation.benchmark.report import commit, plain, to_json
 from gpusense.evaluation.machine import machine
-from gpusense.evaluation.matching import differences, relative_poses
 from gpusense.evaluation.simulation.changes import surface_of
 from gpusense.localization.defaults import DEFAULTS
 
@@ -46,91 +44,22 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from common import command_line, make_parser, note, parse, table
-from matchers import Matcher, matchers
+from matching_tasks import between_scans, in_a_map, rivals
 from recordings import BEAM
 from speed.learning import TYPICAL, values
 from speed.point_models import landmark_scene
+from task_settings import NEEDS, Setting
 
 SCHEMA = 1
-NEEDS = ("localisation", "matching", "in a map", "learning", "landmarks")
-UNITS = {"localisation": "m", "matching": "m", "in a map": "m", "learning": "%", "landmarks": "nats"}
 # Scans of the drive, and those at its beginning that do not count.
 SCANS, SETTLING = 60, 10
 SCANNER = gs.Scanner.uniform(angle_min=-2.356, angle_increment=4.712 / 1079, count=1080, range_max=30.0)
 START = (0.5, 0.5, 0.26)
 # Most particles x beams of a setting, by the kind of device.
 MOST = {"cpu": 4_000_000, "gpu": 1_100_000_000}
-PAIRS = 60
-BEAMS = (90, 180, 360, 720)
 # Most readings of the methods that take some hundred passes over them.
 MOST_SEARCHED = 100_000
 PARTICLES = 10_000
-
-
-@dataclass
-class Setting:
-    """A setting of one need, and what its runs gave.
-
-    Attributes:
-        need: One of ``NEEDS``.
-        method: Name of the method.
-        options: Its setting in words.
-        code: How it is called.
-        precision: The precision.
-        run: Makes a run of a seed; returns errors, and seconds of each step.
-        together: Number of results of a step, by which its seconds are already divided.
-        outside: Version and threads of another program; empty for gpusense.
-        errors, seconds, processor: Of all runs so far; ``processor`` has the processor's seconds of a step.
-        runs: Number of runs.
-        reason: Why it was left out; empty where it was not.
-    """
-
-    need: str
-    method: str
-    options: str
-    code: str
-    precision: str
-    run: Callable[[int], tuple[np.ndarray, np.ndarray]]
-    together: int = 1
-    outside: str = ""
-    errors: list[np.ndarray] = field(default_factory=list)
-    seconds: list[np.ndarray] = field(default_factory=list)
-    processor: list[float] = field(default_factory=list)
-    runs: int = 0
-    reason: str = ""
-
-    def once(self, seed: int) -> None:
-        """Make a run; the first one also runs before it counts, to compile."""
-        if not self.runs:
-            self.run(seed)
-        before = time.process_time()
-        errors, seconds = self.run(seed)
-        self.processor.append((time.process_time() - before) / len(seconds) / self.together)
-        self.errors.append(errors)
-        self.seconds.append(seconds)
-        self.runs += 1
-
-    def row(self, device: Backend) -> dict[str, Any]:
-        """Return the row of the report."""
-        found: dict[str, Any] = {
-            "need": self.need, "backend": device.info.selection, "device": device.info.name,
-            "kind": device.info.kind, "method": self.method, "setting": self.options, "code": self.code,
-            "precision": self.precision, "unit": UNITS[self.need], "runs": self.runs, "reason": self.reason,
-            "seconds": None, "processor_s": None, "error": None,
-        }  # fmt: skip
-        if self.outside:
-            found |= {"backend": "outside", "device": self.outside, "kind": "cpu", "outside": self.outside}
-        if self.runs:
-            errors, seconds = np.concatenate(self.errors), np.concatenate(self.seconds)
-            found["seconds"] = quantiles(seconds) | {"min": float(seconds.min())}
-            found["processor_s"] = float(np.median(self.processor))
-            found["error"] = quantiles(errors) | {"p95": float(np.quantile(errors, 0.95)), "max": float(errors.max())}
-        return found
-
-
-def quantiles(numbers: np.ndarray) -> dict[str, float]:
-    """Return the quartiles."""
-    return dict(zip(("q1", "median", "q3"), map(float, np.quantile(numbers, (0.25, 0.5, 0.75))), strict=True))
 
 
 # ---- localisation
@@ -209,116 +138,6 @@ def localisation(device: Backend) -> Iterator[Setting]:
         )  # fmt: skip
 
 
-# ---- matching
-
-
-def free_poses(grid: gs.OccupancyGrid, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw poses with room around them."""
-    return np.array([gs.worlds.free_pose(grid, rng, 0.4) for _ in range(count)])
-
-
-@dataclass(frozen=True)
-class Pairs:
-    """Pairs of scans with as many beams.
-
-    Attributes:
-        grid: The map.
-        scanner: The scanner.
-        one, two: (P, K) readings of both scans [m].
-        places: (P, 3) poses of the second scans.
-        moved: (P, 3) the same in the frames of the first ones.
-        off: (P, 3) errors of the guesses.
-    """
-
-    grid: gs.OccupancyGrid
-    scanner: gs.Scanner
-    one: np.ndarray
-    two: np.ndarray
-    places: np.ndarray
-    moved: np.ndarray
-    off: np.ndarray
-
-
-def pairs(device: Backend) -> Iterator[Pairs]:
-    """Yield the pairs, by numbers of beams."""
-    rng, grid = np.random.default_rng(5), gs.worlds.building(2, (50.0, 50.0))
-    first = free_poses(grid, PAIRS, rng)
-    second = first + rng.uniform(-1, 1, first.shape) * (1.0, 1.0, np.radians(30))
-    off = rng.uniform(-1, 1, first.shape) * (0.5, 0.5, np.radians(10))
-    truth = relative_poses(first, second)
-    for count in BEAMS:
-        scanner = gs.Scanner.uniform(angle_min=-np.pi, angle_increment=2 * np.pi / count, count=count, range_max=20.0)
-        caster = gs.RayCaster(grid, scanner.range_max, backend=device)
-        one, two = (caster.cast(poses, scanner.bearings).astype(np.float64) for poses in (first, second))
-        # A pose in a wall sees nothing.
-        seen = (one.min(axis=1) > 0.1) & (two.min(axis=1) > 0.1)
-        one, two = (scan + rng.normal(0, 0.02, scan.shape) * (scan < scanner.range_max) for scan in (one, two))
-        yield Pairs(grid, scanner, one[seen], two[seen], second[seen], truth[seen], off[seen])
-
-
-def matching(device: Backend) -> Iterator[Setting]:
-    """Yield the settings of matching: methods, numbers of beams, precisions."""
-    for each in pairs(device):
-        count = each.scanner.count
-        for need, reference, right, methods in (
-            ("matching", each.one, each.moved, ("auto", "icp", "gauss_newton", "correlative")),
-            ("in a map", each.grid, each.places, ("auto", "gauss_newton", "correlative")),
-        ):
-            for method, precision in itertools.product(methods, ("float32", "float64")):
-                if precision == "float64" and (count != 360 or method != "auto" or not device.info.float64):
-                    continue
-                options = "" if precision == "float32" else ', precision="float64"'
-                given = "grid" if need == "in a map" else "reference"
-                yield Setting(
-                    need, method, f"{count} beams",
-                    f'gs.match_scan({given}, ranges, scanner, guess, "{method}"{options})', precision,
-                    matcher(reference, each.two, each.scanner, right, each.off, method, device, precision), len(right),
-                )  # fmt: skip
-
-
-def rivals(device: Backend) -> Iterator[Setting]:
-    """Yield the settings of other programs that match pairs; note the reasons of those that cannot run."""
-    able = []
-    for one in matchers():
-        if one.match is None:
-            note(f"left out: {one.method}: {one.missing}")
-        else:
-            able.append(one)
-    for each, one in itertools.product(pairs(device) if able else (), able):
-
-        def run(seed: int, each: Pairs = each, one: Matcher = one) -> tuple[np.ndarray, np.ndarray]:
-            begin, guesses = time.perf_counter(), each.moved + each.off
-            found = one.match(each.one, each.two, each.scanner, guesses)
-            seconds = (time.perf_counter() - begin) / len(guesses)
-            return differences(np.where(np.isfinite(found), found, guesses), each.moved)[0], np.array([seconds])
-
-        yield Setting(
-            "matching", one.method, f"{each.scanner.count} beams", one.code, "float64", run, len(each.one),
-            outside=one.outside,
-        )  # fmt: skip
-
-
-def matcher(
-    reference: Any,
-    ranges: np.ndarray,
-    scanner: gs.Scanner,
-    right: np.ndarray,
-    off: np.ndarray,
-    method: Any,
-    device: Backend,
-    precision: Any,
-) -> Callable[[int], tuple[np.ndarray, np.ndarray]]:
-    """Make the run of a way to match all pairs in one call."""
-
-    def run(seed: int) -> tuple[np.ndarray, np.ndarray]:
-        begin = time.perf_counter()
-        match = gs.match_scan(reference, ranges, scanner, right + off, method, device, precision=precision)
-        each = (time.perf_counter() - begin) / len(right)
-        return differences(match.pose, right)[0], np.array([each])
-
-    return run
-
-
 # ---- learning and landmarks
 
 
@@ -379,16 +198,6 @@ def landmarks(device: Backend) -> Iterator[Setting]:
         yield Setting(
             "landmarks", kind, f"{PARTICLES} x {count}", f"gs.LandmarkModel(landmarks{words})", precision, run
         )
-
-
-def in_a_map(device: Backend) -> Iterator[Setting]:
-    """Yield the settings of matching in a map."""
-    return (one for one in matching(device) if one.need == "in a map")
-
-
-def between_scans(device: Backend) -> Iterator[Setting]:
-    """Yield the settings of matching between scans."""
-    return (one for one in matching(device) if one.need == "matching")
 
 
 SETTINGS: dict[str, Callable[[Backend], Iterator[Setting]]] = dict(

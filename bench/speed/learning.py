@@ -4,11 +4,11 @@
     python bench/speed/learning.py --backend opencl --pairs 100000 --count 1000 --starts 2     # a quick look
 
 *Rates*: one EM iteration (M-step and the passes over the pairs that it tries) on --pairs pairs of a typical scene,
-without the second derivatives and with them, the upload, and a whole fit from its own start, as the best and the
-median of several runs; one pass, and what of it are the kernel, waited for, and the copy of its rows, the rest being
-their sum on the host, and in brackets a pass without lanes where the device has some; beside them the NumPy reference
-on the same pairs (a part of them where it is slow, said so), whose sums each backend's must match: *error* is the
-largest difference of the fitted parameters, relative, in float64.
+without the second derivatives and with them, the upload, and a whole fit from its own start, of a normal and of a
+Student t to readings of it, as the best and the median of several runs; one pass, and what of it are the kernel, waited
+for, and the copy of its rows, the rest being their sum on the host, and in brackets a pass without lanes where the
+device has some; beside them the NumPy reference on the same pairs (a part of them where it is slow, said so), whose
+sums each backend's must match: *error* is the largest difference of the fitted parameters, relative, in float64.
 
 *Scenes*, on the last backend: fifty with known parameters, from mild to stiff. Parameters whose standard error is
 below 30 % of them are identified. Of these: how many lie within 3 standard errors of the truth; the largest fall of the
@@ -142,6 +142,16 @@ def rates(
         fits.append(gs.fit_beam_parameters(z, expected, TYPICAL.range_max, backend=backend, precision=precision))
 
     whole = best(fit, 3, arguments.seconds)
+    heavy = np.random.default_rng(arguments.seed)
+    tailed = TYPICAL.parameters.replace(hit="student", hit_dof=3.0)
+    z_tailed = gs.worlds.sample_readings(expected, TYPICAL.range_max, tailed, heavy)
+
+    def fit_student() -> None:
+        gs.fit_beam_parameters(
+            z_tailed, expected, TYPICAL.range_max, backend=backend, precision=precision, hit="student"
+        )
+
+    student = best(fit_student, 3, arguments.seconds)
     found = values(fits[-1].parameters)
     if count not in truth:
         reference = gs.fit_beam_parameters(
@@ -164,7 +174,8 @@ def rates(
         "backend": backend.info.selection, "device": backend.info.name, "precision": precision, "pairs": count,
         "hits": pairs.hits, "upload_s": uploaded[0], "iteration_s": plain[0], "iteration_median_s": plain[1],
         "second_s": second[0], **parts, "pairs_per_s": pairs.hits / plain[0], "fit_s": whole[0],
-        "iterations": fits[-1].iterations, "passes": fits[-1].passes, "error": error, "converged": fits[-1].converged,
+        "student_s": student[0], "iterations": fits[-1].iterations, "passes": fits[-1].passes, "error": error,
+        "converged": fits[-1].converged,
     }  # fmt: skip
 
 
@@ -222,7 +233,8 @@ def to_markdown(rows: list[dict[str, Any]], scenes: list[dict[str, Any]]) -> str
     """Format both tables."""
     columns = (
         "backend", "precision", "pairs", "upload ms", "EM iteration ms", "with 2nd derivatives ms",
-        "one pass (no lanes) ms", "kernel, copy, sum ms", "10^6 pairs/s", "x NumPy", "fit s", "passes", "error",
+        "one pass (no lanes) ms", "kernel, copy, sum ms", "10^6 pairs/s", "x NumPy", "fit s",
+        "Student fit s", "passes", "error",
     )  # fmt: skip
     lines = []
     numpy = {row["precision"]: row["pairs_per_s"] for row in rows if row["backend"] == "numpy"}
@@ -235,7 +247,8 @@ def to_markdown(rows: list[dict[str, Any]], scenes: list[dict[str, Any]]) -> str
             f"{r['backend']} ({r['device']})", r["precision"], r["pairs"], f"{1e3 * r['upload_s']:.1f}",
             f"{1e3 * r['iteration_s']:.2f}", f"{1e3 * r['second_s']:.2f}", f"{1e3 * r['pass_s']:.2f}{scalar}",
             f"{1e3 * r['kernel_s']:.2f}, {1e3 * r['download_s']:.2f}, {1e3 * left:.2f}",
-            f"{r['pairs_per_s'] / 1e6:.1f}", ratio, f"{r['fit_s']:.3f}", r["passes"], f"{r['error']:.1e}",
+            f"{r['pairs_per_s'] / 1e6:.1f}", ratio, f"{r['fit_s']:.3f}",
+            f"{r['student_s']:.3f}", r["passes"], f"{r['error']:.1e}",
         ])  # fmt: skip
     scene_columns = (
         "scene", "identified", "within 3 s.e.", "worst, s.e.", "iterations", "EM's worst fall", "book: falls",

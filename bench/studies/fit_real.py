@@ -35,6 +35,7 @@ import gzip
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,7 @@ import gpusense as gs
 from gpusense.evaluation import held_out
 from gpusense.evaluation import range_data as fitting
 from gpusense.evaluation.range_data import RangeData
+from gpusense.world.scanner import Reading
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -225,6 +227,12 @@ def by_incidence(
     return {"fit": fit.to_dict(), "gain": finite(mean), "gain_error": finite(error)}
 
 
+def without_missing(data: RangeData) -> RangeData:
+    """Return the readings that are not missing, with infinite ranges for "no return"."""
+    kept = data.chosen(data.kinds != Reading.MISSING)
+    return replace(kept, ranges=np.where(kept.kinds == Reading.MAX, np.inf, kept.ranges))
+
+
 def discrete(half: RangeData, rest: RangeData, parameters: gs.BeamParameters, width: float) -> dict[str, Any]:
     """Learn the discrete model on one half, and compare with the fitted mixture in the same steps on the other."""
     bins = min(max(round(half.range_max / width), 1), 4096)
@@ -232,7 +240,7 @@ def discrete(half: RangeData, rest: RangeData, parameters: gs.BeamParameters, wi
     def moved(data: RangeData) -> RangeData:
         nearer = np.maximum(data.ranges - parameters.range_bias, 0)
         ranges = np.where(data.ranges < data.range_max, nearer, data.ranges)
-        return fitting.without_missing(RangeData(ranges, data.expected, None, data.block, data.range_max))
+        return without_missing(RangeData(ranges, data.expected, None, data.block, data.range_max))
 
     own, other = moved(half), moved(rest)
     begin = time.perf_counter()

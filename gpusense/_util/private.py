@@ -77,7 +77,7 @@ def _check_parents(folder: Path) -> None:
 
 
 def _check_parent(folder: Path, child: str) -> None:
-    """Check that only this user and root can rename what other users do not own in a folder.
+    """Check that in a folder only this user and root can rename the files of these two.
 
     Raises:
         UnsafeFolderError: other users can.

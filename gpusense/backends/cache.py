@@ -1,10 +1,10 @@
 """Compiled kernels and verdicts on drivers, kept on disk: only the first run on a device makes them.
 
-Entries lie in gpusense's own folder (see :mod:`gpusense.backends.folders`). An entry is one file that is named by a
-hash of its key and written by rename. It begins with that hash and a checksum of hash and contents, so neither damage
-nor an exchange of two files passes. The oldest entries go when the folder holds more than it may; only a file with the
-name and the head of an entry is deleted. Where the folder is not safe or cannot be written, a private temporary folder
-takes its place and one line of the log names it. A cache never stops a run.
+Entries are in gpusense's folder (see :mod:`gpusense.backends.folders`). An entry is one file that is named by a hash of
+its key and written by rename. It begins with that hash and a checksum of hash and contents, so neither damage nor an
+exchange of two files passes. The oldest entries go when the folder holds more than it may; only a file with the name
+and the head of an entry is deleted. Where the folder is not safe or cannot be written, a private temporary folder takes
+its place and one line of the log names it. A cache never stops a run.
 
 PoCL and Warp keep compiled kernels in folders without checksums. Each process gives them an empty folder (see
 :mod:`gpusense.backends.scratch`), and copies kernels there from entries, and new ones back into entries.

@@ -22,7 +22,7 @@ INFLATION = 2.0
 """Factor of the covariances of poses: halves of the recorded logs ask for 2.2 and 2.4 (docs/matching.md)."""
 # Share of the largest eigenvalue below which the information of a scan's links leaves a direction open.
 _OPEN = 1e-6
-# Deviations of a pose in a direction of which nothing is known [m, rad].
+# Deviations of a pose in an unobserved direction [m, rad].
 _UNKNOWN, _UNKNOWN_TURN = 30.0, 3.0
 
 
@@ -43,7 +43,7 @@ def weighed(front: Front) -> Links:
 
 
 def links_of_odometry(front: Front, links: Links, reported: Floats, motion: OdometryMotion) -> Links:
-    """Return links of odometry: from key scan to key scan, and to scans that have no others in some direction.
+    """Return links of odometry: between successive key scans, and to scans without other links in some direction.
 
     Args:
         front: The matches.
@@ -75,7 +75,7 @@ def fitted_odometry(front: Front, links: Links, reported: Floats) -> OdometryMot
 
 
 def constant_motion_links(poses: Floats, keys: NDArray[np.int64], jumped: Flags, links: Links) -> Links:
-    """Return links of constant motion, whose errors add up from scan to scan, where others leave directions open.
+    """Return links of constant motion, whose errors accumulate, where other links leave directions open.
 
     Args:
         poses: (M, 3) poses of the nodes.

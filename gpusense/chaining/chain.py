@@ -62,12 +62,12 @@ def chain_scans(
 
     Each scan is matched to the one before, and to key scans around it (:func:`gpusense.match_scan`). Matches begin at
     the odometry's motion, or at none and at that of their neighbours. Places that are seen again are searched for
-    within the expected drift; closures are taken where they are sure and agree with one another. The poses are those of
-    least squares with a robust kernel over all links; the odometry, with noise fitted to the matches, fills the
-    directions that scans do not observe, and constant motion does so without one.
+    within the expected drift; closures are taken where they are sure and agree with one another. The poses are the
+    least-squares solution with a robust kernel over all links. The odometry, with noise fitted to the matches, or else
+    constant motion fills the directions that scans do not observe.
 
-    Of a robot with several scanners, each is matched with itself, and loops also between those of equal bearings, as of
-    one in front and one in the rear. A key scan is coupled with the scans of the others before and after it.
+    With several scanners, scans of the same scanner are matched; loops also match scanners of equal bearings, such as a
+    front and a rear one. A key scan is coupled with the scans of the other scanners before and after it.
 
     Args:
         scans: (S, K) readings in the order of time [m], at least one; with several scanners S readings, each of its
@@ -87,7 +87,7 @@ def chain_scans(
         backend: The device, see :func:`gpusense.devices`.
 
     Returns:
-        Poses, covariances, links, closures, and what is doubtful.
+        Poses, covariances, links, closures and doubts.
 
     Raises:
         TypeError, ValueError: an argument is of the wrong kind or breaks its rule; the message names it.
@@ -110,7 +110,7 @@ def chain_scans(
 
 
 class Chainer:
-    """Chains scans in steps, after each of which the trajectory so far can be read; see :func:`chain_scans`."""
+    """Chains scans incrementally; the trajectory so far can be read after each step. See :func:`chain_scans`."""
 
     def __init__(
         self,

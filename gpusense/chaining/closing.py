@@ -1,9 +1,9 @@
 """Loops: places that are seen again are found, matched, checked against one another, and closed.
 
 Candidates are key scans that show the same cells of the plane. Each is matched in a window of three deviations of the
-expected drift, which is that of the pose graph so far. A closure is taken where its p_right is high, it agrees with the
-drift, and other matches of the same passages agree with it: T1 and T2 between passages and the paths along both make a
-loop that ends where it began. Small drifts are closed first, which makes the larger ones smaller.
+expected drift in the pose graph so far. A closure is taken where its p_right is high, it agrees with the drift, and
+other matches of the same passages agree with it: T1 and T2 between passages and the paths along both make a loop that
+ends where it began. Small drifts are closed first, which makes the larger ones smaller.
 """
 
 from __future__ import annotations
@@ -233,7 +233,7 @@ def _level_of(drift: Floats) -> Integers:
 
 
 def _deviations(covariances: Floats) -> Floats:
-    """Return the largest deviations of the position and that of the heading, (L, 2)."""
+    """Return the largest deviation of the position, and the deviation of the heading, (L, 2)."""
     place = np.linalg.eigvalsh(covariances[:, :2, :2])[:, -1]
     return np.sqrt(np.maximum(np.stack([place, covariances[:, 2, 2]], axis=1), 0.0))
 

@@ -25,7 +25,8 @@ class Drift:
 
     Args:
         solution: The poses and links.
-        most: Most poses whose joint covariance is kept; others have that of the nearest one before.
+        most: Most poses whose joint covariance is kept; another pose takes the covariance of the nearest kept one
+            before it.
     """
 
     def __init__(self, solution: Solution, most: int = _ANCHORS) -> None:

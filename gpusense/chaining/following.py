@@ -1,9 +1,9 @@
 """Matches of successive scans: first from the odometry or from rest, doubtful ones again from the motions around them.
 
 Without odometry a robot that moves far between scans is guessed badly by rest: along a corridor, where scans look alike
-everywhere, the match then stays where it began. So matches that are not beyond doubt, or whose motion is unlike that
-of their neighbours, are also tried from constant motion. The match with the highest ``p_right`` is taken, which falls
-with the distance from the guess.
+everywhere, the match then stays where it began. So doubtful matches, and matches whose motion differs from their
+neighbours', are also tried from constant motion. The match with the highest ``p_right`` is taken, which falls with the
+distance from the guess.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def weakened(information: Floats, offset: Floats) -> Floats:
 def motions_around(motion: Floats, good: Flags, last: Floats | None) -> tuple[Floats, Floats, Floats]:
     """Return (L, 3) the last good motion before each, the next good one, and their means.
 
-    Where there is none on one side, that of the other side is taken; where there is none at all, rest.
+    Where one side has none, the other side's is taken; where neither side has one, rest.
 
     Args:
         motion: (L, 3) motions.

@@ -287,7 +287,7 @@ def moved_scans(odometry: Floats | None, readings: Floats, step: tuple[float, fl
 
 
 def _are_unlike(one: Floats, two: Floats) -> bool:
-    """Return whether more readings of two scans differ than those of a robot that stands still."""
+    """Return whether more readings of two scans differ than at rest."""
     with np.errstate(invalid="ignore"):
         both = np.isfinite(one) & np.isfinite(two)
         differ = np.abs(one - two) > np.maximum(_DIFFERENCE, _DIFFERENCE_SHARE * one)

@@ -2,8 +2,8 @@
 
 The cost is the sum over links of c^2 log(1 + s / c^2), Cauchy's kernel of the squared distance s = r' I r of a link's
 residual r in deviations (I is its information). Reweighted Gauss-Newton steps, damped as by Levenberg, minimise it; the
-normal equations are sparse and are factored by SuperLU. Poses are those in the frame of a fixed one, so that
-information may be 0 in some directions of some links, and even of all: an undetermined direction stays where it was.
+normal equations are sparse and are factored by SuperLU. Poses are relative to a fixed one. Information may be 0 in some
+directions of some or even all links: an undetermined direction keeps its initial value.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """One trajectory of a robot with several scanners: the scans of all front ends in the order of the log.
 
-Scans of each scanner are matched among themselves. Between two scans of one scanner lie scans of the others, at which
-the robot's pose follows by a share of the motion, by time. So key scans are coupled with the scans of other scanners
-before and after them: by odometry, or by this share.
+Scans of each scanner are matched among themselves. Between two scans of one scanner lie scans of other scanners; the
+robot's pose at those is interpolated by time. So key scans are coupled with the scans of other scanners before and
+after them: by odometry, or by this share.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class Joint:
         return jumped
 
     def ranks(self) -> Integers:
-        """Return the number (K,) of each key scan among those of its scanner."""
+        """Return the index (K,) of each key scan among its scanner's scans."""
         ranks = np.zeros(len(self.keys), np.int64)
         for one in range(len(self.fronts)):
             some = self.owner[self.keys] == one

@@ -1,4 +1,4 @@
-"""Links of a pose graph: what is known of the pose of one scan in the frame of another."""
+"""Links of a pose graph: poses of scans in the frames of other scans, with information."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Links:
         information: (L, 3, 3) inverse covariances, 0 along directions that are not observed.
         p_right: (L,) probabilities that the poses are right; NaN for odometry and constant motion.
         kind: (L,) names, see :data:`gpusense.chaining.links.KINDS`.
-        weight: (L,) factors of the information in the solution: near 0 for links that the others contradict.
+        weight: (L,) factors of the information in the solution: near 0 for links that the rest contradict.
 
     Example:
         >>> import numpy as np

@@ -24,7 +24,7 @@ BATCH = 1024
 """Most pairs of a call."""
 # A match is used from this p_right on.
 SURE = 0.5
-# Half widths of the search of a match of scans whose relative pose is known from others [m, rad].
+# Half widths of a search where other matches determine the relative pose [m, rad].
 NEAR = (0.5, 0.3)
 
 
@@ -135,7 +135,7 @@ class TeamMatcher:
         self._alike = np.array([[np.array_equal(one, two) for two in bearings] for one in bearings])
 
     def can_match(self, first: Integers, second: Integers) -> NDArray[np.bool]:
-        """Return whether scans can be matched: those of one scanner, and of scanners of equal bearings."""
+        """Return whether scans can be matched: scans of one scanner, or of scanners with equal bearings."""
         result: NDArray[np.bool] = self._alike[self._sensor[first], self._sensor[second]]
         return result
 

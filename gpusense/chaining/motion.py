@@ -67,7 +67,7 @@ def fitted_motion(odometry: Floats, poses: Floats, joined: NDArray[np.bool]) -> 
 
 
 def constant_motion_deviation(steps: Floats) -> Floats:
-    """Return the deviations (L, 2) of motions (L, 3) that are those of the step before [m, rad]."""
+    """Return the deviations (L, 2) of motions (L, 3) copied from the step before [m, rad]."""
     length = np.hypot(steps[:, 0], steps[:, 1])
     return np.stack([_RESTLESS + _SHARE * length, _RESTLESS_TURN + _SHARE * np.abs(steps[:, 2])], axis=1)
 

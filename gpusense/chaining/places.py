@@ -1,4 +1,4 @@
-"""Pairs of key scans that may show the same place: those whose end points share cells of the plane."""
+"""Pairs of key scans that may show the same place, since their end points share cells of the plane."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gpusense.world.sensor_scans import SensorScans
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Least share of the cells of a scan that another one must share.
+# Least share of a scan's cells that another scan must share.
 _SHARE = 0.3
 # Key scans whose shares are looked at at once.
 _ROWS = 512
@@ -51,8 +51,8 @@ def overlaps(
 ) -> tuple[Integers, Integers, Floats]:
     """Return pairs of key scans that share many cells, the best of each passage.
 
-    Of the key scans of a scanner in a row that share cells with another one, that with the most is taken. The first
-    ones are of the first passages through each place, so that their number does not grow with that of passages.
+    Of the key scans of a scanner in a row that share cells with another one, that with the most is taken. Earlier scans
+    come from the first passages through each place, so their number does not grow with further passages.
 
     Args:
         places: End points of each key scan in the robot's frame.

@@ -1,4 +1,4 @@
-"""The trajectory of a chain of scans, with its links, its closures, and what is doubtful of it."""
+"""The trajectory of a chain of scans, with its links, closures and doubts."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class ScanChain:
     """The trajectory of S scans, from :func:`gpusense.chain_scans`.
 
     Attributes:
-        poses: (S, 3) poses of the robot at the first listed beam of each scan [m, m, rad]; the first one is that of
-            the odometry, or (0, 0, 0) without one.
+        poses: (S, 3) poses of the robot at the first listed beam of each scan [m, m, rad]; the first is the odometry's,
+            or (0, 0, 0) without odometry.
         covariance: (S, 3, 3) covariances given the first pose [m^2, m rad, rad^2]; very large along directions that
             nothing tells.
         links: The links of the pose graph between scans, with their weights in the solution; closures are among them.
@@ -58,7 +58,7 @@ class ScanChain:
         sensor: (S,) index of the scanner of each scan.
         corrections: (C,) distances [m] by which the closures moved the second scans in the frames of the first ones.
         doubts: Stretches that are doubtful.
-        matched: Number of scans that were matched; for the others the robot stood still by its odometry.
+        matched: Number of scans that were matched; at the rest the robot stood still by its odometry.
         searched: Number of pairs of key scans that were matched in the search for places that are seen again.
 
     Example:
@@ -104,7 +104,7 @@ class ScanChain:
         return result
 
     def explain(self) -> str:
-        """Return the numbers of scans, key scans, links and closures, and what is doubtful, in words."""
+        """Return the numbers of scans, key scans, links and closures, and the doubts, in words."""
         count = len(self.poses)
         lines = [f"{count} scans, {self.matched} matched, {len(self.keys)} key scans, {len(self.links)} links"]
         durations = self.duration if isinstance(self.duration, tuple) else (self.duration,)

@@ -15,7 +15,8 @@ from gpusense.chaining.motion import relative, scan_motions
 
 Floats = NDArray[np.float64]
 
-# Most scans that are looked at, scans between those of a pair, pairs, and the turn during a scan that tells [rad].
+# Most scans that are inspected; scans between the two of a pair; most pairs; least turn during a scan that is evidence
+# [rad].
 _SCANS, _LAG, _PAIRS, _TURN = 2000, 5, 120, 0.01
 # Another order than the listed one must raise the mean score by this much.
 _CLEAR = 0.003

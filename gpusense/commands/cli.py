@@ -91,8 +91,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments after the program's name; ``sys.argv[1:]`` by default.
 
     Returns:
-        The exit code: 0 success, 2 bad input, 130 interrupted, 143 terminated, 129 after the end of the terminal, 141
-        when the reader of standard output is gone, or the command's own.
+        The exit code: 0 success, 2 bad input, 130 interrupted, 143 terminated, 129 after a hang-up of the terminal, 141
+        when the reader of standard output is gone, or a code of the command.
     """
     for stream in (sys.stdout, sys.stderr):
         # A device's name may have characters outside the terminal's encoding.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from gpusense.backends import Selection
 from gpusense.logs import Scan
 from gpusense.models.scan.beam import BeamModel
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.scanner import Reading, classes
+from gpusense.world.scanner import classes
 
 Floats = NDArray[np.float64]
 
@@ -220,9 +220,3 @@ def _number(word: str) -> float | None:
         return float(word)
     except ValueError:
         return None
-
-
-def without_missing(data: RangeData) -> RangeData:
-    """Return the readings that are not missing, with infinite ranges for "no return"."""
-    kept = data.chosen(data.kinds != Reading.MISSING)
-    return replace(kept, ranges=np.where(kept.kinds == Reading.MAX, np.inf, kept.ranges))

@@ -239,7 +239,7 @@ def with_one_scanner(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]
     """Return numbered scans of a log, which must have one scanner.
 
     Raises:
-        ValueError: a scan has another one.
+        ValueError: a scan has another scanner.
     """
     for index, scan in scans:
         if scan.scanner != scans[0][1].scanner:

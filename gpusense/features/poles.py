@@ -60,7 +60,7 @@ def _covariance(circle: np.ndarray) -> np.ndarray:
 def _objects(
     segments: Segments, beams: Beams, noise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return first points, numbers of points and scans of objects in front of others, and bearings of their edges."""
+    """Return first points, numbers of points, scans and bearings of both edges of objects in the foreground."""
     points = segments.points
     total = len(points.point)
     scan = np.repeat(np.arange(len(noise)), points.counts)

@@ -32,7 +32,7 @@ class Cloud(Particles):
         capacity: Most particles.
         sensors: Most sensors of a correction.
         precision: Of their log-likelihoods.
-        residual: Whether draws are those of residual resampling.
+        residual: Whether to draw by residual resampling.
     """
 
     def __init__(
@@ -169,7 +169,7 @@ class Cloud(Particles):
         recorded = self._recordings.items()
         return recorded[-1][1].recording.explain() if recorded else "launches one by one"
 
-    # ---- what crosses to the host
+    # ---- copies to the host
 
     def summary(self) -> Summary:
         """Return the state after the last correction."""

@@ -84,7 +84,7 @@ class Contents(NamedTuple):
         """Return the buffers that take these particles without overwriting the kept ones, and the array for each.
 
         Args:
-            now: The others; those at the beginning of the call.
+            now: The buffers at the beginning of the call, which are kept.
 
         Returns:
             Names of buffers are "poses" and "weights".

@@ -131,7 +131,7 @@ class Nav2Options:
     def make_filter(self, models: Any, **options: Any) -> ParticleFilter:
         """Make a particle filter with the motion, the number of particles, the recovery and the skipping of beams.
 
-        Recovery is "augmented", with gpusense's own rates, where both of ``recovery`` are positive.
+        Recovery is "augmented", with gpusense's rates, where both of ``recovery`` are positive.
 
         Args:
             models: A measurement model, or several.

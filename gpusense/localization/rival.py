@@ -80,7 +80,7 @@ class Rival:
         self._search = RivalSearch(tracker.sensors)
 
     def keep(self) -> None:
-        """Note what the call that begins must leave as it is."""
+        """Record the buffers that the beginning call must not overwrite."""
         self._tracker.keep()
 
     def changing(self) -> tuple[Any, ...]:
@@ -88,7 +88,7 @@ class Rival:
         return self, self._tracker, self._tracker.cloud
 
     def state(self) -> tuple[dict[str, Any], Contents, dict[str, Any]]:
-        """Return the rival as plain data: its own, its particles and their memory."""
+        """Return the rival as plain data: its state, its particles and their memory."""
         return plain_state(self, without=("_tracker", "_search")), *self._tracker.state()
 
     def restore(self, state: tuple[dict[str, Any], Contents, dict[str, Any]]) -> None:

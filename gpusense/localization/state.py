@@ -117,7 +117,7 @@ def readings_on_host(readings: Mapping[int, tuple[Any, ...]], backend: Backend) 
 
 
 def check_state(state: object, options: dict[str, Any], models: tuple[str, ...]) -> FilterState:
-    """Check that a state is of a filter with these options and models; the motion model may be another one.
+    """Check that a state is of a filter with these options and models; the motion model may differ.
 
     Raises:
         TypeError: it is none.

@@ -100,7 +100,7 @@ class _Writer:
         first = float(bearings[0]) if len(bearings) else 0.0
         step = (float(bearings[-1]) - first) / max(len(bearings) - 1, 1)
         if np.abs(bearings - (first + step * np.arange(len(bearings)))).max(initial=0.0) > 1e-9:
-            raise ValueError("bearings: must have even steps in a LaserScan, got others")
+            raise ValueError("bearings: must have even steps in a LaserScan, got uneven ones")
         # Rounding must not turn a range into no return.
         nearer = np.minimum(scan.ranges.astype(np.float32), np.nextafter(np.float32(scanner.range_max), np.float32(0)))
         ranges = np.where(scan.ranges >= scanner.range_max, np.float32(np.inf), nearer)

@@ -109,9 +109,9 @@ def _open(path: Path) -> Iterator[tuple[Any, Any]]:
 
 def _opened(kind: Any, path: Path) -> Any:
     """Return an open reader of a bag; for a truncated bag, with a warning, of its messages up to the cut."""
-    mended = uncut(path)
-    if mended is not None:
+    repaired = uncut(path)
+    if repaired is not None:
         warnings.warn(f"{path}: the bag is cut off; it is read up to there", stacklevel=2)
-    reader = kind(mended or path)
+    reader = kind(repaired or path)
     reader.open()
     return reader

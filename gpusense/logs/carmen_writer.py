@@ -84,5 +84,5 @@ def _geometry(scanner: Scanner) -> str:
     view = float(bearings[-1]) - first if len(bearings) else 0.0
     step = view / max(len(bearings) - 1, 1)
     if np.abs(bearings - (first + step * np.arange(len(bearings)))).max(initial=0.0) > _EVEN:
-        raise ValueError("bearings: must have even steps in a CARMEN log, got others")
+        raise ValueError("bearings: must have even steps in a CARMEN log, got uneven ones")
     return f"0 {first!r} {view!r} {step!r} {scanner.range_max!r} 0.0 0"

@@ -40,7 +40,7 @@ class _Record(NamedTuple):
 
 
 def uncut(path: Path) -> Path | None:
-    """Return a bag of the messages up to the cut of one that is cut off; None for another one.
+    """Return a bag of the messages up to the cut of one that is cut off; None for any other kind.
 
     Args:
         path: The bag: a file, or a folder with ``metadata.yaml``.

@@ -22,7 +22,7 @@ from gpusense.matching.verdicts import PairSums, concluded, tested
 DOUBTFUL, _SURE, _FAR, _FAR_TURN = 0.86, 0.97, 0.2, 0.1
 # Guesses that are farther than this from the result, in capture radii and rad, are poor.
 _NEAR, _NEAR_TURN = 0.1, 0.05
-# Starts of a search that are refined, and how far apart they are: m and rad, at a capture radius of 1 m.
+# Starts of a search that are refined, and their least distances [m, rad] at a capture radius of 1 m.
 _REFINED, _APART, _TURNED = 6, 0.1, 0.05
 # Penalties of a score: for a distance of a capture radius from the guess, and for a last step that was not small.
 _FARTHER, _UNSETTLED = 0.03, 0.05

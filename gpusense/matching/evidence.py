@@ -3,7 +3,7 @@
 The probability is a logistic function of what the scans say at the pose that was found. Its weights were fitted by
 ``bench/derive/match_evidence.py`` to matches of simulated scans and of half of the recorded logs, of neighbouring
 places and of places that have nothing in common; right and wrong poses weigh the same.
-``bench/accuracy/match_verdicts.py`` shows what is said against what happens, for both halves.
+``bench/accuracy/match_verdicts.py`` compares predicted with actual shares of right matches, for both halves.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ that are not observed. ``rival``: 1 where another pose agrees about as well. ``d
 window's half width.
 """
 
-# A pose in which every direction is observed is doubtful below the first probability, another one below the second: it
-# is used along what it observes, with its p_right beside it.
+# A fully observed pose is doubtful below the first probability, any other pose below the second: such a pose is used in
+# its observed directions, together with its p_right.
 DOUBTED, DOUBTED_PARTLY = 0.65, 0.03
 # Constant, and weights of the logarithms of disagreement, contradiction, overlap, pairs, roughness and misfit, of a
 # lost direction, of a second one, of a rival, and of the logarithm of the distance.
 _CONSTANT = -3.123
 _WEIGHTS = np.array([-1.350, -0.164, 1.574, -0.067, -0.202, -0.692, -1.395, 0.622, -2.158, -1.788])
-# Least values of which logarithms are taken, and what is added to distances.
+# Lower bounds of the arguments of logarithms, and the offset of distances.
 _LEAST = np.array([1e-3, 3e-3, 1e-3, 1.0, 0.1, 1e-2])
 _NEAR = 0.04
 

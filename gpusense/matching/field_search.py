@@ -3,9 +3,9 @@
 A score of a cell is its log density in 255 steps. With the nearest cell's distance the sum of scores differs from the
 log-likelihood by rounding alone. With bilinear distances an end point's density depends on its place within a cell. All
 positions are centres of cells, so this place is the same at all positions with one heading. A cell is divided into
-tiles; each kind of tile has a table of its own with the largest density within the tile, rounded up. A bilinear
-function has its least value over a tile at a corner, so these are bounds, and every pose whose bound reaches the
-log-likelihood of some known pose is evaluated by the model.
+tiles; each kind of tile has a separate table with the largest density within the tile, rounded up. A bilinear function
+has its least value over a tile at a corner, so these are bounds, and every pose whose bound reaches the log-likelihood
+of some known pose is evaluated by the model.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ class FieldSearch:
         allowed: np.ndarray | None, most: int,
     ) -> Candidates:  # fmt: skip
         """Return the likeliest poses of a bilinear field: all whose bounds reach a likelihood that is known."""
-        # A cell of the tables lies between four centres; so do those of the ring outside the map.
+        # A cell of the tables lies between four centres, also in the ring outside the map.
         shifted = PoseGrid(searched.start + 0.5, searched.headings, searched.height, searched.width)
 
         def run(headings: slice, floor: int) -> Found:

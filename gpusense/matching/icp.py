@@ -19,9 +19,9 @@ from gpusense.matching.points import GAP, ScanPoints
 # Neighbours on either side to which a line is fitted, and how far they may be from one another: a share of the range
 # and a distance [m]. Bodies in vectors have room for 48.
 REACH, _MOST, _FEWER, _RATIO, _SLACK = 2, 48, 16, 0.1, 0.05
-# Half of the least length of a line [m]; in standard deviations of ranges that of lines for scans of which noise turns
-# such short ones, and that of lines that tell what is observed. Long lines do not turn with noise, but round corners,
-# which costs accuracy.
+# Half of the least length of a line [m]. In standard deviations of ranges: half of the least length where noise turns
+# such short lines, and half of the length of lines that decide which directions are observed. Long lines do not turn
+# with noise, but round corners, which costs accuracy.
 WIDTH, STRAIGHT_WIDTH, LONG_WIDTH = 0.04, 3.5, 8.0
 # Neighbours may be this many deviations apart, or this many of the scanner's steps in bearing times the range.
 _SLACK_DEVIATIONS, _STEPS = 6.0, 2.5
@@ -74,11 +74,11 @@ class IcpPairs:
         self.fit_lines(WIDTH)
 
     def fit_lines(self, width: float, pairs: np.ndarray | None = None) -> None:
-        """Fit lines to the points of all scans, or of those of some pairs.
+        """Fit lines to the points of all scans, or of the scans of some pairs.
 
         Args:
             width: Half of their length [m], as far as there are points.
-            pairs: (P,) numbers of pairs; lines of other ones stay.
+            pairs: (P,) indices of pairs; lines of other pairs are kept.
         """
         if not self._most:
             return

@@ -45,9 +45,9 @@ def locate_scan(
     """Find the likeliest pose of a scan on a grid of poses over the whole map, without a guess.
 
     Positions are centres of map cells. Branch and bound (Hess et al., 2016) over integer scores finds every pose whose
-    score can belong to the largest log-likelihood; the model evaluates these. So the pose is that of brute force with
-    ``model.log_likelihood``, ties by the lowest row, then column, then heading. Damped Gauss-Newton on the model's
-    interpolated field then refines it.
+    score can belong to the largest log-likelihood; the model evaluates these. So the pose equals the result of brute
+    force with ``model.log_likelihood``; ties go to the lowest row, then column, then heading. Damped Gauss-Newton on
+    the model's interpolated field then refines it.
 
     ``p_right`` is the probability that the pose is right, from the readings that agree with the map there, those that
     pass through its walls, those that end before them, and the same of other poses that score nearly as well. A pose is

@@ -50,8 +50,7 @@ class Location:
         score: Mean score of the end points at ``modes[0].pose``, from 0 to 1.
         log_likelihood: log p(z | pose, m) there, by the model.
         agreement: Share of the hits that agree with the expected ranges there.
-        modes: The likeliest pose of the grid of poses and distinct other ones that score nearly as well, by falling
-            score.
+        modes: The likeliest pose of the grid, then distinct poses that score nearly as well, by falling score.
         p_right: Probability that the pose is right: off by at most 0.5 m and 5 degrees. It holds where as many scans
             are tried that were taken on the map as scans of other places.
         evidence: (E,) what ``p_right`` is made of, see :data:`gpusense.matching.location_evidence.NAMES`.

@@ -1,7 +1,7 @@
 """Evidence for and against a pose on a whole map, and the probability that it is right.
 
-The probability is the product of two: that the pose explains the scan, and that it is the right one of the poses that
-score nearly as well, which is 1/2 where another one is as good. Both are logistic functions, whose weights were fitted
+The probability is a product: that the pose explains the scan, times that it is the right one among poses that score
+nearly as well. The latter is 1/2 where a second pose is as good. Both are logistic functions, whose weights were fitted
 by ``bench/derive/location_evidence.py`` to scans of half of the recorded logs and of simulated ones, on the maps of the
 same and of other places; right and wrong poses weigh the same.
 """
@@ -52,7 +52,7 @@ def explained_logs(evidence: np.ndarray) -> np.ndarray:
 
 
 def rival_odds(gap_and_ahead: np.ndarray) -> float:
-    """Return the logarithm of the odds of the first mode against another one."""
+    """Return the log odds of the first mode against another mode."""
     gap, ahead = gap_and_ahead
     return math.inf if math.isinf(gap) else float(_RIVAL_WEIGHTS[0] * gap + _RIVAL_WEIGHTS[1] * ahead)
 

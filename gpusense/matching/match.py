@@ -69,9 +69,9 @@ def match_scan(
             window, without refinement, by branch and bound.
         backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
-        noise: Standard deviation of ranges [m]; errors beyond some three of them lose their weight. ``"auto"``: that of
-            each match, from the scans' own deviations from straight walls, at least that of the steps in which ranges
-            come, and 1 cm; see the field ``noise`` of the result.
+        noise: Standard deviation of ranges [m]; errors beyond some three of them lose their weight. ``"auto"``:
+            estimated for each match from the scans' deviations from straight walls; at least 1 cm, and at least the
+            rounding error of ranges that come in steps. See the field ``noise`` of the result.
         capture: Farthest distance between paired points at the start [m]: the error of a good guess.
         window: Half widths of the search: distance from the guess [m], and turn [rad].
         temperature: In (0, 1]: multiplies the information, for errors that the scans do not show, such as motion during
@@ -120,7 +120,7 @@ def _matches(
 ) -> tuple[ScanMatch, bool]:  # fmt: skip
     """Check the scans, the guess and the motions; return S matches, and whether a single one is wanted.
 
-    ``given`` says whether the options have the noise; else it is that of the scans.
+    ``given`` states whether the options have the noise; otherwise it is estimated from the scans.
     """
     second = readings("ranges", ranges, scanner, device)
     motion = check_motion("motion", motions[0], 1 if second.ndim == 1 else len(second))
@@ -166,7 +166,7 @@ def _matches(
 def _by_noise(
     noise: np.ndarray, options: MatchOptions, matched: Callable[[np.ndarray, MatchOptions], ScanMatch]
 ) -> ScanMatch:
-    """Return the matches of all rows, those of equal noise (S,) in one call each."""
+    """Return the matches of all rows; rows of equal noise (S,) share one call."""
     levels = noise if len(noise) == 1 else np.unique(noise)
     if len(levels) < 2:
         return matched(np.arange(len(noise)), replace(options, noise=float(levels[0])) if len(levels) else options)
@@ -179,7 +179,7 @@ def _to_scans(
     first: np.ndarray, second: np.ndarray, scanner: Scanner, poses: np.ndarray, method: Method, device: Backend,
     precision: Precision, options: MatchOptions, before: np.ndarray | None, motion: np.ndarray | None,
 ) -> ScanMatch:  # fmt: skip
-    """Match (S, K) scans to (S, K) or (1, K) others."""
+    """Match (S, K) scans to (S, K) or (1, K) reference scans."""
     if method in ("gauss_newton", "correlative") and len(second):
         first, second = _still(first, scanner, before), _still(second, scanner, motion)
         return match_by_maps(first, second, scanner, poses, method, device, precision, options)
@@ -206,7 +206,7 @@ def readings(name: str, ranges: object, scanner: Scanner, backend: Backend) -> n
 
 
 def scan_map(ranges: np.ndarray, scanner: Scanner, margin: float, cell: float) -> OccupancyGrid:
-    """Return the map of a scan in the robot's frame: cells of hits are occupied, all others unknown.
+    """Return the map of a scan in the robot's frame: cells of hits are occupied, the rest is unknown.
 
     Args:
         ranges: (K,) readings [m].

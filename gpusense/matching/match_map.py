@@ -197,7 +197,7 @@ def _around(grid: OccupancyGrid, local: _Local, guess: ArrayLike, window: ArrayL
         [[x + cos * local.middle[0] - sin * local.middle[1], y + sin * local.middle[0] + cos * local.middle[1]]]
     )
     center = np.column_stack([grid.world_to_cells(middle), [theta - grid.origin[2]]])
-    # Turns of the frame move the middle; the window's axes are those of the world.
+    # Turns of the frame move the middle; the window's axes are parallel to the world's.
     yaw_cos, yaw_sin = abs(math.cos(grid.origin[2])), abs(math.sin(grid.origin[2]))
     swing = 2 * math.hypot(*local.middle) * math.sin(min(half[2], math.pi) / 2)
     wide = np.array([yaw_cos * half[0] + yaw_sin * half[1], yaw_sin * half[0] + yaw_cos * half[1]]) + swing

@@ -1,8 +1,8 @@
 """The standard deviation of a scan's ranges, from the scan alone.
 
-On a straight wall the inverse range is ``a cos(bearing) + b sin(bearing)``, so that of a beam follows from those of two
-neighbours, at any incidence. The median deviation from it tells the noise: corners, edges and moving things are fewer
-than half of all places. Ranges that come in steps have at least the deviation of rounding, step / sqrt(12).
+On a straight wall the inverse range is ``a cos(bearing) + b sin(bearing)``, so two neighbours predict a beam's inverse
+range, at any incidence. The median deviation from it tells the noise: corners, edges and moving things are fewer than
+half of all places. Ranges that come in steps have at least the deviation of rounding, step / sqrt(12).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _STEP = 0.35
 LEAST_NOISE, LARGEST_NOISE, ROOT = 0.01, 0.08, 2**0.5
 # Noise that is assumed where a scan has too few places [m].
 ASSUMED_NOISE = 0.02
-# Ranges come in steps if all differences are multiples of one of this size [m], up to this share of it.
+# Ranges come in steps if all differences are multiples of a step of at least this size [m], to within this share of it.
 _LEAST_STEP, _ODD = 1e-3, 0.02
 
 
@@ -74,7 +74,7 @@ def _range_steps(ranges: np.ndarray) -> np.ndarray:
 
 
 def match_noise(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the noise of matches (S,) from that of both scans: the larger one, on a scale of steps; NaN is unknown."""
+    """Return the noise of matches (S,): the larger noise of both scans, on a scale of steps; NaN is unknown."""
     both = np.fmax(first, second)
     both = np.clip(np.where(np.isnan(both), ASSUMED_NOISE, both), LEAST_NOISE, LARGEST_NOISE)
     noise: np.ndarray = LEAST_NOISE * ROOT ** np.ceil(np.log(both / LEAST_NOISE) / np.log(ROOT) - 0.1)

@@ -1,13 +1,14 @@
-"""Directions of a pose that the pairs of a match observe, tested against what noise makes up.
+"""Directions of a pose that the pairs of a match observe, tested against spurious information from noise.
 
 The information of Gauss-Newton counts errors of the lines as information: in a corridor, noise turns lines, and turned
 lines seem to constrain the position along it. Where a direction v is not observed, all of v' I v is such a sum of
-squares. Its mean is v' S v, where S is what the variance of the points makes up, and it scatters like a chi-squared
-variable with as many degrees of freedom as there are lines without a common point. So the generalised eigenvalues of
-I v = lambda S v decide: lambda is 1 in the mean where nothing is observed, whatever the units of the coordinates, and
-a direction counts as observed above the quantile of lambda with the probability FALSE_ALARM of a false one.
+squares. Its mean is v' S v, where S is the spurious information due to the variance of the points, and it scatters like
+a chi-squared variable with as many degrees of freedom as there are lines without a common point. So the generalised
+eigenvalues of I v = lambda S v decide: lambda is 1 in the mean where nothing is observed, whatever the units of the
+coordinates, and a direction counts as observed above the quantile of lambda with the probability FALSE_ALARM of a false
+one.
 
-A lost direction is lost in all coordinates: the information of the others is that with the position along it unknown
+A lost direction affects all coordinates: the remaining information assumes that the position along it is unknown
 (Schur's complement). Where translations alone explain what is lost, as along a corridor, the heading stays observed.
 """
 
@@ -123,7 +124,7 @@ def _lost_basis(
     total: np.ndarray, made_up: np.ndarray, critical: np.ndarray, least: np.ndarray, vectors: np.ndarray,
     lost: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Return (S, 3, 3) lost directions in columns, others 0; translations first, where they are lost by themselves."""
+    """Return (S, 3, 3) lost directions in columns, further columns 0; first pure translations that are lost."""
     values, plane = _generalised(total[:, :2, :2], made_up[:, :2, :2])
     slides = _is_lost(values, plane, critical, least)
     basis = np.where(lost[:, None, :], vectors, 0.0)

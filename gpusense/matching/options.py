@@ -19,7 +19,7 @@ _SEARCH_REFERENCE = 64
 _MARGIN = 1e-3
 # Half the distance of neighbouring points, over their step of bearing: pairs may be as far apart [m / rad].
 _SPARSE = 1.5
-# Points apart of those that make a score: a single one.
+# Stride of the points that make a score, so large that only one point does.
 _NO_SCORE = 1 << 24
 # Largest translation of a guess between scans [m]; float32 resolves 6 cm at that distance.
 _FARTHEST = 1e6

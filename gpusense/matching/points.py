@@ -22,7 +22,7 @@ GAP = 3.0
 
 @dataclass(frozen=True)
 class ScanPoints:
-    """End points of the hits of scans, in a frame at the sensor whose axes are those of the robot.
+    """End points of the hits of scans, in a frame at the sensor with axes parallel to the robot's.
 
     Attributes:
         point: (P, 4) x, y [m], bearing in [0, 2 pi) [rad] and range [m], sorted by bearing in each scan.
@@ -42,7 +42,7 @@ class ScanPoints:
         return np.diff(self.start)
 
     def joined(self, others: ScanPoints) -> ScanPoints:
-        """Return these scans and others behind them; steps of bearings are those of these scans."""
+        """Return these scans followed by others; the steps of bearings are these scans'."""
         start = np.concatenate([self.start, self.start[-1] + others.start[1:]]).astype(np.int32)
         squares = np.concatenate([self.squares, others.squares])
         return ScanPoints(np.concatenate([self.point, others.point]), start, self.gap, squares)

@@ -55,7 +55,7 @@ class PoseGrid:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Poses of a search, those of each scan by falling score; ties by row, then column, then heading.
+    """Poses of a search, for each scan by falling score; ties by row, then column, then heading.
 
     Attributes:
         scan: (M,) scan of each pose.

@@ -139,8 +139,8 @@ def pose_likelihood(
 ) -> PoseLikelihood:
     """Compute P(z | x, m) over all positions and headings of a map.
 
-    Positions are centres of cells, those in the middle of square tiles of whole cells from the map's first corner on.
-    Headings are 0, 2 pi / A, ... in the world. The model evaluates them in tiles, so memory is that of the result.
+    Positions are centres of cells: the middle cells of square tiles, counted from the map's first corner. Headings are
+    0, 2 pi / A, ... in the world. The model evaluates them in tiles, so memory is that of the result.
 
     Args:
         model: A scan model: its map, parameters and device are used.

@@ -39,12 +39,12 @@ class ScanMatch:
     Attributes:
         pose: (3,) x, y [m] and theta [rad, in -pi to pi] of the second scan's robot frame in the reference's robot
             frame, or in the world for a map.
-        covariance: (3, 3) of x, y, theta [m^2, m rad, rad^2]; infinite in every coordinate in which a direction lies
-            that nothing constrains, and where the match failed.
+        covariance: (3, 3) of x, y, theta [m^2, m rad, rad^2]; infinite in every coordinate that an unconstrained
+            direction involves, and where the match failed.
         information: (3, 3) inverse of the covariance, finite: exactly 0 along directions that nothing constrains, and
             where the match failed. A pose graph adds it as it is.
         p_right: Probability that the pose is right: off by at most 0.2 m and 5 degrees along its observed directions.
-            It holds where as many matches are tried of places that meet as of places that do not.
+            It assumes that as many pairs of the same place are tried as of different places.
         score: Share of the points in common sight that agree, 1 at best; points that one scan saw through count
             against it.
         iterations: Iterations of the last refinement.
@@ -129,7 +129,7 @@ class ScanMatch:
         return replace(self, pose=pose, information=information, covariance=covariance, directions=directions)
 
     def replaced(self, rows: NDArray[np.intp], others: ScanMatch, chosen: NDArray[np.bool]) -> ScanMatch:
-        """Return S matches with the chosen ones of others in place of some rows."""
+        """Return S matches with some rows replaced from other matches, where chosen."""
         values = {}
         for field in fields(self):
             values[field.name] = np.array(getattr(self, field.name))

@@ -276,7 +276,7 @@ def _filled(array: np.ndarray) -> np.ndarray:
 
 
 def _ranks(scan: np.ndarray, score: np.ndarray) -> np.ndarray:
-    """Return the rank of each score among those of its scan, from 0 for the largest."""
+    """Return the rank of each score within its scan, 0 for the largest."""
     order = np.lexsort((-score.astype(np.int64), scan))
     ordered = scan[order]
     first = np.searchsorted(ordered, ordered)

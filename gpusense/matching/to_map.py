@@ -245,7 +245,7 @@ def _joint(field: np.ndarray, own: np.ndarray, bias: float, lever: np.ndarray) -
     for part in (own, field):
         values, vectors = axes_of(part, lever)
         gone.append(np.where((values == 0)[:, None, :], vectors, 0.0))
-    # Directions of the field that differ little from the scan's own ones are the same ones.
+    # Directions of the field that differ little from the scan's count as equal.
     apart = gone[1] - gone[0] @ (gone[0].transpose(0, 2, 1) @ gone[1])
     apart = np.where(np.linalg.norm(apart, axis=1, keepdims=True) > _APART, apart, 0.0)
     lost = orthonormal(np.concatenate([gone[0], apart], axis=2))
@@ -258,7 +258,7 @@ def _joint(field: np.ndarray, own: np.ndarray, bias: float, lever: np.ndarray) -
 
 
 _LOCK = threading.Lock()
-# The last matchers; each keeps its map alive, so that an id stays its own.
+# The last matchers; each keeps its map alive, so that no other map takes its id.
 _KEPT: dict[tuple[object, ...], MapMatcher] = {}
 _MOST_KEPT = 4
 

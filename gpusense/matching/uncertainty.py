@@ -147,7 +147,7 @@ def observable_directions(
     """Return the information (S, 3, 3) on poses that the lines of the scans leave, 0 along what they do not observe.
 
     Distances to a map know nothing of lines: the ends of a corridor's walls in the map, or gaps between cells, seem to
-    constrain the position along the corridor. A scan matched with itself has the information of its own lines.
+    constrain the position along the corridor. A scan matched with itself has the information of its lines.
 
     Args:
         ranges: (S, K) readings [m].

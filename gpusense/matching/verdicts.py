@@ -34,7 +34,7 @@ def tested(
     device: IcpPairs, result: np.ndarray, points: ScanPoints, pairs: np.ndarray, options: MatchOptions,
     noisy: np.ndarray,
 ) -> PairSums:  # fmt: skip
-    """Return what pairs observe: by the lines of the matches, and where noise may turn these, by longer ones.
+    """Return the directions that pairs observe, by the matches' lines or, where noise may turn these, longer ones.
 
     ``noisy`` are numbers of pairs whose lines noise turns.
     """
@@ -60,7 +60,7 @@ def tested(
         rules = options.last_rules(points.gap)
         stride = options.rules(int(points.counts[pairs[rows, 1]].max(initial=0)), points.gap).stride
         longer = device.run(rows, result[rows, None, :3], rules._replace(stride=stride, thin=1))[:, 0]
-        # Some of the points stand for all of them.
+        # A subset represents all points.
         longer[:, 6:18] *= stride
         for values, others in zip(found, observed(longer, rows, lines[rows]), strict=True):
             values[rows] = others
@@ -105,7 +105,7 @@ def concluded(
 
 
 def judged(match: ScanMatch, guess: np.ndarray, options: MatchOptions) -> ScanMatch:
-    """Return S matches with the probabilities that they are right; doubtful ones and those off the window have failed.
+    """Return S matches with their p_right; doubtful matches and matches beyond the window have failed.
 
     Args:
         match: Matches from ``concluded``.

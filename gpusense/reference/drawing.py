@@ -2,10 +2,10 @@
 
 Systematic resampling draws at (n + u) / N of the total, stratified resampling at (n + u_n) / N: *Probabilistic
 Robotics* table 4.4, and Kitagawa (1996). Residual resampling copies each particle as often as the whole part of its
-expected number says, and draws the rest by the residual weights (Liu and Chen 1998). Between two stages of a
-correction a drawn pose moves by a fraction of the difference of two others, whose spread is that of the cloud
-(differential evolution: ter Braak 2006); differences between separate clusters are shortened. Injected poses come from
-a pool: free cells, or the modes of a likelihood map.
+expected number says, and draws the rest by the residual weights (Liu and Chen 1998). Between two stages of a correction
+a drawn pose moves by a fraction of the difference of two other poses, so that the spread of the moves follows the
+cloud's (differential evolution: ter Braak 2006); differences between separate clusters are shortened. Injected poses
+come from a pool: free cells, or the modes of a likelihood map.
 """
 
 from __future__ import annotations

@@ -35,9 +35,9 @@ def shape_weight(flags: frozenset[str], t: np.ndarray, numbers: np.ndarray) -> n
     return power * rate / (1 + rate * t)
 
 
-def shape_bend(flags: frozenset[str], numbers: np.ndarray) -> float:
-    """Return -E''(t) over the square of the weight."""
-    return 1 / numbers[0] if "STUDENT" in flags else 0 * numbers[0]
+def shape_bend(flags: frozenset[str], square: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """Return -E''(t) over the weight, times u^2, from the weight times u^2."""
+    return square * (1 / numbers[0]) if "STUDENT" in flags else np.zeros_like(square)
 
 
 def half_mass(flags: frozenset[str], b: np.ndarray, numbers: np.ndarray) -> np.ndarray:

@@ -71,7 +71,7 @@ def add_pair(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: 
     t, p = x_0 * phi_0 + x_1 * phi_1, phi_1 - phi_0
     q = x_1 * pull_1 - x_0 * pull_0 + p * t
     w = x_0 * x_0 * pull_0 + x_1 * x_1 * pull_1
-    bend = shape_bend(flags, numbers) * square
+    bend = shape_bend(flags, square, numbers)
     hit = r_hit > 0
     # A mean that is clamped does not move with the bias.
     moved = hit & (mean == expected + terms[10])

@@ -71,11 +71,11 @@ def _failure(error: BaseException) -> bytes:
 def _detach(link: Connection) -> None:
     """Make the process end with its parent, and not with the parent's Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # A job may start processes of its own, which must not hold the link open.
+    # A job may start further processes, which must not hold the link open.
     multiprocessing.current_process().daemon = False
     os.set_inheritable(link.fileno(), False)
     if sys.platform != "win32":
-        # A group of its own: what a job has started ends with the worker.
+        # A new process group: processes that a job has started end with the worker.
         with contextlib.suppress(OSError):
             os.setsid()
         os.register_at_fork(after_in_child=link.close)

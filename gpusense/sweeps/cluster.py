@@ -35,8 +35,8 @@ class DaskExecutor(Executor):
     """Jobs on a Dask cluster, one at a time on each worker, in a process that the worker supervises.
 
     Workers of a cluster at an address are started by ``GPUSENSE_SWEEP_DEVICE=warp:cuda:0 dask worker ADDRESS
-    --nthreads 1 --resources gpusense=1``, one for each device. Where a worker declares this resource, the others take
-    no jobs.
+    --nthreads 1 --resources gpusense=1``, one for each device. Where any worker declares this resource, workers without
+    it take no jobs.
 
     Args:
         address: Of a scheduler, such as ``"tcp://10.0.0.1:8786"``; None starts a cluster in this process, whose
@@ -102,7 +102,7 @@ class DaskExecutor(Executor):
         """
         import distributed
 
-        # A client that is garbage closes itself when it is collected. In the midst of the start of another one it would
+        # A client that is garbage closes itself when it is collected. Collected during another client's start, it would
         # wait forever for a lock that this thread holds.
         gc.collect()
         try:

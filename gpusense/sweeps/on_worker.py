@@ -15,7 +15,7 @@ from gpusense.sweeps.worker import receive
 # Pools of this process by worker and executor: a cluster of one machine has several workers in a process.
 _POOLS: dict[tuple[str, str], Pool] = {}
 _LOCK = threading.Lock()
-# Devices of the Dask workers in this process; others have that of their environment.
+# Devices of the Dask workers in this process; any other worker has the device of its environment.
 DEVICES: dict[str, str] = {}
 
 # An answer: its pickle, or how the worker failed.

@@ -134,7 +134,7 @@ class RemoteWorker:
             raise WorkerDied(f"with its Dask worker at {self.address}", outside=True)
 
     def _failure(self, error: BaseException) -> Exception:
-        """Return the meaning of a Dask task's own error; errors of jobs are answers."""
+        """Return the meaning of a Dask task's error; errors of jobs arrive as answers."""
         import distributed
 
         self._check()

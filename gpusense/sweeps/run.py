@@ -67,7 +67,7 @@ def run(
     to ``attempts`` times; then its row says how the worker ended. One that has exceeded the executor's ``job_timeout``
     is not started again. Where the cause of an end may lie outside the job (SIGKILL, a lost machine), its last start
     comes after all other jobs and alone, so that no sound job fails by its neighbours. If the executor itself ends, or
-    after Ctrl-C, finished jobs stay in the table, and ``resume=True`` runs the others.
+    after Ctrl-C, finished jobs stay in the table, and ``resume=True`` runs the remaining jobs.
 
     Args:
         jobs: The jobs; equal ones run once.
@@ -77,7 +77,7 @@ def run(
             :class:`DaskExecutor`; None runs the jobs here, where one that ends its process ends the sweep. It is not
             shut down.
         root: Folder of maps and logs, on the machine of each worker unless they are sent.
-        backend: Selection string of the device of workers that have none of their own.
+        backend: Selection string of the device, for workers without a chosen device.
         resume: Keep the rows of an existing table, and skip their jobs.
         retry_failed: Run failed jobs of the table again.
         attempts: Most starts of a job whose worker ends.

@@ -196,7 +196,7 @@ class Supervised:
         if process is None or process.pid is None:
             return
         if sys.platform != "win32":
-            # Its group, while the number of the process is not free for others.
+            # Its group, while no other process can take its number.
             with contextlib.suppress(OSError):
                 os.killpg(process.pid, signal.SIGKILL)
         with contextlib.suppress(OSError):
@@ -250,7 +250,7 @@ def result_of(answer: bytes) -> Any:
 
 @contextlib.contextmanager
 def _parent_of_processes() -> Iterator[None]:
-    """Let this process start others, to which Ctrl-C does not come while they start."""
+    """Let this process start child processes that do not receive Ctrl-C while they start."""
     # Workers of Dask are daemons, which may not start processes unless they say otherwise.
     multiprocessing.current_process().daemon = False
     if sys.platform == "win32":

@@ -141,7 +141,7 @@ def row_of(job: Job, outcome: Outcome, attempts: int) -> Row:
         worker=outcome.worker, device=outcome.device, error=outcome.error,
     )  # fmt: skip
     own = fields | job.by_name
-    # A label that is the value itself has no column of its own.
+    # A label that equals the value has no separate column.
     fields |= {f"axis.{name}": label for name, label in job.labels if own.get(name) != label}
     for kind, values in (("option", job.by_name), ("result", outcome.values)):
         for name, value in values.items():

@@ -61,8 +61,8 @@ def work(job: Job, root: str, device: str, sweep: str = "") -> Outcome:
     Args:
         job: The job.
         root: Folder of its files.
-        device: Selection string of the device, where the worker has none of its own.
-        sweep: Name of the sweep: what a worker has read for another one is read again.
+        device: Selection string of the device, for a worker without a chosen device.
+        sweep: Name of the sweep; files that a worker has read for another sweep are read again.
     """
     chosen = device_of(device)
     with _LOCK:

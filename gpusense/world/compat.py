@@ -126,7 +126,7 @@ class Amcl(Peer):
     outside = "occupied"
 
     def readings(self, ranges: np.ndarray, scanner: Scanner, field: bool) -> np.ndarray:
-        """Convert readings to the peer's classes: NaN and inf are left out, all others are ranges.
+        """Convert readings to the peer's classes: NaN and inf are left out, all other readings are ranges.
 
         Args:
             ranges: Readings of any shape and value [m].

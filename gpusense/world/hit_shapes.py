@@ -6,7 +6,7 @@ pictures, simulations and fits get all that they need from :class:`HitShape`. Ke
 and get all other numbers from here.
 
 A shape is registered in :data:`SHAPES` under its name, the value of ``hit=`` in the parameters of scan models.
-CONTRIBUTING.md has the recipe for another one.
+CONTRIBUTING.md has the recipe for another shape.
 """
 
 from __future__ import annotations
@@ -287,5 +287,5 @@ def name_of(shape: HitShape) -> HitName:
 
 
 def shape_of(parameters: Any) -> HitShape:
-    """Return the shape of the hits of parameters of a scan model."""
+    """Return the hit shape of a scan model's parameters."""
     return SHAPES[parameters.hit].of(parameters)

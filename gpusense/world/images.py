@@ -29,7 +29,8 @@ _MAX_PILLOW_WIDTH = 1 << 26  # keeps a strip of one row below Pillow's limit on 
 _DIGITS = b"0123456789 "
 _BLANKS_TO_SPACES = bytes.maketrans(b"\t\n\v\f\r", b"     ")
 
-# Bytes of a pixel that Pillow decodes, by colour type and whether it has 16 bits: grey and palettes; the others take 4.
+# Bytes of a pixel that Pillow decodes, by colour type and whether it has 16 bits: grey and palettes; other types take
+# 4.
 _PNG_BYTES = {(0, False): 1, (3, False): 1, (0, True): 2}
 
 # Shares of red, green and blue in a grey, in thousandths (ITU-R BT.601).

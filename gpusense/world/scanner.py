@@ -156,7 +156,7 @@ class Scanner:
 
         Args:
             message: Any object or mapping with the message's fields angle_min, angle_increment, range_min, range_max
-                and ranges. ``angle_max`` is not read, because it follows from the others.
+                and ranges. ``angle_max`` is not read, because it follows from the other fields.
             mount: Pose (x, y, theta) of the laser in the robot's frame [m, m, rad].
 
         Raises:

@@ -33,10 +33,10 @@ real shape_weight(const real t, const real power, const real rate) {
 #endif
 }
 
-// Return -E''(t) over the square of the weight.
-real shape_bend(const real power) {
+// Return -E''(t) over the weight, times u^2, from the weight times u^2.
+real shape_bend(const real square, const real power) {
 #if STUDENT
-    return 1 / power;
+    return square * (1 / power);
 #else
     return 0;
 #endif

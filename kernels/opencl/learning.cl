@@ -60,7 +60,7 @@ void add_pair(const real z, const real expected, global const real *terms, real 
             q = x_1 * pull_1 - x_0 * pull_0 + p * t;
             w = x_0 * x_0 * pull_0 + x_1 * x_1 * pull_1;
         }
-        const real bend = shape_bend(terms[17]) * square;
+        const real bend = shape_bend(square, terms[17]);
         h_s = square - 1 + t;
         h_m = pull + p;
         h_ss = square * (bend - 2) - t + w + t * t;

@@ -53,11 +53,11 @@ def functions(flags):
         else:
             return ONE
 
-    # Return -E''(t) over the square of the weight.
+    # Return -E''(t) over the weight, times u^2, from the weight times u^2.
     @wp.func
-    def shape_bend(power: real):
+    def shape_bend(square: real, power: real):
         if STUDENT:
-            return ONE / power
+            return square * (ONE / power)
         else:
             return ZERO
 

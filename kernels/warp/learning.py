@@ -109,7 +109,7 @@ def make(name, flags):
                 v_0 = pull_0 + pull_1
                 q = x_1 * pull_1 - x_0 * pull_0 + p * t
                 w = x_0 * x_0 * pull_0 + x_1 * x_1 * pull_1
-            bend = shape_bend(terms[17]) * square
+            bend = shape_bend(square, terms[17])
             h_s = square - ONE + t
             h_m = pull + p
             h_ss = square * (bend - TWO) - t + w + t * t

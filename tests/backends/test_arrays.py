@@ -37,6 +37,7 @@ def call_of(method: str, backend, scan=SCAN):
 # ---- in
 
 
+@pytest.mark.sampled(0.4)
 @pytest.mark.parametrize("method", METHODS)
 def test_results_come_back_in_the_library_of_the_poses(method, backend):
     call, shape = call_of(method, backend)

@@ -54,6 +54,7 @@ def entries(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_ino for path in (folder / folders.OWN).glob("*.gpusense")}
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("family", ["opencl", "warp:cpu"])
 def test_a_second_process_compiles_nothing(needs, tmp_path, expected, family):
     """A compiled kernel is stored as an entry; a second process stores none."""
@@ -88,6 +89,7 @@ def test_nothing_beside_the_cache_is_touched(needs, tmp_path, expected):
     assert after == before and len(before) == 164 and len(entries(folder)) > 5
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("family", ["opencl", "warp:cpu"])
 def test_with_the_cache_off_nothing_is_kept(needs, tmp_path, expected, family):
     needs(family.split(":")[0])

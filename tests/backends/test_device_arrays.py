@@ -30,6 +30,7 @@ def call_of(method: str, backend, scan=SCAN):
     return call, (COUNT, *shape)
 
 
+@pytest.mark.sampled(0.4)
 @pytest.mark.parametrize("real", [np.float32, np.float64])
 @pytest.mark.parametrize("method", METHODS)
 def test_poses_on_the_device_stay_there(method, real, warp_as_gpu, warp_copies):

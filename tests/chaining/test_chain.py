@@ -237,6 +237,7 @@ def test_a_failed_match_is_bridged_over(needs) -> None:
     assert ((chain.links.first <= 4) & (chain.links.second >= 6)).any()
 
 
+@pytest.mark.slow
 def test_joined_logs_of_two_buildings_are_not_closed(lap: tuple[np.ndarray, ...], needs) -> None:
     truth, scans, _ = lap
     x = np.arange(0, 16, 0.4)

@@ -59,6 +59,7 @@ def chains(lap: tuple) -> dict[bool, gs.ScanChain]:
             for known in (True, False)}  # fmt: skip
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("with_odometry", [True, False])
 def test_lasers_in_turn_are_one_trajectory(lap: tuple, chains: dict, with_odometry: bool) -> None:
     (truth, _, sensor, _), chain = lap, chains[with_odometry]

@@ -104,6 +104,7 @@ def test_demo_goes_on_without_a_device_that_was_not_asked_for(needs, monkeypatch
     assert any("the compiler crashed" in failure for failure in report["failures"])
 
 
+@pytest.mark.slow
 def test_demo_draws_without_pyplot(tmp_path):
     done = script(
         "from gpusense.commands import demo; demo.LATTICE = 0.5\n"

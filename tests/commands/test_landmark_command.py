@@ -75,6 +75,7 @@ def test_command_localises(capsys, folder, kind):
     assert document["filter"]["error_median"] < 0.15 and document["device"] == "numpy"
 
 
+@pytest.mark.slow
 def test_exchanged_landmarks_are_reported_and_survived(capsys, swapped, tmp_path):
     drawn = tmp_path / "run.png"
     text = run(capsys, swapped, "--particles", "300", "--scans", "150", "--plot", str(drawn))
@@ -85,6 +86,7 @@ def test_exchanged_landmarks_are_reported_and_survived(capsys, swapped, tmp_path
     assert document["filter"]["error_median"] < 0.2
 
 
+@pytest.mark.slow
 def test_poor_odometry_is_survived(capsys, tmp_path):
     """The heading errs by 0.6 to 0.8 rad in 5 s: noise measured in the run follows it, a fixed small one does not."""
     folder = world.write_run(tmp_path / "poor", seed=2, seconds=30.0, wander=0.31)

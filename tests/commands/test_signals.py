@@ -90,6 +90,7 @@ def stop_at(monkeypatch: pytest.MonkeyPatch, command: str, number: int, step: in
     monkeypatch.setattr(f"gpusense.commands.{command}.progress", stopping)
 
 
+@pytest.mark.sampled(0.35)
 @pytest.mark.parametrize("number", ENDS, ids=lambda number: number.name)
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_command_that_is_stopped_keeps_its_results(command, number, place, tmp_path, monkeypatch, capsys, needs):

@@ -13,6 +13,7 @@ from gpusense.evaluation.calibration_scenes import MAKERS, make_scene
 RUNS = 300
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("name", MAKERS)
 def test_readings_are_calibrated(name):
     scene = make_scene(name)
@@ -45,6 +46,7 @@ WRONG = {
 }  # fmt: skip
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("name", WRONG)
 def test_another_density_is_found(name):
     # The test above can fail: readings of a sensor with other parameters are not calibrated.

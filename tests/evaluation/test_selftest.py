@@ -189,6 +189,7 @@ def test_replay_casts_on_the_device_that_scored(scene):
 # ---- the command
 
 
+@pytest.mark.slow
 def test_all_backends_present_agree(capsys):
     code, out, err = run(capsys)
     assert err == ""
@@ -258,7 +259,7 @@ reference_cast_ranges, envelope = ranges.cast_ranges, distance.distance_envelope
 score_beams, log_density = beam.score_beams, mixture.log_density
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.25)
 @pytest.mark.parametrize(
     "module, name, broken, quantity",
     [
@@ -286,6 +287,7 @@ def test_a_breach_is_detected(capsys, monkeypatch, module, name, broken, quantit
         assert "BREACH" in out
 
 
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("kernel", [None, "sum_parts", "order_fill"])
 def test_a_breach_of_a_gpu_is_detected(kernel, monkeypatch):
     """Tiles, orders and sums, which only GPUs have; the reference pretends to be one."""

@@ -64,6 +64,7 @@ def test_landmarks_are_where_corners_and_doors_are(surveyed):
     assert (deviation > 1e-4).all() and (deviation < 0.1).all()
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("beside", ["alone", "lines", "field"])
 def test_a_filter_localises_by_features(surveyed, beside):
     """Odometry alone is off by more in the end than the filter ever is in the median."""

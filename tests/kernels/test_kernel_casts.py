@@ -10,7 +10,7 @@ from gpusense.backends import Backend
 from gpusense.evaluation.tolerances import differing
 
 
-@pytest.mark.sampled(0.25)
+@pytest.mark.sampled(0.12)
 @pytest.mark.parametrize("sectors", SECTORS)
 @pytest.mark.parametrize("real", PRECISIONS)
 @pytest.mark.parametrize(

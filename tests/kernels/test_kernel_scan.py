@@ -62,7 +62,7 @@ def placed(
     return reference
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize(("precision", "single"), [(np.float32, True), (np.float32, False), (np.float64, False)])
 @pytest.mark.parametrize("end_points", [True, False], ids=["end points", "rays"])
 def test_readings_are_placed_as_the_host_prepares_them(

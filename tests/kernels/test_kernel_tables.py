@@ -197,6 +197,7 @@ def test_long_rectangles_end_at_255_cells(as_kind: Callable[[str], Backend]) -> 
                 assert width.max() == min(255, shape[1]) or height.max() == min(255, shape[0])
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("kind", ["cpu", "gpu"])
 def test_rectangles_of_maps_with_more_rows_or_columns_than_16_bits_count(
     kind: str, as_kind: Callable[[str], Backend]
@@ -267,7 +268,7 @@ def made_anew(
     return found
 
 
-@pytest.mark.sampled(0.3)
+@pytest.mark.sampled(0.2)
 @pytest.mark.parametrize("kind", ["cpu", "gpu"])
 @pytest.mark.parametrize(
     ("shape", "share"), [((610, 590), 0.0), ((610, 590), 1e-4), ((40, 700), 3e-3), ((700, 3), 0.01), ((9, 9), 0.1)]
@@ -285,7 +286,7 @@ def test_updated_rectangles_are_those_made_anew(
         np.testing.assert_array_equal(planes, np.frombuffer(zlib.decompress(anew), np.uint16).reshape(planes.shape))
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("kind", ["cpu", "gpu"])
 @pytest.mark.parametrize("sectors", SECTORS)
 def test_a_cell_that_comes_and_goes_is_seen_as_far_as_rectangles_reach(

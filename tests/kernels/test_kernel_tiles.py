@@ -158,7 +158,7 @@ def test_tiles_that_add_up_strands(names: tuple[str, ...], device: Backend) -> N
         assert_near(found, expected.astype(np.float64), 8 * per_beam(expected, np.float32))
 
 
-@pytest.mark.sampled(0.35)
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize(("names", "real"), [*zip(TILED, PRECISIONS, strict=True)])
 @pytest.mark.parametrize("name", ["book", "hit", "short", "hardly any rand"])
 def test_tiles_of_beams_of_every_kind(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:
@@ -230,7 +230,7 @@ def field_blocks(
     return parts_at(found["parts"], count, blocks), parts_at(reference["parts"], count, blocks), bound
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.2)
 @pytest.mark.parametrize(("name", "names", "real"), FIELD_SCENES)
 def test_blocks_of_fields_of_every_kind(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:
     found, expected, bound = field_blocks(device, name, real, names, 1, 77, 150)

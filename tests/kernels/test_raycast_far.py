@@ -58,6 +58,7 @@ def rounded(value: Fraction, real: np.dtype) -> Fraction:
     return round(value / unit_in_last_place) * unit_in_last_place
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_counts_of_boundaries_near_the_longest_range(precision):
     """Compare counts of boundaries at and next to their rounded distances with fractions."""
@@ -112,6 +113,7 @@ def test_origins_nearly_as_far_off_as_a_range_may_be_long(precision, backend):
             )
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_the_longest_corridor(precision, backend):
     """A million cells inside the map: counts of boundaries as they were at its begin."""

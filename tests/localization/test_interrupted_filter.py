@@ -98,6 +98,7 @@ def interrupt_lines(name: str, backend: str, call: str, most: int | None) -> Non
 some_lines = pytest.mark.parametrize("most", [7, pytest.param(None, marks=pytest.mark.slow)], ids=["some", "all"])
 
 
+@pytest.mark.sampled(0.4)
 @some_lines
 @pytest.mark.parametrize("call", CALLS)
 @pytest.mark.parametrize("name", FILTERS)

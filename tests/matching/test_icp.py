@@ -29,6 +29,7 @@ def run(backend: str, precision: str, scanner, rules, guesses):
         return pairs.run(np.arange(4), guesses, rules)
 
 
+@pytest.mark.sampled(0.4)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("scanner", [RING, FRONT], ids=["ring", "front"])
 @pytest.mark.parametrize("thin", [0, 1])

@@ -133,7 +133,7 @@ def test_other_matchers_find_the_motion(
     measure: ModuleType, needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Matchers that are installed find most motions to 6 cm; their rows name version and threads."""
-    tasks, device = importlib.import_module("needs"), get_backend(needs("opencl"))
+    tasks, device = importlib.import_module("matching_tasks"), get_backend(needs("opencl"))
     monkeypatch.setattr(tasks, "PAIRS", 12)
     monkeypatch.setattr(tasks, "BEAMS", (180,))
     settings = list(tasks.rivals(device))

@@ -7,9 +7,11 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from support.bench_scripts import BENCH, run_script
 
 
+@pytest.mark.slow
 def test_features_are_measured(data_dir: Path, needs: Callable[[str], str], tmp_path: Path) -> None:
     """Simulated floors, one recording's worth of scans, and rates."""
     report = run_script(

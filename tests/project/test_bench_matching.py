@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from support.bench_scripts import run_script
 
 
@@ -19,6 +20,7 @@ def test_global_matching_runs(data_dir: Path, needs: Callable[[str], str], tmp_p
     assert olin["right"] == 1 and olin["found_wrong"] == 0
 
 
+@pytest.mark.slow
 def test_matching_odometry_runs(data_dir: Path, needs: Callable[[str], str], tmp_path: Path) -> None:
     arguments = ["--recorded", str(data_dir), "--backend", needs("opencl"), "--scans", "4", "--log", "csail"]
     report = run_script("accuracy/matching_odometry.py", *arguments, output=tmp_path / "odometry")

@@ -212,6 +212,7 @@ def security(ca, certificate, key):
     return distributed.Security(tls_ca_file=ca, require_encryption=True, **names)
 
 
+@pytest.mark.slow
 def test_tls_keeps_others_out(tmp_path, capsys):
     own, foreign = (write_certificates(tmp_path / name) for name in ("own", "foreign"))
     tls = ("--tls-ca-file", own[0], "--tls-cert", own[1], "--tls-key", own[2])
@@ -288,6 +289,7 @@ def test_a_worker_that_cannot_run_calls_is_left_out(caplog):
         assert caplog.text.count("a worker is left out") == 2
 
 
+@pytest.mark.slow
 def test_a_worker_that_pauses_ends_its_call_and_begins_none(tmp_path):
     with gs.sweep.DaskExecutor(timeout=60) as executor:
         (worker,) = executor._watched.workers.values()

@@ -84,6 +84,7 @@ def await_end(processes, seconds=20):
         time.sleep(0.02)
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_only_jobs_that_end_their_worker_fail(tmp_path, engine):
     ends = ["segmentation fault", "SystemExit", "memory", "kill"]
@@ -97,6 +98,7 @@ def test_only_jobs_that_end_their_worker_fail(tmp_path, engine):
     assert (ended.skipped, ended.failed) == (1, 0) and len(table["seed"]) == 8
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_job_that_hangs_is_ended_at_its_limit(tmp_path, engine):
     # Processes are tested with the harder one: no other thread of the worker runs.

@@ -88,7 +88,7 @@ def load(module: wp.Module, device: wp.Device, group: int) -> None:
     """Compile a module for a device, or take its code from the cache; within :func:`settings`.
 
     Raises:
-        Exception: Warp's own, where the module does not compile.
+        Exception: Warp's errors, where the module does not compile.
     """
     name = module.get_module_identifier(block_dim=group)
     host = fingerprint() if device.is_cpu else f"{device.arch}"

@@ -164,7 +164,7 @@ def model_rows(report: Mapping[str, Any]) -> list[Row]:
     A method that failed in a scene has neither a row for it nor one for all maps. A scene where every method was left
     out, such as one after the deadline of a quick run, does not count.
     """
-    titles, origin = titles_of(report["points"], report["machine"], report["devices"]), origin_of(report)
+    titles, origin = titles_of(report["points"], report["machine"], report.get("devices", ())), origin_of(report)
     groups: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
     everywhere: dict[tuple[str, ...], set[tuple[str, str]]] = {}
     for point in report["points"]:

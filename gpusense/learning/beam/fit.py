@@ -16,7 +16,6 @@ from gpusense._util.progress import progress as progress_bar
 from gpusense._util.typing import FitMethod, Precision
 from gpusense.backends import Selection
 from gpusense.learning.beam.blocks import check_blocks
-from gpusense.learning.beam.book import textbook_em
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.em import Climb, Watch, climb_em
 from gpusense.learning.beam.growth import fit_jointly
@@ -29,6 +28,7 @@ from gpusense.learning.beam.report import report
 from gpusense.learning.beam.result import BeamFit
 from gpusense.learning.beam.searches import climb_genetic, climb_gradient, climb_hill
 from gpusense.learning.beam.shapes import fit_shape
+from gpusense.learning.beam.textbook import textbook_em
 from gpusense.world.hit_shapes import SHAPES, HitName
 from gpusense.world.parameters import BeamParameters
 

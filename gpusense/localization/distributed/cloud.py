@@ -54,7 +54,7 @@ class SplitCloud(FilterCloud):
     Args:
         team: The shards.
         capacity: Most particles of the filter.
-        residual: Whether draws are those of residual resampling.
+        residual: Whether to draw by residual resampling.
 
     Attributes:
         exchanged: Bytes of particles that were handed to shards.
@@ -178,7 +178,7 @@ class SplitCloud(FilterCloud):
         return pieces
 
     def _marks(self, own: np.ndarray, drawn: list[Part]) -> list[tuple[float, float]] | None:
-        """Return the lowest and the highest mark that each shard draws at; None where each copies its own particles."""
+        """Return the lowest and the highest mark of each shard's draws; None where each draws from its part alone."""
         total, whole = float(own[TOTAL]), drawn[0].whole
         if not total > 0.0 and whole != self.count:
             raise RuntimeError("the weights of all particles are 0, so their number cannot change")
@@ -195,7 +195,7 @@ class SplitCloud(FilterCloud):
         parts = zip(self._parts(self.count), self._team.devices, strict=True)
         return f"split: {', '.join(f'{part.size} on {name}' for part, name in parts)}"
 
-    # ---- what crosses to the host
+    # ---- copies to the host
 
     def estimate(self, count: int) -> np.ndarray:
         """See FilterCloud.estimate."""

@@ -18,7 +18,7 @@ class LocalTeam:
     Args:
         models: Models of each shard.
         capacity: Most particles of a shard.
-        residual: Whether draws are those of residual resampling.
+        residual: Whether to draw by residual resampling.
 
     Attributes:
         devices: Selection strings of the devices.
@@ -31,7 +31,7 @@ class LocalTeam:
         self.direct = all(one.reaches(other) for one in self._shards for other in self._shards)
 
     def each(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """Run a method of all shards, each with its own arguments, and return the results."""
+        """Run a method of all shards with the arguments for each, and return the results."""
         steps = [getattr(one, method)(*own) for one, own in zip(self._shards, arguments, strict=True)]
         for one in steps:
             next(one)
@@ -52,9 +52,9 @@ class RemoteTeam:
     Args:
         executors: One for each shard; each must run all functions in the same process.
         make: Function of a module that returns the models of a device.
-        devices: Selection strings, for workers that have no device of their own.
+        devices: Selection strings, for workers without a chosen device.
         capacity: Most particles of a shard.
-        residual: Whether draws are those of residual resampling.
+        residual: Whether to draw by residual resampling.
 
     Attributes:
         devices: Selection strings of the devices.
@@ -80,7 +80,7 @@ class RemoteTeam:
         self.devices = [future.result() for future in made]
 
     def each(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """Run a method of all shards, each with its own arguments, and return the results."""
+        """Run a method of all shards with the arguments for each, and return the results."""
         running = [
             executor.submit(shard_registry.call, name, method, *own)
             for executor, name, own in zip(self._executors, self._names, arguments, strict=True)

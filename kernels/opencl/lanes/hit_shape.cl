@@ -32,6 +32,15 @@ lanes shape_weight_lanes(const lanes t, const lanes power, const lanes rate) {
 #endif
 }
 
+// Return -E''(t) over the weights, times u^2, from the weights times u^2.
+lanes shape_bend_lanes(const lanes square, const real power) {
+#if STUDENT
+    return square * (1 / power);
+#else
+    return 0;
+#endif
+}
+
 #if MASS_TABLE
 // Return the masses between the mean and distances; the tables begin at places.
 lanes half_mass_lanes(const lanes b, global const real *terms, const ilanes place) {

@@ -24,8 +24,8 @@ void add_pair_lanes(const lanes reading, const lanes expected_range, global cons
     int within;
     const lanes mean = mean_range_lanes(expected, terms, 0, &clamped);
     const lanes mass = mass_within_lanes(mean, terms[2], terms, 0, &within);
-    const LanePair scale = hit_scale_lanes(expected, terms, 0);
-    const LanePair exponent = hit_exponent_lanes(z, expected, mean, clamped, scale, terms, 0);
+    const lanes off = z - mean;
+    const LanePair exponent = shape_exponent_lanes((LanePair){off * (off * terms[1]), 0}, terms[17], terms[18]);
     lanes hit = terms[0] - exponent.hi + (terms[8] - exponent.lo);
     if (!within) hit -= log_lanes(mass);
     const lanes length = short_length_lanes(expected, terms, 0);
@@ -41,7 +41,7 @@ void add_pair_lanes(const lanes reading, const lanes expected_range, global cons
     r_short *= part;
     r_rand *= part;
 
-    const lanes u = (clamped ? z - mean : z - expected - terms[10]) * terms[14];
+    const lanes u = off * terms[14];
     const lanes weight = shape_weight_lanes((real)0.5 * u * u, terms[17], terms[18]), pull = weight * u;
     const lanes square = pull * u;
     lanes t = 0, v = 0, q = 0, w = 0, slope = 0;
@@ -56,7 +56,7 @@ void add_pair_lanes(const lanes reading, const lanes expected_range, global cons
         q = x_1 * pull_1 - x_0 * pull_0 + slope * t;
         w = x_0 * x_0 * pull_0 + x_1 * x_1 * pull_1;
     }
-    const lanes bend = shape_bend(terms[17]) * square;
+    const lanes bend = shape_bend_lanes(square, terms[17]);
     // A mean that is clamped does not move with the bias. Terms of a cause that is impossible may be infinite.
     const ilanes is_hit = r_hit > 0, is_short = r_short > 0, moved = is_hit & ~clamped;
     const lanes h_s = is_hit ? square - 1 + t : (lanes)0, h_m = moved ? pull + slope : (lanes)0;

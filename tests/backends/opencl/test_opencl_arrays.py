@@ -39,7 +39,7 @@ def call_of(method: str, backend: Any) -> Any:
     return lambda poses, **options: model.log_likelihood(poses, scan(1), **options)
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.25)
 @pytest.mark.parametrize("real", [np.float32, np.float64])
 @pytest.mark.parametrize("method", METHODS)
 def test_poses_on_the_device_stay_there(method, real, queue, there, copies):

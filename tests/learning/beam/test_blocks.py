@@ -54,6 +54,7 @@ def test_repeated_readings_know_no_more_than_one(needs) -> None:
     assert fit.range_bias_error == pytest.approx(once.range_bias_error, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_errors_over_blocks_are_those_of_repeated_experiments(needs) -> None:
     """60 scans whose 20 readings share an error: the spread of sigma_hit and z_hit over 60 experiments."""
     backend = needs("opencl")

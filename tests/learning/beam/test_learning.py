@@ -36,6 +36,7 @@ def worst_fall(fit: gs.BeamFit) -> float:
     return float(np.max(-np.diff(fit.trace), initial=0.0)) / abs(fit.log_likelihood)
 
 
+@pytest.mark.slow
 def test_fifty_scenes_from_mild_to_stiff(needs) -> None:
     backend = needs("opencl")
     off = []
@@ -59,6 +60,7 @@ def test_fifty_scenes_from_mild_to_stiff(needs) -> None:
     assert 0.75 < np.sqrt(np.mean(off**2)) < 1.25
 
 
+@pytest.mark.sampled(0.4)
 @pytest.mark.parametrize(("truth", "span"), [(TYPICAL, (0.1, 0.9)), (FAR, (0.8, 1.0))], ids=["typical", "far"])
 def test_every_backend_finds_the_same_optimum(truth: gs.BeamParameters, span, backend: str) -> None:
     z, expected = draw(truth, 3000, 1, *span)

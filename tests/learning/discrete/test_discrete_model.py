@@ -54,7 +54,7 @@ def looked_up(table: gs.DiscreteBeamModel, ranges: list[float], expected: np.nda
     return np.where(missing, 0, density.astype(expected.dtype))
 
 
-@pytest.mark.sampled(0.3)
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("name", TABLES)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_a_scan_is_the_sum_of_look_ups_on_every_backend(name, precision, backend):
@@ -158,6 +158,7 @@ def test_learning_finds_the_causes(truth):
     assert each == pytest.approx(fit.log_likelihood, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_standard_errors_are_the_scatter_of_repetitions():
     """Of 16 repetitions the deviation is known to 18 %: within a factor of 2 is 3.9 of those."""
     truth, found, told = gs.DiscreteCauses(0.3, 0.05, 0.85, 0.3), [], []
@@ -169,6 +170,7 @@ def test_standard_errors_are_the_scatter_of_repetitions():
     assert (ratio > 0.5).all() and (ratio < 2).all(), ratio
 
 
+@pytest.mark.slow
 def test_many_steps_are_learned_from_few():
     z, expected = simulated(gs.DiscreteCauses(0.3, 0.05, 0.9, 0.05), 20_000, 300)
     fine = gs.DiscreteBeamModel.learn(z, expected, RANGE, 300)

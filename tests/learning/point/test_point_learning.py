@@ -137,6 +137,7 @@ def test_errors_are_those_of_repeated_experiments_and_blocks_see_repeats() -> No
         assert repeated.independent_errors[name] == pytest.approx(once.independent_errors[name] / 3, rel=1e-3)
 
 
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("kind", ["wrapped_normal", "von_mises"])
 @pytest.mark.parametrize("sigma", [1e-4, 0.2, 1.2])
 def test_headings(kind: Any, sigma: float, monkeypatch: pytest.MonkeyPatch) -> None:

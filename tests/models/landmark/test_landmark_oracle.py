@@ -56,7 +56,7 @@ def scored(name: str, backend: str, precision: str, how: str) -> tuple[np.ndarra
     return model.log_likelihood(poses, features), model.associate(poses, features)[1]
 
 
-@pytest.mark.sampled(0.15)
+@pytest.mark.sampled(0.4)
 @on_every_backend(
     on_warp=lambda name, precision, how: name == "everything" and (precision, how) != ("float64", "sum"),
     name=scenes.SCENES,
@@ -77,6 +77,7 @@ def test_features_against_mpmath(backend, name, precision, how):
     assert (np.abs(log_p[possible].astype(np.float64) - total) <= TOLERANCES["landmark"].value * eps * size).all()
 
 
+@pytest.mark.sampled(0.4)
 @on_every_backend(
     on_warp=lambda name, precision: (name, precision) == ("everything", "float32"),
     name=("ordinary", "everything", "no false positives"),

@@ -44,7 +44,7 @@ GATED = {
 SUMMED = ("range and bearing", "exact")
 
 
-@pytest.mark.sampled(0.4)
+@pytest.mark.sampled(0.5)
 @on_every_backend(
     on_warp=lambda case: case[0] == "range and bearing",
     case=[(name, "nearest") for name in GATED] + [(name, "sum") for name in SUMMED],

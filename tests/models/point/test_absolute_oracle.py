@@ -84,6 +84,7 @@ HEADINGS = {
 }
 
 
+@pytest.mark.sampled(0.4)
 @each_precision
 def test_headings(backend: str, precision: str) -> None:
     for name, p in HEADINGS.items():

@@ -151,6 +151,7 @@ def test_landmarks_in_view_are_detected_and_others_are_not():
     assert stats.kstest(found[:, 1] / 0.02, "norm").pvalue > FALSE_ALARM
 
 
+@pytest.mark.sampled(0.4)
 @pytest.mark.parametrize("field", [1.5, 4.0, 2 * np.pi])
 @pytest.mark.parametrize("sigma", [1e-6, 0.4, 3.0, 1e9])
 def test_bearings_have_the_density_of_the_model(field, sigma):

@@ -14,7 +14,7 @@ from gpusense.evaluation.tolerances import differing
 from gpusense.models.scan import binding, packed_call
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.25)
 @pytest.mark.parametrize("case", CASES)
 def test_short_calls_of_the_host_are_one_graph(case, batching, monkeypatch):
     """Copies there and back and all launches; the bits are those of the ordinary call."""

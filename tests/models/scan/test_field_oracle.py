@@ -102,7 +102,7 @@ def test_field_in_every_frame(place, precision, interpolation, backend):
     compare(field, model, poses, ranges, BEARINGS, scanner.range_min)
 
 
-@pytest.mark.sampled(0.2)
+@pytest.mark.sampled(0.15)
 @pytest.mark.parametrize("interpolation", ["nearest", "bilinear"])
 # The other parameters are host code.
 @on_every_backend(

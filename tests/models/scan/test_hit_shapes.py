@@ -108,6 +108,7 @@ def test_tables_have_the_digits_of_their_precision(dof):
     )
 
 
+@pytest.mark.sampled(0.4)
 @pytest.mark.parametrize("real", ["float32", "float64"])
 def test_models_have_the_density_on_every_backend(real, backend):
     cases = list(itertools.product(MIXTURES, (1.0, 3.3, 1e6), (True, False)))

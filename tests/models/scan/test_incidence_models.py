@@ -48,6 +48,7 @@ def brute_force(model: gs.BeamModel, poses: np.ndarray, z: np.ndarray) -> np.nda
     return found
 
 
+@pytest.mark.sampled(0.4)
 @pytest.mark.parametrize("no_surface", [None, P(0.05, 0.05, 0.8, 0.1, 0.3, 0.2)])
 def test_every_beam_has_the_parameters_of_its_angle(no_surface, backend):
     _, poses, _ = place()
@@ -66,6 +67,7 @@ def test_every_beam_has_the_parameters_of_its_angle(no_surface, backend):
         assert (" and for none" in model.explain()) == (no_surface is not None)
 
 
+@pytest.mark.sampled(0.4)
 @on_every_backend(
     on_warp=lambda weights: weights != (1, 0, 0, 0), weights=[(0.7, 0.1, 0.1, 0.1), (1, 0, 0, 0), (0.5, 0.5, 0, 0)]
 )

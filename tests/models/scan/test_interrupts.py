@@ -110,6 +110,7 @@ class Interrupted:
         return model
 
 
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("every", [4, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("call", CALLS)
 def test_a_call_that_was_interrupted_can_be_repeated(call, every):

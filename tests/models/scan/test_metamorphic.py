@@ -187,7 +187,7 @@ def test_mirror(kind, on, seed, name):
     turned_and_mirrored_scores(after, before, PARAMETERS[kind][name], on)
 
 
-@pytest.mark.sampled(0.2)
+@pytest.mark.sampled(0.15)
 @LAWS
 @given(SEEDS, NAMES, st.integers(-10, 10), st.floats(-7, 7), st.integers(0, 40))
 def test_shift(kind, on, seed, name, far, yaw, cells):
@@ -246,6 +246,7 @@ def cut_in_four(coarse: Scene) -> Scene:
     return replace(coarse, cells=coarse.cells.repeat(2, 0).repeat(2, 1), resolution=CELL / 2)
 
 
+@pytest.mark.sampled(0.5)
 @LAWS
 @given(SEEDS, NAMES)
 def test_cells_cut_in_four_change_no_range(on, seed, name):
@@ -312,6 +313,7 @@ def test_splitting_a_scan(kind, on, seed, name, count):
     assert_near(total, log_p, 2 * sum_error(parts))
 
 
+@pytest.mark.sampled(0.2)
 @LAWS
 @given(SEEDS, NAMES, st.floats(2**-10, 1, width=32))
 def test_temperature(kind, on, seed, name, temperature):

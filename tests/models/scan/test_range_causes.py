@@ -163,7 +163,8 @@ def test_a_made_up_random_density_is_followed(monkeypatch):
         found = {name: parts + math.log(total) for name, parts in models(p).items() if name not in skipped}
         f = gs.LikelihoodFieldParameters(*chosen[[0, 2, 3]] / (total - 0.2), sigma_hit=0.2)
         field = gs.LikelihoodFieldModel(ROOM, SCANNER, f, **HOST).log_likelihood(POSES, WITH_MAX, per_beam=True)[1]
-        found |= {"field": field, "density of a field": FieldDensity(f, RANGE).log(Z / 8)}
+        density = FieldDensity(f, RANGE)
+        found |= {"field": field, "density of a field": density.log(Z / 8), "linear field": np.log(density.rand)}
         found = {name: parts + (math.log(total - 0.2) if "field" in name else 0.0) for name, parts in found.items()}
         return found | table(p) | mixture(chosen)
 
@@ -227,6 +228,7 @@ def test_a_made_up_probability_of_no_return_is_followed(monkeypatch):
         found |= {"joint fit": at["density"], "objective": at["objective"], "kernel's term": at["terms"][7]}
         found["peer"] = np.log(peer_mixture(BASE, RANGE, np.dtype(np.float64), amcl=False)[1][7])
         nothing = gs.BeamModel(ROOM, SCANNER, BASE, **HOST).log_likelihood(POSES, np.full(20, RANGE), per_beam=True)
+        found["field's term"] = FieldDensity(FIELD, RANGE).terms(np.dtype(np.float64))[3]
         found["tabulated"] = tabulated(BASE, 0.5, RANGE, np.dtype(np.float64))[-1]
         found |= {"only max readings": nothing[0], "each of them": nothing[1]}
         impossible, every = gs.BeamParameters(0.0, 0.0, 1.0, 0.0), dict(specialize=False) | HOST
@@ -244,7 +246,9 @@ def test_a_made_up_probability_of_no_return_is_followed(monkeypatch):
         self.weight = 0.5 * weight
 
     monkeypatch.setattr(NoReturn, "__init__", halve)
-    once = dict.fromkeys(("tabulated", "placed", "kernel's term", "peer", "each of them", "nothing but no return"), 1)
+    once = dict.fromkeys(
+        ("field's term", "tabulated", "placed", "kernel's term", "peer", "each of them", "nothing but no return"), 1
+    )
     counts = dict.fromkeys(("host", "sum", "objective"), far.sum()) | once | {"only max readings": 20}
     for name, values in users().items():
         count = counts.get(name, far)

@@ -77,6 +77,7 @@ def test_readings_have_the_density_of_the_mixture(changes):
         assert found.pvalue > FALSE_ALARM, beam
 
 
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("kind", KINDS)
 def test_shares_of_bins_are_those_of_the_log_likelihood(kind):
     # The density that the model itself integrates to 1 with its max atom: chi-square over bins of readings.
@@ -99,7 +100,7 @@ def test_shares_of_bins_are_those_of_the_log_likelihood(kind):
     assert stats.chisquare(counts[some], share[some] * count).pvalue > FALSE_ALARM and counts[~some].sum() == 0
 
 
-@pytest.mark.sampled(0.4)
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_readings_have_the_same_bits_on_every_backend(kind, precision, needs):

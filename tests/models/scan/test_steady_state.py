@@ -130,7 +130,7 @@ def call_of(what: str, device, precision: str):
     return model.log_likelihood, *copied
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.3)
 @on_every_backend(
     what=WHATS, precision=("float32", "float64"), path=("processor", "gpu", "gpu in order"),
     on_warp=lambda what, precision, path: precision == "float32" or path == "gpu in order",

@@ -87,7 +87,7 @@ def same_as_one_by_one(make: Callable[[object], object], as_gpu: Pretend, poses:
     np.testing.assert_allclose(found, plain, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.sampled(0.15)
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("kind", ["all over", "inside"])
 def test_models(kind, ordered, as_gpu, backend):
     grid, scanner, z = world()
@@ -119,7 +119,7 @@ def test_a_table_of_densities(ordered, as_gpu):
     )
 
 
-@pytest.mark.sampled(0.15)
+@pytest.mark.sampled(0.5)
 @on_every_backend(
     method=tuple(CASTERS), kind=("all over", "inside"),
     on_warp=lambda method, kind: (kind, method) in (("all over", "exact"), ("inside", "lookup")),
@@ -172,7 +172,7 @@ def test_in_pieces(chunk, ordered, as_gpu, monkeypatch):
             assert differing(found, right) == 0
 
 
-@pytest.mark.sampled(0.15)
+@pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_work_items_that_add_up_strands_change_nothing(precision, ordered, as_gpu, monkeypatch):
     """Many particles, and few enough rays: alone, in scans of other lengths together, and with impossible readings."""

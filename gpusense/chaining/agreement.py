@@ -84,13 +84,15 @@ def _groups(table: Any, kept: Flags, matches: Links) -> tuple[Integers, Integers
     rows = np.flatnonzero(kept)
     if not len(rows):
         return _NONE, _NONE, np.zeros(0), _NONE
-    count, group = connected_components(table[rows][:, rows], directed=False)
+    count, found = connected_components(table[rows][:, rows], directed=False)
+    group: Integers = np.asarray(found, np.int64)
     evidence = np.bincount(group, -np.log10(1 - np.minimum(matches.p_right[rows], _MOST_RIGHT)), count)
     scans = [
         np.bincount(np.unique(np.stack([group, ends[rows]]), axis=1)[0], minlength=count)
         for ends in (matches.first, matches.second)
     ]
-    return group, np.bincount(group, minlength=count), evidence, np.minimum(*scans)
+    size, fewer = np.bincount(group, minlength=count).astype(np.int64), np.minimum(*scans).astype(np.int64)
+    return group, size, evidence.astype(np.float64), fewer
 
 
 def _consistent(matches: Links, poses: Floats) -> Any:

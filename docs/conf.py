@@ -68,8 +68,6 @@ sphinx_gallery_conf = {
 html_theme = "furo"
 html_title = f"gpusense {version}"
 html_extra_path = ["front"]
-html_static_path = ["static"]
-html_css_files = ["site.css"]
 html_copy_source = False
 
 
@@ -79,10 +77,19 @@ def mark_reports(app: Any, name: str, source: list[str]) -> None:
         source[0] = f"---\norphan: true\n---\n{source[0]}"
 
 
-def keep_colons(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Begin the text of an attribute with an empty line: else napoleon takes words before a colon for its type."""
-    if what in ("attribute", "property"):
-        lines.insert(0, "")
+# A character for private use, in place of the colons of an attribute's text while napoleon reads it.
+COLON = "\ue000"
+
+
+def hide_colons(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Replace colons in the first line of an attribute's text: napoleon takes words before one for a type."""
+    if what in ("attribute", "property") and lines:
+        lines[0] = lines[0].replace(": ", f"{COLON} ")
+
+
+def show_colons(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Put hidden colons back."""
+    lines[:] = [line.replace(COLON, ":") for line in lines]
 
 
 def open_figures(app: Any, doctree: nodes.document) -> None:
@@ -101,8 +108,9 @@ def setup(app: Any) -> None:
     write_figures(figures)
     (figures / "error-vs-time.html").write_text(interactive(), encoding="utf-8")
     app.connect("source-read", mark_reports)
-    # Before napoleon reads docstrings.
-    app.connect("autodoc-process-docstring", keep_colons, priority=100)
+    # Before and after napoleon reads docstrings.
+    app.connect("autodoc-process-docstring", hide_colons, priority=100)
+    app.connect("autodoc-process-docstring", show_colons, priority=900)
     # Before Sphinx collects the files to be downloaded.
     app.connect("doctree-read", open_figures, priority=100)
     # Devices' memory of the tour's programs is freed before the interpreter ends.

@@ -124,7 +124,7 @@ def read_mapping(file: Path) -> dict[Any, Any]:
 
 
 def _problem(error: Exception) -> str:
-    """Return what is wrong with a document, in words of the library that read it."""
+    """Return the error of a document in the words of the parsing library."""
     for name in ("problem", "reason"):
         if text := getattr(error, name, None):
             return " ".join(str(text).split())

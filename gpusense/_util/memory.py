@@ -20,7 +20,7 @@ def available() -> int | None:
 
 
 def check_room(name: str, needed: int, what: str) -> None:
-    """Refuse work whose memory is not there, before it begins.
+    """Refuse work that needs more memory than is free, before it begins.
 
     Args:
         name: Name of the file or argument.

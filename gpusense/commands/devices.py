@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the devices; absent ones come with the reason and the remedy."""
+    """Print the devices; for absent devices, also the reason and the remedy."""
     from gpusense.backends import devices
 
     listed = devices(anew=args.prove)

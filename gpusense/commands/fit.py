@@ -220,7 +220,7 @@ def _document(args: argparse.Namespace, result: FitResult, files: list[Path]) ->
 
 
 def _doubt(parameters: BeamParameters, what: str) -> None:
-    """Say on standard error where readings are not near their expected ranges, and what may be wrong."""
+    """Warn on standard error if readings are far from their expected ranges, with likely causes."""
     z_hit, sigma_hit = parameters.z_hit, parameters.sigma_hit
     if z_hit < _LEAST_HIT or sigma_hit > _MOST_DEVIATION:
         found = f"z_hit {z_hit:.2f}, sigma_hit {sigma_hit:.2f} m"

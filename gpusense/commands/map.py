@@ -132,7 +132,7 @@ def _report(
     args: argparse.Namespace, builder: MapBuilder, grid: OccupancyGrid, image: Path, scans: tuple[int, int],
     chained: ChainedScans | None,
 ) -> None:  # fmt: skip
-    """Print what was made."""
+    """Print a summary of the map."""
     rows, cols = grid.shape
     free, occupied = int(grid.free.sum()), int(grid.occupied.sum())
     if args.json:

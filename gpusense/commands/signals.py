@@ -1,4 +1,4 @@
-"""Signals that end a command: it keeps what it has computed, says so in one line, and leaves no unfinished file.
+"""Signals that end a command, which keeps its results so far, reports this in a line, and leaves no unfinished file.
 
 Ctrl-C, a hang-up of the terminal, and the signal by which containers and ``timeout`` end a program all raise
 exceptions. Only the command line installs handlers, in the main thread, and puts the old ones back.

@@ -23,8 +23,8 @@ class Truth:
     """Features of one scan, in the robot's frame.
 
     Attributes:
-        required: Rows of what is seen well by kind: a pose (3) and a size.
-        allowed: Rows of all that exists; lines are ends x, y, x, y in place of pose and size.
+        required: Clearly visible features by kind: rows of a pose (3) and a size.
+        allowed: All features by kind; lines have ends x, y, x, y in place of pose and size.
         runs: (first beam, number of beams, wall) of each run of beams on a wall.
     """
 

@@ -84,9 +84,9 @@ def compare_held_out(
 ) -> list[HeldOut]:
     """Score held-out readings with fitted parameters and with the defaults of nav2_amcl and Beluga.
 
-    All likelihoods are those of the book's normalised mixture, not the weights that these programs compute. Where the
-    fitted parameters make a held-out reading impossible, a row of softened parameters follows, and gains refer to it.
-    The fit by angles of incidence is another row, softened in the same way; its gain is negative where it is better.
+    All likelihoods use the book's normalised mixture, not the weights that these programs compute. Where the fitted
+    parameters make a held-out reading impossible, a row of softened parameters follows, and gains refer to it. The fit
+    by angles of incidence is another row, softened in the same way; its gain is negative where it is better.
 
     Args:
         fitted: Parameters fitted without ``data``.
@@ -150,7 +150,7 @@ def _incidence_rows(fit: IncidenceFit, data: RangeData, baseline: Floats, place:
 def incidence_log_densities(fit: IncidenceFit, data: RangeData) -> Floats:
     """Return (n,) log p of readings that are not missing, each with the parameters and the fitted offset of its bin.
 
-    A beam that hits no surface has the parameters for these, or those of the first bin, as in a model.
+    A beam that hits no surface has the parameters for such beams or, without them, of the first bin, as in a model.
     """
     assert data.incidence is not None
     edges, bins = fit.parameters.edges, len(fit.parameters.parameters)

@@ -16,7 +16,7 @@ class DeviceCloud(Cloud, FilterCloud):
     Args:
         sensors: The sensors of the filter.
         capacity: Most particles.
-        residual: Whether draws are those of residual resampling.
+        residual: Whether to draw by residual resampling.
     """
 
     def __init__(self, sensors: Sequence[Sensor], capacity: int, *, residual: bool = False) -> None:

@@ -219,7 +219,7 @@ class ParticleFilter(Whole):
 
     @whole
     def correct(self, readings: Any) -> None:
-        """Weigh the particles by readings, and draw new ones where it is due.
+        """Weigh the particles by readings, and resample where the effective sample size is low.
 
         Args:
             readings: The reading of the filter's only model, or a mapping from models to their readings. Where

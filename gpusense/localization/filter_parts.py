@@ -49,7 +49,7 @@ class FilterParts:
         self.last: dict[int, tuple[Any, ...]] = {}
 
     def keep(self) -> None:
-        """Note what the call that begins must leave as it is."""
+        """Record the buffers that the beginning call must not overwrite."""
         self.tracker.keep()
         self.recovery.keep()
 

@@ -122,7 +122,7 @@ class Journal:
 
 
 class Whole:
-    """Base of objects whose calls change all of their state or none.
+    """Base of objects whose calls change their whole state or nothing.
 
     Calls of several threads wait for one another.
     """
@@ -134,7 +134,7 @@ class Whole:
         self._calls = threading.RLock()
 
     def _keep(self) -> None:
-        """Note what the call that begins must leave as it is."""
+        """Record the buffers that the beginning call must not overwrite."""
 
     def _changing(self) -> tuple[Any, ...]:
         """Return the objects whose state a call may change: this one and its parts."""

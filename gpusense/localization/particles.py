@@ -123,7 +123,7 @@ class Particles:
         capacity: Most particles.
         sensors: Most sensors of a correction.
         precision: Of their log-likelihoods.
-        residual: Whether draws are those of residual resampling.
+        residual: Whether to draw by residual resampling.
 
     Attributes:
         count: Particles of the next step.

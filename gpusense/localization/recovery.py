@@ -51,7 +51,7 @@ class Recovery:
         return (self,) if self.rival is None else (self, *self.rival.changing())
 
     def keep(self) -> None:
-        """Note what the call that begins must leave as it is."""
+        """Record the buffers that the beginning call must not overwrite."""
         if self.rival is not None:
             self.rival.keep()
 

@@ -80,7 +80,7 @@ class Rival:
         self._search = RivalSearch(tracker.sensors)
 
     def keep(self) -> None:
-        """Note what the call that begins must leave as it is."""
+        """Record the buffers that the beginning call must not overwrite."""
         self._tracker.keep()
 
     def changing(self) -> tuple[Any, ...]:

@@ -61,7 +61,7 @@ class Tracker:
         self.pool: tuple[int, starts.Spread] = 0, (0.0, 0.0, 0.0)
 
     def keep(self) -> None:
-        """Note the particles that the call that begins must leave as they are."""
+        """Record the buffers that the beginning call must not overwrite."""
         self.cloud.kept = self.cloud.places
 
     # ---- particles

@@ -12,7 +12,7 @@ from gpusense.backends.base import Backend
 
 
 class Pickled(ABC):
-    """Base of objects that copies and pickles make anew by their constructor.
+    """Base of objects whose copies and pickles call the constructor again.
 
     A pickle keeps the constructor's selection string, so "auto" may choose another device on another machine. A queue
     is replaced by the selection string of its device. A copy is on the same device.

@@ -287,5 +287,5 @@ def name_of(shape: HitShape) -> HitName:
 
 
 def shape_of(parameters: Any) -> HitShape:
-    """Return the shape of the hits of parameters of a scan model."""
+    """Return the hit shape of a scan model's parameters."""
     return SHAPES[parameters.hit].of(parameters)

@@ -1,7 +1,7 @@
 """Notice values that are legal but cannot be meant: degrees for radians, millimetres for metres, places off the map.
 
-Such values compute as semantics demand. A warning names the likely cause, once: geometry is looked at where it is made,
-readings in the first scans of a scanner.
+Such values compute as semantics demand. A warning names the likely cause, once. Geometry is checked when it is made,
+readings in a scanner's first scans.
 """
 
 from __future__ import annotations

@@ -13,9 +13,11 @@ from packaging.requirements import Requirement
 from support.paths import ROOT
 
 import gpusense as gs
+from gpusense.commands.cli import COMMANDS
 from gpusense.localization import nav2, nav2_start
 
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+PROJECT = SETTINGS["project"]
 MIGRATION = (ROOT / "docs" / "migration.md").read_text(encoding="utf-8")
 
 
@@ -33,6 +35,19 @@ def code_spans(text):
 def test_citation_has_the_version():
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert citation["version"] == gs.__version__ and citation["license"] == PROJECT["license"]
+
+
+def test_getting_started_lists_every_command():
+    page = (ROOT / "docs" / "getting-started.md").read_text(encoding="utf-8")
+    listed = re.findall(r"^\| `gpusense ([\w-]+)", page, re.MULTILINE)
+    assert sorted(listed) == sorted(COMMANDS)
+
+
+def test_the_picture_of_the_rooms_has_their_order():
+    picture = (ROOT / "docs" / "img" / "architecture.svg").read_text(encoding="utf-8")
+    shown = re.findall(r'class="b"/><text [^>]*class="t">(\w+)<', picture)
+    layers = SETTINGS["tool"]["importlinter"]["contracts"][0]["layers"]
+    assert [f"gpusense.{room}" for room in ("__main__", *shown)] == layers
 
 
 def test_the_page_of_dependencies_has_each():

@@ -1,6 +1,6 @@
 """List the candidates: methods with their variants and knobs, and how to make each for a scene.
 
-Every caster has a candidate with its default knobs; ``_VARIED`` has those whose knobs are varied.
+Every caster has a candidate with its default knobs; ``_VARIED`` lists the methods with varied knobs.
 """
 
 from __future__ import annotations

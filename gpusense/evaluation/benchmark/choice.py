@@ -184,7 +184,7 @@ def choose(listed: Sequence[Entry], error: float | None, seconds: float | None) 
     """Choose the entry for a largest error and a longest time.
 
     With a largest error, the fastest method within both limits is chosen; of equally fast methods, the most exact. With
-    a longest time alone the most exact within it is chosen; of equally exact ones the fastest.
+    a longest time alone, the most exact method within it is chosen; of equally exact methods, the fastest.
 
     Args:
         listed: Entries of one device and one measure.

@@ -54,7 +54,7 @@ class SplitCloud(FilterCloud):
     Args:
         team: The shards.
         capacity: Most particles of the filter.
-        residual: Whether draws are those of residual resampling.
+        residual: Whether to draw by residual resampling.
 
     Attributes:
         exchanged: Bytes of particles that were handed to shards.
@@ -195,7 +195,7 @@ class SplitCloud(FilterCloud):
         parts = zip(self._parts(self.count), self._team.devices, strict=True)
         return f"split: {', '.join(f'{part.size} on {name}' for part, name in parts)}"
 
-    # ---- what crosses to the host
+    # ---- copies to the host
 
     def estimate(self, count: int) -> np.ndarray:
         """See FilterCloud.estimate."""

@@ -46,7 +46,7 @@ class Shard:
     Args:
         models: The filter's models on this device.
         capacity: Most particles of the shard.
-        residual: Whether draws are those of residual resampling.
+        residual: Whether to draw by residual resampling.
     """
 
     def __init__(self, models: Sequence[Any], capacity: int, residual: bool) -> None:

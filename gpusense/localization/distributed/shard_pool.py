@@ -57,7 +57,7 @@ class ShardPool:
     def copies(self, state: Buffer, drawn: int, stage: int) -> tuple[Program, Buffer]:
         """Return the launches that count the certain copies of residual resampling, and the buffer of their results.
 
-        Each device counts those of all particles.
+        Each device counts the copies of all particles.
 
         Args:
             state: State of the filter.

@@ -20,7 +20,7 @@ def hold(name: str, make: Callable[[str], Any], device: str, capacity: int, resi
         make: Returns the models of a device.
         device: Selection string, for a worker without a chosen device.
         capacity: Most particles.
-        residual: Whether draws are those of residual resampling.
+        residual: Whether to draw by residual resampling.
     """
     models = models_of(make, device_of(device))
     _SHARDS[name] = Shard(models, capacity, residual)

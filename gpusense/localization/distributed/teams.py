@@ -18,7 +18,7 @@ class LocalTeam:
     Args:
         models: Models of each shard.
         capacity: Most particles of a shard.
-        residual: Whether draws are those of residual resampling.
+        residual: Whether to draw by residual resampling.
 
     Attributes:
         devices: Selection strings of the devices.
@@ -54,7 +54,7 @@ class RemoteTeam:
         make: Function of a module that returns the models of a device.
         devices: Selection strings, for workers without a chosen device.
         capacity: Most particles of a shard.
-        residual: Whether draws are those of residual resampling.
+        residual: Whether to draw by residual resampling.
 
     Attributes:
         devices: Selection strings of the devices.

@@ -157,7 +157,7 @@ class FeatureModel(PointModel):
         return check_correspondence(correspondence, np.size(correspondence), self._count)
 
     def _read(self, features: object) -> tuple[np.ndarray, np.ndarray]:
-        """Return features as ``_possible`` does; the first ones are looked at for angles in degrees."""
+        """Return features as ``_possible`` does; the first calls also check for angles in degrees."""
         full, impossible = self._possible(features)
         if not self._seen:
             self._seen = look_at_feature_angles(features, *self._angles)

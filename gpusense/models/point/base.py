@@ -100,7 +100,7 @@ class PointModel(Pickled):
         return cast(Precision, self._real.name)
 
     def explain(self) -> str:
-        """Report what this scene leaves out, why, and the saving; readings and poses as of the last call."""
+        """Report the parts that the last call's readings and poses leave out, with reasons and savings."""
         name, omissions = self._describe()
         title = f"{name}, {self.precision}, {self.device.selection} ({self.device.name})"
         code = self._last_code or frozenset()

@@ -93,7 +93,7 @@ def scene_notes(
 
 
 def _kept_of_mixture(pipeline: BeamPipeline, mixtures: Sequence[BeamParameters]) -> tuple[list[Note], list[Note]]:
-    """Return the parts of the density that its parameters need, and those that other parameters would leave out."""
+    """Return the parts of the density that its parameters need, and the parts that other parameters would leave out."""
     flags, kept, could_go = pipeline.mixture.flags, [], []
     peak = max(hit_peak(p) for p in mixtures)
     if "LINEAR" not in flags:

@@ -148,7 +148,7 @@ class _StagedCall(BoundCall):
 
 
 def _shape_of(name: str, value: Any, shape: tuple[int | str, ...]) -> tuple[int, ...]:
-    """Return the shape of an array in host memory; each call reads its numbers anew."""
+    """Return the shape of an array in host memory; each call reads its present numbers."""
     actual = np.shape(cast(Any, arrays.to_host(masks.filled(value), name)))
     if len(actual) != len(shape) or any(isinstance(n, int) and n != m for n, m in zip(shape, actual, strict=True)):
         raise ValueError(f"{name}: shape must be {checks.shape_text(shape)}, got {checks.shape_text(actual)}")

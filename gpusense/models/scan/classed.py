@@ -185,7 +185,7 @@ def _grouped(scan: ClassedScans) -> ClassedScans:
     _, index, inverse, counts = np.unique(vectors, axis=0, return_index=True, return_inverse=True, return_counts=True)
     if len(index) == len(vectors):
         return scan
-    # Rays stand in the order of their first readings.
+    # Rays are in the order of their first readings.
     place = np.argsort(index)
     order = np.argsort(np.argsort(place)[inverse.ravel()], kind="stable")
     return ClassedScans(

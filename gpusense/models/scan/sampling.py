@@ -129,7 +129,7 @@ def drawing_of(
 
 
 def mixture_numbers(mixtures: tuple[BeamParameters, ...]) -> np.ndarray:
-    """Return the numbers of mixtures as kernels take them, and behind them the tables of their shapes of hits."""
+    """Return the mixtures' numbers as kernels take them, followed by the tables of their hit shapes."""
     names = (
         "z_hit", "z_short", "z_max", "z_rand", "sigma_hit", "sigma_growth", "range_bias",
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Measure what the parts that a scene leaves out would cost, and read the text of the kernels that score it."""
+"""Measure the cost of the parts that a scene leaves out, and read the text of the kernels that score it."""
 
 from __future__ import annotations
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import ctypes
+import importlib
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 pytest.importorskip("pyopencl")
+from support.bench_scripts import BENCH
+
 from gpusense.backends import get_backend, processor
 from gpusense.backends.opencl import pocl
 
@@ -201,3 +205,17 @@ def test_the_fingerprint_distinguishes_processors(monkeypatch, tmp_path):
     monkeypatch.undo()
     for cached in (processor.instruction_sets, processor.fingerprint, processor._fields):
         cached.cache_clear()
+
+
+def test_a_copy_of_the_wheel_hides_avx_512(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.syspath_prepend(str(BENCH))
+    script = importlib.import_module("speed.as_avx2")
+    try:
+        named = script.copy_driver(tmp_path)
+    except (FileNotFoundError, ValueError) as error:
+        pytest.skip(str(error))
+    code = Path(named.read_text().strip()).read_bytes()
+    assert script.SET + script.READ not in code
+    # Elsewhere the bytes are left alone.
+    assert code.count(script.SET + script.CLAIM) == 2
+    assert script.READ in code

@@ -25,9 +25,10 @@ import numpy as np
 import gpusense as gs
 from gpusense.backends.base import Backend, Launcher
 from gpusense.backends.proxy import Proxy
+from gpusense.backends.recording import Recording
 from gpusense.evaluation.scoring import chosen_scans, with_poses
 from gpusense.evaluation.worlds import building, cloud_around, cloud_uniform, free_pose, simulate_scan
-from gpusense.interface.launches import Launch
+from gpusense.interface.launches import Launch, Program
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / "docs" / "img"
@@ -178,6 +179,17 @@ class Recorder(Proxy):
     def in_batch(self) -> bool:
         """See Backend.in_batch; while launches are recorded each copy and launch is started by itself."""
         return not self._listening and super().in_batch
+
+    def record(self, program: Program) -> Recording:
+        """See Backend.record; recordings are the backend's own unless launches are recorded."""
+        return super().record(program) if self._listening else self._backend.record(program)
+
+    def replay(self, recording: Recording) -> None:
+        """See Backend.replay."""
+        if self._listening:
+            super().replay(recording)
+        else:
+            self._backend.replay(recording)
 
     def launches_of(self, run: Callable[[], Any]) -> list[Callable[[], None]]:
         """Run a call and return its launches."""

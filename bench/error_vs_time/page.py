@@ -206,7 +206,7 @@ def peers(rows: Sequence[Row]) -> list[str]:
                 rate = row.work / row.seconds / 1e6
                 error = value(row.errors[measure], row.units[measure]) + " nats" * (need != "rays")
                 lines.append((need, row.text, row.outside or "gpusense", f"{rate:.3g}", error, device))
-    return table(("for", "method", "version, threads", "M/s of one core", "error", "processor"), lines, 3)
+    return table(("for", "method", "version, threads", "M/s of one core, whole calls", "error", "processor"), lines, 3)
 
 
 def rival_matchers(rows: Sequence[Row]) -> list[str]:
@@ -233,7 +233,7 @@ def by_map(rows: Sequence[Row], devices: Sequence[str]) -> list[str]:
             rate, wrong = row.work / row.seconds / 1e6, value(row.errors[WRONG], "share")
             thin = known.get(("beam model", "exact, fewer beams, every = 4", device, scene))
             lines.append((device, scene, f"{rate:.4g}", wrong, value(thin.errors[KL], "nats") if thin else "-"))
-    return table(("device", "map", "M rays/s, exact", "wrong", "nats, every 4th beam"), lines, 2)
+    return table(("device", "map", "M rays/s, exact, whole calls", "wrong", "nats, every 4th beam"), lines, 2)
 
 
 def listing(found: Sequence[Source]) -> list[str]:

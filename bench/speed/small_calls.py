@@ -138,6 +138,7 @@ class Bench:
         with plainly(self.device):
             # Its buffers are made now, and large enough.
             plain = make(backend=self.device)
+            plain._short = None
             plain.log_likelihood(max(clouds, key=len), scans[0])
         for poses in clouds:
             kernels, what = self.kernels(make, poses, scans[0]), f"{name}{len(poses)} x {scans.shape[1]}"

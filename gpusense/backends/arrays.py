@@ -24,7 +24,7 @@ _HOST = (1, 3, 11)
 # Poses that make a row whose numbers are reduced side by side, and poses below which they are transposed instead.
 _WIDTH, _FEW = 256, 1 << 14
 # Least poses whose bounds are worth a thread, and most threads: more wait for one another.
-_SHARE, _MOST_SHARES = 1 << 16, 8
+_SHARE, _MOST_SHARES = 1 << 16, 4
 
 Bounds = tuple[tuple[float, ...], tuple[float, ...]]
 """The least and the largest x, y and theta of poses."""

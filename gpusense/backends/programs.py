@@ -130,7 +130,7 @@ class RepeatedPrograms:
         recording = self._programs.get(key)
         if recording is not None:
             self._backend.check_process()
-            self._backend.replay(recording)
+            recording()
             return
         program = make()
         self._backend.run(program)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
 
 # Bytes of a slot, slots, and slots that the threads fill or empty while the device works on the others.
-SLOT, SLOTS, _AHEAD = 4 << 20, 16, 8
+SLOT, SLOTS, _AHEAD = 4 << 20, 16, 12
 # Least bytes of a copy for which pieces pay, and of a piece.
 LEAST, _LEAST_PIECE = 8 << 20, 1 << 20
 # Threads below which a driver's own copy is faster.

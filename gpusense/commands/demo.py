@@ -184,7 +184,8 @@ def _report(scene: Scene, scores: list[Score], failures: list[str], written: Pat
     print(f"""
 first   first call: constructor, compilation (or its cache on disk), map preparation, scoring
 steady  best of up to {REPETITIONS} further calls, transfers included; none for NumPy above {PATIENCE:g} s a call
-rate    millions of particle-beams per second of a steady call; beams without return are not evaluated nor counted
+rate    millions of particle-beams per second of a steady whole call, NumPy in and out; beams without return are not
+        evaluated nor counted
 error   largest error of log p [nats] against the NumPy reference in float64, at every {every}
 rank    of the true pose: 1 if no particle scores better""")
     for name in dict.fromkeys(score.name for score in scores):

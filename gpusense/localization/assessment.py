@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gpusense.localization.estimates import Estimate, clustered, covariance_of
+from gpusense.localization.estimates import Estimate, clustered
 from gpusense.localization.recovery import Recovery
 from gpusense.localization.rival import evidence_of
 from gpusense.localization.spread import is_apart, is_narrow, is_wide, share_off, share_off_of
@@ -32,8 +32,8 @@ def estimate_of(
         method: "mean", "cluster" or "best".
     """
     cloud, shown = tracker.cloud, tracker.shown
-    numbers, summary = cloud.estimate_and_summary(shown)
-    pose, covariance = numbers[:3].copy(), covariance_of(numbers)
+    pose, covariance = tracker.mean_and_covariance()
+    summary = cloud.summary()
     if method == "best":
         pose = tracker.host_particles()[int(np.argmax(cloud.host_weights(shown)))]
     elif method == "cluster":

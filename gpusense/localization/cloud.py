@@ -7,7 +7,7 @@ program.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import numpy as np
@@ -209,37 +209,18 @@ class Cloud(Particles):
 
     def estimate(self, count: int) -> np.ndarray:
         """Return the kernels' estimate of the shown particles: mean, covariance, sum of weights."""
-        numbers = np.empty(ESTIMATE)
-        self._estimate(count, (self.estimated, numbers))
-        return numbers
+        numbers = self._estimate(count, 0)
+        return self._estimate(count, 1) if numbers[WIDE_HEADINGS] else numbers
 
-    def estimate_and_summary(self, count: int) -> tuple[np.ndarray, Summary]:
-        """See FilterCloud.estimate_and_summary; there is one wait for both."""
-        numbers, state = np.empty(ESTIMATE), np.empty(STATE)
-        self._estimate(count, (self.estimated, numbers), (self.states[self.places.state], state))
-        return numbers, summary_of(state)
-
-    def _estimate(self, count: int, *copies: tuple[Buffer, np.ndarray]) -> None:
-        """Copy buffers to arrays after the launches of the estimate, which is the first of them."""
-        self._estimate_pass(count, 0, copies)
-        if copies[0][1][WIDE_HEADINGS]:
-            self._estimate_pass(count, 1, copies)
-
-    def _estimate_pass(self, count: int, second_pass: int, copies: Sequence[tuple[Buffer, np.ndarray]]) -> None:
-        """Run a pass of the estimate, and copy; where the device has graphs, all of it is one."""
-        shown, weight, backend = self.places.shown, self.places.weight, self.backend
-        backend.begin_batch()
-        try:
-            # Clouds that change their size seldom ask twice for the same.
-            self._estimates.run(
-                (shown, weight, count, second_pass),
-                lambda: self.sums.estimate(self.poses[shown], self.weights[weight], self.estimated, count, second_pass),
-            )
-            for buffer, array in copies:
-                backend.download(buffer, array, wait=False)
-            backend.synchronize()
-        finally:
-            backend.end_batch()
+    def _estimate(self, count: int, second_pass: int) -> np.ndarray:
+        """Return the numbers after a pass of the estimate."""
+        shown, weight = self.places.shown, self.places.weight
+        # Clouds that change their size seldom ask twice for the same.
+        self._estimates.run(
+            (shown, weight, count, second_pass),
+            lambda: self.sums.estimate(self.poses[shown], self.weights[weight], self.estimated, count, second_pass),
+        )
+        return self._read(self.estimated, ESTIMATE)
 
     def host_poses(self, index: int, count: int) -> np.ndarray:
         """Return a copy of the poses of a buffer."""

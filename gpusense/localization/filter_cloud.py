@@ -220,10 +220,6 @@ class FilterCloud(ABC):
     def summary(self) -> Summary:
         """Return the state after the last correction."""
 
-    def estimate_and_summary(self, count: int) -> tuple[np.ndarray, Summary]:
-        """Return both at once, which may take one copy to the host."""
-        return self.estimate(count), self.summary()
-
     @abstractmethod
     def particles(self, count: int) -> Any:
         """Return the shown poses: on a GPU an array of the device's library."""

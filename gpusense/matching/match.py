@@ -167,7 +167,7 @@ def _by_noise(
     noise: np.ndarray, options: MatchOptions, matched: Callable[[np.ndarray, MatchOptions], ScanMatch]
 ) -> ScanMatch:
     """Return the matches of all rows; rows of equal noise (S,) share one call."""
-    levels = np.unique(noise)
+    levels = noise if len(noise) == 1 else np.unique(noise)
     if len(levels) < 2:
         return matched(np.arange(len(noise)), replace(options, noise=float(levels[0])) if len(levels) else options)
     rows = [np.flatnonzero(noise == level) for level in levels]

@@ -7,6 +7,8 @@ half of all places. Ranges that come in steps have at least the deviation of rou
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
 from gpusense.world.grid import OccupancyGrid
@@ -28,20 +30,14 @@ _LEAST_STEP, _ODD = 1e-3, 0.02
 
 def scan_noise(ranges: np.ndarray, scanner: Scanner) -> np.ndarray:
     """Return the standard deviations (S,) of the ranges of (S, K) readings [m], NaN where too few places tell it."""
-    bearing = scanner.bearings
-    count = len(bearing)
-    if count < 3 or not len(ranges):
+    if scanner.count < 3 or not len(ranges):
         return np.full(len(ranges), np.nan)
-    place = np.arange(1, count - 1)
-    place = place[:: -(-len(place) // _PLACES)]
-    z = [ranges[:, place + k].astype(np.float64) for k in (-1, 0, 1)]
-    use = np.ones(z[1].shape, bool)
-    for part in z:
-        use &= classes(part, scanner.range_min, scanner.range_max) == Reading.HIT
-    before, after = bearing[place] - bearing[place - 1], bearing[place + 1] - bearing[place]
-    whole = np.sin(before + after)
+    place, left, right = _neighbors(scanner)
+    readings = ranges.astype(np.float64)
+    hit = classes(readings, scanner.range_min, scanner.range_max) == Reading.HIT
+    z = [readings[:, place + k] for k in (-1, 0, 1)]
+    use = hit[:, place - 1] & hit[:, place] & hit[:, place + 1]
     with np.errstate(divide="ignore", invalid="ignore"):
-        left, right = np.sin(after) / whole, np.sin(before) / whole
         expected = 1 / (left / z[0] + right / z[2])
         # The deviation of the difference: errors of the other two ranges, times the derivatives by them.
         share = np.sqrt(1 + ((expected / z[0]) ** 2 * left) ** 2 + ((expected / z[2]) ** 2 * right) ** 2)
@@ -51,6 +47,17 @@ def scan_noise(ranges: np.ndarray, scanner: Scanner) -> np.ndarray:
     middle = np.sort(off, axis=1)[np.arange(len(off)), np.maximum(number - 1, 0) // 2]
     rounding = _range_steps(np.where(use, z[1], np.inf)) / np.sqrt(12)
     return np.where(number >= _LEAST, np.maximum(middle / _MEDIAN, rounding), np.nan)
+
+
+@functools.lru_cache(maxsize=16)
+def _neighbors(scanner: Scanner) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the places (P,) at which noise is measured, and the weights of their neighbours on a straight wall."""
+    bearing, place = scanner.bearings, np.arange(1, scanner.count - 1)
+    place = place[:: -(-len(place) // _PLACES)]
+    before, after = bearing[place] - bearing[place - 1], bearing[place + 1] - bearing[place]
+    whole = np.sin(before + after)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return place, np.sin(after) / whole, np.sin(before) / whole
 
 
 def _range_steps(ranges: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -79,22 +80,28 @@ def scan_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype, motion: np
     """
     if motion is not None and motion.any():
         return _moved_points(ranges, scanner, real, motion)
-    angle = np.mod(scanner.bearings + scanner.mount[2], _FULL_TURN)
-    order = np.argsort(angle, kind="stable")
-    angle = angle[order]
-    bearing = angle.astype(real)
+    order, bearing, cosine, sine = _beams_by_angle(scanner, real)
     z = ranges[:, order]
     hit = (classes(z, scanner.range_min, scanner.range_max) == Reading.HIT) & (z > _NEAREST)
     z = np.where(hit, z, 0).astype(np.float64, copy=False)
     everything = np.empty((*z.shape, 4), real)
-    np.multiply(z, np.cos(angle), out=everything[..., 0], casting="same_kind")
-    np.multiply(z, np.sin(angle), out=everything[..., 1], casting="same_kind")
+    np.multiply(z, cosine, out=everything[..., 0], casting="same_kind")
+    np.multiply(z, sine, out=everything[..., 1], casting="same_kind")
     everything[..., 2] = bearing
     everything[..., 3] = z
     # Points as single items, which a mask takes whole.
     items = everything.view(np.dtype((np.void, 4 * everything.itemsize)))[..., 0]
     point = items[hit].view(real).reshape(-1, 4)
     return _points(point, hit, bearing, np.einsum("sk,sk->s", z, z))
+
+
+@functools.lru_cache(maxsize=16)
+def _beams_by_angle(scanner: Scanner, real: np.dtype) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the order of beams by their angles, and the angles in a precision, cosines and sines in this order."""
+    angle = np.mod(scanner.bearings + scanner.mount[2], _FULL_TURN)
+    order = np.argsort(angle, kind="stable")
+    angle = angle[order]
+    return order, angle.astype(real), np.cos(angle), np.sin(angle)
 
 
 def _moved_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype, motion: np.ndarray) -> ScanPoints:

@@ -104,7 +104,7 @@ def test_a_device_that_is_gone_says_so(needs, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(_opencl.cl, "enqueue_nd_range_kernel", gone)
-        with pytest.raises(RuntimeError, match="no longer available, make the model anew"):
+        with pytest.raises(RuntimeError, match="no longer available, make a new model"):
             model.log_likelihood(poses, ranges)
     np.testing.assert_array_equal(model.log_likelihood(poses, ranges), before)
 

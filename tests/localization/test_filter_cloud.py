@@ -72,7 +72,7 @@ def test_the_interface_is_the_only_base_and_is_implemented_by_both():
     members = {name for name, _ in inspect.getmembers(FilterCloud) if not name.startswith("_")} - {"MEMORY", "PARTS"}
     tested = {
         "place", "set_pool", "move", "correct", "estimate", "summary", "particles", "shares", "moments", "host_poses",
-        "host_weights", "explain", "contents", "restore", "scoring_seconds", "time_scoring", "estimate_and_summary",
+        "host_weights", "explain", "contents", "restore", "scoring_seconds", "time_scoring",
     }  # fmt: skip
     assert members == tested
     for kind in (DeviceCloud, SplitCloud):
@@ -113,9 +113,6 @@ def test_a_correction_has_the_bits_of_the_other_kind(cloud, other, drawn):
     # On a GPU the moments take a second pass.
     np.testing.assert_allclose(host(cloud.moments(COUNT)), cloud.estimate(COUNT)[:9], rtol=1e-9, atol=1e-15)
     one, two = cloud.summary(), other.summary()
-    numbers, both = cloud.estimate_and_summary(COUNT)
-    assert np.array_equal(numbers, cloud.estimate(COUNT)) and both[:4] == one[:4]
-    assert np.array_equal(both.numbers, one.numbers)
     assert one[:4] == two[:4] and 1 <= one.effective_sample_size <= COUNT and not one.degenerate
     # Weights are those of the scores: the likeliest particle is the heaviest.
     log_p = field("numpy").log_likelihood(cloud.host_poses(cloud.places.shown, COUNT), scans(4)[1][0])

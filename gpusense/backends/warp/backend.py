@@ -33,6 +33,8 @@ from gpusense.interface.signatures import KERNELS, Kernel
 from gpusense.interface.sources import relevant
 
 _MOST_NUMBERS = (1 << 31) - 1
+# Bytes of a copy that is read by memory of its own, and such memory of a thread.
+_FEW_BYTES, _MOST_ROOMS = 1 << 10, 32
 
 
 class WarpBackend(ProcessBound, Backend):
@@ -101,11 +103,28 @@ class WarpBackend(ProcessBound, Backend):
                 if not wait and queue.download(buffer, out):
                     return out
                 self._flush(queue)
+            if out.nbytes <= _FEW_BYTES and self.info.kind == "gpu":
+                return self._read(buffer, out)
             if self._staging is not None and self._staging.download(buffer, out):
                 return out
             wp.copy(host_view(out), buffer, count=out.size)
             if wait:
                 self._wait()
+        return out
+
+    def _read(self, buffer: wp.array, out: np.ndarray) -> np.ndarray:
+        """Copy few numbers by page-locked memory of this thread, which takes less than half of the time of others."""
+        rooms = self._thread.__dict__.setdefault("rooms", {})
+        key = out.size, out.dtype
+        if key not in rooms:
+            if len(rooms) >= _MOST_ROOMS:
+                rooms.clear()
+            memory = wp.empty(out.size, dtype=SCALARS[out.dtype], device="cpu", pinned=self._device.is_cuda)
+            rooms[key] = memory, memory.numpy()
+        memory, numbers = rooms[key]
+        wp.copy(memory, buffer, count=out.size)
+        self._wait()
+        out.reshape(-1)[...] = numbers
         return out
 
     def empty_result(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:

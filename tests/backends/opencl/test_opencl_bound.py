@@ -101,7 +101,7 @@ def test_a_bound_call_whose_device_is_gone(as_gpu, queue, there, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(cl, "enqueue_nd_range_kernel", gone)
-        with pytest.raises(RuntimeError, match="no longer available, make the model anew"):
+        with pytest.raises(RuntimeError, match="no longer available, make a new model"):
             call()
     assert differing(call().get(), expected) == 0
 

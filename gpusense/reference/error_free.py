@@ -21,6 +21,12 @@ def two_sum(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return total, (a - (total - shift)) + (b - shift)
 
 
+def ordered_sum(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``a + b = sum + error`` exactly, where a has no smaller exponent than b: Dekker's sum."""
+    total = a + b
+    return total, b - (total - a)
+
+
 def high_half(a: np.ndarray) -> np.ndarray:
     """Return the leading bits of a float, few enough that a product of two such halves is exact."""
     splitter = a.dtype.type(134217729 if a.dtype == np.float64 else 4097)
@@ -37,15 +43,19 @@ def two_product(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pair_sum(a: Pair, b: Pair) -> Pair:
-    """Add two numbers of two parts each, to about twice the working precision."""
+    """Add two numbers of two parts each, to about twice the working precision.
+
+    Where the first parts cancel, their sum still is no smaller than the last bit of either, so it has no smaller exponent
+    than the second parts.
+    """
     total, error = two_sum(a[0], b[0])
-    return two_sum(total, error + (a[1] + b[1]))
+    return ordered_sum(total, error + (a[1] + b[1]))
 
 
 def pair_product(a: Pair, b: Pair) -> Pair:
     """Multiply two numbers of two parts each, to about twice the working precision."""
     product, error = two_product(a[0], b[0])
-    return two_sum(product, error + (a[0] * b[1] + a[1] * b[0]))
+    return ordered_sum(product, error + (a[0] * b[1] + a[1] * b[0]))
 
 
 def add_term(total: tuple[np.ndarray, np.ndarray], term: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,6 +8,12 @@ real2 two_sum(const real a, const real b) {
     return (real2)(sum, (a - (sum - shift)) + (b - shift));
 }
 
+// Return a + b = sum.x + sum.y exactly, where a has no smaller exponent than b: Dekker's sum.
+real2 ordered_sum(const real a, const real b) {
+    const real sum = a + b;
+    return (real2)(sum, b - (sum - a));
+}
+
 // Return the leading bits of a float, few enough that a product of two such halves is exact.
 real high_half(const real a) {
     const real scaled = SPLITTER * a;
@@ -25,16 +31,17 @@ real2 two_product(const real a, const real b) {
     return (real2)(product, error);
 }
 
-// Add two numbers of two parts each, to about twice the working precision.
+// Add two numbers of two parts each, to about twice the working precision. Where the first parts cancel, their sum still
+// is no smaller than the last bit of either, so it has no smaller exponent than the second parts.
 real2 pair_sum(const real2 a, const real2 b) {
     const real2 sum = two_sum(a.x, b.x);
-    return two_sum(sum.x, sum.y + (a.y + b.y));
+    return ordered_sum(sum.x, sum.y + (a.y + b.y));
 }
 
 // Multiply two numbers of two parts each, to about twice the working precision.
 real2 pair_product(const real2 a, const real2 b) {
     const real2 product = two_product(a.x, b.x);
-    return two_sum(product.x, product.y + (a.x * b.y + a.y * b.x));
+    return ordered_sum(product.x, product.y + (a.x * b.y + a.y * b.x));
 }
 
 // Adding and subtracting this number rounds to nearest.

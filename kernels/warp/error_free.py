@@ -34,6 +34,12 @@ def functions(flags):
         shift = total - a
         return vec2(total, (a - (total - shift)) + (b - shift))
 
+    # Return a + b = sum.x + sum.y exactly, where a has no smaller exponent than b: Dekker's sum.
+    @wp.func
+    def ordered_sum(a: real, b: real):
+        total = a + b
+        return vec2(total, b - (total - a))
+
     # Return the leading bits of a float, few enough that a product of two such halves is exact.
     @wp.func
     def high_half(a: real):
@@ -54,17 +60,18 @@ def functions(flags):
         error = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
         return vec2(product, error)
 
-    # Add two numbers of two parts each, to about twice the working precision.
+    # Add two numbers of two parts each, to about twice the working precision. Where the first parts cancel, their sum
+    # still is no smaller than the last bit of either, so it has no smaller exponent than the second parts.
     @wp.func
     def pair_sum(a: vec2, b: vec2):
         total = two_sum(a.x, b.x)
-        return two_sum(total.x, total.y + (a.y + b.y))
+        return ordered_sum(total.x, total.y + (a.y + b.y))
 
     # Multiply two numbers of two parts each, to about twice the working precision.
     @wp.func
     def pair_product(a: vec2, b: vec2):
         product = two_product(a.x, b.x)
-        return two_sum(product.x, product.y + (a.x * b.y + a.y * b.x))
+        return ordered_sum(product.x, product.y + (a.x * b.y + a.y * b.x))
 
     # Add a term to a compensated sum: total.x is the running sum, total.y the sum of its rounding errors.
     @wp.func

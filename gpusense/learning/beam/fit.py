@@ -127,10 +127,10 @@ def fit_beam_parameters(
     if hit != "normal" and method == "em-book":
         raise ValueError(f"hit: must be 'normal' with method 'em-book', as in the book, got {hit!r}")
     device = DeviceSums(*open_device(backend, precision), pairs)
-    start = first_guess(pairs, bounds) if initial is None else start_of(initial, pairs, bounds)
+    start = first_guess(pairs, bounds) if initial is None else start_of(initial, pairs, bounds, hit)
     fit = fit_pairs(device, pairs, bounds, start, options, chosen=initial is not None)
     if not sigma_growth:
-        return fit if hit == "normal" else fit_shape(fit, device, pairs, bounds, options, hit)
+        return fit if hit == "normal" else fit_shape(fit, device, pairs, bounds, options, hit, start, initial)
     return fit_jointly(
         fit, pairs, bounds, options.tolerance, options.responsibilities, growth=bool(sigma_growth), hit=hit
     )

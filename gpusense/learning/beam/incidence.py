@@ -223,11 +223,11 @@ def fit_incidence_parameters(
     device = open_device(backend, precision)
     surfaces = pairs.subset(surface)
     bounds = make_bounds(surfaces, sigma_bounds, lambda_bounds)
-    start = first_guess(surfaces, bounds) if initial is None else start_of(initial, surfaces, bounds)
+    start = first_guess(surfaces, bounds) if initial is None else start_of(initial, surfaces, bounds, hit)
     sums = DeviceSums(*device, surfaces)
     pooled = fit_pairs(sums, surfaces, bounds, start, options, chosen=initial is not None)
     if hit != "normal":
-        pooled = fit_shape(pooled, sums, surfaces, bounds, options, hit)
+        pooled = fit_shape(pooled, sums, surfaces, bounds, options, hit, start, initial)
     binned = Binned(device, bounds, options, pooled, strength)
     fits, counts = binned.fit_bins(pairs, surface, angles, edges)
     no_surface, no_surface_count = binned.fit_no_surface(pairs.subset(~surface))

@@ -113,18 +113,24 @@ def _bounds(name: str, value: tuple[float, float] | None, default: tuple[float, 
     return low, high
 
 
-def start_of(initial: BeamParameters, pairs: Pairs, bounds: Bounds) -> Point:
-    """Make the start of a search from a user's parameters, without the causes that no reading can have.
+def start_of(initial: BeamParameters, pairs: Pairs, bounds: Bounds, hit: str) -> Point:
+    """Make the start of a search with normal hits from a user's parameters, without causes that no reading can have.
+
+    Args:
+        initial: The parameters.
+        pairs: The readings.
+        bounds: Bounds of the shapes.
+        hit: Name of the shape of hits that is fitted in the end.
 
     Raises:
-        ValueError: The remaining causes do not explain the readings, sigma_hit grows with range, or hits are no
-            normal.
+        ValueError: The remaining causes do not explain the readings, sigma_hit grows with range, or the shape of
+            hits is neither the normal nor that of the fit.
     """
-    if initial.hit != "normal":
-        raise ValueError(f"initial: hit must be 'normal', from which other shapes start, got {checks.show(initial)}")
+    if initial.hit not in ("normal", hit):
+        raise ValueError(f"initial: hit must be 'normal' or that of the fit, {hit!r}, got {checks.show(initial)}")
     if initial.sigma_growth:
         raise ValueError(f"initial: sigma_growth must be 0, since it is not learned, got {checks.show(initial)}")
-    point = bounds.hold(Point.of(initial))
+    point = bounds.hold(Point.of(initial.replace(hit="normal")))
     weights = np.where(possible_causes(pairs), point.weights, 0)
     if (pairs.hits and not weights[[0, 1, 3]].any()) or (pairs.max_readings and not weights[2]):
         raise ValueError(f"initial: must give every reading a cause, got {checks.show(initial)}")

@@ -22,14 +22,22 @@ from gpusense.learning.beam.point import Bounds, Point
 from gpusense.learning.beam.problem import NO_PRIOR, Problem, Value
 from gpusense.learning.beam.report import report
 from gpusense.learning.beam.result import BeamFit
-from gpusense.world.hit_shapes import SHAPES, HitName
+from gpusense.world.hit_shapes import SHAPES, HitName, shape_of
+from gpusense.world.parameters import BeamParameters
 
 # Readings that choose between the starts, and the gain [nats] below which they have done so.
 _SAMPLE, _ROUGHLY = 20_000, 1e-2
 
 
 def fit_shape(
-    fit: BeamFit, device: DeviceSums, pairs: Pairs, bounds: Bounds, options: Options, hit: HitName
+    fit: BeamFit,
+    device: DeviceSums,
+    pairs: Pairs,
+    bounds: Bounds,
+    options: Options,
+    hit: HitName,
+    first: Point,
+    initial: BeamParameters | None,
 ) -> BeamFit:
     """Fit the shape of hits as well, from a fit with normal hits.
 
@@ -40,6 +48,8 @@ def fit_shape(
         bounds: Bounds of the shapes.
         options: Options of the fit.
         hit: Name of the shape.
+        first: Start of the fit.
+        initial: The user's parameters, or None; their shape, where it is this one, is a start as well.
     """
     kind = SHAPES[hit]
     if not pairs.hits or not pairs.expected.any():
@@ -49,6 +59,8 @@ def fit_shape(
         bounds.hold(replace(normal, sigma=factor * normal.sigma, shape=kind.at(np.array(shape))))
         for *shape, factor in kind.starts
     ]
+    if initial is not None and initial.hit == hit:
+        starts.append(replace(first, shape=shape_of(initial)))
     problem = Problem(device, pairs, bounds, NO_PRIOR, options.range_bias)
     sample = _sampled(problem)
     best = max((_climb(sample, start, options) for start in starts), key=lambda end: end.value.objective)

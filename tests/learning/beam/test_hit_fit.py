@@ -119,6 +119,15 @@ def test_gradients_are_those_of_differences(bias: bool, monkeypatch: pytest.Monk
         np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), gradient[:, k], rtol=0, atol=1e-7 * size)
 
 
+def test_a_fit_may_start_from_its_shape() -> None:
+    z, expected = (each[:1000] for each in drawn(STUDENT))
+    options: Any = dict(backend="numpy", hit="student")
+    free = gs.fit_beam_parameters(z, expected, RANGE, **options)
+    again = gs.fit_beam_parameters(z, expected, RANGE, initial=free.parameters, **options)
+    assert again.log_likelihood == pytest.approx(free.log_likelihood, abs=1e-6)
+    assert again.parameters.hit_dof == pytest.approx(free.parameters.hit_dof, rel=1e-3)
+
+
 def test_without_ranges_nothing_determines_the_shape() -> None:
     fit = gs.fit_beam_parameters([RANGE] * 5, [4.0] * 5, RANGE, backend="numpy", hit="student")
     assert fit.parameters.hit == "student" and fit.held["hit_dof"] == "no range determines it"

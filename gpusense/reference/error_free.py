@@ -45,8 +45,8 @@ def two_product(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def pair_sum(a: Pair, b: Pair) -> Pair:
     """Add two numbers of two parts each, to about twice the working precision.
 
-    Where the first parts cancel, their sum still is no smaller than the last bit of either, so it has no smaller exponent
-    than the second parts.
+    Where the first parts cancel, the sum is no smaller than the last bit of either, so its exponent is no smaller
+    than that of the second parts.
     """
     total, error = two_sum(a[0], b[0])
     return ordered_sum(total, error + (a[1] + b[1]))

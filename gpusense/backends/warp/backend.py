@@ -177,7 +177,7 @@ class WarpBackend(ProcessBound, Backend):
     @property
     def replays(self) -> bool:
         """See Backend.replays."""
-        return self.info.graphs
+        return self.info.kind == "gpu" and self.info.graphs
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launch | SharedLaunch:
         """See Backend.compile."""

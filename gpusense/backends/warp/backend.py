@@ -33,8 +33,8 @@ from gpusense.interface.signatures import KERNELS, Kernel
 from gpusense.interface.sources import relevant
 
 _MOST_NUMBERS = (1 << 31) - 1
-# Bytes of a copy that is read by memory of its own, and such memory of a thread.
-_FEW_BYTES, _MOST_ROOMS = 1 << 10, 32
+# Most bytes of a copy that a thread reads through memory which it keeps for each type.
+_FEW_BYTES = 1 << 10
 
 
 class WarpBackend(ProcessBound, Backend):
@@ -115,16 +115,14 @@ class WarpBackend(ProcessBound, Backend):
     def _read(self, buffer: wp.array, out: np.ndarray) -> np.ndarray:
         """Copy few numbers by page-locked memory of this thread, which takes less than half of the time of others."""
         rooms = self._thread.__dict__.setdefault("rooms", {})
-        key = out.size, out.dtype
-        if key not in rooms:
-            if len(rooms) >= _MOST_ROOMS:
-                rooms.clear()
-            memory = wp.empty(out.size, dtype=SCALARS[out.dtype], device="cpu", pinned=self._device.is_cuda)
-            rooms[key] = memory, memory.numpy()
-        memory, numbers = rooms[key]
+        if out.dtype not in rooms:
+            count = _FEW_BYTES // out.itemsize
+            memory = wp.empty(count, dtype=SCALARS[out.dtype], device="cpu", pinned=self._device.is_cuda)
+            rooms[out.dtype] = memory, memory.numpy()
+        memory, numbers = rooms[out.dtype]
         wp.copy(memory, buffer, count=out.size)
         self._wait()
-        out.reshape(-1)[...] = numbers
+        out.reshape(-1)[...] = numbers[: out.size]
         return out
 
     def empty_result(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:

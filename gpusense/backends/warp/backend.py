@@ -103,8 +103,10 @@ class WarpBackend(ProcessBound, Backend):
                 if not wait and queue.download(buffer, out):
                     return out
                 self._flush(queue)
-            if out.nbytes <= _FEW_BYTES and self.info.kind == "gpu":
-                return self._read(buffer, out)
+            if self.info.kind == "gpu":
+                room = self._room(out.dtype)
+                if out.nbytes <= _FEW_BYTES:
+                    return self._read(buffer, out, *room)
             if self._staging is not None and self._staging.download(buffer, out):
                 return out
             wp.copy(host_view(out), buffer, count=out.size)
@@ -112,14 +114,17 @@ class WarpBackend(ProcessBound, Backend):
                 self._wait()
         return out
 
-    def _read(self, buffer: wp.array, out: np.ndarray) -> np.ndarray:
-        """Copy few numbers by page-locked memory of this thread, which takes less than half of the time of others."""
+    def _room(self, dtype: np.dtype) -> tuple[wp.array, np.ndarray]:
+        """Return the page-locked memory through which this thread reads few numbers of a type, as two views."""
         rooms = self._thread.__dict__.setdefault("rooms", {})
-        if out.dtype not in rooms:
-            count = _FEW_BYTES // out.itemsize
-            memory = wp.empty(count, dtype=SCALARS[out.dtype], device="cpu", pinned=self._device.is_cuda)
-            rooms[out.dtype] = memory, memory.numpy()
-        memory, numbers = rooms[out.dtype]
+        if dtype not in rooms:
+            count = _FEW_BYTES // dtype.itemsize
+            memory = wp.empty(count, dtype=SCALARS[dtype], device="cpu", pinned=self._device.is_cuda)
+            rooms[dtype] = memory, memory.numpy()
+        return rooms[dtype]
+
+    def _read(self, buffer: wp.array, out: np.ndarray, memory: wp.array, numbers: np.ndarray) -> np.ndarray:
+        """Copy few numbers through page-locked memory, which takes less than half of the time of other memory."""
         wp.copy(memory, buffer, count=out.size)
         self._wait()
         out.reshape(-1)[...] = numbers[: out.size]

@@ -206,7 +206,7 @@ def test_a_frozen_program_trusts_devices_and_says_so(driver, monkeypatch, caplog
     assert verdict_on(INFO, anew=True) == proved and len(tried) == 2
 
 
-@pytest.mark.sampled(0.3)
+@pytest.mark.sampled(0.2)
 @pytest.mark.parametrize(
     ("family", "lanes", "float64"),
     [("opencl", 8, False), ("opencl", 16, True), ("warp", 1, True)],

@@ -13,7 +13,7 @@ from gpusense.evaluation.calibration_scenes import MAKERS, make_scene
 RUNS = 300
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("name", MAKERS)
 def test_readings_are_calibrated(name):
     scene = make_scene(name)

@@ -75,7 +75,7 @@ def test_no_map_is_forgotten(data_dir):
     assert found == {*SMALL, GIGANTIC}
 
 
-@pytest.mark.sampled(0.4)
+@pytest.mark.sampled(0.2)
 @pytest.mark.parametrize("name", SMALL)
 def test_distance_transform_is_scipys(data_dir, opencl, name):
     obstacles = gs.read_map(data_dir / name).obstacles()

@@ -259,7 +259,7 @@ reference_cast_ranges, envelope = ranges.cast_ranges, distance.distance_envelope
 score_beams, log_density = beam.score_beams, mixture.log_density
 
 
-@pytest.mark.sampled(0.25)
+@pytest.mark.sampled(0.1)
 @pytest.mark.parametrize(
     "module, name, broken, quantity",
     [
@@ -327,6 +327,7 @@ def test_a_single_backend_is_held_against_numpy():
     assert not any("simulator" in b.info.name.lower() for b in selftest.chosen_backends())
 
 
+@pytest.mark.slow
 def test_the_stiff_catalogue_on_the_command_line(capsys):
     assert main(["selftest", "--stiff", "--backend", "numpy", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)

@@ -51,7 +51,7 @@ def exact_grid(precision: str) -> np.ndarray:
     return np.array(truth)
 
 
-@pytest.mark.sampled(0.3)
+@pytest.mark.sampled(0.24)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_density_grid_against_60_digits(backend, precision):
     grid, same, truth = stiff.density_grid(backend, precision), numpy_grid(precision), exact_grid(precision)
@@ -86,7 +86,7 @@ def test_density_grid_reaches_what_it_says(precision):
     assert np.mean(np.isinf(naive)) >= 0.15
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_every_row_is_ok(backend, precision):
     rows = stiff.run(backend, precision)

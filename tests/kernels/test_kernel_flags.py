@@ -115,7 +115,7 @@ def test_flags_that_are_off_leave_no_trace_in_opencl(
     assert "#if" not in source.split("#line 1", 1)[1]
 
 
-@pytest.mark.sampled(0.12)
+@pytest.mark.sampled(0.08)
 @traces
 def test_flags_that_are_off_leave_no_trace_in_warp(
     kernel: str, flag: str, beside: tuple[str, ...], opencl: str, warp: str, needs: Callable[[str], str]
@@ -203,7 +203,7 @@ def test_cuda_code_of_a_block_of_the_field_loads_as_little_as_can_be(
     assert not re.search(r"\bmul\.lo\.s64\b|\bshr\.s32\b", whole)
 
 
-@pytest.mark.sampled(0.3)
+@pytest.mark.sampled(0.2)
 @pytest.mark.parametrize("kernel", [*KERNELS])
 def test_a_warp_kernel_is_made_once_for_the_flags_that_matter(kernel: str, needs: Callable[[str], str]) -> None:
     backend = get_backend(needs("warp"))

@@ -37,7 +37,7 @@ BEAMS = [*((name, *case) for name in MIXTURES for case in (((), np.float32), (FU
 BEAMS += [(name, *case) for name in ("book", "hit and short") for case in (((), np.float64), (FULL, np.float32))]
 
 
-@pytest.mark.sampled(0.2)
+@pytest.mark.sampled(0.12)
 @pytest.mark.parametrize(("name", "names", "real"), BEAMS)
 def test_beams_agree_with_the_reference(name: str, names: tuple[str, ...], real: type, device: Backend) -> None:
     occupied = GRIDS["rooms"]

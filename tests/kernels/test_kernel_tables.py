@@ -268,7 +268,7 @@ def made_anew(
     return found
 
 
-@pytest.mark.sampled(0.2)
+@pytest.mark.sampled(0.12)
 @pytest.mark.parametrize("kind", ["cpu", "gpu"])
 @pytest.mark.parametrize(
     ("shape", "share"), [((610, 590), 0.0), ((610, 590), 1e-4), ((40, 700), 3e-3), ((700, 3), 0.01), ((9, 9), 0.1)]

@@ -113,7 +113,7 @@ FIELD_OPTIONS = {
 }
 
 
-@pytest.mark.sampled(0.05)
+@pytest.mark.sampled(0.03)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize(
     ("kind", "option"),

@@ -66,7 +66,7 @@ def assert_no_particle_depends_on_its_lane(call, poses: np.ndarray) -> None:
     assert differing(np.concatenate(pieces), together) == 0
 
 
-@pytest.mark.sampled(0.1)
+@pytest.mark.sampled(0.06)
 @pytest.mark.parametrize("side", [9.0, 90.0])
 @pytest.mark.parametrize("name", LANDMARKS)
 def test_landmarks(name, side, in_lanes, compiled_lanes):

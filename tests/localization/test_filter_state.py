@@ -39,7 +39,7 @@ COPIES = {
 }  # fmt: skip
 
 
-@pytest.mark.sampled(0.3)
+@pytest.mark.sampled(0.2)
 @pytest.mark.parametrize("how", COPIES)
 @pytest.mark.parametrize("name", FILTERS)
 def test_a_copy_continues_with_the_same_bits(name, how, backend):

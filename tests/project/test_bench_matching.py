@@ -37,6 +37,7 @@ def test_matching_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     assert all(row["wrong_percent"] == 0 and row["median_mm"] < 20 for row in report["rows"])
 
 
+@pytest.mark.slow
 def test_match_verdicts_are_measured(needs: Callable[[str], str], tmp_path: Path) -> None:
     """Corridors and scans of few beams, which need no data."""
     arguments = ["--count", "6", "--backend", needs("opencl"), "--part", "corridors", "--part", "few"]

@@ -45,7 +45,7 @@ CROPPED = [kind for kind in KINDS if not kind.whole]
 POLICIES = [("free", "free"), ("occupied", "free"), ("free", "occupied"), ("occupied", "occupied")]
 
 
-@pytest.mark.sampled(0.3)
+@pytest.mark.sampled(0.2)
 @pytest.mark.parametrize("kind", KINDS, ids=by_name)
 def test_every_backend_has_the_bits_of_numpy(kind, backend):
     for precision, policies in (("float32", POLICIES), ("float64", POLICIES[::3])):
@@ -110,7 +110,7 @@ def kernel_cast(scene: Scene, kind: Caster, backend: str, precision: str) -> np.
     return device.download(result, np.empty(count, real))
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("family", FAMILIES)
 def test_dda_is_the_exact_caster_to_the_bit(family, backend):
     """Rays through corners, on edges and along axes, walls that touch at corners, tiny maps, walls at the limit."""

@@ -144,7 +144,7 @@ def hit_cells(scene: Scene, real: np.dtype) -> tuple[np.ndarray, list[tuple[int,
     return ranges, cells
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("family", FAMILIES)
 def test_the_cell_is_the_one_where_the_walk_ends(family, backend):
     """Every wall has another normal, which nothing but the right cell gives; corners, edges and origins in walls."""

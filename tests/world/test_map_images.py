@@ -259,6 +259,7 @@ def big_images():
     yield "map.pgm", b"P2 %d %d 255\n" % (side, side) + b"0 " * (side * side), 1.3
 
 
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize(("name", "content", "most"), big_images(), ids=["png-1-bit", "png", "pgm", "pgm-plain"])
 def test_a_map_is_read_at_a_byte_a_cell(tmp_path, name, content, most):
     """NumPy's and Python's own memory; Pillow holds one more byte a pixel of a grey PNG, which it does not report."""

@@ -125,6 +125,7 @@ def test_a_fit_of_the_model_scores_highest(needs) -> None:
         assert score(near) < fit.log_likelihood
 
 
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize(("method", "scenes"), [("em", (15, 38)), ("gradient", (23,)), ("hill_climb", (31,))])
 def test_other_methods_reach_the_optimum_from_ten_starts(method: str, scenes: tuple[int, ...], needs) -> None:
     backend = needs("opencl")

@@ -54,7 +54,7 @@ def looked_up(table: gs.DiscreteBeamModel, ranges: list[float], expected: np.nda
     return np.where(missing, 0, density.astype(expected.dtype))
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("name", TABLES)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_a_scan_is_the_sum_of_look_ups_on_every_backend(name, precision, backend):

@@ -60,7 +60,7 @@ BUMPERS = {
 }
 
 
-@pytest.mark.sampled(0.4)
+@pytest.mark.sampled(0.25)
 @each_precision
 @pytest.mark.parametrize("scene", SCENES)
 def test_bumpers_by_brute_force(backend: str, precision: str, scene: str) -> None:

@@ -19,7 +19,7 @@ from gpusense.models import run
 from gpusense.models.scan import tiles
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.25)
 @pytest.mark.parametrize("case", CASES)
 def test_a_bound_call_has_the_bits_of_an_ordinary_one(case, batching):
     """With poses and readings on the device, whose contents change; half of them float32."""

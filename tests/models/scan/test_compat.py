@@ -48,7 +48,7 @@ def close(precision: str) -> dict[str, float]:
     return {"rel": 3e-6, "abs": 3e-7} if precision == "float32" else {"rel": 1e-12, "abs": 1e-13}
 
 
-@pytest.mark.sampled(0.2)
+@pytest.mark.sampled(0.12)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize(
     ("peer", "readings", "kept"),

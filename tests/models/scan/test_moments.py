@@ -80,7 +80,7 @@ def scene(real):
     return grid, scanner, poses, expected
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("real", ["float32", "float64"])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_models_have_the_densities_on_every_backend(shape, real, backend):

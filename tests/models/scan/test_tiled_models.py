@@ -87,7 +87,7 @@ def same_as_one_by_one(make: Callable[[object], object], as_gpu: Pretend, poses:
     np.testing.assert_allclose(found, plain, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.25)
 @pytest.mark.parametrize("kind", ["all over", "inside"])
 def test_models(kind, ordered, as_gpu, backend):
     grid, scanner, z = world()
@@ -172,7 +172,7 @@ def test_in_pieces(chunk, ordered, as_gpu, monkeypatch):
             assert differing(found, right) == 0
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_work_items_that_add_up_strands_change_nothing(precision, ordered, as_gpu, monkeypatch):
     """Many particles, and few enough rays: alone, in scans of other lengths together, and with impossible readings."""

@@ -78,7 +78,7 @@ class Sensor:
 
     @property
     def due(self) -> bool:
-        """Whether to learn from the last counted scan: often at first, seldom later."""
+        """Tell whether to learn the correlation of beams from the last scan: each of the first, then two of ten."""
         return self._seen <= DEFAULTS.calibrations or self._seen % 10 <= 1
 
     def count(self) -> None:

@@ -212,7 +212,7 @@ def test_a_copy_of_the_wheel_hides_avx_512(monkeypatch: pytest.MonkeyPatch, tmp_
     script = importlib.import_module("speed.as_avx2")
     try:
         named = script.copy_driver(tmp_path)
-    except (FileNotFoundError, ValueError) as error:
+    except FileNotFoundError as error:
         pytest.skip(str(error))
     code = Path(named.read_text().strip()).read_bytes()
     assert script.SET + script.READ not in code

@@ -24,8 +24,8 @@ _STACK = 1024
 def sectors_of(backend: Backend, rows: int, cols: int) -> int:
     """Return the number of sectors per quadrant; more sectors make steps longer and tables larger.
 
-    GPUs gain most, since neighbouring rays wait for the slowest one. Kernels index the cells of all planes in 32 bits,
-    which limits the number.
+    GPUs gain most, since neighbouring rays wait for the slowest of them. Kernels index the cells of all planes in 32
+    bits, which limits the number.
     """
     sectors = {"gpu": 4, "cpu": 2}[backend.info.kind] if backend.info.backend != "numpy" else 1
     planes = 4 * (rows + 4) * (cols + 4)
@@ -48,7 +48,7 @@ def empty_rectangles(
         obstacles: (rows, cols) bool.
         sectors: Sectors per quadrant: 1, 2 or 4.
         rectangles: Planes of the map before the change, refreshed in place; None makes new planes.
-        changed: Window whose obstacles changed; None is all of the map.
+        changed: Window whose obstacles changed; None for the whole map.
     """
     rows, cols = obstacles.shape
     check_size(rows, cols)
@@ -56,8 +56,8 @@ def empty_rectangles(
         rectangles = backend.empty(4 * sectors * (rows + 2) * (cols + 2), _SHORT, zero=True)
         changed = Window(0, 0, rows, cols)
     top, left, bottom, right = changed.row, changed.col, changed.row + changed.rows, changed.col + changed.cols
-    # A rectangle that changes begins at most RECTANGLE_REACH cells before the changed obstacles and ends at most that
-    # far behind them; the same holds in the opposite directions.
+    # A rectangle that changes begins at most RECTANGLE_REACH cells before the changed obstacles and ends at most as far
+    # behind them, in both directions.
     first, begin = max(top - RECTANGLE_REACH, 0), max(left - RECTANGLE_REACH, 0)
     end = min(right + RECTANGLE_REACH, cols)
     near = obstacles[first : bottom + RECTANGLE_REACH]

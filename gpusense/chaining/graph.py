@@ -138,9 +138,7 @@ def factored(matrix: Any, damping: float) -> Any:
     # Symmetric and positive definite: a symmetric order without pivots.
     damped = (matrix + damping * _UNIT * identity(matrix.shape[0], format="csc")).tocsc()
     options = {"SymmetricMode": True}
-    return splu(
-        damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, relax=1, panel_size=_PANEL, options=options
-    )
+    return splu(damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, relax=1, panel_size=_PANEL, options=options)
 
 
 def _weights(squared: Floats, kernel: float) -> Floats:

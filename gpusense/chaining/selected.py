@@ -1,9 +1,9 @@
 """Covariances of all poses of a pose graph: the diagonal blocks of the inverse of its sparse normal equations.
 
-The matrix of 3 x 3 blocks is eliminated front by front along the tree of eliminations (Duff and Reid 1983). From its
-root down, the blocks of the inverse that lie in the fronts follow from those of the parents (Takahashi et al. 1973):
-with L the column below a pivot D, and Z the inverse, Z_sj = -Z_ss L and Z_jj = D^-1 + L' Z_ss L. Other blocks are never
-computed, so time and memory are those of the elimination.
+The matrix of 3 x 3 blocks is eliminated front by front along the tree of eliminations (Duff and Reid 1983), successive
+columns of equal rows at once. From its root down, the blocks of the inverse that lie in the fronts follow from those of
+the parents (Takahashi et al. 1973): with L the columns below pivots D, and Z the inverse, Z_sj = -Z_ss L and
+Z_jj = D^-1 + L' Z_ss L. Other blocks are never computed, so time and memory are those of the elimination.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def _order(blocks: Any, count: int) -> Integers:
 
 
 def _parts_of(blocks: Any, order: Integers) -> list[tuple[int, int, Integers]]:
-    """Return runs of steps of the elimination, first and beyond the last, and the rows below, which all of a run share."""
+    """Return runs of steps of the elimination, each with its first and its end, and the rows below that all share."""
     count = len(order)
     place = np.empty(count, np.int64)
     place[order] = np.arange(count)

@@ -102,7 +102,7 @@ def _search(
     ``most`` is the number of points of the largest reference and of the largest second scan.
     """
     rules, parts = options.search_rules(most[1], gap, most[0]), []
-    # Results of all starts of a wide window take more memory than all the rest: as many pairs at a time as a launch has.
+    # The results of all starts of wide windows take much memory: as many pairs at a time as a launch has.
     for begin in range(0, len(poor), step := device.pairs_of_launch(len(offsets))):
         part = slice(begin, begin + step)
         coarse = device.run(poor[part], guess[part, None] + offsets, rules)

@@ -209,18 +209,21 @@ def peers(rows: Sequence[Row]) -> list[str]:
     return table(("for", "method", "version, threads", "M/s of one core, whole calls", "error", "processor"), lines, 3)
 
 
-def rival_matchers(rows: Sequence[Row]) -> list[str]:
-    """Return the table of other programs that match pairs of scans, beside gpusense's methods; empty without them."""
-    outside = [row for row in rows if row.outside and row.need == "matching"]
+def rivals(rows: Sequence[Row], need: str, of: str) -> list[str]:
+    """Return the table of other programs for a task, beside gpusense's rows of the same settings."""
+    outside = [row for row in rows if row.outside and row.need == need]
     lines = []
     for device in dict.fromkeys(row.device for row in outside):
-        reference = [row for row in own(rows, "matching", device) if row.precision == "float32"]
+        reference = [row for row in own(rows, need, device) if row.precision == "float32"]
         settings = {row.setting for row in outside}
         listed = [row for row in [*outside, *reference] if row.device == device and row.setting in settings]
         for row in sorted(listed, key=lambda one: (int(one.setting.split()[0]), one.seconds)):
-            errors = [value(row.errors[name], "m") for name in SHOWN["matching"]]
-            lines.append((row.method, row.setting, row.outside or "gpusense", time_text(row.seconds), *errors, device))
-    columns = ("method", "scan", "version, threads", "a match, one core", *SHOWN["matching"], "processor")
+            errors = [value(row.errors[name], "m") for name in SHOWN[need]]
+            whole = time_text(row.quartiles[1])
+            lines.append(
+                (row.method, row.setting, row.outside or "gpusense", time_text(row.seconds), whole, *errors, device)
+            )
+    columns = ("method", "setting", "version, threads", f"{of}, one core", "elapsed", *SHOWN[need], "processor")
     return table(columns, lines, 3) if lines else ["(none in these reports)"]
 
 
@@ -273,8 +276,8 @@ def files(folder: Path = RESULTS) -> dict[Path, str]:
     made = {picture(need): chart(rows, need, devices) for need in needs}
     blocks = {
         "first": answers(rows, devices, FIRST), "answers": answers(rows, devices, WISHES), "peers": peers(rows),
-        "matchers": rival_matchers(rows), "maps": by_map(rows, devices), "reports": listing(found),
-        "limit": [str(LIMIT)],
+        "matchers": rivals(rows, "matching", "a match"), "filters": rivals(rows, "localisation", "a scan"),
+        "maps": by_map(rows, devices), "reports": listing(found), "limit": [str(LIMIT)],
     }  # fmt: skip
     for need in NEEDS:
         blocks[need] = methods(rows, need, devices, fronts=need == "localisation") if need in needs else ["(none yet)"]

@@ -10,10 +10,10 @@ interpolated field with them; *small* calls of 2000 and 4000 particles x 60 beam
 or --map. A scan is cast exactly, with a range for each beam, or noisy: work counts the ranges in it.
 
 Launches are all kernels of a call with its arrays on the device: placing the poses, ordering them, casting, scoring and
-summing, started as the call starts them (on CUDA as one graph). "Alone" each set is waited for, "in a row" ten are. The
-first call includes compilation (or its cache on disk) and the preparation of the map. Errors and bits are those of the
-first particles, against NumPy in float64 and in float32; ranges must have the same bits. Times are the least and the
-median of several runs; machines are noisy, so compare within a run.
+summing, started as the call starts them (on CUDA as one graph). "Alone" each set is waited for, "in a row" ten are, or
+as many as fit into --seconds. The first call includes compilation (or its cache on disk) and the preparation of the
+map. Errors and bits are those of the first particles, against NumPy in float64 and in float32; ranges must have the
+same bits. Times are the least and the median of several runs; machines are noisy, so compare within a run.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from common import (
 
 ROWS = ("clouds", "bilinear", "small", "preparation", "large")
 CHECKED = 100
-# Sets of launches that are waited for together.
+# Most sets of launches that are waited for together.
 IN_A_ROW = 10
 # Scores poses, or casts rays from them, and writes the result to an array if there is one.
 Call = Callable[[Any, Any], Any]
@@ -218,8 +218,9 @@ def measure(device: Recorder, job: Job, arguments: argparse.Namespace) -> dict[s
     least, median = best(run, *limits)
     start_all = as_a_call(device, launches)
     alone, _ = best(waited(device, start_all), *limits)
-    in_a_row, _ = best(waited(device, start_all, IN_A_ROW), *limits)
-    times = {"call_s": least, "median_s": median, "launch_s": alone, "row_s": in_a_row / IN_A_ROW}
+    row_of = min(IN_A_ROW, max(1, int(arguments.seconds / alone)))
+    in_a_row, _ = best(waited(device, start_all, row_of), *limits)
+    times = {"call_s": least, "median_s": median, "launch_s": alone, "row_s": in_a_row / row_of}
     return {**row, "launches": len(launches), **times}
 
 

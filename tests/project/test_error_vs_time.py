@@ -16,6 +16,8 @@ from support.bench_world import made_point, made_report
 from support.browser import CHROMIUM, in_browser
 from support.paths import ROOT
 
+from gpusense.evaluation.benchmark.rows import titles_of
+
 DEVICE = "2 cores of an X, PoCL"
 
 
@@ -196,9 +198,18 @@ def test_devices_and_other_matchers_have_their_places(page: ModuleType, tmp_path
         "| match of two scans, at most 1 cm | **icp, 180 beams**: 300 us, 5 mm | **icp, 180 beams**: 40 us, 5 mm |"
         in text
     )
-    assert re.findall(r"^\| (\w+) \| 180 beams \| (.*?) \| (.*?) \|", text, re.MULTILINE) == [
-        ("icp", "gpusense", "300 us"), ("csm", "csm 1, 1 thread", "1 ms"),
+    assert re.findall(r"^\| (\w+) \| 180 beams \| (.*?) \| (.*?) \| (.*?) \|", text, re.MULTILINE) == [
+        ("icp", "gpusense", "300 us", "600 us"), ("csm", "csm 1, 1 thread", "1 ms", "2 ms"),
     ]  # fmt: skip
+
+
+def test_one_processor_with_and_without_its_widest_vectors() -> None:
+    """PoCL's target tells the columns apart."""
+    titles = {target: titles_of([made_point(backend="opencl:0:0", device="pthread-X", kind="cpu")],
+                                     {"processors": 2, "processor": "X"},
+                                     [{"selection": "opencl:0:0", "driver": "PoCL", "target": target}])["opencl:0:0"]
+              for target in ("skylake-avx512", "haswell")}  # fmt: skip
+    assert titles == {"skylake-avx512": DEVICE, "haswell": f"{DEVICE}, AVX2 only"}
 
 
 # ---- the interactive page

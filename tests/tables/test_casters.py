@@ -24,7 +24,7 @@ from gpusense.tables import casters
 from gpusense.tables.caster_base import CasterInput
 from gpusense.tables.casters import Bresenham, Caster, Cddt, Dda, Exact, Lookup, March
 from gpusense.tables.directional import directional_table
-from gpusense.tables.rectangles import sectors_of
+from gpusense.tables.rectangles import Planes, planes_of
 from gpusense.world import windows
 
 DOCS = ROOT / "docs" / "speed.md"
@@ -119,7 +119,7 @@ def test_dda_is_the_exact_caster_to_the_bit(family, backend):
             ranges = kernel_cast(scene, Dda(), backend, precision)
             same_bits(ranges, kernel_cast(scene, Exact(), backend, precision))
             for sectors in (1, 2, 4):
-                same_bits(ranges, scene_cast(scene, backend, precision, sectors))
+                same_bits(ranges, scene_cast(scene, backend, precision, Planes(sectors)))
 
 
 # ------------------------------------------------------------------------------------------- models, memory, words
@@ -167,7 +167,7 @@ def test_table_bytes_are_those_of_the_page(backend):
     rows, cols = grid.shape
     table = directional_table(grid.obstacles(), 36, pruned=False, outside=False)
     begins, lines = sum(map(len, lists_of(table, 36).values())), int(table[0])
-    sectors = sectors_of(get_backend(backend), rows, cols)
+    sectors = planes_of(get_backend(backend), rows, cols).sectors
     for kind in each_caster(36):
         caster = gs.RayCaster(grid, RANGE, method=kind, backend=backend)
         assert caster.table_bytes == 0

@@ -39,7 +39,7 @@ class Exact(Caster):
     name = "exact"
     exact = True
     error = "exact: float64 to 1e-12 relative; float32 the same bits on every device"
-    memory = "16 bytes per cell of the reachable map, on GPUs 32 up to 2^24 cells, 8 where that is over 4 GiB"
+    memory = "16 bytes per cell of the reachable map, on GPUs 32 up to 2^25 cells, 8 where that is over 4 GiB"
     precomputation = "empty rectangles, one pass over the map per quadrant"
 
     def prepare(self, backend: Backend, inputs: CasterInput) -> Table:

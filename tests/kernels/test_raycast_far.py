@@ -127,5 +127,5 @@ def test_the_longest_corridor(precision, backend):
     cell = np.stack([rng.integers(0, 50, 60), np.full(60, 1)], axis=1)
     scene = Scene(occupied, cell, frac, np.stack([np.ones(60), slope], axis=1), float(MOST))
     expected = length - 1 - cell[:, 0] - frac[:, 0]
-    found = cast(scene, backend, precision, 2, wide=True)
+    found = cast(scene, backend, precision, Planes(2), wide=True)
     assert (np.abs(found - expected) <= np.spacing(expected.astype(precision))).all()

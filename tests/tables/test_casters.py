@@ -167,13 +167,15 @@ def test_table_bytes_are_those_of_the_page(backend):
     rows, cols = grid.shape
     table = directional_table(grid.obstacles(), 36, pruned=False, outside=False)
     begins, lines = sum(map(len, lists_of(table, 36).values())), int(table[0])
-    sectors = planes_of(get_backend(backend), rows, cols).sectors
+    planes = planes_of(get_backend(backend), rows, cols)
     for kind in each_caster(36):
         caster = gs.RayCaster(grid, RANGE, method=kind, backend=backend)
         assert caster.table_bytes == 0
         caster.cast(poses[:2], bearings)
         formula = rows_of_the_page()[kind.name][2]
-        assert caster.table_bytes == value_of(formula, H=rows, W=cols, S=sectors, L=lines, B=begins, bins=36), kind
+        assert caster.table_bytes == value_of(
+            formula, H=planes.lines(rows) - 2, W=cols, S=planes.sectors, L=lines, B=begins, bins=36
+        ), kind
 
 
 @pytest.mark.parametrize("name", ["opencl", "warp"])

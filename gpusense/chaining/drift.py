@@ -1,4 +1,4 @@
-"""How far the poses of two scans may have drifted apart: covariances of relative poses in a pose graph."""
+"""Drift between the poses of two scans: covariances of relative poses in a pose graph."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from gpusense.chaining.graph import Solution, factored, normal_equations, pose_j
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Most poses whose joint covariance is kept; in a longer graph each stands for those after it. At most this share are
-# sides of steps whose variance is this many times the usual one, so that breaks of the chain are seen.
+# Most poses whose joint covariance is kept; in a longer graph each represents the poses up to the next one. At most
+# this share are sides of steps whose variance is this many times the usual one, so that breaks of the chain are
+# represented.
 _ANCHORS, _BREAKS, _LOOSE = 300, 0.4, 10.0
-# Lever [m] with which variances of headings count beside those of positions.
+# Lever by which variances of headings are compared with variances of positions [m].
 _LEVER = 3.0
 # Columns of the inverse that are solved for at once.
 _COLUMNS = 192
-# Damping [1/m^2, 1/rad^2]: a direction that no link observes has a variance of the inverse.
+# Damping [1/m^2, 1/rad^2]; its inverse is the variance along a direction that no link observes.
 DAMPING = 1e-6
 
 
@@ -43,7 +44,7 @@ class Drift:
         if count < 2:
             return
         matrix, _ = normal_equations(solution.poses, solution.links, solution.links.weight, 0)
-        # The first pose is known: its rows and columns are 0.
+        # The first pose is known, so its rows and columns are 0.
         rows = (3 * (anchors[1:, None] - 1) + np.arange(3)).ravel()
         joint = _inverse_part(matrix, rows)
         self._joint[1:, :, 1:, :] = joint.reshape(len(anchors) - 1, 3, len(anchors) - 1, 3)
@@ -60,7 +61,7 @@ class Drift:
 
 
 def _anchors_of(solution: Solution, most: int) -> Integers:
-    """Return the poses whose joint covariance is kept: even ones, and both sides of the loosest steps."""
+    """Return the poses whose joint covariance is kept: evenly spaced ones, and both sides of the loosest steps."""
     count = len(solution.poses)
     if count <= most:
         return np.arange(count)
@@ -79,7 +80,7 @@ def _anchors_of(solution: Solution, most: int) -> Integers:
 
 
 def _inverse_part(matrix: Any, rows: Integers) -> Floats:
-    """Return some rows and columns of the inverse of a sparse matrix, by Schur's complement of the others."""
+    """Return some rows and columns of the inverse of a sparse matrix, by Schur's complement of all remaining ones."""
     from scipy.sparse import identity
 
     damped = (matrix + DAMPING * identity(matrix.shape[0], format="csc")).tocsc()

@@ -1,9 +1,9 @@
 """Covariances of all poses of a pose graph: the diagonal blocks of the inverse of its sparse normal equations.
 
-The matrix of 3 x 3 blocks is eliminated front by front along the tree of eliminations (Duff and Reid 1983). From its
-root down, the blocks of the inverse that lie in the fronts follow from those of the parents (Takahashi et al. 1973):
-with L the column below a pivot D, and Z the inverse, Z_sj = -Z_ss L and Z_jj = D^-1 + L' Z_ss L. Other blocks are never
-computed, so time and memory are those of the elimination.
+The matrix of 3 x 3 blocks is eliminated front by front along the elimination tree (Duff and Reid 1983). From its root
+down, the blocks of the inverse within each front follow from those of its parent (Takahashi et al. 1973): with L the
+column below a pivot D, and Z the inverse, Z_sj = -Z_ss L and Z_jj = D^-1 + L' Z_ss L. No further blocks are computed,
+so time and memory are those of the elimination.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Integers = NDArray[np.int64]
 def pose_covariances(solution: Solution) -> Floats:
     """Return the covariances (N, 3, 3) of poses, given the first one.
 
-    A direction that no link observes has a variance of some 1e6 m^2 or rad^2.
+    A direction that no link observes has a variance of about 1e6 m^2 or rad^2.
     """
     count = len(solution.poses)
     result = np.zeros((count, 3, 3))
@@ -77,7 +77,7 @@ def inverse_blocks(matrix: Any, damping: float) -> Floats:
 
 
 def _order(blocks: Any, count: int) -> Integers:
-    """Return the blocks in an order of elimination with little fill: of minimum degree, by SuperLU."""
+    """Return an elimination order of the blocks with little fill: minimum degree, by SuperLU."""
     from scipy import sparse
     from scipy.sparse.linalg import splu
 
@@ -92,7 +92,7 @@ def _order(blocks: Any, count: int) -> Integers:
 def _eliminated(
     blocks: Any, order: Integers, place: Integers, damping: float
 ) -> tuple[list[Integers], list[Floats], list[Floats]]:
-    """Return, of each step of the elimination, the rows below, the factor L, and the inverse of the pivot."""
+    """Return for each step of the elimination the rows below, the factor L, and the inverse of the pivot."""
     count = len(order)
     below: list[Integers] = []
     factors: list[Floats] = []
@@ -107,7 +107,7 @@ def _eliminated(
         rows = np.unique(np.concatenate([np.array([k]), columns, *(rows for rows, _ in waiting[k])]))
         front = np.zeros((3 * len(rows), 3 * len(rows)))
         for at, value in zip(np.searchsorted(rows, columns), values, strict=True):
-            # Row block of the pivot; the front is used below it.
+            # Row block of the pivot; only the front below it is used further.
             front[3 * at : 3 * at + 3, :3] += value.T
         front[:3, :3] += damping * np.eye(3)
         for others, update in waiting[k]:
@@ -126,6 +126,6 @@ def _eliminated(
 
 
 def _scalars(blocks: Integers) -> Integers:
-    """Return the rows of blocks of three."""
+    """Return the scalar rows of blocks of three."""
     rows: Integers = (3 * blocks[:, None] + np.arange(3)).ravel()
     return rows

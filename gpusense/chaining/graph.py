@@ -24,6 +24,8 @@ KERNEL = 3.0
 # Most iterations, the step that ends them [m, rad], and the first, least and largest damping.
 _ITERATIONS, _SMALL = 50, 1e-6
 _DAMPING, _LEAST, _MOST = 1e-6, 1e-9, 1e6
+# Columns that are factored at once: fewer than SuperLU's default, since few columns of a pose graph are alike.
+_PANEL = 4
 # Information that damping multiplies, of 1 m and 1 rad.
 _UNIT = 1.0
 
@@ -135,7 +137,8 @@ def factored(matrix: Any, damping: float) -> Any:
 
     # Symmetric and positive definite: a symmetric order without pivots.
     damped = (matrix + damping * _UNIT * identity(matrix.shape[0], format="csc")).tocsc()
-    return splu(damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    options = {"SymmetricMode": True}
+    return splu(damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, relax=1, panel_size=_PANEL, options=options)
 
 
 def _weights(squared: Floats, kernel: float) -> Floats:

@@ -72,8 +72,7 @@ class Matcher:
     def across(
         self, first: Integers, other: Matcher, second: Integers, guess: Floats, window: tuple[float, float] | None
     ) -> Found:
-        """Return the poses of the robot at scans of a second scanner with equal bearings, relative to those at these
-        scans.
+        """Return the robot's poses at scans of a second scanner with equal bearings, relative to those at these.
 
         Both are matched as scans of one scanner in the middle of a robot, so that matched poses are those of the
         scanners.

@@ -18,6 +18,8 @@ Integers = NDArray[np.int64]
 _SHARE = 0.3
 # Key scans whose shares are computed at once.
 _ROWS = 512
+# Most cells of a plane for which a table is kept.
+_DENSE = 1 << 22
 # Points farther than this many rms ranges are left out, since they say little about a place.
 _FAR = 2.0
 # Passages per direction through a place with which later ones are compared, the directions, key scans of a scanner
@@ -91,10 +93,26 @@ def _cells_of(places: list[Floats], poses: Floats, cell: float) -> tuple[Integer
     at = np.zeros((len(owner), 3))
     at[:, :2] = np.concatenate(places)
     cells = np.floor(compose_poses(poses[owner], at)[:, :2] / cell).astype(np.int64)
-    _, number = np.unique(cells @ np.array([1 << 31, 1]), return_inverse=True)
+    number = _numbered(cells)
     count = int(number.max(initial=0)) + 1
     both = np.unique(owner * count + number)
     return both // count, both % count
+
+
+def _numbered(cells: Integers) -> Integers:
+    """Return the number (C,) of each cell (C, 2) among the distinct cells, row by row."""
+    if not len(cells):
+        return np.zeros(0, np.int64)
+    low = cells.min(axis=0)
+    rows, cols = (cells.max(axis=0) - low + 1).tolist()
+    if rows * cols > max(_DENSE, len(cells)):
+        _, number = np.unique((cells - low) @ np.array([cols, 1]), return_inverse=True)
+        return number
+    number = (cells - low) @ np.array([cols, 1])
+    seen = np.zeros(rows * cols, bool)
+    seen[number] = True
+    numbers: Integers = np.cumsum(seen)[number] - 1
+    return numbers
 
 
 def _first_passages(table: Any, poses: Floats, sequence: tuple[Integers, Integers]) -> Integers:

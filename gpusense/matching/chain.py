@@ -101,8 +101,14 @@ def _search(
 
     ``most`` is the number of points of the largest reference and of the largest second scan.
     """
-    coarse = device.run(poor, guess[:, None] + offsets, options.search_rules(most[1], gap, most[0]))
-    which, chosen = distinct(coarse[..., :3], coarse[..., 3], best.result[poor, :3], options.capture)
+    rules, parts = options.search_rules(most[1], gap, most[0]), []
+    # The results of all starts of wide windows take much memory: as many pairs at a time as a launch has.
+    for begin in range(0, len(poor), step := device.pairs_of_launch(len(offsets))):
+        part = slice(begin, begin + step)
+        coarse = device.run(poor[part], guess[part, None] + offsets, rules)
+        rows, poses = distinct(coarse[..., :3], coarse[..., 3], best.result[poor[part], :3], options.capture)
+        parts.append((begin + rows, poses))
+    which, chosen = (np.concatenate(values) for values in zip(*parts, strict=True))
     if not len(which):
         return
     fine = device.run(poor[which], chosen[:, None], options.final_rules(most[1], gap))[:, 0]

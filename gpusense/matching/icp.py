@@ -107,10 +107,13 @@ class IcpPairs:
         """
         starts = guesses.shape[1]
         result = np.empty((len(pairs), starts, MATCH_RESULT), self._real)
-        step = max(_MOST_STARTS[self._backend.info.kind] // max(starts, 1), 1)
-        for begin in range(0, len(pairs), step):
+        for begin in range(0, len(pairs), step := self.pairs_of_launch(starts)):
             self._run(pairs[begin : begin + step], guesses[begin : begin + step], rules, result[begin : begin + step])
         return result.astype(np.float64)
+
+    def pairs_of_launch(self, starts: int) -> int:
+        """Return the most pairs of a launch of some starts each."""
+        return max(_MOST_STARTS[self._backend.info.kind] // max(starts, 1), 1)
 
     def _run(self, pairs: np.ndarray, guesses: np.ndarray, rules: MatchRules, result: np.ndarray) -> None:
         """Match the pairs of one launch."""

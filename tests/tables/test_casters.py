@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import math
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -213,3 +214,22 @@ def test_the_page_of_casters_mentions_every_method_and_knob():
             assert any(f"`{knob.name}`" in cell for cell in rows[name]), (name, knob.name)
     page = DOCS.read_text(encoding="utf-8")
     assert "sensor_table=" in page and "save_table(" in page
+
+
+@pytest.mark.parametrize(
+    ("kind", "side", "buffer", "form"),
+    [
+        ("gpu", 2000, 1 << 34, Planes(4, 8)),
+        ("gpu", 6000, 1 << 34, Planes(2, 8)),
+        ("gpu", 20_000, 1 << 36, Planes(1, 8)),
+        ("gpu", 2000, 1 << 26, Planes(2, 8)),
+        ("cpu", 2000, 1 << 34, Planes(2)),
+        ("cpu", 20_000, 1 << 36, Planes(1)),
+    ],
+)
+def test_planes_fit_indices_buffers_and_caches(kind, side, buffer, form):
+    """Indices have 32 bits; a GPU has rows in groups, and four sectors where its caches hold the planes."""
+    info = dataclasses.replace(get_backend("numpy").info, kind=kind, backend="opencl", max_buffer=buffer)
+    planes = planes_of(SimpleNamespace(info=info), side, side)
+    assert planes == form
+    assert planes.entries(side, side) < 1 << 31 and 2 * planes.entries(side, side) <= buffer or planes.sectors == 1

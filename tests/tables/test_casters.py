@@ -232,4 +232,4 @@ def test_planes_fit_indices_buffers_and_caches(kind, side, buffer, form):
     info = dataclasses.replace(get_backend("numpy").info, kind=kind, backend="opencl", max_buffer=buffer)
     planes = planes_of(SimpleNamespace(info=info), side, side)
     assert planes == form
-    assert planes.entries(side, side) < 1 << 31 and 2 * planes.entries(side, side) <= buffer or planes.sectors == 1
+    assert (planes.entries(side, side) < 1 << 31 and 2 * planes.entries(side, side) <= buffer) or planes.sectors == 1

@@ -1,4 +1,4 @@
-"""nav2_amcl and Beluga as compiled from copies of their sources, which the user gives; for ``peers.py``."""
+"""nav2_amcl and Beluga as compiled from copies of their sources, which the user gives: models and filters."""
 
 from __future__ import annotations
 
@@ -16,6 +16,16 @@ import gpusense as gs
 
 CODE = Path(__file__).resolve().parent / "peer_code"
 MODELS = {"beam": 0, "field": 1, "field, prob": 2}
+_NAV2_FILES = (
+    "map/map.c",
+    "map/map_range.c",
+    "pf/pf.c",
+    "pf/pf_kdtree.c",
+    "pf/pf_pdf.c",
+    "pf/pf_vector.c",
+    "pf/eig3.c",
+)
+_C = ("gcc", "-O2", "-DNDEBUG", "-DHAVE_DRAND48", "-fPIC", "-c")
 _FLAGS = ("-std=c++17", "-O2", "-DNDEBUG", "-fPIC", "-shared")
 
 
@@ -120,6 +130,50 @@ class Weigher:
             self._library.discard(self._made)
 
 
+class Follower:
+    """A particle filter of a peer: motion model, weights, resampling, and the pose that it reports.
+
+    The number of particles is fixed, every scan is taken, and no random poses are injected. nav2_amcl reports the mean
+    of its heaviest cluster, Beluga the mean of all particles.
+
+    Args:
+        weigher: The model, which the filter uses until it is gone.
+        particles: Their number.
+        mean: Pose of the start.
+        deviations: Standard deviations of x, y and heading around it [m, m, rad].
+        alpha: The four parameters of the odometry's noise.
+        seed: Of the random numbers.
+    """
+
+    def __init__(
+        self,
+        weigher: Weigher,
+        particles: int,
+        mean: Sequence[float],
+        deviations: Sequence[float],
+        alpha: Sequence[float],
+        seed: int,
+    ) -> None:
+        self._weigher, begin = weigher, weigher._library.start
+        begin.restype = ctypes.c_void_p
+        given = [np.ascontiguousarray(array, np.float64) for array in (mean, deviations, alpha)]
+        self._filter = ctypes.c_void_p(begin(weigher._made, particles, *map(_pointer, given), seed))
+
+    def step(self, odometry: Sequence[float], ranges: np.ndarray) -> np.ndarray:
+        """Take the pose of the odometry and (K,) readings [m]; return the pose on the map."""
+        moved, read, found = np.array(odometry, np.float64), np.ascontiguousarray(ranges, np.float64), np.empty(3)
+        scanner, bearings = self._weigher._scanner, self._weigher._bearings
+        self._weigher._library.step(
+            self._filter, _pointer(moved), _pointer(read), _pointer(bearings), len(read),
+            ctypes.c_double(scanner.range_min), ctypes.c_double(scanner.range_max), _pointer(found),
+        )  # fmt: skip
+        return found
+
+    def __del__(self) -> None:
+        if hasattr(self, "_filter"):
+            self._weigher._library.stop(self._filter)
+
+
 def build(name: str, source: Path, include: Sequence[Path], folder: Path) -> Compiled:
     """Compile a peer.
 
@@ -133,12 +187,15 @@ def build(name: str, source: Path, include: Sequence[Path], folder: Path) -> Com
     if name == "amcl":
         root = source / "nav2_amcl"
         objects = []
-        for file in ("map/map.c", "map/map_range.c", "pf/pf_vector.c", "pf/eig3.c"):
+        for file in _NAV2_FILES:
             objects.append(str(folder / f"{Path(file).stem}.o"))
-            _run("gcc", "-O2", "-fPIC", "-c", f"-I{root / 'include'}", str(root / "src" / file), "-o", objects[-1])
+            # The models' function of this name is in nav2.cpp.
+            renamed = ["-Dpf_update_sensor=filter_update_sensor"] if file == "pf/pf.c" else []
+            _run(*_C, *renamed, f"-I{root / 'include'}", str(root / "src" / file), "-o", objects[-1])
         models = [str(path) for path in sorted((root / "src" / "sensors" / "laser").glob("*.cpp"))]
-        _run("g++", *_FLAGS, f"-I{root}", f"-I{root / 'include'}", "-o", str(library), str(CODE / "nav2.cpp"), *models,
-             *objects)  # fmt: skip
+        models.append(str(root / "src" / "motion_model" / "differential_motion_model.cpp"))
+        _run("g++", *_FLAGS, f"-I{root}", f"-I{root / 'include'}", f"-I{CODE / 'stubs'}", "-o", str(library),
+             str(CODE / "nav2.cpp"), *models, *objects)  # fmt: skip
     else:
         headers = [f"-I{path}" for path in (source / "beluga" / "include", *include)]
         _run("g++", *_FLAGS, *headers, "-DSOPHUS_USE_BASIC_LOGGING", "-o", str(library), str(CODE / "beluga.cpp"),

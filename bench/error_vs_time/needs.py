@@ -43,6 +43,7 @@ from gpusense.localization.defaults import DEFAULTS
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+import rival_filters
 from common import command_line, make_parser, note, parse, table
 from matching_tasks import between_scans, in_a_map, rivals
 from recordings import BEAM
@@ -104,13 +105,18 @@ def drive(run: Any, model: Any, seed: int, particles: int, options: dict[str, An
     return np.array(errors[SETTLING:]), np.array(seconds[SETTLING:])
 
 
-def localisation(device: Backend) -> Iterator[Setting]:
-    """Yield the settings of localisation: particles and beams of each model, then variants of a middle one."""
+def simulated(device: Backend) -> Any:
+    """Return the drive that all filters follow."""
     building = gs.worlds.building(2, (50.0, 50.0))
     world = gs.worlds.change_world(building, np.random.default_rng(4), moved=0.02)
-    run = gs.worlds.simulate_run(
+    return gs.worlds.simulate_run(
         mapped(building), SCANNER, world=world, scans=SCANS, hidden=0.2, seed=3, backend=device
     )
+
+
+def localisation(device: Backend) -> Iterator[Setting]:
+    """Yield the settings of localisation: particles and beams of each model, then variants of a middle one."""
+    run = simulated(device)
     sizes = {
         "field": ((100, 300, 1000, 3000, 10_000, 100_000, 1_000_000), (8, 30, 60, 180, 1080)),
         "beam": ((100, 1000, 10_000, 100_000, 1_000_000), (8, 60, 180, 1080)),
@@ -118,6 +124,10 @@ def localisation(device: Backend) -> Iterator[Setting]:
         "beam, march": ((1000, 10_000), (60,)), "beam, cddt": ((1000, 10_000), (60,)),
     }  # fmt: skip
     grid = [(kind, n, k, "float32", {}) for kind, (ns, ks) in sizes.items() for n, k in itertools.product(ns, ks)]
+    # Beside the filters of other programs.
+    grid += [
+        (kind, n, rival_filters.BEAMS, "float32", {}) for kind in ("field", "beam") for n in rival_filters.PARTICLES[:2]
+    ]
     varied: list[tuple[str, int, int, str, dict[str, Any]]] = [
         (kind, 1000, 60, precision, options)
         for kind in ("field", "beam")
@@ -204,12 +214,16 @@ SETTINGS: dict[str, Callable[[Backend], Iterator[Setting]]] = dict(
     zip(NEEDS, (localisation, between_scans, in_a_map, learning, landmarks), strict=True)
 )
 
+RIVALS: dict[str, Callable[[Backend], Iterator[Setting]]] = {
+    "localisation": lambda device: rival_filters.rivals(simulated(device), START, SETTLING), "matching": rivals,
+}  # fmt: skip
+
 # ---- all
 
 
 def measure(need: str, device: Backend, arguments: argparse.Namespace, *, peers: bool = False) -> list[dict[str, Any]]:
     """Run all settings of a need in rounds, with ``peers`` those of other programs; return their rows."""
-    settings = [*(rivals(device) if peers and need == "matching" else ()), *SETTINGS[need](device)]
+    settings = [*(RIVALS[need](device) if peers and need in RIVALS else ()), *SETTINGS[need](device)]
     begin = time.perf_counter()
     for number in range(arguments.rounds):
         for one in settings:

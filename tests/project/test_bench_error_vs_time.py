@@ -146,6 +146,34 @@ def test_other_matchers_find_the_motion(
     assert names == {"small_gicp icp", "small_gicp gicp", "csm"} >= {one.method for one in settings}
 
 
+def test_filters_of_others_follow_the_robot(measure: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each takes the beams of the setting of every scan; one that cannot be compiled is left out."""
+    module, taken = importlib.import_module("rival_filters"), []
+
+    class Follower:
+        def __init__(self, weigher, particles, mean, deviations, alpha, seed) -> None:
+            assert weigher.parameters and len(deviations) == 3 and len(alpha) == 4 and seed == 7
+
+        def step(self, odometry, ranges):
+            taken.append(len(ranges))
+            return np.add(odometry, (0.03, 0.04, 0.0))
+
+    def weigher(compiled, grid, scanner, parameters, model):
+        return argparse.Namespace(parameters=parameters)
+
+    compiled = {"amcl": (object(), "nav2_amcl 1", ""), "beluga": (None, "beluga", "no sources")}
+    for name, stand_in in {"load": compiled.__getitem__, "Follower": Follower, "Weigher": weigher}.items():
+        monkeypatch.setattr(module, name, stand_in)
+    poses = np.zeros((5, 3))
+    scanner = measure.needs.SCANNER
+    run = argparse.Namespace(grid=None, scanner=scanner, poses=poses, odometry=poses, scans=np.ones((5, 1080)))
+    settings = list(module.rivals(run, (0.5, 0.5, 0.26), 2))
+    assert [one.options for one in settings] == [f"{n} x 60" for n in (500, 2000, 10_000) * 2 + (500, 2000)]
+    assert {one.method for one in settings} == {"nav2_amcl, defaults", "nav2_amcl, product", "nav2_amcl, beam"}
+    errors, seconds = settings[0].run(7)
+    assert taken == [60] * 5 and len(seconds) == 3 and errors == pytest.approx([0.05] * 3)
+
+
 def test_tasks_are_measured(
     measure: ModuleType, needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -1,4 +1,4 @@
-// Beluga's laser models as one C function; peers.py compiles it against a copy of Beluga.
+// Beluga's laser models as one C function, and its filter; compiled_peers.py compiles it against a copy of Beluga.
 // Its distance transform is renamed, so that exact distances can take its place.
 #define nearest_obstacle_distance_map inexact_distance_map
 #include <beluga/algorithm/distance_map.hpp>
@@ -24,6 +24,9 @@ auto nearest_obstacle_distance_map(Range &&mask, Distance &&distance, Neighbors 
 }
 }  // namespace beluga
 
+#include <beluga/algorithm/amcl_core.hpp>
+#include <beluga/motion/differential_drive_model.hpp>
+#include <beluga/random.hpp>
 #include <beluga/sensor/beam_model.hpp>
 #include <beluga/sensor/data/laser_scan.hpp>
 #include <beluga/sensor/likelihood_field_model.hpp>
@@ -70,8 +73,29 @@ Sophus::SE2d state(const double *pose) { return {Sophus::SO2d{pose[2]}, Eigen::V
 
 using Points = std::vector<std::pair<double, double>>;
 
+// A filter: moves by the odometry, weighs by a scan, resamples, and returns the weighted mean.
+struct Filter {
+    virtual ~Filter() = default;
+    virtual Sophus::SE2d step(Sophus::SE2d odometry, Points points) = 0;
+};
+
+template <class Model>
+struct FilterOf : Filter {
+    using Anywhere = std::function<Sophus::SE2d()>;
+    beluga::Amcl<beluga::DifferentialDriveModel2d, Model, Anywhere> amcl;
+    FilterOf(const Model &model, const beluga::DifferentialDriveModelParam &motion, beluga::AmclParams params)
+        : amcl(beluga::DifferentialDriveModel2d{motion}, model, [] { return Sophus::SE2d{}; },
+               beluga::spatial_hash<Sophus::SE2d>{0.5, 0.5, 10 * M_PI / 180}, params) {}
+    Sophus::SE2d step(Sophus::SE2d odometry, Points points) override {
+        amcl.force_update();
+        return std::get<0>(*amcl.update(odometry, std::move(points)));
+    }
+};
+
 struct Made {
     virtual ~Made() = default;
+    virtual Filter *start(const beluga::DifferentialDriveModelParam &motion, const beluga::AmclParams &params,
+                          const Sophus::SE2d &mean, const Eigen::Matrix3d &covariance) const = 0;
     virtual void weigh(Points points, const double *poses, int n, double *weights) const = 0;
     virtual void copy(float *field) const = 0;
 };
@@ -84,6 +108,12 @@ struct Of : Made {
     void weigh(Points points, const double *poses, int n, double *weights) const override {
         const auto weight = model(std::move(points));
         for (int j = 0; j < n; ++j) weights[j] = weight(state(poses + 3 * j));
+    }
+    Filter *start(const beluga::DifferentialDriveModelParam &motion, const beluga::AmclParams &params,
+                  const Sophus::SE2d &mean, const Eigen::Matrix3d &covariance) const override {
+        auto *made = new FilterOf<Model>(model, motion, params);
+        made->amcl.initialize(mean, covariance);
+        return made;
     }
     void copy(float *field) const override {
         if constexpr (with_field) {
@@ -108,9 +138,8 @@ extern "C" void *prepare(const signed char *cells, int rows, int cols, const dou
     return static_cast<Made *>(new Of<beluga::LikelihoodFieldProbModel<Grid>, true>(param, grid));
 }
 
-// Weigh n poses with a scan of k readings.
-extern "C" void weigh(void *made, const double *poses, int n, const double *ranges, const double *bearings, int k,
-                      double range_min, double range_max, double *weights) {
+// Return the end points of a scan.
+static Points points_of(const double *ranges, const double *bearings, int k, double range_min, double range_max) {
     Scan scan;
     scan.ranges_.assign(ranges, ranges + k);
     scan.angles_.assign(bearings, bearings + k);
@@ -118,6 +147,13 @@ extern "C" void weigh(void *made, const double *poses, int n, const double *rang
     scan.most = range_max;
     Points points;
     for (const auto &point : scan.points_in_cartesian_coordinates()) points.emplace_back(point.x(), point.y());
+    return points;
+}
+
+// Weigh n poses with a scan of k readings.
+extern "C" void weigh(void *made, const double *poses, int n, const double *ranges, const double *bearings, int k,
+                      double range_min, double range_max, double *weights) {
+    auto points = points_of(ranges, bearings, k, range_min, range_max);
     static_cast<Made *>(made)->weigh(std::move(points), poses, n, weights);
 }
 
@@ -142,3 +178,27 @@ extern "C" void cast(const signed char *cells, int rows, int cols, const double 
         for (int i = 0; i < k; ++i) expected[j * k + i] = ray.cast(Sophus::SO2d{bearings[i]}).value_or(range_max);
     }
 }
+
+// Start a filter of n particles around a pose; see nav2.cpp.
+extern "C" void *start(void *made, int n, const double *mean, const double *deviations, const double *alpha, int seed) {
+    ranges::detail::get_random_engine().seed(seed);
+    beluga::AmclParams params;
+    params.min_particles = params.max_particles = n;
+    params.alpha_slow = params.alpha_fast = 0;
+    params.kld_epsilon = 0.05;
+    params.kld_z = 0.99;
+    const Eigen::Vector3d spread{deviations[0], deviations[1], deviations[2]};
+    const Eigen::Matrix3d covariance = spread.cwiseAbs2().asDiagonal();
+    return static_cast<Made *>(made)->start({alpha[0], alpha[1], alpha[2], alpha[3]}, params, state(mean), covariance);
+}
+
+extern "C" void step(void *filter, const double *odometry, const double *ranges, const double *bearings, int k,
+                     double range_min, double range_max, double *found) {
+    auto points = points_of(ranges, bearings, k, range_min, range_max);
+    const auto mean = static_cast<Filter *>(filter)->step(state(odometry), std::move(points));
+    found[0] = mean.translation().x();
+    found[1] = mean.translation().y();
+    found[2] = mean.so2().log();
+}
+
+extern "C" void stop(void *filter) { delete static_cast<Filter *>(filter); }

@@ -1,17 +1,23 @@
-// nav2_amcl's laser models as one C function; peers.py compiles it against a copy of navigation2.
-// The brushfire of map_cspace.cpp is included, so that its table of distances is at hand.
+// nav2_amcl's laser models as one C function, and its filter; compiled_peers.py compiles it against a copy of
+// navigation2. The brushfire of map_cspace.cpp is included, so that its table of distances is at hand.
 #include <cmath>
 #include <cstdlib>
 
 #include "src/map/map_cspace.cpp"
+#include "nav2_amcl/angleutils.hpp"
+#include "nav2_amcl/motion_model/differential_motion_model.hpp"
 #include "nav2_amcl/sensors/laser/laser.hpp"
 
 namespace {
 double *result;
 }
 
-// In place of the particle filter's: one sample at a time, of weight 1.
-extern "C" void pf_update_sensor(pf_t *, pf_sensor_model_fn_t sensor_fn, void *data) {
+// The particle filter's own, renamed when pf.c is compiled.
+extern "C" void filter_update_sensor(pf_t *, pf_sensor_model_fn_t sensor_fn, void *data);
+
+// In place of the particle filter's: without a filter one sample at a time, of weight 1.
+extern "C" void pf_update_sensor(pf_t *pf, pf_sensor_model_fn_t sensor_fn, void *data) {
+    if (pf) return filter_update_sensor(pf, sensor_fn, data);
     pf_sample_set_t *set = reinterpret_cast<pf_sample_set_t *>(result);
     sensor_fn(data, set);
 }
@@ -66,10 +72,9 @@ extern "C" void *prepare(const signed char *cells, int rows, int cols, const dou
     return new Made{map, laser};
 }
 
-// Weigh n poses with a scan of k readings.
-extern "C" void weigh(void *made, const double *poses, int n, const double *ranges, const double *bearings, int k,
-                      double range_min, double range_max, double *weights) {
-    nav2_amcl::LaserData data;
+// Fill in a scan of k readings.
+static void fill(nav2_amcl::LaserData &data, void *made, const double *ranges, const double *bearings, int k,
+                 double range_min, double range_max) {
     data.laser = static_cast<Made *>(made)->laser;
     data.range_count = k;
     data.range_max = range_max;
@@ -79,6 +84,13 @@ extern "C" void weigh(void *made, const double *poses, int n, const double *rang
         data.ranges[i][0] = ranges[i] <= range_min ? range_max : ranges[i];
         data.ranges[i][1] = bearings[i];
     }
+}
+
+// Weigh n poses with a scan of k readings.
+extern "C" void weigh(void *made, const double *poses, int n, const double *ranges, const double *bearings, int k,
+                      double range_min, double range_max, double *weights) {
+    nav2_amcl::LaserData data;
+    fill(data, made, ranges, bearings, k, range_min, range_max);
     pf_sample_t *samples = new pf_sample_t[n];
     for (int j = 0; j < n; ++j) {
         samples[j].weight = 1;
@@ -120,4 +132,66 @@ extern "C" void cast(const signed char *cells, int rows, int cols, const double 
             expected[j * k + i] =
                 map_calc_range(map, poses[3 * j], poses[3 * j + 1], poses[3 * j + 2] + bearings[i], range_max);
     map_free(map);
+}
+
+namespace {
+struct Filter {
+    void *made;
+    pf_t *pf;
+    nav2_amcl::DifferentialMotionModel motion;
+    pf_vector_t odometry;
+    bool moved;
+};
+}  // namespace
+
+// Start a filter of n particles around a pose, with standard deviations of x, y and heading, and the model of prepare.
+// The number of particles is fixed; errors of the KLD bound are the defaults, and no random poses are injected.
+extern "C" void *start(void *made, int n, const double *mean, const double *deviations, const double *alpha, int seed) {
+    Filter *filter = new Filter{made, pf_alloc(n, n, 0, 0, nullptr), {}, pf_vector_zero(), false};
+    srand48(seed);
+    filter->pf->pop_err = 0.05;
+    filter->pf->pop_z = 0.99;
+    pf_vector_t center = pf_vector_zero();
+    pf_matrix_t spread = pf_matrix_zero();
+    for (int i = 0; i < 3; ++i) {
+        center.v[i] = mean[i];
+        spread.m[i][i] = deviations[i] * deviations[i];
+    }
+    pf_init(filter->pf, center, spread);
+    filter->motion.initialize(alpha[0], alpha[1], alpha[2], alpha[3], 0);
+    return filter;
+}
+
+// Move by the odometry, weigh by a scan of k readings, resample, and return the mean of the heaviest cluster.
+extern "C" void step(void *given, const double *odometry, const double *ranges, const double *bearings, int k,
+                     double range_min, double range_max, double *found) {
+    Filter *filter = static_cast<Filter *>(given);
+    pf_vector_t pose, delta;
+    for (int i = 0; i < 3; ++i) {
+        pose.v[i] = odometry[i];
+        delta.v[i] = pose.v[i] - filter->odometry.v[i];
+    }
+    delta.v[2] = nav2_amcl::angleutils::angle_diff(pose.v[2], filter->odometry.v[2]);
+    if (filter->moved) filter->motion.odometryUpdate(filter->pf, pose, delta);
+    filter->odometry = pose;
+    filter->moved = true;
+    nav2_amcl::LaserData data;
+    fill(data, filter->made, ranges, bearings, k, range_min, range_max);
+    data.laser->sensorUpdate(filter->pf, &data);
+    pf_update_resample(filter->pf, nullptr);
+    const int clusters = filter->pf->sets[filter->pf->current_set].cluster_count;
+    double heaviest = 0, weight;
+    for (int i = 0; i < clusters; ++i) {
+        pf_vector_t mean;
+        pf_matrix_t spread;
+        if (!pf_get_cluster_stats(filter->pf, i, &weight, &mean, &spread) || weight <= heaviest) continue;
+        heaviest = weight;
+        for (int j = 0; j < 3; ++j) found[j] = mean.v[j];
+    }
+}
+
+extern "C" void stop(void *given) {
+    Filter *filter = static_cast<Filter *>(given);
+    pf_free(filter->pf);
+    delete filter;
 }

@@ -101,8 +101,15 @@ class Row:
         )  # fmt: skip
 
 
-def title_of(point: Mapping[str, Any], machine: Mapping[str, Any], driver: str = "") -> str:
-    """Name the device of a point: its library, and the processor with its cores or the GPU."""
+def title_of(point: Mapping[str, Any], machine: Mapping[str, Any], driver: str = "", target: str = "") -> str:
+    """Name the device of a point: its library, and the processor with its cores or the GPU.
+
+    Args:
+        point: The point.
+        machine: The machine of its report.
+        driver: The device's driver, which tells OpenCL runtimes apart.
+        target: The processor for which PoCL compiles; ``"haswell"`` has no AVX-512.
+    """
     library = {"opencl": "OpenCL", "warp:cuda": "CUDA", "warp:cpu": "Warp"}
     if driver.startswith("Intel"):
         library["opencl"] = "Intel's OpenCL"
@@ -110,6 +117,7 @@ def title_of(point: Mapping[str, Any], machine: Mapping[str, Any], driver: str =
     if point["kind"] == "gpu":
         return f"{point['device']}, {library[prefix]}"
     made = "PoCL" if "pthread" in point["device"] or "cpu-" in point["device"] else library.get(prefix, "NumPy")
+    made += ", AVX2 only" if target == "haswell" else ""
     cores = 1 if prefix == "warp:cpu" else machine["processors"]
     return f"{cores} core{'s' * (cores > 1)} of an {machine['processor']}, {made}"
 
@@ -124,14 +132,14 @@ def titles_of(
     Args:
         points: The points of a report.
         machine: Its machine.
-        devices: Its devices, whose drivers tell the OpenCL runtimes of one processor apart.
+        devices: Its devices, whose drivers and targets tell the OpenCL runtimes of one processor apart.
     """
-    drivers = {device["selection"]: device["driver"] for device in devices}
+    drivers = {device["selection"]: (device["driver"], device.get("target", "")) for device in devices}
     first: dict[str, Mapping[str, Any]] = {}
     for point in points:
         first.setdefault(point["backend"], point)
     outside = first.pop("outside", None)
-    plain = {name: title_of(point, machine, drivers.get(name, "")) for name, point in first.items()}
+    plain = {name: title_of(point, machine, *drivers.get(name, ())) for name, point in first.items()}
     alike = list(plain.values())
     titles = {name: f"{title}, {name}" if alike.count(title) > 1 else title for name, title in plain.items()}
     if outside is not None:

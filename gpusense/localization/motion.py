@@ -141,8 +141,9 @@ class OdometryMotion:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Make the model from a mapping of its attributes, as ``gpusense fit`` writes; missing ones have their
-        defaults.
+        """Make the model from a mapping of its attributes, as ``gpusense fit`` writes it.
+
+        Missing attributes have their defaults.
 
         Raises:
             TypeError: ``values`` is not a mapping, or a value has the wrong type.

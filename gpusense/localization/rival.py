@@ -1,5 +1,4 @@
-"""A rival of a filter's particles: a second cloud, searched when scans contradict the pose, which must win to replace
-it.
+"""A rival of a filter's particles: a second cloud that is searched when scans contradict the pose.
 
 Sensor resetting (Lenser and Veloso, "Sensor resetting localization for poorly modelled mobile robots" (2000)) and
 augmented MCL (*Probabilistic Robotics* table 8.3) mix new poses into the particles at once. A person in front of the

@@ -108,8 +108,7 @@ class Sums:
                            ends=ends, **numbers)  # fmt: skip
 
     def copies(self, numbers: dict[str, Any], copies: Buffer, drawn: int, stage: int) -> Program:
-        """Return the launches that add up the certain copies of residual resampling; they overwrite the sums of
-        weights.
+        """Return the launches that add up certain copies of residual resampling, and overwrite the sums of weights.
 
         Args:
             numbers: Arguments by name: ends, state, particles, block, blocks.

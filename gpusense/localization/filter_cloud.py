@@ -104,7 +104,8 @@ class Summary(NamedTuple):
     """The state of a filter after a correction.
 
     Attributes:
-        effective_sample_size: Effective sample size of the last stage, at most the number of distinct particles after earlier stages.
+        effective_sample_size: Effective sample size of the last stage, at most the number of distinct particles after
+            earlier stages.
         temperature: Share of the temperature that all stages used.
         degenerate: Whether no particle was possible.
         stages: Number of stages that ran.

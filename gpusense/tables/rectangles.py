@@ -56,9 +56,10 @@ class Planes:
 def planes_of(backend: Backend, rows: int, cols: int) -> Planes:
     """Return the planes of a map on a device.
 
-    GPUs gain most from sectors, since neighbouring rays wait for the slowest of them, and from groups of rows, since their
-    caches limit rays: groups halve what is read. On a map that exceeds the caches, four sectors are no faster than two
-    and take twice the memory. Kernels index the cells of all planes in 32 bits, which limits the number of sectors.
+    GPUs gain most from sectors, since neighbouring rays wait for the slowest of them, and from groups of rows, since
+    their caches limit rays: groups halve what is read. On a map that exceeds the caches, four sectors are no faster
+    than two and take twice the memory. Kernels index the cells of all planes in 32 bits, which limits the number of
+    sectors.
     """
     gpu = backend.info.kind == "gpu"
     sectors = 1 if backend.info.backend == "numpy" else 4 if gpu and rows * cols <= _MANY_CELLS else 2

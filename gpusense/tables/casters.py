@@ -20,7 +20,7 @@ from gpusense.tables.cells import check_size
 from gpusense.tables.directional import directional_table
 from gpusense.tables.distances import NO_OBSTACLE, squared_distances
 from gpusense.tables.lookup_files import read_lookup
-from gpusense.tables.rectangles import empty_rectangles, sectors_of
+from gpusense.tables.rectangles import Planes, empty_rectangles, planes_of
 from gpusense.world import windows
 
 __all__ = ["CASTERS", "Bresenham", "Caster", "Cddt", "Dda", "Exact", "Lookup", "March"]
@@ -39,19 +39,18 @@ class Exact(Caster):
     name = "exact"
     exact = True
     error = "exact: float64 to 1e-12 relative; float32 the same bits on every device"
-    memory = "16 bytes per cell of the reachable map, on GPUs 32, less where that is over 4 GiB"
+    memory = "16 bytes per cell of the reachable map, on GPUs 32 up to 2^25 cells, 8 where that is over 4 GiB"
     precomputation = "empty rectangles, one pass over the map per quadrant"
 
     def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
         """See Caster.prepare."""
-        rows, cols = inputs.obstacles.shape
-        sectors = sectors_of(backend, rows, cols)
-        flags = frozenset({f"SECTORS_{sectors}"} if sectors > 1 else ())
-        return Table(empty_rectangles(backend, inputs.obstacles, sectors), 8 * sectors * (rows + 2) * (cols + 2), flags)
+        planes = planes_of(backend, *inputs.obstacles.shape)
+        table = empty_rectangles(backend, inputs.obstacles, planes)
+        return Table(table, 2 * planes.entries(*inputs.obstacles.shape), planes.flags)
 
     def refresh(self, backend: Backend, inputs: CasterInput, table: Buffer, changed: windows.Window) -> bool:
         """See Caster.refresh."""
-        empty_rectangles(backend, inputs.obstacles, sectors_of(backend, *inputs.obstacles.shape), table, changed)
+        empty_rectangles(backend, inputs.obstacles, planes_of(backend, *inputs.obstacles.shape), table, changed)
         return True
 
 
@@ -233,7 +232,7 @@ class Lookup(Caster):
         """Cast a ray per bin and cell, a strip of rows per launch."""
         rows, cols = inputs.obstacles.shape
         table = backend.empty(rows * cols * self.bins, _SHORT)
-        rectangles = empty_rectangles(backend, inputs.obstacles, 1)
+        rectangles = empty_rectangles(backend, inputs.obstacles, Planes(1))
         turns = 2 * math.pi * np.arange(self.bins) / self.bins
         ray = backend.upload(np.stack([np.cos(turns), np.sin(turns)], axis=1).astype(_SINGLE))
         fill = backend.compile("fill_lookup", frozenset({"OUTSIDE_OCCUPIED"} if inputs.outside == "occupied" else ()))

@@ -4,7 +4,8 @@
 // the middle of the sector stays longest. After anisotropic Chebyshev distance maps (Deakin and Knackstedt 2020), which
 // have squares. Planes are padded by a ring of zeros, so a walk that leaves the grid stops. Quadrant q extends to (+x,
 // +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from flat to steep, with a plane for
-// each.
+// each. Planes have one row after the other, or groups of rows: a group has the cells of its first column, then those
+// of the next one, so that cells above one another lie as close together as those beside one another.
 //
 // Planes can be updated after a change of the cells in rows [top, bottom) and columns [left, right) of the map: only
 // cells whose rectangles can contain one of these are computed. For new planes all cells have changed. The input has a
@@ -21,6 +22,11 @@
 
 // Return the index of a cell in a padded plane.
 int padded(const int row, const int col, const int cols) { return (row + 1) * (cols + 2) + col + 1; }
+
+// Return the index of a cell in a padded plane of groups of rows.
+int padded_in_groups(const int row, const int col, const int cols, const int group) {
+    return (row + 1) / group * (cols + 2) * group + (col + 1) * group + (row + 1) % group;
+}
 
 // Return the first cell along an axis whose rectangle can contain the cell low or one beyond it. Rectangles extend to
 // larger (way 1) or smaller (way -1) indices.
@@ -110,7 +116,8 @@ kernel void rectangles_scan(ARGUMENTS) {
     const int col = reach_begin(dx, left) + get_global_id(0), row = reach_begin(dy, top) + get_global_id(1);
     if (col >= reach_end(dx, right, cols) || row >= reach_end(dy, bottom, rows)) return;
     global const uchar *run = runs + (long)(quadrant & 1) * band * cols + (long)(row - first) * cols + col;
-    global ushort *out = rectangles + (long)quadrant * sectors * (rows + 2) * (cols + 2) + padded(row, col, cols);
+    const long plane = (long)lines * (cols + 2);
+    global ushort *out = rectangles + quadrant * sectors * plane + padded_in_groups(row, col, cols, group);
     const int room = min(dy > 0 ? rows - row : row + 1, LONGEST);
     const long step = (long)dy * cols;
     int width = LONGEST, sector = 0, height = 1;
@@ -130,7 +137,7 @@ kernel void rectangles_scan(ARGUMENTS) {
         while (sector < sectors && narrower * middle.x < height * middle.y) {
             const int higher = narrower * middle.x > (height - 1) * middle.y;
             const int sides = higher ? narrower + 256 * height : height > 1 ? width + 256 * (height - 1) : OCCUPIED;
-            out[(long)sector * (rows + 2) * (cols + 2)] = (ushort)sides;
+            out[sector * plane] = (ushort)sides;
             middle = slope(sectors, ++sector);
         }
         width = narrower;

@@ -21,9 +21,11 @@ _NO_FLAGS: frozenset[str] = frozenset()
 # The kernel file ``rectangles`` has the same numbers.
 RECTANGLE_REACH = 254
 _STACK = 1024
-# Rows of a group, and cells of the largest map of four sectors.
+# Rows of a group.
 ROWS = 8
-_MANY_CELLS = 1 << 25
+# Cells of the largest map whose planes have single rows, and of the largest one with four sectors, on GPUs.
+_CACHED = 1 << 23
+_FOUR_SECTORS = 1 << 25
 
 
 @dataclass(frozen=True)
@@ -56,19 +58,18 @@ class Planes:
 def planes_of(backend: Backend, rows: int, cols: int) -> Planes:
     """Return the planes of a map on a device.
 
-    GPUs gain most from sectors, since neighbouring rays wait for the slowest of them, and from groups of rows, since
-    their caches limit rays: groups halve what is read. On a map that exceeds the caches, four sectors are no faster
-    than two and take twice the memory. Kernels index the cells of all planes in 32 bits, which limits the number of
-    sectors.
+    GPUs gain most from sectors, since neighbouring rays wait for the slowest one. Where a GPU's caches do not hold the
+    planes, its memory limits rays, and groups of rows halve what is read; on larger maps four sectors are no faster
+    than two and take twice the memory. Kernels index the cells of all planes in 32 bits, which limits the sectors.
     """
-    gpu = backend.info.kind == "gpu"
-    sectors = 1 if backend.info.backend == "numpy" else 4 if gpu and rows * cols <= _MANY_CELLS else 2
+    gpu, cells = backend.info.kind == "gpu", rows * cols
+    sectors = 1 if backend.info.backend == "numpy" else 4 if gpu and cells <= _FOUR_SECTORS else 2
     while sectors > 1 and (
         4 * sectors * (rows + ROWS + 2) * (cols + 4) >= 1 << 31
         or 8 * sectors * (rows + ROWS + 2) * (cols + 4) > backend.info.max_buffer
     ):
         sectors //= 2
-    return Planes(sectors, ROWS if gpu else 1)
+    return Planes(sectors, ROWS if gpu and cells > _CACHED else 1)
 
 
 def empty_rectangles(

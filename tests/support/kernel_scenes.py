@@ -19,7 +19,7 @@ from gpusense.tables.rectangles import ROWS, Planes, empty_rectangles
 PRECISIONS = (np.float32, np.float64)
 LIMIT, RESOLUTION = 37.3, 0.05
 UNREACHABLE = (1 << 31) - 1
-# Forms of planes of empty rectangles on every device, and one of those of GPUs.
+# Forms of planes of empty rectangles on every device, and that of large maps on GPUs.
 PLANES = (Planes(1), Planes(2), Planes(4))
 GROUPED = Planes(2, ROWS)
 SCALE = RangeScale(LIMIT, RESOLUTION, LIMIT * RESOLUTION)

@@ -219,16 +219,17 @@ def test_the_page_of_casters_mentions_every_method_and_knob():
 @pytest.mark.parametrize(
     ("kind", "side", "buffer", "form"),
     [
-        ("gpu", 2000, 1 << 34, Planes(4, 8)),
+        ("gpu", 2000, 1 << 34, Planes(4)),
+        ("gpu", 4000, 1 << 34, Planes(4, 8)),
         ("gpu", 6000, 1 << 34, Planes(2, 8)),
         ("gpu", 20_000, 1 << 36, Planes(1, 8)),
-        ("gpu", 2000, 1 << 26, Planes(2, 8)),
+        ("gpu", 2000, 1 << 26, Planes(2)),
         ("cpu", 2000, 1 << 34, Planes(2)),
         ("cpu", 20_000, 1 << 36, Planes(1)),
     ],
 )
 def test_planes_fit_indices_buffers_and_caches(kind, side, buffer, form):
-    """Indices have 32 bits; a GPU has rows in groups, and four sectors where its caches hold the planes."""
+    """Indices have 32 bits; a GPU has single rows and four sectors where its caches hold the planes."""
     info = dataclasses.replace(get_backend("numpy").info, kind=kind, backend="opencl", max_buffer=buffer)
     planes = planes_of(SimpleNamespace(info=info), side, side)
     assert planes == form

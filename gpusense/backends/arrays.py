@@ -45,8 +45,8 @@ def to_host(array: object, name: str = "poses") -> object:
     """Return a NumPy view of an array of another library in host memory; other objects as they are.
 
     Raises:
-        TypeError: a tensor whose gradients are recorded.
-        ValueError: a masked value.
+        TypeError: A tensor whose gradients are recorded.
+        ValueError: A masked value.
     """
     if isinstance(array, (np.ndarray, list, tuple)):
         return masks.unmasked(name, array)
@@ -71,8 +71,8 @@ def _adopt(array: Any, backend: Backend, name: str, *, in_place: bool = False) -
     """Return an array on the device as a buffer of the backend.
 
     Raises:
-        TypeError: the backend cannot read it.
-        ValueError: see Backend.adopt.
+        TypeError: The backend cannot read it.
+        ValueError: See Backend.adopt.
     """
     if isinstance(array, Adopted):
         return array
@@ -90,8 +90,8 @@ def host_poses(array: object, name: str, scans: int | None = None) -> tuple[np.n
     The poses are C-contiguous float64 numbers. NaN and infinities are found by the bounds, which calls need anyway.
 
     Raises:
-        TypeError: not numbers.
-        ValueError: another shape, or a value that is not finite.
+        TypeError: Not numbers.
+        ValueError: Another shape, or a value that is not finite.
     """
     read = array if type(array) is np.ndarray else to_host(array, name)
     shape = ("N", 3) if scans is None else (scans, "N", 3)
@@ -155,8 +155,8 @@ def adopt_poses(
         A flat buffer, the number of all poses, whether they are float32, and the owner of the memory.
 
     Raises:
-        TypeError: not float32 or float64, or not on the backend's device.
-        ValueError: another shape, not C-contiguous, or misaligned where no copy may be made.
+        TypeError: Not float32 or float64, or not on the backend's device.
+        ValueError: Another shape, not C-contiguous, or misaligned where no copy may be made.
     """
     adopted = _adopt(array, backend, name, in_place=in_place)
     if not backend.info.float64:
@@ -172,8 +172,8 @@ def adopt_readings(array: object, backend: Backend, beams: int, *, in_place: boo
     """Return (K,) ranges on the device.
 
     Raises:
-        TypeError: not float32 or float64, or not on the backend's device.
-        ValueError: another shape, not C-contiguous, or misaligned where no copy may be made.
+        TypeError: Not float32 or float64, or not on the backend's device.
+        ValueError: Another shape, not C-contiguous, or misaligned where no copy may be made.
     """
     adopted = _adopt(array, backend, "ranges", in_place=in_place)
     if adopted.shape != (beams,):
@@ -186,8 +186,8 @@ def _check_numbers(adopted: Adopted, name: str) -> None:
     """Refuse numbers of another type than float32 or float64, and arrays that are not C-contiguous.
 
     Raises:
-        TypeError: another type.
-        ValueError: not C-contiguous.
+        TypeError: Another type.
+        ValueError: Not C-contiguous.
     """
     if adopted.dtype not in (np.float32, np.float64):
         dtype = adopted.dtype.name if adopted.dtype.isnative else adopted.dtype.str
@@ -225,8 +225,8 @@ def check_out(out: object, shape: tuple[int, ...], real: np.dtype, backend: Back
     """Return the memory of ``out=``: a NumPy array, or a flat buffer on the device; None where ``out`` is None.
 
     Raises:
-        TypeError: not an array of the precision in the memory where the poses are.
-        ValueError: another shape, not C-contiguous, or read-only.
+        TypeError: Not an array of the precision in the memory where the poses are.
+        ValueError: Another shape, not C-contiguous, or read-only.
     """
     if out is None:
         return None
@@ -253,8 +253,8 @@ def _check_result(
     """Hold ``out`` to its rules.
 
     Raises:
-        TypeError: another precision.
-        ValueError: another shape, or of no use for writing.
+        TypeError: Another precision.
+        ValueError: Another shape, or of no use for writing.
     """
     if dtype != real:
         raise TypeError(f"out: must hold {real.name}, got {dtype.name}")

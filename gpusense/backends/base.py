@@ -77,7 +77,7 @@ class Backend(ABC):
         """Allocate a buffer of ``count`` numbers, cleared with ``zero``.
 
         Raises:
-            MemoryError: the device cannot hold it.
+            MemoryError: The device cannot hold it.
         """
 
     @abstractmethod
@@ -96,7 +96,7 @@ class Backend(ABC):
         """Return ``count`` numbers of a buffer from number ``first`` on as ``dtype``, without a copy.
 
         Raises:
-            ValueError: parts cannot begin there; see ``alignment``.
+            ValueError: Parts cannot begin there; see ``alignment``.
         """
 
     # ---- programs
@@ -158,7 +158,7 @@ class Backend(ABC):
         """Refuse a forked child of the process that opened the device.
 
         Raises:
-            RuntimeError: this process is such a child.
+            RuntimeError: This process is such a child.
         """
 
     # ---- arrays of other libraries in the memory of the device
@@ -171,8 +171,8 @@ class Backend(ABC):
         """Return an array of another library without a copy; a misaligned one is copied unless ``in_place``.
 
         Raises:
-            TypeError: it is not in this device's memory, or does not hold numbers.
-            ValueError: it must be used in place, and cannot.
+            TypeError: It is not in this device's memory, or does not hold numbers.
+            ValueError: It must be used in place, and cannot.
         """
         raise TypeError(f"{name}: must be in host memory for {self.info.selection}, got an array on a device")
 

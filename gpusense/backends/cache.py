@@ -131,7 +131,7 @@ def _write(folder: Path, name: str, data: bytes) -> None:
     """Write an entry by rename, and evict old entries where the folder exceeds its limit.
 
     Raises:
-        OSError: the folder does not take it, or something else than a file is in its place.
+        OSError: The folder does not take it, or something else than a file is in its place.
     """
     with contextlib.suppress(FileNotFoundError):
         if not stat.S_ISREG(os.lstat(folder / name).st_mode):

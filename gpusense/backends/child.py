@@ -83,7 +83,7 @@ def time_limit() -> float:
     """Return the time limit of a child [s]: ``$GPUSENSE_PROOF_SECONDS``.
 
     Raises:
-        ValueError: the variable is not a positive number.
+        ValueError: The variable is not a positive number.
     """
     text = os.environ.get("GPUSENSE_PROOF_SECONDS", "")
     try:

@@ -74,8 +74,8 @@ def own_folder(place: Path) -> Path:
     """Return gpusense's folder in a place; make it where it is absent.
 
     Raises:
-        UnsafeFolderError: another user could change it, or it holds files and no marker.
-        OSError: it cannot be made.
+        UnsafeFolderError: Another user could change it, or it holds files and no marker.
+        OSError: It cannot be made.
     """
     folder = Path(os.path.realpath(place)) / OWN
     key = str(folder), _user()
@@ -90,8 +90,8 @@ def private_folder(place: Path) -> Path:
     """Return a folder of this user alone, made where it is absent.
 
     Raises:
-        UnsafeFolderError: another user could change it.
-        OSError: it cannot be made.
+        UnsafeFolderError: Another user could change it.
+        OSError: It cannot be made.
     """
     folder = Path(os.path.realpath(place.parent)) / place.name
     make_private(folder)
@@ -124,8 +124,8 @@ def _mark(folder: Path) -> None:
     only, and a marker that was begun is completed by whoever finds nothing else.
 
     Raises:
-        UnsafeFolderError: the folder holds something and no marker.
-        OSError: the marker cannot be written.
+        UnsafeFolderError: The folder holds something and no marker.
+        OSError: The marker cannot be written.
     """
     if _marker(folder) == _MARKER_TEXT:
         return

@@ -57,7 +57,7 @@ class ProcessBound:
         """Refuse a forked child, where the driver would hang or corrupt memory.
 
         Raises:
-            RuntimeError: this process is not the one that opened the device.
+            RuntimeError: This process is not the one that opened the device.
         """
         if os.getpid() != self._process:
             raise RuntimeError(

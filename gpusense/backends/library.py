@@ -80,6 +80,6 @@ class Library(ABC):
         """Return a backend that works on a user's queue.
 
         Raises:
-            ValueError: the queue is not an in-order queue.
+            ValueError: The queue is not an in-order queue.
         """
         raise NotImplementedError(f"{type(self).__name__} takes no queues of users")

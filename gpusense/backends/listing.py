@@ -74,7 +74,7 @@ def lookup(selection: str) -> tuple[Library, BackendInfo, Any]:
     """Return the library, the description and the handle of a device by its selection string.
 
     Raises:
-        ValueError: the library cannot be imported, or has no such device.
+        ValueError: The library cannot be imported, or has no such device.
     """
     library, reason = registry.load(BY_NAME[selection.partition(":")[0]])
     if library is None:
@@ -98,7 +98,7 @@ def open_device(info: BackendInfo) -> Backend:
     """Open a device without a verdict, with the lanes and precisions that ``info`` says.
 
     Raises:
-        RuntimeError: its selection string means another device.
+        RuntimeError: Its selection string means another device.
     """
     library, other, handle = lookup(info.selection)
     if (other.name, other.driver) != (info.name, info.driver):

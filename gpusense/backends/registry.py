@@ -134,7 +134,7 @@ def set_up_child(name: str, setup: Any) -> None:
     """Prepare a backend in a child as its parent's is; see :meth:`gpusense.backends.library.Library.child_setup`.
 
     Raises:
-        RuntimeError: the library cannot be imported.
+        RuntimeError: The library cannot be imported.
     """
     library, reason = load(BY_NAME[name])
     if library is None:

@@ -41,7 +41,7 @@ def scratch_folder(*, executable: bool = True) -> Path:
         executable: Whether the system must let code run that is loaded from there; some drivers read files instead.
 
     Raises:
-        OSError: there is no such folder.
+        OSError: There is no such folder.
     """
     if not executable:
         with contextlib.suppress(OSError):
@@ -94,7 +94,7 @@ def _make(parent: Path, *, executable: bool) -> Path:
     """Make a folder below ``parent`` that other processes do not remove while this one lives.
 
     Raises:
-        OSError: it is not writable, has too little room, could be replaced by other users, or no code may run from it.
+        OSError: It is not writable, has too little room, could be replaced by other users, or no code may run from it.
     """
     folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=parent))
     with contextlib.ExitStack() as failing:
@@ -122,7 +122,7 @@ def _lock(file: Any) -> None:
     """Lock a file until it is closed or this process ends.
 
     Raises:
-        OSError: another process has locked it, or the system has no such locks.
+        OSError: Another process has locked it, or the system has no such locks.
     """
     try:
         import fcntl
@@ -135,7 +135,7 @@ def _check_room(folder: Path, *, executable: bool) -> None:
     """Write a file to check the room of a folder; the figures of a file system do not show quotas.
 
     Raises:
-        OSError: the folder does not take it, or the system does not let code run from it.
+        OSError: The folder does not take it, or the system does not let code run from it.
     """
     probe = folder / "probe"
     with open(probe, "w+b") as file:
@@ -152,7 +152,7 @@ def _check_code(handle: int) -> None:
     """Map a page of a file as code, as loading a library does.
 
     Raises:
-        OSError: the system refuses, as on a file system that is mounted without execution.
+        OSError: The system refuses, as on a file system that is mounted without execution.
     """
     if not sys.platform.startswith("linux"):
         return
@@ -182,7 +182,7 @@ def _remove_killed(folder: Path) -> None:
     """Remove the folder of a killed process: it is old and private, and its lock file is whole and free.
 
     Raises:
-        OSError: it is not.
+        OSError: It is not.
     """
     if time.time() - folder.lstat().st_mtime < _STALE:
         return

@@ -60,10 +60,10 @@ def get_backend(selection: Selection = "auto") -> Backend:
         selection: See :mod:`gpusense.backends.selection`; a backend is returned as it is.
 
     Raises:
-        TypeError: the selection is neither a string nor a queue.
-        ValueError: the selection names nothing, or a device that is absent or unusable, or is a queue that is not an
+        TypeError: The selection is neither a string nor a queue.
+        ValueError: The selection names nothing, or a device that is absent or unusable, or is a queue that is not an
             in-order queue. No other device is taken in its place, but for ``"auto"``.
-        RuntimeError: the device was opened before this process was forked.
+        RuntimeError: The device was opened before this process was forked.
 
     Example:
         >>> from gpusense.backends import get_backend
@@ -143,7 +143,7 @@ def _open_fastest() -> Backend:
     """Open the fastest device that opens, and report those that were passed over.
 
     Raises:
-        ValueError: there is none, not even NumPy.
+        ValueError: There is none, not even NumPy.
     """
     chain = Chain()
     with notices.held() as lines:
@@ -168,7 +168,7 @@ def _open(selection: str) -> Backend:
     """Open the device of a listed selection string.
 
     Raises:
-        ValueError: it is unusable.
+        ValueError: It is unusable.
     """
     library, info, handle = listing.lookup(selection)
     verdict = listing.verdict_on(info, handle, library)
@@ -194,7 +194,7 @@ def _library_of_queue(candidate: object) -> tuple[Library, int]:
     """Return the library and the key of a user's queue.
 
     Raises:
-        TypeError: it is no queue.
+        TypeError: It is no queue.
     """
     kinds = [entry for entry in ENTRIES if entry.queue]
     for entry in kinds:
@@ -210,7 +210,7 @@ def _open_queue(queue: Any, library: Library) -> Backend:
     """Open a user's queue.
 
     Raises:
-        ValueError: its device is unusable, or it is not an in-order queue.
+        ValueError: Its device is unusable, or it is not an in-order queue.
     """
     info, handle = library.device_of_queue(queue)
     verdict = proof.trust(info)

@@ -127,7 +127,7 @@ class OpenCLBackend(ProcessBound, Backend):
         """Refuse a buffer that is larger than the device's largest.
 
         Raises:
-            MemoryError: it is.
+            MemoryError: It is.
         """
         if size > self.info.max_buffer:
             raise MemoryError(
@@ -267,8 +267,8 @@ class OpenCLBackend(ProcessBound, Backend):
         """Build the program of a kernel file; return it with its key in the cache.
 
         Raises:
-            ValueError: the device lacks float64 and the program needs it.
-            RuntimeError: the driver does not compile it.
+            ValueError: The device lacks float64 and the program needs it.
+            RuntimeError: The driver does not compile it.
         """
         if "FLOAT64" in flags and not self.info.float64:
             raise ValueError(f"precision: must be 'float32' on {self.info.name}, which has no float64, got 'float64'")

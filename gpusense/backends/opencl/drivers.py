@@ -77,7 +77,7 @@ def platforms() -> list[cl.Platform]:
     """Return the platforms of all drivers that can be loaded.
 
     Raises:
-        RuntimeError: no combination of drivers can be loaded.
+        RuntimeError: No combination of drivers can be loaded.
     """
     global _loaded, _pocl_came_first
     with _lock:
@@ -229,7 +229,7 @@ def _variables(drivers: tuple[Driver, ...] | None, *, kernels: bool = True) -> d
     """Return the variables by which the loader loads these drivers only, and PoCL keeps kernels in scratch.
 
     Raises:
-        OSError: no folder takes files.
+        OSError: No folder takes files.
     """
     variables = {}
     with contextlib.suppress(OSError):
@@ -250,7 +250,7 @@ def _pocl_folder(*, kernels: bool) -> Path:
     """Return the folder for PoCL; where no code may run it takes part in no run, and keeps PoCL out of other folders.
 
     Raises:
-        OSError: no folder takes files.
+        OSError: No folder takes files.
     """
     if kernels:
         with contextlib.suppress(OSError):

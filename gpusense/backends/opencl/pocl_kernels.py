@@ -131,7 +131,7 @@ def pocl_kernels() -> PoclKernels:
     """Return the kernels of this process.
 
     Raises:
-        OSError: no folder takes files.
+        OSError: No folder takes files.
     """
     folder = scratch_folder() / "pocl"
     folder.mkdir(exist_ok=True)

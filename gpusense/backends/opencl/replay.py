@@ -82,8 +82,8 @@ class OpenCLRecording(Recording):
         """Return a user's queue for the stream of a call.
 
         Raises:
-            TypeError: it is no queue, or one of another context or device.
-            ValueError: it is not an in-order queue.
+            TypeError: It is no queue, or one of another context or device.
+            ValueError: It is not an in-order queue.
         """
         same = isinstance(stream, cl.CommandQueue) and (stream.context, stream.device) == (
             self._queue.context,

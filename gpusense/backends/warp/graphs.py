@@ -139,7 +139,7 @@ class GraphCache:
         """Return the graph of steps.
 
         Raises:
-            RuntimeError: the driver does not capture them.
+            RuntimeError: The driver does not capture them.
         """
         if self._device.is_cuda and self._stream is None:
             self._stream = wp.Stream(self._device)

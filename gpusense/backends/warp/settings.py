@@ -47,7 +47,7 @@ def _folder() -> Path:
     """Return this process's folder for Warp's kernels, which Warp reads and does not map as code.
 
     Raises:
-        OSError: no folder takes files.
+        OSError: No folder takes files.
     """
     folder = scratch_folder(executable=False) / "warp"
     folder.mkdir(exist_ok=True)

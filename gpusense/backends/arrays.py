@@ -1,4 +1,4 @@
-"""Arrays of other libraries: on a device they are used in place, in host memory they become NumPy views.
+"""Arrays of other libraries: device arrays are used in place, host arrays become NumPy views.
 
 Two protocols are read: DLPack (PyTorch, CuPy, JAX, Warp, NumPy) and the CUDA array interface. The registry of backends
 names the libraries whose arrays have neither.
@@ -21,9 +21,9 @@ from gpusense.backends.registry import entry_of_array, selection_for
 
 # DLPack's numbers for memory that the processor reads: host memory, also pinned for CUDA or ROCm.
 _HOST = (1, 3, 11)
-# Poses that make a row whose numbers are reduced side by side, and poses below which they are transposed instead.
+# Number of poses in a row whose numbers are reduced side by side, and number below which poses are transposed instead.
 _WIDTH, _FEW = 256, 1 << 14
-# Least poses whose bounds are worth a thread, and most threads: more wait for one another.
+# Least number of poses whose bounds are worth a thread, and largest number of threads: more wait for each other.
 _SHARE, _MOST_SHARES = 1 << 16, 4
 
 Bounds = tuple[tuple[float, ...], tuple[float, ...]]
@@ -60,7 +60,7 @@ def to_host(array: object, name: str = "poses") -> object:
 
 
 def copied_to_host(array: object, backend: Backend, name: str) -> object:
-    """Return readings as a NumPy array, NaN where masked; those on the device are copied, after its work has ended."""
+    """Return readings as a NumPy array, NaN where masked; device arrays are copied after the device has finished."""
     array = masks.filled(array)
     if not on_device(array):
         return to_host(array, name)
@@ -87,7 +87,7 @@ def _adopt(array: Any, backend: Backend, name: str, *, in_place: bool = False) -
 def host_poses(array: object, name: str, scans: int | None = None) -> tuple[np.ndarray, Bounds]:
     """Return (N, 3) poses in host memory, or the poses of S scans in sequence, and their bounds.
 
-    The poses are C-contiguous float64 numbers. NaN and infinities are found by the bounds, which calls need anyway.
+    The poses are C-contiguous float64 numbers. The bounds, which calls need anyway, reveal NaN and infinities.
 
     Raises:
         TypeError: Not numbers.
@@ -106,10 +106,10 @@ def host_poses(array: object, name: str, scans: int | None = None) -> tuple[np.n
 
 
 def bounds_of(poses: np.ndarray) -> Bounds:
-    """Return the least and the largest of each column of (N, 3) poses, 0 for no poses; NaN where a column holds one.
+    """Return the minimum and maximum of each column of (N, 3) poses; 0 without poses, NaN for a column with NaN.
 
-    Columns of three are slow to reduce; rows are not. Few poses are transposed. Of many, each 256 neighbours are a row,
-    and rows are reduced one after the other, by several threads where there are very many.
+    Columns of three are slow to reduce; rows are not. Few poses are transposed. Many poses form rows of 256 neighbours,
+    and rows are reduced one after the other, by several threads for very many poses.
     """
     count = len(poses)
     if not count:
@@ -128,7 +128,7 @@ def bounds_of(poses: np.ndarray) -> Bounds:
             helpers.finish(started)
         low = np.minimum.reduce([part[0] for part in parts])
         high = np.maximum.reduce([part[1] for part in parts])
-    # Both keep NaN.
+    # Both functions propagate NaN.
     return tuple(low.tolist()), tuple(high.tolist())
 
 
@@ -250,7 +250,7 @@ def check_out(out: object, shape: tuple[int, ...], real: np.dtype, backend: Back
 def _check_result(
     dtype: np.dtype, shape: tuple[int, ...], usable: bool, real: np.dtype, wanted: tuple[int, ...]
 ) -> None:
-    """Hold ``out`` to its rules.
+    """Check ``out`` against its rules.
 
     Raises:
         TypeError: Another precision.

@@ -4,7 +4,7 @@ The place is ``$GPUSENSE_CACHE_DIR``, else ``$XDG_CACHE_HOME/gpusense``, else th
 ``~/.cache/gpusense`` on Linux, ``~/Library/Caches/gpusense`` on macOS, and below ``%LOCALAPPDATA%`` on Windows.
 ``GPUSENSE_CACHE=off`` switches the cache off. A place may hold files of other programs: gpusense reads, writes and
 deletes only in the folder ``gpusense-kernels`` there, which has a marker file. Kernels are code, so it must be this
-user's, and no other user may write in it or rename a folder above it, whichever variable chose the place.
+user's, and no other user may write in it or rename a folder above it, whatever variable chose the place.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _MARKER_TEXT = (
 )
 # The folders that were checked, for a user; no other user can change them afterwards.
 _checked: set[tuple[str, int]] = set()
-# Folders that were reported.
+# Folders that have been reported.
 _reported: set[str] = set()
 
 
@@ -99,7 +99,7 @@ def private_folder(place: Path) -> Path:
 
 
 def report(place: Place, error: OSError) -> None:
-    """Report once that a place is not used, or takes no files."""
+    """Report once that a place is not used or not writable."""
     if str(place.folder) not in _reported:
         _reported.add(str(place.folder))
         rule = reason_of(error)
@@ -120,8 +120,8 @@ def _user() -> int:
 def _mark(folder: Path) -> None:
     """Write the marker of an empty folder; check that any other folder has it.
 
-    Between any two steps this process may be killed, or another process may look. So files come after a whole marker
-    only, and a marker that was begun is completed by whoever finds nothing else.
+    This process may be killed, or another may look, between any two steps. Therefore files are written only after a
+    complete marker, and a process that finds only an unfinished marker completes it.
 
     Raises:
         UnsafeFolderError: The folder holds something and no marker.
@@ -145,7 +145,7 @@ def _mark(folder: Path) -> None:
 
 
 def _marker(folder: Path) -> bytes | None:
-    """Return the contents of a folder's marker: empty where there is none, None where its place is taken."""
+    """Return the contents of a folder's marker: empty without one, None if something else is in its place."""
     try:
         return read_regular(folder / MARKER, 4096)
     except FileNotFoundError:

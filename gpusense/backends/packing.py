@@ -10,12 +10,12 @@ import zipfile
 import zlib
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-# Of the files of one entry, in all.
+# Largest total size of the files of an entry.
 _MOST_BYTES = 256 << 20
 
 
 class RefusedError(ValueError):
-    """Packed files that are whole and not wanted."""
+    """Packed files that are intact but exceed a limit."""
 
 
 def pack(files: dict[str, bytes]) -> bytes:

@@ -1,9 +1,9 @@
 """A folder of this process for the compiled kernels of drivers, which is removed when the process ends.
 
-Drivers do not check the files in their folders: one that another process left half-written, or that a disk has damaged,
-ends the run. So every process begins with an empty folder, and only files whose checksums hold are copied into
-it (see :mod:`gpusense.backends.cache`). Only this user may change it. Its name, owner and lock file distinguish it from
-other folders, which are never removed.
+Drivers do not check the files in their folders: a half-written or damaged file ends the run. Therefore every process
+begins with an empty folder, and only files whose checksums hold are copied into it (see
+:mod:`gpusense.backends.cache`). Only this user may change it. Its name, owner and lock file distinguish it from other
+folders, which are never removed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from gpusense.backends import folders
 _PREFIX = "gpusense-run-"
 _NAME = re.compile(rf"{_PREFIX}[a-z0-9_]{{8}}")
 _LOCK_FILE = "lock"
-# Bytes that must be free: kernels of a long run, with room for the compiler's temporary files.
+# Free space that is required [bytes]: for the kernels of a long run and the compiler's temporary files.
 _NEEDED = 16 << 20
 # Seconds after which a folder whose lock is free belongs to a process that was killed.
 _STALE = 600
@@ -38,7 +38,7 @@ def scratch_folder(*, executable: bool = True) -> Path:
     """Return this process's folder.
 
     Args:
-        executable: Whether the system must let code run that is loaded from there; some drivers read files instead.
+        executable: Whether the system must allow code from there to run; some drivers only read the files.
 
     Raises:
         OSError: There is no such folder.
@@ -189,7 +189,7 @@ def _remove_killed(folder: Path) -> None:
     check_private(folder)
     names, expected = os.listdir(folder), _lock_text(folder.name)
     if not names:
-        # Killed before it made the lock file. Only an empty folder is removed by this.
+        # The process was killed before it made the lock file. This removes only an empty folder.
         folder.rmdir()
         return
     found = read_regular(folder / _LOCK_FILE, len(expected))

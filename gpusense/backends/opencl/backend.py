@@ -240,7 +240,7 @@ class OpenCLBackend(ProcessBound, Backend):
             self.synchronize()
 
     def enqueue(self, kernel: cl.Kernel, size: tuple[int, ...], group: tuple[int, ...]) -> None:
-        """Queue a launch of a kernel whose arguments are set."""
+        """Enqueue a launch of a kernel whose arguments are set."""
         # Before, so that an interrupt leaves no launch uncounted; and after, for a thread that waits in between.
         with self._count:
             self._queued += 1
@@ -291,7 +291,7 @@ class OpenCLBackend(ProcessBound, Backend):
         return program, key
 
     def _kept(self, source: str) -> cl.Program | None:
-        """Return the program as an earlier run compiled it; None where there is none that the driver accepts."""
+        """Return the program as an earlier run compiled it; None if the driver accepts none."""
         binary = None if self._cache is None else self._cache.load(source, self.options)
         if self._cache is None or binary is None:
             return None

@@ -65,7 +65,7 @@ def trouble() -> str:
 
 @contextlib.contextmanager
 def settings(*, kernels: bool = True) -> Iterator[None]:
-    """Switch off Warp's greeting and progress and set this process's folder of kernels; restore all on leaving."""
+    """Switch off Warp's greeting and progress and set this process's folder of kernels; restore everything on exit."""
     with LOCK:
         changed: dict[str, Any]
         if hasattr(wp.config, "log_level"):

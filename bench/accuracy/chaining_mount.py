@@ -33,7 +33,7 @@ from common import make_parser, parse, publish, table
 LASERS = ("jarvis-s3000", "jarvis-nav350")
 LENGTH = 5.0
 # Logs with raw odometry, and the length of motions to which mounts are fitted [m].
-LOGS = (*LASERS, "olin", "aces", "csail", "fr079")
+LOGS = (*LASERS, "olin", "aces", "csail")
 MOTION = 0.5
 # First steps of the search [m, m, rad, s].
 STEPS = (0.02, 0.02, 0.01, 0.03)

@@ -1,4 +1,4 @@
-"""How far the poses of two scans may have drifted apart: covariances of relative poses in a pose graph."""
+"""Drift between the poses of two scans: covariances of relative poses in a pose graph."""
 
 from __future__ import annotations
 
@@ -13,28 +13,29 @@ from gpusense.chaining.links import CLOSURE, Links
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Most poses whose joint covariance is kept; in a longer graph each stands for those after it. At most this share are
-# sides of steps whose variance is this many times the usual one, so that breaks of the chain are seen.
+# Most poses whose joint covariance is kept; in a longer graph each represents the poses up to the next one. At most
+# this share are sides of steps whose variance is this many times the usual one, so that breaks of the chain are
+# represented.
 _ANCHORS, _BREAKS, _LOOSE = 300, 0.4, 10.0
-# Lever [m] with which variances of headings count beside those of positions.
+# Lever by which variances of headings are compared with variances of positions [m].
 _LEVER = 3.0
 # Columns of the inverse that are solved for at once.
 _COLUMNS = 192
-# Damping [1/m^2, 1/rad^2]: a direction that no link observes has a variance of the inverse.
+# Damping [1/m^2, 1/rad^2]; its inverse is the variance along a direction that no link observes.
 DAMPING = 1e-6
 
 
 class Drift:
     """Covariances of relative poses of a solved pose graph.
 
-    In a graph of more poses than are kept the others are eliminated from its local links. Its closures count as links
-    between kept poses, with the covariance of the steps in between, so the time is linear in the number of poses
-    however many closures there are.
+    In a graph with more poses than are kept, all remaining poses are eliminated from its local links. Its closures
+    become links between kept poses, widened by the covariance of the steps in between, so the time is linear in the
+    number of poses for any number of closures.
 
     Args:
         solution: The poses and links.
-        most: Most poses whose joint covariance is kept, at least 3; another pose takes the covariance of the nearest
-            kept one before it.
+        most: Most poses whose joint covariance is kept, at least 3; any other pose takes the covariance of the nearest
+            kept pose before it.
 
     Attributes:
         anchors: (A,) numbers of the kept poses, ascending.
@@ -51,7 +52,7 @@ class Drift:
         moved = (links.kind == CLOSURE) & (len(anchors) < count)
         local = links[~moved]
         matrix, _ = normal_equations(poses, local, local.weight, 0)
-        # The first pose is known: its rows and columns are 0.
+        # The first pose is known, so its rows and columns are 0.
         rows = (3 * (anchors[1:, None] - 1) + np.arange(3)).ravel()
         whole, size = np.zeros_like(self._joint), 3 * len(anchors) - 3
         whole[1:, :, 1:, :] = _reduced(matrix, rows).reshape(len(anchors) - 1, 3, len(anchors) - 1, 3)
@@ -73,7 +74,7 @@ class Drift:
 
 
 def _spread_of_steps(solution: Solution) -> Floats:
-    """Return the covariances (N - 1, 3, 3) of the poses in the frames of those before, by the links between both."""
+    """Return the covariances (N - 1, 3, 3) of the poses relative to their predecessors, by the links between both."""
     links = solution.links
     information = np.zeros((len(solution.poses), 3, 3))
     follow = np.abs(links.second - links.first) == 1
@@ -84,7 +85,7 @@ def _spread_of_steps(solution: Solution) -> Floats:
 
 
 def _anchors_of(spread: Floats, most: int) -> Integers:
-    """Return the poses whose joint covariance is kept: even ones, and both sides of the loosest steps."""
+    """Return the poses whose joint covariance is kept: evenly spaced ones, and both sides of the loosest steps."""
     count = len(spread) + 1
     variance = spread[:, 0, 0] + spread[:, 1, 1] + _LEVER**2 * spread[:, 2, 2]
     loose = np.flatnonzero(variance > _LOOSE * np.median(variance))
@@ -95,7 +96,7 @@ def _anchors_of(spread: Floats, most: int) -> Integers:
 
 
 def _reduced(matrix: Any, rows: Integers) -> Floats:
-    """Return the information of some rows of a sparse one, with the others eliminated: Schur's complement."""
+    """Eliminate all but some rows of sparse information, by Schur's complement, and return the information of these."""
     from scipy.sparse import identity
 
     damped = (matrix + DAMPING * identity(matrix.shape[0], format="csc")).tocsc()
@@ -112,9 +113,9 @@ def _reduced(matrix: Any, rows: Integers) -> Floats:
 def _add_closures(whole: Floats, poses: Floats, closures: Links, anchors: Integers, spread: Floats) -> None:
     """Add closures to the information (A, 3, A, 3) of kept poses.
 
-    A small motion of a scan, and of what is fixed to it, is that of a frame at the origin: between such motions a link
-    has the same information whichever scans of a rigid body it is between. The covariance of the steps from the kept
-    poses to the scans, as if these were not linked otherwise, is added to that of the closure.
+    Small motions are expressed as motions of a frame at the origin that is fixed to the scan, so a link has the same
+    information between any scans of a rigid body. The covariance of the steps from the kept poses to the scans, as if
+    these had no further links, is added to that of the closure.
     """
     steps = np.arange(len(spread))
     _, two = pose_jacobians(poses, steps, steps + 1)
@@ -140,7 +141,7 @@ def _add_closures(whole: Floats, poses: Floats, closures: Links, anchors: Intege
 
 
 def _fixed(poses: Floats) -> Floats:
-    """Return the derivatives (L, 3, 3) of poses by the motion of a frame at the origin that they are fixed to."""
+    """Return the derivatives (L, 3, 3) of poses by the motion of a frame at the origin to which they are fixed."""
     result = np.tile(np.eye(3), (len(poses), 1, 1))
     result[:, 0, 2], result[:, 1, 2] = -poses[:, 1], poses[:, 0]
     return result

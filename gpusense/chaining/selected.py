@@ -1,9 +1,9 @@
 """Covariances of all poses of a pose graph: the diagonal blocks of the inverse of its sparse normal equations.
 
-The matrix of 3 x 3 blocks is eliminated front by front along the tree of eliminations (Duff and Reid 1983), successive
-columns of equal rows at once. From its root down, the blocks of the inverse that lie in the fronts follow from those of
-the parents (Takahashi et al. 1973): with L the columns below pivots D, and Z the inverse, Z_sj = -Z_ss L and
-Z_jj = D^-1 + L' Z_ss L. Other blocks are never computed, so time and memory are those of the elimination.
+The matrix of 3 x 3 blocks is eliminated front by front along the elimination tree (Duff and Reid 1983), successive
+columns with equal rows at once. From its root down, the blocks of the inverse within each front follow from those of
+its parent (Takahashi et al. 1973): with L the columns below pivots D, and Z the inverse, Z_sj = -Z_ss L and Z_jj = D^-1
++ L' Z_ss L. No further blocks are computed, so time and memory are those of the elimination.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Integers = NDArray[np.int64]
 def pose_covariances(solution: Solution) -> Floats:
     """Return the covariances (N, 3, 3) of poses, given the first one.
 
-    A direction that no link observes has a variance of some 1e6 m^2 or rad^2.
+    A direction that no link observes has a variance of about 1e6 m^2 or rad^2.
     """
     count = len(solution.poses)
     result = np.zeros((count, 3, 3))
@@ -75,7 +75,7 @@ def inverse_blocks(matrix: Any, damping: float) -> Floats:
 
 
 def _order(blocks: Any, count: int) -> Integers:
-    """Return the blocks in an order of elimination with little fill: of minimum degree, by SuperLU."""
+    """Return an elimination order of the blocks with little fill: minimum degree, by SuperLU."""
     from scipy import sparse
     from scipy.sparse.linalg import splu
 
@@ -113,7 +113,7 @@ def _parts_of(blocks: Any, order: Integers) -> list[tuple[int, int, Integers]]:
 def _eliminated(
     blocks: Any, order: Integers, parts: list[tuple[int, int, Integers]], home: Integers, damping: float
 ) -> tuple[list[Floats], list[Floats]]:
-    """Return, of each run of steps of the elimination, the factor L and the inverse of the pivots.
+    """Return for each run of steps of the elimination the factor L and the inverse of the pivots.
 
     ``home`` (N,) has the run of each step.
     """
@@ -125,7 +125,7 @@ def _eliminated(
     for k, (begin, end, below) in enumerate(parts):
         rows, size = np.append(np.arange(begin, end), below), 3 * (end - begin)
         front = np.zeros((3 * len(rows), 3 * len(rows)))
-        # Columns of the pivots; of theirs the lower triangle is used.
+        # Columns of the pivots; only the lower triangle of the pivots is used.
         split = front.reshape(len(rows), 3, len(rows), 3)
         for step in range(begin, end):
             part = slice(blocks.indptr[order[step]], blocks.indptr[order[step] + 1])
@@ -149,6 +149,6 @@ def _eliminated(
 
 
 def _scalars(blocks: Integers) -> Integers:
-    """Return the rows of blocks of three."""
+    """Return the scalar rows of blocks of three."""
     rows: Integers = (3 * blocks[:, None] + np.arange(3)).ravel()
     return rows

@@ -16,16 +16,16 @@ from gpusense.interface.launches import Program, launch
 from gpusense.interface.structs import MatchRules
 from gpusense.matching.points import GAP, ScanPoints
 
-# Neighbours on either side to which a line is fitted, and how far they may be from one another: a share of the range
-# and a distance [m]. Bodies in vectors have room for 48.
+# Neighbours on either side to which a line is fitted, and their largest distance: a share of the range plus a distance
+# [m]. Lanes have room for 48 neighbours.
 REACH, _MOST, _FEWER, _RATIO, _SLACK = 2, 48, 16, 0.1, 0.05
-# Half of the least length of a line [m]. In standard deviations of ranges: half of the least length where noise turns
-# such short lines, and half of the length of lines that decide which directions are observed. Long lines do not turn
-# with noise, but round corners, which costs accuracy.
+# Half the least length of a line [m], and two half lengths in standard deviations of ranges: of lines where noise turns
+# the shortest ones, and of lines that decide which directions are observed. Noise does not turn long lines, but they
+# round corners, which costs accuracy.
 WIDTH, STRAIGHT_WIDTH, LONG_WIDTH = 0.04, 3.5, 8.0
 # Neighbours may be this many deviations apart, or this many of the scanner's steps in bearing times the range.
 _SLACK_DEVIATIONS, _STEPS = 6.0, 2.5
-# With farther steps of bearing lines have three points [rad].
+# With larger steps of bearing, lines have three points [rad].
 _SPARSE = 0.12
 # Most starts of one launch; a call can be interrupted between launches.
 _MOST_STARTS = {"cpu": 1 << 12, "gpu": 1 << 18}
@@ -35,7 +35,7 @@ _LOCK = threading.Lock()
 
 
 def points_of_line(gap: float, noise: float, lever: np.ndarray) -> np.ndarray:
-    """Return the points (S,) that share a long line, at half of a scan's rms range ``lever``; see ``IcpPairs``."""
+    """Return the number of points (S,) of a long line at half of a scan's rms range ``lever``; see ``IcpPairs``."""
     spacing = 0.5 * lever * gap / GAP
     width = max(WIDTH, LONG_WIDTH * noise)
     points: np.ndarray = np.clip(2 * width / np.maximum(spacing, 1e-9), 2 * REACH + 1, 2 * _MOST + 1)
@@ -57,7 +57,7 @@ class IcpPairs:
         points: The points of all scans.
         pairs: (S, 2) numbers of the reference and of the second scan.
         noise: Standard deviation of ranges [m].
-        space: Holds the buffers.
+        space: The workspace of the buffers.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class IcpPairs:
         """Fit lines to the points of all scans, or of the scans of some pairs, from the next match on.
 
         Args:
-            width: Half of their length [m], as far as there are points.
+            width: Half their length [m]; shorter where points are missing.
             pairs: (P,) indices of pairs; lines of other pairs are kept.
         """
         if not self._most:

@@ -12,13 +12,13 @@ from gpusense._util import checks
 from gpusense.interface.structs import MatchRules
 from gpusense.matching.points import GAP
 
-# Points that take part while the scale shrinks, and of each start of a search.
+# Points that are used while the scale shrinks, and for each start of a search.
 _COARSE_POINTS, _SEARCH_POINTS = 200, 30
 # Most points of the reference in a search.
 _SEARCH_REFERENCE = 64
-# Poses on the edge of a window are in it [m, rad].
+# Margin by which poses on the edge of a window count as inside [m, rad].
 _MARGIN = 1e-3
-# Half the distance of neighbouring points, over their step of bearing: pairs may be as far apart [m / rad].
+# Pairs may be as far apart as half the distance of neighbouring points, this times their step of bearing [m / rad].
 _SPARSE = 1.5
 # Stride of the points that make a score, so large that only one point does.
 _NO_SCORE = 1 << 24
@@ -43,7 +43,7 @@ class MatchOptions:
     one_way: bool = False
 
     def is_outside(self, offset: np.ndarray) -> np.ndarray:
-        """Return whether (S, 3) offsets from guesses are beyond the window, but for what a start may move."""
+        """Return whether (S, 3) offsets from guesses leave the window, enlarged by the move that a start may make."""
         turn = np.abs((offset[:, 2] + math.pi) % (2 * math.pi) - math.pi)
         reach, half = self.window
         outside: np.ndarray = (np.hypot(offset[:, 0], offset[:, 1]) > reach + _MARGIN) | (turn > half + _MARGIN)
@@ -70,7 +70,7 @@ class MatchOptions:
         return full._replace(iterations=1, capture=full.least_capture, scale=full.least_scale, score_stride=_NO_SCORE)
 
     def search_rules(self, points: int, gap: float, reference: int) -> MatchRules:
-        """Return the rules of the many starts of a search: few points, few of the reference's, few iterations."""
+        """Return the rules of the many starts of a search: few points of both scans, and few iterations."""
         full = self.rules(points, gap)
         stride, least = max(points // _SEARCH_POINTS, 1), max(2.5 * full.least_scale, 0.08 * self.capture)
         return full._replace(

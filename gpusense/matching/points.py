@@ -16,7 +16,7 @@ _FULL_TURN = 2 * math.pi
 _NEAREST = 1e-6
 # Beams are dense up to this step [rad].
 _DENSE = math.radians(2.5)
-# Largest step between bearings that hides nothing, in steps of the scanner.
+# Largest step between the bearings of neighbours that hides nothing [steps of the scanner].
 GAP = 3.0
 
 
@@ -42,7 +42,7 @@ class ScanPoints:
         return np.diff(self.start)
 
     def joined(self, others: ScanPoints) -> ScanPoints:
-        """Return these scans followed by others; the steps of bearings are these scans'."""
+        """Return these scans followed by the second ones, with ``gap`` of the first."""
         start = np.concatenate([self.start, self.start[-1] + others.start[1:]]).astype(np.int32)
         squares = np.concatenate([self.squares, others.squares])
         return ScanPoints(np.concatenate([self.point, others.point]), start, self.gap, squares)
@@ -90,7 +90,7 @@ def scan_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype, motion: np
     np.multiply(z, sine, out=everything[..., 1], casting="same_kind")
     everything[..., 2] = bearing
     everything[..., 3] = z
-    # Points as single items, which a mask takes whole.
+    # View each point as a single item, so that a mask selects whole points.
     items = everything.view(np.dtype((np.void, 4 * everything.itemsize)))[..., 0]
     point = items[hit].view(real).reshape(-1, 4)
     return _points(point, hit, gap, np.einsum("sk,sk->s", z, z))

@@ -1,4 +1,4 @@
-"""Verdicts on matches: information from their pairs, the directions that they observe, and their status."""
+"""Judge matches: information from their pairs, the directions that they observe, and their status."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from gpusense.matching.uncertainty import inflation_of, observed_pairs, symmetri
 
 # Distances from guesses are relative to windows of at least this [m].
 _LEAST_WINDOW = 0.1
-# Lines turn with noise by this much in the mean square [rad^2] where longer ones tell what is observed.
+# Mean square turn of lines by noise [rad^2] from which longer lines decide which directions are observed.
 _TURNED_LINES = 0.05
 
 
 class PairSums(NamedTuple):
-    """Information of the pairs of matches in the sensors' frames, variances of points, factors of covariances (S,)."""
+    """Information of pairs in the sensors' frames, variances of points and factors of covariances, for S matches."""
 
     found: Observed
     variance: np.ndarray
@@ -34,7 +34,7 @@ def tested(
     device: IcpPairs, result: np.ndarray, points: ScanPoints, pairs: np.ndarray, options: MatchOptions,
     noisy: np.ndarray,
 ) -> PairSums:  # fmt: skip
-    """Return the directions that pairs observe, by the matches' lines or, where noise may turn these, longer ones.
+    """Return the directions that pairs observe, by the matches' lines or, where noise may turn these, by longer lines.
 
     ``noisy`` are numbers of pairs whose lines noise turns.
     """
@@ -50,7 +50,7 @@ def tested(
         information, doubt = symmetric(sums[:, 6:12]), symmetric(sums[:, 12:18])
         return observed_pairs(information, doubt, noise[rows], lever[rows], independent)
 
-    # Short lines decide only what is beyond doubt.
+    # Short lines decide only where the result is beyond doubt.
     found = observed(result, np.arange(len(result)), np.zeros(len(result)))
     turned = (result[:, 12] + result[:, 15]) * noise > _TURNED_LINES * np.maximum(result[:, 19], 1e-30)
     turned[noisy] = True
@@ -76,8 +76,8 @@ def concluded(
 
     Args:
         pose: (S, 3) poses.
-        information: (S, 3, 3) of them.
-        factor: (S,) by which it is multiplied for a sum over pairs [m^2].
+        information: (S, 3, 3) information on the poses.
+        factor: (S,) factor that turns the information into a sum over pairs [m^2].
         score: (S,) scores.
         iterations: (S,) iterations.
         status: (S,) statuses so far.
@@ -135,7 +135,7 @@ def judged(match: ScanMatch, guess: np.ndarray, options: MatchOptions) -> ScanMa
 def pair_sums(
     backend: Backend, real: np.dtype, points: ScanPoints, pairs: np.ndarray, options: MatchOptions
 ) -> np.ndarray:
-    """Return results (S, 35) of pairs of scans that stay where they are, but for one last step."""
+    """Return results (S, 35) of pairs of scans at their poses, after a single last step."""
     lock, space = space_of(backend)
     stride = options.rules(int(points.counts[pairs[:, 1]].max(initial=0)), points.gap).score_stride
     rules = options.last_rules(points.gap)._replace(score_stride=stride)

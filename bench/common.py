@@ -38,6 +38,9 @@ LOGS = ("intel", "freiburg-079", "csail", "aces")
 # A rate counts if no error is larger [eps (1 + |log p|) for each reading].
 MOST_EPS = 16.0
 
+# Names the script that runs another one, such as speed/as_avx2.py, for the command of its report.
+THROUGH = "GPUSENSE_BENCH_THROUGH"
+
 # ---- options
 
 
@@ -355,7 +358,7 @@ def table(columns: Sequence[str], rows: Iterable[Iterable[Any]]) -> str:
 def command_line(script: str) -> str:
     """Return the command as typed, absolute paths by their last part."""
     words = [Path(word).name if Path(word).is_absolute() else word for word in sys.argv[1:]]
-    return shlex.join(["python", script, *words])
+    return shlex.join(["python", *os.environ.get(THROUGH, "").split(), script, *words])
 
 
 def machine(commit: str) -> dict[str, str]:

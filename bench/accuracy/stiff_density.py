@@ -35,6 +35,7 @@ from gpusense.reference.mixture import log_density
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from accuracy.extreme_tables import write_tables
 from common import FIGURES, command_line, make_parser, parse, publish, table
 
 mpl.use("Agg")
@@ -200,22 +201,6 @@ def picture(families: list[dict[str, Any]]) -> str:
     note = "Largest error as a share of its bound, over all stiff and extreme cases; more than 100 % would be orange."
     parts.append(f'<text x="10" y="{top + height * len(names) + 22}" fill="#4a5568">{note}</text>')
     return "\n".join([*parts, "</svg>", ""])
-
-
-def write_tables(page: Path, tables: dict[str, str]) -> None:
-    """Replace what stands between the marks of a page.
-
-    Raises:
-        ValueError: a mark is missing.
-    """
-    text = page.read_text(encoding="utf-8")
-    for name, lines in tables.items():
-        begin, end = f"<!-- made: {name} -->", "<!-- end -->"
-        if begin not in text:
-            raise ValueError(f"{page.name}: must have the mark {begin}, got none")
-        before, _, after = text.partition(begin)
-        text = f"{before}{begin}\n{lines}\n{end}{after.partition(end)[2]}"
-    page.write_text(text, encoding="utf-8")
 
 
 def grid_rows(backends: list[str], families: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -10,17 +10,17 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from error_vs_time.charts import Chart, Mark, drawing
+from error_vs_time.choices import FIRST, KL, SHOWN, WISHES, WRONG, answers, lead, own, value
 from error_vs_time.reports import LIMIT, RESULTS, ROOT, Source, commit_trouble, rows_of, sources
 
 from gpusense._util.files import write_whole
-from gpusense.evaluation.benchmark.choice import choose, error_text, front, time_text
+from gpusense.evaluation.benchmark.choice import front, time_text
 from gpusense.evaluation.benchmark.report import table
 from gpusense.evaluation.benchmark.rows import ALL, Row
 from gpusense.plots.error_page import error_page
@@ -28,111 +28,9 @@ from gpusense.plots.error_page import error_page
 HERE = Path(__file__).parent
 PAGE = Path("docs/error-vs-time.md")
 IMAGES = Path("docs/img")
-WRONG, MEDIAN, TAIL, LARGEST = (
-    "rays wrong by more than a cell", "median error of a ray", "95 % error of a ray", "largest error of a ray",
-)  # fmt: skip
-KL, FINE = "KL divergence at a comparable temperature", "KL divergence from the true posterior"
-SHIFT, GLOBAL = "shift of the mean position", "the same, all over the map"
-# By need: the measures of its figure and of its table, the first one that of choices.
-SHOWN = {
-    "rays": (WRONG, MEDIAN, TAIL, LARGEST), "beam model": (KL, GLOBAL, FINE, SHIFT),
-    "likelihood field": (KL, GLOBAL, FINE, SHIFT),
-    "localisation": ("median error", "95 % error"), "matching": ("median error", "95 % error"),
-    "in a map": ("median error", "95 % error"), "learning": ("median error", "largest error"),
-    "landmarks": ("median error",),
-}  # fmt: skip
 NEEDS = tuple(SHOWN)
 # Methods whose knob other implementations share.
 TABLES = ("cddt", "lookup", "march, centre")
-
-
-@dataclass(frozen=True)
-class Wish:
-    """An upper limit of the error or of the time.
-
-    Attributes:
-        words: In words.
-        need: Its need.
-        error: The largest error of the need's first measure; None without a limit.
-        seconds: The longest time [s]; None without a limit.
-        only: Chooses rows.
-    """
-
-    words: str
-    need: str
-    error: float | None = None
-    seconds: float | None = None
-    only: Callable[[Row], bool] = lambda row: True
-
-
-def _default(row: Row) -> bool:
-    """Return whether a filter has the default temperature and stages."""
-    return "," not in row.setting
-
-
-def _particles(count: int) -> Callable[[Row], bool]:
-    return lambda row: _default(row) and row.setting.startswith(f"{count} x")
-
-
-FIRST = (
-    Wish("10 000 particles at 100 Hz", "localisation", seconds=0.01, only=_particles(10_000)),
-    Wish("1000 particles at 100 Hz", "localisation", seconds=0.01, only=_particles(1000)),
-    Wish("localisation to 2 cm", "localisation", error=0.02, only=_default),
-)
-WISHES = (
-    *FIRST,
-    Wish("beam model, at most 0.01 nats", "beam model", error=0.01),
-    Wish("beam model, at most 10 ms", "beam model", seconds=0.01),
-    Wish("beam model, at most 1 ms", "beam model", seconds=0.001),
-    Wish("likelihood field, at most 0.01 nats", "likelihood field", error=0.01),
-    Wish("likelihood field, at most 1 ms", "likelihood field", seconds=0.001),
-    Wish("rays, at most 1 % wrong", "rays", error=0.01),
-    Wish("match of two scans, at most 1 cm", "matching", error=0.01),
-    Wish("match in a map, at most 1 cm", "in a map", error=0.01),
-    Wish("parameters learned, at most 5 % off", "learning", error=0.05),
-    Wish("unknown landmarks, at most 0.2 nats", "landmarks", error=0.2, only=lambda row: row.method != "known"),
-)
-
-
-def value(number: float, unit: str) -> str:
-    """Format an error; shares and relative errors in percent, lengths in millimetres or centimetres."""
-    if unit in ("share", "relative"):
-        return "0" if number == 0 else error_text(number, "%")
-    if unit == "nats":
-        return "0" if number < 1e-6 else f"{number:.2g}"
-    return f"{number:.3g}" if unit == "cells" else error_text(number, unit)
-
-
-def own(rows: Iterable[Row], need: str, device: str, scene: str = ALL) -> list[Row]:
-    """Return gpusense's rows of a need on a device."""
-    return [row for row in rows if (row.need, row.device, row.scene) == (need, device, scene) and not row.outside]
-
-
-def answer(rows: Sequence[Row], wish: Wish, device: str) -> str:
-    """Return the method for a wish with its time and error."""
-    able = [row for row in own(rows, wish.need, device) if wish.only(row) and not row.maps]
-    measure = SHOWN[wish.need][0]
-    entries = [row.entry(measure) for row in able]
-    chosen = choose(entries, wish.error, wish.seconds)
-    if not able:
-        return "-"
-    if chosen is None:
-        nearest = min(entries, key=lambda entry: entry.seconds if wish.error is None else entry.error)
-        row = able[entries.index(nearest)]
-        return f"none; nearest: {row.text}, {_figures(row, measure)}"
-    row = able[entries.index(chosen)]
-    return f"**{row.text}**: {_figures(row, measure)}"
-
-
-def _figures(row: Row, measure: str) -> str:
-    unit = row.units[measure]
-    return f"{time_text(row.seconds)}, {value(row.errors[measure], unit)}{' nats' * (unit == 'nats')}"
-
-
-def answers(rows: Sequence[Row], devices: Sequence[str], wishes: Sequence[Wish]) -> list[str]:
-    """Return the table of wishes."""
-    lines = [(wish.words, *(answer(rows, wish, device) for device in devices)) for wish in wishes]
-    return table(("to do", *devices), lines, 1 + len(devices))
 
 
 def best(rows: Sequence[Row], measure: str) -> list[Row]:
@@ -274,8 +172,10 @@ def files(folder: Path = RESULTS) -> dict[Path, str]:
     devices = list(dict.fromkeys(row.device for row in rows))
     needs = [need for need in NEEDS if any(row.need == need for row in rows)]
     made = {picture(need): chart(rows, need, devices) for need in needs}
+    able = [device for device in devices if own(rows, FIRST[0].need, device)]
     blocks = {
-        "first": answers(rows, devices, FIRST), "answers": answers(rows, devices, WISHES), "peers": peers(rows),
+        "lead": lead(rows, devices), "first": answers(rows, able, FIRST),
+        "answers": answers(rows, devices, WISHES), "peers": peers(rows),
         "matchers": rivals(rows, "matching", "a match"), "filters": rivals(rows, "localisation", "a scan"),
         "maps": by_map(rows, devices), "reports": listing(found), "limit": [str(LIMIT)],
     }  # fmt: skip

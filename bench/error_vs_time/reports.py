@@ -107,7 +107,13 @@ def sources(folder: Path = RESULTS) -> list[Source]:
     twice = {name for name in kinds if kinds.count(name) > 1}
     if twice:
         raise ValueError(f"reports: each device must have one of a kind, got several of {sorted(twice)}")
-    return sorted(found, key=lambda source: (any("NVIDIA" in title for title in source.titles), source.name))
+    return sorted(found, key=_place)
+
+
+def _place(source: Source) -> tuple[bool, str, str]:
+    """Return the place of a report: processors first, and a variant behind the device that it varies."""
+    device = source.name.removesuffix(f"_{source.kind}.json")
+    return any("NVIDIA" in title for title in source.titles), device, source.kind
 
 
 def read_tasks(file: Path) -> dict[str, Any]:

@@ -19,7 +19,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import json
 
 import numpy as np
-from common import make_parser
+from common import command_line, make_parser
+from common import machine as described
 
 import gpusense as gs
 from gpusense.evaluation.machine import machine, machine_line
@@ -115,7 +116,9 @@ def main() -> None:
             )
     print(f"\n{machine_line()}")
     if args.output is not None:
-        Path(args.output).with_suffix(".json").write_text(json.dumps(dict(machine=machine(), rows=rows), indent=1))
+        stated = {"command": command_line("bench/speed/filter_step.py"), "commit": described(args.commit)["commit"]}
+        report = stated | {"machine": machine(), "rows": rows}
+        Path(args.output).with_suffix(".json").write_text(json.dumps(report, indent=1))
 
 
 if __name__ == "__main__":

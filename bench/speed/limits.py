@@ -4,10 +4,11 @@
     python bench/speed/limits.py --backend opencl --backend warp:cuda:0 --particles 100000 --rows all --output NAME
     python bench/speed/limits.py --rows clouds bilinear --scan noisy --particles 20000 --beams 180
 
-Rows: *clouds* are rays, beam model and field with a cloud over the whole map and one around a pose; *bilinear* the
-interpolated field with them; *small* calls of 2000 and 4000 particles x 60 beams; *preparation* that of the map;
-*large* a million particles, and a map of 20 000 x 20 000 cells. The map is the built-in building of 2000 x 2000 cells,
-or --map. A scan is cast exactly, with a range for each beam, or noisy: work counts the ranges in it.
+Rows: *clouds* are rays (into one array, and into a new one each call), beam model and field with a cloud over the whole
+map and one around a pose; *bilinear* the interpolated field with them; *small* calls of 2000 and 4000 particles x 60
+beams; *preparation* that of the map; *large* a million particles, and a map of 20 000 x 20 000 cells. The map is the
+built-in building of 2000 x 2000 cells, or --map. A scan is cast exactly, with a range for each beam, or noisy: work
+counts the ranges in it.
 
 Launches are all kernels of a call with its arrays on the device: placing the poses, ordering them, casting, scoring and
 summing, started as the call starts them (on CUDA as one graph). "Alone" each set is waited for, "in a row" ten are, or
@@ -136,7 +137,10 @@ def cloud_jobs(scene: Scene, arguments: argparse.Namespace) -> Iterator[Job]:
         poses = scene.cloud(cloud, count)
         if "clouds" in arguments.rows:
             out = np.empty((count, beams), np.float32)
-            yield Job(f"rays, {cloud}, {count} x {beams}", count * beams, cast, poses, out, checked=True, cast=True)
+            label = f"rays, {cloud}, {count} x {beams}"
+            yield Job(label, count * beams, cast, poses, out, checked=True, cast=True)
+            if cloud == "tracking":
+                yield Job(f"{label}, a new array each", count * beams, cast, poses, checked=True, cast=True)
         for name, make in score.items():
             yield Job(f"{name}, {cloud}, {count} x {hits}", count * hits, make, poses, checked=True)
 

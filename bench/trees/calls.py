@@ -100,6 +100,9 @@ class Warp(Host):
         return np.asarray(array.numpy())
 
 
+# Particles of filters.
+FILTERS = (500, 4000)
+
 # Makes the calls of a row ready: a function that runs some and waits, the result, and how many it runs.
 Ready = tuple[Callable[[], Any], Callable[[], np.ndarray], int]
 
@@ -143,6 +146,9 @@ class Rows:
             scans, few = arrays["scans"].shape
             label = f"{model}, {scans} scans of {arrays['scan poses'].shape[1]} x {few}"
             self.makers[label] = functools.partial(self._several, places[0], model)
+            for count in FILTERS:
+                step = functools.partial(self._follow, places[0], model, count)
+                self.makers[f"filter step, {model}, {count} x {few}"] = step
             self.makers[f"preparation, {model}"] = functools.partial(self._prepare, places[0], model)
 
     def _model(self, place: Host, name: str, few: bool = False) -> Any:
@@ -190,6 +196,20 @@ class Rows:
 
         def run() -> None:
             found[:] = [model.log_likelihood(poses, scans)]
+
+        return run, lambda: np.asarray(found[0]), 1
+
+    def _follow(self, place: Host, name: str, count: int) -> Ready:
+        """Make a filter of the default options ready, whose robot stands still: predict, correct, estimate."""
+        model, ranges = self._model(place, name, few=True)
+        poses, found = self._arrays["tracking"], []
+        pf = gs.ParticleFilter(model, particles=count, seed=1)
+        pf.initialize(mean=poses.mean(axis=0), covariance=np.cov(poses.T))
+
+        def run() -> None:
+            pf.predict((0, 0, 0), (0, 0, 0))
+            pf.correct(ranges)
+            found[:] = [pf.estimate().pose]
 
         return run, lambda: np.asarray(found[0]), 1
 

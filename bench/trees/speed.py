@@ -6,8 +6,8 @@
 
 Rows are those of limits.py and small_calls.py that the public interface has: rays, beam model and field with a cloud
 over the whole map and one around a pose, calls of 2000 and 4000 particles x 60 beams, ordinary and bound, several scans
-in one call, and the preparation of the map; with NumPy arrays, and on GPUs with poses and results on the device, where
-a call is its launches and the start of these.
+in one call, steps of filters with 500 and 4000 particles (predict, correct, estimate), and the preparation of the map;
+with NumPy arrays, and on GPUs with poses and results on the device, where a call is its launches and their start.
 
 Each tree has a process of its own (calls.py), and both have the same arrays. The processes take turns in the order
 old, new, new, old, so that a machine that becomes slower favours neither. A turn takes --seconds, and its time is that

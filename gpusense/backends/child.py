@@ -7,6 +7,7 @@ that it was sent.
 from __future__ import annotations
 
 import contextlib
+import glob
 import importlib
 import json
 import os
@@ -15,6 +16,7 @@ import secrets
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from typing import IO, Any
 
@@ -22,6 +24,8 @@ from gpusense._util.files import unnamed_file
 
 # Seconds; a first compilation takes some three on a common processor.
 _LIMIT = 60.0
+# A child that waits for a processor gets more time, at most this number of limits.
+_MOST_LIMITS = 10
 MARK = "gpusense-child "
 # Bytes of a child's output that are looked through for reports.
 _MOST_OUTPUT = 16 << 20
@@ -123,12 +127,11 @@ def run_text(arguments: list[str], job: dict[str, Any], variables: dict[str, str
             )
         except OSError as error:
             return Outcome([], f"no child process can be started: {error}", conclusive=False, started=False)
+        starved = False
         try:
             with contextlib.suppress(BrokenPipeError):
-                process.communicate(json.dumps({**job, "token": token}).encode() + b"\n", timeout=limit)
-            code: int | None = process.returncode
-        except subprocess.TimeoutExpired:
-            code = None
+                starved = _await(process, json.dumps({**job, "token": token}).encode() + b"\n", limit)
+            code = process.returncode
         finally:
             _end(process)
         said = _read_reports(out)
@@ -138,9 +141,37 @@ def run_text(arguments: list[str], job: dict[str, Any], variables: dict[str, str
         if code == 0:
             return Outcome(said, "" if answered else "ends the process with exit code 0, without an answer")
         if code is None:
-            return Outcome(said, f"hangs: no answer in {limit:g} s")
+            return Outcome(said, f"hangs: no answer in {limit:g} s", conclusive=not starved)
         failure = _describe(code, _last_words(errors))
         return Outcome(said, failure, conclusive=-code not in _FOREIGN and not PASSING.search(failure))
+
+
+def _await(process: subprocess.Popen[bytes], text: bytes, limit: float) -> bool:
+    """Wait for the end of a child, at most a limit of seconds in which it does not wait for a processor.
+
+    Returns:
+        Whether it was ended before it had its limit: so busy a machine says nothing of the driver.
+    """
+    begun, wait, unsent, left = time.monotonic(), limit, text, 0.0
+    while wait > 0:
+        try:
+            process.communicate(unsent, timeout=wait)
+            return False
+        except subprocess.TimeoutExpired:
+            unsent = b""
+            elapsed = time.monotonic() - begun
+            left = limit - elapsed + min(_starved(process.pid), elapsed)
+            wait = min(left, _MOST_LIMITS * limit - elapsed)
+    return left > 0
+
+
+def _starved(process: int) -> float:
+    """Return how long the threads of a process have waited for a processor [s]; 0 where the system does not say."""
+    total = 0
+    for file in glob.glob(f"/proc/{process}/task/*/schedstat"):
+        with contextlib.suppress(OSError, ValueError, IndexError), open(file, encoding="ascii") as stream:
+            total += int(stream.read().split()[1])
+    return total / 1e9
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

@@ -1,1 +1,1 @@
-"""Trajectories from scans alone: matches chained over key scans, loops closed, and the pose graph of both."""
+"""Trajectories from scans alone: chained matches over key scans, loop closures, and the pose graph of both."""

@@ -1,8 +1,8 @@
-"""Which matches of places agree with one another: the evidence that a place was seen again.
+"""Find matches of places that agree with each other, the evidence that a place was seen again.
 
-T1 and T2 between the same passages and the paths along both make a loop that ends where it began. A match counts only
-while enough of those that agree with it also count. Where the drift does not tell whether a match may be right, a group
-of more evidence is needed: across a break of the chain, or farther than the drift allows.
+Two matches T1 and T2 between the same passages agree if they and the paths along both passages form a loop that ends
+where it began. A match counts only while enough matches that agree with it also count. Across a break of the chain, and
+beyond the expected drift, the drift cannot confirm a match, so a group with more evidence is needed.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool]
 
-# Matches that agree with one, itself among them.
+# Least number of matches that agree with a match, including itself.
 _AGREE = 3
 # Evidence of a group, the sum of -log10(1 - p_right) with p_right at most a largest one; different scans on both sides.
 _EVIDENCE, _MOST_RIGHT, _SCANS = 6.5, 0.999, 3
-# Passages that are compared are at most this far apart on both sides [m], and as many key scans; matches of a part.
+# Compared matches are at most this far apart on both sides [m], and at most this many key scans; matches of a batch.
 _PASSAGE, _KEYS, _MATCHES = 8.0, 64, 1024
-# Loops of two matches end within this of their beginning [m, rad], and a share of the way [m/m, rad/m].
+# Largest gap of a closed loop of two matches [m, rad], and its growth with the path [m/m, rad/m].
 _MISSED, _MISSED_TURN, _SHARE, _SHARE_TURN = 0.15, 0.03, 0.03, 0.01
 _NONE = np.zeros(0, np.int64)
 
 
 def agreeing(matches: Links, poses: Floats, strict: Flags) -> Flags:
-    """Return which matches (L,) enough others of the same passages agree with.
+    """Return which matches (L,) are supported by enough further matches of the same passages.
 
     Args:
         matches: Matches of places.
         poses: (K, 3) poses of the key scans.
-        strict: (L,) whether a match must be of a group.
+        strict: (L,) whether a match must belong to a group.
     """
     if not len(matches):
         return np.zeros(0, bool)
@@ -55,7 +55,7 @@ def agreeing(matches: Links, poses: Floats, strict: Flags) -> Flags:
 
 
 def largest_group(matches: Links, poses: Floats) -> tuple[int, float]:
-    """Return the size and the evidence of the group of matches that agree with the most evidence."""
+    """Return the size and the evidence of the group of agreeing matches with the most evidence."""
     if not len(matches):
         return 0, 0.0
     table = _consistent(matches, poses)
@@ -64,7 +64,7 @@ def largest_group(matches: Links, poses: Floats) -> tuple[int, float]:
 
 
 def _supported(table: Any, kept: Flags) -> Flags:
-    """Return which matches (L,) enough others agree with, each of which is also supported."""
+    """Return which matches (L,) agree with enough further matches that are themselves supported."""
     while True:
         fewer = kept & (table @ kept.astype(np.int64) >= _AGREE - 1)
         if (fewer == kept).all():
@@ -73,7 +73,7 @@ def _supported(table: Any, kept: Flags) -> Flags:
 
 
 def _groups(table: Any, kept: Flags, matches: Links) -> tuple[Integers, Integers, Floats, Integers]:
-    """Return groups of kept matches that agree, directly or by others.
+    """Return groups of kept matches that agree, directly or through further matches.
 
     Returns:
         The number of the group of each of the kept matches; of each group the number of matches, their evidence, and
@@ -116,7 +116,7 @@ def _consistent(matches: Links, poses: Floats) -> Any:
 
 
 def _neighbours(matches: Links, path: Floats) -> Iterator[tuple[Integers, Integers]]:
-    """Yield pairs of matches of the same passages, some of all at a time; both ways, without those of one scan."""
+    """Yield pairs of matches of the same passages in batches: both orders, without pairs that share a scan."""
     first, second = matches.first, matches.second
     order = np.argsort(second, kind="stable")
     scans = second[order]

@@ -1,4 +1,4 @@
-"""The links of the pose graph of a chain: matches, odometry, and constant motion where both leave directions open."""
+"""Assemble the links of a chain: matches, odometry, and constant motion where both leave directions open."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool]
 
 TEMPERATURE = 0.04
-"""Factor of the information of matches: recorded scans have errors that repeat, which no single match shows."""
+"""Factor of the information of matches: recorded scans have repeating errors that no single match reveals."""
 INFLATION = 2.0
-"""Factor of the covariances of poses: halves of the recorded logs ask for 2.2 and 2.4 (docs/matching.md)."""
+"""Factor of the covariances of poses: the two halves of the recorded logs give 2.2 and 2.4 (docs/matching.md)."""
 # Share of the largest eigenvalue below which the information of a scan's links leaves a direction open.
 _OPEN = 1e-6
-# Deviations of a pose in an unobserved direction [m, rad].
+# Deviations of a pose along an unobserved direction [m, rad].
 _UNKNOWN, _UNKNOWN_TURN = 30.0, 3.0
 
 
 def weighed(front: Front) -> Links:
-    """Return the matches so far with their information times the temperature.
+    """Return the matches so far with their information multiplied by the temperature.
 
-    Scans between two key scans are matched to both, and share the errors of these: together they count as one.
+    Scans between two key scans are matched to both and share the errors of these, so both matches count as one.
     """
     links, keys = front.links, np.array(front.keys)
     is_key = np.zeros(front.done, bool)
@@ -49,7 +49,7 @@ def links_of_odometry(front: Front, links: Links, reported: Floats, motion: Odom
         front: The matches.
         links: Their links, as weighed.
         reported: (M,) poses of the odometer at the nodes.
-        motion: Its noise.
+        motion: Noise of the odometer.
     """
     nodes = np.arange(1, front.done)
     keys = np.array(front.keys)
@@ -62,7 +62,7 @@ def links_of_odometry(front: Front, links: Links, reported: Floats, motion: Odom
 def shared_odometry(
     kind: str, first: NDArray[np.int64], second: NDArray[np.int64], reported: Floats, motion: OdometryMotion
 ) -> Links:
-    """Return links by the poses (M, 3) of an odometer at nodes."""
+    """Return links from the poses (M, 3) of an odometer at nodes."""
     return Links.of(kind, first, second, *odometry_links(motion, reported[first], reported[second]))
 
 
@@ -80,8 +80,8 @@ def constant_motion_links(poses: Floats, keys: NDArray[np.int64], jumped: Flags,
     Args:
         poses: (M, 3) poses of the nodes.
         keys: (K,) numbers of the key scans.
-        jumped: (M - 1,) whether the time jumps from a node to the next, and no match tells the motion.
-        links: The others.
+        jumped: (M - 1,) whether the time jumps from a node to the next, and no match determines the motion.
+        links: All further links.
     """
     second = np.arange(1, len(poses))[_is_open(len(poses), links)]
     first = keys[np.searchsorted(keys, second) - 1]
@@ -97,7 +97,7 @@ def constant_motion_links(poses: Floats, keys: NDArray[np.int64], jumped: Flags,
 
 
 def _is_open(count: int, links: Links) -> Flags:
-    """Return whether the links to earlier scans leave a direction of a node open, but for the first of all nodes."""
+    """Return whether the links to earlier scans leave a direction of a node open; the first node counts as known."""
     total = np.zeros((count, 3, 3))
     np.add.at(total, links.second, links.information)
     values = np.linalg.eigvalsh(total[1:])

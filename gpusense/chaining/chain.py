@@ -1,4 +1,4 @@
-"""The trajectory of a robot from its scans alone, or with its odometry: matches, loops, and their pose graph."""
+"""Compute a robot's trajectory from its scans, with or without odometry: matches, loops, and their pose graph."""
 
 from __future__ import annotations
 
@@ -58,13 +58,13 @@ def chain_scans(
     precision: Precision = "float32",
     backend: Selection = "auto",
 ) -> ScanChain:
-    """Return the trajectory of a robot from its scans, and its odometry where there is any.
+    """Return the trajectory of a robot from its scans and, where available, its odometry.
 
     Each scan is matched to the one before, and to key scans around it (:func:`gpusense.match_scan`). Matches begin at
-    the odometry's motion, or at none and at that of their neighbours. Places that are seen again are searched for
-    within the expected drift; closures are taken where they are sure and agree with one another. The poses are the
-    least-squares solution with a robust kernel over all links. The odometry, with noise fitted to the matches, or else
-    constant motion fills the directions that scans do not observe.
+    the odometry's motion; without odometry they begin at rest and at the motion of their neighbours. Places that are
+    seen again are searched for within the expected drift; closures are accepted where they are sure and agree with each
+    other. The poses are the least-squares solution with a robust kernel over all links. Directions that scans do not
+    observe are filled by the odometry, with noise fitted to the matches, or else by constant motion.
 
     With several scanners, scans of the same scanner are matched; loops also match scanners of equal bearings, such as a
     front and a rear one. A key scan is coupled with the scans of the other scanners before and after it.
@@ -73,17 +73,17 @@ def chain_scans(
         scans: (S, K) readings in the order of time [m], at least one; with several scanners S readings, each of its
             scanner's length.
         scanner: Their scanner, or several; its mount is the sensor's pose on the robot.
-        odometry: (S, 3) poses of the odometer at the scans [m, m, rad]. None: there is none.
+        odometry: (S, 3) poses of the odometer at the scans [m, m, rad]. None: no odometry.
         sensor: (S,) index of the scanner of each scan; with several scanners only.
         times: (S,) times of the first beams [s]. None: unknown.
-        duration: Time from the first beam of a scan to the last one [s], with which scans are freed of the robot's
-            motion; needs ``times``. Beams are measured evenly in time, in their order, in reverse or at once: that
-            with which scans agree best. 0: at once. With several scanners also one number for each.
+        duration: Time from the first beam of a scan to the last one [s], by which scans are corrected for the robot's
+            motion; needs ``times``. Beams are measured evenly in time in their order, in reverse, or all at once; the
+            order in which scans agree best is used. 0: at once. With several scanners optionally one number for each.
         motion: Noise of the odometry. None: fitted to the matches.
-        step: Motion by odometry below which a scan is not matched [m, rad]: such scans cost nothing.
+        step: Motion by odometry below which a scan is not matched [m, rad]; such scans cost nothing.
         key_step: Motion after which a scan becomes a key scan [m, rad].
         close_loops: Whether places that are seen again are searched for.
-        precision: Of the matches, ``"float32"`` or ``"float64"``.
+        precision: Precision of the matches, ``"float32"`` or ``"float64"``.
         backend: The device, see :func:`gpusense.devices`.
 
     Returns:
@@ -148,7 +148,7 @@ class Chainer:
 
     @property
     def scans(self) -> int:
-        """Number of scans that are chained so far."""
+        """Number of scans chained so far."""
         ends = [
             int(rows[front.nodes[front.done - 1]]) + 1
             for front, rows in zip(self._fronts, self._data.rows, strict=True)
@@ -162,11 +162,11 @@ class Chainer:
         return None if self._loops is None else self._loops[1]
 
     def steps(self) -> Iterator[str]:
-        """Match, search and close, a part at a time, and yield a word on each."""
+        """Match, search and close loops step by step, and yield a message on each step."""
         for one, duration in enumerate(self._durations):
             if duration > 0 and self._fronts[one].done == 1:
                 yield from self._find_order(one)
-        # The front end that is behind the others is next.
+        # Advance the front end that is farthest behind.
         while waiting := [
             (int(rows[front.nodes[front.done]]), one)
             for one, (front, rows) in enumerate(zip(self._fronts, self._data.rows, strict=True))
@@ -180,7 +180,7 @@ class Chainer:
             yield from self._loops[1].steps()
 
     def _find_order(self, one: int) -> Iterator[str]:
-        """Find the order in which a scanner's beams are measured, and begin with it."""
+        """Determine the order in which a scanner's beams are measured, and restart its front end with it."""
         assert self._times is not None
         data, duration = self._data, self._durations[one]
         matcher = Matcher(data.readings[one], data.scanners[one], self._options)
@@ -253,13 +253,13 @@ class Chainer:
             if self._options.motion is None and self._fitted_to != front.done and one == 0:
                 self._motion, self._fitted_to = fitted_odometry(front, links, wheels), front.done
             others = links_of_odometry(front, links, wheels, self._motion or OdometryMotion())
-            # All scanners have the same odometer.
+            # All scanners share one odometer.
             others = replace(others, information=others.information / len(joint.fronts))
             parts.append(joint.renumbered(others, one))
         return Links.joined([*parts, joint.couplings(self._odometry[joint.nodes], self._motion)])
 
     def _placed(self, joint: Joint, solution: Solution, spread: Floats, corrections: Floats) -> ScanChain:
-        """Return the result for all scans so far: those that are no nodes stand where the last node does."""
+        """Return the result for all scans so far; a scan that is no node has the pose of the last node."""
         count, nodes = self.scans, joint.nodes
         node = np.searchsorted(nodes, np.arange(count), "right") - 1
         poses, covariance = solution.poses[node], spread[node]
@@ -296,7 +296,7 @@ def _carried(poses: Floats, keys: Integers, placed: Floats) -> Floats:
     Args:
         poses: (N, 3) poses.
         keys: (K,) indices of key scans, the first one 0.
-        placed: (K, 3) new poses of these.
+        placed: (K, 3) new poses of the key scans.
     """
     place = np.searchsorted(keys, np.arange(len(poses)), "right") - 1
     return compose_poses(placed[place], pose_difference(poses[keys[place]], poses))

@@ -1,10 +1,10 @@
-"""Loops: places that are seen again are found, matched, checked against one another, and closed.
+"""Loops: find places that are seen again, match them, check the matches against each other, and close.
 
 Candidates are key scans that show the same cells of the plane. Each is matched in a window of three deviations of the
-expected drift in the pose graph so far. A closure is taken where its p_right is high, it agrees with the drift, and
-other matches of the same passages agree with it (see ``agreement``). Small drifts are closed first, which makes the
-larger ones smaller. Where the chain is broken between two places, or they are farther apart than the drift allows, a
-group of matches that agree is needed. A break that is closed is none any more.
+expected drift in the pose graph so far. A closure is accepted if its p_right is high, it agrees with the drift, and
+further matches of the same passages agree with it (see ``agreement``). Small drifts are closed first, which reduces the
+larger ones. Where the chain is broken between two places, or they are farther apart than the drift allows, a group of
+agreeing matches is needed. A closure across a break removes the break.
 """
 
 from __future__ import annotations
@@ -28,29 +28,29 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool]
 
-# Windows of searches [m, rad], the least size of a cell of places for each [m], and the most candidates of each.
+# Windows of searches [m, rad], with the least cell size of places [m] and the most candidates for each.
 _LEVELS = (
     ((0.6, 0.3), 1.0, 4000),
     ((1.5, 0.6), 1.0, 2000),
     ((4.0, 1.05), 2.0, 600),
     ((10.0, 1.6), 4.0, 150),
 )
-# Deviations of the drift that a window holds; most squared distances in deviations of a closure from the drift, and of
-# one of a group.
+# Deviations of the drift that a window covers; largest squared distance of a closure from the drift [squared
+# deviations], and the same for one of a group.
 _DEVIATIONS, _GATE, _FAR = 3.0, 16.0, 100.0
 # Least p_right of a closure.
 _SURE = 0.9
 # Closures of lower weight in the solution are dropped.
 _WEIGHT = 0.25
-# Closures that are far off are first solved for with a kernel this many times as wide.
+# Closures far off the present solution are first solved with a kernel this many times as wide.
 _WIDE = 10.0
-# Every second key scan is compared with earlier ones, and not with neighbours of those that it was compared with.
+# Every second key scan is compared with earlier ones, and not with direct neighbours of scans already compared.
 _EACH, _NEIGHBOURS = 2, 3
 # A pair is searched again where its pose has moved by more than this share of the window.
 _ELSEWHERE = 0.5
-# Relative gain of the cost that ends a solution between rounds.
+# Relative gain of the cost below which a solution between rounds ends.
 _GAIN = 1e-4
-# Most rounds of a level, and the motion of poses in a round from which another one may find more [m].
+# Most rounds of a level, and the least motion of poses in a round that justifies another one [m].
 _ROUNDS, _MOVED = 5, 0.3
 
 
@@ -66,7 +66,7 @@ class Loops:
         nodes: (K,) indices of the key scans.
         sequence: (K,) scanners of the key scans, and (K,) their numbers among those of their scanner.
         places: End points of the key scans.
-        broken: (K,) number of breaks of the chain before each key scan; that of the earlier side where one is closed.
+        broken: (K,) number of breaks of the chain before each key scan; a closed break counts for its earlier side.
         links: Links between key scans, without closures.
         solution: The solution so far.
         closures: Closures so far.
@@ -89,13 +89,13 @@ class Loops:
     matches: Links = field(default_factory=lambda: Links.joined([]))
     searched: int = 0
     _drift_of: tuple[Solution, Drift] | None = None
-    # Pairs that were matched, ascending by their numbers, the levels of their last searches, and their guesses.
+    # Matched pairs in ascending order of their numbers, the levels of their last searches, and their guesses.
     _tried: tuple[Integers, Integers, Integers, Floats] = field(
         default_factory=lambda: (_NONE, _NONE, _NONE, np.zeros((0, 3)))
     )
 
     def steps(self) -> Iterator[str]:
-        """Search and close, and yield a word on each round."""
+        """Search and close, and yield a message on each round."""
         for level in range(len(_LEVELS)):
             for _ in range(_ROUNDS):
                 before = self.solution.poses
@@ -108,12 +108,12 @@ class Loops:
                     break
 
     def _search(self, level: int) -> bool:
-        """Match candidates of a level and of those below, and return whether there were any."""
+        """Match candidates of a level and of all lower levels, and return whether there were any."""
         _, cell, most = _LEVELS[level]
         first, second, share = overlaps(self.places, self.solution.poses, cell, self.apart, self.sequence)
         drift = _deviations(self._drift().relative(first, second))
         needed = _level_of(drift)
-        # Once more with the next window: deviations are estimates. The last one is for large drifts only.
+        # Repeat with the next window, since deviations are estimates. The last window is for large drifts only.
         again = (needed == level - 1) & (level < len(_LEVELS) - 1)
         needed = np.where(again, level, needed)
         new = (self.sequence[1][second] % _EACH == 0) & (needed <= level)
@@ -147,7 +147,7 @@ class Loops:
         self._tried = first[same], second[same], level[same], guess[same]
 
     def _is_tried(self, first: Integers, second: Integers, level: Integers) -> Flags:
-        """Return whether pairs, or those with a neighbouring first scan, were matched at their level or a later one."""
+        """Return whether pairs, or pairs with a neighbouring first scan, were matched at their level or a later one."""
         found = np.zeros(len(first), bool)
         pairs, levels = self._pairs(*self._tried[:2]), self._tried[2]
         if not len(pairs):
@@ -159,7 +159,7 @@ class Loops:
         return found
 
     def _pairs(self, first: Integers, second: Integers, shift: int = 0) -> Integers:
-        """Return numbers (L,) of pairs, or of those with neighbours of the first scans."""
+        """Return numbers (L,) of pairs, or of the pairs with first scans shifted by ``shift``."""
         scanner, rank = (values[first] for values in self.sequence)
         count = len(self.nodes) + 2 * _NEIGHBOURS
         numbers: Integers = (scanner * count + rank + _NEIGHBOURS + shift) * count + second
@@ -173,7 +173,7 @@ class Loops:
         self._tried = first[last], second[last], level[last], guess[last]
 
     def _keep_matches(self, found: Links) -> None:
-        """Remember sure matches, in place of earlier ones of the same pairs."""
+        """Remember sure matches, which replace earlier ones of the same pairs."""
         again = np.isin(self._pairs(self.matches.first, self.matches.second), self._pairs(found.first, found.second))
         self.matches = Links.joined([self.matches[~again], found])
 
@@ -191,7 +191,7 @@ class Loops:
         return Links.joined(parts)
 
     def _accept(self) -> None:
-        """Take the matches that agree with the drift and with others, and solve; drop those that are contradicted."""
+        """Accept the matches that agree with the drift and with each other, solve, and drop contradicted closures."""
         left = self.matches
         squared = self._squared(left)
         across = self.broken[left.first] != self.broken[left.second]
@@ -215,7 +215,7 @@ class Loops:
         covariance = self._drift().relative(matches.first, matches.second)
         off = matches.residuals(self.solution.poses)
         covariance = covariance + np.diag([0.05**2, 0.05**2, 0.01**2])
-        # Directions that a match does not observe say nothing.
+        # Directions that a match does not observe are no evidence.
         scale = np.array([1.0, 1.0, 0.2])
         values, vectors = np.linalg.eigh(matches.information * scale[:, None] * scale)
         seen = values > 1e-9 * np.maximum(values[:, -1:], 1e-300)
@@ -229,7 +229,7 @@ class Loops:
 
 
 def joined_breaks(broken: Integers, closures: Links) -> Integers:
-    """Return the numbers of breaks (K,) where closures join the sides of some: the least of each joined part."""
+    """Return the numbers of breaks (K,) after closures have joined parts of the chain: the least of each part."""
     from scipy import sparse
     from scipy.sparse.csgraph import connected_components
 

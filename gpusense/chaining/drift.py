@@ -1,4 +1,4 @@
-"""How far the poses of two scans may have drifted apart: covariances of relative poses in a pose graph."""
+"""Drift between the poses of two scans: covariances of relative poses in a pose graph."""
 
 from __future__ import annotations
 
@@ -8,45 +8,59 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense.chaining.graph import Solution, factored, normal_equations, pose_jacobians
+from gpusense.chaining.links import CLOSURE, Links
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Most poses whose joint covariance is kept; in a longer graph each stands for those after it. At most this share are
-# sides of steps whose variance is this many times the usual one, so that breaks of the chain are seen.
+# Most poses whose joint covariance is kept; in a longer graph each represents the poses up to the next one. At most
+# this share are sides of steps whose variance is this many times the usual one, so that breaks of the chain are
+# represented.
 _ANCHORS, _BREAKS, _LOOSE = 300, 0.4, 10.0
-# Lever [m] with which variances of headings count beside those of positions.
+# Lever by which variances of headings are compared with variances of positions [m].
 _LEVER = 3.0
 # Columns of the inverse that are solved for at once.
 _COLUMNS = 192
-# Damping [1/m^2, 1/rad^2]: a direction that no link observes has a variance of the inverse.
+# Damping [1/m^2, 1/rad^2]; its inverse is the variance along a direction that no link observes.
 DAMPING = 1e-6
 
 
 class Drift:
     """Covariances of relative poses of a solved pose graph.
 
+    In a graph with more poses than are kept, all remaining poses are eliminated from its local links. Its closures
+    become links between kept poses, widened by the covariance of the steps in between, so the time is linear in the
+    number of poses for any number of closures.
+
     Args:
         solution: The poses and links.
-        most: Most poses whose joint covariance is kept, at least 3; another pose takes the covariance of the nearest
-            kept one before it.
+        most: Most poses whose joint covariance is kept, at least 3; any other pose takes the covariance of the nearest
+            kept pose before it.
 
     Attributes:
         anchors: (A,) numbers of the kept poses, ascending.
     """
 
     def __init__(self, solution: Solution, most: int = _ANCHORS) -> None:
-        count = len(solution.poses)
-        self._poses = solution.poses
-        self.anchors = anchors = _anchors_of(solution, most)
+        poses, links, count = solution.poses, solution.links, len(solution.poses)
+        self._poses = poses
+        spread = _spread_of_steps(solution) if count > most else np.zeros((0, 3, 3))
+        self.anchors = anchors = _anchors_of(spread, most) if count > most else np.arange(count)
         self._joint = np.zeros((len(anchors), 3, len(anchors), 3))
         if count < 2:
             return
-        matrix, _ = normal_equations(solution.poses, solution.links, solution.links.weight, 0)
-        # The first pose is known: its rows and columns are 0.
+        moved = (links.kind == CLOSURE) & (len(anchors) < count)
+        local = links[~moved]
+        matrix, _ = normal_equations(poses, local, local.weight, 0)
+        # The first pose is known, so its rows and columns are 0.
         rows = (3 * (anchors[1:, None] - 1) + np.arange(3)).ravel()
-        joint = _inverse_part(matrix, rows)
-        self._joint[1:, :, 1:, :] = joint.reshape(len(anchors) - 1, 3, len(anchors) - 1, 3)
+        whole, size = np.zeros_like(self._joint), 3 * len(anchors) - 3
+        whole[1:, :, 1:, :] = _reduced(matrix, rows).reshape(len(anchors) - 1, 3, len(anchors) - 1, 3)
+        if moved.any():
+            _add_closures(whole, poses, links[moved], anchors, spread)
+        left = whole[1:, :, 1:, :].reshape(size, size)
+        inverse = np.linalg.inv(0.5 * (left + left.T))
+        self._joint[1:, :, 1:, :] = (0.5 * (inverse + inverse.T)).reshape(len(anchors) - 1, 3, len(anchors) - 1, 3)
 
     def relative(self, first: Integers, second: Integers) -> Floats:
         """Return the covariances (L, 3, 3) of the poses of second scans in the frames of first ones."""
@@ -59,17 +73,20 @@ class Drift:
         return result
 
 
-def _anchors_of(solution: Solution, most: int) -> Integers:
-    """Return the poses whose joint covariance is kept: even ones, and both sides of the loosest steps."""
-    count = len(solution.poses)
-    if count <= most:
-        return np.arange(count)
+def _spread_of_steps(solution: Solution) -> Floats:
+    """Return the covariances (N - 1, 3, 3) of the poses relative to their predecessors, by the links between both."""
     links = solution.links
-    information = np.zeros((count, 3, 3))
+    information = np.zeros((len(solution.poses), 3, 3))
     follow = np.abs(links.second - links.first) == 1
     later = np.maximum(links.first, links.second)[follow]
     np.add.at(information, later, links.information[follow] * links.weight[follow, None, None])
-    spread = np.linalg.inv(information[1:] + DAMPING * np.eye(3))
+    spread: Floats = np.asarray(np.linalg.inv(information[1:] + DAMPING * np.eye(3)), np.float64)
+    return spread
+
+
+def _anchors_of(spread: Floats, most: int) -> Integers:
+    """Return the poses whose joint covariance is kept: evenly spaced ones, and both sides of the loosest steps."""
+    count = len(spread) + 1
     variance = spread[:, 0, 0] + spread[:, 1, 1] + _LEVER**2 * spread[:, 2, 2]
     loose = np.flatnonzero(variance > _LOOSE * np.median(variance))
     loose = loose[np.argsort(-variance[loose], kind="stable")][: int(_BREAKS * most / 2)]
@@ -78,8 +95,8 @@ def _anchors_of(solution: Solution, most: int) -> Integers:
     return anchors
 
 
-def _inverse_part(matrix: Any, rows: Integers) -> Floats:
-    """Return some rows and columns of the inverse of a sparse matrix, by Schur's complement of the others."""
+def _reduced(matrix: Any, rows: Integers) -> Floats:
+    """Eliminate all but some rows of sparse information, by Schur's complement, and return the information of these."""
     from scipy.sparse import identity
 
     damped = (matrix + DAMPING * identity(matrix.shape[0], format="csc")).tocsc()
@@ -90,6 +107,41 @@ def _inverse_part(matrix: Any, rows: Integers) -> Floats:
         for begin in range(0, len(rows), _COLUMNS):
             part = slice(begin, begin + _COLUMNS)
             left[:, part] -= side.T @ factor.solve(side[:, part].toarray())
-    inverse: Floats = np.asarray(np.linalg.inv(0.5 * (left + left.T)), np.float64)
-    result: Floats = 0.5 * (inverse + inverse.T)
+    return left
+
+
+def _add_closures(whole: Floats, poses: Floats, closures: Links, anchors: Integers, spread: Floats) -> None:
+    """Add closures to the information (A, 3, A, 3) of kept poses.
+
+    Small motions are expressed as motions of a frame at the origin that is fixed to the scan, so a link has the same
+    information between any scans of a rigid body. The covariance of the steps from the kept poses to the scans, as if
+    these had no further links, is added to that of the closure.
+    """
+    steps = np.arange(len(spread))
+    _, two = pose_jacobians(poses, steps, steps + 1)
+    back = np.linalg.inv(two @ _fixed(poses[1:]))
+    step = back @ spread @ back.transpose(0, 2, 1)
+    way = np.zeros((len(poses), 3, 3))
+    length = np.diff(np.append(anchors, len(poses)))
+    for k in range(1, int(length.max())):
+        at = anchors[length > k] + k
+        way[at] = way[at - 1] + step[at - 1]
+    first, second = closures.first, closures.second
+    _, two = pose_jacobians(poses, first, second)
+    two = two @ _fixed(poses[second])
+    information = two.transpose(0, 2, 1) @ (closures.information * closures.weight[:, None, None]) @ two
+    information = information @ np.linalg.inv(np.eye(3) + (way[first] + way[second]) @ information)
+    blocks = whole.transpose(0, 2, 1, 3)
+    ends = [np.searchsorted(anchors, scans, "right") - 1 for scans in (first, second)]
+    moved = [np.linalg.inv(_fixed(poses[anchors[end]])) for end in ends]
+    for one, a in enumerate(ends):
+        for other, b in enumerate(ends):
+            block = moved[one].transpose(0, 2, 1) @ information @ moved[other]
+            np.add.at(blocks, (a, b), block if one == other else -block)
+
+
+def _fixed(poses: Floats) -> Floats:
+    """Return the derivatives (L, 3, 3) of poses by the motion of a frame at the origin to which they are fixed."""
+    result = np.tile(np.eye(3), (len(poses), 1, 1))
+    result[:, 0, 2], result[:, 1, 2] = -poses[:, 1], poses[:, 0]
     return result

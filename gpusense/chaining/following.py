@@ -1,7 +1,7 @@
-"""Matches of successive scans: first from the odometry or from rest, doubtful ones again from the motions around them.
+"""Match successive scans from the odometry or from rest, and doubtful ones again from neighbouring motions.
 
-Without odometry a robot that moves far between scans is guessed badly by rest: along a corridor, where scans look alike
-everywhere, the match then stays where it began. So doubtful matches, and matches whose motion differs from their
+Without odometry, rest is a poor guess for a robot that moves far between scans: along a corridor, where scans look
+alike everywhere, the match then stays at its guess. So doubtful matches, and matches whose motion differs from their
 neighbours', are also tried from constant motion. The match with the highest ``p_right`` is taken, which falls with the
 distance from the guess.
 """
@@ -23,21 +23,21 @@ Flags = NDArray[np.bool]
 
 # Half widths of a second search after a failed one [m, rad].
 _WIDE = (2.0, math.pi)
-# A match is beyond doubt from this p_right on, and motions that differ by more are unlike [m, rad].
+# A match is beyond doubt from this p_right, and motions that differ by more than this are unlike [m, rad].
 _BEYOND, _UNLIKE, _UNLIKE_TURN = 0.9, 0.25, 0.1
-# Most rounds of constant motion, each from the good motions of the one before.
+# Most rounds of constant motion, each from the good motions of the previous one.
 _ROUNDS = 4
 
 
 def matched_again(matcher: Matcher, found: ScanMatch, first: Integers, second: Integers, guess: Floats) -> ScanMatch:
-    """Return matches of which those that have failed are tried from the motions before and after, and in a wide window.
+    """Retry failed matches from the motions before and after, and in a wide window, and return all matches.
 
     Args:
         matcher: Matches scans.
         found: L matches of successive scans.
         first: (L,) indices.
         second: (L,) indices.
-        guess: (L, 3) their guesses.
+        guess: (L, 3) guesses of the matches.
     """
     for attempt in ("before", "after", "wide"):
         good = found.usable & (found.p_right >= SURE)
@@ -58,7 +58,7 @@ def matched_again(matcher: Matcher, found: ScanMatch, first: Integers, second: I
 def matched_by_motion(
     matcher: Matcher, found: ScanMatch, first: Integers, second: Integers, last: Floats | None
 ) -> tuple[ScanMatch, Floats]:
-    """Return matches of which doubtful ones are tried from the motions around them, and from the usual motion.
+    """Retry doubtful matches from neighbouring motions and from the usual motion, and return all matches.
 
     Args:
         matcher: Matches scans.
@@ -68,7 +68,7 @@ def matched_by_motion(
         last: (3,) motion before the first pair; None where it is not known.
 
     Returns:
-        The matches, and (L, 3) offsets to another motion that may also be used; NaN where there is none.
+        The matches, and (L, 3) offsets to a second possible motion; NaN without one.
     """
     seen = [found]
     for _ in range(_ROUNDS):
@@ -91,12 +91,12 @@ def matched_by_motion(
 
 
 def _rivals(found: ScanMatch, seen: list[ScanMatch]) -> Floats:
-    """Return offsets (L, 3) to the most probable other poses along what both observe; NaN where there is none."""
+    """Return offsets (L, 3) to the most probable rival poses along directions that both observe; NaN without one."""
     rival, best = np.full((len(found), 3), np.nan), np.zeros(len(found))
     for other in seen:
         off = other.pose - found.pose
         off[:, 2] = wrap_angle(off[:, 2])
-        # A direction that a match does not observe says nothing.
+        # A direction that a match does not observe is no evidence.
         scale = np.stack([np.ones(len(off)), np.ones(len(off)), found.lever], axis=1)
         along = np.abs(np.einsum("lij,lj->li", found.directions, off * scale)) * (found.eigenvalues > 0)
         apart = (along.max(axis=1) > _UNLIKE) & other.usable & (other.p_right >= SURE) & (other.p_right > best)
@@ -105,7 +105,7 @@ def _rivals(found: ScanMatch, seen: list[ScanMatch]) -> Floats:
 
 
 def weakened(information: Floats, offset: Floats) -> Floats:
-    """Return information (L, 3, 3) of poses that spans others at offsets (L, 3), by Woodbury's identity; NaN: none."""
+    """Return information (L, 3, 3) that spans rivals at offsets (L, 3), by Woodbury's identity; NaN: no rival."""
     offset = np.where(np.isfinite(offset), offset, 0.0)
     side = np.einsum("lij,lj->li", information, offset)
     total = 4 + (side * offset).sum(axis=1)
@@ -114,13 +114,13 @@ def weakened(information: Floats, offset: Floats) -> Floats:
 
 
 def motions_around(motion: Floats, good: Flags, last: Floats | None) -> tuple[Floats, Floats, Floats]:
-    """Return (L, 3) the last good motion before each, the next good one, and their means.
+    """Return the last good motion before each, the next good motion, and their mean, each (L, 3).
 
-    Where one side has none, the other side's is taken; where neither side has one, rest.
+    Without a good motion on one side, that of the opposite side is taken; without any, rest.
 
     Args:
         motion: (L, 3) motions.
-        good: (L,) whether each holds.
+        good: (L,) whether each motion is good.
         last: (3,) motion before the first one; None where it is not known.
     """
     motion = np.concatenate([np.zeros((1, 3)) if last is None else last[None], motion])
@@ -138,13 +138,13 @@ def _tried(
     matcher: Matcher, found: ScanMatch, rows: Integers, first: Integers, second: Integers, guess: Floats,
     window: tuple[float, float] | None,
 ) -> ScanMatch:  # fmt: skip
-    """Return matches of which some are tried from other guesses, and replaced where their p_right is higher."""
+    """Retry some matches from new guesses, and return all matches, replaced where p_right is higher."""
     again = matcher.match(first[rows], second[rows], guess, window)
     return found.replaced(rows, again, _is_better(found, rows, again))
 
 
 def _is_better(found: ScanMatch, rows: Integers, again: ScanMatch) -> Flags:
-    """Return whether new matches of some pairs are usable where those before are not, or have a higher p_right."""
+    """Return whether new matches of some pairs are usable where the previous ones are not, or have a higher p_right."""
     usable, before = again.usable, found.usable[rows]
     better: Flags = (usable & ~before) | ((usable == before) & (again.p_right > found.p_right[rows]))
     return better

@@ -1,7 +1,7 @@
-"""The front end of a chain: successive scans are matched, and each to a local map of key scans around it.
+"""The front end of a chain matches successive scans, and each scan to the key scans around it.
 
-Scans are taken in groups, each of which is matched in few launches: every scan to the one before, every key scan to
-some key scans before it, and every other scan to the key scans on both sides. Time and memory grow linearly.
+Scans are processed in groups of few launches each: every scan is matched to the previous one, every key scan to several
+key scans before it, and every scan between to the key scans on both sides. Time and memory grow linearly.
 """
 
 from __future__ import annotations
@@ -23,15 +23,16 @@ from gpusense.world.scanner import Scanner
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Key scans before it to which a key scan is matched.
+# Number of preceding key scans to which a key scan is matched.
 LOCAL = 4
-# Least p_right of a match that has failed but is a better guess than constant motion.
+# Least p_right of a failed match that is still a better guess than constant motion.
 _LIKELY = 0.1
-# Least p_right of a match over failed ones, and most of these in a row.
+# Least p_right of a match that bridges failed ones, and most failed ones in a row that it bridges.
 _BRIDGE, _GAP = 0.8, 5
-# Readings differ by more than this [m], and this share; scans are unlike where more than a share of them does.
+# Readings differ if they are apart by more than this [m] and this share; scans are unlike if more than this share of
+# their readings differs.
 _DIFFERENCE, _DIFFERENCE_SHARE, _UNLIKE = 0.15, 0.1, 0.3
-# A direction is a turn where this much of its length is.
+# A direction counts as a turn if its heading component exceeds this.
 _TURNING = 0.5
 
 
@@ -47,15 +48,15 @@ class Front:
 
     Attributes:
         jumps: (S,) whether the time jumps before a scan.
-        nodes: (M,) indices of the scans that are matched, those before which the robot has moved.
+        nodes: (M,) indices of the matched scans, before which the robot has moved.
         steps: Motions from each node to the next.
         keys: Numbers of the nodes that are key scans.
         p_right: Probabilities of the matches of steps; 0 where none is usable.
-        lost: Numbers of directions that these leave open.
-        rivalled: Whether other motions explain the scans of a step about as well.
-        bridged: Whether a step that no match tells is that of a match over it.
-        spanned: Whether a match leads over a step that no match tells, and over its neighbours.
-        unseen: (L, 3, 3) projections of steps onto these.
+        lost: Numbers of directions that these matches leave open.
+        rivalled: Whether a second motion explains the scans of a step about as well.
+        bridged: Whether a step without a match of its own is taken from a match that spans it.
+        spanned: Whether a match spans an unmatched step together with its neighbours.
+        unseen: (L, 3, 3) projections of steps onto their open directions.
         links: The links between nodes.
     """
 
@@ -81,7 +82,7 @@ class Front:
 
     @property
     def done(self) -> int:
-        """Number of nodes that are matched."""
+        """Number of matched nodes."""
         return len(self.steps) + 1
 
     @property
@@ -100,7 +101,7 @@ class Front:
         return chained(np.zeros(3), self.steps)
 
     def confirmations(self) -> Integers:
-        """Return the number of matches of farther scans that span each step from node to node, beside a first one."""
+        """Count the matches of farther scans that span each step from node to node, without the first one."""
         links = self.links
         far = np.abs(links.second - links.first) > 1
         ends = np.sort(np.stack([links.first[far], links.second[far]]), axis=0)
@@ -111,11 +112,11 @@ class Front:
         return spanning
 
     def advance(self) -> bool:
-        """Match the next group; return whether there was one. An interrupt leaves the groups before it."""
+        """Match the next group; return whether there was one. An interrupt keeps the previous groups."""
         trial = copy.copy(self)
         trial.keys, trial._parts = list(self.keys), list(self._parts)
         found = trial._match_group()
-        # One call, which no signal divides.
+        # A single call, which no signal divides.
         self.__dict__.update(trial.__dict__)
         return found
 
@@ -131,7 +132,7 @@ class Front:
         return True
 
     def _follow(self, part: Integers) -> None:
-        """Match nodes to those before them."""
+        """Match nodes to their predecessors."""
         first, second = self.nodes[part - 1], self.nodes[part]
         still = np.zeros((len(part), 3))
         guess = still if self._odometry is None else pose_difference(self._odometry[first], self._odometry[second])
@@ -168,11 +169,11 @@ class Front:
         self.lost = np.concatenate([self.lost, np.where(usable, (found.eigenvalues == 0).sum(axis=1), 3)])
 
     def _bridge(self, begin: int, end: int) -> None:
-        """Match over failed steps, of those from ``begin`` to ``end``, and take these from the matches."""
+        """Bridge failed steps between ``begin`` and ``end`` by matches over them."""
         none = np.zeros(end - begin, bool)
         self.bridged, self.spanned = np.append(self.bridged, none), np.append(self.spanned, none)
         for before, after in ((1, 0), (0, 1)):
-            # From one scan more on one side, over a step that is known.
+            # Extend by one scan on one side, over a known step.
             rows = begin + np.flatnonzero(self.p_right[begin:end] < SURE)
             known = rows - before + after
             inside = (known >= begin) & (known < end)
@@ -196,13 +197,13 @@ class Front:
             self.spanned[steps] = True
 
     def _matched_over(self, first: Integers, second: Integers, rows: Integers) -> tuple[Integers, Floats, Floats]:
-        """Add links of good matches over failed ones, and return their rows, poses and p_right."""
+        """Add links of good matches over failed steps, and return their rows, poses and p_right."""
         if not len(rows):
             return rows, np.zeros((0, 3)), np.zeros(0)
         nodes = self.nodes[first], self.nodes[second]
         match = self.matcher.match(*nodes, relative(self.poses, first, second))
         if self._odometry is None:
-            # Failed steps may be worse guesses than constant motion is.
+            # Failed steps may be worse guesses than constant motion.
             steps = np.where((self.p_right < SURE)[:, None], self._expected, self.steps)
             guess = relative(chained(np.zeros(3), steps), first, second)
             again = self.matcher.match(*nodes, guess)
@@ -212,7 +213,7 @@ class Front:
         return rows[good], match.pose[good], match.p_right[good]
 
     def _filled(self, found: ScanMatch, usable: NDArray[np.bool], guess: Floats) -> Floats:
-        """Return the motions by matches, and along what these do not observe by odometry or constant motion."""
+        """Return the motions by matches, filled along unobserved directions by odometry or constant motion."""
         steps = np.where(usable[:, None], found.pose, guess)
         unseen = self._unseen_of(found, usable)
         for k in np.flatnonzero(unseen.any(axis=(1, 2))):
@@ -224,7 +225,7 @@ class Front:
         """Return projections (L, 3, 3) of motions onto the directions that matches do not observe."""
         lost = found.eigenvalues == 0
         if self._odometry is None:
-            # A turn need not go on.
+            # A turn need not continue.
             lost &= np.abs(found.directions[:, :, 2]) < _TURNING
         directions = found.directions * lost[:, :, None]
         scale = np.stack([np.ones(len(lost)), np.ones(len(lost)), found.lever], axis=1)
@@ -232,7 +233,7 @@ class Front:
         return np.where(usable[:, None, None], unseen, np.eye(3))
 
     def _choose_keys(self, begin: int, end: int) -> None:
-        """Choose key scans among nodes: after a motion, and on both sides of a match that has failed."""
+        """Choose key scans among nodes: after a motion, and on both sides of a failed match."""
         poses = self.poses
         length, turn = self._options.key_step
         for k in range(begin, end):
@@ -243,7 +244,7 @@ class Front:
                 self.keys.append(k)
 
     def _match_locally(self, last: bool) -> None:
-        """Match new key scans to those before them, and the scans between two key scans to both."""
+        """Match new key scans to preceding ones, and the scans between two key scans to both."""
         first, second = [], []
         poses, keys = self.poses, np.array(self.keys)
         end = self.done if last else int(keys[-1]) + 1
@@ -259,7 +260,7 @@ class Front:
                     second.append(k)
         self._waiting = end
         one, two = np.array(first, np.int64), np.array(second, np.int64)
-        # A failed step between two nodes separates them, as does one that may be another.
+        # A failed or ambiguous step between two nodes separates them.
         broken = np.append(0, np.cumsum(((self.p_right < SURE) & ~self.spanned) | self.rivalled))
         same = broken[one] == broken[two]
         one, two = one[same], two[same]
@@ -270,9 +271,9 @@ class Front:
 
 
 def moved_scans(odometry: Floats | None, readings: Floats, step: tuple[float, float]) -> Integers:
-    """Return the indices of scans before which the robot has moved since the last such one.
+    """Return the indices of scans before which the robot has moved since the previously chosen scan.
 
-    It has moved where the odometer has by a step, or where the readings differ though the odometer has not.
+    It has moved if the odometer has moved by a step, or if the readings differ although the odometer rests.
     """
     if odometry is None or step == (0.0, 0.0):
         return np.arange(len(readings))
@@ -287,7 +288,7 @@ def moved_scans(odometry: Floats | None, readings: Floats, step: tuple[float, fl
 
 
 def _are_unlike(one: Floats, two: Floats) -> bool:
-    """Return whether more readings of two scans differ than at rest."""
+    """Return whether more readings of two scans differ than would at rest."""
     with np.errstate(invalid="ignore"):
         both = np.isfinite(one) & np.isfinite(two)
         differ = np.abs(one - two) > np.maximum(_DIFFERENCE, _DIFFERENCE_SHARE * one)

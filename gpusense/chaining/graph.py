@@ -1,9 +1,9 @@
-"""Poses that agree best with the links of a pose graph: sparse least squares with a robust kernel.
+"""Solve a pose graph by sparse least squares with a robust kernel.
 
 The cost is the sum over links of c^2 log(1 + s / c^2), Cauchy's kernel of the squared distance s = r' I r of a link's
 residual r in deviations (I is its information). Reweighted Gauss-Newton steps, damped as by Levenberg, minimise it; the
-normal equations are sparse and are factored by SuperLU. Poses are relative to a fixed one. Information may be 0 in some
-directions of some or even all links: an undetermined direction keeps its initial value.
+normal equations are sparse and are factored by SuperLU. Poses are relative to a fixed pose. Information may be 0 in
+some directions of some or even all links: an undetermined direction keeps its initial value.
 """
 
 from __future__ import annotations
@@ -21,10 +21,12 @@ Floats = NDArray[np.float64]
 
 # Scale of Cauchy's kernel [deviations of a link].
 KERNEL = 3.0
-# Most iterations, the step that ends them [m, rad], the first damping and its least and largest values.
+# Most iterations, the step that ends them [m, rad], and the first, least and largest damping.
 _ITERATIONS, _SMALL = 50, 1e-6
 _DAMPING, _LEAST, _MOST = 1e-6, 1e-9, 1e6
-# Information that damping multiplies: that of 1 m and 1 rad.
+# Columns that are factored at once: fewer than SuperLU's default, since few columns of a pose graph are alike.
+_PANEL = 4
+# Information that damping multiplies, of 1 m and 1 rad.
 _UNIT = 1.0
 
 
@@ -33,7 +35,7 @@ class Solution:
     """Poses of a pose graph.
 
     Attributes:
-        poses: (N, 3) poses; the fixed one is where it was.
+        poses: (N, 3) poses; the fixed one is unchanged.
         links: The links with their weights.
         cost: The minimum.
         iterations: Iterations.
@@ -46,14 +48,14 @@ class Solution:
 
 
 def solve(poses: Floats, links: Links, *, fixed: int = 0, kernel: float = KERNEL, least: float = 1e-7) -> Solution:
-    """Return the poses that agree best with links, near given ones.
+    """Return the poses near initial ones that agree best with links.
 
     Args:
         poses: (N, 3) poses to begin with [m, m, rad].
-        links: Links between them, whose weights do not count.
-        fixed: The pose that stays.
+        links: Links between them; their weights are ignored.
+        fixed: Index of the pose that is kept.
         kernel: Scale of Cauchy's kernel [deviations]; infinity for plain least squares.
-        least: Relative gain of the cost that ends the iterations.
+        least: Relative gain of the cost below which the iterations end.
     """
     at, damping = np.array(poses, np.float64), _DAMPING
     squared = links.squared_distances(at)
@@ -109,7 +111,7 @@ def normal_equations(poses: Floats, links: Links, weight: Floats, fixed: int) ->
 
 
 def pose_jacobians(poses: Floats, first: NDArray[np.int64], second: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Return the derivatives (L, 3, 3) of second poses in the frames of first ones by both."""
+    """Return the derivatives (L, 3, 3) of relative poses by the first and by the second pose."""
     c, s = np.cos(poses[first, 2]), np.sin(poses[first, 2])
     off = poses[second] - poses[first]
     x, y = c * off[:, 0] + s * off[:, 1], c * off[:, 1] - s * off[:, 0]
@@ -135,11 +137,12 @@ def factored(matrix: Any, damping: float) -> Any:
 
     # Symmetric and positive definite: a symmetric order without pivots.
     damped = (matrix + damping * _UNIT * identity(matrix.shape[0], format="csc")).tocsc()
-    return splu(damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    options = {"SymmetricMode": True}
+    return splu(damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, relax=1, panel_size=_PANEL, options=options)
 
 
 def _weights(squared: Floats, kernel: float) -> Floats:
-    """Return the factors of links of squared distances: Cauchy's weights."""
+    """Return Cauchy's weights of links by their squared distances."""
     weights: Floats = 1 / (1 + squared / kernel**2) if np.isfinite(kernel) else np.ones(len(squared))
     return weights
 

@@ -1,8 +1,8 @@
-"""One trajectory of a robot with several scanners: the scans of all front ends in the order of the log.
+"""Joint trajectory of a robot with several scanners: the scans of all front ends in the order of the log.
 
-Scans of each scanner are matched among themselves. Between two scans of one scanner lie scans of other scanners; the
-robot's pose at those is interpolated by time. So key scans are coupled with the scans of other scanners before and
-after them: by odometry, or by this share.
+Scans of each scanner are matched among themselves. The robot's pose at scans of further scanners between them is
+interpolated in time. So key scans are coupled with the preceding and following scans of further scanners, by odometry
+or by this interpolation.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool]
 
-# Deviations of a pose between scans of two scanners: of mounts and clocks [m, rad], and a share of the motion.
+# Deviations of a pose between scans of two scanners: by mounts and clocks [m, rad], and a share of the motion.
 _MOUNTS, _MOUNTS_TURN, _SHARE = 0.01, 0.01, 0.1
-# Constant motion goes on over intervals at most this many times as long.
+# Constant motion continues over intervals at most this many times as long.
 _LONGER = 3.0
 # The share between key scans.
 _KEY_SHARE = 0.02
@@ -39,19 +39,19 @@ class Joint:
 
     Args:
         fronts: The front ends.
-        rows: Of each, the indices of its scans in the log.
+        rows: Indices in the log of the scans of each front end.
         times: (S,) times of the poses at the scans of the log [s]; None: evenly.
-        scans: Scans of the log that are taken.
+        scans: Number of scans of the log that are used.
 
     Attributes:
         nodes: (M,) indices of the matched scans in the log, ascending.
-        of: Of each front end, the numbers of its nodes among these.
+        of: For each front end the numbers of its nodes among all nodes.
         owner: (M,) index of the front end of each node.
         keys: (K,) numbers of nodes that are key scans.
-        failed: (M - 1,) whether no scanner tells the motion from a node to the next.
-        open: (M - 1,) whether the scanners that tell it leave a direction open.
-        contested: (M - 1,) whether the scanners that tell it may tell another one as well.
-        poses: (M, 3) poses by the matches that tell most of each motion, chained from the first one.
+        failed: (M - 1,) whether no scanner determines the motion from a node to the next.
+        open: (M - 1,) whether the scanners that determine it leave a direction open.
+        contested: (M - 1,) whether a second motion explains their scans as well.
+        poses: (M, 3) poses by the matches that determine each motion best, chained from the first one.
     """
 
     def __init__(self, fronts: Sequence[Front], rows: Sequence[Integers], times: Floats | None, scans: int) -> None:
@@ -73,13 +73,13 @@ class Joint:
         return list(zip(self.fronts, self.of, strict=True))
 
     def renumbered(self, links: Links, index: int) -> Links:
-        """Return links between nodes of a front end as links between nodes of all, without those beyond the last."""
+        """Renumber links of a front end to the nodes of all front ends; links beyond the last node are left out."""
         count = len(self.of[index])
         return links[(links.first < count) & (links.second < count)].renumbered(self.of[index])
 
     @property
     def broken(self) -> Integers:
-        """(M,) number of motions before each node that no scanner tells, and over which no match leads."""
+        """(M,) number of motions before each node that no scanner determines and no match spans."""
         spanned = np.zeros(len(self.failed), bool)
         for front, of in self._each():
             step, inside = _steps_of(of, len(self.nodes))
@@ -88,7 +88,7 @@ class Joint:
         return result
 
     def jumped(self) -> Flags:
-        """Return whether the time jumps from a node to the next, for all scanners that are there."""
+        """Return whether the time jumps from a node to the next for all scanners with scans there."""
         jumped = np.ones(len(self.nodes) - 1, bool)
         for front, of in self._each():
             step, inside = _steps_of(of, len(self.nodes))
@@ -104,7 +104,7 @@ class Joint:
         return ranks
 
     def confirmations(self) -> Integers:
-        """Return the number (M - 1,) of matches that tell the motion from a node to the next, beside a first one."""
+        """Count the matches (M - 1,) that determine the motion from a node to the next, without the first one."""
         total = np.count_nonzero(self._trust > 0, axis=0) - 1
         for front, of in self._each():
             step, inside = _steps_of(of, len(self.nodes))
@@ -114,7 +114,7 @@ class Joint:
         return result
 
     def _trust_of(self, front: Front, of: Integers) -> Integers:
-        """Return what a front end tells of each motion: -1 nothing, 0 no match, 1 with open directions, 2 all."""
+        """Rate a front end's knowledge of each motion: -1 no scans, 0 no match, 1 with open directions, 2 full."""
         step, inside = _steps_of(of, len(self.nodes))
         trust = np.full(len(step), -1)
         if inside.any():
@@ -139,7 +139,7 @@ class Joint:
         return found & (self._trust.max(axis=0) < 2)
 
     def _contested(self) -> Flags:
-        """Return whether another motion explains the scans of every front end that tells each motion."""
+        """Return whether a second motion explains the scans of every front end that determines each motion."""
         contested = np.ones(len(self.nodes) - 1, bool)
         for index, (front, of) in enumerate(self._each()):
             told = self._trust[index] > 0
@@ -148,7 +148,7 @@ class Joint:
         return contested
 
     def _chained(self, times: Floats | None) -> Floats:
-        """Return poses by the motions of those front ends that tell most."""
+        """Return poses by the motions of the front ends that determine them best."""
         t = self.nodes.astype(np.float64) if times is None else times[self.nodes]
         moved = np.zeros((len(self.nodes) - 1, 3))
         unseen = np.zeros((len(moved), 3, 3))
@@ -174,9 +174,9 @@ class Joint:
         return chained(np.zeros(3), moved)
 
     def pairs(self) -> tuple[Integers, Integers]:
-        """Return nodes with those of other scanners before and after them: earlier and later ones (L,).
+        """Pair nodes with the preceding and following nodes of further scanners; return earlier and later ones (L,).
 
-        These are key scans, and scans of which the matches to the one before do not tell all.
+        The nodes are key scans, and scans whose matches to their predecessors leave directions open.
         """
         count, pairs = len(self.nodes), []
         before, after = np.full((len(self.fronts), count), -1), np.full((len(self.fronts), count), -1)
@@ -197,11 +197,11 @@ class Joint:
         return both[0], both[1]
 
     def couplings(self, reported: Floats | None, motion: OdometryMotion | None) -> Links:
-        """Return links between key scans and scans of other scanners.
+        """Return links between key scans and scans of further scanners.
 
         Args:
             reported: (M, 3) poses of the odometer at the nodes, or None.
-            motion: Its noise, or None.
+            motion: Noise of the odometer, or None.
         """
         if len(self.fronts) == 1:
             return Links.joined([])
@@ -231,7 +231,7 @@ def _shares(moved: Floats, share: float) -> Floats:
 
 
 def _information(deviation: Floats) -> Floats:
-    """Return the information (L, 3, 3) of couplings with deviations beside those of mounts."""
+    """Return the information (L, 3, 3) of couplings from their deviations and those of mounts."""
     diagonal = 1 / (np.array([_MOUNTS, _MOUNTS, _MOUNTS_TURN]) ** 2 + deviation[:, [0, 0, 1]] ** 2)
     return diagonal[:, :, None] * np.eye(3)
 
@@ -243,6 +243,6 @@ def _below(keys: Sequence[int], count: int) -> Integers:
 
 
 def _steps_of(of: Integers, count: int) -> tuple[Integers, Flags]:
-    """Return the steps (M - 1,) of a front end in which the motions between all nodes lie, and whether there is one."""
+    """Return the step (M - 1,) of a front end that contains each motion between all nodes, and whether there is one."""
     step = np.searchsorted(of, np.arange(max(count - 1, 0)), "right") - 1
     return step, (step >= 0) & (step < len(of) - 1)

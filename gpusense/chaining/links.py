@@ -30,12 +30,12 @@ class Links:
 
     Attributes:
         first: (L,) indices of the scans in whose frames poses are.
-        second: (L,) indices of the scans whose poses are known.
+        second: (L,) indices of the scans at these poses.
         pose: (L, 3) poses of the second scans in the frames of the first ones [m, m, rad].
         information: (L, 3, 3) inverse covariances, 0 along directions that are not observed.
         p_right: (L,) probabilities that the poses are right; NaN for odometry and constant motion.
-        kind: (L,) names, see :data:`gpusense.chaining.links.KINDS`.
-        weight: (L,) factors of the information in the solution: near 0 for links that the rest contradict.
+        kind: (L,) kinds, see :data:`gpusense.chaining.links.KINDS`.
+        weight: (L,) factors of the information in the solution: near 0 for links that all remaining ones contradict.
 
     Example:
         >>> import numpy as np
@@ -56,7 +56,7 @@ class Links:
     def of(
         cls, kind: str, first: object, second: object, pose: Floats, information: Floats, p_right: object = np.nan
     ) -> Links:
-        """Return links of one kind, of weight 1."""
+        """Return links of one kind with weight 1."""
         count = len(pose)
         return cls(
             np.asarray(first, np.int64).reshape(count), np.asarray(second, np.int64).reshape(count),
@@ -97,11 +97,11 @@ class Links:
 
 
 def chained(first: Floats, steps: Floats) -> Floats:
-    """Return (S + 1, 3) poses from the first one on, each a step further.
+    """Return (S + 1, 3) poses: the first one, then one after each step.
 
     Args:
         first: (3,) pose.
-        steps: (S, 3) poses in the frames of those before.
+        steps: (S, 3) poses in the frames of their predecessors.
     """
     heading = np.cumsum(np.append(first[2], steps[:, 2]))
     c, s = np.cos(heading[:-1]), np.sin(heading[:-1])

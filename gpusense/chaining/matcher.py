@@ -1,4 +1,4 @@
-"""Matches between scans of a log by their indices, of one scanner or of several scanners of a robot."""
+"""Match scans of a log by their indices, for one scanner or several scanners of a robot."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 GROUP = 256
-"""Scans of a group, after which an interrupt keeps what is matched."""
+"""Scans of a group; an interrupt keeps the matches of finished groups."""
 BATCH = 1024
-"""Most pairs of a call."""
-# A match is used from this p_right on.
+"""Most pairs of one call."""
+# Least p_right of a match that is used.
 SURE = 0.5
 # Half widths of a search where other matches determine the relative pose [m, rad].
 NEAR = (0.5, 0.3)
@@ -48,7 +48,7 @@ class Matcher:
     Attributes:
         readings: The readings.
         scanner: The scanner.
-        motion: (S, 3) motions of the robot during the scans; None where these take no time.
+        motion: (S, 3) motions of the robot during the scans; None if scans are instantaneous.
     """
 
     def __init__(self, readings: Floats, scanner: Scanner, options: ChainOptions) -> None:
@@ -72,9 +72,10 @@ class Matcher:
     def across(
         self, first: Integers, other: Matcher, second: Integers, guess: Floats, window: tuple[float, float] | None
     ) -> Found:
-        """Return the poses of the robot at scans of another scanner of equal bearings, in the frames at these ones.
+        """Return the robot's poses at scans of a second scanner with equal bearings, relative to those at these.
 
-        Both are matched as scans of one scanner in the middle of a robot, whose poses are then those of the scanners.
+        Both are matched as scans of one scanner in the middle of a robot, so that matched poses are those of the
+        scanners.
         """
         one, two = (np.array(matcher.scanner.mount) for matcher in (self, other))
         plain = Scanner(
@@ -110,7 +111,7 @@ class Matcher:
         )
 
     def links(self, kind: str, first: Integers, second: Integers, guess: Floats) -> Links:
-        """Return the links of those matches near their guesses that may be used."""
+        """Return links of the usable matches near their guesses."""
         parts = []
         for begin in range(0, len(first), BATCH):
             part = slice(begin, begin + BATCH)
@@ -124,7 +125,7 @@ class TeamMatcher:
     """Matches scans of several scanners of a robot.
 
     Args:
-        matchers: Those of the scanners.
+        matchers: The matcher of each scanner.
         sensor: (S,) indices of the scanners of all scans.
         place: (S,) indices of the scans among those of their scanners.
     """
@@ -135,12 +136,12 @@ class TeamMatcher:
         self._alike = np.array([[np.array_equal(one, two) for two in bearings] for one in bearings])
 
     def can_match(self, first: Integers, second: Integers) -> NDArray[np.bool]:
-        """Return whether scans can be matched: scans of one scanner, or of scanners with equal bearings."""
+        """Return whether scans can be matched: if they are from one scanner, or from scanners with equal bearings."""
         result: NDArray[np.bool] = self._alike[self._sensor[first], self._sensor[second]]
         return result
 
     def match(self, first: Integers, second: Integers, guess: Floats, window: tuple[float, float]) -> Found:
-        """Return the poses at second scans in the frames at first ones, of pairs that can be matched."""
+        """Return the poses at second scans relative to those at first scans, for pairs that can be matched."""
         pairs = self._sensor[first] * len(self._matchers) + self._sensor[second]
         parts, order = [], []
         for pair in np.unique(pairs):

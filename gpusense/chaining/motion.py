@@ -1,4 +1,4 @@
-"""Motion between scans by the odometry, or constant motion in its place, with information."""
+"""Motion between scans by odometry or by constant motion, with information."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from gpusense.localization.pose_algebra import pose_difference, wrap_angle
 
 Floats = NDArray[np.float64]
 
-# Least deviations of a motion by odometry [m, rad]: a number is needed in each direction.
+# Least deviations of a motion by odometry [m, rad], since each direction needs a finite information.
 _LEAST = (1e-3, 5e-4)
 # Most steps to which the noise of an odometer is fitted.
 _MOST_STEPS = 1000
-# Deviations of constant motion: a share of it, and of a scan's time or a scan [m, rad].
+# Deviations of constant motion: a share of the motion, and an amount per scan [m, rad].
 _SHARE, _RESTLESS, _RESTLESS_TURN = 0.5, 0.02, 0.02
 
 
@@ -30,7 +30,7 @@ def odometry_links(motion: OdometryMotion, before: Floats, after: Floats) -> tup
         after: (L, 3) later poses.
 
     Returns:
-        (L, 3) poses in the frames of those before, and (L, 3, 3) inverse covariances.
+        (L, 3) relative poses, and (L, 3, 3) inverse covariances.
     """
     count = len(before)
     poses, covariances = np.zeros((count, 3)), np.zeros((count, 3, 3))
@@ -47,14 +47,14 @@ def odometry_links(motion: OdometryMotion, before: Floats, after: Floats) -> tup
 
 
 def fitted_motion(odometry: Floats, poses: Floats, joined: NDArray[np.bool]) -> OdometryMotion:
-    """Return the noise of an odometer against matched poses; the default where too little is known.
+    """Fit the noise of an odometer to matched poses; return the default where too little is known.
 
     Args:
         odometry: (M, 3) poses of the odometer at key scans.
         poses: (M, 3) poses by matches.
-        joined: (M - 1,) whether a match tells the motion between two of them in all directions.
+        joined: (M - 1,) whether a match determines the motion between successive key scans in all directions.
     """
-    # The longest stretch without a gap.
+    # Use the longest stretch without a gap.
     ends = np.flatnonzero(~np.concatenate([[False], joined, [False]]))
     longest = int(np.argmax(np.diff(ends)))
     part = slice(ends[longest], min(ends[longest + 1], ends[longest] + _MOST_STEPS))
@@ -67,7 +67,7 @@ def fitted_motion(odometry: Floats, poses: Floats, joined: NDArray[np.bool]) -> 
 
 
 def constant_motion_deviation(steps: Floats) -> Floats:
-    """Return the deviations (L, 2) of motions (L, 3) copied from the step before [m, rad]."""
+    """Return the deviations (L, 2) of motions (L, 3) copied from the previous step [m, rad]."""
     length = np.hypot(steps[:, 0], steps[:, 1])
     return np.stack([_RESTLESS + _SHARE * length, _RESTLESS_TURN + _SHARE * np.abs(steps[:, 2])], axis=1)
 
@@ -95,7 +95,7 @@ def relative(poses: Floats, first: NDArray[np.int64], second: NDArray[np.int64])
 
 
 def partial_motion(motion: Floats, share: Floats) -> Floats:
-    """Return the motions (L, 3) after a share (L,) of others, which are arcs (see ``gpusense.world.deskew``)."""
+    """Return the motions (L, 3) after a share (L,) of full motions, which are arcs (see ``gpusense.world.deskew``)."""
     half = motion[:, 2] / 2
     length = share * np.sinc(share * half / math.pi) / np.sinc(half / math.pi)
     turn = (share - 1) * half
@@ -105,7 +105,7 @@ def partial_motion(motion: Floats, share: Floats) -> Floats:
 
 
 def filled_motion(motion: Floats, expected: Floats, unseen: Floats) -> Floats:
-    """Return a motion (3,) that is the expected one along what a projection (3, 3) has of their difference."""
+    """Replace the part of a motion (3,) in a projection's (3, 3) range by the expected motion."""
     off = expected - motion
     off[2] = wrap_angle(off[2])
     result: Floats = motion + unseen @ off

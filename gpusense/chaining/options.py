@@ -15,7 +15,7 @@ from gpusense.localization.motion import OdometryMotion
 
 Floats = NDArray[np.float64]
 
-# A gap of the times longer than this many usual steps, and than this [s], is a jump.
+# A time gap longer than this many usual steps, and longer than this [s], is a jump.
 _JUMP_STEPS, _JUMP = 10.0, 2.0
 
 
@@ -30,7 +30,7 @@ class ChainOptions:
         motion: Noise of the odometry; None to fit it to the matches.
         close_loops: Whether places that are seen again are searched for.
         backend: The device.
-        precision: Of the matches.
+        precision: Precision of the matches.
     """
 
     step: tuple[float, float]

@@ -1,4 +1,4 @@
-"""Pairs of key scans that may show the same place, since their end points share cells of the plane."""
+"""Find pairs of key scans that may show the same place because their end points share cells of the plane."""
 
 from __future__ import annotations
 
@@ -14,16 +14,18 @@ from gpusense.world.sensor_scans import SensorScans
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Least share of a scan's cells that another scan must share.
+# Least share of a scan's cells that a second scan must share.
 _SHARE = 0.3
-# Key scans whose shares are looked at at once.
+# Key scans whose shares are computed at once.
 _ROWS = 512
-# Points farther than this many rms ranges say little of a place.
+# Most cells of a plane for which a table is kept.
+_DENSE = 1 << 22
+# Points farther than this many rms ranges are left out, since they say little about a place.
 _FAR = 2.0
-# Passages through a place in each of some directions that later ones are compared with, key scans of a scanner between
-# two passages, and most of one.
+# Passages per direction through a place with which later ones are compared, the directions, key scans of a scanner
+# between two passages, and most key scans of a passage.
 _PASSAGES, _WAYS, _AWAY, _LONG = 4, 4, 16, 64
-# Most first scans of a second one, and the share of cells that is large.
+# Most first scans for each second one, and the share of cells that counts as large.
 _PAIRS, _LARGE = 8, 0.6
 
 
@@ -51,8 +53,8 @@ def overlaps(
 ) -> tuple[Integers, Integers, Floats]:
     """Return pairs of key scans that share many cells, the best of each passage.
 
-    Of the key scans of a scanner in a row that share cells with another one, that with the most is taken. Earlier scans
-    come from the first passages through each place, so their number does not grow with further passages.
+    From successive key scans of a scanner that share cells with a second one, the one with the largest share is taken.
+    Earlier scans come from the first passages through each place, so their number does not grow with further passages.
 
     Args:
         places: End points of each key scan in the robot's frame.
@@ -86,21 +88,37 @@ def overlaps(
 
 
 def _cells_of(places: list[Floats], poses: Floats, cell: float) -> tuple[Integers, Integers]:
-    """Return the key scans (C,) and the numbers (C,) of the cells that their points are in, each once."""
+    """Return the key scans (C,) and the numbers (C,) of the cells that contain their points, each pair once."""
     owner = np.repeat(np.arange(len(places)), [len(points) for points in places])
     at = np.zeros((len(owner), 3))
     at[:, :2] = np.concatenate(places)
     cells = np.floor(compose_poses(poses[owner], at)[:, :2] / cell).astype(np.int64)
-    _, number = np.unique(cells @ np.array([1 << 31, 1]), return_inverse=True)
+    number = _numbered(cells)
     count = int(number.max(initial=0)) + 1
     both = np.unique(owner * count + number)
     return both // count, both % count
 
 
+def _numbered(cells: Integers) -> Integers:
+    """Return the number (C,) of each cell (C, 2) among the distinct cells, row by row."""
+    if not len(cells):
+        return np.zeros(0, np.int64)
+    low = cells.min(axis=0)
+    rows, cols = (cells.max(axis=0) - low + 1).tolist()
+    if rows * cols > max(_DENSE, len(cells)):
+        _, number = np.unique((cells - low) @ np.array([cols, 1]), return_inverse=True)
+        return number
+    number = (cells - low) @ np.array([cols, 1])
+    seen = np.zeros(rows * cols, bool)
+    seen[number] = True
+    numbers: Integers = np.cumsum(seen)[number] - 1
+    return numbers
+
+
 def _first_passages(table: Any, poses: Floats, sequence: tuple[Integers, Integers]) -> Integers:
     """Return the key scans of the first passages, by a scanner in a direction, through enough of their cells.
 
-    A cell is passed once more where it is seen after some key scans in which it was not, or after many in a row.
+    A new passage of a cell begins after several key scans that do not show it, or after many in a row that do.
     """
     scanners, ranks = sequence
     ways = scanners * _WAYS + np.floor(poses[:, 2] / (2 * np.pi) * _WAYS + 0.5).astype(np.int64) % _WAYS
@@ -119,7 +137,7 @@ def _first_passages(table: Any, poses: Floats, sequence: tuple[Integers, Integer
 
 
 def _most_alike(first: Integers, second: Integers, share: Floats, poses: Floats) -> tuple[Integers, Integers, Floats]:
-    """Return a few pairs of each second scan: of large shares and like headings, the earliest first ones."""
+    """Choose a few pairs for each second scan: with large shares and similar headings, earliest first scans first."""
     apart = np.abs(wrap_angle(poses[first, 2] - poses[second, 2])) > 0.5 * np.pi
     order = np.lexsort((first, apart.astype(np.int64) + (share < _LARGE), second))
     begin = np.searchsorted(second[order], second[order])
@@ -137,7 +155,7 @@ def _best_of_passages(
     order = np.lexsort((rank, scanner, second))
     first, second, scanner, rank = (values[order] for values in (first, second, scanner, rank))
     share = share[order]
-    # A run ends where a first scan or more is left out.
+    # A run ends where first scans are skipped.
     begins = np.append(True, (np.diff(second) != 0) | (np.diff(scanner) != 0) | (np.diff(rank) > 1))
     run = np.cumsum(begins)
     best = np.lexsort((-share, run))

@@ -16,10 +16,10 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 REASONS = {
-    "no match": "the scan matches neither the one before nor key scans: its motion is that of odometry or a guess",
+    "no match": "the scan matches neither its predecessor nor key scans: its motion is from odometry or a guess",
     "unobserved": "the scans do not observe a direction of the motion, as along a corridor, and there is no odometry",
-    "contested": "the scans agree about as well after another motion, and there is no odometry to tell which it was",
-    "unconfirmed": "a single match tells the motion, and there is no odometry: no other match agrees with it",
+    "contested": "the scans agree about as well for a second motion, and there is no odometry to decide between both",
+    "unconfirmed": "a single match determines the motion, and there is no odometry: no further match confirms it",
     "jump": "the time jumps, and the robot may be anywhere after it",
 }
 """The meaning of each doubt."""
@@ -30,7 +30,7 @@ class Doubt(NamedTuple):
 
     Attributes:
         first: Index of the scan before the first doubtful motion.
-        last: Index of the scan after the last one.
+        last: Index of the scan after the last doubtful motion.
         reason: One of :data:`gpusense.chaining.result.REASONS`.
     """
 
@@ -47,18 +47,18 @@ class ScanChain:
         poses: (S, 3) poses of the robot at the first listed beam of each scan [m, m, rad]; the first is the odometry's,
             or (0, 0, 0) without odometry.
         covariance: (S, 3, 3) covariances given the first pose [m^2, m rad, rad^2]; very large along directions that
-            nothing tells.
+            nothing determines.
         links: The links of the pose graph between scans, with their weights in the solution; closures are among them.
         keys: (K,) indices of the key scans.
-        motion: The noise of the odometry, given or fitted to the matches; None without odometry.
-        motions: (S, 3) motion of the robot from the first listed beam of each scan to the last one, or None where
-            scans take no time.
+        motion: The noise of the odometry, as passed or fitted to the matches; None without odometry.
+        motions: (S, 3) motion of the robot from the first listed beam of each scan to the last one, or None if scans
+            are instantaneous.
         duration: Time from the first listed beam to the last one that was used [s]; negative where beams are listed in
             reverse: see :attr:`later`. With several scanners a tuple.
         sensor: (S,) index of the scanner of each scan.
         corrections: (C,) distances [m] by which the closures moved the second scans in the frames of the first ones.
         doubts: Stretches that are doubtful.
-        matched: Number of scans that were matched; at the rest the robot stood still by its odometry.
+        matched: Number of scans that were matched; during all remaining ones the robot stood still by its odometry.
         searched: Number of pairs of key scans that were matched in the search for places that are seen again.
 
     Example:
@@ -104,7 +104,7 @@ class ScanChain:
         return result
 
     def explain(self) -> str:
-        """Return the numbers of scans, key scans, links and closures, and the doubts, in words."""
+        """Describe the numbers of scans, key scans, links and closures, and the doubts, in words."""
         count = len(self.poses)
         lines = [f"{count} scans, {self.matched} matched, {len(self.keys)} key scans, {len(self.links)} links"]
         durations = self.duration if isinstance(self.duration, tuple) else (self.duration,)
@@ -112,14 +112,16 @@ class ScanChain:
             order = "in reverse" if duration < 0 else "in their order"
             of = f"scanner {k}: " if len(durations) > 1 else ""
             if duration:
-                lines.append(f"{of}scans of {abs(duration):.3g} s, measured {order}, are freed of the robot's motion")
+                lines.append(
+                    f"{of}scans of {abs(duration):.3g} s, measured {order}, are corrected for the robot's motion"
+                )
         if len(self.corrections):
             lines.append(
                 f"{len(self.corrections)} closures, which moved scans by {np.median(self.corrections):.2f} m in the "
                 f"median and {self.corrections.max():.2f} m at most"
             )
         else:
-            lines.append("no place was seen again, or none for sure: no loop is closed")
+            lines.append("no place was seen again with certainty: no loop is closed")
         for reason, meaning in REASONS.items():
             some = [doubt for doubt in self.doubts if doubt.reason == reason]
             if some:
@@ -137,7 +139,7 @@ def doubts_of(joint: Joint, alone: bool) -> tuple[Doubt, ...]:
 
     Args:
         joint: The matched scans.
-        alone: Whether there is no odometry.
+        alone: Whether odometry is missing.
     """
     failed, open_, nodes = joint.failed, joint.open & alone, joint.nodes
     contested = joint.contested & ~failed & ~open_

@@ -1,9 +1,9 @@
 """Covariances of all poses of a pose graph: the diagonal blocks of the inverse of its sparse normal equations.
 
-The matrix of 3 x 3 blocks is eliminated front by front along the tree of eliminations (Duff and Reid 1983). From its
-root down, the blocks of the inverse that lie in the fronts follow from those of the parents (Takahashi et al. 1973):
-with L the column below a pivot D, and Z the inverse, Z_sj = -Z_ss L and Z_jj = D^-1 + L' Z_ss L. Other blocks are never
-computed, so time and memory are those of the elimination.
+The matrix of 3 x 3 blocks is eliminated front by front along the elimination tree (Duff and Reid 1983), successive
+columns with equal rows at once. From its root down, the blocks of the inverse within each front follow from those of
+its parent (Takahashi et al. 1973): with L the columns below pivots D, and Z the inverse, Z_sj = -Z_ss L and Z_jj = D^-1
++ L' Z_ss L. No further blocks are computed, so time and memory are those of the elimination.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Integers = NDArray[np.int64]
 def pose_covariances(solution: Solution) -> Floats:
     """Return the covariances (N, 3, 3) of poses, given the first one.
 
-    A direction that no link observes has a variance of some 1e6 m^2 or rad^2.
+    A direction that no link observes has a variance of about 1e6 m^2 or rad^2.
     """
     count = len(solution.poses)
     result = np.zeros((count, 3, 3))
@@ -44,40 +44,38 @@ def inverse_blocks(matrix: Any, damping: float) -> Floats:
     blocks.sort_indices()
     count = blocks.shape[0] // 3
     order = _order(blocks, count)
-    place = np.empty(count, np.int64)
-    place[order] = np.arange(count)
-    below, factors, inverses = _eliminated(blocks, order, place, damping)
-    children = [0] * count
-    for rows in below:
-        if len(rows):
-            children[rows[0]] += 1
+    parts = _parts_of(blocks, order)
+    home = np.repeat(np.arange(len(parts)), [end - begin for begin, end, _ in parts])
+    factors, inverses = _eliminated(blocks, order, parts, home, damping)
+    children = np.bincount([home[rows[0]] for _, _, rows in parts if len(rows)], minlength=len(parts))
     fronts: dict[int, Floats] = {}
     result = np.empty((count, 3, 3))
-    for k in range(count - 1, -1, -1):
-        rows, factor = below[k], factors[k]
-        size = 3 * len(rows)
-        front = np.empty((3 + size, 3 + size))
-        if size:
-            parent = int(rows[0])
-            known = np.append(parent, below[parent])
-            at = _scalars(np.searchsorted(known, rows))
+    for k in range(len(parts) - 1, -1, -1):
+        begin, end, rows = parts[k]
+        factor, size = factors[k], 3 * (end - begin)
+        front = np.empty((size + 3 * len(rows), size + 3 * len(rows)))
+        front[:size, :size] = inverses[k]
+        if len(rows):
+            parent = int(home[rows[0]])
+            first, last, known = parts[parent]
+            at = _scalars(np.searchsorted(np.append(np.arange(first, last), known), rows))
             inner = fronts[parent][np.ix_(at, at)]
             side = -inner @ factor
-            front[3:, 3:], front[3:, :3], front[:3, 3:] = inner, side, side.T
-            front[:3, :3] = inverses[k] - factor.T @ side
+            front[size:, size:], front[size:, :size], front[:size, size:] = inner, side, side.T
+            front[:size, :size] -= factor.T @ side
             children[parent] -= 1
             if not children[parent]:
                 del fronts[parent]
-        else:
-            front[:3, :3] = inverses[k]
-        result[order[k]] = 0.5 * (front[:3, :3] + front[:3, :3].T)
+        pivots = np.arange(end - begin)
+        found = front[:size, :size].reshape(end - begin, 3, end - begin, 3)[pivots, :, pivots, :]
+        result[order[begin:end]] = 0.5 * (found + found.transpose(0, 2, 1))
         if children[k]:
             fronts[k] = front
     return result
 
 
 def _order(blocks: Any, count: int) -> Integers:
-    """Return the blocks in an order of elimination with little fill: of minimum degree, by SuperLU."""
+    """Return an elimination order of the blocks with little fill: minimum degree, by SuperLU."""
     from scipy import sparse
     from scipy.sparse.linalg import splu
 
@@ -89,43 +87,68 @@ def _order(blocks: Any, count: int) -> Integers:
     return order
 
 
-def _eliminated(
-    blocks: Any, order: Integers, place: Integers, damping: float
-) -> tuple[list[Integers], list[Floats], list[Floats]]:
-    """Return, of each step of the elimination, the rows below, the factor L, and the inverse of the pivot."""
+def _parts_of(blocks: Any, order: Integers) -> list[tuple[int, int, Integers]]:
+    """Return runs of steps of the elimination, each with its first and its end, and the rows below that all share."""
     count = len(order)
+    place = np.empty(count, np.int64)
+    place[order] = np.arange(count)
     below: list[Integers] = []
+    children: list[list[Integers]] = [[] for _ in range(count)]
+    for k in range(count):
+        columns = place[blocks.indices[blocks.indptr[order[k]] : blocks.indptr[order[k] + 1]]]
+        rows = np.unique(np.concatenate([columns[columns > k], *children[k]]))
+        children[k] = []
+        if len(rows):
+            children[rows[0]].append(rows[1:])
+        below.append(rows)
+    parts, begin = [], 0
+    for k in range(count):
+        rows = below[k]
+        if k + 1 == count or not len(rows) or rows[0] != k + 1 or len(rows) != len(below[k + 1]) + 1:
+            parts.append((begin, k + 1, rows))
+            begin = k + 1
+    return parts
+
+
+def _eliminated(
+    blocks: Any, order: Integers, parts: list[tuple[int, int, Integers]], home: Integers, damping: float
+) -> tuple[list[Floats], list[Floats]]:
+    """Return for each run of steps of the elimination the factor L and the inverse of the pivots.
+
+    ``home`` (N,) has the run of each step.
+    """
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
     factors: list[Floats] = []
     inverses: list[Floats] = []
-    waiting: list[list[tuple[Integers, Floats]]] = [[] for _ in range(count)]
-    for k in range(count):
-        node = order[k]
-        part = slice(blocks.indptr[node], blocks.indptr[node + 1])
-        columns, values = place[blocks.indices[part]], blocks.data[part]
-        later = columns >= k
-        columns, values = columns[later], values[later]
-        rows = np.unique(np.concatenate([np.array([k]), columns, *(rows for rows, _ in waiting[k])]))
+    waiting: list[list[tuple[Integers, Floats]]] = [[] for _ in parts]
+    for k, (begin, end, below) in enumerate(parts):
+        rows, size = np.append(np.arange(begin, end), below), 3 * (end - begin)
         front = np.zeros((3 * len(rows), 3 * len(rows)))
-        for at, value in zip(np.searchsorted(rows, columns), values, strict=True):
-            # Row block of the pivot; the front is used below it.
-            front[3 * at : 3 * at + 3, :3] += value.T
-        front[:3, :3] += damping * np.eye(3)
+        # Columns of the pivots; only the lower triangle of the pivots is used.
+        split = front.reshape(len(rows), 3, len(rows), 3)
+        for step in range(begin, end):
+            part = slice(blocks.indptr[order[step]], blocks.indptr[order[step] + 1])
+            columns, values = place[blocks.indices[part]], blocks.data[part]
+            later = columns >= step
+            split[np.searchsorted(rows, columns[later]), :, step - begin, :] += values[later].transpose(0, 2, 1)
         for others, update in waiting[k]:
             at = _scalars(np.searchsorted(rows, others))
             front[np.ix_(at, at)] += update
         waiting[k] = []
-        inverse: Floats = np.asarray(np.linalg.inv(front[:3, :3]), np.float64)
-        side = front[3:, :3]
+        pivot = np.tril(front[:size, :size])
+        pivot += np.tril(pivot, -1).T + damping * np.eye(size)
+        inverse: Floats = np.asarray(np.linalg.inv(pivot), np.float64)
+        side = front[size:, :size]
         factor: Floats = side @ inverse
-        if len(rows) > 1:
-            waiting[rows[1]].append((rows[1:], front[3:, 3:] - factor @ side.T))
-        below.append(rows[1:])
+        if len(below):
+            waiting[home[below[0]]].append((below, front[size:, size:] - factor @ side.T))
         factors.append(factor)
         inverses.append(inverse)
-    return below, factors, inverses
+    return factors, inverses
 
 
 def _scalars(blocks: Integers) -> Integers:
-    """Return the rows of blocks of three."""
+    """Return the scalar rows of blocks of three."""
     rows: Integers = (3 * blocks[:, None] + np.arange(3)).ravel()
     return rows

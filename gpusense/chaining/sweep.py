@@ -1,7 +1,7 @@
-"""The order in which beams are measured: as they are listed, in reverse, or all at once.
+"""Determine the order in which beams are measured: as listed, in reverse, or all at once.
 
-Drivers of lasers that turn clockwise list their beams in reverse, and some state times that do not hold. Scans between
-which the robot turns tell: freed of its motion by the right order they agree best.
+Drivers of lasers that turn clockwise list their beams in reverse, and some report wrong times. Scans during which the
+robot turns decide: corrected for its motion by the right order they agree best.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from gpusense.chaining.motion import relative, scan_motions
 
 Floats = NDArray[np.float64]
 
-# Most scans that are inspected; scans between the two of a pair; most pairs; least turn during a scan that is evidence
-# [rad].
+# Most scans that are inspected; scans between the two of a pair; most pairs; least turn during a scan that counts as
+# evidence [rad].
 _SCANS, _LAG, _PAIRS, _TURN = 2000, 5, 120, 0.01
-# Another order than the listed one must raise the mean score by this much.
+# An order other than the listed one must raise the mean score by this much.
 _CLEAR = 0.003
 
 
@@ -26,9 +26,9 @@ def signed_duration(matcher: Matcher, times: Floats, duration: float) -> float:
     """Return the time from the first listed beam to the last one: negative in reverse order, 0 for all at once.
 
     Args:
-        matcher: Matches scans that are not freed of motion.
+        matcher: Matches scans without correction for motion.
         times: (S,) times of the scans [s].
-        duration: The time in the listed order [s], which holds where the scans do not tell.
+        duration: The time in the listed order [s], which is returned where the scans do not decide.
     """
     count = min(len(times), _SCANS)
     if count <= _LAG + 1:

@@ -43,6 +43,7 @@ around it, places that are seen again are found and matched, and the poses are t
 and the odometry. The command says what was closed, and what is doubtful. CARMEN logs have poses, which in raw ones are
 copies of the odometry: --chain finds better ones. With --reference the poses are those of a TUM trajectory.
 Several lasers of a bag, whose transforms have their mounts, make one trajectory and one map.
+A chain begins at 0 0 0 of its map: 'gpusense localize' follows the same log from --start 0 0 0, others with --global.
 
 Ctrl-C ends the chain, and the map of the scans so far is written; or it ends the map, which then holds some of the
 scans. A map of more than four million cells is built in bands of rows: then it is the map of the bands so far, and of
@@ -52,6 +53,7 @@ Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
 example:
   gpusense map --log run.bag --out map.yaml --tum run.tum --plot map.png
+  gpusense localize --map map.yaml --log run.bag --start 0 0 0
   gpusense map --log run.bag --topic /front /rear --out map.yaml
   gpusense map --log run.log.gz --chain --range-limit 20 --out map.yaml
   gpusense map --log run.log.gz --every 2 --range-limit 20 --resolution 0.1 --out even.yaml

@@ -19,7 +19,7 @@ from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.tables.distances import distance_transform
-from gpusense.tables.rectangles import empty_rectangles
+from gpusense.tables.rectangles import Planes, empty_rectangles
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters, IncidenceParameters, LikelihoodFieldParameters
 from gpusense.world.scanner import Scanner
@@ -172,7 +172,9 @@ def _tables(backend: Backend, scene: Scene) -> tuple[Results, list[Check]]:
     name, obstacles = backend.info.selection, scene.grid.obstacles()
     rows, cols = obstacles.shape
     squared, exact = distance_transform(obstacles, squared=True, backend=backend), TOLERANCES["distance transform"]
-    planes = backend.download(empty_rectangles(backend, obstacles, 1), np.empty(4 * (rows + 2) * (cols + 2), np.uint16))
+    planes = backend.download(
+        empty_rectangles(backend, obstacles, Planes(1)), np.empty(4 * (rows + 2) * (cols + 2), np.uint16)
+    )
     sides = np.minimum(planes & 255, planes >> 8)
     results: Results = {exact.name: (squared, exact), "empty squares": (sides, TOLERANCES["empty squares"])}
     return results, [Check.of(name, "SciPy", "distance transform", squared, scipy_squares(obstacles), exact)]

@@ -27,7 +27,7 @@ from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.densities import log_mixture, naive_log_mixture
 from gpusense.models.scan.field import LikelihoodFieldModel
-from gpusense.tables.rectangles import empty_rectangles
+from gpusense.tables.rectangles import Planes, empty_rectangles
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 from gpusense.world.scanner import Scanner
@@ -110,7 +110,7 @@ def density_grid(backend: Selection, precision: str) -> Densities:
     ulp = float(np.spacing(real.type(RANGE_MAX / 2)))
     poses = np.full((8, 4), (0.5, 0.5, 1.0, 0.0), real)
     poses[1:7, 0] = 1 - ulp / 16, 0.9990234375, 0.5, 0.7109375, 0.328125, ulp
-    rectangles, count = empty_rectangles(device, obstacles, 1), len(poses)
+    rectangles, count = empty_rectangles(device, obstacles, Planes(1)), len(poses)
     cells = device.upload(np.array([(c, 0) for c in (40, 39, 39, 39, 37, 31, 24, 20)], np.int32))
     pose, ray, ranges = device.upload(poses), device.upload(np.array([[1, 0]], real)), device.empty(count, real)
     wide = frozenset({"FLOAT64"} if real == np.float64 else ())

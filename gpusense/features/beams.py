@@ -1,4 +1,4 @@
-"""The beams of scans in the order of points: which have a point, no return, or no information."""
+"""Beams of scans in the order of points: each has a point, no return, or no information."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gpusense.matching.points import ScanPoints
 from gpusense.world.scanner import Reading, Scanner, classes
 
 _FULL_TURN = 2 * math.pi
-# Beams are neighbours up to this step, in usual steps.
+# Largest step between the bearings of neighbouring beams [usual steps].
 _NEIGHBOURS = 1.5
 
 
@@ -32,7 +32,7 @@ class Beams:
     maxima: np.ndarray
 
     def without_return(self, scan: np.ndarray, last: np.ndarray, first: np.ndarray) -> np.ndarray:
-        """Return the beams without a return between pairs of points (P,) of scans, in the direction of bearings."""
+        """Count the beams (P,) without a return between pairs of points of scans, in the direction of bearings."""
         one, two = self.beam[last], self.beam[first]
         between = self.maxima[scan, two] - self.maxima[scan, one]
         result: np.ndarray = between + np.where(two < one, self.maxima[scan, -1], 0)
@@ -40,7 +40,7 @@ class Beams:
 
 
 def beams_of(ranges: np.ndarray, scanner: Scanner, points: ScanPoints) -> Beams:
-    """Return the beams of (S, K) readings whose points are at hand."""
+    """Return the beams of (S, K) readings with these points."""
     angle = np.mod(scanner.bearings + scanner.mount[2], _FULL_TURN)
     order = np.argsort(angle, kind="stable")
     state = classes(ranges, scanner.range_min, scanner.range_max)[:, order]
@@ -59,7 +59,7 @@ def beams_of(ranges: np.ndarray, scanner: Scanner, points: ScanPoints) -> Beams:
 
 
 def _beams_of_points(points: ScanPoints, bearing: np.ndarray, scan: np.ndarray, state: np.ndarray) -> np.ndarray:
-    """Return the beam of each point: points are the hits beyond a micrometre, in order."""
+    """Return the beam of each point; points are the hits beyond a micrometre, in order."""
     hits = state == Reading.HIT
     if np.count_nonzero(hits) == len(scan):
         return np.nonzero(hits)[1]

@@ -1,4 +1,4 @@
-"""Landmarks from features with a position: nearby features of one kind, direction and size form one landmark."""
+"""Cluster features with a position: nearby features of one kind, direction and size form one landmark."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from gpusense.features.feature_map import FeatureMap
 from gpusense.features.result import KIND_TYPE, Features, Floats
 
-# Features are of one landmark within this many deviations, with this much added [m], and directions and sizes within
-# these [rad, m or rad].
+# Features belong to one landmark within this many deviations, widened by this distance [m], if their directions [rad]
+# and sizes [m or rad] differ by at most these.
 _DEVIATIONS, _FLOOR, _TURN = 4.0, 0.03, 0.4
 _SIZES = {"corner": 0.5, "door": 0.4, "pole": 0.1, "reflector": 0.1}
 
@@ -65,7 +65,7 @@ class _Clusters:
         self._size = np.zeros(0)
 
     def nearest(self, world: InWorld, i: int) -> int:
-        """Return the landmark that a feature may be of, or -1."""
+        """Return the landmark to which a feature may belong, or -1."""
         off = self._pose[:, :2] - world.pose[i, :2]
         near = np.flatnonzero(np.abs(off).max(axis=1, initial=0) < 2.0)
         if not len(near):

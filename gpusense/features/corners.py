@@ -12,7 +12,7 @@ from gpusense.features.segments import Segments
 
 # Least turn between two walls [rad], and most points between them.
 _LEAST_TURN, _BETWEEN = math.radians(25), 2
-# Lines meet if the vertex is this many beams and deviations from the end of each.
+# Lines meet if the vertex is at most this many beams and deviations from the end of each.
 _BEAMS, _DEVIATIONS = 1.5, 3.0
 
 
@@ -27,7 +27,7 @@ def find_corners(segments: Segments, straight: np.ndarray, mount: tuple[float, f
     inverse = np.linalg.inv(normals)
     vertex = (inverse @ np.stack([segments.distance[one], segments.distance[two]], axis=1)[..., None])[..., 0]
     along = np.stack([_along(vertex, alpha), _along(vertex, beta)], axis=1)
-    # The error of the distance of the vertex from each line, by errors of angle and distance.
+    # Derivatives of the vertex's distance from each line by the angle and the distance of the line.
     row = np.zeros((len(one), 2, 4))
     row[:, 0, 0], row[:, 0, 1], row[:, 1, 2], row[:, 1, 3] = -along[:, 0], 1, -along[:, 1], 1
     jacobian = np.zeros((len(one), 3, 4))
@@ -39,7 +39,7 @@ def find_corners(segments: Segments, straight: np.ndarray, mount: tuple[float, f
     spread = np.sqrt(np.einsum("cii->c", covariance[:, :2, :2]))
     space = (_BEAMS + between)[:, None] * np.stack([segments.spacing[one, 1], segments.spacing[two, 0]], axis=1)
     gap = np.stack([along[:, 0] - segments.ends[one, 1], segments.ends[two, 0] - along[:, 1]], axis=1)
-    # So near the vertex a point is on both lines, within noise.
+    # Within this distance of the vertex a point lies on both lines, up to noise.
     noise = np.sqrt(np.maximum(segments.variance[one], segments.variance[two]))
     reach = _DEVIATIONS * (spread + noise / np.abs(np.sin(turn)))
     meets = (np.abs(gap) <= space + reach[:, None]).all(axis=1)
@@ -50,13 +50,13 @@ def find_corners(segments: Segments, straight: np.ndarray, mount: tuple[float, f
 
 
 def _along(vertex: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Return places of points along lines."""
+    """Return the coordinates of points along lines."""
     place: np.ndarray = -np.sin(angle) * vertex[:, 0] + np.cos(angle) * vertex[:, 1]
     return place
 
 
 def _neighbours(segments: Segments, straight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return pairs of lines that follow one another, with a few points between them at most, and their number."""
+    """Return pairs of successive lines with at most a few points between them, and the number of these points."""
     one = np.flatnonzero(straight)
     two, between, linked = one, np.zeros(len(one), np.int64), np.ones(len(one), bool)
     found = []

@@ -57,7 +57,7 @@ class ScanDevice:
     def _parts(
         self, kernel: str, name: str, numbers: int, part: np.ndarray, scan: np.ndarray, **more: np.ndarray
     ) -> np.ndarray:
-        """Return the numbers (P, numbers) that a kernel writes for each part."""
+        """Return the (P, numbers) array that a kernel writes, a row for each part."""
         count = len(part)
         found = np.empty((count, numbers), self._real)
         if count:

@@ -1,4 +1,4 @@
-"""Doors: gaps in a straight wall that a person or robot fits through, open at least in part."""
+"""Doors: gaps in a straight wall wide enough for a person or robot, open at least in part."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from gpusense.features.lines import scores_of
 from gpusense.features.result import Found
 from gpusense.features.segments import Segments
 
-# Width of a door [m].
+# Least and largest width of a door [m].
 _NARROWEST, _WIDEST = 0.5, 2.0
-# Both sides are of one wall up to this [m] and [rad], and this many deviations.
+# Largest offset [m] and turn [rad] between both sides of one wall, to which this many deviations are added.
 _ASIDE, _PARALLEL, _DEVIATIONS = 0.03, math.radians(4), 3.0
-# Least length of a wall [m] and of its other side; largest uncertainty of a jamb across and along the wall [m].
+# Least length of a wall and of its other side; largest uncertainty of a jamb across and along the wall [m].
 _WALL, _OTHER, _VAGUE, _COARSE = 0.5, 0.1, 0.08, 0.4
-# Uncertainty of a jamb at grazing incidence in deviations of ranges, as a step of beams.
+# Uncertainty of a jamb at grazing incidence [standard deviations of ranges].
 _REVEAL = 4.0
-# Share of the beams between the jambs that nothing stops before the wall, and that go on by this [m].
+# Least shares of the beams between the jambs that reach the wall, without and with a leaf, and that pass through it;
+# the distance behind the wall that counts as through [m].
 _UNSTOPPED, _UNSTOPPED_BESIDE_LEAF, _THROUGH, _DEEP = 0.6, 0.25, 0.25, 0.4
 # Length of a leaf in widths of its door, its least turn from the wall [rad], and the gap beside its hinge [m].
 _LEAF, _LEAST_TURN, _TOUCHING = (0.6, 1.25), math.radians(15), 0.12
@@ -34,9 +35,9 @@ class _Gaps:
     Attributes:
         before: (D,) segment before the gap.
         after: (D,) segment after it.
-        wall: (D,) the one of both segments that lies on the wall.
-        other: (D,) the other one: a part of the wall, or the leaf of a door.
-        ends: (D, 4) places of both jambs along the wall, and the steps of beams there [m].
+        wall: (D,) the segment of these two that lies on the wall.
+        other: (D,) the second segment: a part of the wall, or the leaf of a door.
+        ends: (D, 4) positions of both jambs along the wall, and the distances between beams there [m].
     """
 
     before: np.ndarray
@@ -68,7 +69,7 @@ def find_doors(segments: Segments, straight: np.ndarray, beams: Beams, mount: tu
 
 def _between_walls(segments: Segments, straight: np.ndarray, before: np.ndarray, after: np.ndarray) -> _Gaps:
     """Return the gaps between two parts of a straight wall."""
-    # The better line is the wall; the other one has to lie on it.
+    # The more certain line is the wall, and the second one must lie on it.
     wall = np.where(segments.covariance[before, 0, 0] <= segments.covariance[after, 0, 0], before, after)
     other = np.where(wall == before, after, before)
     left, right = _jambs(segments, before, after, wall)
@@ -85,7 +86,7 @@ def _beside_leaves(segments: Segments, straight: np.ndarray, before: np.ndarray,
     alpha, beta = segments.angle[wall], segments.angle[leaf]
     sine = np.sin(beta - alpha)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # Where the lines meet, along each of them.
+        # Position of the intersection along each line.
         hinge = (segments.distance[leaf] - segments.distance[wall] * np.cos(beta - alpha)) / sine
         reached = (segments.distance[leaf] * np.cos(beta - alpha) - segments.distance[wall]) / sine
     first = leaf == after
@@ -103,7 +104,7 @@ def _beside_leaves(segments: Segments, straight: np.ndarray, before: np.ndarray,
 
 
 def _is_wide(segments: Segments, straight: np.ndarray, gaps: _Gaps) -> np.ndarray:
-    """Return which gaps are as wide as doors, of a wall that is long enough, with jambs that are known."""
+    """Return which gaps are as wide as doors, in a wall of sufficient length, with jambs at known positions."""
     width = gaps.ends[:, 1] - gaps.ends[:, 0]
     good = straight[gaps.wall] & (segments.length[gaps.wall] >= _WALL) & (segments.length[gaps.other] >= _OTHER)
     result: np.ndarray = good & (width >= _NARROWEST) & (width <= _WIDEST) & (gaps.ends[:, 2:] <= _COARSE).all(axis=1)
@@ -111,7 +112,7 @@ def _is_wide(segments: Segments, straight: np.ndarray, gaps: _Gaps) -> np.ndarra
 
 
 def _one_each(segments: Segments, gaps: _Gaps, sure: np.ndarray) -> np.ndarray:
-    """Return one of each set of overlapping doors: one with long walls on both sides, or else the narrowest."""
+    """Choose one of each set of overlapping doors: one with long walls on both sides, or else the narrowest."""
     wall, ends = gaps.wall, gaps.ends
     order = np.lexsort((ends[:, 1] - ends[:, 0], ~sure, segments.scan[wall]))
     middle = segments.place(wall, ends[:, :2].mean(axis=1))
@@ -129,7 +130,7 @@ def _one_each(segments: Segments, gaps: _Gaps, sure: np.ndarray) -> np.ndarray:
 
 
 def _ordered(segments: Segments, one: np.ndarray, two: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sides of gaps: the segment before and the segment after it, also around the end of a scan."""
+    """Return the segments before and after each gap, also across the end of a scan."""
     around = segments.successor[np.searchsorted(segments.scan, segments.scan[one], side="right") - 1] >= 0
     before = np.concatenate([one, two[around]])
     after = np.concatenate([two, one[around]])
@@ -139,7 +140,7 @@ def _ordered(segments: Segments, one: np.ndarray, two: np.ndarray) -> tuple[np.n
 def _jambs(
     segments: Segments, before: np.ndarray, after: np.ndarray, wall: np.ndarray
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Return places of both jambs along the wall, and the steps of beams there."""
+    """Return the positions of both jambs along the wall, and the distances between beams there."""
     found = []
     bearing = segments.points.point[:, 2].astype(np.float64)
     for point, side in ((segments.last[before], 1), (segments.first[after], -1)):
@@ -147,7 +148,7 @@ def _jambs(
         turn = np.where(np.abs(turn) < 1.55, turn, np.nan)
         step = segments.distance[wall] * segments.step / np.square(np.cos(turn))
         place = segments.distance[wall] * np.tan(turn) + side * 0.5 * step
-        # Of the reveal of a jamb, what is not farther from the wall than noise seems to be wall.
+        # The part of a jamb's reveal within noise of the wall is taken for wall.
         found.append((place, np.hypot(step, _REVEAL * np.sqrt(segments.variance[wall]) * np.sin(turn))))
     return found[0], found[1]
 
@@ -171,7 +172,7 @@ def _on_wall(segments: Segments, wall: np.ndarray, other: np.ndarray) -> np.ndar
 
 
 def _openness(segments: Segments, beams: Beams, gaps: _Gaps) -> tuple[np.ndarray, np.ndarray]:
-    """Return which gaps are open, and the share of their beams that go through."""
+    """Return which gaps are open, and the share of their beams that pass through."""
     points, wall = segments.points, gaps.wall
     scan = segments.scan[wall]
     begin, total = points.start[scan], points.counts[scan]
@@ -189,7 +190,8 @@ def _openness(segments: Segments, beams: Beams, gaps: _Gaps) -> tuple[np.ndarray
     def count(chosen: np.ndarray) -> np.ndarray:
         return np.bincount(which[chosen], minlength=len(wall))
 
-    # Beside a jamb beams go on. Something before the wall that does not begin there hides the jamb; else it is a leaf.
+    # Beams beside a jamb pass the wall. An object before the wall hides the jamb, unless it begins there: then it is a
+    # leaf.
     beside = np.stack([last, first], axis=1)[which]
     at_end = np.stack([number == 0, number == inside[which] - 1], axis=1) & (depth < -margin)[:, None]
     apart = np.hypot(*np.moveaxis(place[index][:, None] - place[beside], 2, 0))
@@ -207,7 +209,7 @@ def _found(
     segments: Segments, wall: np.ndarray, other: np.ndarray, ends: np.ndarray, through: np.ndarray,
     mount: tuple[float, float, float],
 ) -> Found:  # fmt: skip
-    """Return doors by their walls and jambs (D, 4): places along the wall and steps of beams."""
+    """Return doors from their walls and jambs (D, 4), see ``ends`` of :class:`_Gaps`."""
     angle, middle = segments.angle[wall], ends[:, :2].mean(axis=1)
     c, s = np.cos(angle), np.sin(angle)
     mine = segments.covariance[wall]

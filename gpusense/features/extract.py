@@ -27,9 +27,9 @@ from gpusense.matching.noise import ASSUMED_NOISE, scan_noise
 from gpusense.matching.points import scan_points
 from gpusense.world.scanner import Scanner
 
-# Noise with which scans are split: at least this [m], at most this.
+# Least and largest noise with which scans are split [m].
 _LEAST_NOISE, _LARGEST_NOISE = 3e-3, 0.1
-# Most readings that are in work at once.
+# Most readings that are processed at once.
 _READINGS = 1 << 22
 
 
@@ -46,25 +46,25 @@ def extract_features(
 
     A scan is split into straight pieces where two lines explain its readings better than one, by more than noise does
     (split and merge, Pavlidis and Horowitz 1974), and a line is fitted to the ranges of each by maximum likelihood.
-    Pieces that a circle explains as well are round walls, and no lines. Corners are vertices of neighbouring lines.
-    Doors are gaps of 0.5 to 2 m in a wall, between two jambs, through which beams go on; hallways are parallel walls
-    0.6 to 3.2 m apart on both sides of the scanner, beside each other for twice their distance; poles are
-    circles with radii of 1.5 to 50 cm in front of all that is beside them. Reflectors are short runs of beams that are
-    at least three times as bright as is usual in their scan; they count as cylinders.
+    Pieces that a circle explains as well are round walls rather than lines. Corners are vertices of neighbouring lines.
+    Doors are gaps of 0.5 to 2 m in a wall, between two jambs, through which beams pass; hallways are parallel walls 0.6
+    to 3.2 m apart on both sides of the scanner, beside each other for twice their distance; poles are circles with
+    radii of 1.5 to 50 cm in front of their background. Reflectors are short runs of beams at least three times as
+    bright as the median of their scan; they count as cylinders.
 
-    Covariances follow from the deviation of ranges, which the readings of each scan tell, from the residuals of each
-    line, and from the distance of beams at edges. The device computes in float64 where it can, and in float32
+    Covariances follow from the standard deviation of ranges, which is estimated from each scan, from the residuals of
+    each line, and from the distance between beams at edges. The device computes in float64 where it can, and in float32
     elsewhere.
 
     Args:
-        ranges: (K,) readings of a scan [m], or (S, K) of several. Readings are classed as everywhere: see
-            :func:`gpusense.classify`. A reading of "no return" says that a beam goes on.
+        ranges: (K,) readings of a scan [m], or (S, K) of several. They are classed by :func:`gpusense.classify`. A
+            reading of "no return" shows that its beam passes through a gap.
         scanner: The scanner; its mount is the sensor's pose on the robot. The robot is at rest during a scan:
-            :func:`gpusense.deskew_scan` makes such a scan of one in motion.
+            :func:`gpusense.deskew_scan` corrects a scan taken in motion.
         kinds: Kinds to extract: one, or several of "line", "corner", "door", "hallway", "pole" and "reflector".
         backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         noise: Standard deviation of ranges [m]. ``"auto"``: that of each scan, from its deviations from straight
-            walls; readings of more than 10 cm of noise have no lines.
+            walls; scans with more than 10 cm of noise have no lines.
         intensities: Intensities of the readings, of their shape, in any unit; NaN where unknown. None: no reflectors.
 
     Returns:
@@ -112,7 +112,7 @@ def extract_features(
 def _shapes(
     backend: Backend, real: np.dtype, scans: np.ndarray, scanner: Scanner, noise: np.ndarray, kinds: tuple[str, ...]
 ) -> dict[str, Found]:
-    """Return the features of (S, K) readings by kind, but for reflectors."""
+    """Return the features of (S, K) readings by kind, except reflectors."""
     points = scan_points(scans, scanner, np.dtype(np.float64))
     if not len(points.point) or set(kinds) <= {"reflector"}:
         return {}

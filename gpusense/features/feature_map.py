@@ -1,4 +1,4 @@
-"""Landmarks and lines that were made of features, and their files."""
+"""Landmarks and lines made of features, and their files."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from gpusense.world.landmarks import LandmarkMap
 from gpusense.world.line_map import LineMap
 
 LANDMARK_KINDS = ("corner", "door", "pole", "reflector")
-"""Kinds of features whose poses stay where they are while the robot moves."""
+"""Kinds of features whose positions do not depend on the robot's pose."""
 MAP_KINDS = ("line", *LANDMARK_KINDS)
-"""Kinds of features of which maps are made."""
+"""Kinds of features from which maps are made."""
 
 _COLUMNS = (
     "x", "y", "signature", "kind", "theta", "size", "covariance_xx", "covariance_xy", "covariance_yy", "count",
@@ -34,14 +34,14 @@ _LARGEST_SIZE = 1e5
 
 @dataclass(frozen=True, eq=False)
 class FeatureMap:
-    """Landmarks and lines that were made of features, from :func:`gpusense.map_features`.
+    """Landmarks and lines made of features by :func:`gpusense.map_features`.
 
     Attributes:
         kind: (M,) "line", "corner", "door", "pole" or "reflector".
         pose: (M, 3) x, y [m] and theta [rad] in the world, as in :class:`gpusense.Features`: of a line its middle, and
             the direction with the free side on its left.
-        covariance: (M, 2, 2) of x and y [m^2]; larger where its features scatter more than their covariances say. Of a
-            line only that across it: its ends are free.
+        covariance: (M, 2, 2) of x and y [m^2]; larger where its features scatter more than their covariances say. For a
+            line only the variance across it, since its ends are free.
         size: (M,) length [m], opening angle [rad], width or radius [m].
         count: (M,) number of features.
 
@@ -74,7 +74,7 @@ class FeatureMap:
         return LandmarkMap(self.pose[chosen, :2], signature_of(self.kind[chosen], self.size[chosen]))
 
     def lines(self) -> LineMap:
-        """Return a map of the lines, each seen from the side of its features."""
+        """Return a map of the lines, each visible from the side of its features."""
         rows = self.kind == "line"
         half = 0.5 * self.size[rows, None] * np.column_stack([np.cos(self.pose[rows, 2]), np.sin(self.pose[rows, 2])])
         middle = self.pose[rows, :2]
@@ -141,13 +141,13 @@ def kinds_of(kinds: str | Sequence[str], allowed: tuple[str, ...]) -> tuple[str,
 
 
 def joined_maps(parts: Sequence[FeatureMap]) -> FeatureMap:
-    """Return several maps as one."""
+    """Join several maps."""
     if not parts:
         return FeatureMap(
             np.zeros(0, KIND_TYPE), np.zeros((0, 3)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0, np.int64)
         )
     values = {one.name: np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(FeatureMap)}
-    # Rounding leaves matrices a little asymmetric.
+    # Rounding leaves matrices slightly asymmetric.
     values["covariance"] = 0.5 * (values["covariance"] + values["covariance"].transpose(0, 2, 1))
     return FeatureMap(**values)
 

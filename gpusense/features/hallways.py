@@ -1,4 +1,4 @@
-"""Hallways: pairs of parallel walls with the scanner in between, longer than they are apart."""
+"""Hallways: pairs of parallel walls with the scanner between them, longer than their distance."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from gpusense.features.lines import in_robot_frame, scores_of
 from gpusense.features.result import Found
 from gpusense.features.segments import Segments
 
-# Width [m], and least length of the part that both walls have beside each other, in widths.
+# Least and largest width [m], and least length over which both walls face each other [widths].
 _NARROWEST, _WIDEST, _LEAST_LENGTH = 0.6, 3.2, 2.0
-# Walls are parallel up to this angle [rad] and this many deviations; lines of one wall are apart by at most this [m].
+# Walls are parallel up to this angle [rad] plus this many deviations; lines of one wall have at most this offset [m].
 _PARALLEL, _DEVIATIONS, _SAME = math.radians(2), 3.0, 0.06
-# Hallways of a scan whose axes differ by less are one [rad].
+# Hallways of a scan whose axes differ by less are one hallway [rad].
 _ONE_AXIS = math.radians(15)
 
 
@@ -35,7 +35,7 @@ def wrapped(angle: np.ndarray) -> np.ndarray:
 
 
 def find_hallways(segments: Segments, straight: np.ndarray, mount: tuple[float, float, float]) -> Found:
-    """Return the hallways of scans: the axis abreast of the robot, observed across the axis and in direction."""
+    """Return the hallways of scans: the axis point abreast of the robot, observed across the axis and in direction."""
     lines = np.flatnonzero(straight)
     low, high = _extents(segments, lines)
     one, two = pairs_of(segments.scan[lines])
@@ -44,7 +44,7 @@ def find_hallways(segments: Segments, straight: np.ndarray, mount: tuple[float, 
     off = wrapped(segments.angle[a] - segments.angle[b] - math.pi)
     deviation = np.sqrt(segments.covariance[a, 0, 0] + segments.covariance[b, 0, 0])
     width = frame.distance[a] + frame.distance[b]
-    # Places along the second wall run the other way.
+    # Positions along the second wall run in the opposite direction.
     overlap = np.minimum(high[one], -low[two]) - np.maximum(low[one], -high[two])
     good = (np.abs(off) <= _PARALLEL + _DEVIATIONS * deviation) & (width >= _NARROWEST) & (width <= _WIDEST)
     good &= overlap >= _LEAST_LENGTH * width
@@ -71,7 +71,7 @@ def find_hallways(segments: Segments, straight: np.ndarray, mount: tuple[float, 
 
 
 def _extents(segments: Segments, lines: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first and last places of the wall of each line, together with other lines of the same wall."""
+    """Return the ends of the wall of each line along it, other lines of the same wall included."""
     one, two = pairs_of(segments.scan[lines])
     a, b = lines[one], lines[two]
     low, high = segments.ends[lines, 0].copy(), segments.ends[lines, 1].copy()
@@ -87,7 +87,7 @@ def _extents(segments: Segments, lines: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _one_each(scan: np.ndarray, angle: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Return the pairs with the longest walls, one of each scan and axis."""
+    """Choose the pair with the longest walls of each scan and axis."""
     order = np.lexsort((-length, scan))
     kept: list[int] = []
     taken: list[int] = []

@@ -19,9 +19,9 @@ from gpusense.models.scan.caster import RayCaster
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
 
-# Beams, range [m], and distance of the places of scans that are cast in a map [m], their distance from obstacles [m].
+# Scans cast in a map: beams, range [m], distance between their positions [m] and from obstacles [m].
 _BEAMS, _RANGE, _SPACING, _CLEARANCE = 720, 12.0, 1.0, 0.3
-# Most scans that are cast in a map, and least of them that show a landmark.
+# Most scans cast in a map, and least number of them that must show a landmark.
 _MOST_SCANS, _VIEWS = 4000, 3
 
 
@@ -33,11 +33,11 @@ def map_features(
     pose_deviation: ArrayLike = (0.03, 0.01),
     least: int = 2,
 ) -> FeatureMap:
-    """Make landmarks and lines of the features of scans at known poses.
+    """Make landmarks and lines from the features of scans at known poses.
 
-    Features of one kind, direction and size are one landmark where they are within four deviations of one another.
-    Its position is the mean of theirs, weighted by their information. Lines are one where they are within four
-    deviations in direction and across, and overlap or nearly so. Hallways have no position.
+    Features of one kind, direction and size form one landmark if they lie within four standard deviations of each
+    other. Its position is the mean of theirs, weighted by their information. Lines are joined if they agree in
+    direction and offset within four standard deviations, and overlap or nearly do. Hallways have no position.
 
     Args:
         features: Features of S scans.
@@ -84,16 +84,16 @@ def landmarks_of_map(
     spacing: float = _SPACING,
     backend: Selection = "auto",
 ) -> FeatureMap:
-    """Make landmarks and lines of the features that a scanner would see in a map.
+    """Make landmarks and lines from the features that a scanner would see in a map.
 
     Scans of 720 beams are cast from free places all over the map, and their features are clustered as by
-    :func:`map_features`. Edges of cells count as noise of the map's resolution.
+    :func:`map_features`. The rounding of walls to cells counts as noise.
 
     Args:
         grid: The map.
         kinds: Kinds out of "line", "corner", "door", "pole" and "reflector".
         range_max: Range of the scans [m].
-        spacing: Distance between neighbouring places [m]; larger where there would be more than 4000.
+        spacing: Distance between neighbouring scans [m]; enlarged where there would be more than 4000 of them.
         backend: The device, see ``gpusense.devices()``.
 
     Raises:
@@ -121,7 +121,7 @@ def landmarks_of_map(
 
 
 def _free_places(grid: OccupancyGrid, spacing: float) -> Floats:
-    """Return (S, 3) poses on a lattice of free cells apart from obstacles, heading 0."""
+    """Return (S, 3) poses with heading 0 on a lattice of free cells away from obstacles."""
     from scipy.ndimage import distance_transform_edt
 
     blocked = np.pad(grid.occupied | grid.unknown, 1, constant_values=True)

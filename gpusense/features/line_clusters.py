@@ -1,4 +1,4 @@
-"""Lines of a map: lines of scans that agree in direction and offset, and overlap or nearly do, become one."""
+"""Merge lines of scans that agree in direction and offset, and overlap or nearly do, into lines of a map."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from gpusense.features.feature_map import FeatureMap
 from gpusense.features.result import KIND_TYPE, Features, Floats, across_lines
 
-# Lines are one within this many deviations, with this much added across [m] and in direction [rad]; pieces of one line
-# are at most this far apart [m].
+# Pieces belong to one line within this many deviations, widened by this offset [m] and turn [rad]; the gap between them
+# is at most this [m].
 _DEVIATIONS, _FLOOR, _TURN, _GAP = 4.0, 0.03, 0.02, 0.3
-# Lines are compared where their directions differ by less than this [rad].
+# Only lines whose directions differ by less than this are compared [rad].
 _ALIKE = 0.15
-# Most passes in which lines that have grown together are joined.
+# Most passes that join lines which have grown together.
 _PASSES = 4
 
 
@@ -66,13 +66,13 @@ def lines_of(features: Features, poses: Floats, spread: Floats, least: int) -> F
 
 
 def _in_world(features: Features, poses: Floats, spread: Floats) -> _Pieces:
-    """Return lines of scans in the world, with the errors of poses in their covariances."""
+    """Return lines of scans in the world, with the errors of poses added to their covariances."""
     at = poses[features.scan]
     c, s = np.cos(at[:, 2]), np.sin(at[:, 2])
     off = np.stack([c * features.pose[:, 0] - s * features.pose[:, 1],
                     s * features.pose[:, 0] + c * features.pose[:, 1]], axis=1)  # fmt: skip
     theta = at[:, 2] + features.pose[:, 2]
-    # An error of the heading moves the middle across by the way to it along the line.
+    # An error of the heading moves the middle across by that error times its distance along the line.
     lever = np.cos(theta) * off[:, 0] + np.sin(theta) * off[:, 1]
     turned = np.stack([lever, np.ones_like(lever)], axis=1) * spread[1]
     # To the left, which is towards the scanner.
@@ -82,7 +82,7 @@ def _in_world(features: Features, poses: Floats, spread: Floats) -> _Pieces:
 
 
 class _Lines:
-    """Lines that grow, each by offset and direction in the frame of the piece that began it."""
+    """Growing lines, each with its offset and direction in the frame of its first piece."""
 
     def __init__(self, most: int) -> None:
         self.count = 0
@@ -91,7 +91,7 @@ class _Lines:
         self._state, self._covariance = np.zeros((most, 2)), np.zeros((most, 2, 2))
 
     def nearest(self, pieces: _Pieces, i: int) -> int:
-        """Return the line that a piece may be of, or -1."""
+        """Return the line to which a piece may belong, or -1."""
         n = self.count
         turn = np.mod(pieces.theta[i] - self._theta[:n] + math.pi, 2 * math.pi) - math.pi
         near = np.flatnonzero(np.abs(turn) < _ALIKE)
@@ -130,13 +130,13 @@ class _Lines:
 
 
 def _place(origin: np.ndarray, theta: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return places of points along lines and across them, to the left."""
+    """Return the coordinates of points along lines, and across them to the left."""
     (x, y), c, s = (point - origin).T, np.cos(theta), np.sin(theta)
     return c * x + s * y, c * y - s * x
 
 
 def _rows(along: np.ndarray) -> np.ndarray:
-    """Return the offset and direction (P, 2, 2) of a line at places along it, by its offset and direction at 0."""
+    """Return the matrices (P, 2, 2) that take a line's offset and direction at 0 to those at positions along it."""
     rows = np.zeros((len(along), 2, 2))
     rows[:, 0, 0] = rows[:, 1, 1] = 1
     rows[:, 0, 1] = along

@@ -1,4 +1,4 @@
-"""Lines: segments that are straight, long enough to have a direction, and no part of a round wall."""
+"""Lines: straight segments that are long enough to have a direction, and not part of a round wall."""
 
 from __future__ import annotations
 
@@ -13,18 +13,19 @@ from gpusense.features.segments import PENALTY, Segments
 
 # Least points and length [m] of a line, and largest deviation of its direction [rad].
 LEAST_POINTS, LEAST_LENGTH, LARGEST_DEVIATION = 6, 0.3, 0.06
-# Those of a side of a corner.
+# The same limits for a side of a corner.
 SIDE_POINTS, SIDE_LENGTH, SIDE_DEVIATION = 4, 0.15, 0.1
-# Most squared deviations per point of a line, and of a circle that takes the place of two lines.
+# Largest mean squared deviation per degree of freedom of a line.
 POOR = 3.0
-# A circle may cost this much more than two lines, which have more parameters; beside a part that is round; passes.
+# Amount by which a circle may cost more than two lines, which have more parameters; the same beside a round part;
+# passes.
 _ROUND, _ROUND_BESIDE, _ROUNDS = 12.0, 35.0, 4
 # A round wall turns by at least and at most this between two segments [rad].
 _LEAST_TURN, _LARGEST_TURN = 0.02, 1.4
 
 
 class Frame(NamedTuple):
-    """Lines in the robot's frame: their normals' directions, distances from the robot, and covariances of both."""
+    """Lines in the robot's frame: directions of their normals, distances from the robot, and covariances of both."""
 
     angle: np.ndarray
     distance: np.ndarray
@@ -32,7 +33,7 @@ class Frame(NamedTuple):
 
 
 def straight(device: ScanDevice, segments: Segments) -> tuple[np.ndarray, np.ndarray]:
-    """Return which segments (G,) are lines, and which are sides of corners, which may be shorter."""
+    """Return which segments (G,) are lines, and which may be sides of corners, where shorter ones suffice."""
     deviation = np.sqrt(segments.covariance[:, 0, 0])
     free = np.maximum(segments.count - 2, 1)
     good = np.isfinite(segments.distance) & (segments.cost <= POOR * free + PENALTY) & ~_is_round(device, segments)
@@ -60,7 +61,7 @@ def _is_round(device: ScanDevice, segments: Segments) -> np.ndarray:
     for _ in range(_ROUNDS):
         found[one[sure]] = True
         found[two[sure]] = True
-        # Beside a part that is round, less is needed.
+        # Beside a round part, weaker evidence suffices.
         sure = arc & (found[one] | found[two]) & (circle[:, 3] <= apart + _ROUND_BESIDE)
     return found
 

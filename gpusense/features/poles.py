@@ -11,15 +11,15 @@ from gpusense.features.device import ScanDevice
 from gpusense.features.result import Found
 from gpusense.features.segments import Segments
 
-# Radius [m], and least points of a pole.
+# Least and largest radius [m], and least points of a pole.
 _THINNEST, _THICKEST, _LEAST_POINTS = 0.015, 0.5, 4
-# The background of a pole is farther by this [m], and this many deviations.
+# Least distance between a pole and its background: this [m] plus this many deviations.
 _BEHIND, _DEVIATIONS = 0.08, 6.0
-# The larger a pole, the more must it be rounder than lines: radius for which this is a deviation [m].
+# Larger poles must fit a circle more clearly than lines: radius that counts as one deviation [m].
 _USUAL = 0.1
 # Squared deviations per reading and edge of a pole, and how much more than its segments' lines it may cost.
 _POOR, _ROUND = 2.5, 6.0
-# Cost by which each line but the first fits noise.
+# Reduction of the cost by which each line after the first fits noise.
 _EACH = 8.0
 
 
@@ -72,7 +72,7 @@ def _objects(
     jump = _BEHIND + _DEVIATIONS * noise[scan]
     rises, falls = r[following] - r > jump, r - r[following] > jump
     gap = (step > points.gap) | (following == np.arange(total))
-    # An object ends where ranges rise or beams have no return, and begins where they fall.
+    # An object begins where ranges fall, and ends where they rise or beams have no return.
     begins = np.zeros(total, bool)
     begins[following[falls & ~gap]] = True
     begins |= beams.opens_before
@@ -89,10 +89,10 @@ def _runs(
     start: np.ndarray, scan: np.ndarray, starts: np.ndarray, stops: np.ndarray, ends: np.ndarray, bearing: np.ndarray,
     step: float, counts: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Return the objects from points that begin one to the next stop, if that ends it, and they are narrow enough."""
+    """Return the objects from starting points to their next stops that are ends, if they are narrow enough."""
     place = np.searchsorted(stops, starts)
     last = np.where(place < len(stops), stops[np.minimum(place, len(stops) - 1)], -1)
-    # Around the end of a scan.
+    # Across the end of a scan.
     same = (last >= 0) & (scan[np.maximum(last, 0)] == scan[starts])
     head = np.searchsorted(stops, start[scan[starts]])
     wrapped = stops[np.minimum(head, len(stops) - 1)]
@@ -110,7 +110,7 @@ def _runs(
 
 
 def _cost_of_lines(segments: Segments, first: np.ndarray, count: np.ndarray, scan: np.ndarray) -> np.ndarray:
-    """Return the cost of each object's lines: residuals, a penalty for each further line, 1 for each other point."""
+    """Return the cost of each object's lines: residuals, a penalty per further line, and 1 per point off lines."""
     total = segments.points.counts[scan]
     cost = np.zeros(len(first))
     head, tail = np.searchsorted(segments.scan, scan), np.searchsorted(segments.scan, scan, side="right")

@@ -1,4 +1,4 @@
-"""Reflectors: bright cylinders, seen as short runs of beams far brighter than the rest of their scan."""
+"""Reflectors: bright cylinders, which appear as short runs of beams far brighter than the rest of their scan."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 from gpusense.features.result import Found, nothing
 from gpusense.world.scanner import Reading, Scanner, classes
 
-# Least intensity of a bright beam, and of a reflector's brightest beam, in medians of the scan.
+# Least intensity of a bright beam, and of a reflector's brightest beam [medians of the scan].
 _BRIGHT, _BRIGHTEST = 2.0, 3.0
 # Least beams, largest width [m], and largest step of ranges between neighbours [m].
 _LEAST_BEAMS, _WIDEST, _STEP = 2, 0.4, 0.2
-# Neighbouring beams are at most this many usual steps apart.
+# Largest step between the bearings of neighbouring beams [usual steps].
 _NEIGHBOURS = 1.5
-# Ranges to reflectors are off together by this [m]: bright echoes come early or late.
+# Standard deviation of the common error of a reflector's ranges [m]: bright echoes are timed early or late.
 _TOGETHER = 0.01
 
 
@@ -39,14 +39,14 @@ def find_reflectors(ranges: np.ndarray, intensities: np.ndarray, scanner: Scanne
 
 
 def _runs(bright: np.ndarray, r: np.ndarray, steps: np.ndarray, step: float) -> list[np.ndarray]:
-    """Return runs of bright beams, in the order of bearings, around the last one if beams go all around."""
+    """Return runs of bright beams in the order of bearings, across the last beam if beams cover a full turn."""
     count = len(bright)
     linked = bright & np.roll(bright, -1) & (steps <= _NEIGHBOURS * step) & (np.abs(np.roll(r, -1) - r) < _STEP)
     first = np.flatnonzero(bright & ~np.roll(linked, 1))
     last = np.flatnonzero(bright & ~linked)
     if not len(first):
         return []
-    # The run that begins last may end before the first one begins.
+    # The last run may continue at the first beams.
     ends = last if last[0] >= first[0] else np.append(last[1:], last[0] + count)
     return [np.arange(a, b + 1) % count for a, b in zip(first, ends, strict=True)]
 
@@ -54,7 +54,7 @@ def _runs(bright: np.ndarray, r: np.ndarray, steps: np.ndarray, step: float) -> 
 def _reflector(
     light: np.ndarray, r: np.ndarray, bearing: np.ndarray, usual: float, step: float
 ) -> tuple[float, float, float, float, float] | None:
-    """Return distance, bearing, width, variance of the bearing and number of beams of a run; None if it is none."""
+    """Return distance, bearing, width, variance of the bearing and number of beams of a run; None for other runs."""
     peak = float(light.max())
     inner = light >= 0.5 * (peak + usual)
     count = int(np.count_nonzero(inner))
@@ -72,7 +72,7 @@ def _reflector(
 
 
 def _found(rows: np.ndarray, mount: tuple[float, float, float]) -> Found:
-    """Return reflectors of rows: scan, distance, bearing, width, variance of the bearing, number of beams, noise."""
+    """Return reflectors from rows: scan, distance, bearing, width, variance of the bearing, number of beams, noise."""
     scan, distance, bearing, width, variance, count, noise = rows.T
     c, s = np.cos(bearing), np.sin(bearing)
     radius = 0.5 * width

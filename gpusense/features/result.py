@@ -20,10 +20,10 @@ KIND_TYPE = "<U9"
 KINDS = ("line", "corner", "door", "hallway", "pole", "reflector")
 """Kinds of features; reflectors need intensities."""
 
-# Signatures of two kinds differ by at least one of these; sizes are below it.
+# Distance between the signatures of successive kinds; sizes are smaller.
 SIGNATURE_STEP = 10.0
 _LARGEST_SIZE = 9.0
-# A coordinate is lost if a lost direction has more than this of it.
+# A coordinate is unobserved if an unobserved direction has a larger component along it.
 _PARALLEL = 1e-6
 
 
@@ -71,7 +71,7 @@ class Features:
         return (self[i : i + 1] for i in range(len(self)))
 
     def __getitem__(self, index: slice | NDArray[np.bool] | NDArray[np.int64] | str) -> Features:
-        """Return some of the features: those of a kind, of a mask, of indices or of a slice."""
+        """Return a selection of the features, by kind, mask, indices or slice."""
         chosen: slice | NDArray[Any]
         if isinstance(index, str):
             chosen = self.kind == checks.choice("kind", index, KINDS)
@@ -92,8 +92,8 @@ class Features:
         """Return features as :class:`gpusense.LandmarkModel` takes them.
 
         Args:
-            kind: A kind or several; None for all. Poses of lines and hallways move with the robot: they are no
-                landmarks.
+            kind: A kind or several; None for all. Lines and hallways are no landmarks, since their poses move with the
+                robot.
 
         Returns:
             (F, 3) range [m], bearing [rad] and signature, see :func:`signature_of`, in the robot's frame.
@@ -125,7 +125,7 @@ class Features:
         c, s = np.cos(angle), np.sin(angle)
         x, y = chosen.pose[:, 0], chosen.pose[:, 1]
         middle, half = c * y - s * x, 0.5 * chosen.size
-        # At the foot of the normal the distance is that at the middle, and the way there times the angle.
+        # The offset at the foot of the normal is that at the middle plus the angle times the distance between both.
         across = across_lines(chosen)
         variance, both = across[:, 1, 1], across[:, 0, 1] + middle * across[:, 1, 1]
         far = across[:, 0, 0] + 2 * middle * across[:, 0, 1] + middle**2 * variance
@@ -144,7 +144,7 @@ class Features:
 
 
 def across_lines(lines: Features) -> Floats:
-    """Return the (F, 2, 2) covariance of the offset of lines away from the scanner, at the middle, and of direction."""
+    """Return the (F, 2, 2) covariances of offset, at the middle and away from the scanner, and direction of lines."""
     rows = np.zeros((len(lines), 2, 3))
     rows[:, 0, 0], rows[:, 0, 1], rows[:, 1, 2] = np.sin(lines.pose[:, 2]), -np.cos(lines.pose[:, 2]), 1
     result = np.asarray(np.linalg.inv(rows @ lines.information @ rows.transpose(0, 2, 1)), np.float64)
@@ -193,8 +193,8 @@ class Found:
     Attributes:
         scan: (F,) index of the scan.
         pose: (F, 3) in the robot's frame.
-        observed: (F, M, 3) rows: directions of x, y and theta that are observed, orthonormal.
-        covariance: (F, M, M) along these.
+        observed: (F, M, 3) orthonormal rows: the observed directions in x, y and theta.
+        covariance: (F, M, M) covariances along the observed directions.
         size: (F,) see ``Features``.
         score: (F,) see ``Features``.
     """
@@ -212,13 +212,13 @@ class Found:
 
 
 def nothing() -> Found:
-    """Return no feature."""
+    """Return an empty set of features."""
     empty = np.zeros(0)
     return Found(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), empty, empty)
 
 
 def features_of(found: dict[str, Found]) -> Features:
-    """Return features of several kinds, ordered by scan, then kind."""
+    """Join features of several kinds, ordered by scan, then kind."""
     parts = list(found.values())
     kind = np.concatenate(
         [np.full(len(part.scan), name, KIND_TYPE) for name, part in found.items()] or [np.zeros(0, KIND_TYPE)]

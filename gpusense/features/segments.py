@@ -11,11 +11,11 @@ from gpusense.features.device import ScanDevice
 from gpusense.matching.points import GAP, ScanPoints
 
 _FULL_TURN = 2 * math.pi
-# Two lines must lower the cost of one by this to be two [squares of deviations].
+# Reduction of the cost from which two lines replace one [squared deviations].
 PENALTY = 25.0
-# Degrees of freedom with which a scan's noise counts in the noise of each segment.
+# Degrees of freedom of a scan's noise as prior for the noise of each segment.
 _PRIOR = 20.0
-# Least noise of ranges in a covariance [m].
+# Least standard deviation of ranges in a covariance [m].
 LEAST_NOISE = 2e-4
 
 
@@ -29,13 +29,13 @@ class Segments:
         first: (G,) first point.
         count: (G,) points.
         angle: (G,) direction of the line's normal, away from the sensor [rad].
-        distance: (G,) of the line from the sensor [m], NaN without a line.
+        distance: (G,) distance of the line from the sensor [m], NaN without a line.
         covariance: (G, 2, 2) of angle and distance.
         cost: (G,) sum of squared deviations of ranges over their variance.
         variance: (G,) variance of ranges, from the scan and from the segment's residuals [m^2].
-        ends: (G, 2) places of the first and last point along the line, from the foot of the normal [m].
-        spacing: (G, 2) distance of two beams along the line at these [m].
-        successor: (G,) next segment of the scan, after the last one the first if beams go all around, else -1.
+        ends: (G, 2) positions of the first and last point along the line, from the foot of the normal [m].
+        spacing: (G, 2) distances between neighbouring beams along the line at its ends [m].
+        successor: (G,) next segment of the scan, or -1; after the last one the first if beams cover a full turn.
         apart: (G,) whether something may be hidden before the successor.
     """
 
@@ -123,7 +123,7 @@ def _described(
     points: ScanPoints, closed: np.ndarray, noise: np.ndarray, first: np.ndarray, count: np.ndarray,
     scan: np.ndarray, line: np.ndarray,
 ) -> Segments:  # fmt: skip
-    """Return segments with all that follows from their lines."""
+    """Return segments with the attributes that follow from their lines."""
     a, b, r11, r12, r22, cost = line.T
     size = np.hypot(a, b)
     valid = (cost >= 0) & (r22 > 0) & (count >= 3) & np.isfinite(line).all(axis=1) & (size > 0)

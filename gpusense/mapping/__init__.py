@@ -1,1 +1,1 @@
-"""Occupancy grids made from scans and poses."""
+"""Build occupancy grids from scans and poses."""

@@ -1,4 +1,4 @@
-"""Occupancy grids from scans at known poses, by the inverse sensor model and log-odds (book section 9.2)."""
+"""Build occupancy grids from scans at known poses by the inverse sensor model and log-odds (book section 9.2)."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def build_map(
     A large map is built in bands of rows, so that it takes little more memory than its result, a byte a cell.
 
     Args:
-        scans: (S, K) readings [m]; missing readings say nothing. A ray may span 524 288 cells along an axis. With
+        scans: (S, K) readings [m]; missing readings are ignored. A ray may span 524 288 cells along an axis. With
             several scanners S readings, each of its scanner's length.
         poses: (S, 3) poses of the robot in the world [m, m, rad].
         scanner: The scanner's geometry, or several scanners.
@@ -62,8 +62,8 @@ def build_map(
             rays, and its origin is a multiple of the resolution.
         shape: Rows and columns; requires ``origin``. Cells of rays outside are left out.
         range_limit: Ranges beyond it clear cells up to it and mark no obstacle [m]. None: ``scanner.range_max``.
-        clear_max: Whether max readings clear cells up to ``range_limit``. By default they say nothing, since dark and
-            oblique surfaces return nothing, either.
+        clear_max: Whether max readings clear cells up to ``range_limit``. By default they are ignored, since dark and
+            oblique surfaces also return nothing.
         p_hit: Occupancy after one hit and an even prior, in (0.5, 1).
         p_miss: Occupancy after one miss and an even prior, in (0, 0.5).
         p_prior: Occupancy before any ray, in (0, 1).
@@ -100,8 +100,8 @@ def build_map(
 class MapBuilder:
     """Builds a map incrementally; the map so far can be read at any time. See :func:`build_map`.
 
-    Counts take eight bytes a cell, the map itself one. So large maps are built in bands of rows, each from all scans
-    that meet it.
+    Counts take eight bytes a cell, and the map itself one. So large maps are built in bands of rows, each from all
+    scans that meet it.
     """
 
     def __init__(
@@ -184,7 +184,7 @@ class MapBuilder:
         return np.flatnonzero((high >= band.row - 1) & (low <= band.row + band.rows + 1))
 
     def _rays_of(self, part: np.ndarray) -> RayEnds:
-        """Return the rays of some scans, which are kept no longer."""
+        """Return the rays of some scans, and drop the stored ones."""
         key = part.tobytes()
         return self._kept.pop(key) if key in self._kept else self._survey.rays(part)
 
@@ -194,7 +194,7 @@ class MapBuilder:
 
     @property
     def rays(self) -> int:
-        """Rays that have been counted; rays beside the map are not."""
+        """Number of rays counted so far, without rays beside the map."""
         return self._rays + (0 if self._counts is None else self._counts.rays)
 
     @property
@@ -204,11 +204,11 @@ class MapBuilder:
 
     @property
     def bands(self) -> int:
-        """Bands of rows that are counted one after the other; a map of one is whole after each step."""
+        """Bands of rows, counted one after another; a map of a single band is complete after each step."""
         return len(self._bands)
 
     def grid(self) -> OccupancyGrid:
-        """Return the map so far: of all bands that are done, and of the one that is being counted."""
+        """Return the map so far: the finished bands and the current one."""
         cells = self._cells
         if self._finished < len(self._bands):
             cells = cells.copy()

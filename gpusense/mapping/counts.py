@@ -1,4 +1,4 @@
-"""Hits and misses of cells, counted on a device ray by ray, and the occupancies that follow from them."""
+"""Count hits and misses of cells on a device ray by ray, and compute the occupancies."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gpusense.world.grid import OccupancyGrid
 from gpusense.world.windows import Window
 
 _INT = np.dtype(np.int32)
-# Cells whose counts are in work at once on the host.
+# Cells whose counts the host processes at once.
 _CHUNK = 1 << 20
 # Counts below this have their occupancies in a table.
 _FEW = 256
@@ -70,7 +70,7 @@ class BandCounts:
             space.wait()
 
     def _counts(self) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
-        """Yield the hits and misses of the band's cells, row by row, some at a time."""
+        """Yield the hits and misses of the band's cells in pieces, row by row."""
         cells, backend = self._band.cells, self._backend
         for first in range(0, cells, _CHUNK):
             size = min(_CHUNK, cells - first)
@@ -81,7 +81,9 @@ class BandCounts:
             yield slice(first, first + size), hits, misses
 
     def occupancies(self, out: np.ndarray, model: tuple[float, float, float]) -> None:
-        """Write the occupancies of the band's cells into the (H, W) int8 cells of the map; cells without a ray stay.
+        """Write the occupancies of the band into the (H, W) int8 cells of the map.
+
+        Cells without a ray keep their value.
 
         Args:
             out: The cells.

@@ -1,4 +1,4 @@
-"""Rays of scans at known poses: where they start and end, and which part of a map they meet."""
+"""Rays of scans at known poses: their starts and ends, and the part of a map that they meet."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Survey:
 
 
 class RayEnds:
-    """Start and end of each ray of scans in the world, as far as they say something about the map.
+    """Start and end in the world of each ray of scans that carries information about the map.
 
     Args:
         scans: (S, K) readings [m].
@@ -147,7 +147,7 @@ class CellRays:
             start, end = frame.world_to_cells(ends.start), frame.world_to_cells(ends.end)
             low, high = np.minimum(start, end), np.maximum(start, end)
             first, last = (window.col, window.row), (window.col + window.cols, window.row + window.rows)
-            # A fraction of a cell more than the window, for the rounding of places.
+            # Enlarge the window by a fraction of a cell for the rounding of coordinates.
             meets = ((high >= np.subtract(first, 1)) & (low <= np.add(last, 1))).all(axis=1)
             row = np.clip(end[:, 1], 0, shape[0] - 1)
             self.ending = int(np.count_nonzero(meets & (row >= first[1]) & (row < last[1])))
@@ -162,7 +162,7 @@ class CellRays:
 
 
 def check_lengths(ends: RayEnds, resolution: float, first: int) -> None:
-    """Refuse rays that span more cells than a walk can take.
+    """Refuse rays that span more cells than a walk can count.
 
     Args:
         ends: The rays.
@@ -183,7 +183,7 @@ def check_lengths(ends: RayEnds, resolution: float, first: int) -> None:
 
 
 def extent(boxes: np.ndarray, resolution: float) -> tuple[tuple[float, float, float], tuple[int, int]]:
-    """Return origin and shape of the smallest map of whole cells that holds all rays, with a cell to spare around it.
+    """Return origin and shape of the smallest map of whole cells that holds all rays, with a margin of one cell.
 
     Args:
         boxes: (S, 4) least x and y and largest x and y of the rays of each scan [m].

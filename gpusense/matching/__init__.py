@@ -1,1 +1,1 @@
-"""Poses of scans and local maps relative to scans and maps."""
+"""Poses of scans and local maps relative to other scans and maps."""

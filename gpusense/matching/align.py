@@ -15,7 +15,7 @@ from gpusense.world.grid import OccupancyGrid
 
 # Deviation of the smoothing [cells of the global map], its reach in deviations, and least share of known cells.
 _SIGMA, _REACH, _KNOWN = 0.7, 3.0, 1e-3
-# Difference of the shares of known cells around a cell of both maps from which it does not count: one map ends there.
+# A cell is left out if the shares of known cells around it differ by more than this: one of both maps ends there.
 _UNLIKE = 0.15
 # Most cells of the local map, iterations, and the step that ends them [cells, and cells at the mean lever].
 _MOST, _ITERATIONS, _SMALL = 20_000, 20, 1e-4
@@ -67,18 +67,18 @@ class Alignment:
         self._xy, self._values, self._shares = xy[near], values[near], shares[near]
         self._lever = max(float(np.sqrt(np.mean(self._xy**2))), 1.0)
         self._farthest = farthest
-        # Only the part of the map that the cells reach.
+        # Keep only the part of the map that the cells can reach.
         reach = float(np.hypot(*self._xy.T).max()) + farthest + _REACH * _SIGMA + 2
         low, high = poses[:, :2].min(axis=0) - reach, poses[:, :2].max(axis=0) + reach
         first, end = (np.clip(np.round(edge), 0, grid.shape[::-1]).astype(int) for edge in (low, high))
         part = slice(first[1], end[1]), slice(first[0], end[0])
-        # A margin, so that cells at the border of the map have neighbours on all sides.
+        # The margin gives cells at the border of the map neighbours on all sides.
         occupied, self._known = (np.pad(image[part], 1) for image in (grid.occupied, ~grid.unknown))
         self._corner = first - 1
         self._map, self._share = smoothed(occupied, self._known, _SIGMA)
 
     def refined(self, pose: np.ndarray, most: float) -> np.ndarray:
-        """Return the best pose near a pose, or that pose itself if the other is too far away.
+        """Return the best pose near a start, or the start itself if the optimum is too far away.
 
         Args:
             pose: (3,) pose of the local map's middle in the global map's frame [cells, cells, rad].

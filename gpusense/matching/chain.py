@@ -1,4 +1,4 @@
-"""The chain of a match between scans: ICP from the guess, and a search around it where the scans do not agree."""
+"""Match pairs of scans: ICP from the guess, then a search around the guess where the scans do not agree."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from gpusense.matching.result import ScanMatch
 from gpusense.matching.uncertainty import statuses
 from gpusense.matching.verdicts import PairSums, concluded, tested
 
-# A score below this starts a search of the window, and a score below the second one, far from the guess, a search
-# nearby: far is in capture radii and rad.
+# Scores below the first value start a search of the window. Scores below the second one start a search near the guess
+# if the result is farther from it than this distance [capture radii] or turn [rad].
 DOUBTFUL, _SURE, _FAR, _FAR_TURN = 0.86, 0.97, 0.2, 0.1
-# Guesses that are farther than this from the result, in capture radii and rad, are poor.
+# Guesses farther from the result than this distance [capture radii] or turn [rad] are poor.
 _NEAR, _NEAR_TURN = 0.1, 0.05
-# Starts of a search that are refined, and their least distances [m, rad] at a capture radius of 1 m.
-_REFINED, _APART, _TURNED = 6, 0.1, 0.05
-# Penalties of a score: for a distance of a capture radius from the guess, and for a last step that was not small.
+# Starts of a search that are refined, and their least distances [capture radii, rad].
+_REFINED, _APART, _APART_TURN = 6, 0.1, 0.11
+# Penalties of a score: per capture radius of distance from the guess, and for a last step that was not small.
 _FARTHER, _UNSETTLED = 0.03, 0.05
-# Starts whose score is this far below the best one are not refined.
+# Starts that score lower than the best one by more than this are not refined.
 _PROMISING = 0.15
 # Lines turn with noise by this in the mean square [rad^2] where longer ones give the pose.
 _TURNED = 0.11
-# Poses farther apart than this whose scores are this close make a match ambiguous.
+# A match is ambiguous if two poses differ by more than this distance [m] or turn [rad], and score alike within this.
 _OTHER, _OTHER_TURN, _CLOSE = 0.25, 0.1, 0.012
 
 
 class Best(NamedTuple):
-    """The best results (S, 35), and the offset to a pose that agrees about as well (S, 3); NaN without one."""
+    """The best results (S, 35), and offsets (S, 3) to poses that agree about as well, NaN without one."""
 
     result: np.ndarray
     other: np.ndarray
@@ -51,7 +51,7 @@ def match_pairs(
     options: MatchOptions,
     mount: tuple[float, float],
 ) -> ScanMatch:
-    """Match pairs of scans; ``judged`` says how probable the matches are.
+    """Match pairs of scans; ``judged`` adds the probability that they are right.
 
     Args:
         backend: The device.
@@ -83,7 +83,6 @@ def match_pairs(
             _repeat(device, sensor, best, options, most, points.gap)
         noisy = _straighten(device, best.result, points, pairs, options)
         sums = tested(device, best.result, points, pairs, options, noisy)
-        space.wait()
     return _finished(best, sums, pairs, points, options, mount)
 
 
@@ -97,25 +96,31 @@ def _search(
     most: tuple[int, int],
     gap: float,
 ) -> None:
-    """Search around the guesses of some pairs, and put better results in place.
+    """Search around the guesses of some pairs, and replace results by better ones.
 
     ``most`` is the number of points of the largest reference and of the largest second scan.
     """
-    coarse = device.run(poor, guess[:, None] + offsets, options.search_rules(most[1], gap, most[0]))
-    which, chosen = distinct(coarse[..., :3], coarse[..., 3], best.result[poor, :3], options.capture)
+    rules, parts = options.search_rules(most[1], gap, most[0]), []
+    # The results of all starts of wide windows take much memory: as many pairs at a time as a launch has.
+    for begin in range(0, len(poor), step := device.pairs_of_launch(len(offsets))):
+        part = slice(begin, begin + step)
+        coarse = device.run(poor[part], guess[part, None] + offsets, rules)
+        rows, poses = distinct(coarse[..., :3], coarse[..., 3], best.result[poor[part], :3], options.capture)
+        parts.append((begin + rows, poses))
+    which, chosen = (np.concatenate(values) for values in zip(*parts, strict=True))
     if not len(which):
         return
     fine = device.run(poor[which], chosen[:, None], options.final_rules(most[1], gap))[:, 0]
     rows = poor[which]
     order = np.arange(len(rows)) - np.searchsorted(rows, rows)
-    # The starts of a pair one after another, those of all pairs together.
+    # The starts of all pairs in one launch, grouped by pair.
     for turn in range(order.max() + 1):
         now = order == turn
         _compare(rows[now], guess[which[now]], fine[now], best, options)
 
 
 def _compare(rows: np.ndarray, guess: np.ndarray, found: np.ndarray, best: Best, options: MatchOptions) -> None:
-    """Put one result of each pair in place where it is better, and keep the other one if it agrees about as well."""
+    """Replace the best result of each pair by a better one; keep the worse one as a rival if both score alike."""
     before = best.result[rows]
     better = found[:, 3] - _prior(found, guess, options) > before[:, 3] - _prior(before, guess, options)
     winner, loser = (np.where(choice[:, None], found, before) for choice in (better, ~better))
@@ -130,7 +135,7 @@ def _compare(rows: np.ndarray, guess: np.ndarray, found: np.ndarray, best: Best,
 
 
 def _prior(result: np.ndarray, guess: np.ndarray, options: MatchOptions) -> np.ndarray:
-    """Return what results lose of their scores: far from their guesses, outside the window, or without convergence."""
+    """Return the penalties of scores, for distances from guesses, poses outside the window, and no convergence."""
     offset = result[:, :3] - guess
     distance = np.hypot(offset[:, 0], offset[:, 1]) / options.capture
     lost: np.ndarray = _FARTHER * distance + _UNSETTLED * (result[:, 5] == 0) + options.is_outside(offset)
@@ -152,7 +157,7 @@ def _repeat(device: IcpPairs, guess: np.ndarray, best: Best, options: MatchOptio
 def _straighten(
     device: IcpPairs, result: np.ndarray, points: ScanPoints, pairs: np.ndarray, options: MatchOptions
 ) -> np.ndarray:
-    """Match pairs again by longer lines where noise turns the usual ones; return the numbers of these pairs."""
+    """Match pairs again with longer lines where noise turns the usual ones; return the numbers of these pairs."""
     turn = (result[:, 12] + result[:, 15]) * options.noise**2 / np.maximum(result[:, 19], 1e-30)
     rows = np.flatnonzero(turn > _TURNED)
     if len(rows) and STRAIGHT_WIDTH * options.noise > WIDTH:
@@ -170,12 +175,12 @@ def nearby(options: MatchOptions) -> MatchOptions:
 
 
 def distinct(poses: np.ndarray, score: np.ndarray, known: np.ndarray, capture: float) -> tuple[np.ndarray, np.ndarray]:
-    """Choose the best poses that differ from one another and from a known one.
+    """Choose the best poses that differ from each other and from a known pose.
 
     Args:
         poses: (S, M, 3) poses.
         score: (S, M) their scores.
-        known: (S, 3) poses that are not chosen.
+        known: (S, 3) poses near which none is chosen.
         capture: Capture radius [m].
 
     Returns:
@@ -187,7 +192,7 @@ def distinct(poses: np.ndarray, score: np.ndarray, known: np.ndarray, capture: f
     for _ in range(min(_REFINED, score.shape[1]) + 1):
         offset = poses - last[:, None]
         same = np.hypot(offset[..., 0], offset[..., 1]) < _APART * capture
-        left[same & (np.abs(wrapped(offset[..., 2])) < _TURNED)] = -np.inf
+        left[same & (np.abs(wrapped(offset[..., 2])) < _APART_TURN)] = -np.inf
         best = left.argmax(axis=1)
         last = poses[rows, best]
         good = np.flatnonzero(left[rows, best] > least)
@@ -204,10 +209,12 @@ def wrapped(angle: np.ndarray) -> np.ndarray:
 
 
 def to_sensor(pose: np.ndarray, mount: tuple[float, float]) -> np.ndarray:
-    """Return poses of one robot frame in another as poses of frames at the sensors, whose axes are the robots'."""
+    """Convert relative poses of robot frames to poses of frames at the sensors with the robots' axes."""
     x, y = mount
     c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-    return np.stack([pose[:, 0] + c * x - s * y - x, pose[:, 1] + s * x + c * y - y, pose[:, 2]], axis=1)
+    sensor = np.array(pose)
+    sensor[:, 0], sensor[:, 1] = pose[:, 0] + c * x - s * y - x, pose[:, 1] + s * x + c * y - y
+    return sensor
 
 
 def _finished(
@@ -219,9 +226,11 @@ def _finished(
     x, y = mount
     theta = wrapped(result[:, 2])
     c, s = np.cos(theta), np.sin(theta)
-    pose = np.stack([result[:, 0] - c * x + s * y + x, result[:, 1] - s * x - c * y + y, theta], axis=1)
+    pose = np.empty((len(result), 3))
+    pose[:, 0], pose[:, 1], pose[:, 2] = result[:, 0] - c * x + s * y + x, result[:, 1] - s * x - c * y + y, theta
     # Derivative of the sensor's pose with respect to the robot's.
-    moved = np.tile(np.eye(3), (len(pose), 1, 1))
+    moved = np.zeros((len(pose), 3, 3))
+    moved[:, range(3), range(3)] = 1
     moved[:, 0, 2], moved[:, 1, 2] = -s * x - c * y, c * x - s * y
     found, factor = sums.found, sums.factor
     final = moved.transpose(0, 2, 1) @ found.information @ moved / factor[:, None, None]

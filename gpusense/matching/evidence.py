@@ -1,9 +1,9 @@
 """Evidence for and against a match, and the probability that its pose is right.
 
-The probability is a logistic function of what the scans say at the pose that was found. Its weights were fitted by
-``bench/derive/match_evidence.py`` to matches of simulated scans and of half of the recorded logs, of neighbouring
-places and of places that have nothing in common; right and wrong poses weigh the same.
-``bench/accuracy/match_verdicts.py`` compares predicted with actual shares of right matches, for both halves.
+The probability is a logistic function of the evidence that the scans give at the pose. Its weights were fitted by
+``bench/derive/match_evidence.py`` to matches of scans from simulations and from half of the recorded logs, of
+neighbouring places and of places without anything in common; right and wrong poses have equal weight.
+``bench/accuracy/match_verdicts.py`` compares predicted and actual shares of right matches for both halves.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ NAMES = ("disagreement", "contradiction", "overlap", "pairs", "roughness", "misf
 ``disagreement``: 1 less the score. ``contradiction``: share of the points in common sight that one scan saw through.
 ``overlap``: share of all points that are in common sight. ``pairs``: number of pairs of points. ``roughness``: root
 mean square error of pairs over the noise. ``misfit``: 1 less the mean weight of pairs. ``lost``: number of directions
-that are not observed. ``rival``: 1 where another pose agrees about as well. ``distance``: that from the guess, over the
-window's half width.
+that are not observed. ``rival``: 1 where another pose agrees about as well. ``distance``: distance from the guess over
+the window's half width.
 """
 
-# A fully observed pose is doubtful below the first probability, any other pose below the second: such a pose is used in
-# its observed directions, together with its p_right.
+# A fully observed pose is doubtful below the first probability, a partly observed one below the second: it is used only
+# along its observed directions, together with its p_right.
 DOUBTED, DOUBTED_PARTLY = 0.65, 0.03
-# Constant, and weights of the logarithms of disagreement, contradiction, overlap, pairs, roughness and misfit, of a
+# Constant, then weights: of the logarithms of disagreement, contradiction, overlap, pairs, roughness and misfit, of one
 # lost direction, of a second one, of a rival, and of the logarithm of the distance.
 _CONSTANT = -3.123
 _WEIGHTS = np.array([-1.350, -0.164, 1.574, -0.067, -0.202, -0.692, -1.395, 0.622, -2.158, -1.788])
@@ -45,11 +45,14 @@ def pair_evidence(result: np.ndarray, lost: np.ndarray, other: np.ndarray, noise
     pairs, weights = np.maximum(result[:, 18], 1), result[:, 19]
     rough = np.sqrt(result[:, 20] / np.maximum(weights, 1e-30)) / max(noise, 1e-6)
     common = np.maximum(seen + through, 1)
+    evidence = np.empty((len(result), len(NAMES)))
     values = (
         1 - result[:, 3], through / common, seen / np.maximum(common + unseen, 1), pairs, np.minimum(rough, 20.0),
         1 - weights / pairs, lost, np.isfinite(other).all(axis=1), 0 * lost,
     )  # fmt: skip
-    return np.stack(values, axis=1)
+    for column, value in enumerate(values):
+        evidence[:, column] = value
+    return evidence
 
 
 def features_of(evidence: np.ndarray) -> np.ndarray:

@@ -3,9 +3,9 @@
 A score of a cell is its log density in 255 steps. With the nearest cell's distance the sum of scores differs from the
 log-likelihood by rounding alone. With bilinear distances an end point's density depends on its place within a cell. All
 positions are centres of cells, so this place is the same at all positions with one heading. A cell is divided into
-tiles; each kind of tile has a separate table with the largest density within the tile, rounded up. A bilinear function
-has its least value over a tile at a corner, so these are bounds, and every pose whose bound reaches the log-likelihood
-of some known pose is evaluated by the model.
+tiles; each tile of the cell has its table of the largest density within the tile, rounded up. A bilinear function has
+its least value over a tile at a corner, so these are bounds, and every pose whose bound reaches the log-likelihood of
+some known pose is evaluated by the model.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from gpusense.world.field_density import FieldDensity
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Reading, classes
 
-# Side of the largest block that is bounded as a whole [m], relative to the field's max_distance, and most levels.
+# Side of the largest block with one bound, relative to the field's max_distance, and most levels.
 _BLOCK, _MOST_LEVELS = 0.8, 5
-# Tiles along a side of a cell for bilinear fields, if there is room for as many table cells.
+# Tiles along a side of a cell for bilinear fields, if this many table cells suffice.
 _TILES, _MOST_TABLE_CELLS = (4, 2, 1), 1 << 28
 # Rounding of a log-likelihood, in steps for each hit.
 _ROUNDING = 2e-3
 
 
 class Candidates(NamedTuple):
-    """Poses that a search found, by falling score (M,), and the index of the likeliest.
+    """Poses that a search found, in falling order of score, and the index of the likeliest.
 
     Attributes:
         poses: (M, 3) in the world.
@@ -120,7 +120,7 @@ class FieldSearch:
     def find(
         self, ranges: np.ndarray, points: np.ndarray, searched: PoseGrid, allowed: np.ndarray | None, depth: float
     ) -> Candidates:
-        """Return the poses whose scores are near the best one, and the likeliest by the model.
+        """Return the poses that score nearly as well as the best one, and the likeliest by the model.
 
         Args:
             ranges: (K,) readings [m].
@@ -146,7 +146,7 @@ class FieldSearch:
         self, model: LikelihoodFieldModel, ranges: np.ndarray, cells: np.ndarray, searched: PoseGrid,
         allowed: np.ndarray | None, most: int,
     ) -> Candidates:  # fmt: skip
-        """Return the likeliest poses of a bilinear field: all whose bounds reach a likelihood that is known."""
+        """Return the likeliest poses of a bilinear field: all whose bounds reach a known likelihood."""
         # A cell of the tables lies between four centres, also in the ring outside the map.
         shifted = PoseGrid(searched.start + 0.5, searched.headings, searched.height, searched.width)
 
@@ -205,7 +205,7 @@ _SEARCHES: weakref.WeakKeyDictionary[LikelihoodFieldModel, FieldSearch] = weakre
 
 
 def field_search(model: LikelihoodFieldModel, stride: int) -> FieldSearch:
-    """Return the search of a model; a model whose map has changed has a new one."""
+    """Return the search of a model, which is rebuilt after a change of its map."""
     search = _SEARCHES.get(model)
     if search is None or search.grid is not model.grid or search.stride != stride:
         search = _SEARCHES[model] = FieldSearch(model, stride)

@@ -12,20 +12,20 @@ from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import MATCH_RESULT
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
-from gpusense.interface.launches import launch
+from gpusense.interface.launches import Program, launch
 from gpusense.interface.structs import MatchRules
 from gpusense.matching.points import GAP, ScanPoints
 
-# Neighbours on either side to which a line is fitted, and how far they may be from one another: a share of the range
-# and a distance [m]. Bodies in vectors have room for 48.
+# Neighbours on either side to which a line is fitted, and their largest distance: a share of the range plus a distance
+# [m]. Lanes have room for 48 neighbours.
 REACH, _MOST, _FEWER, _RATIO, _SLACK = 2, 48, 16, 0.1, 0.05
-# Half of the least length of a line [m]. In standard deviations of ranges: half of the least length where noise turns
-# such short lines, and half of the length of lines that decide which directions are observed. Long lines do not turn
-# with noise, but round corners, which costs accuracy.
+# Half the least length of a line [m], and two half lengths in standard deviations of ranges: of lines where noise turns
+# the shortest ones, and of lines that decide which directions are observed. Noise does not turn long lines, but they
+# round corners, which costs accuracy.
 WIDTH, STRAIGHT_WIDTH, LONG_WIDTH = 0.04, 3.5, 8.0
 # Neighbours may be this many deviations apart, or this many of the scanner's steps in bearing times the range.
 _SLACK_DEVIATIONS, _STEPS = 6.0, 2.5
-# With farther steps of bearing lines have three points [rad].
+# With larger steps of bearing, lines have three points [rad].
 _SPARSE = 0.12
 # Most starts of one launch; a call can be interrupted between launches.
 _MOST_STARTS = {"cpu": 1 << 12, "gpu": 1 << 18}
@@ -35,7 +35,7 @@ _LOCK = threading.Lock()
 
 
 def points_of_line(gap: float, noise: float, lever: np.ndarray) -> np.ndarray:
-    """Return the points (S,) that share a long line, at half of a scan's rms range ``lever``; see ``IcpPairs``."""
+    """Return the number of points (S,) of a long line at half of a scan's rms range ``lever``; see ``IcpPairs``."""
     spacing = 0.5 * lever * gap / GAP
     width = max(WIDTH, LONG_WIDTH * noise)
     points: np.ndarray = np.clip(2 * width / np.maximum(spacing, 1e-9), 2 * REACH + 1, 2 * _MOST + 1)
@@ -57,7 +57,7 @@ class IcpPairs:
         points: The points of all scans.
         pairs: (S, 2) numbers of the reference and of the second scan.
         noise: Standard deviation of ranges [m].
-        space: Holds the buffers.
+        space: The workspace of the buffers.
     """
 
     def __init__(
@@ -71,17 +71,22 @@ class IcpPairs:
         self._point, self._start = space.upload("match points", point), space.upload("match start", points.start)
         self._line = space.empty("match lines", point.size, real)
         self._most, self._gap, self._noise = int(points.counts.max(initial=0)), points.gap, noise
+        # Launches that start with the next match, so that its copies need not wait for them.
+        self._fits: Program = ()
         self.fit_lines(WIDTH)
 
     def fit_lines(self, width: float, pairs: np.ndarray | None = None) -> None:
-        """Fit lines to the points of all scans, or of the scans of some pairs.
+        """Fit lines to the points of all scans, or of the scans of some pairs, from the next match on.
 
         Args:
-            width: Half of their length [m], as far as there are points.
+            width: Half their length [m]; shorter where points are missing.
             pairs: (P,) indices of pairs; lines of other pairs are kept.
         """
         if not self._most:
             return
+        # A fit to all scans replaces an earlier one.
+        if pairs is not None and self._fits:
+            self._backend.run(self._fits)
         scans = np.arange(self._counts[0], dtype=np.int32) if pairs is None else np.unique(self._pairs[pairs])
         flags = with_lanes_flag(self._backend.info.lanes, "fit_lines", self._flags)
         lines = launch(
@@ -92,7 +97,7 @@ class IcpPairs:
             ratio=max(_RATIO, _STEPS * self._gap / GAP), slack=max(_SLACK, _SLACK_DEVIATIONS * self._noise),
             width=width, gap=self._gap,
         )  # fmt: skip
-        self._backend.run((lines,))
+        self._fits = (lines,)
 
     def run(self, pairs: np.ndarray, guesses: np.ndarray, rules: MatchRules) -> np.ndarray:
         """Match some pairs from several guesses each.
@@ -107,10 +112,13 @@ class IcpPairs:
         """
         starts = guesses.shape[1]
         result = np.empty((len(pairs), starts, MATCH_RESULT), self._real)
-        step = max(_MOST_STARTS[self._backend.info.kind] // max(starts, 1), 1)
-        for begin in range(0, len(pairs), step):
+        for begin in range(0, len(pairs), step := self.pairs_of_launch(starts)):
             self._run(pairs[begin : begin + step], guesses[begin : begin + step], rules, result[begin : begin + step])
         return result.astype(np.float64)
+
+    def pairs_of_launch(self, starts: int) -> int:
+        """Return the most pairs of a launch of some starts each."""
+        return max(_MOST_STARTS[self._backend.info.kind] // max(starts, 1), 1)
 
     def _run(self, pairs: np.ndarray, guesses: np.ndarray, rules: MatchRules, result: np.ndarray) -> None:
         """Match the pairs of one launch."""
@@ -125,6 +133,6 @@ class IcpPairs:
             pair=space.upload("match pairs", self._pairs[pairs]), guess=space.upload("match guesses", padded),
             result=buffer, scans=self._counts[0], points=self._counts[1], pairs=count, starts=starts, rules=rules,
         )  # fmt: skip
-        self._backend.run((matching,))
-        space.download(buffer, result)
-        space.wait()
+        fits, self._fits = self._fits, ()
+        self._backend.run((*fits, matching))
+        space.read(buffer, result)

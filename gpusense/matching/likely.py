@@ -1,4 +1,4 @@
-"""The poses on a whole map at which a scan is likeliest: candidates among which later scans decide."""
+"""Find the likeliest poses of a scan on a whole map, candidates that later scans distinguish."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from gpusense.matching.locate import end_points_of
 from gpusense.matching.pose_grid import PoseGrid, distinct_poses
 from gpusense.models.scan.field import LikelihoodFieldModel
 
-# Distance and angle between neighbouring poses [m, rad]; half of each is within the reach of a cloud of particles.
+# Distance and angle between neighbouring poses [m, rad]; a cloud of particles covers half of each.
 _RESOLUTION, _ANGLE = 0.1, math.radians(3.0)
-# Poses that score less than the best one by this are not found; poses nearer than this to a better one are not new.
+# Depth of scores below the best one to which poses are searched; poses nearer than this to a better one are dropped.
 _DEPTH, _NEAR, _TURNED = 0.06, 0.5, math.radians(15.0)
 
 

@@ -21,11 +21,11 @@ from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Reading, classify
 
-# Side of the largest block that is bounded as a whole [m], relative to the field's max_distance, and most levels.
+# Side of the largest block with one bound, relative to the field's max_distance, and most levels.
 _BLOCK, _MOST_LEVELS = 0.8, 5
-# Poses that score lower than the best one by this share of the largest score are searched for modes.
+# Modes are searched down to this share of the largest score below the best pose.
 _DEPTH = 0.0125
-# Poses nearer than this to a better one are part of its mode [m, rad].
+# Poses nearer than this to a better pose belong to its mode [m, rad].
 _MODE_RADIUS, _MODE_ANGLE = 0.5, math.radians(15)
 # A range agrees with the map within this many sigma_hit, or cells, of the expected range.
 _AGREE_SIGMAS, _AGREE_CELLS = 1.5, 3
@@ -45,13 +45,13 @@ def locate_scan(
     """Find the likeliest pose of a scan on a grid of poses over the whole map, without a guess.
 
     Positions are centres of map cells. Branch and bound (Hess et al., 2016) over integer scores finds every pose whose
-    score can belong to the largest log-likelihood; the model evaluates these. So the pose equals the result of brute
+    score can belong to the largest log-likelihood, and the model evaluates them. So the pose equals the result of brute
     force with ``model.log_likelihood``; ties go to the lowest row, then column, then heading. Damped Gauss-Newton on
     the model's interpolated field then refines it.
 
-    ``p_right`` is the probability that the pose is right, from the readings that agree with the map there, those that
-    pass through its walls, those that end before them, and the same of other poses that score nearly as well. A pose is
-    ``"found"`` if it is at least ``min_probability``.
+    ``p_right`` is the probability that the pose is right. It is computed from the shares of the readings that agree
+    with the map, pass through its walls or end before them, at this pose and at other poses that score nearly as well.
+    A pose is ``"found"`` if ``p_right`` is at least ``min_probability``.
 
     Args:
         model: A likelihood field; its beams, parameters and device are used.
@@ -154,7 +154,7 @@ def _modes(
 def _refined(
     smooth: LikelihoodFieldModel, ranges: np.ndarray, pose: np.ndarray, farthest: float, most: float
 ) -> np.ndarray:
-    """Return the pose of maximal likelihood near a pose, or that pose itself if the other is too far away [m, rad]."""
+    """Return the pose of maximal likelihood near a start, or the start if the maximum is too far away [m, rad]."""
     near: np.ndarray = climb(smooth, ranges[None], pose[None])[0][0]
     near[2] = math.remainder(near[2], 2 * math.pi)
     turn = abs(math.remainder(near[2] - pose[2], 2 * math.pi))
@@ -171,7 +171,7 @@ def _is_free(grid: OccupancyGrid, pose: np.ndarray) -> bool:
 def _shares(
     model: LikelihoodFieldModel, ranges: np.ndarray, hits: np.ndarray, caster: RayCaster, poses: np.ndarray
 ) -> np.ndarray:
-    """Return shares (M, 3) of the hits at poses: as long as expected ranges, longer, and shorter."""
+    """Return shares (M, 3) of the hits at poses that are as long as expected ranges, longer, and shorter."""
     x, y, yaw = model.scanner.mount
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     sensors = poses + np.stack([cos * x - sin * y, sin * x + cos * y, np.full(len(poses), yaw)], axis=1)
@@ -188,6 +188,6 @@ def _said(modes: tuple[PoseMode, ...], least: float) -> tuple[float, np.ndarray,
     p_right = probability_right(evidence)
     if p_right >= least:
         return p_right, evidence, "found"
-    # Would the pose be found if there were no other?
+    # Evaluate the pose as if it had no rival.
     alone = probability_right(location_evidence(modes[:1], _DEPTH))
     return p_right, evidence, "ambiguous" if alone >= least else "no match"

@@ -23,8 +23,9 @@ class PoseMode:
         score: Mean score of the end points, from 0 (all far from obstacles) to 1 (all on obstacles).
         log_likelihood: log p(z | pose, m) by the model.
         agreement: Share of the hits that agree with the expected ranges at the pose.
-        through: Share of the hits that are longer than the expected ranges: beams that pass through walls of the map.
-        short: Share of the hits that are shorter, as before people.
+        through: Share of the hits that are longer than the expected ranges, as if beams passed through walls of the
+            map.
+        short: Share of the hits that are shorter, for example because people stand before walls.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -51,9 +52,10 @@ class Location:
         log_likelihood: log p(z | pose, m) there, by the model.
         agreement: Share of the hits that agree with the expected ranges there.
         modes: The likeliest pose of the grid, then distinct poses that score nearly as well, by falling score.
-        p_right: Probability that the pose is right: off by at most 0.5 m and 5 degrees. It holds where as many scans
-            are tried that were taken on the map as scans of other places.
-        evidence: (E,) what ``p_right`` is made of, see :data:`gpusense.matching.location_evidence.NAMES`.
+        p_right: Probability that the pose is right: off by at most 0.5 m and 5 degrees. It assumes that scans from the
+            map's place and from other places are equally frequent.
+        evidence: (E,) numbers from which ``p_right`` is computed, see
+            :data:`gpusense.matching.location_evidence.NAMES`.
         status: ``"found"``; ``"ambiguous"`` where other modes are as good; ``"no match"`` where no pose explains the
             scan.
         resolution: Distance between neighbouring positions of the grid of poses [m].
@@ -89,5 +91,5 @@ class Location:
 
     @property
     def found(self) -> bool:
-        """Whether one pose alone explains the scan."""
+        """Whether a single pose explains the scan."""
         return self.status == "found"

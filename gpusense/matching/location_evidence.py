@@ -1,9 +1,9 @@
 """Evidence for and against a pose on a whole map, and the probability that it is right.
 
-The probability is a product: that the pose explains the scan, times that it is the right one among poses that score
-nearly as well. The latter is 1/2 where a second pose is as good. Both are logistic functions, whose weights were fitted
-by ``bench/derive/location_evidence.py`` to scans of half of the recorded logs and of simulated ones, on the maps of the
-same and of other places; right and wrong poses weigh the same.
+The probability is a product of two: the pose explains the scan, and it is the right one among poses that score nearly
+as well. The latter is 1/2 where a second pose is as good. Both are logistic functions, whose weights were fitted by
+``bench/derive/location_evidence.py`` to scans of half of the recorded logs and of simulated ones, on the maps of the
+same and of other places; right and wrong poses have equal weight.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ NAMES = ("miss", "through", "short", "gap", "ahead")
 """Evidence for and against a pose.
 
 ``miss``: 1 less the score. ``through``, ``short``: shares of the hits that pass through walls of the map, and that end
-before them. ``gap``: score less that of the strongest other mode, over the depth to which modes are searched; infinite
-without another. ``ahead``: agreement less that mode's.
+    before them. ``gap``: lead in score over the second mode, relative to the depth to which modes are searched;
+    infinite without a second mode. ``ahead``: lead in agreement over that mode.
 """
 
 # Constant, and weights of the logarithms of miss, through and short: whether the pose explains the scan.
 _CONSTANT = -6.73
 _WEIGHTS = (-0.04, -4.83, 0.34)
-# Weights of gap and ahead: whether it is the right one of two.
+# Weights of gap and ahead: whether it is the right one of two modes.
 _RIVAL_WEIGHTS = (1.87, 5.22)
-# Addends before logarithms.
+# Offsets added before logarithms are taken.
 _LEAST = (3e-3, 1e-2, 1e-2)
 
 

@@ -52,11 +52,10 @@ def match_scan(
     """Return the pose of a scan in the frame of an earlier scan, or in a map.
 
     Points of the second scan are paired with the nearest points of the reference, and moved onto the lines through
-    these and their neighbours (point-to-line ICP, Censi 2008) with weights that leave out what disagrees. Space
-    that the reference did not see neither attracts nor repels. Where the scans do not agree at the end, ``"auto"``
-    searches around the guess from many starts, and takes the pose with the best score. In a map, the
-    reference is the scan that is expected at the guess, and then at the pose found; where that fails, the whole window
-    is searched.
+    these and their neighbours (point-to-line ICP, Censi 2008) with weights that suppress outliers. Space that the
+    reference did not see neither attracts nor repels. Where the scans do not agree at the end, ``"auto"`` searches
+    around the guess from many starts, and takes the pose with the best score. In a map, the reference is the scan that
+    is expected at the guess, and then at the pose found; where that fails, the whole window is searched.
 
     Args:
         reference: (K,) readings of the earlier scan [m], or (S, K) for S matches; or a map.
@@ -69,7 +68,7 @@ def match_scan(
             window, without refinement, by branch and bound.
         backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
-        noise: Standard deviation of ranges [m]; errors beyond some three of them lose their weight. ``"auto"``:
+        noise: Standard deviation of ranges [m]; errors beyond about three of them lose their weight. ``"auto"``:
             estimated for each match from the scans' deviations from straight walls; at least 1 cm, and at least the
             rounding error of ranges that come in steps. See the field ``noise`` of the result.
         capture: Farthest distance between paired points at the start [m]: the error of a good guess.
@@ -80,7 +79,7 @@ def match_scan(
         motion: (3,) or (S, 3) motion of the robot during the second scan, from odometry: its pose at the last beam in
             its frame at the first one [m, m, rad]. Beams are measured in their order, evenly in time; guess and result
             are poses at the first beam. None: the robot is at rest.
-        reference_motion: Likewise during the reference scan; not for a map.
+        reference_motion: The same during the reference scan; must be None for a map.
 
     Returns:
         The match, or S matches.
@@ -120,7 +119,7 @@ def _matches(
 ) -> tuple[ScanMatch, bool]:  # fmt: skip
     """Check the scans, the guess and the motions; return S matches, and whether a single one is wanted.
 
-    ``given`` states whether the options have the noise; otherwise it is estimated from the scans.
+    ``given`` states whether the caller chose the noise; otherwise it is estimated from the scans.
     """
     second = readings("ranges", ranges, scanner, device)
     motion = check_motion("motion", motions[0], 1 if second.ndim == 1 else len(second))
@@ -166,7 +165,7 @@ def _matches(
 def _by_noise(
     noise: np.ndarray, options: MatchOptions, matched: Callable[[np.ndarray, MatchOptions], ScanMatch]
 ) -> ScanMatch:
-    """Return the matches of all rows; rows of equal noise (S,) share one call."""
+    """Return the matches of all rows; rows with equal noise (S,) share one call."""
     levels = noise if len(noise) == 1 else np.unique(noise)
     if len(levels) < 2:
         return matched(np.arange(len(noise)), replace(options, noise=float(levels[0])) if len(levels) else options)
@@ -184,8 +183,11 @@ def _to_scans(
         first, second = _still(first, scanner, before), _still(second, scanner, motion)
         return match_by_maps(first, second, scanner, poses, method, device, precision, options)
     real = np.dtype(precision)
-    moved = [np.zeros((len(scans), 3)) if m is None else m for scans, m in ((first, before), (second, motion))]
-    points = scan_points(np.concatenate([first, second]), scanner, real, np.concatenate(moved))
+    moved = None
+    if before is not None or motion is not None:
+        both = (first, before), (second, motion)
+        moved = np.concatenate([np.zeros((len(scans), 3)) if m is None else m for scans, m in both])
+    points = scan_points(np.concatenate([first, second]), scanner, real, moved)
     pairs = np.stack([np.arange(len(second)) % max(len(first), 1), len(first) + np.arange(len(second))], axis=1)
     match = match_pairs(device, real, points, pairs, poses, method, options, scanner.mount[:2])
     return judged(match, poses, options)
@@ -233,7 +235,7 @@ def match_by_maps(
     references: np.ndarray, ranges: np.ndarray, scanner: Scanner, guess: np.ndarray, method: str, backend: Backend,
     precision: str, options: MatchOptions,
 ) -> ScanMatch:  # fmt: skip
-    """Match (S, K) readings to maps of (S, K) or (1, K) references from (S, 3) guesses, one after the other."""
+    """Match (S, K) readings one by one to maps of (S, K) or (1, K) references, from (S, 3) guesses."""
     matches = []
     matcher = None
     for i, scan in enumerate(ranges):

@@ -1,4 +1,4 @@
-"""Match a local map with a global one: branch and bound, and the correlation of the book's section 6.5."""
+"""Match a local map with a global one by branch and bound and the correlation of the book's section 6.5."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ Floats = NDArray[np.float64]
 _OCCUPIED, _FREE = 400, 200
 # Deviation and cap of the field around the global map's obstacles [cells].
 _SIGMA, _CAP = 2.0, 8.0
-# Levels of branch and bound, and score below the best one to which modes are looked for, as a share of the largest.
+# Levels of branch and bound, and share of the largest score below the best pose to which modes are searched.
 _LEVELS, _DEPTH = 5, 0.02
-# Poses nearer than this to a better one are part of its mode [m, rad].
+# Poses nearer than this to a better pose belong to its mode [m, rad].
 _MODE_RADIUS, _MODE_ANGLE, _MODES = 0.5, math.radians(10), 10
 # Least overlap, as a share of the local map's known cells, and share of the best correlation that makes a rival.
 _OVERLAP, _RIVAL = 0.3, 0.95
-# Cells, or angles between headings of the search, by which the alignment moves a pose at most.
+# Largest move of a pose by the alignment [cells, and steps of heading].
 _FARTHEST = 3.0
 # Half widths of the window around a guess [m, m, rad].
 _WINDOW = (1.0, 1.0, 0.35)
@@ -80,7 +80,7 @@ class MapMatch:
 
     @property
     def found(self) -> bool:
-        """Whether one pose alone explains the local map."""
+        """Whether a single pose explains the local map."""
         return self.status == "found"
 
 
@@ -97,17 +97,17 @@ def match_map(
     """Find the pose of a local map in a global one, in a window or without a guess.
 
     The search sums scores of the local map's occupied cells in the likelihood field of the global map, and of its free
-    cells in the global map's free cells; branch and bound finds the poses of the largest sums exactly. Among each of
-    these and its neighbours, the one with the largest correlation of both maps (*Probabilistic Robotics* equation
-    6.26), over cells that both know, is aligned to a fraction of a cell by least squares between the smoothed maps
-    (Lucas and Kanade 1981). The pose is the aligned one with the largest correlation.
+    cells in the global map's free cells; branch and bound finds the poses of the largest sums exactly. From each of
+    these and its neighbours, the pose with the largest correlation of both maps (*Probabilistic Robotics* equation
+    6.26) over cells known to both is aligned to a fraction of a cell, by least squares between the smoothed maps (Lucas
+    and Kanade 1981). The result is the aligned pose with the largest correlation.
 
     Args:
         local_grid: The local map; its resolution may differ.
         grid: The global map. Positions are its cells.
         guess: (3,) pose of the local map's frame in the world [m, m, rad]. None: the whole map is searched.
-        window: (3,) half widths in x, y and theta around the guess [m, m, rad]; all poses within, and some beyond, are
-            searched. None: 1 m, 1 m and 0.35 rad.
+        window: (3,) half widths in x, y and theta around the guess [m, m, rad]; all poses within it are searched, and
+            some beyond. None: 1 m, 1 m and 0.35 rad.
         angle: Angle between neighbouring headings [rad], > 0.
         min_correlation: Correlation below which there is no match, from 0 to 1.
         backend: The device, see :func:`gpusense.devices`.
@@ -159,7 +159,7 @@ class _Local:
         row, col = np.nonzero(~grid.unknown)
         centers = grid.cell_centers(row, col)
         middle = (centers.min(axis=0) + centers.max(axis=0)) / 2
-        # The centre of a cell: maps whose cells coincide then match exactly.
+        # The middle is the centre of a cell, so that maps with coincident cells match exactly.
         self.middle = centers[np.hypot(*(centers - middle).T).argmin()]
         self.xy = (centers - self.middle) / cell
         self.occupied = occupied = grid.occupied[row, col]
@@ -169,7 +169,7 @@ class _Local:
 
 
 def _thinned(index: np.ndarray, most: int) -> np.ndarray:
-    """Return at most ``most`` of some indices, evenly chosen."""
+    """Return at most ``most`` of the indices, evenly spaced."""
     return index if len(index) <= most else index[np.arange(most) * len(index) // most]
 
 
@@ -197,7 +197,7 @@ def _around(grid: OccupancyGrid, local: _Local, guess: ArrayLike, window: ArrayL
         [[x + cos * local.middle[0] - sin * local.middle[1], y + sin * local.middle[0] + cos * local.middle[1]]]
     )
     center = np.column_stack([grid.world_to_cells(middle), [theta - grid.origin[2]]])
-    # Turns of the frame move the middle; the window's axes are parallel to the world's.
+    # Rotations of the frame move the middle; the window's axes are parallel to the world's.
     yaw_cos, yaw_sin = abs(math.cos(grid.origin[2])), abs(math.sin(grid.origin[2]))
     swing = 2 * math.hypot(*local.middle) * math.sin(min(half[2], math.pi) / 2)
     wide = np.array([yaw_cos * half[0] + yaw_sin * half[1], yaw_sin * half[0] + yaw_cos * half[1]]) + swing
@@ -250,7 +250,7 @@ def _distinct(poses: np.ndarray, cell: float) -> list[int]:
 
 
 def _correlation(local: _Local, grid: OccupancyGrid, pose: np.ndarray) -> tuple[float, float]:
-    """Return the correlation of both maps over cells that both know, and the share of these (book equation 6.26).
+    """Return the correlation of both maps over cells known to both (book equation 6.26), and the share of these cells.
 
     With m 1 for occupied and 0 for free cells, and its mean over both maps, the correlation is the sum of (m - mean)
     (m_local - mean) over the root of the product of the sums of (m - mean)^2 and (m_local - mean)^2. Below the least

@@ -9,7 +9,7 @@ coordinates, and a direction counts as observed above the quantile of lambda wit
 one.
 
 A lost direction affects all coordinates: the remaining information assumes that the position along it is unknown
-(Schur's complement). Where translations alone explain what is lost, as along a corridor, the heading stays observed.
+(Schur's complement). Where translations alone explain the loss, as along a corridor, the heading stays observed.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-# Probability that a direction that is not observed counts as observed, and the normal quantile of the rest.
+# Probability that an unobserved direction counts as observed, and the normal quantile of its complement.
 FALSE_ALARM, _QUANTILE = 1e-4, 3.72
 # Least degrees of freedom, and least ratio of an observed direction.
 _LEAST_LINES, _LEAST_RATIO = 4.0, 2.0
-# An observed direction has this many pairs.
+# Least number of pairs that observe a direction.
 LEAST_PAIRS = 1.5
-# Spurious information of lines without errors [pairs].
+# Spurious information attributed to lines without errors [pairs].
 _SPURIOUS = 1e-3
 # Share of the largest eigenvalue below which a direction of an information is lost.
 _NOTHING = 1e-9
@@ -52,11 +52,11 @@ def critical_ratio(lines: np.ndarray) -> np.ndarray:
 def observed_information(
     information: np.ndarray, spurious: np.ndarray, lever: np.ndarray, lines: np.ndarray, least: np.ndarray
 ) -> Observed:
-    """Return the information of pairs along the directions that they observe.
+    """Remove from the information of pairs the directions that they do not observe.
 
     Args:
         information: (S, 3, 3) sums of w J J'.
-        spurious: (S, 3, 3) the part of them that the variance of the points makes up, in the mean.
+        spurious: (S, 3, 3) the expected part of it that is due to the variance of the points.
         lever: (S,) length by which headings are multiplied [m].
         lines: (S,) lines of the scan without a common point.
         least: (S,) least pairs of an observed direction.
@@ -75,7 +75,7 @@ def observed_information(
         result[some] = without(total[some], basis, made_up[some])
         values, vectors = np.array(values), np.array(vectors)
         values[some], vectors[some] = _generalised(result[some], made_up[some])
-    # Noise makes up 1 of each eigenvalue.
+    # Noise contributes 1 to each eigenvalue.
     left = np.where(np.arange(3) < count[:, None], 0.0, np.maximum(values - 1, 1e-3 * values))
     sides = made_up @ vectors
     result = np.einsum("sik,sk,sjk->sij", sides, left, sides)
@@ -86,14 +86,16 @@ def observed_information(
 
 def balance_of(lever: np.ndarray) -> np.ndarray:
     """Return (S, 3) factors that turn x, y and ``lever`` times the heading into x, y and the heading."""
-    return np.stack([np.ones_like(lever), np.ones_like(lever), 1 / lever], axis=1)
+    factors = np.ones((len(lever), 3))
+    factors[:, 2] = 1 / lever
+    return factors
 
 
 def without(information: np.ndarray, lost: np.ndarray, made_up: np.ndarray) -> np.ndarray:
     """Return information (S, 3, 3) with the positions along lost directions (S, 3, L) unknown; columns may be 0.
 
     The directions have no information at all in the result, up to rounding. ``made_up`` (S, 3, 3) is the information
-    that rounding and noise make up.
+    that comes from rounding and noise.
     """
     side = information @ lost
     inner = lost.transpose(0, 2, 1) @ (side + made_up @ lost)
@@ -113,7 +115,7 @@ def _generalised(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _is_lost(values: np.ndarray, vectors: np.ndarray, critical: np.ndarray, least: np.ndarray) -> np.ndarray:
-    """Return which directions noise alone explains, or have hardly a pair; all with smaller ratios are also lost."""
+    """Return which directions noise explains or hardly a pair observes, and all directions with smaller ratios."""
     pairs = values / np.maximum(np.square(vectors).sum(axis=1), 1e-300)
     lost = (values < critical[:, None]) | (pairs < least[:, None])
     result: np.ndarray = np.logical_or.accumulate(lost[:, ::-1], axis=1)[:, ::-1]
@@ -136,7 +138,7 @@ def _lost_basis(
     basis[one, :, 0] = translation[one, :, 0]
     two = (count == 2) & (sliding == 2)
     basis[two, :, :2] = np.eye(3)[:, :2]
-    # One translation and another direction: that of the two which is less like the translation.
+    # Beside one translation, choose the direction that is less parallel to it.
     mixed = np.flatnonzero((count == 2) & (sliding == 1))
     if len(mixed):
         along = np.abs(np.einsum("si,sik->sk", translation[mixed, :, 0], basis[mixed, :, :2]))
@@ -165,7 +167,10 @@ def axes_of(information: np.ndarray, lever: np.ndarray) -> tuple[np.ndarray, np.
     return values, vectors
 
 
-def covariance_of(information: np.ndarray, lever: np.ndarray, reach: tuple[float, float]) -> np.ndarray:
+def covariance_of(
+    information: np.ndarray, lever: np.ndarray, reach: tuple[float, float],
+    known_axes: tuple[np.ndarray, np.ndarray] | None = None,
+) -> np.ndarray:  # fmt: skip
     """Return the covariance (S, 3, 3) of an information: its inverse, infinite in every coordinate that is lost.
 
     A coordinate is lost if positions along a lost direction within ``reach`` of each other differ in it by more than
@@ -175,9 +180,10 @@ def covariance_of(information: np.ndarray, lever: np.ndarray, reach: tuple[float
         information: (S, 3, 3), 0 along lost directions.
         lever: (S,) length by which headings are multiplied [m].
         reach: Farthest distance [m] and angle [rad] from the guess.
+        known_axes: The result of ``axes_of``, where it is known.
     """
     scale = balance_of(lever)
-    values, vectors = axes_of(information, lever)
+    values, vectors = axes_of(information, lever) if known_axes is None else known_axes
     gone = values == 0
     axes = vectors * scale[:, :, None]
     inverse = np.where(gone, 0, 1 / np.where(gone, 1, values))
@@ -185,7 +191,7 @@ def covariance_of(information: np.ndarray, lever: np.ndarray, reach: tuple[float
     lost = np.where(gone[:, None, :], axes, 0.0)
     if not gone.any():
         return covariance
-    # How far one may go along each lost direction within reach, and how far each coordinate then moves.
+    # Largest move along each lost direction within reach, and the change of each coordinate by it.
     limit = np.array([max(reach[0], 1e-3), max(reach[0], 1e-3), max(reach[1], 1e-3)])
     with np.errstate(divide="ignore"):
         far = np.min(np.where(np.abs(lost) > 0, limit[:, None] / np.abs(lost), np.inf), axis=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -11,13 +12,13 @@ from gpusense._util import checks
 from gpusense.interface.structs import MatchRules
 from gpusense.matching.points import GAP
 
-# Points that take part while the scale shrinks, and of each start of a search.
+# Points that are used while the scale shrinks, and for each start of a search.
 _COARSE_POINTS, _SEARCH_POINTS = 200, 30
 # Most points of the reference in a search.
 _SEARCH_REFERENCE = 64
-# Poses on the edge of a window are in it [m, rad].
+# Margin by which poses on the edge of a window count as inside [m, rad].
 _MARGIN = 1e-3
-# Half the distance of neighbouring points, over their step of bearing: pairs may be as far apart [m / rad].
+# Pairs may be as far apart as half the distance of neighbouring points, this times their step of bearing [m / rad].
 _SPARSE = 1.5
 # Stride of the points that make a score, so large that only one point does.
 _NO_SCORE = 1 << 24
@@ -42,7 +43,7 @@ class MatchOptions:
     one_way: bool = False
 
     def is_outside(self, offset: np.ndarray) -> np.ndarray:
-        """Return whether (S, 3) offsets from guesses are beyond the window, but for what a start may move."""
+        """Return whether (S, 3) offsets from guesses leave the window, enlarged by the move that a start may make."""
         turn = np.abs((offset[:, 2] + math.pi) % (2 * math.pi) - math.pi)
         reach, half = self.window
         outside: np.ndarray = (np.hypot(offset[:, 0], offset[:, 1]) > reach + _MARGIN) | (turn > half + _MARGIN)
@@ -69,7 +70,7 @@ class MatchOptions:
         return full._replace(iterations=1, capture=full.least_capture, scale=full.least_scale, score_stride=_NO_SCORE)
 
     def search_rules(self, points: int, gap: float, reference: int) -> MatchRules:
-        """Return the rules of the many starts of a search: few points, few of the reference's, few iterations."""
+        """Return the rules of the many starts of a search: few points of both scans, and few iterations."""
         full = self.rules(points, gap)
         stride, least = max(points // _SEARCH_POINTS, 1), max(2.5 * full.least_scale, 0.08 * self.capture)
         return full._replace(
@@ -104,6 +105,13 @@ def check_options(noise: object, capture: object, window: object) -> MatchOption
     Raises:
         TypeError, ValueError: an option breaks its rule.
     """
+    if type(noise) is type(capture) is float and type(window) is tuple and {*map(type, window)} == {float}:
+        return _of_numbers(noise, capture, window)
+    return _checked(noise, capture, window)
+
+
+def _checked(noise: object, capture: object, window: object) -> MatchOptions:
+    """Check options of any kind; see ``check_options``."""
     values = checks.array("window", window, (2,))
     reach = checks.real("window[0]", float(values[0]), low=0.0)
     turn = checks.real("window[1]", float(values[1]), low=0.0, high=math.pi + 1e-9)
@@ -113,6 +121,10 @@ def check_options(noise: object, capture: object, window: object) -> MatchOption
     if reach > 20 * options.capture:
         raise ValueError(f"window: must reach at most 20 times capture = {options.capture}, got {reach}")
     return options
+
+
+# Most calls repeat the options of the one before.
+_of_numbers = functools.lru_cache(maxsize=16)(_checked)
 
 
 def check_guess(guess: object, matches: int | None, farthest: float = _FARTHEST) -> np.ndarray:

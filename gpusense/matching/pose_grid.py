@@ -1,4 +1,4 @@
-"""Poses to search, and poses that a search found."""
+"""Grids of poses to search, and the poses that a search found."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class PoseGrid:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Poses of a search, for each scan by falling score; ties by row, then column, then heading.
+    """Poses of a search, in falling order of score for each scan; ties by row, then column, then heading.
 
     Attributes:
         scan: (M,) scan of each pose.
@@ -96,7 +96,7 @@ def end_cells(points: np.ndarray, headings: np.ndarray, start: np.ndarray) -> np
 
 
 def distinct_poses(poses: np.ndarray, count: int, radius: float, angle: float, first: int = 0) -> list[int]:
-    """Return the indices of poses that are far from all better ones, and of the first.
+    """Return the indices of the best pose, and of poses that are far from all better ones.
 
     Args:
         poses: (M, 3) poses, by falling score [m, m, rad].

@@ -86,7 +86,7 @@ class PoseLikelihood:
         return float(-(p * np.log(p)).sum())
 
     def modes(self, count: int = 10, *, radius: float = 0.5, angle: float = 0.26) -> tuple[Floats, Floats]:
-        """Return the best poses that are no neighbours of a better one.
+        """Return the local maxima: poses that are not near a better one.
 
         Args:
             count: Largest number of modes.
@@ -94,7 +94,7 @@ class PoseLikelihood:
             angle: Least difference of heading of modes that are near each other [rad].
 
         Returns:
-            (M, 3) poses [m, m, rad] and (M,) log-likelihoods, the best first. Poses that are impossible are left out.
+            (M, 3) poses [m, m, rad] and (M,) log-likelihoods, the best first. Impossible poses are left out.
         """
         checks.integer("count", count, low=1)
         near, turn = checks.real("radius", radius, low=0), checks.real("angle", angle, low=0)
@@ -211,7 +211,7 @@ def _fill(model: ScanModel, ranges: np.ndarray, result: PoseLikelihood, free: bo
 
 
 def _log_sum(log_p: np.ndarray) -> float:
-    """Return the log of the sum of probabilities; NaN stands for none."""
+    """Return the log of the sum of probabilities; NaN counts as 0."""
     known = log_p[~np.isnan(log_p)].astype(np.float64)
     high = known.max(initial=-np.inf)
     return float(high + np.log(np.exp(known - high).sum())) if np.isfinite(high) else float(high)

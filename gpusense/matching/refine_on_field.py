@@ -1,4 +1,4 @@
-"""Poses of maximal likelihood near given ones, by damped Gauss-Newton on a likelihood field."""
+"""Find poses of maximal likelihood near starts by damped Gauss-Newton on a likelihood field."""
 
 from __future__ import annotations
 

@@ -30,6 +30,15 @@ USABLE = ("converged", "unobservable", "ambiguous")
 """Statuses of poses that may be used along their observed directions."""
 
 
+def is_usable(status: str | NDArray[np.str_]) -> NDArray[np.bool]:
+    """Return whether statuses are of poses that may be used along their observed directions."""
+    named = np.asarray(status)
+    usable = named == USABLE[0]
+    for name in USABLE[1:]:
+        usable = usable | (named == name)
+    return usable
+
+
 @dataclass(frozen=True, eq=False)
 class ScanMatch:
     """The pose of a scan in the frame of an earlier scan or of a map, from :func:`gpusense.match_scan`.
@@ -44,7 +53,7 @@ class ScanMatch:
         information: (3, 3) inverse of the covariance, finite: exactly 0 along directions that nothing constrains, and
             where the match failed. A pose graph adds it as it is.
         p_right: Probability that the pose is right: off by at most 0.2 m and 5 degrees along its observed directions.
-            It assumes that as many pairs of the same place are tried as of different places.
+            It assumes that pairs of the same place and of different places are equally frequent.
         score: Share of the points in common sight that agree, 1 at best; points that one scan saw through count
             against it.
         iterations: Iterations of the last refinement.
@@ -53,7 +62,7 @@ class ScanMatch:
             by ``lever``.
         lever: Root mean square range of the second scan [m].
         noise: Standard deviation of ranges that was used [m].
-        evidence: (E,) what ``p_right`` is made of, see :data:`gpusense.matching.evidence.NAMES`.
+        evidence: (E,) numbers from which ``p_right`` is computed, see :data:`gpusense.matching.evidence.NAMES`.
         status: One of :data:`gpusense.matching.result.STATUSES`; an array of strings for S matches.
 
     Example:
@@ -87,7 +96,7 @@ class ScanMatch:
     @property
     def usable(self) -> NDArray[np.bool]:
         """Whether the pose may be used along its observed directions, with ``information``. For S matches (S,)."""
-        return np.isin(self.status, USABLE)
+        return is_usable(self.status)
 
     def __len__(self) -> int:
         if self.pose.ndim == 1:
@@ -129,7 +138,7 @@ class ScanMatch:
         return replace(self, pose=pose, information=information, covariance=covariance, directions=directions)
 
     def replaced(self, rows: NDArray[np.intp], others: ScanMatch, chosen: NDArray[np.bool]) -> ScanMatch:
-        """Return S matches with some rows replaced from other matches, where chosen."""
+        """Return S matches in which the chosen ones of some rows are replaced by other matches."""
         values = {}
         for field in fields(self):
             values[field.name] = np.array(getattr(self, field.name))
@@ -137,7 +146,7 @@ class ScanMatch:
         return ScanMatch(**values)
 
     def explain(self) -> str:
-        """Return status and its meaning, for one match or counted over many."""
+        """Return the status and its meaning, for one match or counted over many."""
         if isinstance(self.status, str):
             return f"{self.status}: {STATUSES[self.status]}"
         names, counts = np.unique(self.status, return_counts=True)

@@ -12,7 +12,7 @@ from gpusense.interface.structs import ScoreTable
 
 _BYTE = np.dtype(np.uint8)
 _NO_FLAGS: frozenset[str] = frozenset()
-# Columns that a kernel in vectors reads at once; the kernel file ``search`` has the same number.
+# Columns that a kernel with lanes reads at once; the kernel file ``search`` has the same number.
 RUN = 16
 # Largest score of a cell.
 TOP = 255
@@ -31,7 +31,7 @@ def quantized(values: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 def field_scores(distances: np.ndarray, sigma: float, max_distance: float) -> np.ndarray:
-    """Return scores of distances [m] that fall like a normal density from 255 to 0 at ``max_distance``."""
+    """Return scores of distances [m], which fall like a normal density from 255 to 0 at ``max_distance``."""
     values = np.exp(-0.5 * (np.minimum(distances, max_distance) / sigma) ** 2)
     return quantized(values, math.exp(-0.5 * (max_distance / sigma) ** 2), 1.0)
 
@@ -62,7 +62,7 @@ class ScoreTables:
         stack = scores[None] if scores.ndim == 2 else scores
         tables, rows, cols = stack.shape
         self.backend, self.levels, self.stride, self._beyond = backend, levels, stride, beyond
-        # The margin holds all pooled cells that a table's cells reach, and a run of cells that none reaches.
+        # The margin holds all pooled cells that a table's cells reach, and a run of cells beyond them.
         self.shape = ScoreTable(tables, rows, cols, ((1 << levels) - 1) * stride + RUN)
         if self._cells(self.shape) > _MOST_CELLS:
             raise ValueError(f"scores: must have at most {_MOST_CELLS} cells with margins, got {stack.shape}")
@@ -78,7 +78,7 @@ class ScoreTables:
 
     @property
     def table_bytes(self) -> int:
-        """Bytes of all tables that have been made on the device."""
+        """Bytes of all tables made on the device so far."""
         folded = sum(self._cells(shape) for _, shape in self._folded.values())
         return len(self._levels) * self._cells(self.shape) + folded
 

@@ -1,8 +1,8 @@
 """The best poses on a grid of poses, by branch and bound or by brute force, for several scans at once.
 
-Scores are sums of integers, so both ways return the same poses with the same scores. Branch and bound evaluates blocks
-of positions by pooled tables, whose sums are upper bounds, and only divides blocks whose bound reaches the best score
-so far (Hess et al., Real-time loop closure in 2D lidar SLAM, ICRA 2016).
+Scores are sums of integers, so both methods return the same poses with the same scores. Branch and bound evaluates
+blocks of positions by pooled tables, whose sums are upper bounds, and only divides blocks whose bound reaches the best
+score so far (Hess et al., Real-time loop closure in 2D lidar SLAM, ICRA 2016).
 """
 
 from __future__ import annotations
@@ -256,7 +256,7 @@ class _Run:
         self._kept = [(candidates[reached], score[reached])]
 
     def found(self) -> Found:
-        """Return the poses in order."""
+        """Return the poses in falling order of score."""
         self._kept.append((np.empty((0, 3), np.int32), np.empty(0, np.int32)))
         candidates, score = (np.concatenate(parts) for parts in zip(*self._kept, strict=True))
         reached = score >= self._floor[candidates[:, 0] // self._turns]

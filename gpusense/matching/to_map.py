@@ -1,7 +1,7 @@
 """Matches of scans to a map: to expected scans, by Gauss-Newton on likelihood fields, and by searches.
 
 A likelihood field measures distances to the centres of occupied cells, half a cell behind the surface that a laser
-sees. Expected scans have the surfaces themselves, and say what a scan could not see.
+sees. Expected scans lie on the surfaces themselves, and show which space a scan could not see.
 """
 
 from __future__ import annotations
@@ -32,15 +32,16 @@ from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import LikelihoodFieldParameters
 from gpusense.world.scanner import Reading, Scanner, classes
 
-# Weight of readings that have nothing to do with the map.
+# Weight of readings unrelated to the map.
 _RANDOM = 0.2
 # Least deviation of a field in cells.
 _LEAST_CELLS = 1.5
-# A score below this is a failure. Least hits, and least pairs and share of pairs that observe a direction.
+# Least score and hits of a match, and least pairs and share of pairs that observe a direction.
 _POOR, _FEW, _LEAST_PAIRS, _LEAST_SHARE = 0.3, 5, 2.0, 0.01
-# In maps drawn of end points, readings end this far behind surfaces; most that field and expected scan differ [cells].
+# In maps drawn from end points, readings end this far behind surfaces; largest difference between the poses by field
+# and by expected scan [cells].
 _BEHIND, _MOST_OFF = 0.1, 3.0
-# Sine of the angle between directions that are not the same.
+# Least sine of the angle between different directions.
 _APART = 0.3
 # Positions and headings of a search: cells apart, and points apart at a scan's rms range; most levels of its tables.
 _SEARCH_CELL, _LEVELS = 0.1, 4
@@ -67,7 +68,7 @@ class MapMatcher:
             sigmas.append(2.5 * sigmas[-1])
         self._sigmas = sigmas[::-1]
         self._models = [self._model(sigma, precision) for sigma in self._sigmas]
-        # A scan of few beams is matched to an expected one of many.
+        # Scans of few beams are matched to expected scans of many.
         self._dense = dense_scanner(scanner)
         if self._dense is not scanner:
             self._options = replace(options, one_way=True)
@@ -114,7 +115,7 @@ class MapMatcher:
         return judged(found, guess, self._options)
 
     def _behind_surfaces(self, ranges: np.ndarray, pose: np.ndarray) -> np.ndarray:
-        """Return whether end points lie behind the surfaces of occupied cells, as in maps drawn of end points."""
+        """Return whether end points lie behind the surfaces of occupied cells, as in maps drawn from end points."""
         off = ranges - self._caster.cast(self._sensors(pose), self._scanner.bearings)
         near = self._hits(ranges) & (np.abs(off) < max(0.3 * self._options.capture, 3 * self._grid.resolution))
         with np.errstate(invalid="ignore"):
@@ -216,7 +217,7 @@ class MapMatcher:
         of_field = observed_information(information, nothing, lever, pairs, least).information
         of_field /= np.maximum(variance, 1e-12)[:, None, None]
         own = observable_directions(ranges, pose, variance, self._scanner, self._backend, self._real, self._options)
-        # Surfaces are half a cell off the centres of cells, and poses of a search are on a grid.
+        # Surfaces are half a cell off the centres of cells, and poses of a search lie on a grid.
         spacing = self._stride * self._grid.resolution / math.sqrt(12) if method == "correlative" else 0.0
         bias = np.hypot(0.5 * self._grid.resolution, spacing)
         joint, lost = _joint(of_field, own, bias, lever)
@@ -237,7 +238,7 @@ class MapMatcher:
 def _joint(field: np.ndarray, own: np.ndarray, bias: float, lever: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the information (S, 3, 3) whose covariance is the sum of both and of a bias [m], and its lost directions.
 
-    A direction that either of them does not observe is lost.
+    A direction is lost if either information does not observe it.
     """
     scale = balance_of(lever)
     both = scale[:, :, None] * scale[:, None, :]
@@ -258,7 +259,7 @@ def _joint(field: np.ndarray, own: np.ndarray, bias: float, lever: np.ndarray) -
 
 
 _LOCK = threading.Lock()
-# The last matchers; each keeps its map alive, so that no other map takes its id.
+# The last matchers; each keeps its map alive, so that no later map has the same id.
 _KEPT: dict[tuple[object, ...], MapMatcher] = {}
 _MOST_KEPT = 4
 

@@ -1,7 +1,7 @@
 """Information of a match, from its pairs, and its status.
 
 The inverse information of Gauss-Newton times the variance of the errors is a covariance, both corrected for the weights
-of normal errors; ``observability`` takes out first what noise makes up.
+of normal errors; ``observability`` first removes the information that noise contributes.
 
 Errors of neighbours are correlated: they share points of a line, and errors of a surface. The variance of their
 weighted sum is 1 + 2 sum rho_k times that of independent errors, with the autocorrelation rho_k over k points. Blocks
@@ -24,11 +24,11 @@ from gpusense.world.scanner import Scanner
 
 # Least pairs of points of a match, least share of points in common sight, and least score.
 _FEW, _OVERLAP, _POOR = 5, 0.1, 0.46
-# Pairs for which the noise counts.
+# Number of pairs as which the prior noise counts.
 _PRIOR_PAIRS = 2.0
-# Least variance of a point [m^2]: float32 has some micrometres at ten metres.
+# Least variance of a point [m^2]: float32 resolves about a micrometre at ten metres.
 _LEAST_VARIANCE = 1e-9
-# A last step has converged that is shorter than this in deviations of the pose, along observed directions.
+# A match has converged if its last step along observed directions is shorter than this [deviations of the pose].
 _SHORT = 0.5
 
 
@@ -69,8 +69,8 @@ def _noise_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def inflation_of(squares: np.ndarray) -> np.ndarray:
     """Return (S,) variances of sums of weighted errors, relative to independent errors; at least 1.
 
-    The ratio to single points rises with the size of blocks, and is less certain with large ones. So its steps count
-    until the first one that is not positive. The last of them counts twice: once blocks are longer than the
+    The ratio to single points rises with the size of blocks, and is less certain for large ones. So its steps are
+    summed until the first one that is not positive. The last of them counts twice: once blocks are longer than the
     correlation, each step is half of the one before.
 
     Args:
@@ -91,7 +91,7 @@ def variance_of(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the variance of single errors (S,) [m^2], and the factor (S,) of the inverse information.
 
-    Three numbers of a pose are fitted to the pairs, and the noise counts like some pairs more.
+    The three fitted numbers of a pose reduce the degrees of freedom, and the prior noise adds some.
 
     Args:
         squared: (S,) weighted mean squared error [m^2].
@@ -109,11 +109,11 @@ def variance_of(
 def observed_pairs(
     information: np.ndarray, doubt: np.ndarray, variance: np.ndarray, lever: np.ndarray, lines: np.ndarray
 ) -> Observed:
-    """Return what pairs of points and lines observe.
+    """Return the information that pairs of points and lines observe.
 
     Args:
         information: (S, 3, 3) sums of w J J'.
-        doubt: (S, 3, 3) the part of it that a unit variance of the points makes up.
+        doubt: (S, 3, 3) the part of it that is due to a unit variance of the points.
         variance: (S,) variance of the points [m^2].
         lever: (S,) length by which headings are multiplied [m].
         lines: (S,) lines without a common point.
@@ -144,10 +144,10 @@ def observable_directions(
     ranges: np.ndarray, pose: np.ndarray, variance: np.ndarray, scanner: Scanner, backend: Backend, real: np.dtype,
     options: MatchOptions,
 ) -> np.ndarray:  # fmt: skip
-    """Return the information (S, 3, 3) on poses that the lines of the scans leave, 0 along what they do not observe.
+    """Return the information (S, 3, 3) on poses by the scans' lines, 0 along directions that they do not observe.
 
-    Distances to a map know nothing of lines: the ends of a corridor's walls in the map, or gaps between cells, seem to
-    constrain the position along the corridor. A scan matched with itself has the information of its lines.
+    Distances to a map ignore lines: the ends of a corridor's walls in the map, or gaps between cells, seem to constrain
+    the position along the corridor. A scan matched with itself has the information of its lines.
 
     Args:
         ranges: (S, K) readings [m].
@@ -166,7 +166,6 @@ def observable_directions(
         device.fit_lines(max(WIDTH, LONG_WIDTH * options.noise))
         rules = options.rules(int(points.counts.max(initial=0)), points.gap)
         result = device.run(everything, np.zeros((len(pose), 1, 3)), rules)[:, 0].astype(np.float64)
-        space.wait()
     turned = _turned(pose[:, 2], scanner.mount[:2])
     information, doubt = (turned @ symmetric(result[:, at : at + 6]) @ turned.transpose(0, 2, 1) for at in (6, 12))
     lever = points.rms_range(everything)
@@ -176,7 +175,7 @@ def observable_directions(
 
 
 def _turned(heading: np.ndarray, mount: tuple[float, float]) -> np.ndarray:
-    """Return (S, 3, 3) derivatives that turn information on sensors' poses into that on robots' poses in the world."""
+    """Return (S, 3, 3) derivatives that convert information on sensors' poses to that on robots' poses in the world."""
     c, s, (x, y) = np.cos(heading), np.sin(heading), mount
     zero, one = np.zeros(len(c)), np.ones(len(c))
     return np.stack([c, -s, zero, s, c, zero, zero - y, zero + x, one], axis=1).reshape(-1, 3, 3)

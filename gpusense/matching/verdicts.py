@@ -1,4 +1,4 @@
-"""Verdicts on matches: information from their pairs, the directions that they observe, and their status."""
+"""Judge matches: information from their pairs, the directions that they observe, and their status."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from gpusense.matching.icp import LONG_WIDTH, WIDTH, IcpPairs, points_of_line, s
 from gpusense.matching.observability import Observed, axes_of, covariance_of
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import ScanPoints
-from gpusense.matching.result import USABLE, ScanMatch
+from gpusense.matching.result import ScanMatch, is_usable
 from gpusense.matching.uncertainty import inflation_of, observed_pairs, symmetric, variance_of
 
 # Distances from guesses are relative to windows of at least this [m].
 _LEAST_WINDOW = 0.1
-# Lines turn with noise by this much in the mean square [rad^2] where longer ones tell what is observed.
+# Mean square turn of lines by noise [rad^2] from which longer lines decide which directions are observed.
 _TURNED_LINES = 0.05
 
 
 class PairSums(NamedTuple):
-    """Information of the pairs of matches in the sensors' frames, variances of points, factors of covariances (S,)."""
+    """Information of pairs in the sensors' frames, variances of points and factors of covariances, for S matches."""
 
     found: Observed
     variance: np.ndarray
@@ -34,7 +34,7 @@ def tested(
     device: IcpPairs, result: np.ndarray, points: ScanPoints, pairs: np.ndarray, options: MatchOptions,
     noisy: np.ndarray,
 ) -> PairSums:  # fmt: skip
-    """Return the directions that pairs observe, by the matches' lines or, where noise may turn these, longer ones.
+    """Return the directions that pairs observe, by the matches' lines or, where noise may turn these, by longer lines.
 
     ``noisy`` are numbers of pairs whose lines noise turns.
     """
@@ -50,7 +50,7 @@ def tested(
         information, doubt = symmetric(sums[:, 6:12]), symmetric(sums[:, 12:18])
         return observed_pairs(information, doubt, noise[rows], lever[rows], independent)
 
-    # Short lines decide only what is beyond doubt.
+    # Short lines decide only where the result is beyond doubt.
     found = observed(result, np.arange(len(result)), np.zeros(len(result)))
     turned = (result[:, 12] + result[:, 15]) * noise > _TURNED_LINES * np.maximum(result[:, 19], 1e-30)
     turned[noisy] = True
@@ -76,8 +76,8 @@ def concluded(
 
     Args:
         pose: (S, 3) poses.
-        information: (S, 3, 3) of them.
-        factor: (S,) by which it is multiplied for a sum over pairs [m^2].
+        information: (S, 3, 3) information on the poses.
+        factor: (S,) factor that turns the information into a sum over pairs [m^2].
         score: (S,) scores.
         iterations: (S,) iterations.
         status: (S,) statuses so far.
@@ -87,7 +87,7 @@ def concluded(
         pairs: (S,) sums of weights.
         options: The window and the noise.
     """
-    usable = np.isin(status, USABLE)
+    usable = is_usable(status)
     two = usable & np.isfinite(other).all(axis=1)
     offset = np.where(two[:, None], other, 0.0)
     # The covariance plus a quarter of the offset's square, by Woodbury's identity.
@@ -96,9 +96,11 @@ def concluded(
     status = np.where(two, "ambiguous", status)
     values, vectors = axes_of(information, lever)
     shares = values * (factor / np.maximum(pairs, 1))[:, None]
+    # The axes of the information that is kept, where all of it is.
+    axes = (values, vectors) if usable.all() else None
     information = np.where(usable[:, None, None], information, 0.0)
     return ScanMatch(
-        pose, covariance_of(information, lever, options.window), information, np.zeros(len(pose)), score,
+        pose, covariance_of(information, lever, options.window, axes), information, np.zeros(len(pose)), score,
         iterations.astype(np.int64), shares, vectors.transpose(0, 2, 1), lever, np.full(len(pose), options.noise),
         evidence, status,
     )  # fmt: skip
@@ -116,11 +118,14 @@ def judged(match: ScanMatch, guess: np.ndarray, options: MatchOptions) -> ScanMa
     evidence = match.evidence.copy()
     evidence[:, -1] = np.hypot(offset[:, 0], offset[:, 1]) / max(options.window[0], _LEAST_WINDOW)
     status, outside = np.asarray(match.status), options.is_outside(offset)
-    p_right = np.where(match.usable & ~outside, probability_right(evidence), 0.0)
+    usable = match.usable
+    p_right = np.where(usable & ~outside, probability_right(evidence), 0.0)
     least = np.where(status == "converged", DOUBTED, DOUBTED_PARTLY)
-    status = np.where(match.usable & (p_right < least), "doubtful", status)
-    status = np.where(match.usable & outside, "outside window", status)
-    failed = ~np.isin(status, USABLE)[:, None, None]
+    status = np.where(usable & (p_right < least), "doubtful", status)
+    status = np.where(usable & outside, "outside window", status)
+    if is_usable(status).all():
+        return replace(match, evidence=evidence, p_right=p_right, status=status)
+    failed = ~is_usable(status)[:, None, None]
     return replace(
         match, evidence=evidence, p_right=p_right, status=status, information=np.where(failed, 0.0, match.information),
         covariance=np.where(failed, np.where(np.eye(3) > 0, np.inf, 0.0), match.covariance),
@@ -130,12 +135,11 @@ def judged(match: ScanMatch, guess: np.ndarray, options: MatchOptions) -> ScanMa
 def pair_sums(
     backend: Backend, real: np.dtype, points: ScanPoints, pairs: np.ndarray, options: MatchOptions
 ) -> np.ndarray:
-    """Return results (S, 35) of pairs of scans that stay where they are, but for one last step."""
+    """Return results (S, 35) of pairs of scans at their poses, after a single last step."""
     lock, space = space_of(backend)
     stride = options.rules(int(points.counts[pairs[:, 1]].max(initial=0)), points.gap).score_stride
     rules = options.last_rules(points.gap)._replace(score_stride=stride)
     with lock, space:
         device = IcpPairs(backend, real, points, pairs, options.noise, space)
         result = device.run(np.arange(len(pairs)), np.zeros((len(pairs), 1, 3)), rules)[:, 0]
-        space.wait()
     return result

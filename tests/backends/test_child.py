@@ -88,6 +88,24 @@ def test_a_hanging_child_and_its_children_are_ended(monkeypatch, tmp_path):
         time.sleep(0.05)
 
 
+@pytest.mark.parametrize(
+    ("waits", "limits", "failure", "conclusive"),
+    [(0, 600, "hangs: no answer in 0.1 s", True), (60, 600, "", True), (60, 2, "hangs: no answer in 0.1 s", False)],
+)
+def test_a_child_without_a_processor_gets_more_time(monkeypatch, waits, limits, failure, conclusive):
+    monkeypatch.setenv("GPUSENSE_PROOF_SECONDS", "0.1")
+    monkeypatch.setattr(child, "_MOST_LIMITS", limits)
+    monkeypatch.setattr(child, "_starved", lambda _: waits)
+    text = "import time; time.sleep(0.3); print('gpusense-child {\"done\": \"%s\"}' % job['token'])"
+    outcome = run_text(text)
+    assert (outcome.failure, outcome.conclusive) == (failure, conclusive)
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/schedstat"), reason="this system does not say how long threads wait")
+def test_waits_of_threads_are_seconds():
+    assert 0 < child._starved(os.getpid()) < 1e5 and child._starved(0) == 0
+
+
 @pytest.mark.parametrize("name", ["SIGKILL", "SIGTERM", "SIGINT"])
 def test_signals_from_outside_say_nothing_of_the_driver(name):
     outcome = run_text(f"import os, signal; signal.signal(2, signal.SIG_DFL); os.kill(os.getpid(), signal.{name})")

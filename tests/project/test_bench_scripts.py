@@ -32,7 +32,7 @@ def test_limits_runs(selection: str, needs: Callable[[str], str], tmp_path: Path
     assert sum(row["what"].startswith("field, bilinear") for row in report["rows"]) == 2
     assert all(row["call_s"] > 0 and row["launch_s"] > 0 and row["first_s"] > 0 for row in report["rows"])
     checked = [row for row in report["rows"] if row["checked"]]
-    assert len(checked) == 14 and all(row["median_error"] < 1e-4 and row["error"] < 1e-2 for row in checked)
+    assert len(checked) == 16 and all(row["median_error"] < 1e-4 and row["error"] < 1e-2 for row in checked)
     assert not any(row["differing_bits"] for row in checked if row["what"].startswith("rays"))
 
 
@@ -118,13 +118,14 @@ def test_trees_are_compared(needs: Callable[[str], str], tmp_path: Path) -> None
     """A tree has the bits of itself, and rows of both its processes."""
     arguments = ["--old", str(BENCH.parent), "--new", str(BENCH.parent), "--backend", needs("opencl"), "--limit", "50"]
     arguments += ["--particles", "1000", "--beams", "8", "--size", "20", "--blocks", "2", "--turns", "2", "--bits"]
-    words = ["--rows", "field, tracking", "rays, global", "preparation", "scans"]
+    words = ["--rows", "field, tracking", "rays, global", "preparation", "scans", "step, field, 500"]
     report = run_script(
         "compare_trees.py", "speed", *arguments, "--seconds", "0.001", *words, output=tmp_path / "trees"
     )
     names = {row["what"] for row in report["rows"]}
     assert {"rays, global, 1000 x 8", "field, tracking, 1000 x 8", "preparation, field"} <= names
     assert {"field, tracking, 1000 x 60", "field, tracking, 1000 x 60, bound", "field, 20 scans of 500 x 60"} <= names
+    assert "filter step, field, 500 x 60" in names
     for row in report["rows"]:
         assert row["same_bits"] and not row["slower"] and len(row["blocks"]) == 2
         assert row["quartiles"][0] <= row["ratio"] <= row["quartiles"][1] and row["old_s"] > 0 and row["new_s"] > 0

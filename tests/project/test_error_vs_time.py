@@ -58,7 +58,7 @@ def test_reports_are_of_this_code(reports: ModuleType) -> None:
 
 def test_reports_state_command_and_device(reports: ModuleType) -> None:
     for source in reports.sources():
-        assert source.report["command"].startswith("python bench/error_vs_time/"), source.name
+        assert re.match("python (bench/speed/as_avx2.py )?bench/error_vs_time/", source.report["command"]), source.name
         assert source.titles and source.report["date"] and "/work" not in source.report["command"]
         assert "--quick" not in source.report["command"], f"{source.name}: of 512 particles"
 
@@ -135,6 +135,8 @@ def test_the_answers_by_hand(page: ModuleType, tmp_path: Path) -> None:
     text = page.files(tmp_path)[page.PAGE]
     assert f"| to do | {DEVICE} |" in text
     assert "| 10 000 particles at 100 Hz | **field, 10000 x 60**: 8 ms, 2 cm |" in text
+    first = f"- **10 000 particles at 100 Hz on a laptop's processor** ({DEVICE}): 8 ms, 2 cm, `make(field)`\n"
+    assert first in text and "on a GPU** (" not in text
     assert "| 1000 particles at 100 Hz | **beam, 1000 x 60**: 9 ms, 6 mm |" in text
     # A temperature of 1 is no default: it is right in simulations alone.
     assert "| localisation to 2 cm | **field, 1000 x 60**: 2 ms, 1.9 cm |" in text
@@ -152,6 +154,15 @@ def test_noise_of_times_gives_the_same_answers(page: ModuleType, tmp_path: Path,
         text = page.files(tmp_path)[page.PAGE]
         found.append(re.findall(r"^\| (?:10 000|1000|localisation).*?\*\*(.*?)\*\*", text, re.MULTILINE))
     assert found[0] == found[1] and len(found[0]) == 6
+
+
+def test_a_variant_of_a_device_stands_behind_it(reports: ModuleType) -> None:
+    names = [f"error_vs_time_{name}.json" for name in ("cpu_avx2_models", "cpu_tasks", "h200_models", "cpu_models")]
+    titles = {name: ("NVIDIA H200" if "h200" in name else "X",) for name in names}
+    found = [reports.Source(one, one[:-5].rsplit("_", 1)[1], {}, titles[one]) for one in names]
+    assert [one.name[14:-5] for one in sorted(found, key=reports._place)] == [
+        "cpu_models", "cpu_tasks", "cpu_avx2_models", "h200_models",
+    ]  # fmt: skip
 
 
 def test_reports_of_uncommitted_changes_are_refused(page: ModuleType, tmp_path: Path) -> None:

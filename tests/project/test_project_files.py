@@ -63,7 +63,8 @@ def test_the_page_of_dependencies_has_each():
 # Parameters of nav2_amcl's node that from_nav2 does not know.
 IGNORED = {
     "always_reset_initial_pose", "beam_skip_distance", "beam_skip_error_threshold", "first_map_only", "initial_pose.z",
-    "save_pose_rate", "freespace_downsampling", "random_seed", "use_sim_time",
+    "save_pose_rate", "freespace_downsampling", "random_seed", "use_sim_time", "allow_parameter_qos_overrides",
+    "initialize_at_saved_pose", "saved_pose_filepath",
 }  # fmt: skip
 
 

@@ -35,7 +35,6 @@ def published() -> str:
 def test_each_report_is_published(published: str) -> None:
     """A page links it, or the table of a report links the file beside it."""
     names = {Path(name).stem for name in re.findall(r"results/([\w.-]+)", published)}
-    names |= {f"extreme-{device}" for device in ("cpu", "h200") if "results/extreme-" in published}
     assert [file.name for file in REPORTS if file.stem not in names] == []
 
 
@@ -86,6 +85,12 @@ def test_tables_are_written_between_their_marks(stiff_density: ModuleType, tmp_p
     assert page.read_text() == text
     with pytest.raises(ValueError, match="must have the mark <!-- made: three -->"):
         stiff_density.write_tables(page, {"three": ""})
+
+
+def test_tables_of_extreme_sizes_are_those_of_the_reports(stiff_density: ModuleType) -> None:
+    page = (ROOT / "docs" / "numerics.md").read_text(encoding="utf-8")
+    for name, lines in importlib.import_module("accuracy.extreme_tables").tables().items():
+        assert f"<!-- made: {name} -->\n{lines}\n<!-- end -->" in page, "run bench/accuracy/extreme_tables.py"
 
 
 def test_the_picture_shows_broken_bounds(stiff_density: ModuleType) -> None:

@@ -1,0 +1,132 @@
+"""Which method for a limit of error or time: what docs/error-vs-time.md begins with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from gpusense.evaluation.benchmark.choice import choose, error_text, time_text
+from gpusense.evaluation.benchmark.report import table
+from gpusense.evaluation.benchmark.rows import ALL, Row
+
+WRONG, MEDIAN, TAIL, LARGEST = (
+    "rays wrong by more than a cell", "median error of a ray", "95 % error of a ray", "largest error of a ray",
+)  # fmt: skip
+KL, FINE = "KL divergence at a comparable temperature", "KL divergence from the true posterior"
+SHIFT, GLOBAL = "shift of the mean position", "the same, all over the map"
+# By need: the measures of its figure and of its table, the first one that of choices.
+SHOWN = {
+    "rays": (WRONG, MEDIAN, TAIL, LARGEST), "beam model": (KL, GLOBAL, FINE, SHIFT),
+    "likelihood field": (KL, GLOBAL, FINE, SHIFT),
+    "localisation": ("median error", "95 % error"), "matching": ("median error", "95 % error"),
+    "in a map": ("median error", "95 % error"), "learning": ("median error", "largest error"),
+    "landmarks": ("median error",),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Wish:
+    """An upper limit of the error or of the time.
+
+    Attributes:
+        words: In words.
+        need: Its need.
+        error: The largest error of the need's first measure; None without a limit.
+        seconds: The longest time [s]; None without a limit.
+        only: Chooses rows.
+    """
+
+    words: str
+    need: str
+    error: float | None = None
+    seconds: float | None = None
+    only: Callable[[Row], bool] = lambda row: True
+
+
+def _default(row: Row) -> bool:
+    """Return whether a filter has the default temperature and stages."""
+    return "," not in row.setting
+
+
+def _particles(count: int) -> Callable[[Row], bool]:
+    return lambda row: _default(row) and row.setting.startswith(f"{count} x")
+
+
+FIRST = (
+    Wish("10 000 particles at 100 Hz", "localisation", seconds=0.01, only=_particles(10_000)),
+    Wish("1000 particles at 100 Hz", "localisation", seconds=0.01, only=_particles(1000)),
+    Wish("localisation to 2 cm", "localisation", error=0.02, only=_default),
+)
+WISHES = (
+    *FIRST,
+    Wish("beam model, at most 0.01 nats", "beam model", error=0.01),
+    Wish("beam model, at most 10 ms", "beam model", seconds=0.01),
+    Wish("beam model, at most 1 ms", "beam model", seconds=0.001),
+    Wish("likelihood field, at most 0.01 nats", "likelihood field", error=0.01),
+    Wish("likelihood field, at most 1 ms", "likelihood field", seconds=0.001),
+    Wish("rays, at most 1 % wrong", "rays", error=0.01),
+    Wish("match of two scans, at most 1 cm", "matching", error=0.01),
+    Wish("match in a map, at most 1 cm", "in a map", error=0.01),
+    Wish("parameters learned, at most 5 % off", "learning", error=0.05),
+    Wish("unknown landmarks, at most 0.2 nats", "landmarks", error=0.2, only=lambda row: row.method != "known"),
+)
+
+
+def value(number: float, unit: str) -> str:
+    """Format an error; shares and relative errors in percent, lengths in millimetres or centimetres."""
+    if unit in ("share", "relative"):
+        return "0" if number == 0 else error_text(number, "%")
+    if unit == "nats":
+        return "0" if number < 1e-6 else f"{number:.2g}"
+    return f"{number:.3g}" if unit == "cells" else error_text(number, unit)
+
+
+def own(rows: Iterable[Row], need: str, device: str, scene: str = ALL) -> list[Row]:
+    """Return gpusense's rows of a need on a device."""
+    return [row for row in rows if (row.need, row.device, row.scene) == (need, device, scene) and not row.outside]
+
+
+def chosen(rows: Sequence[Row], wish: Wish, device: str) -> tuple[Row | None, bool]:
+    """Return the method for a wish and whether it keeps the limit, else the nearest one; None without any."""
+    able = [row for row in own(rows, wish.need, device) if wish.only(row) and not row.maps]
+    if not able:
+        return None, False
+    entries = [row.entry(SHOWN[wish.need][0]) for row in able]
+    best = choose(entries, wish.error, wish.seconds)
+    if best is not None:
+        return able[entries.index(best)], True
+    nearest = min(entries, key=lambda entry: entry.seconds if wish.error is None else entry.error)
+    return able[entries.index(nearest)], False
+
+
+def answer(rows: Sequence[Row], wish: Wish, device: str) -> str:
+    """Return the method for a wish with its time and error."""
+    row, kept = chosen(rows, wish, device)
+    if row is None:
+        return "-"
+    figures = _figures(row, SHOWN[wish.need][0])
+    return f"**{row.text}**: {figures}" if kept else f"none; nearest: {row.text}, {figures}"
+
+
+def lead(rows: Sequence[Row], devices: Sequence[str]) -> list[str]:
+    """Return the first wish's methods on the first processor and the first GPU that have any, with their code."""
+    lines = []
+    for place, gpu in (("a laptop's processor", False), ("a GPU", True)):
+        for device in devices:
+            row, kept = chosen(rows, FIRST[0], device)
+            if row is not None and kept and ("NVIDIA" in device) == gpu:
+                figures = _figures(row, SHOWN[row.need][0])
+                lines.append(f"- **{FIRST[0].words} on {place}** ({device}): {figures}, `{row.code}`")
+                break
+    return lines
+
+
+def _figures(row: Row, measure: str) -> str:
+    unit = row.units[measure]
+    return f"{time_text(row.seconds)}, {value(row.errors[measure], unit)}{' nats' * (unit == 'nats')}"
+
+
+def answers(rows: Sequence[Row], devices: Sequence[str], wishes: Sequence[Wish]) -> list[str]:
+    """Return the table of wishes."""
+    lines = [(wish.words, *(answer(rows, wish, device) for device in devices)) for wish in wishes]
+    return table(("to do", *devices), lines, 1 + len(devices))

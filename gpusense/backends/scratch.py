@@ -81,7 +81,7 @@ def _own_folder(place: folders.Place) -> Path:
     """Return gpusense's folder in a place; report a place that is not safe, since compiled kernels are not kept there.
 
     Raises:
-        OSError: there is none.
+        OSError: Neither is possible.
     """
     try:
         return folders.own_folder(place.folder)

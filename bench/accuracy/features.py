@@ -27,15 +27,16 @@ import numpy as np
 from scipy.stats import chi2
 
 import gpusense as gs
-from gpusense.evaluation.feature_scenes import floor_plan
-from gpusense.evaluation.feature_scores import FREE, Score, score_scan
-from gpusense.evaluation.feature_truth import truth_of
 from gpusense.features.result import Features
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
 import recordings
 from common import add_repeats, best, make_parser, parse, publish, table
+from support.feature_scenes import floor_plan
+from support.feature_scores import FREE, Score, score_scan
+from support.feature_truth import truth_of
 
 PARTS = ("simulated", "ransac", "real", "localisation", "rates")
 BEAMS, NOISES = (180, 360, 1081), (0.0, 0.01, 0.03, 0.05)

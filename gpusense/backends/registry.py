@@ -7,7 +7,6 @@ the class in ``library.py``, through which devices are listed, proved and opened
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 import importlib.util
 import platform
 import sys
@@ -119,9 +118,12 @@ def remedy(entry: Entry) -> str:
 
 def _is_installed(distribution: str) -> bool:
     """Return whether a distribution is installed, by the name under which pip knows it."""
+    # Loads the library of e-mails.
+    from importlib import metadata
+
     try:
-        return bool(importlib.metadata.version(distribution))
-    except importlib.metadata.PackageNotFoundError:
+        return bool(metadata.version(distribution))
+    except metadata.PackageNotFoundError:
         return False
 
 

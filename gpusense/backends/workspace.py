@@ -195,6 +195,11 @@ class Workspace:
         self._busy.append(out)
         self._backend.download(buffer, out, wait=False)
 
+    def read(self, buffer: Buffer, out: np.ndarray) -> None:
+        """Copy the head of a buffer into a C-contiguous array, after all copies and launches, and wait for it."""
+        self._backend.download(buffer, out)
+        self._busy.clear()
+
     def wait(self) -> None:
         """Wait for all copies and launches."""
         self._backend.synchronize()

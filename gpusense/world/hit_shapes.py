@@ -26,6 +26,8 @@ HitName: TypeAlias = Literal["normal", "student"]
 LEAST_DOF, MOST_DOF = 1.0, 1e6
 # For half of the degrees of freedom above this, the ratio of gamma functions is its asymptotic series.
 _SERIES_FROM = 30.0
+# From here on erf is 1 in float64.
+_ERF_IS_ONE = 6.0
 # The largest number below one half.
 _MOST_HALF = math.nextafter(0.5, 0)
 
@@ -167,9 +169,13 @@ class NormalHit(HitShape):
 
     def half_mass(self, u: Floats) -> Floats:
         """See HitShape.half_mass."""
+        scaled = u * u.dtype.type(math.sqrt(0.5))
+        if scaled.min(initial=np.inf) >= _ERF_IS_ONE:
+            # SciPy, which takes as long to load as a whole call of a model, is not needed.
+            return np.full_like(scaled, 0.5)
         from scipy.special import erf
 
-        return u.dtype.type(0.5) * erf(u * u.dtype.type(math.sqrt(0.5)))
+        return u.dtype.type(0.5) * erf(scaled)
 
     def drawn(self, share: Floats, low: Floats, high: Floats) -> Floats:
         """See HitShape.drawn."""

@@ -155,9 +155,9 @@ def _evict(path: Path) -> None:
         return
     with contextlib.suppress(OSError):
         expected = _MAGIC + bytes.fromhex(name[1])
-        found = read_regular(path, MAX_ENTRY_BYTES, head=len(expected))
+        head = read_regular(path, MAX_ENTRY_BYTES, head=len(expected))
         # A process may be killed before it has written the head.
-        if found == expected or (path.suffix == ".new" and expected.startswith(found)):
+        if head == expected or (path.suffix == ".new" and expected.startswith(head)):
             path.unlink()
 
 

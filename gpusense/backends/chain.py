@@ -85,12 +85,12 @@ class Chain:
 
     def _present(self, entry: Entry) -> list[Device]:
         """Return the devices of a backend that may be chosen; note why an installed backend has none."""
-        found, absent = listing.present(entry)
-        found = [device for device in found if device.kind != "simulator"]
-        if not found and importlib.util.find_spec(entry.package) is not None:
+        devices, absent = listing.present(entry)
+        devices = [device for device in devices if device.kind != "simulator"]
+        if not devices and importlib.util.find_spec(entry.package) is not None:
             for part in absent:
                 self.failures.append(Failure("", part.reason, f"{part.name}: {part.reason}", True))
-        return found
+        return devices
 
 
 def best_of(candidates: list[Device], failures: list[Failure] | None = None) -> Device | None:

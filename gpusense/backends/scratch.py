@@ -192,8 +192,8 @@ def _remove_killed(folder: Path) -> None:
         # The process was killed before it made the lock file. This removes only an empty folder.
         folder.rmdir()
         return
-    found = read_regular(folder / _LOCK_FILE, len(expected))
-    if found != expected and not (names == [_LOCK_FILE] and expected.startswith(found)):
+    content = read_regular(folder / _LOCK_FILE, len(expected))
+    if content != expected and not (names == [_LOCK_FILE] and expected.startswith(content)):
         return
     flags = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     with os.fdopen(os.open(folder / _LOCK_FILE, flags), "r+b") as lock:

@@ -74,8 +74,8 @@ def get_backend(selection: Selection = "auto") -> Backend:
         True
     """
     if isinstance(selection, str):
-        key, found = _looks
-        if key == _circumstances() and (backend := found.get(selection)) is not None:
+        key, backends = _looks
+        if key == _circumstances() and (backend := backends.get(selection)) is not None:
             return backend
         return _look(selection)
     return selection if isinstance(selection, Backend) else _opened_queue(selection)

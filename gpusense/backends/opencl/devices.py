@@ -20,10 +20,10 @@ def list_devices() -> list[tuple[BackendInfo, cl.Device]]:
             platforms = drivers.platforms()
         except RuntimeError:
             return []
-        found = []
+        devices = []
         for p, platform in enumerate(platforms):
-            found += [(_describe(f"opencl:{p}:{d}", one), one) for d, one in enumerate(_devices_of(platform))]
-        _listed[:] = found
+            devices += [(_describe(f"opencl:{p}:{d}", one), one) for d, one in enumerate(_devices_of(platform))]
+        _listed[:] = devices
     return list(_listed)
 
 

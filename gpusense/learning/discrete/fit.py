@@ -142,8 +142,8 @@ def _fit(data: Counts, value: float, theta: Floats, trace: list[float], labels: 
     errors = independent = _standard_errors(data, theta, ~(at_low | at_high))
     blocks = 0 if labels is None else int(labels[0].max()) + 1
     if labels is not None:
-        found = _block_errors(data, theta, ~(at_low | at_high), labels)
-        errors = {name: found[name] if math.isfinite(independent[name]) else math.nan for name in NAMES}
+        over_blocks = _block_errors(data, theta, ~(at_low | at_high), labels)
+        errors = {name: over_blocks[name] if math.isfinite(independent[name]) else math.nan for name in NAMES}
     status = "the gradient vanishes" if converged else "the search ended before the gradient vanished"
     ends = [name for name, end in zip(NAMES, at_low | at_high, strict=True) if end]
     unknown = [name for name, error in errors.items() if math.isnan(error) and name not in ends]

@@ -102,20 +102,20 @@ class _Beacons(Problem):
         return log_p, gradient
 
     def _bias(self, theta: Floats) -> Floats:
-        own = theta[self._first :]
+        biases = theta[self._first :]
         if self.biases > 1:
-            return own[self.ids]
-        return np.full(len(self.ranges), own[0] if self.biases else 0.0)
+            return biases[self.ids]
+        return np.full(len(self.ranges), biases[0] if self.biases else 0.0)
 
     def values(self, theta: Floats) -> dict[str, float]:
         values = {"sigma_range": math.exp(theta[0])}
         if self.kind == "mixture":
             values |= {"sigma_heavy": math.exp(theta[2]), "heavy_weight": float(theta[3])}
         values |= {"z_hit": 1 - float(theta[1]), "z_rand": float(theta[1])}
-        own = theta[self._first :]
+        biases = theta[self._first :]
         if self.biases == 1:
-            return values | {"bias": float(own[0])}
-        return values | {f"bias[{i}]": float(bias) for i, bias in enumerate(own)}
+            return values | {"bias": float(biases[0])}
+        return values | {f"bias[{i}]": float(bias) for i, bias in enumerate(biases)}
 
 
 def fit_beacon_parameters(
@@ -214,8 +214,8 @@ def _readings(poses: ArrayLike, ranges: ArrayLike, beacons: int, ids: object) ->
 
 def _parameters(problem: _Beacons, theta: Floats, nu: int, mount: tuple[float, float]) -> BeaconParameters:
     values = {name: value for name, value in problem.values(theta).items() if not name.startswith("bias")}
-    own = tuple(theta[problem._first :].tolist())
-    bias = 0.0 if not own else own[0] if len(own) == 1 else own
+    biases = tuple(theta[problem._first :].tolist())
+    bias = 0.0 if not biases else biases[0] if len(biases) == 1 else biases
     return BeaconParameters(**values, bias=bias, kind=problem.kind, nu=nu, range_max=problem.range_max, mount=mount)  # type: ignore[arg-type]
 
 

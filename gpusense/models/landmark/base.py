@@ -114,8 +114,8 @@ class FeatureModel(PointModel):
 
     def _arguments(self) -> dict[str, Any]:
         names = (self._name, "association", "mount")
-        own = {name: getattr(self, name) for name in names} | {"specialize": self._specialize}
-        return super()._arguments() | own
+        options = {name: getattr(self, name) for name in names} | {"specialize": self._specialize}
+        return super()._arguments() | options
 
     def _options(self) -> tuple[str, ...]:
         return f"{self._name}={self._count}", f"association={self.association!r}"

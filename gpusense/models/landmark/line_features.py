@@ -90,8 +90,8 @@ def _whitened(features: np.ndarray, p: LineParameters) -> _Whitened:
     slope = both / one
     # The model's part first: the contribution of the lever cancels.
     across = p.sigma_distance**2 + (middle - slope) ** 2 * p.sigma_angle**2
-    own = features[:, DISTANCE_VARIANCE] - 2 * slope * features[:, MIXED] + slope**2 * features[:, ANGLE_VARIANCE]
-    rest = across + np.maximum(own, 0.0)
+    measured = features[:, DISTANCE_VARIANCE] - 2 * slope * features[:, MIXED] + slope**2 * features[:, ANGLE_VARIANCE]
+    rest = across + np.maximum(measured, 0.0)
     a, c = np.sqrt(0.5 / one), np.sqrt(0.5 / rest)
     return _Whitened(a, -slope * c, c, slope, np.sqrt(rest + slope**2 * one))
 

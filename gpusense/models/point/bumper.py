@@ -162,10 +162,10 @@ class BumperModel(PointModel):
         return cast(np.ndarray, self._score(poses, out, program, left_out, items=int(kept.sum())))
 
     def _arguments(self) -> dict[str, Any]:
-        own = dict(
+        options = dict(
             grid=self.grid, outline=self._outline, segments=self._segments, unknown=self.unknown, outside=self.outside
         )
-        return super()._arguments() | own
+        return super()._arguments() | options
 
     def sample(self, poses: AnyArray, seed: int = 0, *, step: int = 0) -> np.ndarray:
         """Draw the states of the bumper from P(pressed | x, m) at each pose, on the host; see ``BeamModel.sample``.

@@ -147,9 +147,9 @@ class BeamModel(ScanModel):
 
     def _arguments(self) -> dict[str, Any]:
         angles = self.incidence_parameters
-        own = dict(parameters=None if angles is not None else self._parameters, incidence=angles,
-                   caster=self._caster.method, sensor_table=self.sensor_table)  # fmt: skip
-        return super()._arguments() | own
+        options = dict(parameters=None if angles is not None else self._parameters, incidence=angles,
+                       caster=self._caster.method, sensor_table=self.sensor_table)  # fmt: skip
+        return super()._arguments() | options
 
     def _options(self) -> tuple[str, ...]:
         return (f"caster={self._caster.method}",)

@@ -233,9 +233,9 @@ class ScanModel(Pickled):
                 return cast(np.ndarray, log_likelihood_of(poses, ranges, calls))
         if self._short is not None:
             with self._lock:
-                found = self._short.score(poses, ranges, out, per_beam=per_beam)
-            if found is not None:
-                return found
+                result = self._short.score(poses, ranges, out, per_beam=per_beam)
+            if result is not None:
+                return result
         request = make_request(self._setting, poses, ranges, out, per_beam=per_beam)
         with self._lock, self._workspace:
             run(self._pipeline, request, self._workspace, self._last_call)

@@ -35,6 +35,8 @@ _MOST_HALF = math.nextafter(0.5, 0)
 class HitShape(ABC):
     """The density of a correct range, of scale 1 around 0.
 
+    A subclass has at most one fitted parameter, since fits on a device move a single coordinate.
+
     Attributes:
         flags: Flags of the kernels that evaluate it.
         tabulated: Whether kernels look up the mass in a table, which the host makes of ``half_mass``.
@@ -48,6 +50,20 @@ class HitShape(ABC):
     fitted: ClassVar[tuple[str, ...]] = ()
     limits: ClassVar[tuple[tuple[float, float], ...]] = ()
     starts: ClassVar[tuple[tuple[float, ...], ...]] = ((1.0,),)
+
+    def __init_subclass__(cls) -> None:
+        """Check the numbers of fitted parameters, limits and coordinates of starts.
+
+        Raises:
+            TypeError: They differ, or are more than one.
+        """
+        super().__init_subclass__()
+        counts = {len(cls.fitted), len(cls.limits), *(len(start) - 1 for start in cls.starts)}
+        if len(counts) > 1 or max(counts) > 1:
+            raise TypeError(
+                f"{cls.__name__}: must have at most one fitted parameter, with limits and a coordinate of each start, "
+                f"got fitted={cls.fitted}, limits={cls.limits}, starts={cls.starts}"
+            )
 
     @classmethod
     @abstractmethod

@@ -28,7 +28,7 @@ NUMPY_SHARE = 8
 
 
 class LeftOutError(ValueError):
-    """Raised by a candidate that cannot be measured in a scene, such as for the time that its table would take."""
+    """Raised by a candidate that cannot be measured in a scene, for example because its table would take too long."""
 
 
 @dataclass(frozen=True)

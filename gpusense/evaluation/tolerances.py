@@ -142,7 +142,7 @@ _ALL = (
     Tolerance(
         "exact EM falls", 1e-9, "|log-likelihood|", "rounding of sums; a step that does not gain is rejected",
     ),
-    Tolerance("batching, order, repetition", 0, "values with other bits", "a single work-item scores each particle"),
+    Tolerance("batching, order, repetition", 0, "values with other bits", "one work-item scores a particle by itself"),
 )  # fmt: skip
 
 TOLERANCES: dict[str, Tolerance] = {tolerance.name: tolerance for tolerance in _ALL}

@@ -172,8 +172,8 @@ def fit_position_parameters(
     problem = _Fixes(errors, np.cos(heading), np.sin(heading), inside, correlated, area, start, fit_mount, spread)
     end = maximize(problem, most, least)
     c = problem.covariance(end.theta)
-    spread = dict(covariance=c) if correlated else dict(sigma=float(math.exp(-end.theta[1])))
+    noise = dict(covariance=c) if correlated else dict(sigma=float(math.exp(-end.theta[1])))
     rand = float(end.theta[0])
     at = (float(end.theta[-2]), float(end.theta[-1])) if fit_mount else start
-    parameters = PositionParameters(**spread, z_hit=1 - rand, z_rand=rand, region=base.region, mount=at)
+    parameters = PositionParameters(**noise, z_hit=1 - rand, z_rand=rand, region=base.region, mount=at)
     return report(problem, end, parameters, numbers, int((~used).sum()))

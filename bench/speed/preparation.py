@@ -29,7 +29,7 @@ from gpusense.evaluation.selftest import scipy_squares
 from gpusense.evaluation.worlds import building
 from gpusense.tables.cells import packed
 from gpusense.tables.distances import squared_distances
-from gpusense.tables.rectangles import empty_rectangles
+from gpusense.tables.rectangles import Planes, empty_rectangles
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -113,7 +113,10 @@ def time_map(backend: Backend, name: str, cells: np.ndarray, repeats: int) -> tu
         "distances": lambda: squared_distances(backend, obstacles),
         "distances to 40 cells": lambda: squared_distances(backend, obstacles, CAP),
     }
-    steps |= {f"rectangles, {n} sectors": functools.partial(empty_rectangles, backend, obstacles, n) for n in (1, 2, 4)}
+    steps |= {
+        f"rectangles, {n} sectors": functools.partial(empty_rectangles, backend, obstacles, Planes(n))
+        for n in (1, 2, 4)
+    }
     steps |= {f"{key}, whole": functools.partial(whole, kind, grid, backend) for key, kind in MODELS.items()}
     rows = []
     for step, run in steps.items():

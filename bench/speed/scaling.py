@@ -58,7 +58,7 @@ import numpy as np
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.tables.rectangles import sectors_of
+from gpusense.tables.rectangles import planes_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -163,8 +163,7 @@ class Device:
             return (
                 f"{spent:.0f} s are used up, of {self.until:.0f} s of the device's {self.arguments.total:.0f} s so far"
             )
-        sectors = sectors_of(self.backend, side, side)
-        table = (8 * sectors if kind != "field" else 4) * side**2
+        table = 2 * planes_of(self.backend, side, side).entries(side, side) if kind != "field" else 4 * side**2
         device = 1.5 * table + 8 * side**2 + min(100 * n + 4 * n * k, 1 << 30)
         host = 4 * side**2 + 60 * n + (4 * n * k if kind == "rays" else 0)
         if self.info.kind == "cpu":

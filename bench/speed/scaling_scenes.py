@@ -12,7 +12,7 @@ import gpusense as gs
 from gpusense.evaluation.worlds import building, cloud_around, free_pose
 from gpusense.interface.structs import Caster, Window
 from gpusense.reference import raycast
-from gpusense.tables.rectangles import empty_rectangles, sectors_of
+from gpusense.tables.rectangles import empty_rectangles, planes_of
 from gpusense.world.frames import place_poses, ray_vectors
 
 RANGE_MAX, RESOLUTION, LARGEST_BUILDING = 30.0, 0.05, 2000
@@ -83,15 +83,14 @@ def count_reads(scene: Scene, backend: Any) -> tuple[float, float]:
     )
     rng = np.random.default_rng(1)
     poses = Scene(grid, np.array([0.5 * cols * size, 0.5 * rows * size, 0.0]), grid, 0.0).cloud(COUNTED, rng)[CHECKED:]
-    sectors = sectors_of(backend, *scene.grid.shape)
-    planes = empty_rectangles(backend, grid.obstacles("free"), sectors)
-    table = Counted(backend.download(planes, np.empty(4 * sectors * (rows + 2) * (cols + 2), np.uint16)))
+    form = planes_of(backend, *scene.grid.shape)
+    planes = empty_rectangles(backend, grid.obstacles("free"), form)
+    table = Counted(backend.download(planes, np.empty(form.entries(rows, cols), np.uint16)))
     placed = place_poses(poses, grid, (0.0, 0.0, 0.0), np.dtype(np.float32))
     rays = ray_vectors(rng.uniform(-np.pi, np.pi, len(poses)), (0.0, 0.0, 0.0)).astype(np.float32)
     limit = np.float32(RANGE_MAX / size)
-    flags = frozenset({f"SECTORS_{sectors}"} if sectors > 1 else ())
     found = raycast.cast_ray(
-        flags, table, Window(0, 0, rows, cols), placed.cell, placed.pose, rays, limit, Caster(0, 0.0, 0.0)
+        form.flags, table, Window(0, 0, rows, cols), placed.cell, placed.pose, rays, limit, Caster(0, 0.0, 0.0)
     )  # type: ignore[arg-type]
     # The read that finds an obstacle is no step.
     return table.reads / len(poses), (table.reads - np.count_nonzero(found < limit)) / len(poses)

@@ -1,4 +1,4 @@
-"""Compare the backends of this machine: each with the float64 truth on its rounded inputs, and in pairs."""
+"""Compare each backend of this machine with the float64 truth on its rounded inputs, and the backends in pairs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.tables.distances import distance_transform
-from gpusense.tables.rectangles import empty_rectangles
+from gpusense.tables.rectangles import Planes, empty_rectangles
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters, IncidenceParameters, LikelihoodFieldParameters
 from gpusense.world.scanner import Scanner
@@ -40,7 +40,7 @@ _MODELS: dict[str, tuple[Callable[..., BeamModel | LikelihoodFieldModel], dict[s
         },
     ),
 }
-# Width of a sonar's cone [rad], and the angle of incidence beyond which a wall reflects sound away [rad].
+# Width of a sonar's cone, and the angle of incidence beyond which a wall reflects sound away [rad].
 _CONE, _CRITICAL = 0.2, 1.1
 
 
@@ -87,7 +87,7 @@ def built_in_scene(seed: int = 0) -> Scene:
 
 
 Results = dict[str, tuple[np.ndarray, Tolerance]]
-# Copies of the scene's poses in one call on a GPU: enough for the models to order them.
+# Copies of the scene's poses in one call on a GPU, enough for the models to order them.
 _REPEATS = 192
 
 
@@ -172,7 +172,9 @@ def _tables(backend: Backend, scene: Scene) -> tuple[Results, list[Check]]:
     name, obstacles = backend.info.selection, scene.grid.obstacles()
     rows, cols = obstacles.shape
     squared, exact = distance_transform(obstacles, squared=True, backend=backend), TOLERANCES["distance transform"]
-    planes = backend.download(empty_rectangles(backend, obstacles, 1), np.empty(4 * (rows + 2) * (cols + 2), np.uint16))
+    planes = backend.download(
+        empty_rectangles(backend, obstacles, Planes(1)), np.empty(4 * (rows + 2) * (cols + 2), np.uint16)
+    )
     sides = np.minimum(planes & 255, planes >> 8)
     results: Results = {exact.name: (squared, exact), "empty squares": (sides, TOLERANCES["empty squares"])}
     return results, [Check.of(name, "SciPy", "distance transform", squared, scipy_squares(obstacles), exact)]
@@ -187,7 +189,7 @@ def _ranges(backend: Backend, scene: Scene, precision: Precision, *, sonar: bool
         ring = _model(_SONAR, scene, backend, precision)
         assert isinstance(ring, BeamModel)
         results[f"{precision} ranges of cones"] = ring.expected_ranges(scene.poses), ranges
-        # A cone without return has no angle: -1 stands for it, which is no angle of incidence.
+        # A cone without return has no angle of incidence; -1 marks it.
         results[angles.name] = np.nan_to_num(ring.incidence(scene.poses), nan=-1.0), angles
     return results
 

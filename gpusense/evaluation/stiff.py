@@ -27,7 +27,7 @@ from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.caster import RayCaster
 from gpusense.models.scan.densities import log_mixture, naive_log_mixture
 from gpusense.models.scan.field import LikelihoodFieldModel
-from gpusense.tables.rectangles import empty_rectangles
+from gpusense.tables.rectangles import Planes, empty_rectangles
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
 from gpusense.world.scanner import Scanner
@@ -103,14 +103,14 @@ def density_grid(backend: Selection, precision: str) -> Densities:
     """Evaluate the density grid in the kernel ``score_beams``.
 
     The map is one row of cells with a wall. Eight particles face it from distances that are exact in cells: inside the
-    wall, an ulp before it, and further up to beyond range_max. Deviations and rates are rounded to the precision first,
+    wall, an ulp before it, and farther, to beyond range_max. Deviations and rates are rounded to the precision first,
     so that device and truth have the same inputs.
     """
     device, real, obstacles = get_backend(backend), np.dtype(precision), np.arange(48)[None] >= 40
     ulp = float(np.spacing(real.type(RANGE_MAX / 2)))
     poses = np.full((8, 4), (0.5, 0.5, 1.0, 0.0), real)
     poses[1:7, 0] = 1 - ulp / 16, 0.9990234375, 0.5, 0.7109375, 0.328125, ulp
-    rectangles, count = empty_rectangles(device, obstacles, 1), len(poses)
+    rectangles, count = empty_rectangles(device, obstacles, Planes(1)), len(poses)
     cells = device.upload(np.array([(c, 0) for c in (40, 39, 39, 39, 37, 31, 24, 20)], np.int32))
     pose, ray, ranges = device.upload(poses), device.upload(np.array([[1, 0]], real)), device.empty(count, real)
     wide = frozenset({"FLOAT64"} if real == np.float64 else ())
@@ -161,7 +161,7 @@ def _grid_readings(p: BeamParameters, expected: Floats, ulp: float) -> Floats:
 
 
 def error_in_eps(computed: ArrayLike, truth: ArrayLike, precision: str) -> Floats:
-    """Return errors in eps (1 + |log p|) of a precision; infinite where only one is infinite, or one is NaN."""
+    """Return errors in eps (1 + |log p|) of a precision; infinite if only one side is infinite or a side is NaN."""
     a, b = np.asarray(computed, np.float64), np.asarray(truth, np.float64)
     with np.errstate(all="ignore"):
         error = np.abs(a - b) / (1 + np.abs(b)) / float(np.finfo(precision).eps)

@@ -1,1 +1,1 @@
-"""Localisation of a robot: the particle filter, its motion models, weights and temperature."""
+"""Localise a robot: particle filter, motion models, weights and temperature."""

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-# Bins of the cloud [m, rad]; bound of the error of its density, and the normal quantile of that bound's probability.
+# Bins of the cloud [m, rad], error bound of its density, and the normal quantile of the bound's probability.
 BIN, BIN_TURN = 0.5, math.radians(10)
 ERROR, QUANTILE = 0.02, 2.326
 

@@ -1,4 +1,4 @@
-"""The estimate of a filter: the pose, how sure it is by scans and by the particles, and the word for that."""
+"""The estimate of a filter: its pose, the probability of being lost by scans and particles, and the verdict."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gpusense.localization.tracker import Tracker
 from gpusense.localization.verdict import Verdict
 from gpusense.localization.words import word_of
 
-# Most particles whose spread is counted one by one; larger and narrow clouds are approximated by a normal density.
+# Most particles whose spread is counted one by one; larger narrow clouds are approximated by a normal density.
 _MOST_LOOKED_AT = 100_000
 
 
@@ -27,7 +27,7 @@ def estimate_of(
     Args:
         tracker: The particles.
         verdict: Verdict on their pose.
-        recovery: Their rivals.
+        recovery: Recovery with the rivals of the particles.
         readings: Last readings by the index of their sensor.
         method: "mean", "cluster" or "best".
     """
@@ -43,7 +43,7 @@ def estimate_of(
     word = word_of(p_lost, verdict.wrong, wide=is_wide(covariance), apart=is_apart(covariance))
     size = summary.effective_sample_size
     if not size > 0:
-        # The kernels have summed no squares: before a correction, or where no weighted particle was possible.
+        # The kernels have no sum of squares before a correction, or where no weighted particle was possible.
         weights = cloud.host_weights(shown)
         size = float(weights.sum() ** 2 / (weights @ weights))
     temperature = tracker.sensors[0].temperature(tracker.options.temperature)
@@ -54,7 +54,7 @@ def estimate_of(
 
 
 def _p_lost(tracker: Tracker, verdict: Verdict, recovery: Recovery, pose: np.ndarray, covariance: np.ndarray) -> float:
-    """Return the probability that a pose is far off, by the scans and by the particles."""
+    """Return the probability that a pose is far off, according to scans and particles."""
     if is_narrow(covariance) or tracker.shown > _MOST_LOOKED_AT:
         share = share_off(covariance)
     else:

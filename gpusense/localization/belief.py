@@ -1,19 +1,19 @@
-"""Belief that a localiser follows a wrong pose: a hidden Markov model of two states, right and wrong.
+"""Belief that a localiser follows a wrong pose: a hidden Markov model with the states right and wrong.
 
 The two states are "right" (the robot is where the localiser's distribution says) and "wrong" (it is elsewhere). The
-prior probability of "wrong" is ``START``. From one scan to the next a right pose goes wrong, by a silent divergence or
-because the robot is carried away, with probability ``1 - exp(-(PER_SCAN n + PER_METRE d))`` after n scans and d metres,
-and a wrong one becomes right with probability ``FOUND`` a scan. While the distribution is so wide that it has several
-places, both happen with probability ``WIDE`` a scan.
+prior probability of "wrong" is ``START``. From one scan to the next a right pose becomes wrong, by a silent divergence
+or because the robot is carried away, with probability ``1 - exp(-(PER_SCAN n + PER_METRE d))`` after n scans and d
+metres, and a wrong pose becomes right with probability ``FOUND`` per scan. While the distribution is wide enough to
+cover several places, both happen with probability ``WIDE`` per scan.
 
 A scan gives a log-likelihood ratio r of "wrong" against "right". Consecutive ratios are dependent: the same furniture
 is wrong in all scans of a room. They are modelled as an autoregressive process of first order whose correlation
-``rho = STAYS exp(-d / LENGTH - turn / TURN)`` falls with the way between two scans. For normal ratios of one variance
-the exact increment of the log odds is then
+``rho = STAYS exp(-d / LENGTH - turn / TURN)`` falls with the motion between two scans. For normal ratios of one
+variance the exact increment of the log odds is then
 
     (r_t - rho r_{t-1}) / (1 + rho),
 
-so a robot that stands gains next to nothing from its hundredth scan, and a change is seen at once (Hamilton, "A new
+so a standing robot gains almost nothing from its hundredth scan, and a change is detected at once (Hamilton, "A new
 approach to the economic analysis of nonstationary time series", *Econometrica* 57 (1989), treats such regimes).
 
 Some wrong places look like the right one: scans agree there as well, and none of them is evidence. ``ALIKE`` is the
@@ -25,8 +25,8 @@ prior share of such places among wrong ones. A place ceases to look alike at the
 and a short log leaves the probability of "wrong" at or above a share ``ALIKE`` of its prior odds, however well scans
 agree.
 
-A search, as after a start anywhere, chooses a place because the scans agree with it. This agreement is therefore no new
-evidence: it counts as repeated from the scan before. A contradiction counts in full.
+A search, as after a start anywhere, chooses a place because the scans agree with it. So this agreement is no new
+evidence: it counts as repeated from the previous scan. A contradiction counts in full.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ PER_SCAN, PER_METRE, FOUND, WIDE = 1e-3, 2e-3, 0.003, 0.05
 STAYS, LENGTH, TURN = 0.95, 2.0, 1.0
 # Prior share of wrong places that look like the right one; distance and turn over which it falls to 1 / e [m, rad].
 ALIKE, ALIKE_LENGTH, ALIKE_TURN = 0.12, 8.0, 2.0
-# Searches on a right map of which one finds a wrong place; wrong places that count.
+# One in this many searches on a right map finds a wrong place; most wrong places that count.
 MISSES, MOST_PLACES = 8, 2
-# Longest way from one scan to the next that counts [m]; a longer one is a jump of the localiser.
+# Longest motion from one scan to the next that counts [m]; a longer one is a jump of the localiser.
 _FASTEST = 1.0
 
 
@@ -54,9 +54,9 @@ class Belief(NamedTuple):
     Attributes:
         log_odds: Logarithm of the odds of "wrong".
         ratio: Log-likelihood ratio of the last judged scan.
-        pose: Pose at which it was judged; None before.
-        scans: Scans since then.
-        chosen: Whether the next pose will be one that scans have chosen among many.
+        pose: Pose at which that scan was judged; None before.
+        scans: Scans since that one.
+        chosen: Whether the next pose is one that scans choose among many.
         alike: Share of "wrong" that looks like the right place.
     """
 
@@ -74,20 +74,19 @@ class Belief(NamedTuple):
 
     @classmethod
     def anywhere(cls, after: int = 0) -> Belief:
-        """Return the belief at a place that was searched for on a map.
+        """Return the belief at a place that a search on a map has found.
 
         Args:
-            after: Places that were searched for before and were wrong. On a right map a search misses one in
-                ``MISSES``.
+            after: Wrong places of earlier searches. On a right map one in ``MISSES`` searches fails.
         """
         return cls(math.log(MISSES) * min(after, MOST_PLACES), chosen=True)
 
     def counted(self) -> Belief:
-        """Return the belief with one scan more."""
+        """Return the belief with one more scan counted."""
         return self._replace(scans=self.scans + 1)
 
     def widened(self) -> Belief:
-        """Return the belief after scans that found no common pose: the next pose may be any."""
+        """Return the belief after scans without a common pose: the next pose may be anywhere."""
         return Belief(self._moved(WIDE, WIDE, min(self.scans, 100))[0], chosen=True)
 
     def judged(self, pose: tuple[float, float, float], ratio: float) -> Belief:
@@ -95,7 +94,7 @@ class Belief(NamedTuple):
 
         Args:
             pose: Pose at which the scan was judged [m, m, rad].
-            ratio: Log-likelihood ratio of "wrong" against "right"; NaN where the scan tells nothing.
+            ratio: Log-likelihood ratio of "wrong" against "right"; NaN for a scan without evidence.
         """
         way, turn, rho, before = 0.0, 0.0, 0.0, self.ratio
         if self.chosen and ratio < 0:

@@ -1,7 +1,7 @@
 """The particle cloud of a filter on one device: its steps, and the numbers that it copies to the host.
 
-A correction has stages until no temperature is left. On a GPU motion, scores and weights of a stage are one recorded
-program.
+A correction runs stages until the temperature is used up. On a GPU motion, scores and weights of a stage are one
+recorded program.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Cloud(Particles):
         backend: The device.
         capacity: Most particles.
         sensors: Most sensors of a correction.
-        precision: Of their log-likelihoods.
+        precision: Precision of the log-likelihoods.
         residual: Whether to draw by residual resampling.
     """
 
@@ -53,7 +53,7 @@ class Cloud(Particles):
         self.set_particles(places, count, weight_block(self.backend, count))
 
     def _fill(self, *arrays: tuple[Buffer, np.ndarray]) -> None:
-        """Copy arrays to buffers that work of earlier steps may use."""
+        """Copy arrays to buffers that earlier steps may still use."""
         self.backend.synchronize()
         for buffer, array in arrays:
             self.backend.upload(np.ascontiguousarray(array, np.float64), buffer)
@@ -65,14 +65,14 @@ class Cloud(Particles):
         self.pool, self.pool_size = self.backend.upload(np.ascontiguousarray(poses, np.float64)), len(poses)
 
     def upload_settings(self, settings: np.ndarray) -> None:
-        """Copy the numbers of a step to the device."""
+        """Copy the settings of a step to the device."""
         self._uploads.append(settings)
         self.backend.upload(settings, self.settings, wait=False)
         if len(self._uploads) > 64:
             self.wait()
 
     def wait(self) -> None:
-        """Wait for all work."""
+        """Wait until the device is idle."""
         self.backend.synchronize()
         self._uploads.clear()
 
@@ -91,19 +91,19 @@ class Cloud(Particles):
     def run_stages(
         self, settings: np.ndarray, stages: list[Stage], drawn: int, sensors: int, score: Callable[[Stage], None]
     ) -> None:
-        """Run a correction: stages until nothing is left of the temperature.
+        """Run a correction: stages until the temperature is used up.
 
         Args:
-            settings: Numbers of the step.
+            settings: Settings of the step.
             stages: The stages.
             drawn: Particles of the next step.
-            sensors: Sensors that are used, the first ones of ``log_p``.
-            score: Runs the launches of a stage: the motion of the first one, the log-likelihoods, and the weighing.
+            sensors: Number of sensors that are used, the first ones of ``log_p``.
+            score: Runs the launches of a stage: its motion if it is the first one, log-likelihoods, and weighing.
         """
         self.use(sensors)
         self.upload_settings(settings)
         if settings[SLOW_RATE] > 0:
-            # Averages of the likelihood last.
+            # Averages of the likelihood persist.
             self._copy_state(self.places.state, stages[0].state)
         for stage in stages:
             last, deep = stage.most == 1, settings
@@ -119,7 +119,7 @@ class Cloud(Particles):
         self.set_particles(stage.places, drawn, weight_block(self.backend, drawn))
 
     def _deepen(self, stage: Stage, settings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Weigh a stage on lower rungs while too few particles have weight; return the state and the settings."""
+        """Weigh a stage again on lower rungs while too few particles have weight; return state and settings."""
         numbers = self._read(self.states[stage.state], STATE)
         while is_starved(numbers, settings, stage.number, self.count):
             settings = deeper(settings)
@@ -152,7 +152,7 @@ class Cloud(Particles):
 
         Args:
             stage: The stage.
-            key: All on which the sensors' programs depend.
+            key: Everything on which the sensors' programs depend.
             scoring: Returns the program that scores the poses of a buffer, and the owners of its memory.
         """
         whole = (key, stage, self.count)
@@ -165,7 +165,7 @@ class Cloud(Particles):
         recorded.start()
 
     def explain(self) -> str:
-        """Return how the last recorded step is started."""
+        """Describe how the last recorded step is started."""
         recorded = self._recordings.items()
         return recorded[-1][1].recording.explain() if recorded else "launches one by one"
 
@@ -176,14 +176,14 @@ class Cloud(Particles):
         return summary_of(self._read(self.states[self.places.state], STATE))
 
     def shares(self, count: int) -> Any:
-        """Return the weights of the shown particles, whose sum is 1: on a GPU an array of the device's library."""
+        """Return the weights of the shown particles with sum 1: on a GPU an array of the device's library."""
         if self.backend.info.kind != "gpu":
             weights = self.host_weights(count)
             return weights / weights.sum()
         return self.backend.lend(self.device_shares(count), (count,), _DOUBLE)
 
     def device_shares(self, count: int) -> Buffer:
-        """Return a new buffer with the weights of the shown particles, whose sum is 1."""
+        """Return a new buffer with the weights of the shown particles, with sum 1."""
         out, weight = self.backend.blank(count, _DOUBLE), self.weights[self.places.weight]
         program = self.sums.estimate(self.poses[self.places.shown], weight, self.estimated, count)
         program += self.sums.launch("normalize_weights", count, weight=weight, estimate=self.estimated, share=out,
@@ -197,7 +197,7 @@ class Cloud(Particles):
             return self.estimate(count)[:MOMENTS]
         out, poses, weight = self.backend.blank(ESTIMATE, _DOUBLE), self.poses[self.places.shown], self.places.weight
         for second_pass in (0, 1):
-            # The second pass is right for any headings.
+            # The second pass is correct for any headings.
             self.backend.run(self.sums.estimate(poses, self.weights[weight], out, count, second_pass))
         return self._lent(out, (MOMENTS,))
 
@@ -213,9 +213,9 @@ class Cloud(Particles):
         return self._estimate(count, 1) if numbers[WIDE_HEADINGS] else numbers
 
     def _estimate(self, count: int, second_pass: int) -> np.ndarray:
-        """Return the numbers after a pass of the estimate."""
+        """Run a pass of the estimate, and return its buffer."""
         shown, weight = self.places.shown, self.places.weight
-        # Clouds that change their size seldom ask twice for the same.
+        # Clouds that change their size rarely ask twice for the same size.
         self._estimates.run(
             (shown, weight, count, second_pass),
             lambda: self.sums.estimate(self.poses[shown], self.weights[weight], self.estimated, count, second_pass),
@@ -231,7 +231,7 @@ class Cloud(Particles):
         return self._read(self.weights[self.places.weight], count)
 
     def contents(self, count: int) -> Contents:
-        """Return a copy of all particles, ``count`` of which are shown."""
+        """Return a copy of all particles, of which ``count`` are shown."""
         places, weighed = self.places, self.places.shown != self.places.next
         return Contents(
             self.host_poses(places.shown, count), self.host_weights(count),

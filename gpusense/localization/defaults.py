@@ -1,4 +1,4 @@
-"""Defaults of localisation that the filter, the motion model and the commands share; the docs have them as a table."""
+"""Defaults of localisation, shared by the filter, the motion model and the commands; the docs have a table of them."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ class Defaults(NamedTuple):
     """Options of a particle filter; ``docs/localization.md`` has the measurements behind them.
 
     Attributes:
-        particles: Their number.
-        particles_everywhere: Their number where the filter begins anywhere on a map.
+        particles: Number of particles.
+        particles_everywhere: Number of particles where the filter starts anywhere on a map.
         beams: Beams of a scan that commands use; None for all.
         threshold: Resample below this share of the particles.
         stages: Most stages of a correction.
-        share: Least effective sample size of a stage, as a share of the particles, where they lie together.
-        enough: Effective sample size that is enough for a stage of any number of particles that lie together.
-        share_apart: Least share where they lie apart, and among landmarks, so that no peak wins by chance.
+        share: Least effective sample size of a stage, as a share of the particles, if they lie together.
+        enough: Effective sample size that suffices for a stage, for any number of particles that lie together.
+        share_apart: Least share if they lie apart, and among landmarks, so that no peak wins by chance.
         jitter: Factor of the difference of two particles by which a drawn particle is jittered between stages.
         farthest: Largest such difference [m].
         farthest_turn: Largest such difference of headings [rad].
         wide_scans: Corrections after a start anywhere on the map that use a lower temperature.
-        wide_share: Factor of the temperature there: particles that lie apart must not be judged as precisely.
+        wide_share: Factor of that temperature, since particles that lie apart must be judged less precisely.
         slow: Rate of the slow average of the likelihood.
         fast: Rate of the fast average.
         most_injected: Largest share of injected particles.
-        recovery: Of the filter.
-        temperature: Of the filter.
-        calibrations: Corrections from which the temperature is learned at first; later two of ten.
+        recovery: Recovery of the filter.
+        temperature: Temperature of the filter.
+        calibrations: Corrections at the beginning that all teach the temperature; later two of ten do.
         field: Parameters of the likelihood field of ``gpusense localize``.
         alpha: Noise of the odometry.
         reverse: Probability that a translation went the other direction.

@@ -18,17 +18,17 @@ from gpusense.localization.verdict import sightings
 Floats = NDArray[np.float64]
 Cause = Literal["none", "people", "start", "mount", "map", "unknown"]
 
-# Poses tried elsewhere on the map; how many of the best are refined; refinements of each, and their largest
+# Poses tried elsewhere on the map, number of the best ones that are refined, refinements of each, and their largest
 # displacement.
 _TRIED, _REFINED, _AROUND, _REACH = 8192, 12, 64, (0.4, 0.4, 0.2)
 # A pose explains a scan if at least these shares agree: of the beams that meet walls, and of all informative beams.
 _FITS, _FITS_OF_ALL = 0.85, 0.6
-# Another mount is a cause from this angle on [rad]; steps in which it is tried.
+# Least angle from which a wrong mount is a cause [rad]; steps in which mounts are tried.
 _LEAST_TURN, _TURNS = math.radians(20), 72
-# Radius within which beams pass through one place [m]; least distance of another place [m]; share of beams that a crowd
-# makes short.
+# Radius of one place through which beams pass [m]; least distance of a second place [m]; share of beams that a crowd
+# shortens.
 _ONE_PLACE, _ELSEWHERE, _CROWD = 1.5, 1.0, 0.3
-# Most points among which the place is looked for.
+# Most points among which the place is searched.
 _MOST_POINTS = 1000
 _STILL = np.zeros((3, 3))
 
@@ -41,13 +41,13 @@ class Diagnosis:
         agree: Number of beams that end at a mapped wall, as they should.
         through: Number of beams that pass through a mapped wall.
         short: Number of beams that end in mapped free space.
-        place: (x, y) around which most beams pass through walls [m]; None without one.
-        inside: Whether the pose is inside of solid cells.
+        place: (x, y) of the wall near which most beams pass through [m]; None without one.
+        inside: Whether the pose is inside solid cells.
         off: Whether the pose is in unknown cells or off the map.
         elsewhere: (x, y, theta) of a pose that explains the scan better; None without one, or without a search.
-        turned: Angle by which the scanner seems to be turned against its mount [rad]; pi with ``mirrored`` for one that
-            is upside down; None where the mount fits or no other one does.
-        mirrored: Whether the readings seem to run the other direction.
+        turned: Angle by which the scanner seems to be turned relative to its mount [rad]; pi with ``mirrored`` for a
+            scanner that is upside down; None if the mount fits or no other mount does.
+        mirrored: Whether the readings seem to be in the opposite order.
         cause: Likely cause: "none" (nothing contradicts the pose), "people" (some beams are short, none long), "start"
             (the robot is elsewhere on this map), "mount" (the scanner has another mount), "map" (no place of the map
             explains the scan) or "unknown".
@@ -71,7 +71,7 @@ class Diagnosis:
 
     @property
     def counted(self) -> int:
-        """Number of beams that tell anything."""
+        """Number of beams that give evidence."""
         return self.agree + self.through + self.short
 
     @property
@@ -79,7 +79,7 @@ class Diagnosis:
         """The evidence and the likely cause in one line."""
         parts = [self._beams()]
         if self.inside:
-            parts.append("the pose is inside of solid cells")
+            parts.append("the pose is inside solid cells")
         if self.off:
             parts.append("the pose is in unknown cells or off the map")
         cause = self._cause()
@@ -87,7 +87,7 @@ class Diagnosis:
 
     def _beams(self) -> str:
         if not self.counted:
-            return "no beam meets mapped cells that tell anything"
+            return "no beam meets mapped cells that give evidence"
         met = self.agree + self.through
         if self.through and 10 * self.through >= met:
             at = "" if self.place is None else ", most near x = {:.1f}, y = {:.1f}".format(*self.place)
@@ -118,7 +118,7 @@ def diagnose(
         sensors: Sensors of a filter.
         readings: Readings by the index of their sensor.
         pose: (3,) pose.
-        random_poses: Returns poses anywhere on the map; None to look nowhere else.
+        random_poses: Returns poses anywhere on the map; None to skip the search elsewhere.
     """
     scans = sightings(sensors, readings, pose, _STILL)
     found = evidence_of(scans)
@@ -149,7 +149,7 @@ def evidence_of(scans: Sequence[Passages]) -> Diagnosis:
 
 
 def _fits(scans: Sequence[Passages]) -> bool:
-    """Tell whether a pose explains scans: most beams that meet walls agree, and most of all."""
+    """Tell whether a pose explains scans: most beams that meet walls agree, and most informative beams."""
     agree, through, short = (sum(one.count(kind) for one in scans) for kind in (AGREES, THROUGH, SHORT))
     inside = any(one.inside or one.off for one in scans)
     return not inside and agree > _FITS * (agree + through) and agree > _FITS_OF_ALL * (agree + through + short)
@@ -171,7 +171,7 @@ def _place(scans: Sequence[Passages]) -> tuple[float, float] | None:
 def _mount(
     sensors: Sequence[Sensor], readings: Mapping[int, tuple[Any, ...]], pose: Floats
 ) -> tuple[float | None, bool]:
-    """Return the angle by which scans must be turned to fit at a pose, None for no angle, and whether mirrored."""
+    """Return the angle by which scans must be turned to fit at a pose (None for no angle), and whether mirrored."""
     best: tuple[float, float | None, bool] = (0.0, None, False)
     for mirrored in (False, True):
         given = _mirrored(sensors, readings) if mirrored else readings
@@ -187,14 +187,14 @@ def _mount(
 
 
 def _mirrored(sensors: Sequence[Sensor], readings: Mapping[int, tuple[Any, ...]]) -> dict[int, tuple[Any, ...]]:
-    """Return the scans among readings, with their ranges in the opposite order."""
+    """Return the scans among readings with their ranges in the opposite order."""
     return {index: (reading[0][::-1], *reading[1:]) for index, reading in readings.items() if sensors[index].calibrates}
 
 
 def _best_elsewhere(
     sensors: Sequence[Sensor], readings: Mapping[int, tuple[Any, ...]], random_poses: Callable[[int], Floats]
 ) -> Floats | None:
-    """Return the likeliest of random poses after a refinement; None without a sensor that has a map."""
+    """Return the likeliest of random poses after refinement; None if no sensor has a map."""
     scanning = {index: reading for index, reading in readings.items() if sensors[index].calibrates}
     if not scanning:
         return None

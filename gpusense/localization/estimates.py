@@ -1,4 +1,4 @@
-"""Poses of the robot from weighted particles."""
+"""Estimate the robot's pose from weighted particles."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ _BIN, _BIN_TURN = 0.5, 0.35
 
 @dataclass(frozen=True)
 class Estimate:
-    """Pose of the robot as the particles know it.
+    """Pose of the robot according to the particles.
 
     Attributes:
         pose: (3,) x, y, theta [m, m, rad].
         covariance: (3, 3) covariance of the particles about it.
         effective_sample_size: ``1 / sum w^2`` of the last correction, 1 to N.
         p_lost: Probability that the pose is off by more than 1 m or 0.5 rad; see ``docs/localization.md``.
-        verdict: "tracking"; "uncertain", where the particles are spread wide or over several places, or p_lost is above
+        verdict: "tracking"; "uncertain", if the particles are spread widely or over several places, or p_lost is above
             0.1; or "lost", where scans or features contradict the pose and p_lost is above 0.5.
         explained: Among the beams of the last scan that the map could explain, the share that agrees with it at the
             pose; NaN without one.
-        temperature: Of the first sensor.
-        used: Share of the temperature that the stages of the last correction used: less than 1 where even the last
-            stage would have left too few particles.
-        degenerate: Whether no particle was possible at the last correction, which has changed nothing then.
-        particles: Their number.
+        temperature: Temperature of the first sensor.
+        used: Share of the temperature that the stages of the last correction used: below 1 if even the last stage would
+            have left too few particles.
+        degenerate: Whether no particle was possible at the last correction, which then changed nothing.
+        particles: Number of particles.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -65,12 +65,12 @@ class Estimate:
 
     @property
     def lost(self) -> bool:
-        """Whether p_lost is above 0.5: the pose is of no use, whether scans contradict it or the spread is wide."""
+        """Whether p_lost is above 0.5: the pose is unusable, because scans contradict it or the spread is wide."""
         return self.p_lost > LOST
 
 
 def covariance_of(numbers: np.ndarray) -> np.ndarray:
-    """Return the covariance in the numbers of the kernel ``finish_estimate``; rounding makes no variance negative."""
+    """Return the covariance from the results of kernel ``finish_estimate``; negative variances by rounding are 0."""
     xx, xy, xt, yy, yt, tt = numbers[3:9]
     xx, yy, tt = (max(float(variance), 0.0) for variance in (xx, yy, tt))
     return np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])

@@ -1,10 +1,10 @@
-"""Whether a filter is lost among landmarks: how much better its particles predict features than poses anywhere.
+"""Evidence of being lost among landmarks: how much better particles predict features than poses anywhere do.
 
 Before each correction, the mean likelihood of the features over the particles is compared with the larger of two
 alternatives: the mean over poses anywhere among the landmarks, and the likelihood that all features are false
 positives. The difference, in nats for each feature, is the logarithm of a Bayes factor (Jeffreys 1961). A filter that
-follows the robot gains several nats; one on a wrong map, or at a wrong place, gains none, and noise that was fitted to
-a wrong map cannot hide it.
+follows the robot gains several nats. A filter on a wrong map or at a wrong place gains none, and noise fitted to a
+wrong map cannot hide that.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from gpusense.models.landmark.base import FeatureModel
 
 Floats = NDArray[np.float64]
 
-# Gain at which right and wrong are equally likely [nats for a feature]; scans over which the shown gain is averaged;
+# Gain at which right and wrong are equally likely [nats per feature]; scans over which the gain is averaged; number of
 # poses anywhere, and their margin around the landmarks [m].
 LEAST_GAIN, MEMORY, _ANYWHERE, _MARGIN = 1.0, 20, 1000, 1.0
 
@@ -41,9 +41,9 @@ class Evidence:
         )
 
     def gain(self, poses: Floats, weights: Floats, features: Floats) -> float:
-        """Return by how much particles predict a scan better than chance [nats], before they are corrected by it.
+        """Return the gain of particles over chance in predicting a scan [nats], before the scan corrects them.
 
-        Landmarks count as unknown: where two are exchanged in the map, a pose is right all the same.
+        Landmarks count as unidentified, since a pose is right even if two landmarks are exchanged in the map.
 
         Args:
             poses: (N, 3) predicted particles.
@@ -51,7 +51,7 @@ class Evidence:
             features: (F, ...) features of the scan, F > 0.
 
         Returns:
-            The gain of all features; NaN where neither particles nor chance can have given them.
+            The gain of all features; NaN if neither particles nor chance can explain them.
         """
         count = len(features)
         false = self._log_p(self._poses[:1], features, np.full(count, -1))[0]

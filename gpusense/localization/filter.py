@@ -1,4 +1,4 @@
-"""Particle filter: Monte Carlo localisation with the measurement and motion models of this package."""
+"""Particle filter: Monte Carlo localisation with the package's measurement and motion models."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from gpusense.world.grid import OccupancyGrid
 class ParticleFilter(Whole):
     """Monte Carlo localisation: particles that move with the odometry and are weighed by sensors.
 
-    All state is on the device of the models. Random numbers depend on seed, step and particle alone: the same seed
-    gives the same particles on every backend, but for roundings of log-likelihoods. A correction has up to ``stages``
-    stages. Each applies the largest share of the temperature that keeps the effective sample size above a threshold,
-    then resamples and jitters (annealing). So a few hundred particles track a precise scanner.
+    All state is on the device of the models. Random numbers depend on seed, step and particle alone: a seed gives the
+    same particles on every backend, up to rounding of log-likelihoods. A correction has up to ``stages`` stages. Each
+    applies the largest share of the temperature that keeps the effective sample size above a threshold, then resamples
+    and jitters (annealing). So a few hundred particles track a precise scanner.
 
     Args:
         models: A measurement model, or several models on one device: scans, landmarks, beacons, positions, headings,
             contacts. Each with temperature 1.
         motion: :class:`OdometryMotion`, :class:`OmniMotion` or :class:`VelocityMotion`.
-        particles: Their number, or (least, most): as many as KLD sampling asks for (Fox 2001).
+        particles: Number of particles, or (least, most) with the number chosen by KLD sampling (Fox 2001).
         seed: Seed of the random numbers, 0 to 2^64 - 1.
         temperature: Factor of the log-likelihoods of scans in (0, 1], or "auto": from the correlation of beams, which
             the filter measures while it runs (:func:`calibrate_temperature`). Other sensors have temperature 1.
@@ -48,17 +48,17 @@ class ParticleFilter(Whole):
             resetting, Lenser and Veloso 2000) and takes over once later scans prefer it; "augmented": inject uniform
             particles where the scans' likelihood drops (*Probabilistic Robotics* table 8.3); None: neither.
         beam_skip: None, or a share of the particles in (0, 1): a beam that a smaller share explains is left out, such
-            as one that hits a person. A scan that would lose most of its beams is used as a whole, as is every scan
-            while the particles are spread out. Each correction then first asks 100 particles on the host.
+            as a beam that hits a person. A scan that would lose most of its beams is used completely, as is every scan
+            while the particles are spread out. Each correction then first evaluates 100 particles on the host.
 
     Attributes:
         motion: The motion model.
         options: The options, checked.
 
     Raises:
-        TypeError: A model or option of another type.
-        ValueError: No model, models of several devices, a device without float64, an option beyond its limits, or
-            ``recovery="augmented"`` without a map.
+        TypeError: A model or option has the wrong type.
+        ValueError: There is no model, models have several devices, a device lacks float64, an option breaks its rule,
+            or ``recovery="augmented"`` has no map.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -147,10 +147,11 @@ class ParticleFilter(Whole):
     def initialize_uniform(self, *, bounds: AnyArray | None = None, particles: int | None = None) -> None:
         """Draw particles uniformly over the free cells of the map, with any heading.
 
-        Without bounds and with ``recovery="sensor"``, the pose to which they converge is compared with other places.
+        Without bounds and with ``recovery="sensor"``, the pose to which they converge is later compared with other
+        places.
 
         Args:
-            bounds: ((x_min, y_min), (x_max, y_max)) [m]: only there. Needed for models without a grid.
+            bounds: ((x_min, y_min), (x_max, y_max)) [m] to which they are limited; required for models without a grid.
             particles: Their number; the filter's (most) by default.
 
         Raises:
@@ -169,7 +170,7 @@ class ParticleFilter(Whole):
             particles: Their number; the filter's (most) by default.
 
         Raises:
-            TypeError, ValueError: it has not these, or no finite log-likelihood.
+            TypeError, ValueError: ``likelihood`` lacks these arrays, or has no finite log-likelihood.
 
         Example:
             >>> import gpusense as gs
@@ -186,7 +187,7 @@ class ParticleFilter(Whole):
 
     @settled
     def predict(self, *motion: Any) -> None:
-        """Move the particles: by the odometry before and after the step, or what the motion model takes.
+        """Move the particles by the odometry before and after the step, or by other arguments of the motion model.
 
         Args:
             *motion: For odometry two (3,) poses in the odometer's frame; for velocities (v, w) and a duration [s].
@@ -198,7 +199,7 @@ class ParticleFilter(Whole):
         self._parts.check_started()
         sampled = self.motion.sampled(*motion)
         if self._parts.tracker.pending is None and self._parts.recovery.active is None:
-            # One assignment.
+            # A single assignment, which no interrupt divides.
             self._parts.tracker.follow(sampled)
         else:
             self._follow(sampled)
@@ -222,13 +223,13 @@ class ParticleFilter(Whole):
         """Weigh the particles by readings, and resample where the effective sample size is low.
 
         Args:
-            readings: The reading of the filter's only model, or a mapping from models to their readings. Where
-                ``log_likelihood`` takes several arguments, a tuple has them: ``(features, correspondence)``,
-                ``(ranges, ids)``, ``(fix, covariance)``. None is a missing reading.
-                :meth:`estimate` and :meth:`reset` read arrays of a device again, which must not change until then.
+            readings: The reading of the filter's only model, or a mapping from models to their readings. If
+                ``log_likelihood`` takes several arguments, pass a tuple of them: ``(features, correspondence)``,
+                ``(ranges, ids)``, ``(fix, covariance)``. None is a missing reading. Arrays on a device must not change
+                until :meth:`estimate` and :meth:`reset`, which read them again.
 
-        Where it raises, an interrupt by the user included, the filter is as it was before, so a correction can be
-        repeated. So are all calls of a filter.
+        If it raises, even by an interrupt of the user, the filter is unchanged, so the correction can be repeated. This
+        holds for all calls of a filter.
 
         Raises:
             RuntimeError: the filter is not initialised.
@@ -242,7 +243,7 @@ class ParticleFilter(Whole):
     def reset(self) -> None:
         """Replace half of the particles by poses at which the last readings are likely (sensor resetting).
 
-        A motion that was predicted after these readings also moves the new particles.
+        A motion predicted after these readings also moves the new particles.
 
         Raises:
             RuntimeError: there are no readings since the particles were initialised.
@@ -282,10 +283,10 @@ class ParticleFilter(Whole):
 
     @settled
     def diagnose(self, *, search: bool = True) -> Diagnosis:
-        """Return the evidence of the last readings at the estimate, and the likely cause where they contradict it.
+        """Return the evidence of the last readings at the estimate, and the likely cause of a contradiction.
 
         Args:
-            search: Whether to look for a better pose elsewhere on the map, which takes some milliseconds.
+            search: Whether to search for a better pose elsewhere on the map, which takes a few milliseconds.
 
         Raises:
             RuntimeError: the filter is not initialised.
@@ -307,29 +308,29 @@ class ParticleFilter(Whole):
     @property
     @settled
     def temperatures(self) -> tuple[float, ...]:
-        """Temperature of each model now."""
+        """Present temperature of each model."""
         return tuple(sensor.temperature(self.options.temperature) for sensor in self._sensors)
 
     @property
     @settled
     def gain(self) -> float:
-        """Mean gain of recent features over features anywhere or false ones [nats]; below 1 the filter is lost.
+        """Mean gain of predicting recent features over chance [nats]; below 1 the filter is lost.
 
-        NaN without a landmark model, and before 20 scans with features.
+        It is NaN without a landmark model, and before 20 scans with features.
         """
         return self._parts.verdict.gain
 
     @property
     def scoring_seconds(self) -> float:
-        """Seconds that the models' log-likelihoods have taken, if ``time_scoring`` was called before.
+        """Seconds that the models' log-likelihoods have taken since ``time_scoring`` was called.
 
-        Without it they are the seconds in which they were started; 0 where a step is one recorded program. Those of a
-        filter over several devices are added up.
+        Without ``time_scoring`` only the time of starting them counts; it is 0 where a step is one recorded program.
+        The times of several devices are added up.
         """
         return self._cloud.scoring_seconds
 
     def time_scoring(self) -> None:
-        """Wait for the log-likelihoods of each stage from now on, so that ``scoring_seconds`` is their time."""
+        """Wait for the log-likelihoods of each stage from now on, so that ``scoring_seconds`` measures their time."""
         self._cloud.time_scoring()
 
     @property
@@ -357,7 +358,7 @@ class ParticleFilter(Whole):
     @property
     @settled
     def particles(self) -> Any:
-        """(N, 3) poses after the last step: on a GPU an array of the device, which other libraries use in place."""
+        """(N, 3) poses after the last step: on a GPU an array of the device, which further libraries use in place."""
         return self._cloud.particles(self._moved().shown)
 
     @property
@@ -373,7 +374,7 @@ class ParticleFilter(Whole):
         return self._cloud.moments(self._moved().shown)
 
     def explain(self) -> str:
-        """Return in one line how a step is started on the device."""
+        """Describe in one line how a step is started on the device."""
         return self._cloud.explain()
 
     # ---- state
@@ -388,11 +389,10 @@ class ParticleFilter(Whole):
         """Take over the state of a filter with the same options and models, and continue with the same bits.
 
         Args:
-            state: The result of :meth:`state`. It can be of a filter on another device, or of one that is split over
-                several.
+            state: The result of :meth:`state`, also of a filter on another device or split over several devices.
 
         Raises:
-            TypeError, ValueError: it is no state, or of a filter with other options or models.
+            TypeError, ValueError: ``state`` is no state, or belongs to a filter with other options or models.
         """
         given = check_state(state, *self._kind())
         self._parts.restore(given.contents, given.memory)

@@ -1,4 +1,4 @@
-"""The interface of a filter's particles, which are on one device or split over several."""
+"""The interface of a filter's particles on one device or split over several."""
 
 from __future__ import annotations
 
@@ -32,17 +32,18 @@ from gpusense.reference.tempering import left_of
 _DEEPEST = LOWEST**5
 # Effective sample size below which a stage is weighed again on a deeper ladder.
 _FEWEST = 10.0
-# Jitter of a stage on a deeper ladder: the peak lies beyond the particles, which must not shrink before they reach it.
+# Jitter of a stage on a deeper ladder: the peak lies beyond the particles, which must not contract before they reach
+# it.
 _WIDE_JITTER = 0.7
 # Index of a sensor, and its readings.
 SensorReadings = tuple[int, tuple[Any, ...]]
 
 
 class Step(NamedTuple):
-    """A correction.
+    """Arguments of a correction.
 
     Attributes:
-        settings: Its numbers, by the places in ``interface.constants``.
+        settings: Settings, by the places in ``interface.constants``.
         kind: Kind of the motion that begins it.
         stages: Most stages.
         drawn: Particles of the next step.
@@ -62,7 +63,7 @@ class Contents(NamedTuple):
     Attributes:
         poses: (N, 3) shown poses.
         weights: (N,) their weights, before they are normalised.
-        next_poses: (M, 3) poses of the next step; None where they are those shown, as they were not weighed.
+        next_poses: (M, 3) poses of the next step; None if these are the shown ones, which were not weighed.
         next_weights: (M,) weights with which the next step begins; None together with ``next_poses``.
         state: State of the last correction, as the kernels hold it.
         pool: Poses from which recovery injects particles; None without them.
@@ -81,13 +82,13 @@ class Contents(NamedTuple):
         return len(self.poses if self.next_poses is None else self.next_poses)
 
     def places_and_arrays(self, now: Places) -> tuple[Places, list[tuple[str, int, np.ndarray]]]:
-        """Return the buffers that take these particles without overwriting the kept ones, and the array for each.
+        """Return buffers for these particles that do not overwrite kept ones, and the array for each buffer.
 
         Args:
             now: The buffers at the beginning of the call, which are kept.
 
         Returns:
-            Names of buffers are "poses" and "weights".
+            Places, and arrays by the name ("poses" or "weights") and index of their buffer.
         """
         places = now.placed(now)
         if self.next_poses is None or self.next_weights is None:
@@ -103,10 +104,11 @@ class Summary(NamedTuple):
     """The state of a filter after a correction.
 
     Attributes:
-        effective_sample_size: Of the last stage, and at most the number of distinct particles after earlier ones.
+        effective_sample_size: Effective sample size of the last stage, at most the number of distinct particles after
+            earlier stages.
         temperature: Share of the temperature that all stages used.
-        degenerate: No particle was possible.
-        stages: Stages that ran.
+        degenerate: Whether no particle was possible.
+        stages: Number of stages that ran.
         numbers: The state as the kernels hold it.
         resampled: Whether particles were drawn at the end.
     """
@@ -127,7 +129,7 @@ def summary_of(numbers: np.ndarray) -> Summary:
         used += float(own[RUNG])
         if own[LEFT] == 0.0:
             break
-        # Each copy moves by the difference of two other parents, so m parents have at most m^3 distinct copies.
+        # Each copy is jittered by the difference of two other parents, so m parents have at most m^3 distinct copies.
         distinct = min(distinct, float(own[SAMPLE_SIZE]) ** 3)
         stage += 1
     size = min(float(own[SAMPLE_SIZE]), distinct)
@@ -135,7 +137,7 @@ def summary_of(numbers: np.ndarray) -> Summary:
 
 
 def is_starved(numbers: np.ndarray, settings: np.ndarray, stage: int, count: int) -> bool:
-    """Tell whether even the last rung of a stage leaves too few particles with weight, and a deeper one may not.
+    """Tell whether even the last rung of a stage leaves too few particles with weight, and a deeper rung may not.
 
     Args:
         numbers: The state after the stage.
@@ -151,7 +153,7 @@ def is_starved(numbers: np.ndarray, settings: np.ndarray, stage: int, count: int
 
 
 def deeper(settings: np.ndarray) -> np.ndarray:
-    """Return the numbers of a step whose ladder begins below the last rung of the present one."""
+    """Return the settings of a step whose ladder begins below the last rung of the present ladder."""
     result = settings.copy()
     result[DEPTH] *= LOWEST
     result[JITTER], result[FARTHEST_X], result[FARTHEST_THETA] = _WIDE_JITTER, math.inf, math.pi
@@ -159,7 +161,7 @@ def deeper(settings: np.ndarray) -> np.ndarray:
 
 
 def meaningful(numbers: np.ndarray, averages: bool) -> np.ndarray:
-    """Return a state without the numbers that nothing reads: of stages that did not run, and of unused averages.
+    """Clear the numbers of a state that nothing reads: of stages that did not run, and of unused averages.
 
     Args:
         numbers: The state as the kernels hold it.
@@ -175,15 +177,15 @@ def meaningful(numbers: np.ndarray, averages: bool) -> np.ndarray:
 class FilterCloud(ABC):
     """Particles of a filter.
 
-    Steps write no buffer that ``kept`` names. Their last assignments name the new buffers in ``places``, so a call of
-    a filter that was interrupted has changed nothing once the attributes in ``MEMORY`` have their old values again.
+    Steps write no buffer that ``kept`` names, and finally name the new buffers in ``places``. So an interrupted call of
+    a filter is undone by restoring the attributes in ``MEMORY``.
 
     Attributes:
         MEMORY: Names of the attributes that a step changes.
-        PARTS: Names of those that hold state themselves; none.
+        PARTS: Names of attributes that hold state themselves; none.
         count: Particles of the next step.
         places: Buffers of the particles.
-        kept: Those at the beginning of the call of the filter that is running.
+        kept: Buffers at the beginning of the filter's running call.
     """
 
     MEMORY: ClassVar[tuple[str, ...]]
@@ -204,7 +206,7 @@ class FilterCloud(ABC):
 
     @abstractmethod
     def move(self, settings: np.ndarray, kind: int) -> None:
-        """Move the particles now, by the numbers of a step and a kind of motion."""
+        """Move the particles now, by the settings of a step and a kind of motion."""
 
     @abstractmethod
     def correct(self, step: Step) -> None:
@@ -242,7 +244,7 @@ class FilterCloud(ABC):
 
     @abstractmethod
     def explain(self) -> str:
-        """Return in one line how a step is started."""
+        """Describe in one line how a step is started."""
 
     # ---- state
 
@@ -259,7 +261,7 @@ class FilterCloud(ABC):
     @property
     @abstractmethod
     def scoring_seconds(self) -> float:
-        """Seconds of all log-likelihoods, added up over devices."""
+        """Seconds of all log-likelihoods, summed over devices."""
 
     @abstractmethod
     def time_scoring(self) -> None:

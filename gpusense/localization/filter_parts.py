@@ -22,7 +22,7 @@ from gpusense.localization.verdict import Verdict
 
 
 class FilterParts:
-    """Particles that follow the robot, the verdict on their pose, and its recovery.
+    """Particles that follow the robot, the verdict on their pose, and recovery from a wrong pose.
 
     Args:
         sensors: The sensors.
@@ -34,7 +34,7 @@ class FilterParts:
         options: Options of the filter.
         tracker: The particles, and the numbers of each step.
         verdict: The verdict on their pose.
-        recovery: Their rivals.
+        recovery: Recovery with the rivals of the particles.
         last: Readings of the last correction by the index of their sensor.
     """
 
@@ -49,7 +49,7 @@ class FilterParts:
         self.last: dict[int, tuple[Any, ...]] = {}
 
     def keep(self) -> None:
-        """Record the buffers that the beginning call must not overwrite."""
+        """Record the buffers that the call now beginning must not overwrite."""
         self.tracker.keep()
         self.recovery.keep()
 
@@ -58,10 +58,10 @@ class FilterParts:
         return self, self.tracker, self.tracker.cloud, self.verdict, *self.sensors, *self.recovery.changing()
 
     def check_started(self) -> None:
-        """Refuse to go on without particles.
+        """Refuse to continue without particles.
 
         Raises:
-            RuntimeError: there are none.
+            RuntimeError: there are no particles.
         """
         if not self.tracker.started:
             raise RuntimeError(
@@ -96,7 +96,7 @@ class FilterParts:
         self.recovery.expect_anywhere()
 
     def _begin(self, poses: np.ndarray) -> None:
-        """Replace all particles, and forget what earlier ones have seen."""
+        """Replace all particles, and forget the history of the previous ones."""
         self.tracker.place(poses)
         self.tracker.pending, self.last = None, {}
         self.recovery.restart()

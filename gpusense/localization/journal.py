@@ -1,14 +1,14 @@
 """State of a filter on the host: it changes as a whole or not at all, and is copied to and from plain data.
 
-Python may raise KeyboardInterrupt between any two lines. A call that changes a filter first keeps all of the filter's
-attributes in a journal, and drops it at its end by one assignment. If the call is interrupted, the journal restores the
-attributes: at once or, if another interrupt prevents that, before the next call. Buffers on a device need no copy: a
-step writes those that the attributes do not name yet.
+Python may raise KeyboardInterrupt between any two lines. A call that changes a filter first saves all of the filter's
+attributes in a journal, and at its end drops the journal by one assignment. If the call is interrupted, the journal
+restores the attributes at once or, if a second interrupt prevents that, before the next call. Buffers on a device need
+no copy, since a step writes only buffers that the attributes do not name yet.
 
-A class lists its state in ``MEMORY``, and in ``PARTS`` the attributes that hold state themselves. In a class of this
-package without ``MEMORY`` all attributes are state. Dictionaries, lists and queues are saved item by item, objects of
-this package attribute by attribute, everything else by identity. Arrays belong to the last group, so arrays of state
-are replaced and never written.
+A class lists its state in ``MEMORY``, and in ``PARTS`` the attributes that hold state themselves. In any other class of
+this package all attributes are state. Dictionaries, lists and queues are saved item by item, objects of this package
+attribute by attribute, everything else by identity. Arrays belong to the last group, so arrays of state are replaced
+and never written.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import numpy as np
 
 _PACKAGE = "gpusense.localization."
 _PLAIN = (bool, int, float, str, np.generic)
-# Sensors are state of the filter alone, though other parts refer to them.
+# Sensors are state of the filter alone, although further parts refer to them.
 _SENSORS = "_sensors"
 # Containers whose items are state.
 _CONTAINERS = (dict, list, deque)
@@ -42,7 +42,7 @@ _OTHER, _OBJECT, _CONTAINER = range(3)
 
 
 class _Kinds(dict[type, int]):
-    """Whether values of a class hold state in their attributes or items, or are state as they are."""
+    """Whether values of a class hold state in their attributes, in their items, or by identity."""
 
     def __missing__(self, kind: type) -> int:
         own = kind.__module__.startswith(_PACKAGE) and not issubclass(kind, (tuple, type))
@@ -64,7 +64,7 @@ def _attributes(owner: Any) -> dict[str, Any]:
 
 
 class Journal:
-    """All state of objects at one moment.
+    """The complete state of objects at one moment.
 
     Args:
         owners: The objects.
@@ -78,7 +78,7 @@ class Journal:
         self._objects: list[tuple[Any, dict[str, Any]]] = []
         self._containers: list[tuple[Any, Any]] = []
         kinds, open_ = _KINDS, list(owners)
-        # By identity: each object or container once.
+        # By identity, so that each object or container is saved once.
         seen: set[int] = set()
         for one in open_:
             if id(one) in seen:
@@ -99,7 +99,7 @@ class Journal:
                 open_ += [item for name, item in kept.items() if kinds[type(item)] and name != _SENSORS]
 
     def is_running(self) -> bool:
-        """Return whether the call that may change the object has called the present one."""
+        """Return whether the present call runs within the journal's call."""
         frame: FrameType | None = sys._getframe(1)
         while frame is not None:
             if frame is self._frame:
@@ -108,11 +108,11 @@ class Journal:
         return False
 
     def close(self) -> None:
-        """Forget the call, whose frame holds this object."""
+        """Drop the reference to the call's frame, which holds this object."""
         self._frame = None
 
     def restore(self) -> None:
-        """Put everything back; repeated if it was interrupted."""
+        """Restore everything; an interrupted restoration is repeated."""
         for one, values in self._objects:
             names = getattr(one, "MEMORY", values)
             one.__dict__.update({name: values[name] for name in names if name in values})
@@ -122,7 +122,7 @@ class Journal:
 
 
 class Whole:
-    """Base of objects whose calls change their whole state or nothing.
+    """Base of objects whose calls change their state completely or not at all.
 
     Calls of several threads wait for one another.
     """
@@ -134,14 +134,14 @@ class Whole:
         self._calls = threading.RLock()
 
     def _keep(self) -> None:
-        """Record the buffers that the beginning call must not overwrite."""
+        """Record the buffers that the call now beginning must not overwrite."""
 
     def _changing(self) -> tuple[Any, ...]:
         """Return the objects whose state a call may change: this one and its parts."""
         return (self,)
 
     def settle(self) -> None:
-        """Put the state back that an interrupted call has left behind."""
+        """Restore the state after an interrupted call."""
         if self._journal is not None and not self._journal.is_running():
             self._journal.restore()
             self._journal = None
@@ -151,14 +151,14 @@ W = TypeVar("W", bound=Whole)
 
 
 def whole(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W, P], R]:
-    """Make a method change all of its object's state, or, where it raises, none."""
+    """Make a method change its object's state completely or, if it raises, not at all."""
 
     @functools.wraps(method)
     def call(self: W, /, *args: P.args, **kwargs: P.kwargs) -> R:
         with self._calls:
             self.settle()
             if self._journal is not None:
-                # Part of a call that is whole.
+                # A call within a call that is already whole.
                 return method(self, *args, **kwargs)
             self._keep()
             journal = self._journal = Journal(self._changing(), sys._getframe())
@@ -177,7 +177,7 @@ def whole(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W, P],
 
 
 def settled(method: Callable[Concatenate[W, P], R]) -> Callable[Concatenate[W, P], R]:
-    """Make a method that changes no state, but by methods that are :func:`whole`, see none of an interrupted call."""
+    """Settle the state before a method that changes state only through methods that are :func:`whole`."""
 
     @functools.wraps(method)
     def call(self: W, /, *args: P.args, **kwargs: P.kwargs) -> R:
@@ -204,7 +204,7 @@ class Held(NamedTuple):
 
 
 class _NotPlainError(Exception):
-    """A value that is no state: of a device, or of another package."""
+    """A value that is no plain data, such as an object of a device or of another package."""
 
 
 def plain_state(owner: Any, *, without: Collection[str] = ()) -> dict[str, Any]:
@@ -226,7 +226,7 @@ def _plain(value: Any) -> Any:
     """Return a copy of a value as plain data.
 
     Raises:
-        _NotPlainError: it is none.
+        _NotPlainError: the value is not plain data.
     """
     kind = type(value)
     if isinstance(value, np.ndarray):
@@ -254,7 +254,7 @@ def set_state(owner: Any, values: Mapping[str, Any]) -> None:
 
 
 def _merged(now: Any, value: Any) -> Any:
-    """Return a value of plain data; objects of this package, and what they know beside their state, are those now."""
+    """Return a value from plain data; present objects of this package keep everything that is not state."""
     if isinstance(value, Held):
         kind = type(now)
         target = now
@@ -265,7 +265,7 @@ def _merged(now: Any, value: Any) -> Any:
             made = getattr(importlib.import_module(module), name)
             target = made.__new__(made)
         elif not hasattr(kind, "MEMORY"):
-            # Another object, so that one assignment changes all of it.
+            # A new object, so that a single assignment replaces it.
             target = copy.copy(now)
         set_state(target, value.values)
         return target

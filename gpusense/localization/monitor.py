@@ -1,4 +1,4 @@
-"""Verdict on the poses of any localiser: pose and readings in, probability of being lost out."""
+"""Judge the poses of any localiser: pose and readings in, probability of being lost out."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gpusense.localization.spread import is_apart, is_wide, share_off
 from gpusense.localization.verdict import Verdict, VerdictState
 from gpusense.localization.words import LOST, Word, word_of
 
-# Poses drawn from a covariance, by which features are predicted.
+# Number of poses drawn from a covariance to predict features.
 _DRAWN = 64
 
 
@@ -28,7 +28,7 @@ class PoseVerdict:
 
     Attributes:
         p_lost: Probability that the pose is off by more than 1 m or 0.5 rad.
-        verdict: "tracking"; "uncertain", where the covariance is wide or p_lost is above 0.1; or "lost", where readings
+        verdict: "tracking"; "uncertain", if the covariance is wide or p_lost is above 0.1; or "lost", if readings
             contradict the pose and p_lost is above 0.5.
         explained: Among the beams that the map could explain, the share that agrees with it at the pose; NaN without
             one.
@@ -50,18 +50,18 @@ class PoseVerdict:
 
 
 class PoseMonitor:
-    """Judge the poses of a localiser by its scans, one after the other.
+    """Judge the poses of a localiser by its scans, one after another.
 
-    It needs no particle filter: poses may come from AMCL, from a graph, or from a motion capture. Each call adds a scan
-    to a belief that is kept from call to call (``docs/localization.md``), so pass the scans in their order.
+    It needs no particle filter: poses may come from AMCL, a pose graph or motion capture. Each call adds a scan to a
+    belief that persists between calls (``docs/localization.md``), so pass the scans in order.
 
     Args:
         models: A model of scans or landmarks with the map, or several of one device.
         seed: Seed of the random poses with which features are compared.
 
     Raises:
-        TypeError: Another object.
-        ValueError: No model, models of several devices, or only models that have no map.
+        TypeError: An object is no such model.
+        ValueError: There is no model, models have several devices, or none has a map.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -87,12 +87,12 @@ class PoseMonitor:
         return f"PoseMonitor([{names}], scans={self._verdict.state.corrections}, wrong={self._verdict.wrong:.2g})"
 
     def update(self, pose: AnyArray, ranges: Any, covariance: AnyArray | None = None) -> PoseVerdict:
-        """Judge a pose by the readings that were taken there.
+        """Judge a pose by the readings taken there.
 
         Args:
             pose: (3,) x, y, theta [m, m, rad].
             ranges: (K,) readings of the only model, or a mapping from models to their readings; for landmarks a tuple
-                ``(features,)``. None, or no reading, gives no evidence.
+                ``(features,)``. None, and a scan without a reading, give no evidence.
             covariance: (3, 3) covariance of the pose, which may be infinite; None if the localiser states none.
 
         Raises:
@@ -117,7 +117,7 @@ class PoseMonitor:
 
     @property
     def state(self) -> VerdictState:
-        """All that the monitor remembers of the scans: an immutable value, which may be kept and put back."""
+        """All that the monitor remembers of the scans: an immutable value that may be stored and assigned again."""
         return self._verdict.state
 
     @state.setter
@@ -127,18 +127,18 @@ class PoseMonitor:
         self._verdict.state = state
 
     def reset(self) -> None:
-        """Forget all scans, as after the localiser was given a new pose."""
+        """Forget all scans, for example after the localiser was set to a new pose."""
         self._verdict.reset()
         self._pose, self._last = None, {}
 
     def diagnose(self, *, search: bool = True) -> Diagnosis:
-        """Return the evidence of the last readings at the last pose, and the likely cause where they contradict it.
+        """Return the evidence of the last readings at the last pose, and the likely cause of a contradiction.
 
         Args:
-            search: Whether to look for a better pose elsewhere on the map, which takes some milliseconds.
+            search: Whether to search for a better pose elsewhere on the map, which takes a few milliseconds.
 
         Raises:
-            RuntimeError: there is no pose yet.
+            RuntimeError: no pose was judged yet.
         """
         if self._pose is None:
             raise RuntimeError("diagnose: needs an update first")

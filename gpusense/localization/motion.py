@@ -1,4 +1,4 @@
-"""Motion models: how far a robot may have moved, given its odometry or its commands.
+"""Motion models: densities of a robot's motion, given its odometry or its commands.
 
 The models are those of Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), chapter 5. Each gives the means and
 deviations of a first turn, a translation ahead and to the left, and a second turn, which the kernel
@@ -18,9 +18,9 @@ from gpusense._util import checks
 from gpusense.interface.constants import STRAIGHT, VELOCITY_MODEL
 from gpusense.localization.defaults import DEFAULTS
 
-# Below this translation [m] no direction can be read from it.
+# Least translation that has a direction [m].
 SHORTEST = 0.01
-# Largest turn of a step, and largest deviation of turns [rad]: kernels take headings of up to LARGEST_HEADING.
+# Largest turn of a step, and largest deviation of turns [rad], since kernels take headings of up to LARGEST_HEADING.
 _MOST_TURNED = 1e5
 
 
@@ -30,8 +30,8 @@ class SampledMotion(NamedTuple):
     Attributes:
         mean: First turn, translation ahead and to the left, second turn [rad, m, m, rad].
         deviation: Their standard deviations.
-        kind: A straight translation, or an arc.
-        reverse: Probability that the translation went the other direction.
+        kind: Straight translation or arc.
+        reverse: Probability that the translation had the opposite direction.
     """
 
     mean: tuple[float, float, float, float]
@@ -52,7 +52,7 @@ class MotionModel(Protocol):
 
 
 def _difference(before: np.ndarray, after: np.ndarray) -> tuple[float, float, float]:
-    """Return one pose in the frame of another, without the cost of arrays."""
+    """Return one pose in the frame of a second one, without the cost of arrays."""
     (x0, y0, theta0), (x1, y1, theta1) = before.tolist(), after.tolist()
     x, y, cosine, sine = x1 - x0, y1 - y0, math.cos(theta0), math.sin(theta0)
     return cosine * x + sine * y, cosine * y - sine * x, math.remainder(theta1 - theta0, math.tau)
@@ -61,8 +61,8 @@ def _difference(before: np.ndarray, after: np.ndarray) -> tuple[float, float, fl
 def odometry_turns(before: object, after: object) -> tuple[float, float, float]:
     """Return an odometer's motion as a first turn, a translation and a second turn [rad, m, rad].
 
-    A translation below 1 cm has its turn in the second turn. A first turn of more than a quarter counts as driving
-    backwards, with a negative translation.
+    Below a translation of 1 cm the whole turn is the second turn. A first turn of more than a quarter turn counts as
+    driving backwards, with a negative translation.
 
     Args:
         before: (3,) pose in the frame of the odometer [m, m, rad].
@@ -106,13 +106,12 @@ class OdometryMotion:
     Attributes:
         alpha: (4,) noise. The variances are ``alpha[0] turn^2 + alpha[1] trans^2`` of each turn, and
             ``alpha[2] trans^2 + alpha[3] (turn1^2 + turn2^2)`` of the translation [rad^2, m^2].
-        reverse: Probability that the translation went the other direction. Some odometers count wheel turns without a
-            sign; the tracks of such a log are lost at 0.
-        least: Standard deviations of translation and turns that are always added [m, rad]: wheels that slip, a robot
-            that is pushed.
+        reverse: Probability that the translation had the opposite direction. Some odometers count wheel turns without a
+            sign; a filter loses track on such logs with 0.
+        least: Standard deviations of translation and turns that are always added [m, rad], for slipping wheels or a
+            pushed robot.
         systematic: Systematic errors, corrected before noise is added: the shares of translations and of turns that the
-            odometer misses, and a turn for each metre [rad/m], as by wheels of unequal radius (Borenstein and Feng
-            1996).
+            odometer misses, and a turn per metre [rad/m], as from wheels of unequal radius (Borenstein and Feng 1996).
         sideways: Variance of a sideways translation per squared turn [m^2/rad^2], for a robot that slips as it turns,
             or whose odometer reports a point other than its centre of rotation. 0 is the book's model, which has no
             sideways motion.
@@ -142,7 +141,9 @@ class OdometryMotion:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Make the model from a mapping of its attributes, as ``gpusense fit`` writes; a missing one is the default.
+        """Make the model from a mapping of its attributes, as ``gpusense fit`` writes it.
+
+        Missing attributes have their defaults.
 
         Raises:
             TypeError: ``values`` is not a mapping, or a value has the wrong type.
@@ -166,7 +167,7 @@ class OdometryMotion:
         trans *= 1 + stretch
         a1, a2, a3, a4 = self.alpha
         at, ar = self.least
-        # Noise does not depend on the direction: a turn by half a turn and back is none.
+        # Noise does not depend on the direction: turning by half a turn and back is no turn.
         deviations = [math.sqrt(a1 * turn * turn + a2 * trans * trans + ar * ar) for turn in (first, second)]
         squares = first * first + second * second
         length = math.sqrt(a3 * trans * trans + a4 * squares + at * at)
@@ -258,14 +259,14 @@ class VelocityMotion:
         length = math.hypot(math.sqrt(a1 * v * v + a2 * w * w) * seconds, at)
         half = math.sqrt(a3 * v * v + a4 * w * w) * seconds / 2
         last = math.hypot(math.sqrt(a5 * v * v + a6 * w * w) * seconds, ar)
-        # The last turn takes whole turns back.
+        # The last turn removes whole turns.
         back = math.tau * -round(w * seconds / math.tau)
         return SampledMotion((w * seconds / 2, v * seconds, 0.0, back), (half, length, 0.0, last), VELOCITY_MODEL)
 
 
 def settings_of(motion: SampledMotion) -> tuple[np.ndarray, float]:
-    """Return means and deviations as a (8,) array, and the probability of a reverse."""
+    """Return means and deviations as an (8,) array, and the probability of a reverse."""
     first, ahead, left, second = motion.deviation
-    # A heading whose deviation is many turns is uniform, so a limit changes nothing but the size of its numbers.
+    # A heading with a deviation of many turns is uniform, so a limit changes only the size of the numbers.
     turns = min(first, _MOST_TURNED), min(second, _MOST_TURNED)
     return np.array([*motion.mean, turns[0], ahead, left, turns[1]]), motion.reverse

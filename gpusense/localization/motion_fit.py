@@ -1,21 +1,22 @@
-"""Noise of the odometry model from a log with reference poses, by maximum likelihood with weak priors.
+"""Fit the noise of the odometry model to a log with reference poses, by maximum likelihood with weak priors.
 
 The difference between reference and odometry over a step is, to first order, normal: (along, across, heading) =
 (noise of the translation, trans * noise of the first turn + noise to the side, noise of both turns). Where references
 are further apart, the covariances of the steps in between add up (:mod:`gpusense.localization.step_errors`). A Student
-t density with 4 degrees of freedom keeps single slips from inflating the noise of all steps. Steps that fit better with
-the odometer's translation reversed are counted, and give the probability of a reverse. A filter draws normal noise: the
-variances are multiplied by the mean square of standardised errors, each at most 9.
+t density with 4 degrees of freedom prevents single slips from inflating the noise of all steps. The probability of a
+reverse comes from the number of steps that fit better with the odometer's translation reversed. A filter draws normal
+noise: the variances are multiplied by the mean square of standardised errors, each at most 9.
 
 Errors of an odometer repeat from step to step (a wheel's radius, a slope), while a filter draws new noise at each step.
 Their constant part is also fitted (on the intel log 3 degrees a metre). For the rest, variances are multiplied by
 1 + 2 sum rho_l, the inflation of the variance of a sum by the autocorrelation rho_l of standardised errors.
 
-A log may not determine each variance: a robot that never turned tells nothing of the noise of turns. The logarithm of
-each has a normal prior around the default, whose deviation is a factor of ten. A variance without data keeps the
-default, and 100 steps that determine it move it by 2 % of the way to it. With the Fisher information I of the t density
-(Lange, Little and Taylor 1989), the logarithms have the covariance (I + 1 / prior variance)^-1. A variance counts as
-determined where that at least halves the prior's deviation. One that is not, inflated too, is the default at most.
+A log may not determine each variance: a robot that never turned says nothing about the noise of turns. The logarithm of
+each variance has a normal prior around the default, with a deviation of a factor of ten. A variance without data keeps
+the default; the prior moves a variance determined by 100 steps by 2 % of the distance to the default. With the Fisher
+information I of the t density (Lange, Little and Taylor 1989), the logarithms have the covariance (I + 1 / prior
+variance)^-1. A variance counts as determined if the data at least halve the prior's deviation. An undetermined
+variance, including its inflation, is at most the default.
 """
 
 from __future__ import annotations
@@ -37,18 +38,19 @@ from gpusense.localization.step_errors import NOISES, REST, Errors, corrected, e
 
 _FREEDOM = 4.0
 _LEAST_ALPHA, _MOST_ALPHA = 1e-6, 1.0
-# Limits of the least deviations [m, rad], and the largest standardised error squared that counts in the tails.
+# Limits of the least deviations [m, rad], and the largest squared standardised error that counts in the tails.
 _LEAST, _MOST, _FAR = 0.002, 0.1, 9.0
-# A reversed translation must fit better by this distance [m] to count.
+# Distance by which a reversed translation must fit better to count [m].
 _CLEAR = 0.05
 # Longest lag of the autocorrelation, and the largest inflation.
 _LAGS, _MOST_INFLATION = 10, 10.0
 # Prior deviation of each of the three parts of the systematic error; rounds of the fit.
 _PRIOR, _ROUNDS = 0.1, 3
-# Defaults of the variances, prior deviation of their logarithms, and steps that the default of ``reverse`` counts as.
+# Defaults of the variances, prior deviation of their logarithms, and number of steps that the default of ``reverse``
+# counts as.
 _DEFAULT = np.array([*DEFAULTS.alpha, DEFAULTS.sideways, *(value**2 for value in DEFAULTS.least)])
 _PRIOR_LOG, _PRIOR_STEPS = math.log(10), 25
-# A variance is determined where the deviation of its logarithm is at most this share of the prior's.
+# A variance is determined if the deviation of its logarithm is at most this share of the prior deviation.
 _DETERMINED = 0.5
 
 
@@ -60,15 +62,15 @@ class MotionFit:
         motion: The model.
         steps: Number of steps of the odometer between the first and the last reference.
         reversed_steps: Steps in which the odometer's translation had the wrong sign.
-        inflation: Factor of the variances, by the autocorrelation and the tails of errors; ``motion`` has it.
-        log_likelihood: Of all differences before the inflation, natural logarithm up to a constant.
+        inflation: Factor of the variances by the autocorrelation and the tails of errors, included in ``motion``.
+        log_likelihood: Log-likelihood of all differences before the inflation, up to a constant.
         references: Number of reference poses.
         travelled: Sum of the translations of the steps [m].
-        turned: Sum of their turns [rad].
+        turned: Sum of the turns of the steps [rad].
         log_errors: (7,) standard errors of the logarithms of alpha1 to alpha4, ``sideways`` and the squares of
-            ``least``, if steps err independently; 2.3, a factor of ten, where the log holds no information.
+            ``least``, if steps err independently; 2.3, a factor of ten, if the log has no information.
         undetermined: Names of the parameters that the log does not determine, with an error of the logarithm above
-            1.15. Each is the default, or less where the log excludes the default.
+            1.15. Each has its default, or less if the log excludes the default.
 
     Example:
         >>> import gpusense as gs
@@ -101,17 +103,18 @@ class MotionFit:
 def fit_odometry_motion(odometry: AnyArray, poses: AnyArray, *, systematic: bool = True) -> MotionFit:
     """Fit the noise of :class:`OdometryMotion` to a log with reference poses.
 
-    The fitted noise holds for one step of ``odometry`` and depends on the step's length, so pass every step that a
-    filter will take. Reference poses may be known at some only. A variance that the log does not determine is at most
-    the default of :class:`OdometryMotion`, and is in ``undetermined``.
+    The fitted noise is that of one step of ``odometry`` and depends on the step's length, so pass every step that a
+    filter will take. Reference poses may be known at some steps only. A variance that the log does not determine is at
+    most the default of :class:`OdometryMotion`, and is in ``undetermined``.
 
     Args:
         odometry: (M, 3) poses of the odometer, M > 2 [m, m, rad].
-        poses: (M, 3) reference poses at the same times; rows of NaN where none is known, at most M - 3.
-        systematic: Also fit the errors that repeat at each step; they are 0 otherwise.
+        poses: (M, 3) reference poses at the same times; rows of NaN where unknown, at most M - 3.
+        systematic: Whether to fit the errors that repeat at each step; otherwise they are 0.
 
     Raises:
-        TypeError, ValueError: not poses, fewer than three, or an odometer that moved by less than 1 cm and 0.01 rad.
+        TypeError, ValueError: the arrays are no poses, or fewer than three, or the odometer moved by less than 1 cm and
+            0.01 rad.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -162,7 +165,7 @@ def _references(poses: AnyArray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the reference poses and their indices.
 
     Raises:
-        TypeError, ValueError: they are no poses, or fewer than three.
+        TypeError, ValueError: the arrays are no poses, or fewer than three are known.
     """
     values = checks.array("poses", poses, (count, 3), finite=False)
     absent = np.isnan(values).all(axis=1)
@@ -174,7 +177,7 @@ def _references(poses: AnyArray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _reverse(turns: np.ndarray, reference: np.ndarray, at: np.ndarray) -> tuple[int, int]:
-    """Reverse the translations that fit better reversed; return the numbers of steps tested and reversed.
+    """Reverse translations that then fit better; return the numbers of steps tested and reversed.
 
     A reverse shows only where a step has a reference before and after it.
     """
@@ -187,7 +190,7 @@ def _reverse(turns: np.ndarray, reference: np.ndarray, at: np.ndarray) -> tuple[
 
 
 def _start(alpha: float) -> np.ndarray:
-    """Return variances to begin a search with: alpha1 to alpha4, ``sideways``, and ``least`` [m^2, rad^2]."""
+    """Return initial variances of a search: alpha1 to alpha4, ``sideways``, and ``least`` [m^2, rad^2]."""
     return np.array([alpha] * 5 + list(_DEFAULT[5:]))
 
 
@@ -198,7 +201,7 @@ def _motion(noise: np.ndarray, reverse: float, repeated: np.ndarray) -> Odometry
 
 
 def _fitted(errors: Errors, starts: list[np.ndarray]) -> tuple[np.ndarray, float]:
-    """Return the most likely variances with the prior, and the negative log-likelihood there without it."""
+    """Return the most probable variances given the prior, and the negative log-likelihood there without it."""
     from scipy.optimize import minimize
 
     def cost(logs: np.ndarray) -> float:
@@ -222,7 +225,7 @@ def _limited(logs: np.ndarray) -> np.ndarray:
 def _systematic(noise: np.ndarray, errors: Errors, before: np.ndarray) -> np.ndarray:
     """Return the correction (3,) of the systematic error for given variances.
 
-    It is by least squares, reweighted for the t density, around the error that is already corrected.
+    It comes from least squares, reweighted for the t density, around the error that is already corrected.
     """
     inverse = np.linalg.inv(errors.covariances(noise))
     design, residual = errors.design, errors.residual
@@ -238,7 +241,7 @@ def _systematic(noise: np.ndarray, errors: Errors, before: np.ndarray) -> np.nda
 
 
 def _distance(turns: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Return distances between the ends of steps."""
+    """Return the distances between the ends of steps and of reference steps."""
     x, y = turns[:, 1] * np.cos(turns[:, 0]), turns[:, 1] * np.sin(turns[:, 0])
     return np.hypot(x - truth[:, 0], y - truth[:, 1])
 
@@ -255,7 +258,7 @@ def _log_errors(noise: np.ndarray, errors: Errors) -> np.ndarray:
 
 
 def _inflation(noise: np.ndarray, errors: Errors) -> float:
-    """Return the factor of the variances by the tails of errors, and by their largest autocorrelation."""
+    """Return the factor of the variances by the tails of errors and by their autocorrelation."""
     variances = np.diagonal(errors.covariances(noise), axis1=1, axis2=2)
     standardised = list((errors.residual / np.sqrt(variances)).T)
     factors, tails = [1.0], [float(np.mean(np.minimum(error**2, _FAR))) for error in standardised]
@@ -270,7 +273,7 @@ def _inflation(noise: np.ndarray, errors: Errors) -> float:
 def _cost(noise: np.ndarray, errors: Errors) -> float:
     """Return the negative log-likelihood of residuals."""
     (a, b, c), (_, d, e), (_, _, f) = errors.covariances(noise).transpose(1, 2, 0)
-    # The inverse of a symmetric matrix by its minors.
+    # Inverse of a symmetric matrix by its minors.
     p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
     determinant = np.maximum(a * p + b * q + c * r, 1e-30)
     x, y, z = errors.residual.T

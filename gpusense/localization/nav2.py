@@ -61,9 +61,9 @@ class Nav2Options:
     weights: BeamWeights | FieldWeights
     """The model's parameters as they are in the file, for ``compat="amcl"``; their weights need not sum to 1."""
     parameters: BeamParameters | LikelihoodFieldParameters
-    """The model's parameters with weights that sum to 1; from ``beam_model`` where ``gpusense fit`` wrote the file."""
+    """The model's parameters with weights that sum to 1; those of ``beam_model`` if ``gpusense fit`` wrote the file."""
     alpha: tuple[float, float, float, float, float]
-    """Noise of the odometry, alpha1 to alpha5; the fifth is for omnidirectional robots. A missing one is the fitted one
+    """Noise of the odometry, alpha1 to alpha5; the fifth is for omnidirectional robots. Missing ones come from the fit
     in a file of ``gpusense fit --fit-motion``."""
     odometry: OdometryMotion | None
     """The noise that ``gpusense fit --fit-motion`` wrote; None in other files, and for omnidirectional robots."""
@@ -98,7 +98,7 @@ class Nav2Options:
     initial_pose: tuple[float, float, float] | None
     """The robot's first pose (x, y, yaw) [m, m, rad]; None where the file sets none."""
     initial_covariance: nav2_start.Matrix | None
-    """(3, 3) covariance of the first pose, of Beluga's ``initial_pose.covariance_x`` and others; None without one."""
+    """(3, 3) covariance of the first pose, of Beluga's ``initial_pose.covariance_x`` and so on; None without one."""
     ignored: tuple[str, ...]
     """Names of other parameters in the file, which have no effect here."""
 
@@ -110,7 +110,7 @@ class Nav2Options:
         Args:
             grid: The map.
             scanner: The scanner.
-            compat: Whether to weigh as nav2_amcl does, by ``weights``; else log p of the book, by ``parameters``.
+            compat: Whether to weigh as nav2_amcl does, by ``weights``; otherwise log p of the book, by ``parameters``.
             options: Options of :class:`BeamModel` or :class:`LikelihoodFieldModel`, such as ``backend``.
 
         Raises:
@@ -123,7 +123,7 @@ class Nav2Options:
         return cast("BeamModel | LikelihoodFieldModel", kind(grid, scanner, chosen, **options))
 
     def make_motion(self) -> MotionModel:
-        """Make the motion model: the fitted noise where there is one, else ``alpha`` with the defaults of gpusense."""
+        """Make the motion model from the fitted noise, or else from ``alpha`` and the defaults of gpusense."""
         if self.motion == "omni":
             return OmniMotion(self.alpha)
         return OdometryMotion(self.alpha[:4]) if self.odometry is None else self.odometry
@@ -135,7 +135,7 @@ class Nav2Options:
 
         Args:
             models: A measurement model, or several.
-            options: Other options of :class:`ParticleFilter`, or these in place of the file's.
+            options: Further options of :class:`ParticleFilter`, or replacements of the file's.
 
         Raises:
             TypeError, ValueError: As the class does.
@@ -158,7 +158,7 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str |
     and growth, in ``beam_model``: these are then ``parameters``; and its ``odometry_motion`` is ``odometry``.
 
     Args:
-        source: The file of parameters; or its content: a mapping with ``amcl: ros__parameters:``, in any namespace, or
+        source: The file of parameters, or its content: a mapping with ``amcl: ros__parameters:`` in any namespace, or
             the mapping of the parameters themselves.
         node: Name of the node, with or without its namespaces, such as ``"/robot1/amcl"``; None for the only amcl.
 
@@ -168,7 +168,7 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str |
     Raises:
         FileNotFoundError: The file is missing.
         TypeError: A value has the wrong type; the message names the parameter.
-        ValueError: A value breaks its rule, or the file holds parameters of no such node, or of several.
+        ValueError: A value breaks its rule, or the file has parameters for no such node, or for several.
 
     Example:
         >>> import gpusense as gs
@@ -226,7 +226,7 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str |
 
 
 def has_parameters(content: Mapping[Any, Any]) -> bool:
-    """Return whether a file's content is parameters by ROS nodes, or amcl's parameters without a node."""
+    """Return whether a file holds parameters by ROS nodes, or amcl's parameters without a node."""
     return any(key in content for key in _DEFAULTS) or any(True for _ in nodes_of(content))
 
 

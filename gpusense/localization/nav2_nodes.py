@@ -15,13 +15,12 @@ FITTED = ("beam_model", "incidence_model", "odometry_motion")
 def parameters_of(content: Mapping[str, Any], name: str, node: str | None, known: Collection[str]) -> dict[str, Any]:
     """Return the parameters of a node by dotted names; as in ROS, ``/**`` supplies the parameters that the node lacks.
 
-    A mapping within the parameters has the parameters of a dotted name: ``initial_pose: {x: 1}`` is
-    ``initial_pose.x: 1``.
+    A mapping within the parameters is equivalent to dotted names: ``initial_pose: {x: 1}`` is ``initial_pose.x: 1``.
 
     Args:
         content: The content of a file, or the mapping of the parameters themselves.
         name: Name of the file.
-        node: Name of the node, with or without its namespaces; None for the only one of the name amcl.
+        node: Name of the node, with or without its namespaces; None for the only node named amcl.
         known: Names of amcl's parameters.
 
     Raises:

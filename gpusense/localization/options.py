@@ -1,4 +1,4 @@
-"""Options of a particle filter, and the numbers of its steps that follow from them."""
+"""Options of a particle filter, and the settings of its steps that follow from them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _DRAWS = {"systematic": SYSTEMATIC, "stratified": INDEPENDENT, "residual": RESID
 
 
 class Options(NamedTuple):
-    """Options of :class:`gpusense.ParticleFilter`, which has their meanings.
+    """Options of :class:`gpusense.ParticleFilter`, which describes them.
 
     Attributes:
         least: Fewest particles.
@@ -124,14 +124,15 @@ def settings_of_step(
     sensors: Sequence[tuple[float, int]],
     one_peak: bool,
 ) -> np.ndarray:
-    """Return the numbers of a step, by the places in ``interface.constants``.
+    """Return the settings of a step, by the places in ``interface.constants``.
 
     Args:
         options: Options of the filter.
         motion: The move that begins the step.
         step: Number of the step.
-        count: Particles.
-        pool: Poses that recovery injects: their number, and how far they are spread in x, y [m] and heading [rad].
+        count: Number of particles.
+        pool: Number of poses that recovery injects, and half widths of the box around each in x, y [m] and heading
+            [rad].
         sensors: Temperature and beams of each sensor that is used.
         one_peak: Whether the particles lie together, and no sensor has several peaks among them.
     """
@@ -144,8 +145,8 @@ def settings_of_step(
     s[THRESHOLD] = options.threshold
     s[DEPTH] = 1.0
     s[STRATIFIED] = _DRAWS[options.resampling]
-    # Sums of weights stay below 2^53: a weight is 1 on average, and their squares at most 1 / threshold. An effective
-    # sample size of one particle is above any lower threshold.
+    # Sums of weights stay below 2^53, since a weight is 1 on average and its square at most 1 / threshold. An effective
+    # sample size of one particle exceeds any lower threshold.
     threshold = max(options.threshold, 1 / _MOST)
     spare = math.ceil(math.log2(max(count, 2))) + math.ceil(-math.log2(threshold)) + 2
     s[SCALE] = 2.0 ** (52 - spare)

@@ -1,8 +1,8 @@
 """The particles of a filter on their device, and the launches of its steps.
 
-Four buffers hold poses and four hold weights, in two banks: a step reads those of one bank and writes those of the
-other. So an interrupted step has changed nothing. A stage of a correction scores and weighs the poses of a buffer, and
-draws into the other one of its bank.
+Four buffers hold poses and four hold weights, in two banks: a step reads from one bank and writes to the other bank. So
+an interrupted step has changed nothing. A stage of a correction scores and weighs the poses of a buffer, and draws into
+the second buffer of its bank.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Places(NamedTuple):
 
     Attributes:
         shown: Weighted poses.
-        next: Poses of the next step; the same where no step has weighed them.
+        next: Poses of the next step; equal to ``shown`` if no step has weighed them.
         weight: Weights of the shown poses.
         before: Weights with which the next step begins.
         state: State of the last correction.
@@ -39,12 +39,12 @@ class Places(NamedTuple):
     state: int = 0
 
     def placed(self, kept: Places) -> Places:
-        """Return the buffers of new particles, which leave those of ``kept`` as they are."""
+        """Return the buffers of new particles, which do not overwrite those of ``kept``."""
         poses, weights = kept.free()
         return Places(poses, poses, weights + 1, weights + 1, 1 - kept.state)
 
     def moved(self, kept: Places) -> Places:
-        """Return the buffers after a move by itself: weights stay those that the next correction begins with."""
+        """Return the buffers after a move without a correction, which keeps the weights for the next correction."""
         poses = kept.free()[0]
         return self._replace(shown=poses, next=poses, weight=self.before)
 
@@ -53,10 +53,10 @@ class Places(NamedTuple):
         """Return the stages of a correction.
 
         Args:
-            kept: Buffers that it leaves as they are.
+            kept: Buffers that the correction does not overwrite.
             most: Largest number of stages.
             drawn: Particles of the next step.
-            kind: Kind of the motion that begins the first one.
+            kind: Kind of the motion that begins the first stage.
         """
         (poses, weights), state = kept.free(), 1 - kept.state
         first = Stage(poses, 0, most, drawn if most == 1 else 0, self.before, weights, state, self.next, kind)
@@ -65,7 +65,7 @@ class Places(NamedTuple):
         ]
 
     def free(self) -> tuple[int, int]:
-        """Return the first poses and the first weights of the banks that hold none of these."""
+        """Return the first poses and the first weights of the banks that hold none of these buffers."""
         return 2 - self.shown // 2 * 2, 2 - self.weight // 2 * 2
 
 
@@ -73,15 +73,15 @@ class Stage(NamedTuple):
     """A stage of a correction.
 
     Attributes:
-        source: Index of the buffer with its poses; it draws into the other one of the bank.
-        number: Its number, from 0.
+        source: Index of the buffer with its poses; it draws into the second buffer of the bank.
+        number: Number of the stage, from 0.
         most: Most stages of the correction.
-        drawn: Particles that it draws; 0 where the number follows from its weights.
-        before: Index of the weights before it.
-        weight: Index of the weights that it sets; those that it draws are in the buffer behind.
+        drawn: Number of particles that it draws; 0 if that follows from its weights.
+        before: Index of the weights before the stage.
+        weight: Index of the weights that it sets; the weights of drawn particles are in the next buffer.
         state: Index of the state that it writes.
         origin: Index of the poses before the motion.
-        kind: Kind of the motion before it; None where there is none.
+        kind: Kind of the motion before the stage; None without motion.
     """
 
     source: int
@@ -96,7 +96,7 @@ class Stage(NamedTuple):
 
     @property
     def key(self) -> tuple[int, ...]:
-        """All on which its launches after the scores depend."""
+        """Everything on which its launches after the scores depend."""
         return self[:7]
 
     @property
@@ -111,7 +111,7 @@ class Stage(NamedTuple):
 
     @property
     def places(self) -> Places:
-        """The buffers after it."""
+        """The buffers after the stage."""
         return Places(self.source, self.target, self.weight, self.after, self.state)
 
 
@@ -122,14 +122,14 @@ class Particles:
         backend: The device.
         capacity: Most particles.
         sensors: Most sensors of a correction.
-        precision: Of their log-likelihoods.
+        precision: Precision of the log-likelihoods.
         residual: Whether to draw by residual resampling.
 
     Attributes:
         count: Particles of the next step.
         places: Buffers of the particles.
-        kept: Buffers that steps leave as they are: those at the beginning of a call of the filter.
-        pool_size: Poses from which recovery injects particles.
+        kept: Buffers that steps do not overwrite: those at the beginning of a call of the filter.
+        pool_size: Number of poses from which recovery injects particles.
     """
 
     MEMORY: ClassVar[tuple[str, ...]] = ("count", "block", "places", "pool", "pool_size")
@@ -141,7 +141,7 @@ class Particles:
         self.backend, self.capacity, self.precision, self._sensors = backend, capacity, precision, sensors
         self.count, self.places, self.kept = capacity, Places(), Places()
         self.block = weight_block(backend, capacity)
-        # Memory that a processor shares with the host is not lent.
+        # Memory that a processor shares with the host is not lent to other libraries.
         make = backend.blank if backend.info.kind == "gpu" else backend.empty
         self.poses = [make(3 * capacity, _DOUBLE) for _ in range(4)]
         self.weights = [make(capacity, _DOUBLE) for _ in range(4)]
@@ -160,7 +160,7 @@ class Particles:
         return -(-self.count // self.block)
 
     def set_particles(self, places: Places, count: int, block: int) -> None:
-        """Set the buffers and the number of particles, and those of a block of weights."""
+        """Set the buffers, the number of particles, and the number in a block of weights."""
         self.places, self.count, self.block = places, count, block
 
     def use(self, sensors: int) -> None:
@@ -175,7 +175,7 @@ class Particles:
                                 target=self.poses[target], particles=self.count, kind=kind)  # fmt: skip
 
     def sizes(self) -> dict[str, int]:
-        """Return numbers of particles by the names of arguments."""
+        """Return the numbers of particles by the names of arguments."""
         return dict(particles=self.count, block=self.block)
 
     def numbers(self, stage: Stage) -> dict[str, Any]:
@@ -195,7 +195,7 @@ class Particles:
     def drawing(
         self, source: tuple[Buffer, Buffer, int], stage: Stage, drawn: int, copies: Buffer | None = None
     ) -> Program:
-        """Return the launch that draws from poses with cumulative weights, given with their number."""
+        """Return the launch that draws from ``source``: poses, their cumulative weights, and their number."""
         poses, ends, count = source
         copies = next(one for one in (copies, self._copies, ends) if one is not None)
         return self.sums.launch("draw_particles", drawn, source=poses, weight=self.weights[stage.weight], ends=ends,
@@ -209,7 +209,7 @@ class Particles:
         return self.sums.set_weights(self.numbers(stage), (stage.number, stage.most), out)
 
     def weighing(self, stage: Stage) -> Program:
-        """Return the launches of a stage after its scores: weights, and the draw where its size is known."""
+        """Return the launches of a stage after its scores: weights, and the draw if its size is known."""
         find, *scored = self.sums.highest(self.blocks)
         found = scored[0], scored[1]
         weights = self.sums.weigh(self.numbers(stage), found, stage.number) + self.setting(stage)
@@ -217,7 +217,7 @@ class Particles:
         return self.scoring(self._sensors) + find + weights + draw
 
     def draw(self, stage: Stage, drawn: int) -> Program:
-        """Return the launches that draw into the other buffer."""
+        """Return the launches that draw into the second buffer of the bank."""
         copies: Program = ()
         if self._copies is not None:
             given = {name: self.numbers(stage)[name] for name in ("state", "particles", "block", "blocks")}

@@ -1,16 +1,16 @@
-"""Beams of a scan against the map at one pose: which agree, which end too early, and which pass through walls.
+"""Judge the beams of a scan against the map at one pose: some agree, some end too early, some pass through walls.
 
 Each judged beam is traced through the map with two companion rays that start beside it and diverge, so that a slightly
-wrong pose, the edge of a door or a grazed wall decides nothing. A beam
+wrong pose, the edge of a door or a grazed wall is no evidence. A beam
 
 - **agrees** where its reading lies between the walls that the three rays meet, within a tolerance;
 - **passes through** where all three meet a wall well before the reading: no person or box makes a beam longer;
 - is **short** where its end lies in mapped free space and no ray has met a wall: people, furniture, or a wrong pose;
-- tells **nothing** where unknown cells or the map's edge come first, where the three rays contradict each other, or
-  where the reading is missing.
+- gives **no** evidence where unknown cells or the map's edge come first, where the three rays contradict each other, or
+    where the reading is missing.
 
-Only grid and pose are needed, so the walk runs on the host, costs the same for every model and holds no table: some
-thousand look-ups for a scan. A diagonal pair of walls stops a ray, as in the casters.
+Only grid and pose are needed, so the walk runs on the host, costs the same for every model and holds no table: a few
+thousand look-ups per scan. A diagonal pair of walls stops a ray, as in the casters.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ Floats = NDArray[np.float64]
 NOTHING, AGREES, SHORT, THROUGH, VANISHED = range(5)
 # Most beams of a scan that are judged; readings beyond are walked up to here only [m].
 _BEAMS, _FARTHEST = 32, 20.0
-# Companions start beside the beam [m] and spread by an angle [rad]; both grow with the deviations of the pose, up to
-# these.
+# Companions start beside the beam [m] and diverge by an angle [rad]; both grow with the deviations of the pose, up to
+# these limits.
 _BESIDE, _APART, _MOST_BESIDE, _MOST_APART = 0.08, 0.025, 0.3, 0.1
-# Tolerance of a range: a part of it, at least [m] and at least in cells.
+# Tolerance of a range: a share of it, and its least values [m] and [cells].
 _PART, _LEAST, _LEAST_CELLS = 0.02, 0.2, 2.0
 # Agreeing readings within this of a wall are close [m].
 _CLOSE = 0.1
@@ -50,7 +50,7 @@ class Passages(NamedTuple):
         bearing: (B,) bearing from the scanner [rad].
         wall: (B, 2) where the beam meets the first mapped wall, NaN where it meets none before its end [m].
         close: (B,) whether an agreeing reading ends within 0.1 m of that wall, or within a cell.
-        inside: Whether the pose is inside of solid cells.
+        inside: Whether the pose is inside solid cells.
         off: Whether the pose is in unknown cells or off the map.
     """
 
@@ -71,10 +71,10 @@ class Counts(NamedTuple):
 
     Attributes:
         agree: Agreeing beams.
-        close: Those among them that end close to a wall.
+        close: Agreeing beams that end close to a wall.
         through: Beams that pass through walls.
-        short: Short ones.
-        nothing: Beams that tell nothing.
+        short: Short beams.
+        nothing: Beams that give no evidence.
     """
 
     agree: int
@@ -146,7 +146,7 @@ def passages(
 
 
 def _origin_of(pose: Floats, mount: tuple[float, float, float]) -> tuple[Floats, float]:
-    """Return where the beams begin, and the direction of bearing 0."""
+    """Return the origin of the beams, and the direction of bearing 0."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     return np.array([pose[0] + c * mount[0] - s * mount[1], pose[1] + s * mount[0] + c * mount[1]]), pose[2] + mount[2]
 
@@ -162,8 +162,8 @@ def _walked(
     """Walk three rays of each beam.
 
     Returns:
-        (3, B) range to the first wall and (3, B) to the first unknown cell, inf for none up to the end of the walk;
-        (B,) tolerance of the readings; largest range that is walked.
+        (3, B) range to the first wall and (3, B) to the first unknown cell, inf for none within the walk; (B,)
+        tolerance of the readings; largest range that is walked.
     """
     side, (x0, y0, yaw) = grid.resolution, grid.origin
     beside = min(max(_BESIDE, deviations[0], side), max(_MOST_BESIDE, side))
@@ -194,14 +194,14 @@ def _first_cells(
     distance = _STEP * number
     column = np.floor(np.repeat(x, steps) + distance * np.repeat(along, steps)).astype(np.int64)
     row = np.floor(np.repeat(y, steps) + distance * np.repeat(up, steps)).astype(np.int64)
-    # As unsigned numbers, negative ones are beyond every limit.
+    # As unsigned numbers, negative indices exceed every limit.
     within = (column.view(np.uint64) < columns) & (row.view(np.uint64) < rows)
     cells, place = grid.cells.reshape(-1), row * columns + column
     # Cells off the map are unknown, -1.
     value = np.full(len(ray), -1, np.int8)
     np.copyto(value, cells.take(place, mode="clip"), where=within)
     wall = value >= grid.occupied_threshold
-    # Where two successive cells share only a corner, both cells beside the corner may be walls.
+    # If two successive cells share only a corner, both cells beside the corner may be walls.
     corner = np.flatnonzero((column[1:] != column[:-1]) & (row[1:] != row[:-1]))
     corner = corner[(number[corner + 1] > 0) & within[corner + 1] & within[corner]]
     one, two = row[corner + 1] * columns + column[corner], row[corner] * columns + column[corner + 1]

@@ -92,7 +92,7 @@ def mean_pose(poses: AnyArray, weights: AnyArray | None = None) -> np.ndarray:
 
     Args:
         poses: (N, 3) poses [m, m, rad], N > 0.
-        weights: (N,) weights >= 0 with a positive sum; None for equal ones.
+        weights: (N,) weights >= 0 with a positive sum; None for equal weights.
 
     Raises:
         TypeError, ValueError: not poses, or not weights.

@@ -1,18 +1,18 @@
-"""Log-likelihood ratio of "the pose is wrong" against "the pose is right" of one scan.
+"""Log-likelihood ratio of "the pose is wrong" against "the pose is right" for one scan.
 
 A short beam is hardly evidence: people and furniture shorten beams at right poses as often as walls do at wrong poses.
 Of the beams that meet a mapped wall, T pass through it and A agree with it, C of them to within a few centimetres.
 Where a filter has fitted a wrong pose to a scan, beams also agree, but less closely. On a wrong map many beams, N, end
-in unknown cells or off the map and tell nothing. With n = A + S + T informative beams, S of them short, and f(a, b) =
-log((a + 1/2) / (b + 1/2)),
+in unknown cells or off the map and give no evidence. With n = A + S + T informative beams, S of them short, and f(a, b)
+= log((a + 1/2) / (b + 1/2)),
 
     r = n / (n + FEW) (BIAS + SLOPE f(T, A) + BLUNT f(A - C, C) + NOTHING f(N, n)),
 
-within LIMITS: no agreement excludes that another place looks alike. A pose inside of solid cells adds SOLID, one in
-unknown cells UNKNOWN. The coefficients come from a logistic regression on some 450 simulated runs: people, moved and
-new furniture, glass, wrong maps, 16 to 360 beams and kidnapping, half of the weight for right poses and half for wrong
-ones. 200 other runs (``bench/studies/verdict_fit.py``) give 3.03, 1.42, 0.63 and 0.44. BIAS is lower by CAUTION, since
-false alarms cost more: it was chosen on the tuning half of the recorded logs, as nothing else was.
+within LIMITS, since no agreement excludes that another place looks alike. A pose inside solid cells adds SOLID, a pose
+in unknown cells UNKNOWN. The coefficients come from a logistic regression on about 450 simulated runs: people, moved
+and new furniture, glass, wrong maps, 16 to 360 beams and kidnapping, half of the weight for right poses and half for
+wrong ones. 200 other runs (``bench/studies/verdict_fit.py``) give 3.03, 1.42, 0.63 and 0.44. BIAS is lower by CAUTION,
+since false alarms cost more; CAUTION alone was chosen on the tuning half of the recorded logs.
 
 Among landmarks the ratio is that of the prediction of features (:mod:`gpusense.localization.evidence`).
 """
@@ -31,7 +31,7 @@ _OF_GAIN, _LIMIT_OF_GAIN = 0.25, 3.0
 
 
 def ratio_of_scan(scans: Sequence[Passages]) -> float:
-    """Return the ratio of the scans of one moment; NaN where they tell nothing.
+    """Return the ratio of simultaneous scans; NaN if they give no evidence.
 
     Args:
         scans: Judged beams of each scanner, at one pose.
@@ -49,12 +49,12 @@ def ratio_of_scan(scans: Sequence[Passages]) -> float:
 
 
 def _odds(one: int, other: int) -> float:
-    """Return the log odds of two counts, as if half a beam more had been seen of each."""
+    """Return the log odds of two counts, with half a beam added to each."""
     return math.log((one + 0.5) / (other + 0.5))
 
 
 def explained_of_scan(scans: Sequence[Passages]) -> float:
-    """Return the share that agrees among the beams that the map could explain; NaN without any."""
+    """Return the share of agreeing beams among those that the map could explain; NaN without any."""
     counts = counts_of(scans)
     return counts.agree / counts.telling if counts.telling else math.nan
 
@@ -63,9 +63,9 @@ def ratio_of_features(gain: float, count: int, least: float) -> float:
     """Return the ratio of the prediction of features.
 
     Args:
-        gain: Logarithm by which the particles predict the features better than chance [nats].
+        gain: Gain of the particles over chance in predicting the features [nats].
         count: Number of features.
-        least: Gain of a feature at which right and wrong are equally likely [nats].
+        least: Gain per feature at which right and wrong are equally likely [nats].
     """
     if math.isnan(gain):
         return gain

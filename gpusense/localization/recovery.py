@@ -1,4 +1,4 @@
-"""Recovery of a filter from a wrong pose: rivals of its particles, searched for where scans contradict them."""
+"""Recovery of a filter from a wrong pose by rivals of its particles, which are searched when scans contradict them."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from gpusense.localization.rival_search import can_search
 from gpusense.localization.tracker import Tracker
 from gpusense.localization.verdict import Verdict
 
-# Turns the filter's seed into the rival's seed.
+# Mask that turns the filter's seed into the rival's seed.
 _RIVAL = 0x9E3779B97F4A7C15
-# Probability that another place is right above which a rival is searched for; more than before the first scan.
+# Probability that another place is right above which a rival is searched; above the prior before the first scan.
 _DOUBT = 0.2
 
 
@@ -29,7 +29,7 @@ class Recovery:
 
     Attributes:
         rival: The rival of the particles, if there was one.
-        everywhere: How many places anywhere are still to be compared with the one that is found.
+        everywhere: Number of places anywhere that are still to be compared with the place found.
     """
 
     MEMORY: ClassVar[tuple[str, ...]] = ("rival", "everywhere")
@@ -51,12 +51,12 @@ class Recovery:
         return (self,) if self.rival is None else (self, *self.rival.changing())
 
     def keep(self) -> None:
-        """Record the buffers that the beginning call must not overwrite."""
+        """Record the buffers that the call now beginning must not overwrite."""
         if self.rival is not None:
             self.rival.keep()
 
     def restart(self) -> None:
-        """Forget the rival: the particles begin anew."""
+        """Forget the rival, since the particles begin anew."""
         self.everywhere = 0
         if self.rival is not None:
             self.rival.stop()
@@ -71,17 +71,17 @@ class Recovery:
             self.rival.predict(motion)
 
     def is_doubted(self) -> bool:
-        """Tell whether the last scans that were judged contradict the pose, or a rival competes with it."""
+        """Tell whether the last judged scans contradict the pose, or a rival competes with it."""
         verdict = self._verdict
         apart = self.active is not None or not self._tracker.together
         return apart or verdict.wrong > _DOUBT or verdict.explains_little
 
     def corrected(self, given: list[SensorReadings], readings: Mapping[int, tuple[Any, ...]]) -> None:
-        """Compare the particles with their rival, or search for one where scans contradict the pose.
+        """Compare the particles with their rival, or search for a rival if scans contradict the pose.
 
         Args:
-            given: Indices of sensors with the readings by which the particles were corrected.
-            readings: The same readings with all beams, which the next call cannot change.
+            given: Indices of sensors, with the readings that corrected the particles.
+            readings: Copies of the same readings with all beams.
         """
         if not self._searches:
             return
@@ -101,7 +101,7 @@ class Recovery:
             self._made().start(pose, covariance, list(readings.items()), step=tracker.step, prior=prior)
 
     def _compare(self, rival: Rival, given: list[SensorReadings]) -> None:
-        """Correct the rival, and let it replace the particles where it has won."""
+        """Correct the rival, and let it replace the particles if it has won."""
         tracker = self._tracker
         rival.correct(given, evidence_of(tracker.cloud.summary()))
         won = rival.judge(*tracker.mean_and_covariance(), given)
@@ -113,7 +113,7 @@ class Recovery:
             self.expect_anywhere()
 
     def _made(self) -> Rival:
-        """Return the rival, which is made at its first use: it has the sensors of the filter."""
+        """Return the rival, which is made at its first use with the sensors of the filter."""
         if self.rival is None:
             tracker = self._tracker
             options = tracker.options._replace(

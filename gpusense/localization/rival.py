@@ -1,18 +1,18 @@
-"""A rival of a filter's particles: a second cloud that is searched for where scans contradict the pose, and must win.
+"""A rival of a filter's particles: a second cloud that is searched when scans contradict the pose.
 
 Sensor resetting (Lenser and Veloso, "Sensor resetting localization for poorly modelled mobile robots" (2000)) and
 augmented MCL (*Probabilistic Robotics* table 8.3) mix new poses into the particles at once. A person in front of the
-scanner then costs a sound track, since a pose that was chosen for a scan explains that scan. Here the new poses form a
+scanner can then destroy a sound track, since a pose chosen for a scan explains that scan. Here the new poses form a
 separate cloud, which moves with the same odometry and is corrected by the same readings. With p(z_t | z_1 .. z_t-1) of
 each cloud, the mean likelihood of its predicted particles, the logarithm of the Bayes factor
 
     B = sum over later scans t of log p_rival(z_t | ...) - log p_filter(z_t | ...)
 
-counts for the rival (Kass and Raftery, "Bayes factors" (1995)); the scan by which the rival was chosen does not. The
-rival replaces the particles once B exceeds ``WIN``, after ``SCANS`` scans if it lies together, and after ``APART`` ones
-if several places are as likely, provided that the beams that meet walls speak for it. Until then the particles give the
-estimate, and the probability that the rival is right adds to the probability of being lost. A rival that ends at the
-pose of the particles, falls behind, or has not won after ``LONGEST`` scans is given up.
+is evidence for the rival (Kass and Raftery, "Bayes factors" (1995)); the scan by which the rival was chosen is not. The
+rival replaces the particles once B exceeds ``WIN``, after ``SCANS`` scans if it lies together, and after ``APART``
+scans if several places are equally likely, provided that the beams that meet walls support it. Until then the particles
+give the estimate, and the probability that the rival is right adds to the probability of being lost. A rival is given
+up if it ends at the pose of the particles, falls behind, or has not won after ``LONGEST`` scans.
 """
 
 from __future__ import annotations
@@ -35,22 +35,23 @@ from gpusense.localization.spread import FAR, FAR_TURN, deviations
 from gpusense.localization.tracker import Tracker
 from gpusense.localization.verdict import sightings
 
-# Log Bayes factors at which a rival wins, and at which a losing rival ends; scans that a converged rival needs to win,
-# and one with several places; scans after which an undecided rival is given up.
+# Log Bayes factors at which a rival wins, and at which a losing rival ends; scans to win for a converged rival, and for
+# a rival with several places; scans after which an undecided rival is given up.
 WIN, LOSE, SCANS, APART, LONGEST = 7.0, -7.0, 3, 8, 15
-# Scans after which a rival with several places is given up where the beams that meet walls contradict the best one.
+# Scans after which a rival with several places is given up if the beams that meet walls contradict the best place.
 SETTLES = 5
-# Rivals with which a pose is compared that was searched for on the whole map.
+# Number of rivals with which a pose from a search on the whole map is compared.
 COMPARISONS = 3
-# Prior odds of a rival of a tracked pose: its place was not known before.
+# Prior odds of a rival of a tracked pose, whose place was unknown before.
 PRIOR = -7.0
-# Particles of a rival; half widths around a pose that begins it [m, m, rad].
+# Particles of a rival; half widths around each of its initial poses [m, m, rad].
 PARTICLES, _SPREAD = 1000, (0.1, 0.1, 0.05)
-# A cloud lies together up to this deviation [m]. Two clouds are at one place up to these [m, rad].
+# Largest deviation of a cloud that lies together [m]. Largest distance and turn between two clouds at one place [m,
+# rad].
 _TOGETHER, _SAME, _SAME_TURN = 0.5, 0.5, 0.3
-# Mean ratio of wrong against right up to which the beams speak for a pose; share of the mean that a scan leaves.
+# Mean ratio of wrong against right up to which the beams support a pose; share of the old mean kept by a new scan.
 _RIGHT, _AGAINST, _KEPT = -1.0, 0.0, 0.6
-# Most that a scan counts [nats].
+# Largest contribution of a scan [nats].
 _MOST = 50.0
 
 
@@ -67,7 +68,7 @@ class Rival:
 
     Attributes:
         active: Whether there is a rival now.
-        log_odds: Its log odds against the particles.
+        log_odds: Log odds of the rival against the particles.
     """
 
     def __init__(self, tracker: Tracker) -> None:
@@ -80,7 +81,7 @@ class Rival:
         self._search = RivalSearch(tracker.sensors)
 
     def keep(self) -> None:
-        """Record the buffers that the beginning call must not overwrite."""
+        """Record the buffers that the call now beginning must not overwrite."""
         self._tracker.keep()
 
     def changing(self) -> tuple[Any, ...]:
@@ -115,8 +116,8 @@ class Rival:
             pose: (3,) estimated pose of the particles.
             covariance: (3, 3) their covariance.
             readings: Indices of sensors with the last readings.
-            step: Number of the last step of the filter: the same ones have the same rival.
-            prior: Prior log odds; at 0 places near the estimate are no rivals.
+            step: Number of the last step of the filter; equal steps give equal rivals.
+            prior: Prior log odds; with 0, places near the estimate are no rivals.
         """
         self._tracker.step = step
         key, options = self._tracker.key(), self._tracker.options
@@ -131,7 +132,7 @@ class Rival:
         self._tracker.pending = None
         self._tracker.place(starts.spread(tries[chosen], _SPREAD, options.most, key, each=True))
         self.active, self.log_odds, self._prior, self._scans, self._settled = True, prior, prior, 0, False
-        # Nothing of an earlier rival is part of the state.
+        # No trace of an earlier rival may remain in the state.
         self._ratios, self._place = np.zeros(3), np.zeros(3)
 
     def predict(self, motion: SampledMotion) -> None:
@@ -155,7 +156,7 @@ class Rival:
     def judge(
         self, pose: np.ndarray, covariance: np.ndarray, readings: list[SensorReadings]
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the rival's particles and their weights if it has won; give it up where it cannot.
+        """Return the rival's particles and weights if it has won; give it up if it cannot win.
 
         Args:
             pose: (3,) estimated pose of the particles.
@@ -166,13 +167,13 @@ class Rival:
         gain = self.log_odds - self._prior
         together = deviations(own)[0] < _TOGETHER
         if not together:
-            # The mean of several places is not one of them.
+            # The mean of several places is none of them.
             poses, weights = self._tracker.host_particles(), self._tracker.host_weights()
             self._place, own = poses[int(np.argmax(weights))], np.zeros((3, 3))
         self._compare(own, pose, covariance, dict(readings))
         if together and not self._settled:
             self._settled = True
-            # The particles were also spread once: two clouds that lie together begin as equals.
+            # The particles were also spread out once, so two clouds that lie together start with even odds.
             self.log_odds, gain = (0.0, 0.0) if self._prior == 0.0 else (self.log_odds, gain)
         if together and self.is_at(pose, _SAME, _SAME_TURN):
             self.stop()
@@ -186,30 +187,30 @@ class Rival:
     def _compare(
         self, own: np.ndarray, pose: np.ndarray, covariance: np.ndarray, readings: dict[int, tuple[Any, ...]]
     ) -> None:
-        """Add the ratios of both poses: among people, the likelihood alone prefers places with many walls."""
+        """Add the ratios of both poses, since among people the likelihood alone prefers places with many walls."""
         sensors = self._tracker.sensors
         pair = [ratio_of_scan(sightings(sensors, readings, *at)) for at in ((self._place, own), (pose, covariance))]
         if not any(map(math.isnan, pair)):
             self._ratios = _KEPT * self._ratios + np.array([*pair, 1.0])
 
     def _is_plausible(self, *, better: bool = False) -> bool:
-        """Tell whether the beams that meet walls speak for the rival, or more so than for the particles."""
+        """Tell whether the beams that meet walls support the rival, in itself or more than the particles."""
         mine, other, weight = self._ratios
         return bool(not weight or (mine / weight < _RIGHT and (mine < other or not better)))
 
     def _is_contradicted(self) -> bool:
-        """Tell whether the beams that meet walls speak against the rival."""
+        """Tell whether the beams that meet walls contradict the rival."""
         mine, _, weight = self._ratios
         return bool(weight and mine / weight > _AGAINST)
 
     def _is_late(self, gain: float) -> bool:
-        """Tell whether a rival has fallen behind or had enough scans; equals that lie together may both be right."""
+        """Tell whether a rival has fallen behind or had enough scans; equal clouds that lie together may both stay."""
         if self._scans >= (SCANS if self._settled else SETTLES) and self._is_contradicted():
             return True
         over = self._scans >= LONGEST
         if self._prior == 0.0 and self._settled:
             return gain < LOSE or (over and not self._is_plausible())
-        # A cloud that is still spread predicts a scan badly.
+        # A cloud that is still spread out predicts scans badly.
         return over or (gain < LOSE and self._prior < 0.0 and (self._settled or self._scans >= SCANS))
 
     def is_at(self, pose: np.ndarray, far: float = FAR, turn: float = FAR_TURN) -> bool:

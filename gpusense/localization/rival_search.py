@@ -1,10 +1,9 @@
-"""Poses at which a rival of a filter's particles begins: candidates for the last readings on the whole map.
+"""Find poses at which a rival of a filter's particles begins: candidates for the last readings on the whole map.
 
-A scan is searched for by branch and bound on the whole map (:func:`gpusense.matching.likely.likely_poses`), so no place
-is missed for lack of tries: once with all beams, and once with the longer half, since people shorten beams. Among
-people the likelihood prefers places with many walls, so candidates are weighed by the beams that meet walls as well
-(:mod:`gpusense.localization.ratio`). Landmarks are searched for by poses drawn at random, as are scans of maps whose
-search finds nothing.
+Scans are searched by branch and bound on the whole map (:func:`gpusense.matching.likely.likely_poses`), which misses no
+place: once with all beams, and once with the longer half, since people shorten beams. Among people the likelihood
+prefers places with many walls, so candidates are also weighed by the beams that meet walls
+(:mod:`gpusense.localization.ratio`). For landmarks, and where the search finds nothing, poses are drawn at random.
 """
 
 from __future__ import annotations
@@ -26,16 +25,15 @@ from gpusense.models.landmark.base import FeatureModel
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.world.parameters import LikelihoodFieldParameters
 
-# Candidates of each search on a map; effective number of candidates from which a rival begins; beams of a scan in a
-# search.
+# Candidates of each search on a map; effective number of candidates that begin a rival; beams of a scan in a search.
 _CANDIDATES, _EFFECTIVE, _BEAMS = 40, 5, 60
-# Covariance of a candidate: half the distances between poses of the search.
+# Covariance of a candidate, whose standard deviations are half the distances between poses of the search.
 _SPREAD_OF_POSE = np.diag([0.05**2, 0.05**2, 0.025**2])
-# Field parameters of a search, wider than the filter's, since a search tries poses farther apart.
+# Field parameters of a search, wider than the filter's, since its poses are farther apart.
 _FIELD = LikelihoodFieldParameters(z_hit=0.7, z_max=0.0, z_rand=0.3, sigma_hit=0.15)
-# Random poses, and the effective number of them that begin a rival.
+# Number of random poses, and their effective number that begins a rival.
 _TRIES, _CHOSEN = 20_000, 100
-# Deviation of random poses around the estimate, at least [m], and margin around landmarks [m].
+# Least deviation of random poses around the estimate [m], and margin around landmarks [m].
 _NEARBY, _MARGIN = 2.0, 1.0
 
 
@@ -59,14 +57,14 @@ class RivalSearch:
         key: starts.Key,
         temperature: float | str,
     ) -> tuple[np.ndarray, np.ndarray, int]:
-        """Return candidates (M, 3), their log-likelihoods (M,), and the effective number of them that begins a rival.
+        """Return candidates (M, 3), their log-likelihoods (M,), and the effective number that begins a rival.
 
         Args:
             pose: (3,) estimated pose of the particles.
             covariance: (3, 3) their covariance.
             readings: Indices of sensors with the last readings.
             key: Seed and step of random poses.
-            temperature: Of the filter.
+            temperature: Temperature of the filter.
         """
         tries, effective = self._on_map(readings), _EFFECTIVE
         on_map = len(tries) > 0
@@ -80,7 +78,7 @@ class RivalSearch:
         return tries, score - self._ratios(tries, readings) if on_map else score, effective
 
     def _ratios(self, poses: np.ndarray, readings: Sequence[SensorReadings]) -> np.ndarray:
-        """Return the log-likelihood ratios (M,) of "wrong" against "right" of poses; 0 where scans tell nothing."""
+        """Return the log-likelihood ratios (M,) of "wrong" against "right" for poses; 0 without evidence from scans."""
         known = dict(readings)
         ratios = [ratio_of_scan(sightings(self._sensors, known, pose, _SPREAD_OF_POSE)) for pose in poses]
         return np.nan_to_num(np.array(ratios))
@@ -97,7 +95,7 @@ class RivalSearch:
         return np.empty((0, 3))
 
     def _field_of(self, sensor: Sensor) -> LikelihoodFieldModel:
-        """Return the field of a sensor's map for searches; it is made once."""
+        """Return the field of a sensor's map for searches, which is made once."""
         grid, scanner = sensor.model.grid, sensor.model.scanner
         if self._field is None or self._field.grid is not grid or self._field.scanner is not scanner:
             beams = min(_BEAMS, scanner.count)
@@ -107,7 +105,7 @@ class RivalSearch:
         return self._field
 
     def _at_random(self, pose: np.ndarray, covariance: np.ndarray, key: starts.Key) -> np.ndarray:
-        """Return poses anywhere, and around the estimate with any heading."""
+        """Return poses anywhere, and poses around the estimate with any heading."""
         if self._pool is None:
             self._pool = _anywhere(self._sensors)
         anywhere = starts.spread(*self._pool, _TRIES // 2, key)
@@ -117,7 +115,7 @@ class RivalSearch:
 
 
 def drawn(score: np.ndarray, count: int, effective: int) -> np.ndarray | None:
-    """Return indices drawn by likelihoods, tempered so that some are effective; None if none is possible."""
+    """Draw indices by likelihoods, tempered to an effective number of them; None if no pose is possible."""
     possible = np.isfinite(score)
     if not possible.any():
         return None
@@ -138,12 +136,12 @@ def drawn(score: np.ndarray, count: int, effective: int) -> np.ndarray | None:
 
 
 def can_search(sensors: Sequence[Sensor]) -> bool:
-    """Tell whether a sensor has a map in which a rival can be searched for."""
+    """Tell whether a sensor has a map in which a rival can be searched."""
     return any(hasattr(one.model, "grid") or isinstance(one.model, FeatureModel) for one in sensors)
 
 
 def _anywhere(sensors: Sequence[Sensor]) -> tuple[np.ndarray, starts.Spread]:
-    """Return centres and half widths of all places where a robot may be: free cells, or the box of the landmarks."""
+    """Return centres and half widths of all places where a robot may be: free cells, or the landmarks' bounding box."""
     models = [sensor.model for sensor in sensors]
     if any(hasattr(model, "grid") for model in models):
         return starts.free_pool(models, None)

@@ -1,4 +1,4 @@
-"""Scores of a filter's particles by readings of its sensors, call by call or as part of one recorded program."""
+"""Score a filter's particles by readings of its sensors, call by call or within one recorded program."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gpusense.localization.filter_cloud import SensorReadings
 from gpusense.localization.particles import Stage
 from gpusense.localization.sensors import Sensor
 
-# Programs of scores that are kept.
+# Most recorded programs that are kept.
 _MOST_PROGRAMS = 8
 _MOST_VIEWS = 32
 _DOUBLE = np.dtype(np.float64)
@@ -27,13 +27,13 @@ def given_of(readings: Any, sensors: Sequence[Sensor]) -> list[SensorReadings]:
     """Return the readings that are not missing, in the order of the sensors.
 
     Args:
-        readings: The reading of the only sensor, or a mapping from models to theirs. A tuple that begins with an array
-            holds several arguments, any other is an array itself.
+        readings: The reading of the only sensor, or a mapping from models to readings. A tuple that begins with an
+            array holds several arguments; any other tuple is an array itself.
         sensors: The sensors.
 
     Raises:
-        KeyError: a model that is not among the sensors'.
-        TypeError: several sensors, and no mapping.
+        KeyError: a model that no sensor has.
+        TypeError: there are several sensors, and ``readings`` is no mapping.
     """
     if isinstance(readings, Mapping):
         index = {id(sensor.model): i for i, sensor in enumerate(sensors)}
@@ -49,7 +49,7 @@ def given_of(readings: Any, sensors: Sequence[Sensor]) -> list[SensorReadings]:
 
 
 def _is_several(value: Any) -> bool:
-    """Tell whether a reading is a tuple of arguments: its first one is an array, not a number."""
+    """Tell whether a reading is a tuple of arguments: its first item is an array, not a number."""
     return isinstance(value, tuple) and len(value) > 0 and np.ndim(value[0]) > 0
 
 
@@ -60,7 +60,7 @@ class FilterScoring:
         sensors: The sensors of the filter.
 
     Attributes:
-        timed: Whether to wait for the log-likelihoods of each stage, so that their time is known.
+        timed: Whether to wait for the log-likelihoods of each stage, to measure their time.
     """
 
     timed = False
@@ -72,12 +72,12 @@ class FilterScoring:
         self._views: dict[tuple[str, int, int], Any] = {}
 
     def records(self, given: Sequence[SensorReadings]) -> bool:
-        """Tell whether a stage with such readings is one recorded program: on a GPU that can score all of them."""
+        """Tell whether a stage with such readings is one recorded program: on a GPU that can score them all."""
         gpu = self._backend.info.kind == "gpu"
         return gpu and all(self._sensors[index].records(reading) for index, reading in given)
 
     def of(self, cloud: Cloud, given: Sequence[SensorReadings]) -> Callable[[Stage], None]:
-        """Return the function that runs a stage with the readings of sensors, given by their indices."""
+        """Return the function that runs a stage with readings, by the indices of their sensors."""
         if not self.records(given):
             return functools.partial(self._called, cloud, given)
         for index, reading in given:
@@ -127,7 +127,7 @@ class FilterScoring:
         return self._views.get(key) or self._view(key, cloud.log_p[place], (count,), cloud.precision)
 
     def _view(self, key: tuple[str, int, int], buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> Any:
-        """Return a view of a buffer and keep it: clouds of one size have few."""
+        """Return a view of a buffer, which is kept, since clouds of one size have few views."""
         if len(self._views) >= _MOST_VIEWS:
             self._views.clear()
         self._views[key] = self._backend.view(buffer, shape, dtype)

@@ -1,4 +1,4 @@
-"""A measurement model as a sensor of a filter: its device, its readings on the device, and its temperature."""
+"""A measurement model as a filter's sensor: its device, its readings on the device, and its temperature."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gpusense.models.scan.model import ScanModel
 from gpusense.world.grid import OccupancyGrid
 
 _DOUBLE = np.dtype(np.float64)
-# Calls that are started before one waits.
+# Calls that may be started before the host waits.
 _MOST_STARTED = 64
 _MOST_SENSORS = DEPTH - TEMPERATURE
 
@@ -36,17 +36,17 @@ class Sensor:
 
     Attributes:
         model: The model.
-        backend: Its device.
+        backend: Device of the model.
         precision: Precision of its log-likelihoods.
         beams: Beams that a scan uses; 0 for other models.
         seconds: Time of all calls of ``score``.
         calibrates: Whether temperature="auto" learns from it.
-        ambiguous: Whether its likelihood may have several peaks among particles that lie together, as of landmarks
+        ambiguous: Whether its likelihood may have several peaks among particles that lie together, as for landmarks
             that may be exchanged.
 
     Raises:
         TypeError: another object.
-        ValueError: a model with a temperature other than 1.
+        ValueError: the model has a temperature other than 1.
     """
 
     MEMORY, PARTS = ("_correlation", "_seen", "_learned"), ()
@@ -67,7 +67,7 @@ class Sensor:
         self.seconds, self._started = 0.0, 0
 
     def temperature(self, chosen: float | str) -> float:
-        """Return the temperature of the log-likelihood now, given that of scans or "auto"."""
+        """Return the present temperature of the log-likelihood, from the chosen one of scans or "auto"."""
         if not self.calibrates:
             return 1.0
         return self._correlation.temperature(self.beams) if isinstance(chosen, str) else chosen
@@ -89,7 +89,7 @@ class Sensor:
         """Learn the correlation of beams from the last counted scan, at the estimated pose."""
         axes, scanner = axes_of(covariance), self.model.scanner
         parts = self.parts(poses_around(pose, axes), reading)
-        # Another object, as it is part of the state.
+        # A new object, since it is part of the state.
         correlation = copy.copy(self._correlation)
         correlation.add(parts, axes, scanner.bearings + pose[2], follows=self._learned == self._seen - 1)
         self._correlation, self._learned = correlation, self._seen
@@ -118,7 +118,7 @@ class Sensor:
             reading: The reading.
             out: (N,) array on the device.
             before: Called before poses are read, to start the launches that write them.
-            timed: Wait for them, and add their time to ``seconds``.
+            timed: Whether to wait for the log-likelihoods, and add their time to ``seconds``.
         """
         begin = time.perf_counter()
         if self.calibrates:
@@ -128,7 +128,7 @@ class Sensor:
                 )
             self.model.start_scoring(poses, *reading, out=out, before=before)
             self._started += 1
-            # Arrays that it reads stay alive until then.
+            # Arrays that the device reads must stay alive until then.
             if timed or self._started >= _MOST_STARTED:
                 self.model.finish_scoring()
                 self._started = 0
@@ -141,7 +141,7 @@ class Sensor:
     # ---- recorded steps
 
     def records(self, reading: tuple[Any, ...]) -> bool:
-        """Tell whether the device alone can score such a reading: a scan on the host, or one on the device."""
+        """Tell whether the device can score such a reading by itself: a scan on the host or on the device."""
         return self.calibrates and len(reading) == 1 and not self.model.compat
 
     @property
@@ -181,8 +181,8 @@ def sensors_of(models: Any) -> list[Sensor]:
 
     Raises:
         TypeError: another object.
-        ValueError: none, too many, one twice, with a temperature, of several devices or precisions, or of a device
-            without float64.
+        ValueError: there are none, too many, or one twice, or they have a temperature, several devices or precisions,
+            or a device without float64.
     """
     chosen = list(models) if isinstance(models, Sequence) else [models]
     if not 0 < len(chosen) <= _MOST_SENSORS:

@@ -1,10 +1,10 @@
-"""Skipping of beams that most particles cannot explain: people, and furniture that has been moved.
+"""Skip beams that most particles cannot explain, as on people and moved furniture.
 
-nav2_amcl has the idea as ``do_beamskip``. There a particle explains a beam whose end is within 0.5 m of a wall. Here it
-explains one as in the verdict (:mod:`gpusense.localization.verdict`), so any model of scans can skip. Two faults of
-nav2's are absent: beams that do not exist are not counted as skipped, and where too many would be, the scan is used as
-a whole with the log-likelihoods of all its beams. Scans are also used as a whole while the particles are spread out:
-then few particles, the right ones, explain most beams.
+The idea is nav2_amcl's ``do_beamskip``. There a particle explains a beam whose end is within 0.5 m of a wall. Here it
+explains a beam that it makes likelier than poses anywhere do, so any model of scans can skip. Two faults of nav2_amcl
+are absent: nonexistent beams do not count as skipped, and if too many would be skipped, the scan is used completely
+with the log-likelihoods of all its beams. Scans are also used completely while the particles are spread out, since then
+only the few right particles explain most beams.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from gpusense.localization.filter_cloud import SensorReadings
 from gpusense.localization.pose_algebra import mean_pose
 from gpusense.localization.sensors import Sensor
 
-# Particles that are asked; largest deviation of particles that lie together [m]; largest share of skipped beams.
+# Number of evaluated particles; largest deviation of particles that lie together [m]; largest share of skipped beams.
 _ASKED, TOGETHER, _MOST_SKIPPED = 100, 0.5, 0.7
 
 
@@ -64,7 +64,7 @@ def without_skipped(
     elsewhere: np.ndarray,
     share: float,
 ) -> tuple[Any, ...]:
-    """Return a scan without the beams that too few particles explain: their readings are missing.
+    """Return a scan in which the beams that too few particles explain are missing readings.
 
     Args:
         sensor: A sensor of scans.
@@ -95,7 +95,7 @@ def boundary(elsewhere: np.ndarray) -> float | None:
         elsewhere: (M, K) log-likelihoods of used beams at poses anywhere in the free space.
 
     Returns:
-        None where all beams are equally likely everywhere, or none is possible.
+        The boundary; None if all beams are equally likely everywhere, or none is possible.
     """
     values = elsewhere[np.isfinite(elsewhere)]
     if not values.size:

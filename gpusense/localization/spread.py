@@ -11,11 +11,11 @@ from gpusense.localization.pose_algebra import wrap_angle
 
 Floats = NDArray[np.float64]
 
-# A pose is off beyond these [m, rad]: the definition of p_lost.
+# Errors beyond which a pose is far off, by the definition of p_lost [m, rad].
 FAR, FAR_TURN = 1.0, 0.5
-# Particles beyond these deviations do not lie together [m, rad].
+# Largest deviations of particles that lie together [m, rad].
 WIDE, WIDE_TURN = 0.5, 0.25
-# Deviations below which nothing is far off [m, rad], and up to which a normal density is taken in place of particles.
+# Deviations below which no error is far off [m, rad], and up to which a normal density replaces the particles.
 _NARROW, _NARROW_TURN = 0.2, 0.1
 # Nodes and weights of a Gauss-Legendre quadrature on [-1, 1].
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)
@@ -23,7 +23,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)
 
 def deviations(covariance: Floats) -> tuple[float, float]:
     """Return the largest standard deviation of the position over directions [m], and that of the heading [rad]."""
-    # Numbers of Python: arrays of nine take several times as long.
+    # Python's floats, since arrays of nine items take several times as long.
     (xx, xy, xt), (yx, yy, yt), (tx, ty, tt) = covariance.tolist()
     if not all(map(math.isfinite, (xx, xy, xt, yx, yy, yt, tx, ty, tt))):
         return math.inf, math.inf
@@ -32,13 +32,13 @@ def deviations(covariance: Floats) -> tuple[float, float]:
 
 
 def is_wide(covariance: Floats) -> bool:
-    """Return whether the position deviates by more than half a metre, or the heading by more than 0.25 rad."""
+    """Return whether the deviation of the position exceeds half a metre, or that of the heading 0.25 rad."""
     position, heading = deviations(covariance)
     return position > WIDE or heading > WIDE_TURN
 
 
 def is_apart(covariance: Floats) -> bool:
-    """Tell whether deviations are above 1 m or 0.5 rad, so that no place is more than one of several."""
+    """Tell whether deviations exceed 1 m or 0.5 rad, so that the distribution may cover several places."""
     position, heading = deviations(covariance)
     return position > FAR or heading > FAR_TURN
 
@@ -52,7 +52,7 @@ def is_narrow(covariance: Floats) -> bool:
 def share_off(covariance: Floats) -> float:
     """Return the probability that a normal error is beyond 1 m or 0.5 rad.
 
-    Position and heading count as independent: the probability of either is then right to second order in each.
+    Position and heading are treated as independent: the probability of either is then right to second order in each.
 
     Args:
         covariance: (3, 3) covariance of x, y [m] and heading [rad]; infinite entries are certainly off.

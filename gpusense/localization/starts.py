@@ -1,6 +1,6 @@
-"""Particles of starts and resets, drawn on the host by the reference of the kernels' generator.
+"""Draw particles of starts and resets on the host, by the reference of the kernels' generator.
 
-So they are equal on every backend. Sensor resetting: Lenser and Veloso, *Sensor resetting localization for poorly
+So they are equal on all backends. Sensor resetting: Lenser and Veloso, *Sensor resetting localization for poorly
 modelled mobile robots* (2000).
 """
 
@@ -20,11 +20,11 @@ from gpusense.world.plausible import look_at_heading, look_at_start
 
 Key = tuple[int, int, int]
 Spread = tuple[float, float, float]
-# Poses of a pool: free cells of larger maps are thinned evenly.
+# Most poses of a pool; free cells of larger maps are thinned evenly.
 _MOST_POOL = 1 << 18
 # Stream of random numbers that no kernel uses.
 _STREAM = 64
-# Poses that a reset tries: for each new particle, and the fewest; new particles for each pose that is chosen of them.
+# Poses that a reset tries per new particle, and at least; new particles per chosen pose.
 _TRIES, _LEAST_TRIES, _SHARE = 10, 20_000, 10
 # Half widths of the box around a chosen pose [m, m, rad].
 _SPREAD = (0.1, 0.1, 0.05)
@@ -68,7 +68,7 @@ def spread(pool: np.ndarray, half: Spread, count: int, key: Key, *, each: bool =
         half: Half widths of the box [m, m, rad].
         count: Poses to draw.
         key: Seed and step.
-        each: Take the centres in their order, again and again, instead of drawing them.
+        each: Whether to take the centres cyclically in their order instead of drawing them.
     """
     first, more = _words(count, key, 1), _words(count, key, 2)
     row = np.arange(count) % len(pool)
@@ -107,7 +107,7 @@ def free_pool(models: Sequence[Any], bounds: Any) -> tuple[np.ndarray, Spread]:
 
 
 def rows_by_weight(weights: np.ndarray, count: int, start: float = 0.5) -> np.ndarray:
-    """Return indices drawn systematically by weights of any positive sum; ``start`` is that of the first mark."""
+    """Draw indices systematically by weights of any positive sum; ``start`` is the place of the first mark."""
     ends = np.cumsum(weights)
     rows = np.searchsorted(ends, (np.arange(count) + start) / count * ends[-1], side="right")
     return np.minimum(rows, len(weights) - 1)
@@ -117,7 +117,7 @@ def likely_pool(likelihood: Any, count: int, key: Key) -> tuple[np.ndarray, Spre
     """Return poses drawn by their likelihood, and half widths of a cell of the likelihood's grid.
 
     Raises:
-        TypeError, ValueError: it has no such arrays, or no finite log-likelihood.
+        TypeError, ValueError: ``likelihood`` has no such arrays, or no finite log-likelihood.
     """
     if not hasattr(likelihood, "log_p") or not (hasattr(likelihood, "poses") or hasattr(likelihood, "positions")):
         raise TypeError(f"likelihood: must be one of pose_likelihood, got {checks.show(likelihood)}")
@@ -140,7 +140,7 @@ def likely_pool(likelihood: Any, count: int, key: Key) -> tuple[np.ndarray, Spre
 
 
 def look_at(pose: np.ndarray, grid: OccupancyGrid | None) -> None:
-    """Warn of a start that cannot be meant.
+    """Warn of an implausible start.
 
     Args:
         pose: (3,) pose.
@@ -154,12 +154,12 @@ def look_at(pose: np.ndarray, grid: OccupancyGrid | None) -> None:
 
 
 def _replaced(particles: int) -> int:
-    """Return how many particles get new poses."""
+    """Return the number of particles that get new poses."""
     return max(particles // 2, 1)
 
 
 def tries_of(particles: int) -> int:
-    """Return how many poses a reset of particles tries."""
+    """Return the number of poses that a reset of particles tries."""
     return max(_LEAST_TRIES, _TRIES * _replaced(particles))
 
 
@@ -171,7 +171,7 @@ def with_likely_poses(
     temperature: float | str,
     key: Key,
 ) -> np.ndarray:
-    """Replace half of the particles by draws around the likeliest of other poses, and return all.
+    """Replace half of the particles by draws around the likeliest of ``tries``, and return all particles.
 
     Args:
         poses: (N, 3) particles.

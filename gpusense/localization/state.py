@@ -1,4 +1,4 @@
-"""State of a particle filter as plain data: to copy it, to store it, and to go on with it elsewhere."""
+"""State of a particle filter as plain data, to copy, store, or continue on another device."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gpusense.localization.verdict import Verdict
 
 @dataclass(frozen=True, eq=False)
 class FilterState:
-    """State of a :class:`ParticleFilter`: particles, weights, step, options, and all that it has learned.
+    """State of a :class:`ParticleFilter`: particles, weights, step, options, and everything learned.
 
     It holds no device and no models, and can be pickled. A filter with the same models and options takes it over by
     ``restore`` and continues with the same bits as the original.
@@ -32,7 +32,7 @@ class FilterState:
         options: Keyword arguments of the filter's constructor.
         models: Names of the classes of its models.
         contents: Particles on the host.
-        memory: The rest: learned temperature, recent verdicts, the number of the step.
+        memory: Everything else: learned temperature, recent verdicts, the number of the step.
 
     Example:
         >>> import gpusense as gs, pickle
@@ -54,7 +54,7 @@ class FilterState:
 
     @property
     def particles(self) -> np.ndarray:
-        """(N, 3) poses after the last step; a predicted motion that has not run yet is in ``memory``."""
+        """(N, 3) poses after the last step; a predicted motion that is still pending is in ``memory``."""
         return self.contents.poses
 
     @property
@@ -64,7 +64,7 @@ class FilterState:
 
     @property
     def step(self) -> int:
-        """Number of the last step, which random numbers depend on."""
+        """Number of the last step, on which random numbers depend."""
         return int(self.memory["tracker"]["step"])
 
 
@@ -83,7 +83,7 @@ def model_names(sensors: Sequence[Sensor]) -> tuple[str, ...]:
 def memory_of(
     tracker: Tracker, verdict: Verdict, recovery: Recovery, readings: Mapping[int, tuple[Any, ...]]
 ) -> dict[str, Any]:
-    """Return the filter's state other than particles, as plain data with arrays in host memory."""
+    """Return the filter's state without particles, as plain data with arrays in host memory."""
     return {
         "tracker": plain_state(tracker), "verdict": plain_state(verdict), "recovery": recovery.state(),
         "sensors": [plain_state(sensor) for sensor in tracker.sensors],
@@ -120,8 +120,8 @@ def check_state(state: object, options: dict[str, Any], models: tuple[str, ...])
     """Check that a state is of a filter with these options and models; the motion model may differ.
 
     Raises:
-        TypeError: it is none.
-        ValueError: it is of a filter with another option, or with other models.
+        TypeError: ``state`` is no FilterState.
+        ValueError: it belongs to a filter with another option or other models.
     """
     if not isinstance(state, FilterState):
         raise TypeError(f"state: must be a FilterState, got {checks.show(state)}")

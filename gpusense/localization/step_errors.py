@@ -16,8 +16,8 @@ from gpusense.localization.pose_algebra import pose_difference, wrap_angle
 
 # Variances of the model: alpha1 to alpha4, sideways, and the squares of the least deviations.
 NOISES = ("alpha1", "alpha2", "alpha3", "alpha4", "sideways", "least translation", "least turn")
-# A step that ends this near [m, rad] is at rest: its motion may be jitter, so it tells of the least deviations alone.
-# By the defaults, a motion of this length has a tenth of their variances.
+# A step that ends this near its start [m, rad] is at rest: its motion may be jitter, so it informs only the least
+# deviations. By the defaults, the noise of a motion of this length has a tenth of their variances.
 REST = (0.02, 0.01)
 
 
@@ -98,7 +98,7 @@ def _of_steps(turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     first, trans, second = np.where(moving[:, None], turns, 0.0).T
     squares = first**2 + second**2
     basis = np.zeros((len(NOISES), len(turns), 3, 3))
-    # A first turn moves the end to the side; the second one turns the heading alone.
+    # A first turn moves the end to the side; the second turn changes only the heading.
     for noise, (one, two) in {0: (first**2, second**2), 1: (trans**2, trans**2), 6: (1.0, 1.0)}.items():
         length = turns[:, 1] if noise == 6 else trans
         basis[noise, :, 1, 1] = one * length**2

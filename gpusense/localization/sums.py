@@ -35,7 +35,7 @@ def weight_block(backend: Backend, count: int) -> int:
 
 
 def reduction_fans(blocks: int) -> tuple[int, ...]:
-    """Return the rows that are added up in turn: blocks of a group, then groups; or all blocks of a small cloud."""
+    """Return the numbers of rows that are added up in turn: blocks of a group, then groups; or all of a small cloud."""
     if blocks <= MOST_BLOCKS:
         return (blocks,)
     fan = math.isqrt(blocks - 1) + 1
@@ -71,7 +71,7 @@ class Sums:
         return (launch(kernel, with_lanes_flag(self._backend.info.lanes, kernel, _PLAIN), (size,), **arguments),)
 
     def highest(self, blocks: int) -> tuple[Program, Buffer, int]:
-        """Return the launches that find the largest score of each group, their buffer of results, and its length."""
+        """Return the launches that find the largest score of each group, the buffer of results, and its length."""
         fan, *groups_of = reduction_fans(blocks)
         if not groups_of:
             return (), self.largest, blocks
@@ -95,12 +95,12 @@ class Sums:
         return weigh + self._weight_totals(blocks)
 
     def set_weights(self, numbers: dict[str, Any], place: tuple[int, int], out: tuple[Buffer, Buffer]) -> Program:
-        """Return the launch that sets weights, after that which weighs.
+        """Return the launch that sets weights after weighing.
 
         Args:
             numbers: Arguments by name, as for the weighing.
             place: The stage, and the most stages.
-            out: Receive the weights and their cumulative sums.
+            out: Buffers that receive the weights and their cumulative sums.
         """
         (stage, stages), (weight, ends), blocks = place, out, numbers["blocks"]
         return self.launch("set_weights", blocks + 1, highest=self._highest, sums=self.rows, joined=self._joined,
@@ -108,7 +108,7 @@ class Sums:
                            ends=ends, **numbers)  # fmt: skip
 
     def copies(self, numbers: dict[str, Any], copies: Buffer, drawn: int, stage: int) -> Program:
-        """Return the launches that add up the certain copies of residual resampling; the sums of weights are lost.
+        """Return the launches that add up certain copies of residual resampling, and overwrite the sums of weights.
 
         Args:
             numbers: Arguments by name: ends, state, particles, block, blocks.
@@ -125,9 +125,9 @@ class Sums:
         )  # fmt: skip
 
     def estimate(self, poses: Buffer, weight: Buffer, estimate: Buffer, count: int, second_pass: int = 0) -> Program:
-        """Return the launches that write the estimate of a cloud, or those of its second pass."""
+        """Return the launches that write the estimate of a cloud, or of its second pass."""
         info, block = self._backend.info, block_of(count)
-        # A work-item of a kernel in vectors takes all lanes.
+        # A work-item of a kernel with lanes processes all lanes.
         lanes = ESTIMATE_LANES if info.kind == "cpu" or info.lanes > 1 else 1
         blocks, each = -(-count // block), ESTIMATE_LANES // lanes
         program = self.launch("sum_poses", blocks * each, poses=poses, weight=weight, estimate=estimate,

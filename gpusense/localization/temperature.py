@@ -1,6 +1,6 @@
-"""Temperature of a scan's log-likelihood: the weight at which its curvature is the variance of its score.
+"""Temperature of a scan's log-likelihood: the weight at which its curvature equals the variance of its score.
 
-The product over beams of a scan counts each as independent. They are not: one error of the map, or one person, changes
+The product over a scan's beams treats them as independent. They are not: one error of the map, or one person, changes
 many neighbours. Let s_k be the score of beam k, the gradient of its log-likelihood with respect to the pose, H the sum
 of the negative second derivatives, and J the variance of the sum of the s_k. A likelihood has J = H (Bartlett's second
 identity). One with a temperature T has T^2 J = T H on average, so T = tr(P H) / tr(P J) (Pauli, Racugno and Ventura,
@@ -11,21 +11,20 @@ J is measured. B, the sum of s_k s_k', is the variance for independent beams. Bl
 sums B_b have the variance B_b under independence. A fit to the scan takes B_b B^-1 of the sum of all scores away from
 each, and leaves B_b - B_b B^-1 B_b. The ratio of the measured variance to this one, F_n for n blocks, is 1 for
 independent beams at any n, and the inflation of the variance for beams whose correlation is shorter than a block. Four
-blocks are the longest that leave a degree of freedom.
+blocks are the longest blocks that leave a degree of freedom.
 
 Errors of maps are correlated over any length, so the variance still grows from blocks to the whole scan. Let it grow by
-x each time that blocks are four times as long (method of aggregated variance: Beran, *Statistics for Long-Memory
-Processes* (1994), section 4.4). The fit removes the part that all blocks share, so that of the inflations V, x V and
-x^2 V of sixteenths, quarters and the whole
+a factor x each time that blocks become four times as long (method of aggregated variance: Beran, *Statistics for
+Long-Memory Processes* (1994), section 4.4). The fit removes the part that all blocks share. So the inflations V, x V
+and x^2 V of sixteenths, quarters and the whole are observed as F_16 = (V - x^2 V / 16) / (1 - 1 / 16) and F_4 = (x V -
+x^2 V / 4) / (1 - 1 / 4).
 
-    F_16 = (V - x^2 V / 16) / (1 - 1 / 16) and F_4 = (x V - x^2 V / 4) / (1 - 1 / 4) are seen.
-
-With R = F_4 / F_16, x is 4 R / (5 - R), and the inflation of the whole x^2 V = F_4 3 R / (5 - 2 R): F_4 for R = 1. R
-counts up to 5/3, where sums over n beams have the variance n^1.5; beyond, the fit hides most of the errors.
+With R = F_4 / F_16, x is 4 R / (5 - R), and the inflation of the whole x^2 V = F_4 3 R / (5 - 2 R): F_4 for R = 1. R is
+limited to 5/3, where sums over n beams have the variance n^1.5; beyond that, the fit hides most of the errors.
 
 Errors that repeat from scan to scan add up in a filter. With a correlation r of the blocks' scores at the same
-direction in consecutive scans, and a filter that keeps the share f of what it knew, errors have the variance
-(1 + r f) / (1 - r f) of independent ones. Its inverse is the second factor of the temperature.
+direction in consecutive scans, and a filter that keeps the share f of its information, errors have the variance (1 + r
+f) / (1 - r f) of independent ones. Its inverse is the second factor of the temperature.
 """
 
 from __future__ import annotations
@@ -38,20 +37,20 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray
 from gpusense.models.scan.model import ScanModel
 
-# Independent beams of a scan before there is data.
+# Independent beams of a scan before any data.
 INDEPENDENT_AT_FIRST = 10.0
 # Fewest independent beams of a scan, largest correlation of consecutive scans, and largest growth R.
 INDEPENDENT_AT_LEAST, _LARGEST_REPEAT, _LARGEST_GROWTH = 1.0, 0.9, 5 / 3
-# Scans whose weight has fallen to 1 / e; least scans from which to judge; least beams of a scan.
+# Number of scans over which weights fall to 1 / e; least scans for an estimate; least beams of a scan.
 _MEMORY, _LEAST_SCANS, _FEWEST = 40, 5, 8
-# Blocks of a scan: long, short, and compared from scan to scan.
+# Blocks of a scan: long ones, short ones, and those compared from scan to scan.
 _LONG, _SHORT, _SECTORS = 4, 16, 8
-# Least and largest steps [m], and radians that count as a metre.
+# Least and largest steps [m], and radians that correspond to a metre.
 _STEPS, _TURN = (1e-4, 0.1), 0.25
 # Deviations from the pose to the points of a cubature of degree 3 in 3 dimensions (Arasaratnam and Haykin, "Cubature
 # Kalman filters" (2009)): differences are means of derivatives over the normal density of the pose.
 _FAR = 3**0.5
-# Steps at first where no covariance is known, ahead, to the side [m] and in heading [rad].
+# Initial steps without a known covariance: ahead, to the side [m] and in heading [rad].
 _FIRST_STEPS = (0.05, 0.05, 0.0125)
 
 
@@ -68,7 +67,7 @@ def axes_of(covariance: np.ndarray) -> np.ndarray:
 
 
 def poses_around(pose: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Return the (7, 3) poses at which scores are measured: the pose, and a step forth and back along each axis."""
+    """Return the (7, 3) poses at which scores are measured: the pose, and a step forward and back along each axis."""
     return np.vstack([pose, pose + _FAR * axes.T, pose - _FAR * axes.T])
 
 
@@ -109,9 +108,9 @@ class BeamCorrelation:
     def __init__(self) -> None:
         self.scans, self.beams = 0, 0.0
         # Curvature; variance for independent beams; variance of long blocks, measured and for independent beams; the
-        # same two of short blocks.
+        # same for short blocks.
         self._sums = np.zeros(6)
-        # Products and squares of consecutive scans; share of a pose's information that a scan brings.
+        # Products and squares of consecutive scans; share of a pose's information that a scan contributes.
         self._products, self._pairs, self._gain = np.zeros(2), 0, 0.0
         self._previous: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -120,10 +119,10 @@ class BeamCorrelation:
 
         Args:
             parts: (7, K) log-likelihoods of beams at :func:`poses_around` the estimated pose, in the order of their
-                bearings; beams without one, which are 0 or not finite, are left out.
+                bearings; beams with 0 or a non-finite value are left out.
             axes: (3, 3) steps between the poses; their squares are the covariance of the pose.
             directions: (K,) directions of beams in the world [rad]: needed to compare consecutive scans.
-            follows: Whether the scan is the next one after the last one added.
+            follows: Whether the scan directly follows the last one added.
 
         Raises:
             TypeError, ValueError: arrays of other shapes.
@@ -151,8 +150,8 @@ class BeamCorrelation:
     def _follow(
         self, scores: _Scores, axes: np.ndarray, directions: np.ndarray, used: np.ndarray, follows: bool
     ) -> None:
-        """Compare a scan's blocks with the last scan's blocks in the same directions."""
-        # Sectors of the world, an eighth of a scan wide, and a whole number of them around.
+        """Correlate a scan's blocks with the last scan's blocks in the same directions."""
+        # Sectors of the world, an eighth of a scan wide, in a whole number per turn.
         ahead = np.sort(np.mod(directions, 2 * np.pi))
         gap = float(np.diff(ahead, append=ahead[0] + 2 * np.pi).max())
         around = max(round(_SECTORS * 2 * np.pi / max(2 * np.pi - gap, 0.1)), 1)
@@ -218,10 +217,10 @@ def _variances(scores: _Scores, count: int) -> tuple[float, float]:
 
 
 def learn_from_scan(correlation: BeamCorrelation, model: Any, ranges: AnyArray, pose: AnyArray) -> None:
-    """Add a scan at a pose whose covariance is unknown: of one scan with the temperature so far.
+    """Add a scan at a pose of unknown covariance, which is taken from this scan and the present temperature.
 
     Args:
-        correlation: The variance of the scores of other scans.
+        correlation: The running variance of the scores of scans.
         model: A model of scans.
         ranges: (K,) ranges [m].
         pose: (3,) pose of the robot [m, m, rad].
@@ -243,10 +242,10 @@ def _parts(model: Any, poses: np.ndarray, ranges: AnyArray) -> np.ndarray:
 
 
 def calibrate_temperature(model: Any, scans: AnyArray, poses: AnyArray) -> float:
-    """Return the temperature that a log calls for, where each scan is judged by itself.
+    """Return the temperature that a log's scans have, each judged by itself.
 
-    A filter with ``temperature="auto"`` measures this from its scans, and lowers it further where errors repeat from
-    scan to scan.
+    A filter with ``temperature="auto"`` measures it from its scans, and lowers it further if errors repeat from scan to
+    scan.
 
     Args:
         model: A :class:`BeamModel` or :class:`LikelihoodFieldModel`.
@@ -254,8 +253,8 @@ def calibrate_temperature(model: Any, scans: AnyArray, poses: AnyArray) -> float
         poses: (S, 3) poses of the robot at the scans, from a tracker or a reference [m, m, rad].
 
     Raises:
-        TypeError: not a model of scans, or not arrays.
-        ValueError: fewer than five scans have eight beams with a log-likelihood, or another number of poses.
+        TypeError: ``model`` is no model of scans, or an argument is no array.
+        ValueError: fewer than five scans have eight beams with a log-likelihood, or the number of poses differs.
 
     Example:
         >>> import gpusense as gs, numpy as np

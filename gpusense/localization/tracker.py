@@ -1,4 +1,4 @@
-"""Particles that follow the robot: their motion, their weighing, and the numbers of each step.
+"""Particles that follow the robot: their motion, their weighing, and the settings of each step.
 
 A filter has one tracker for its particles and another for the rival.
 """
@@ -38,11 +38,11 @@ class Tracker:
     Attributes:
         started: Whether there are particles.
         step: Number of the last step.
-        pending: The motion that the next step begins with.
-        shown: Number of shown particles, those of the last step.
-        wide: Corrections left at a low temperature.
+        pending: The motion with which the next step begins.
+        shown: Number of shown particles, which are those of the last step.
+        wide: Number of remaining corrections at a low temperature.
         together: Whether the particles lie together, as far as is known.
-        pool: Poses that recovery injects: their number, and half widths of the box around each.
+        pool: Number of poses that recovery injects, and half widths of the box around each.
         distinct: Share of distinct particles before the last correction.
         corrections: Corrections so far.
     """
@@ -61,7 +61,7 @@ class Tracker:
         self.pool: tuple[int, starts.Spread] = 0, (0.0, 0.0, 0.0)
 
     def keep(self) -> None:
-        """Record the buffers that the beginning call must not overwrite."""
+        """Record the buffers that the call now beginning must not overwrite."""
         self.cloud.kept = self.cloud.places
 
     # ---- particles
@@ -72,7 +72,7 @@ class Tracker:
         return *self.options.words, self.step
 
     def number(self, particles: int | None) -> int:
-        """Return a checked number of particles; the most for None."""
+        """Return a checked number of particles; None gives the most."""
         most = self.options.most
         return most if particles is None else checks.integer("particles", particles, low=1, high=most)
 
@@ -98,7 +98,7 @@ class Tracker:
         return self.cloud.host_poses(self.cloud.places.shown, self.shown)
 
     def moved_particles(self) -> tuple[np.ndarray, np.ndarray]:
-        """Move the particles that have not followed the last motion; return copies of their poses and weights."""
+        """Run a pending motion; return copies of the particles' poses and weights."""
         if self.pending is not None:
             self.move(None)
         return self.host_particles(), self.host_weights()
@@ -131,14 +131,14 @@ class Tracker:
     # ---- steps
 
     def follow(self, motion: SampledMotion) -> None:
-        """Move the particles when the next correction begins: one program has both."""
+        """Postpone a motion to the next correction, so that one program does both."""
         if self.pending is None:
             self.pending = motion
         else:
             self.move(motion)
 
     def move(self, following: SampledMotion | None) -> None:
-        """Run the pending motion; ``following`` becomes pending."""
+        """Run the pending motion; ``following`` becomes the pending one."""
         motion = STILL if self.pending is None else self.pending
         self.cloud.move(self.settings(motion, []), motion.kind)
         self.shown, self.pending = self.cloud.count, following
@@ -159,13 +159,13 @@ class Tracker:
         self.wide = max(self.wide - 1, 0)
 
     def _distinct_share(self) -> float:
-        """Return the share of distinct particles before a correction without motion, where copies are alike."""
+        """Return the share of distinct particles before a correction without motion, where copies are equal."""
         last = self.cloud.summary()
         before = self.distinct if last.stages == 1 else 1.0
         return before * min(last.effective_sample_size / self.shown, 1.0) if last.resampled else before
 
     def learn(self, given: list[SensorReadings], is_doubted: Callable[[], bool]) -> None:
-        """Find out whether the particles lie together, and learn from scans at a pose that none contradicts.
+        """Determine whether the particles lie together, and learn from scans at a pose that nothing contradicts.
 
         Args:
             given: Indices of sensors with the readings of the last correction.
@@ -182,7 +182,7 @@ class Tracker:
                 sensor.correlate(pose, covariance, reading)
 
     def settings(self, motion: SampledMotion, given: list[int]) -> np.ndarray:
-        """Return the numbers of a new step with readings of sensors, by their indices."""
+        """Return the settings of a new step with readings of sensors, by their indices."""
         temperature, sensors = self.options.temperature, []
         wide = DEFAULTS.wide_share if self.wide and temperature == "auto" else 1.0
         for sensor in (self.sensors[index] for index in given):
@@ -192,7 +192,7 @@ class Tracker:
         return settings_of_step(self.options, motion, step, count, self.pool, sensors, one_peak)
 
     def _wanted(self) -> int:
-        """Return the particles of the next step by KLD sampling."""
+        """Return the number of particles of the next step by KLD sampling."""
         return kld_count(self.next_particles(), self.options.least, self.options.most)
 
 
@@ -208,7 +208,7 @@ def _due_of(sensors: Sequence[Sensor], given: Sequence[SensorReadings]) -> list[
 
 
 def is_together(covariance: np.ndarray) -> bool:
-    """Tell whether particles of a covariance lie together: their deviation along x and along y is at most half a metre.
+    """Tell whether particles lie together: their deviation along x and along y is at most half a metre.
 
     Args:
         covariance: (3, 3) covariance of their poses [m, m, rad].

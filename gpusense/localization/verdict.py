@@ -1,4 +1,4 @@
-"""Verdict of a filter or of any localiser: the probability that its pose is lost, and a word for it.
+"""Verdict on a filter or any localiser: the probability that it is lost, and a word for it.
 
 ``p_lost`` is the probability that the pose is off by more than 1 m or 0.5 rad. With W the belief that another place is
 right (:mod:`gpusense.localization.belief`), and s the share of the particles, or of a covariance, beyond these limits,
@@ -6,7 +6,7 @@ right (:mod:`gpusense.localization.belief`), and s the share of the particles, o
     p_lost = W + (1 - W) s.
 
 W comes from the scans (:mod:`gpusense.localization.ratio`), s from the spread. Models of positions or headings have no
-map and give no evidence: W would stay at the prior and its rates, so it is left out.
+map and give no evidence: W would follow only its prior and rates, so it is left out.
 """
 
 from __future__ import annotations
@@ -30,27 +30,27 @@ from gpusense.models.landmark.base import FeatureModel
 
 # Random poses.
 _RANDOM = 64
-# A pose with at most this belief that it is wrong is judged again after this distance [m], this turn [rad], this number
-# of corrections, or a drop of the readings' log-likelihood by this much [nats].
+# A pose with at most this belief of being wrong is judged again after this distance [m], turn [rad], number of
+# corrections, or drop of the readings' log-likelihood [nats].
 _SURE, _WAY, _TURNED, _SELDOM, _DROP = 0.05, 0.25, 0.25, 10, 3.0
-# Corrections after which a filter judges without being asked, where its pose is not sure.
+# Corrections after which a filter with an unsure pose judges even without a call of ``estimate``.
 _INTERVAL = 5
-# Share of explained beams below which it is worth while to look elsewhere.
+# Share of explained beams below which a search elsewhere is worthwhile.
 _FEW = 0.4
 
 
 class VerdictState(NamedTuple):
-    """All that a verdict remembers; immutable, so it is kept and put back by assignment.
+    """Everything that a verdict remembers; immutable, so it is saved and restored by assignment.
 
     Attributes:
         belief: Belief that the pose is wrong.
         corrections: Corrections since the filter began.
         judged: Corrections at the last judgement; -1 before.
-        explained: Share of explained beams there; NaN without beams.
+        explained: Share of explained beams at that judgement; NaN without beams.
         gains: Gains of recent features by the index of their sensor.
         ratios: Ratios of features since the last judgement.
-        places: Places that were searched for since the last one that scans have confirmed.
-        evidence: Evidence of the readings that were judged last, by the particles.
+        places: Number of places searched since the last one that scans have confirmed.
+        evidence: Evidence, by the particles, of the readings that were judged last.
     """
 
     belief: Belief = Belief()
@@ -72,7 +72,7 @@ class Verdict:
         seed: Seed of the poses among landmarks.
 
     Attributes:
-        state: All that it remembers.
+        state: Everything that the verdict remembers.
         informed: Whether a sensor has a map, so that readings can contradict a pose.
     """
 
@@ -93,12 +93,12 @@ class Verdict:
         """Forget all scans.
 
         Args:
-            anywhere: Whether the pose is searched for on the whole map.
+            anywhere: Whether the pose is searched on the whole map.
         """
         self.state = VerdictState(Belief.anywhere() if anywhere else Belief())
 
     def watches(self, readings: Mapping[int, tuple[Any, ...]]) -> bool:
-        """Tell whether readings have features, whose prediction is judged before the correction."""
+        """Tell whether readings include features, whose prediction is judged before the correction."""
         return any(index in self._evidence and _count(reading) for index, reading in readings.items())
 
     def predicted(self, poses: np.ndarray, weights: np.ndarray, readings: Mapping[int, tuple[Any, ...]]) -> None:
@@ -116,7 +116,7 @@ class Verdict:
 
     @property
     def gain(self) -> float:
-        """Least mean gain of the predictions of features [nats]; NaN without enough of them."""
+        """Least mean gain of the predictions of features [nats]; NaN without enough features."""
         means = [gains.mean for _, gains in self.state.gains]
         return min((mean for mean in means if not math.isnan(mean)), default=math.nan)
 
@@ -133,17 +133,17 @@ class Verdict:
 
     @property
     def due(self) -> bool:
-        """Tell whether a filter that is not asked for its estimate judges now."""
+        """Tell whether a filter judges now even without a call of ``estimate``."""
         return self.state.corrections % (_SELDOM if self.state.belief.wrong <= _SURE else _INTERVAL) == 0
 
     def doubt(self) -> None:
-        """Restart with a pose that a search has just found; the scans that chose it are no evidence."""
+        """Restart with a pose that a search has just found, for which the scans of the search are no evidence."""
         places = self.state.places + 1
         self.state = self.state._replace(belief=Belief.anywhere(after=places - 1), judged=-1, places=places)
 
     @property
     def explains_little(self) -> bool:
-        """Tell whether few beams of the last judged scans agree with the pose; people can also be the cause."""
+        """Tell whether few beams of the last judged scans agree with the pose; people can be the cause as well."""
         return self.state.explained < _FEW
 
     @property
@@ -158,13 +158,13 @@ class Verdict:
         readings: Mapping[int, tuple[Any, ...]],
         evidence: float = -math.inf,
     ) -> float:
-        """Judge a pose by the last readings, once for each correction, and less often where the pose is sure.
+        """Judge a pose by the last readings, at most once per correction, and less often if the pose is sure.
 
         Args:
             pose: (3,) estimated pose.
             covariance: (3, 3) its covariance.
             readings: Last readings by the index of their sensor.
-            evidence: log p(last readings | earlier readings) of the particles; -inf judges in any case.
+            evidence: log p(last readings | earlier readings) of the particles; -inf always judges.
 
         Returns:
             Share of the beams that the pose explains; NaN without beams.
@@ -195,7 +195,7 @@ class Verdict:
         return explained
 
     def _adds_nothing(self, pose: np.ndarray, covariance: np.ndarray, evidence: float) -> bool:
-        """Tell whether a pose is sure and so near to the one judged last that its scan adds next to no evidence."""
+        """Tell whether a pose is sure and so near the last judged one that its scan adds almost no evidence."""
         state = self.state
         before = state.belief.pose
         if before is None or state.judged < 0 or state.belief.wrong > _SURE or state.ratios or is_wide(covariance):
@@ -222,6 +222,6 @@ def sightings(
 
 
 def _count(reading: tuple[Any, ...]) -> int:
-    """Return the number of features of a reading; 0 for one that the model will refuse."""
+    """Return the number of features of a reading; 0 for a reading that the model will refuse."""
     shape = np.shape(reading[0])
     return int(shape[0]) if shape else 0

@@ -88,8 +88,8 @@ def resample(weights: AnyArray, count: int, rng: Any = None, *, method: str = "s
             None draws fresh numbers from the system.
         method: "systematic": one random number (book table 4.4, the low-variance sampler); particle i appears ``floor``
             or ``ceil`` of ``count * w_i`` times. "stratified": one number in each of ``count`` strata (Kitagawa 1996).
-            "residual": ``floor(count * w_i)`` copies, and the rest by independent draws from the weights that are left
-            (Liu and Chen 1998).
+            "residual": ``floor(count * w_i)`` copies, and the remaining particles by independent draws from the
+            remaining weights (Liu and Chen 1998).
 
     Returns:
         (count,) int64 indices in ascending order; the expected copies of particle i are ``count * w_i``.
@@ -133,7 +133,7 @@ def resample(weights: AnyArray, count: int, rng: Any = None, *, method: str = "s
 def _residual(
     steps: np.ndarray, total: int, size: int, generator: np.random.Generator | np.random.RandomState
 ) -> np.ndarray:
-    """Return the indices of residual resampling; copies and what is left are exact."""
+    """Return the indices of residual resampling, with exact copies and remainders."""
     # size * steps exceeds 64 bits: a long division, bit by bit of size.
     copies, left = np.zeros(len(steps), np.int64), np.zeros(len(steps), np.int64)
     for bit in bin(size)[2:]:
@@ -153,7 +153,7 @@ def _generator(rng: Any) -> np.random.Generator | np.random.RandomState:
     """Return a generator as it is, or a new one from a seed.
 
     Raises:
-        TypeError, ValueError: It is neither.
+        TypeError, ValueError: ``rng`` is neither a generator nor a seed.
     """
     if isinstance(rng, (np.random.Generator, np.random.RandomState)):
         return rng

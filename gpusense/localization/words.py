@@ -1,4 +1,4 @@
-"""Words for a probability of being lost."""
+"""Words for the probability of being lost."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ from typing import Literal
 
 Word = Literal["tracking", "uncertain", "lost"]
 WORDS: tuple[Word, ...] = ("tracking", "uncertain", "lost")
-# Probabilities above which a pose is lost, and up to which it is tracked.
+# Probabilities above which a pose is lost, and up to which it is tracking.
 LOST, TRACKING = 0.5, 0.1
 
 
 def word_of(p_lost: float, wrong: float, *, wide: bool, apart: bool) -> Word:
-    """Return the word for a probability of being lost.
+    """Return the word for the probability of being lost.
 
     Args:
         p_lost: The probability.
         wrong: Probability that another place is right, by the scans.
         wide: Whether the distribution is too wide for a pose that is tracked.
-        apart: Whether it covers several places, so that scans cannot contradict one of them.
+        apart: Whether the distribution covers several places, so that scans cannot contradict a single one.
     """
     if wrong > LOST and not apart:
         return "lost"

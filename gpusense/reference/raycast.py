@@ -10,13 +10,16 @@ import numpy as np
 
 from gpusense.interface import structs
 from gpusense.reference.ray import crossed, make_ray, start_casts
-from gpusense.reference.rectangles import OCCUPIED, padded
+from gpusense.reference.rectangles import OCCUPIED, padded_in_groups
+
+# Rows of a group of the planes with the flag ROW_GROUPS.
+GROUP = 8
 
 
 def sector_of(sectors: int, speed_x: np.ndarray, speed_y: np.ndarray) -> np.ndarray:
     """Return the sector of a direction within its quadrant, from flat to steep.
 
-    A wrong sector would cost steps, not change the result.
+    A wrong sector would cost steps, but not change the result.
     """
     if sectors == 1:
         return np.zeros(len(speed_x), np.intp)
@@ -54,10 +57,11 @@ def cast_ray(
     quadrant = np.where(r.step[0] > 0, 0, 1) + np.where(r.step[1] > 0, 0, 2)
     sectors = 4 if "SECTORS_4" in flags else 2 if "SECTORS_2" in flags else 1
     plane = quadrant * sectors + sector_of(sectors, *r.speed)
-    table = plane * ((window.rows + 2) * (window.cols + 2))
+    group = GROUP if "ROW_GROUPS" in flags else 1
+    table = plane * (-(-(window.rows + 2) // group) * group * (window.cols + 2))
     while len(active):
         at = origin[:, active] + r.step[:, active] * k[:, active].astype(np.int64)
-        sides = map_table[table[active] + padded(at[1], at[0], window.cols)]
+        sides = map_table[table[active] + padded_in_groups(at[1], at[0], window.cols, group)]
         stopped = sides <= OCCUPIED
         if stopped.any():
             hit = stopped if "OUTSIDE_OCCUPIED" in flags else sides == OCCUPIED

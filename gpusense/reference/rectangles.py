@@ -1,10 +1,11 @@
-"""Empty rectangles: for each cell and sector of directions, width and height of a rectangle of free cells there.
+"""Empty rectangles: for each cell and sector of directions, width and height of a rectangle of free cells.
 
 The cell is at its corner; sides are at most 255, kept as width + 256 height. A ray may cross such a rectangle in one
-step without missing an obstacle; it is the one in which the ray in the middle of the sector stays longest. After
-anisotropic Chebyshev distance maps (Deakin and Knackstedt 2020), which have squares. Planes are padded by a ring of
-zeros; quadrant q extends to (+x, +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from
-flat to steep.
+step without missing an obstacle; it is the rectangle in which the ray in the middle of the sector stays longest. The
+idea follows the anisotropic Chebyshev distance maps of Deakin and Knackstedt (2020), which have squares. Planes are
+padded by a ring of zeros; quadrant q extends to (+x, +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2
+or 4 sectors from flat to steep. Planes store rows one after the other, or in groups: a group has the cells of its first
+column, then those of the next column.
 
 Planes can be updated after a change of the cells in rows [top, bottom) and columns [left, right) of the map: only cells
 whose rectangles can contain one of these are computed. The input has a band of rows, from row first on.
@@ -19,7 +20,7 @@ import numpy as np
 from gpusense.reference.bits import cells_left, cells_right, unpacked
 
 LONGEST = 255
-# The entry of an occupied cell; the ring has 0.
+# The entry of an occupied cell; ring cells have 0.
 OCCUPIED = 1
 RECTANGLE_REACH = 254
 
@@ -29,13 +30,18 @@ def padded(row: np.ndarray, col: np.ndarray, cols: int) -> np.ndarray:
     return (row + 1) * (cols + 2) + col + 1
 
 
+def padded_in_groups(row: np.ndarray, col: np.ndarray, cols: int, group: int) -> np.ndarray:
+    """Return the index of a cell in a padded plane of groups of rows."""
+    return (row + 1) // group * (cols + 2) * group + (col + 1) * group + (row + 1) % group
+
+
 def reach_begin(way: int, low: int) -> int:
     """Return the first cell whose rectangle, extending that way, can contain the cell low or one beyond it."""
     return max(low - RECTANGLE_REACH, 0) if way > 0 else low
 
 
 def reach_end(way: int, high: int, size: int) -> int:
-    """Return one beyond the last cell whose rectangle, extending that way, can contain one before the cell high."""
+    """Return one beyond the last cell whose rectangle, extending that way, can contain a cell before high."""
     return high if way > 0 else min(high + RECTANGLE_REACH, size)
 
 
@@ -100,16 +106,13 @@ def longest(runs: np.ndarray, along: int, across: int) -> np.ndarray:
 
 
 def _quadrants(
-    rectangles: np.ndarray, rows: int, cols: int, sectors: int, top: int, left: int, bottom: int, right: int
-) -> Iterator[tuple[int, tuple[int, int], tuple[slice, slice], np.ndarray]]:
-    """Yield quadrants, with directions along x and y, the rows and columns that a change reaches, and planes."""
-    planes = rectangles[: 4 * sectors * (rows + 2) * (cols + 2)].reshape(4, sectors, rows + 2, cols + 2)
+    rows: int, cols: int, top: int, left: int, bottom: int, right: int
+) -> Iterator[tuple[int, tuple[int, int], tuple[slice, slice]]]:
+    """Yield quadrants, with directions along x and y, and the rows and columns that a change reaches."""
     for quadrant in range(4):
         dx, dy = (-1 if quadrant & 1 else 1), (-1 if quadrant & 2 else 1)
         row = slice(reach_begin(dy, top), reach_end(dy, bottom, rows))
-        col = slice(reach_begin(dx, left), reach_end(dx, right, cols))
-        part = planes[quadrant, :, row.start + 1 : row.stop + 1, col.start + 1 : col.stop + 1]
-        yield quadrant, (dx, dy), (row, col), part
+        yield quadrant, (dx, dy), (row, slice(reach_begin(dx, left), reach_end(dx, right, cols)))
 
 
 def rectangles_rows(
@@ -129,14 +132,16 @@ def rectangles_rows(
 ) -> None:
     """Find the widest rectangles of sufficient height along rows, from free cells in columns."""
     free = runs[: 2 * band * cols].reshape(2, band, cols)
-    for quadrant, (dx, _), (row, col), planes in _quadrants(rectangles, rows, cols, sectors, top, left, bottom, right):
+    planes = rectangles[: 4 * sectors * (rows + 2) * (cols + 2)].reshape(4, sectors, rows + 2, cols + 2)
+    for quadrant, (dx, _), (row, col) in _quadrants(rows, cols, top, left, bottom, right):
+        reached_part = planes[quadrant, :, row.start + 1 : row.stop + 1, col.start + 1 : col.stop + 1]
         seen = reached(dx, col, cols)
         run = free[quadrant >> 1, row.start - first : row.stop - first, seen][:, ::dx]
         part = slice(col.start - seen.start, col.stop - seen.start)
         for sector in range(sectors):
             height, width = slope(sectors, sector)
             wide, high = longest(run, width, height)[:, :, ::dx]
-            planes[sector] = np.maximum(wide + 256 * high, OCCUPIED)[:, part]
+            reached_part[sector] = np.maximum(wide + 256 * high, OCCUPIED)[:, part]
 
 
 def free_rows(
@@ -161,14 +166,19 @@ def rectangles_scan(
     left: int,
     bottom: int,
     right: int,
+    lines: int,
+    group: int,
 ) -> None:
     """Find the highest rectangles of sufficient width along columns, from free cells in rows."""
     free = runs[: 2 * band * cols].reshape(2, band, cols)
-    for quadrant, (_, dy), (row, col), planes in _quadrants(rectangles, rows, cols, sectors, top, left, bottom, right):
+    planes = rectangles[: 4 * sectors * lines * (cols + 2)].reshape(4, sectors, lines * (cols + 2))
+    for quadrant, (_, dy), (row, col) in _quadrants(rows, cols, top, left, bottom, right):
+        line, column = np.ogrid[row, col]
+        cells = padded_in_groups(line, column, cols, group)
         seen = reached(dy, row, rows)
         run = free[quadrant & 1, seen.start - first : seen.stop - first, col][::dy].T
         part = slice(row.start - seen.start, row.stop - seen.start)
         for sector in range(sectors):
             height, width = slope(sectors, sector)
             high, wide = (side.T[::dy] for side in longest(run, height, width))
-            planes[sector] = np.maximum(wide + 256 * high, OCCUPIED)[part]
+            planes[quadrant, sector, cells] = np.maximum(wide + 256 * high, OCCUPIED)[part]

@@ -20,7 +20,7 @@ from gpusense.tables.cells import check_size
 from gpusense.tables.directional import directional_table
 from gpusense.tables.distances import NO_OBSTACLE, squared_distances
 from gpusense.tables.lookup_files import read_lookup
-from gpusense.tables.rectangles import empty_rectangles, sectors_of
+from gpusense.tables.rectangles import Planes, empty_rectangles, planes_of
 from gpusense.world import windows
 
 __all__ = ["CASTERS", "Bresenham", "Caster", "Cddt", "Dda", "Exact", "Lookup", "March"]
@@ -28,7 +28,7 @@ __all__ = ["CASTERS", "Bresenham", "Caster", "Cddt", "Dda", "Exact", "Lookup", "
 _BYTE, _SHORT, _SINGLE = (np.dtype(name) for name in (np.uint8, np.uint16, np.float32))
 # Rays per launch that fills a look-up table, so that a launch takes about a second.
 _TILE = {"cpu": 1 << 22, "gpu": 1 << 30}
-# Flags of the lines of other programs.
+# Flags of other programs' lines.
 _LINES = {"amcl": "AMCL_LINES", "beluga": "BELUGA_LINES"}
 
 
@@ -39,19 +39,18 @@ class Exact(Caster):
     name = "exact"
     exact = True
     error = "exact: float64 to 1e-12 relative; float32 the same bits on every device"
-    memory = "16 bytes per cell of the reachable map, on GPUs 32, less where that is over 4 GiB"
+    memory = "16 bytes per cell of the reachable map, on GPUs 32 up to 2^25 cells, 8 where that is over 4 GiB"
     precomputation = "empty rectangles, one pass over the map per quadrant"
 
     def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
         """See Caster.prepare."""
-        rows, cols = inputs.obstacles.shape
-        sectors = sectors_of(backend, rows, cols)
-        flags = frozenset({f"SECTORS_{sectors}"} if sectors > 1 else ())
-        return Table(empty_rectangles(backend, inputs.obstacles, sectors), 8 * sectors * (rows + 2) * (cols + 2), flags)
+        planes = planes_of(backend, *inputs.obstacles.shape)
+        table = empty_rectangles(backend, inputs.obstacles, planes)
+        return Table(table, 2 * planes.entries(*inputs.obstacles.shape), planes.flags)
 
     def refresh(self, backend: Backend, inputs: CasterInput, table: Buffer, changed: windows.Window) -> bool:
         """See Caster.refresh."""
-        empty_rectangles(backend, inputs.obstacles, sectors_of(backend, *inputs.obstacles.shape), table, changed)
+        empty_rectangles(backend, inputs.obstacles, planes_of(backend, *inputs.obstacles.shape), table, changed)
         return True
 
 
@@ -75,9 +74,9 @@ class Bresenham(Caster):
     """Bresenham's line from cell to cell.
 
     Args:
-        lines: None; ``"amcl"`` for the lines of nav2_amcl, which look one cell beyond the ray's end and may be longer
-            than range_max; or ``"beluga"`` for Beluga's, where a line midway between two cells takes the straight one,
-            and rays from outside the grid meet nothing.
+        lines: None; ``"amcl"`` for the lines of nav2_amcl, which extend one cell beyond the ray's end and may be longer
+            than range_max; or ``"beluga"`` for Beluga's, which go straight midway between two cells, and meet nothing
+            from outside the grid.
 
     Raises:
         TypeError, ValueError: ``lines`` is neither None nor one of these words.
@@ -115,10 +114,10 @@ class March(Caster):
     """Ray marching through the distance field.
 
     Args:
-        tolerance: Least step [cells], 0.001 to 10: a smaller one is more exact and slower.
-        rule: ``"safe"`` shortens steps by sqrt(2) cells, so that only the least step can pass an obstacle.
-            ``"centre"`` steps by the distance between cell centres, as range_libc and f1tenth_gym do: it is faster and
-            misses corners.
+        tolerance: Least step [cells], 0.001 to 10: smaller steps are more exact and slower.
+        rule: ``"safe"`` shortens steps by sqrt(2) cells, so that only the least step can pass an obstacle. ``"centre"``
+            steps by the distance between cell centres, as range_libc and f1tenth_gym do: it is faster, but misses
+            corners.
 
     Raises:
         TypeError, ValueError: A knob has the wrong type, or is out of range.
@@ -233,7 +232,7 @@ class Lookup(Caster):
         """Cast a ray per bin and cell, a strip of rows per launch."""
         rows, cols = inputs.obstacles.shape
         table = backend.empty(rows * cols * self.bins, _SHORT)
-        rectangles = empty_rectangles(backend, inputs.obstacles, 1)
+        rectangles = empty_rectangles(backend, inputs.obstacles, Planes(1))
         turns = 2 * math.pi * np.arange(self.bins) / self.bins
         ray = backend.upload(np.stack([np.cos(turns), np.sin(turns)], axis=1).astype(_SINGLE))
         fill = backend.compile("fill_lookup", frozenset({"OUTSIDE_OCCUPIED"} if inputs.outside == "occupied" else ()))
@@ -262,7 +261,7 @@ CASTERS = {caster.name: caster for caster in _ALL}
 
 
 def choose(argument: str, value: object, lines: str | None = None) -> Caster:
-    """Return a caster by its name, Bresenham's with some program's lines; a caster is returned as it is.
+    """Return a caster by name, Bresenham with the lines of a program; a caster is returned unchanged.
 
     Raises:
         TypeError: The value is neither a name nor a caster.

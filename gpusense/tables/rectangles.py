@@ -5,6 +5,8 @@ Processors run few long work-items, one per row. GPUs run one work-item per cell
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from gpusense.backends import Backend
@@ -19,25 +21,60 @@ _NO_FLAGS: frozenset[str] = frozenset()
 # The kernel file ``rectangles`` has the same numbers.
 RECTANGLE_REACH = 254
 _STACK = 1024
+# Rows of a group, and cells of the largest map of four sectors.
+ROWS = 8
+_MANY_CELLS = 1 << 25
 
 
-def sectors_of(backend: Backend, rows: int, cols: int) -> int:
-    """Return the number of sectors per quadrant; more sectors make steps longer and tables larger.
+@dataclass(frozen=True)
+class Planes:
+    """How empty rectangles are stored: sectors per quadrant, and rows of a group.
 
-    GPUs gain most, since neighbouring rays wait for the slowest one. Kernels index the cells of all planes in 32 bits,
-    which limits the number.
+    Attributes:
+        sectors: Sectors per quadrant: 1, 2 or 4. More sectors make steps longer and tables larger.
+        group: Rows of a group: 1, or ``ROWS`` on GPUs.
     """
-    sectors = {"gpu": 4, "cpu": 2}[backend.info.kind] if backend.info.backend != "numpy" else 1
-    planes = 4 * (rows + 4) * (cols + 4)
-    while sectors > 1 and (planes * sectors >= 1 << 31 or 2 * planes * sectors > backend.info.max_buffer):
+
+    sectors: int
+    group: int = 1
+
+    @property
+    def flags(self) -> frozenset[str]:
+        """Flags of the kernels that read the planes."""
+        groups = ("ROW_GROUPS",) if self.group > 1 else ()
+        return frozenset({f"SECTORS_{self.sectors}", *groups} if self.sectors > 1 else groups)
+
+    def lines(self, rows: int) -> int:
+        """Return the number of rows of a plane of a map with ``rows`` rows, the ring and whole groups included."""
+        return -(-(rows + 2) // self.group) * self.group
+
+    def entries(self, rows: int, cols: int) -> int:
+        """Return the number of rectangles of all planes of a map."""
+        return 4 * self.sectors * self.lines(rows) * (cols + 2)
+
+
+def planes_of(backend: Backend, rows: int, cols: int) -> Planes:
+    """Return the planes of a map on a device.
+
+    GPUs gain most from sectors, since neighbouring rays wait for the slowest of them, and from groups of rows, since
+    their caches limit rays: groups halve what is read. On a map that exceeds the caches, four sectors are no faster
+    than two and take twice the memory. Kernels index the cells of all planes in 32 bits, which limits the number of
+    sectors.
+    """
+    gpu = backend.info.kind == "gpu"
+    sectors = 1 if backend.info.backend == "numpy" else 4 if gpu and rows * cols <= _MANY_CELLS else 2
+    while sectors > 1 and (
+        4 * sectors * (rows + ROWS + 2) * (cols + 4) >= 1 << 31
+        or 8 * sectors * (rows + ROWS + 2) * (cols + 4) > backend.info.max_buffer
+    ):
         sectors //= 2
-    return sectors
+    return Planes(sectors, ROWS if gpu else 1)
 
 
 def empty_rectangles(
     backend: Backend,
     obstacles: np.ndarray,
-    sectors: int,
+    planes: Planes,
     rectangles: Buffer | None = None,
     changed: Window | None = None,
 ) -> Buffer:
@@ -46,24 +83,24 @@ def empty_rectangles(
     Args:
         backend: The device.
         obstacles: (rows, cols) bool.
-        sectors: Sectors per quadrant: 1, 2 or 4.
+        planes: How the rectangles are stored.
         rectangles: Planes of the map before the change, refreshed in place; None makes new planes.
-        changed: Window whose obstacles changed; None is all of the map.
+        changed: Window whose obstacles changed; None for the whole map.
     """
     rows, cols = obstacles.shape
     check_size(rows, cols)
     if rectangles is None or changed is None:
-        rectangles = backend.empty(4 * sectors * (rows + 2) * (cols + 2), _SHORT, zero=True)
+        rectangles = backend.empty(planes.entries(rows, cols), _SHORT, zero=True)
         changed = Window(0, 0, rows, cols)
     top, left, bottom, right = changed.row, changed.col, changed.row + changed.rows, changed.col + changed.cols
-    # A rectangle that changes begins at most RECTANGLE_REACH cells before the changed obstacles and ends at most that
-    # far behind them; the same holds in the opposite directions.
+    # A rectangle that changes begins at most RECTANGLE_REACH cells before the changed obstacles and ends at most as far
+    # behind them, in both directions.
     first, begin = max(top - RECTANGLE_REACH, 0), max(left - RECTANGLE_REACH, 0)
     end = min(right + RECTANGLE_REACH, cols)
     near = obstacles[first : bottom + RECTANGLE_REACH]
     band = len(near)
     runs = backend.empty(2 * band * cols, _BYTE)
-    place = (rows, cols, sectors, first, band, top, left, bottom, right)
+    place = (rows, cols, planes.sectors, first, band, top, left, bottom, right)
     if backend.info.kind == "cpu":
         strips, height = -(-(end - begin) // 64), min(changed.rows + RECTANGLE_REACH, rows)
         columns = backend.compile("free_columns", _NO_FLAGS)
@@ -74,6 +111,6 @@ def empty_rectangles(
         words, bits = -(-cols // 32), backend.upload(packed(near))
         backend.compile("free_rows", _NO_FLAGS)((end - begin, band), bits, runs, band, cols, words, begin, end)
         size = (min(changed.cols + RECTANGLE_REACH, cols), min(changed.rows + RECTANGLE_REACH, rows), 4)
-        backend.compile("rectangles_scan", _NO_FLAGS)(size, runs, rectangles, *place)
+        backend.compile("rectangles_scan", _NO_FLAGS)(size, runs, rectangles, *place, planes.lines(rows), planes.group)
     backend.synchronize()
     return rectangles

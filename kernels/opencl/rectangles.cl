@@ -1,10 +1,12 @@
 // Empty rectangles: for each cell and each sector of directions, width and height of a rectangle of free cells that has
 // the cell at its corner and extends in that direction. Both are at most 255, stored as width + 256 height. A ray may
 // cross the rectangle in one step without missing an obstacle. Of all such rectangles it is the one in which the ray in
-// the middle of the sector stays longest. After anisotropic Chebyshev distance maps (Deakin and Knackstedt 2020), which
-// have squares. Planes are padded by a ring of zeros, so a walk that leaves the grid stops. Quadrant q extends to (+x,
-// +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from flat to steep, with a plane for
-// each.
+// the middle of the sector stays longest. The idea follows the anisotropic Chebyshev distance maps of Deakin and
+// Knackstedt (2020), which have squares. Planes are padded by a ring of zeros, so a walk that leaves the grid stops.
+// Quadrant q extends to (+x, +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from flat
+// to steep, with a plane for each. Planes store rows one after the other, or in groups: a group has the cells of its
+// first column, then those of the next column, so that cells above one another lie as close together as cells beside
+// one another.
 //
 // Planes can be updated after a change of the cells in rows [top, bottom) and columns [left, right) of the map: only
 // cells whose rectangles can contain one of these are computed. For new planes all cells have changed. The input has a
@@ -21,6 +23,11 @@
 
 // Return the index of a cell in a padded plane.
 int padded(const int row, const int col, const int cols) { return (row + 1) * (cols + 2) + col + 1; }
+
+// Return the index of a cell in a padded plane of groups of rows.
+int padded_in_groups(const int row, const int col, const int cols, const int group) {
+    return (row + 1) / group * (cols + 2) * group + (col + 1) * group + (row + 1) % group;
+}
 
 // Return the first cell along an axis whose rectangle can contain the cell low or one beyond it. Rectangles extend to
 // larger (way 1) or smaller (way -1) indices.
@@ -110,13 +117,14 @@ kernel void rectangles_scan(ARGUMENTS) {
     const int col = reach_begin(dx, left) + get_global_id(0), row = reach_begin(dy, top) + get_global_id(1);
     if (col >= reach_end(dx, right, cols) || row >= reach_end(dy, bottom, rows)) return;
     global const uchar *run = runs + (long)(quadrant & 1) * band * cols + (long)(row - first) * cols + col;
-    global ushort *out = rectangles + (long)quadrant * sectors * (rows + 2) * (cols + 2) + padded(row, col, cols);
+    const long plane = (long)lines * (cols + 2);
+    global ushort *out = rectangles + quadrant * sectors * plane + padded_in_groups(row, col, cols, group);
     const int room = min(dy > 0 ? rows - row : row + 1, LONGEST);
     const long step = (long)dy * cols;
     int width = LONGEST, sector = 0, height = 1;
     int2 middle = slope(sectors, 0);
     while (sector < sectors) {
-        // While no sector can end, read four rows between two decisions, so that reads need not wait for one another.
+        // While no sector can end, read four rows between two decisions, so that reads do not wait for each other.
         if (height + 3 <= room) {
             global const uchar *next = run + (height - 1) * step;
             const int four = min(min((int)next[0], (int)next[step]), min((int)next[2 * step], (int)next[3 * step]));
@@ -130,7 +138,7 @@ kernel void rectangles_scan(ARGUMENTS) {
         while (sector < sectors && narrower * middle.x < height * middle.y) {
             const int higher = narrower * middle.x > (height - 1) * middle.y;
             const int sides = higher ? narrower + 256 * height : height > 1 ? width + 256 * (height - 1) : OCCUPIED;
-            out[(long)sector * (rows + 2) * (cols + 2)] = (ushort)sides;
+            out[sector * plane] = (ushort)sides;
             middle = slope(sectors, ++sector);
         }
         width = narrower;

@@ -13,7 +13,6 @@ from . import ray as ray_file
 from . import rectangles
 from .prelude import precision, reader
 from .ray import off_grid
-from .rectangles import padded
 
 ENTRY = wp.uint16
 
@@ -24,7 +23,7 @@ def functions(flags):
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     geometry = ray_file.functions(flags)
-    make_ray, start_walk = geometry.make_ray, geometry.start_walk
+    Ray, make_ray, start_walk = geometry.Ray, geometry.make_ray, geometry.start_walk
     crossed, as_bits, farther = geometry.crossed, geometry.as_bits, geometry.farther
     COUNT, FIRST = geometry.COUNT, geometry.FIRST
     entry_at = reader(ENTRY)
@@ -33,11 +32,12 @@ def functions(flags):
     OUTSIDE_OCCUPIED = "OUTSIDE_OCCUPIED" in flags
     SECTORS_2 = "SECTORS_2" in flags
     SECTORS_4 = "SECTORS_4" in flags
+    ROW_GROUPS = "ROW_GROUPS" in flags
     SECTORS = 4 if SECTORS_4 else 2 if SECTORS_2 else 1
     ZERO, ABOVE_COUNT = real(0.0), real(float(COUNT) + 1.0)
     FLATTEST, STEEPEST = real(0.41421356), real(2.4142136)
 
-    # Return the sector of a direction within its quadrant, from flat to steep. A wrong sector would cost steps, not
+    # Return the sector of a direction within its quadrant, from flat to steep. A wrong sector would cost steps, but not
     # change the result.
     @wp.func
     def sector_of(speed_x: real, speed_y: real):
@@ -49,6 +49,48 @@ def functions(flags):
             sector = wp.where(steep, 2, 0)
             sector += wp.where(speed_y > wp.where(steep, STEEPEST, FLATTEST) * speed_x, 1, 0)
         return sector
+
+    # Rows of a group of the planes; without ROW_GROUPS each row stands alone.
+    GROUP = 8 if ROW_GROUPS else 1
+    ROWS = wp.uint32(GROUP)
+
+    # The way of a ray through a plane of rectangles: index of the origin's column, the origin's row, and steps in x and
+    # y, so that boundaries COUNT + k need no conversion; skip is what a group has beyond its first column.
+    @wp.struct
+    class Way:
+        col: wp.uint32
+        row: wp.uint32
+        step_x: wp.uint32
+        step_y: wp.uint32
+        skip: wp.uint32
+
+    # Return the way of a ray that begins in a cell through the plane of its direction.
+    @wp.func
+    def way_of(r: Ray, cell: wp.vec2i, window: types.Window):
+        plane = (wp.where(r.right, 0, 1) + wp.where(r.up, 0, 2)) * SECTORS + sector_of(r.speed_x, r.speed_y)
+        stride = GROUP * (window.cols + 2)
+        groups = (window.rows + 2 + GROUP - 1) // GROUP
+        way = Way()
+        way.step_x = wp.uint32(GROUP * r.step_x)
+        way.col = wp.uint32(plane * groups * stride + GROUP * (cell.x + 1)) - way.step_x * FIRST
+        way.skip = wp.uint32(stride - GROUP)
+        if ROW_GROUPS:
+            way.step_y = wp.uint32(r.step_y)
+            way.row = wp.uint32(cell.y + 1) - way.step_y * FIRST
+        else:
+            way.step_y = wp.uint32(stride * r.step_y)
+            way.col += wp.uint32(stride * (cell.y + 1)) - way.step_y * FIRST
+        return way
+
+    # Return the rectangle at the cell of a way behind k_x and k_y boundaries.
+    @wp.func
+    def rectangle_at(map_table: wp.array(dtype=ENTRY), way: Way, k_x: real, k_y: real):
+        col = way.col + way.step_x * as_bits(k_x)
+        index = col + way.step_y * as_bits(k_y)
+        if ROW_GROUPS:
+            row = way.row + way.step_y * as_bits(k_y)
+            index = col + row + row // ROWS * way.skip
+        return wp.uint32(entry_at(map_table, wp.int32(index)))
 
     # Return the distance in cells to the first occupied cell, limit where none is nearer.
     @wp.func
@@ -69,17 +111,11 @@ def functions(flags):
         if ORIGINS_OUTSIDE:
             if start.t >= limit:
                 return limit
-        plane = (wp.where(r.right, 0, 1) + wp.where(r.up, 0, 2)) * SECTORS + sector_of(r.speed_x, r.speed_y)
-        step_x = wp.uint32(r.step_x)
-        step_y = wp.uint32(r.step_y * (window.cols + 2))
-        origin = (
-            wp.uint32(plane * (window.rows + 2) * (window.cols + 2) + padded(cell.y, cell.x, window.cols))
-            - (step_x + step_y) * FIRST
-        )
+        way = way_of(r, cell, window)
         k_x = COUNT + real(start.k_x)
         k_y = COUNT + real(start.k_y)
         t = real(start.t)
-        sides = wp.uint32(entry_at(map_table, wp.int32(origin + step_x * as_bits(k_x) + step_y * as_bits(k_y))))
+        sides = rectangle_at(map_table, way, k_x, k_y)
         # A step beyond limit still ends in the table. GPUs are fastest with a single exit of the loop.
         while sides > OCCUPIED and t < limit:
             end_x = farther(k_x, sides & wp.uint32(255))
@@ -93,7 +129,7 @@ def functions(flags):
             aside = crossed(t, speed, a, wp.where(by_x, r.inv_y, r.inv_x), not by_x)
             k_x = wp.where(by_x, end_x, aside)
             k_y = wp.where(by_x, aside, end_y)
-            sides = wp.uint32(entry_at(map_table, wp.int32(origin + step_x * as_bits(k_x) + step_y * as_bits(k_y))))
+            sides = rectangle_at(map_table, way, k_x, k_y)
         if OUTSIDE_OCCUPIED:
             return wp.min(t, limit)
         else:

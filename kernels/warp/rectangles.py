@@ -1,12 +1,15 @@
 """Empty rectangles: for each cell and each sector of directions, width and height of a rectangle of free cells that has
 the cell at its corner and extends in that direction. Both are at most 255, stored as width + 256 height. A ray may
-cross the rectangle in one step without missing an obstacle. Of all such rectangles it is the one in which the ray in
-the middle of the sector stays longest. After anisotropic Chebyshev distance maps (Deakin and Knackstedt 2020), which
-have squares.
+cross the rectangle in one step without missing an obstacle. Of all such rectangles it is the rectangle in which the ray
+in the middle of the sector stays longest. The idea follows the anisotropic Chebyshev distance maps of Deakin and
+Knackstedt (2020), which have squares.
 
 Planes are padded by a ring of zeros, so a walk that leaves the grid stops. Quadrant q extends to (+x, +y), (-x, +y),
 (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from flat to steep, with a plane for each. All planes
 have fewer than 2^31 cells, so indices fit int32.
+
+Planes have one row after the other, or groups of rows: a group has the cells of its first column, then those of the
+next one, so that cells above one another lie as close together as those beside one another.
 
 Planes can be updated after a change of the cells in rows [top, bottom) and columns [left, right) of the map: only cells
 whose rectangles can contain one of these are computed. For new planes all cells have changed. The input has a band of
@@ -19,7 +22,7 @@ from .bits import cells_left, cells_right
 from .prelude import kernel
 
 LONGEST = wp.constant(255)
-# The entry of an occupied cell; the ring has 0.
+# The entry of an occupied cell; ring cells have 0.
 OCCUPIED = wp.constant(1)
 # Distance from a changed cell to the farthest cell whose rectangle contains it.
 RECTANGLE_REACH = wp.constant(254)
@@ -31,6 +34,12 @@ STACK = wp.constant(256)
 @wp.func
 def padded(row: wp.int32, col: wp.int32, cols: wp.int32):
     return (row + 1) * (cols + 2) + col + 1
+
+
+# Return the index of a cell in a padded plane of groups of rows.
+@wp.func
+def padded_in_groups(row: wp.int32, col: wp.int32, cols: wp.int32, group: wp.int32):
+    return (row + 1) // group * (cols + 2) * group + (col + 1) * group + (row + 1) % group
 
 
 # Return the first cell along an axis whose rectangle can contain the cell low or one beyond it. Rectangles extend to
@@ -154,7 +163,7 @@ def free_rows(bits, runs, band, cols, words, begin, end):
 # Find the rectangles along columns: the higher a rectangle, the narrower. For GPUs: one work-item takes a cell and
 # quadrant; the first work-item of a quadrant takes the first of its cells.
 @kernel()
-def rectangles_scan(runs, rectangles, rows, cols, sectors, first, band, top, left, bottom, right):
+def rectangles_scan(runs, rectangles, rows, cols, sectors, first, band, top, left, bottom, right, lines, group):
     quadrant, row_item, col_item = wp.tid()
     dx = wp.where((quadrant & 1) != 0, -1, 1)
     dy = wp.where((quadrant & 2) != 0, -1, 1)
@@ -163,8 +172,8 @@ def rectangles_scan(runs, rectangles, rows, cols, sectors, first, band, top, lef
     if col >= reach_end(dx, right, cols) or row >= reach_end(dy, bottom, rows):
         return
     run = (quadrant & 1) * band * cols + (row - first) * cols + col
-    plane = (rows + 2) * (cols + 2)
-    out = quadrant * sectors * plane + padded(row, col, cols)
+    plane = lines * (cols + 2)
+    out = quadrant * sectors * plane + padded_in_groups(row, col, cols, group)
     room = wp.min(wp.where(dy > 0, rows - row, row + 1), LONGEST)
     width = int(LONGEST)
     height = int(1)
@@ -172,7 +181,7 @@ def rectangles_scan(runs, rectangles, rows, cols, sectors, first, band, top, lef
     middle = slope(sectors, 0)
     step = dy * cols
     while sector < sectors:
-        # While no sector can end, read four rows between two decisions, so that reads need not wait for one another.
+        # While no sector can end, read four rows between two decisions, so that reads do not wait for each other.
         if height + 3 <= room:
             first_of = run + (height - 1) * step
             a = wp.min(int(runs[first_of]), int(runs[first_of + step]))

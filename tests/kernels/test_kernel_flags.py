@@ -48,6 +48,7 @@ TRACES = [
     ("place_inputs", "END_POINTS", (), r"\bguard_scale \*", r"array_store\(var_guard\b"),
     ("cast_ranges", "SECTORS_2", (), r"define SECTORS 2$", r"var_speed_y > var_speed_x"),
     ("cast_ranges", "SECTORS_4", (), r"\b2\.4142136\b", r"\b2\.41421"),
+    ("cast_ranges", "ROW_GROUPS", (), r"\brow / GROUP\b", r"wp::floordiv\("),
     ("cast_tiles", "ORDERED", (), r"\border\[", r"address\(var_order\b"),
     ("beam_tiles", "ORDERED", ("RAND", "LINEAR"), r"\border\[", r"address\(var_order\b"),
     ("beam_tiles", "SHARED_RAYS", ("RAND", "LINEAR"), r"\bfirst\[", r"address\(var_first\b"),

@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 from support.kernel_scenes import (
     GRIDS,
+    GROUPED,
+    PLANES,
     PRECISIONS,
-    SECTORS,
     UNREACHABLE,
     each_grid,
     on_both,
     planes_of,
+    row_after_row,
     scene_flags,
     squared_distances,
 )
@@ -26,7 +28,7 @@ from support.kernel_scenes import (
 from gpusense.backends import Backend, get_backend
 from gpusense.reference.rectangles import OCCUPIED, slope
 from gpusense.tables.cells import packed
-from gpusense.tables.rectangles import empty_rectangles
+from gpusense.tables.rectangles import Planes, empty_rectangles
 from gpusense.world.windows import Window
 
 # ---- distances
@@ -154,14 +156,15 @@ def as_kind(backend: str, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Ba
     return pretend
 
 
-def made(device: Backend, occupied: np.ndarray, sectors: int, *mend: Any) -> np.ndarray:
+def made(device: Backend, occupied: np.ndarray, form: Planes, *before: Any) -> np.ndarray:
     rows, cols = occupied.shape
-    planes = np.empty((4, sectors, rows + 2, cols + 2), np.uint16)
-    return device.download(empty_rectangles(device, occupied, sectors, *mend), planes)
+    planes = np.empty((4, form.sectors, form.lines(rows), cols + 2), np.uint16)
+    return device.download(empty_rectangles(device, occupied, form, *before), planes)
 
 
-@pytest.mark.parametrize("sectors", SECTORS)
-def test_rectangles_of_small_maps_are_the_best_there_are(sectors: int, as_kind: Callable[[str], Backend]) -> None:
+@pytest.mark.parametrize("form", PLANES, ids=repr)
+def test_rectangles_of_small_maps_are_the_best_there_are(form: Planes, as_kind: Callable[[str], Backend]) -> None:
+    sectors = form.sectors
     rng = np.random.default_rng(21)
     for shape in ((1, 1), (1, 9), (14, 1), (3, 5), (11, 13), (16, 16)):
         for share in (0.0, 0.03, 0.15, 0.5, 1.0):
@@ -176,7 +179,7 @@ def test_rectangles_of_small_maps_are_the_best_there_are(sectors: int, as_kind: 
                     worth = np.minimum(size * num, size[:, None] * den)[:, :, None, None]
                     best[quadrant, sector] = np.where(empty, worth, 0).max(axis=(0, 1))
             for kind in ("cpu", "gpu"):
-                planes = made(as_kind(kind), occupied, sectors)
+                planes = made(as_kind(kind), occupied, form)
                 check_empty(occupied, planes)
                 np.testing.assert_array_equal(score(planes), best)
 
@@ -185,8 +188,8 @@ def test_long_rectangles_end_at_255_cells(as_kind: Callable[[str], Backend]) -> 
     for shape in ((300, 310), (1, 600), (600, 2)):
         occupied = np.zeros(shape, bool)
         for kind in ("cpu", "gpu"):
-            for sectors in SECTORS:
-                planes = made(as_kind(kind), occupied, sectors)
+            for form in PLANES:
+                sectors, planes = form.sectors, made(as_kind(kind), occupied, form)
                 check_empty(occupied, planes)
                 width, height = sides_of(planes)
                 middle = np.array([slope(sectors, sector) for sector in range(sectors)])
@@ -204,9 +207,9 @@ def test_rectangles_of_maps_with_more_rows_or_columns_than_16_bits_count(
 ) -> None:
     occupied = np.random.default_rng(27).random((2, 70_000)) < 1e-3
     for seen in (occupied, np.ascontiguousarray(occupied.T)):
-        expected = planes_of(seen, 2, kind)
+        expected = planes_of(seen, PLANES[1], kind)
         check_empty(seen, expected)
-        np.testing.assert_array_equal(made(as_kind(kind), seen, 2), expected)
+        np.testing.assert_array_equal(made(as_kind(kind), seen, PLANES[1]), expected)
 
 
 @each_grid
@@ -214,11 +217,16 @@ def test_rectangles_of_maps_with_more_rows_or_columns_than_16_bits_count(
 def test_rectangles_have_the_bits_of_the_reference(
     occupied: np.ndarray, kind: str, as_kind: Callable[[str], Backend]
 ) -> None:
-    for sectors in SECTORS:
-        expected = planes_of(occupied, sectors, kind)
+    for form in PLANES:
+        expected = planes_of(occupied, form, kind)
         check_empty(occupied, expected)
-        np.testing.assert_array_equal(made(as_kind(kind), occupied, sectors), expected)
-        np.testing.assert_array_equal(score(expected), score(planes_of(occupied, sectors, "cpu")))
+        np.testing.assert_array_equal(made(as_kind(kind), occupied, form), expected)
+        np.testing.assert_array_equal(score(expected), score(planes_of(occupied, form, "cpu")))
+    if kind == "gpu":
+        groups = made(as_kind(kind), occupied, GROUPED)
+        np.testing.assert_array_equal(groups, planes_of(occupied, GROUPED, kind))
+        in_rows = planes_of(occupied, Planes(GROUPED.sectors), kind)
+        np.testing.assert_array_equal(row_after_row(groups, GROUPED, len(occupied)), in_rows)
 
 
 @each_grid
@@ -254,7 +262,7 @@ def edits(rng: np.random.Generator, shape: tuple[int, int]) -> list[Window]:
 
 @functools.cache
 def made_anew(
-    shape: tuple[int, int], share: float, sectors: int, kind: str
+    shape: tuple[int, int], share: float, form: Planes, kind: str
 ) -> list[tuple[np.ndarray, Window | None, bytes]]:
     """Yield a map after each edit: the map, the changed window, and the compressed rectangles made anew."""
     rng = np.random.default_rng(5)
@@ -264,7 +272,7 @@ def made_anew(
         if changed is not None:
             part = changed.cut(occupied)
             part[...] = ~part if changed.cells == 1 else rng.random(part.shape) < [0, 0.02, 1][number % 3]
-        found.append((occupied.copy(), changed, zlib.compress(planes_of(occupied, sectors, kind).tobytes(), 1)))
+        found.append((occupied.copy(), changed, zlib.compress(planes_of(occupied, form, kind).tobytes(), 1)))
     return found
 
 
@@ -276,10 +284,10 @@ def made_anew(
 def test_updated_rectangles_are_those_made_anew(
     shape: tuple[int, int], share: float, kind: str, as_kind: Callable[[str], Backend]
 ) -> None:
-    device, sectors = as_kind(kind), 2
-    rectangles, planes = None, np.empty((4, sectors, shape[0] + 2, shape[1] + 2), np.uint16)
-    for occupied, changed, anew in made_anew(shape, share, sectors, kind):
-        mended = empty_rectangles(device, occupied, sectors, *(() if changed is None else (rectangles, changed)))
+    device, form = as_kind(kind), GROUPED if kind == "gpu" else PLANES[1]
+    rectangles, planes = None, np.empty((4, form.sectors, form.lines(shape[0]), shape[1] + 2), np.uint16)
+    for occupied, changed, anew in made_anew(shape, share, form, kind):
+        mended = empty_rectangles(device, occupied, form, *(() if changed is None else (rectangles, changed)))
         assert changed is None or mended is rectangles
         rectangles = mended
         device.download(rectangles, planes)
@@ -288,19 +296,19 @@ def test_updated_rectangles_are_those_made_anew(
 
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("kind", ["cpu", "gpu"])
-@pytest.mark.parametrize("sectors", SECTORS)
+@pytest.mark.parametrize("form", PLANES, ids=repr)
 def test_a_cell_that_comes_and_goes_is_seen_as_far_as_rectangles_reach(
-    sectors: int, kind: str, as_kind: Callable[[str], Backend]
+    form: Planes, kind: str, as_kind: Callable[[str], Backend]
 ) -> None:
     """In an empty map, 255 cells from the borders, the change reaches as far as it can, and no farther."""
     device, shape, place = as_kind(kind), (520, 530), (257, 262)
     occupied = np.zeros(shape, bool)
-    rectangles = empty_rectangles(device, occupied, sectors)
-    empty = made(device, occupied, sectors)
+    rectangles = empty_rectangles(device, occupied, form)
+    empty = made(device, occupied, form)
     for number in range(2):
         occupied[place] = number == 0
-        mended = made(device, occupied, sectors, rectangles, Window(*place, 1, 1))
-        expected = planes_of(occupied, sectors, kind) if number == 0 else empty
+        mended = made(device, occupied, form, rectangles, Window(*place, 1, 1))
+        expected = planes_of(occupied, form, kind) if number == 0 else empty
         np.testing.assert_array_equal(mended, expected)
         if number == 0:
             differ = np.argwhere((mended != empty).any(axis=(0, 1))) - 1

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from support.kernel_scenes import (
     EXACT,
+    GROUPED,
     LASER,
     ONE_SCAN,
+    PLANES,
     PRECISIONS,
     SCALE,
-    SECTORS,
     assert_near,
     nothing,
     on_both,
     planes_of,
     run,
     scene_flags,
-    sector_flags,
 )
 from support.score_scenes import (
     FIELD_SCENES,
@@ -47,6 +47,7 @@ from gpusense.evaluation.tolerances import differing, per_beam
 from gpusense.interface.constants import BLOCK_TERMS, TILE, strands_in
 from gpusense.interface.structs import Score, Window
 from gpusense.reference.error_free import strand_sums
+from gpusense.tables.rectangles import Planes
 
 SPREADS = range(6)
 COUNTS = (1, 15, 16, 17, 777)
@@ -86,16 +87,16 @@ def test_tiles_of_ranges_in_float64(spread: int, device: Backend) -> None:
     assert differing(found, expected) == 0
 
 
-@pytest.mark.parametrize("sectors", SECTORS)
-def test_tiles_of_ranges_in_sectors(sectors: int, device: Backend) -> None:
+@pytest.mark.parametrize("form", [*PLANES, GROUPED], ids=repr)
+def test_tiles_of_ranges_in_every_form_of_planes(form: Planes, device: Backend) -> None:
     real, count, rays = np.float32, 777, 53
     (cell, pose), ray = poses(count, real), rays_of(rays, real)
     ranges, none = np.full((count, rays), np.nan, real), np.zeros(1, np.int32)
     rest = (ray, ranges, WINDOW, count, rays, EXACT, SCALE)
     flags, numpy = scene_flags(real, "ORIGINS_OUTSIDE", "OUTSIDE_OCCUPIED"), get_backend("numpy")
     expected = run(numpy, "cast_ranges", flags, (rays, count), planes_of(OCCUPIED), cell, pose, *rest)
-    flags |= sector_flags(sectors)
-    planes = planes_of(OCCUPIED, sectors, "gpu")
+    flags |= form.flags
+    planes = planes_of(OCCUPIED, form, "gpu")
     found = run(device, "cast_tiles", flags, items(count, 1), planes, cell, pose, none, *rest, 1)
     assert differing(found["ranges"], expected["ranges"]) == 0
 

@@ -27,7 +27,7 @@ from gpusense.backends.numpy.backend import NumpyBackend
 from gpusense.tables.casters import CASTERS, Lookup, March
 from gpusense.world.frames import frame_of
 from gpusense.world.windows import Window
-from gpusense.tables.rectangles import empty_rectangles
+from gpusense.tables.rectangles import Planes, empty_rectangles
 from gpusense.world.windows import Window
 
 rng = np.random.default_rng(0)
@@ -53,13 +53,13 @@ for kind in ("cpu", "gpu"):
     for map_ in (cells, np.where(rng.random((70, 9)) < 0.02, 100, 0)):
         wrong += np.count_nonzero(gs.distance_transform(map_, squared=True, backend=device)
                                   != gs.distance_transform(map_, squared=True, backend=numpy))
-    for sectors in (1, 2, 4):
-        tables = []
+    for form in (Planes(1), Planes(2), Planes(4), *((Planes(2, 8),) if kind == "gpu" else ())):
+        tables, entries = [], form.entries(13, 17)
         for one in (device, numpy):
-            table = empty_rectangles(one, cells > 0, sectors)
-            tables.append(one.download(table, np.empty(4 * sectors * 15 * 19, np.uint16)))
-            empty_rectangles(one, changed, sectors, table, part)
-            tables.append(one.download(table, np.empty(4 * sectors * 15 * 19, np.uint16)))
+            table = empty_rectangles(one, cells > 0, form)
+            tables.append(one.download(table, np.empty(entries, np.uint16)))
+            empty_rectangles(one, changed, form, table, part)
+            tables.append(one.download(table, np.empty(entries, np.uint16)))
         wrong += np.count_nonzero(tables[0] != tables[2]) + np.count_nonzero(tables[1] != tables[3])
 
 # Poses that are no numbers, off the window, and of huge headings, as arrays on a device may be.

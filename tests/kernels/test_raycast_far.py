@@ -24,6 +24,7 @@ from support.raycast_scenes import (
 from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import differing
 from gpusense.reference.ray import crossed
+from gpusense.tables.rectangles import Planes
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
@@ -100,7 +101,7 @@ def test_origins_nearly_as_far_off_as_a_range_may_be_long(precision, backend):
     found = cast(scene, backend, precision)
     assert 100 < np.count_nonzero(found < MOST) < 600
     for sectors in (2, 4):
-        assert differing(cast(scene, backend, precision, sectors), found) == 0
+        assert differing(cast(scene, backend, precision, Planes(sectors)), found) == 0
     assert differing(found, cast(scene, "numpy", precision)) == 0
     if precision == "float64" and backend == "numpy":
         # The walk begins near the map, at a place on the ray that is exact.
@@ -126,5 +127,5 @@ def test_the_longest_corridor(precision, backend):
     cell = np.stack([rng.integers(0, 50, 60), np.full(60, 1)], axis=1)
     scene = Scene(occupied, cell, frac, np.stack([np.ones(60), slope], axis=1), float(MOST))
     expected = length - 1 - cell[:, 0] - frac[:, 0]
-    found = cast(scene, backend, precision, 2, wide=True)
+    found = cast(scene, backend, precision, Planes(2), wide=True)
     assert (np.abs(found - expected) <= np.spacing(expected.astype(precision))).all()

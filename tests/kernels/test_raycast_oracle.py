@@ -21,6 +21,7 @@ from support.raycast_scenes import (
 )
 
 from gpusense.backends import get_backend
+from gpusense.tables.rectangles import Planes
 
 
 def test_there_are_enough_rays():
@@ -64,7 +65,7 @@ def test_every_backend_has_the_bits_of_numpy_for_any_number_of_sectors(family, b
         expected = cast(scene, "numpy", precision)
         # Vectors too, where the device has them.
         for wide in (False, True) if get_backend(backend).info.lanes > 1 else (False,):
-            found = cast(scene, backend, precision, sectors, wide=wide)
+            found = cast(scene, backend, precision, Planes(sectors), wide=wide)
             wrong = np.flatnonzero(expected.view(bits) != found.view(bits))
             assert not len(wrong), [(scene.ray(i), found[i], expected[i]) for i in wrong[:3]]
 

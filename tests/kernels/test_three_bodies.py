@@ -40,6 +40,7 @@ class Purpose:
 
 
 ARRAYS = "works on all elements at once"
+COUNTS = "counts of boundaries are integers in the bits of a float; in NumPy numbers"
 FLOOR = "some OpenCL drivers call floor and clamp as functions; Warp and NumPy have their own"
 FLOAT64 = "error_free.cl has the precision of real, which may be float32; Warp and NumPy choose it by the call"
 EIGHT = "a work-item reads eight numbers before it uses any; the reference takes all of them at once"
@@ -73,8 +74,9 @@ ON_PURPOSE = [
     Purpose("landmarks", "negative_where at_places", REFERENCE_ONLY, ARRAYS),
     Purpose("placement", "floor_cells", (OPENCL,), FLOOR),
     Purpose("ranges", "caster_of", (WARP, NUMPY), "OpenCL requires the file caster, which sources.py resolves"),
+    Purpose("raycast", "way_of rectangle_at", KERNELS_ONLY, COUNTS),
     Purpose("ray", "as_bits farther", (WARP,), "OpenCL has casts of bits, as_bits and as_real; NumPy needs none"),
-    Purpose("ray", "whole", KERNELS_ONLY, "counts of boundaries are integers in the bits of a float; in NumPy numbers"),
+    Purpose("ray", "whole", KERNELS_ONLY, COUNTS),
     Purpose("ray", "start_casts", REFERENCE_ONLY, ARRAYS),
     Purpose("rectangles", "reached _runs longest _quadrants", REFERENCE_ONLY, ARRAYS),
     Purpose("relative", "pair_sum_float64", (OPENCL,), FLOAT64),

@@ -114,7 +114,7 @@ def test_missing_readings_give_no_evidence(model):
         found = monitor.update(POSES[0], np.full(71, np.nan))
         assert math.isnan(found.explained) and found.p_lost == pytest.approx(0.1, abs=0.02)
     assert monitor.update(POSES[0], None).verdict == "uncertain"
-    assert monitor.diagnose().text == "no beam meets mapped cells that tell anything"
+    assert monitor.diagnose().text == "no beam meets mapped cells that give evidence"
 
 
 def test_several_sensors_and_landmarks():

@@ -32,7 +32,7 @@ def test_limits_runs(selection: str, needs: Callable[[str], str], tmp_path: Path
     assert sum(row["what"].startswith("field, bilinear") for row in report["rows"]) == 2
     assert all(row["call_s"] > 0 and row["launch_s"] > 0 and row["first_s"] > 0 for row in report["rows"])
     checked = [row for row in report["rows"] if row["checked"]]
-    assert len(checked) == 14 and all(row["median_error"] < 1e-4 and row["error"] < 1e-2 for row in checked)
+    assert len(checked) == 16 and all(row["median_error"] < 1e-4 and row["error"] < 1e-2 for row in checked)
     assert not any(row["differing_bits"] for row in checked if row["what"].startswith("rays"))
 
 

@@ -14,12 +14,14 @@ from gpusense.backends import Backend, get_backend
 from gpusense.backends.numpy.backend import NumpyBackend
 from gpusense.interface.signatures import KERNELS
 from gpusense.interface.structs import Caster, Cone, MixtureTables, RangeScale, ScanBatch, Window
-from gpusense.tables.rectangles import empty_rectangles
+from gpusense.tables.rectangles import ROWS, Planes, empty_rectangles
 
 PRECISIONS = (np.float32, np.float64)
 LIMIT, RESOLUTION = 37.3, 0.05
 UNREACHABLE = (1 << 31) - 1
-SECTORS = (1, 2, 4)
+# Forms of planes of empty rectangles on every device, and one of those of GPUs.
+PLANES = (Planes(1), Planes(2), Planes(4))
+GROUPED = Planes(2, ROWS)
 SCALE = RangeScale(LIMIT, RESOLUTION, LIMIT * RESOLUTION)
 # Particles of each scan and those before a launch, which are not read where there is one scan.
 ONE_SCAN = ScanBatch(1, 0)
@@ -118,23 +120,26 @@ def scene_flags(real: type, *names: str) -> frozenset[str]:
     return frozenset({*names, *(("FLOAT64",) if real is np.float64 else ())})
 
 
-def sector_flags(sectors: int) -> frozenset[str]:
-    return frozenset({f"SECTORS_{sectors}"} if sectors > 1 else ())
+def planes_of(occupied: np.ndarray, form: Planes = PLANES[0], kind: str = "cpu") -> np.ndarray:
+    """Return (4, sectors, lines, cols + 2) rectangles by the reference's kernels for processors or for GPUs."""
+    return _planes(occupied.tobytes(), occupied.shape, form, kind)
 
 
-def planes_of(occupied: np.ndarray, sectors: int = 1, kind: str = "cpu") -> np.ndarray:
-    """Return (4, sectors, rows + 2, cols + 2) rectangles by the reference's kernels for processors or for GPUs."""
-    return _planes(occupied.tobytes(), occupied.shape, sectors, kind)
+def row_after_row(planes: np.ndarray, form: Planes, rows: int) -> np.ndarray:
+    """Return planes of any form as (4, sectors, rows + 2, cols + 2) rectangles, one row after the other."""
+    _, sectors, lines, stride = planes.shape
+    groups = planes.reshape(4, sectors, lines // form.group, stride, form.group)
+    return groups.swapaxes(3, 4).reshape(planes.shape)[:, :, : rows + 2]
 
 
 @functools.lru_cache(maxsize=32)
-def _planes(cells: bytes, shape: tuple[int, int], sectors: int, kind: str) -> np.ndarray:
+def _planes(cells: bytes, shape: tuple[int, int], form: Planes, kind: str) -> np.ndarray:
     # A backend of its own: that of the tests may pretend to be a GPU.
     backend = NumpyBackend()
     backend.info = dataclasses.replace(backend.info, kind=kind)
-    planes = np.empty((4, sectors, shape[0] + 2, shape[1] + 2), np.uint16)
+    planes = np.empty((4, form.sectors, form.lines(shape[0]), shape[1] + 2), np.uint16)
     occupied = np.frombuffer(cells, bool).reshape(shape)
-    backend.download(empty_rectangles(backend, occupied, sectors), planes)
+    backend.download(empty_rectangles(backend, occupied, form), planes)
     planes.flags.writeable = False
     return planes
 
@@ -146,16 +151,18 @@ def ranges_on_both(
     flags: frozenset[str],
     cell: np.ndarray,
     pose: np.ndarray,
-    sectors: int = 1,
+    form: Planes = PLANES[0],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return ranges along every kind of bearing, by the reference with 1 sector and by a device with any number."""
+    """Return ranges along every kind of bearing, by the reference with 1 sector and by a device with any planes."""
     ray = directions(real)
     ranges = np.full((len(pose), len(ray)), np.nan, real)
     size, counts = (len(ray), len(pose)), (len(pose), len(ray))
     rest = (cell, pose, ray, ranges, window_of(occupied), *counts, EXACT, SCALE)
     reference = run(get_backend("numpy"), "cast_ranges", flags, size, planes_of(occupied), *rest)
-    flags |= sector_flags(sectors)
-    found = run(device, "cast_ranges", flags, size, planes_of(occupied, sectors), *rest)
+    flags |= form.flags
+    found = run(
+        device, "cast_ranges", flags, size, planes_of(occupied, form, "cpu" if form.group == 1 else "gpu"), *rest
+    )
     return reference["ranges"], found["ranges"]
 
 

@@ -12,7 +12,7 @@ from support.ray_oracles import Ray, walk
 from gpusense.backends import get_backend
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.structs import Caster, RangeScale, Window
-from gpusense.tables.rectangles import empty_rectangles
+from gpusense.tables.rectangles import Planes, empty_rectangles
 
 LAST_FLOAT32 = 1 - 2.0**-24
 FRACTIONS = (0.0, 0.25, 0.5, 0.75, LAST_FLOAT32)
@@ -45,15 +45,18 @@ class Scene:
         return np.array([walk(cells, self.ray(i), self.outside_occupied).t for i in range(len(self.cell))])
 
 
+ONE_SECTOR = Planes(1)
+
+
 @functools.cache
-def cast(scene: Scene, backend: str, precision: str, sectors: int = 1, *, wide: bool = False) -> np.ndarray:
+def cast(scene: Scene, backend: str, precision: str, form: Planes = ONE_SECTOR, *, wide: bool = False) -> np.ndarray:
     """Return the kernel's ranges in cells; poses carry the direction as their heading, the one ray is along it.
 
     Args:
         scene: Map and rays.
         backend: Where they are cast.
         precision: ``"float32"`` or ``"float64"``.
-        sectors: Sectors of a quadrant for which rectangles are made.
+        form: Form of the planes of rectangles.
         wide: Whether the kernel is the one for the device's lanes, where there is one.
     """
     device, real = get_backend(backend), np.dtype(precision)
@@ -63,8 +66,8 @@ def cast(scene: Scene, backend: str, precision: str, sectors: int = 1, *, wide: 
     flags |= {"ORIGINS_OUTSIDE"} if not ((scene.cell >= 0) & (scene.cell < (cols, rows))).all() else set()
     pose = np.concatenate([scene.frac, scene.direction], axis=1)
     count = len(pose)
-    flags |= {f"SECTORS_{sectors}"} if sectors > 1 else set()
-    table = empty_rectangles(device, scene.occupied, sectors)
+    flags |= form.flags
+    table = empty_rectangles(device, scene.occupied, form)
     cell, pose = device.upload(scene.cell.astype(np.int32)), device.upload(pose.astype(real))
     rays, ranges = device.upload(np.array([[1.0, 0.0]], real)), device.empty(count, real)
     code = with_lanes_flag(device.info.lanes, "cast_ranges", flags) if wide else frozenset(flags)

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import math
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from gpusense.tables import casters
 from gpusense.tables.caster_base import CasterInput
 from gpusense.tables.casters import Bresenham, Caster, Cddt, Dda, Exact, Lookup, March
 from gpusense.tables.directional import directional_table
-from gpusense.tables.rectangles import sectors_of
+from gpusense.tables.rectangles import Planes, planes_of
 from gpusense.world import windows
 
 DOCS = ROOT / "docs" / "speed.md"
@@ -119,7 +120,7 @@ def test_dda_is_the_exact_caster_to_the_bit(family, backend):
             ranges = kernel_cast(scene, Dda(), backend, precision)
             same_bits(ranges, kernel_cast(scene, Exact(), backend, precision))
             for sectors in (1, 2, 4):
-                same_bits(ranges, scene_cast(scene, backend, precision, sectors))
+                same_bits(ranges, scene_cast(scene, backend, precision, Planes(sectors)))
 
 
 # ------------------------------------------------------------------------------------------- models, memory, words
@@ -167,13 +168,15 @@ def test_table_bytes_are_those_of_the_page(backend):
     rows, cols = grid.shape
     table = directional_table(grid.obstacles(), 36, pruned=False, outside=False)
     begins, lines = sum(map(len, lists_of(table, 36).values())), int(table[0])
-    sectors = sectors_of(get_backend(backend), rows, cols)
+    planes = planes_of(get_backend(backend), rows, cols)
     for kind in each_caster(36):
         caster = gs.RayCaster(grid, RANGE, method=kind, backend=backend)
         assert caster.table_bytes == 0
         caster.cast(poses[:2], bearings)
         formula = rows_of_the_page()[kind.name][2]
-        assert caster.table_bytes == value_of(formula, H=rows, W=cols, S=sectors, L=lines, B=begins, bins=36), kind
+        assert caster.table_bytes == value_of(
+            formula, H=planes.lines(rows) - 2, W=cols, S=planes.sectors, L=lines, B=begins, bins=36
+        ), kind
 
 
 @pytest.mark.parametrize("name", ["opencl", "warp"])
@@ -211,3 +214,22 @@ def test_the_page_of_casters_mentions_every_method_and_knob():
             assert any(f"`{knob.name}`" in cell for cell in rows[name]), (name, knob.name)
     page = DOCS.read_text(encoding="utf-8")
     assert "sensor_table=" in page and "save_table(" in page
+
+
+@pytest.mark.parametrize(
+    ("kind", "side", "buffer", "form"),
+    [
+        ("gpu", 2000, 1 << 34, Planes(4, 8)),
+        ("gpu", 6000, 1 << 34, Planes(2, 8)),
+        ("gpu", 20_000, 1 << 36, Planes(1, 8)),
+        ("gpu", 2000, 1 << 26, Planes(2, 8)),
+        ("cpu", 2000, 1 << 34, Planes(2)),
+        ("cpu", 20_000, 1 << 36, Planes(1)),
+    ],
+)
+def test_planes_fit_indices_buffers_and_caches(kind, side, buffer, form):
+    """Indices have 32 bits; a GPU has rows in groups, and four sectors where its caches hold the planes."""
+    info = dataclasses.replace(get_backend("numpy").info, kind=kind, backend="opencl", max_buffer=buffer)
+    planes = planes_of(SimpleNamespace(info=info), side, side)
+    assert planes == form
+    assert (planes.entries(side, side) < 1 << 31 and 2 * planes.entries(side, side) <= buffer) or planes.sectors == 1

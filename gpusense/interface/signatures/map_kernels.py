@@ -43,7 +43,8 @@ KERNELS: dict[str, Kernel] = {
         "int words", "int begin", "int end",
     ),
     "rectangles_scan": kernel(
-        "rectangles", "col row quadrant", "uchar runs [2 * band * cols]", f"out {_PLANES}", *_CHANGED,
+        "rectangles", "col row quadrant", "uchar runs [2 * band * cols]",
+        "out ushort rectangles [4 * sectors * lines * (cols + 2)]", *_CHANGED, "int lines", "int group",
     ),
     "fill_lookup": kernel(
         "lookup_table", "bin cell", "ushort rectangles [map]", "real2 ray [bins]",

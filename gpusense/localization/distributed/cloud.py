@@ -48,8 +48,8 @@ class SplitCloud(FilterCloud):
 
     Each stage of a correction exchanges the largest score, then the sums of integer weights. A stage that draws also
     exchanges particles: without jitter each shard receives the parents that it draws; with jitter or residual
-    resampling it receives all parents. Each call names the particles and buffers that it works on; shards remember
-    none, and their state is here.
+    resampling it receives all parents. Each call names its particles and buffers; shards remember none, and their state
+    is kept here.
 
     Args:
         team: The shards.
@@ -80,7 +80,7 @@ class SplitCloud(FilterCloud):
         return self._team.each(method, [arguments] * self._size)
 
     def _set(self, places: Places, count: int, state: np.ndarray) -> None:
-        """Set all that a step changes."""
+        """Set everything that a step changes."""
         self.places, self.count, self._state = places, count, state
 
     # ---- steps
@@ -92,7 +92,7 @@ class SplitCloud(FilterCloud):
         self._set(places, count, np.zeros(STATE))
 
     def _fill(self, arrays: list[tuple[str, int, np.ndarray]]) -> None:
-        """Copy arrays to the buffers of shards, to each its part."""
+        """Copy to the buffers of each shard its part of arrays."""
         parts = [self._parts(len(array)) for _, _, array in arrays]
         self._team.each("fill", [
             ([(name, index, array[own.first : own.first + own.size])
@@ -133,7 +133,7 @@ class SplitCloud(FilterCloud):
         offsets = np.cumsum([0.0, *(one[column] for one in each[:-1])])
         shown = state.copy()
         if marks is not None:
-            # A filter that changes its size draws, whatever its weights.
+            # A filter that changes its size always draws.
             shown[number * STAGE + RESAMPLED] = 1.0
         asked = None if self._team.direct else marks
         found = self._team.each("set_weights", [(stage, totals, shown, float(offset), asked) for offset in offsets])
@@ -143,7 +143,7 @@ class SplitCloud(FilterCloud):
             self._all("use_settings", step.settings)
 
     def _weigh(self, stage: Stage, step: Step, state: np.ndarray) -> tuple[list[Any], np.ndarray, int, np.ndarray]:
-        """Score the particles, and weigh them on lower rungs while too few have weight; write the stage's state.
+        """Score the particles, weigh them, again on lower rungs while too few have weight, and write the stage's state.
 
         Returns:
             Sums of weights of each shard and of all, the column that counts, and the settings that were used.
@@ -162,7 +162,7 @@ class SplitCloud(FilterCloud):
             self._all("use_settings", settings)
 
     def _exchanged(self, stage: Stage, marks: object, found: list[Any], offsets: np.ndarray) -> list[Any]:
-        """Hand particles to the shards that draw from them; return for each what its method ``draw`` takes."""
+        """Hand particles to the shards that draw from them; return the arguments of each shard's ``draw``."""
         if marks is None:
             return [False] * self._size
         if self._team.direct:
@@ -178,14 +178,14 @@ class SplitCloud(FilterCloud):
         return pieces
 
     def _marks(self, own: np.ndarray, drawn: list[Part]) -> list[tuple[float, float]] | None:
-        """Return the lowest and the highest mark of each shard's draws; None where each draws from its part alone."""
+        """Return the lowest and the highest mark of each shard's draws; None if each draws from its part alone."""
         total, whole = float(own[TOTAL]), drawn[0].whole
         if not total > 0.0 and whole != self.count:
             raise RuntimeError("the weights of all particles are 0, so their number cannot change")
         if (own[RESAMPLED] == 0.0 and whole == self.count) or not total > 0.0:
             return None
         if own[LEFT] > 0.0 or self._residual:
-            # Jitter takes differences of any two particles; the last residual draws may be of any particle.
+            # Jitter takes differences of any two particles; the last residual draws may take any particle.
             return [(-1.0, total)] * self._size
         ends = [(part.first / whole, (part.first + part.size) / whole) for part in drawn]
         return [(float(mark_of(np.array(low), total)), float(mark_of(np.array(high), total))) for low, high in ends]
@@ -276,5 +276,5 @@ class SplitCloud(FilterCloud):
         self._all("time_scoring")
 
     def close(self) -> None:
-        """Forget the shards."""
+        """Release the shards."""
         self._team.close()

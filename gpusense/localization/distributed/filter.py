@@ -20,12 +20,12 @@ class SplitParticleFilter(ParticleFilter):
     Each device moves, scores, weighs and draws its share of the particles. In each stage of a correction the devices
     exchange the largest score, sums of weights, and parents that another device draws. Random numbers depend on a
     particle's index in the whole filter, and sums of weights are exact. So particles and weights equal those of
-    :class:`ParticleFilter` on one device of the same kind; they have the same bits where log-likelihoods have.
+    :class:`ParticleFilter` on one device of the same kind, bit for bit if log-likelihoods do.
 
     Args:
         make: Returns the models of a device, given its selection string. With ``executors`` it must be a function of a
             module, or a ``functools.partial`` of one.
-        devices: Selection strings, one for each share of the particles; a device may occur twice.
+        devices: Selection strings, one for each share of the particles; a device may occur more than once.
         executors: One for each device, with one worker that stays the same process: ``ProcessExecutor([device])``, or
             those of ``DaskExecutor.on_each()``; None keeps all shares in this process.
         **options: Options of :class:`ParticleFilter`.
@@ -70,7 +70,7 @@ class SplitParticleFilter(ParticleFilter):
         """Return room for the particles of each device."""
         make, devices, executors = self._make, self._devices, self._executors
         most, count, residual = self.options.most, len(devices), self.options.resampling == "residual"
-        # Parts are whole blocks, and the number of blocks need not be a multiple of the number of shards.
+        # Parts are whole blocks, so the largest part may exceed an equal share.
         share = min(most, most // count + 3 * parts_of(most, count)[0].block)
         team: LocalTeam | RemoteTeam
         if executors is None:
@@ -97,7 +97,7 @@ class SplitParticleFilter(ParticleFilter):
 
     @property
     def exchanged(self) -> int:
-        """Bytes of particles that devices have handed to one another."""
+        """Bytes of particles that devices have exchanged."""
         return self._cloud.exchanged
 
     def close(self) -> None:

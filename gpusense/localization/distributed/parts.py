@@ -1,4 +1,4 @@
-"""Shares of a filter's particles, and the messages that shards exchange."""
+"""Parts of a filter's particles, and the messages that shards exchange."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from gpusense.localization.sums import block_of
 
 # A method of a shard, which yields once; poses with cumulative weights; the index of a sensor with its readings; the
-# lowest and the highest mark that each shard draws at.
+# lowest and the highest mark of each shard's draws.
 Step = Generator[None, None, Any]
 Piece = tuple[np.ndarray, np.ndarray]
 SensorReadings = tuple[int, tuple[Any, ...]]
@@ -23,8 +23,8 @@ class Part(NamedTuple):
 
     Attributes:
         first: Index of the first one in the whole filter.
-        size: Their number.
-        whole: Particles of the whole filter.
+        size: Number of particles.
+        whole: Number of particles of the whole filter.
         block: Particles of a block of sums.
     """
 

@@ -34,7 +34,7 @@ from gpusense.localization.particles import Places, Stage
 from gpusense.localization.sensors import Sensor
 from gpusense.reference.tempering import left_of, rung_of
 
-# Units in the last place within which the product of two numbers reaches a neighbour of another product.
+# Units in the last place by which a factor is varied until a product has the wanted value.
 _UNITS = 16
 _DOUBLE = np.dtype(np.float64)
 _MOST_RECORDED = 8
@@ -56,8 +56,8 @@ class Shard:
         self._part = Part(0, 0, 0, 16)
         self._settings = np.zeros(0)
         self._pool, self._residual = ShardPool(self._backend), residual
-        # Ones, and settings whose temperature is the offset to add: the launch ``add_scores`` then shifts cumulative
-        # weights.
+        # With an array of ones, and an offset as the temperature in settings, the launch ``add_scores`` shifts
+        # cumulative weights.
         self._ones: tuple[Any, Any] | None = None
         self._recordings = ProgramCache[RecordedProgram](_MOST_RECORDED)
         self._timed = False
@@ -88,7 +88,7 @@ class Shard:
 
         Args:
             part: The particles.
-            settings: Numbers of the step of the whole filter.
+            settings: Settings of the whole filter's step.
             origin: Index of the poses before the move.
             target: Index of the poses after it.
             kind: Kind of the motion.
@@ -105,7 +105,7 @@ class Shard:
         self._cloud.set_particles(Places(), part.size, part.block)
 
     def _upload_settings(self, drawn: Part, share: float | None = None) -> None:
-        """Upload the numbers of the step for the particles of a part, with another share where one is given."""
+        """Upload the settings of the step for a part's particles, with a different share if one is passed."""
         settings = self._settings.copy()
         settings[FIRST], settings[WHOLE], settings[DRAWN] = drawn.first, self._part.whole, drawn.whole
         if share is not None:
@@ -113,7 +113,7 @@ class Shard:
         self._backend.upload(settings, self._cloud.settings)
 
     def use_settings(self, settings: np.ndarray) -> Step:
-        """Take other numbers for the step."""
+        """Replace the settings of the step."""
         self._settings = settings.copy()
         self._upload_settings(self._part)
         yield
@@ -137,7 +137,7 @@ class Shard:
         return float(self._read(cloud.sums.largest, cloud.blocks).max())
 
     def _recorded(self, source: int, given: Sequence[SensorReadings]) -> RecordedProgram:
-        """Return the recorded program that scores a buffer; its start does not wait, so that devices work together."""
+        """Return the recorded program that scores a buffer; starting it does not wait, so devices work concurrently."""
         sensors = tuple((index, self._sensors[index].version) for index, _ in given)
         key = (source, self._part.size, self._part.block, sensors)
         kept = self._recordings.get(key)
@@ -171,17 +171,17 @@ class Shard:
         return self._read(cloud.sums.totals, WEIGHT_SUMS)
 
     def set_weights(self, stage: Stage, totals: np.ndarray, state: np.ndarray, offset: float, marks: Marks) -> Step:
-        """Set the weights by the sums and the state of the whole filter; return the particles that draws need.
+        """Set the weights from the sums and the state of the whole filter; return the particles that draws need.
 
         Args:
             stage: The stage.
             totals: Sums of the whole filter.
-            state: Its state after this stage.
-            offset: Sum of the weights of the shards before.
-            marks: The lowest and the highest mark that each shard draws at; None where nothing is drawn.
+            state: State of the whole filter after this stage.
+            offset: Sum of the weights of all preceding shards.
+            marks: The lowest and the highest mark of each shard's draws; None where nothing is drawn.
 
         Returns:
-            For each pair of marks, poses and cumulative weights of the particles from the one to the other.
+            For each pair of marks, poses and cumulative weights of the particles between them.
         """
         cloud, part = self._cloud, self._part
         if part.size:
@@ -198,7 +198,7 @@ class Shard:
         return [(poses[a : b + 1], ends[a : b + 1]) for a, b in zip(begins, finals, strict=True)]
 
     def _choose_rung(self, totals: np.ndarray, left: float) -> None:
-        """Set the share at which the kernel, which counts the shard's particles, takes the rung of the whole filter."""
+        """Set the share for which the kernel, which counts the shard's particles, chooses the whole filter's rung."""
         if not left > 0.0:
             return
         count, least = float(self._part.size), self._settings[SHARE] * self._part.whole
@@ -207,14 +207,14 @@ class Shard:
             found = rung_of(totals, self._settings, share * count)
             if found == wanted:
                 break
-            # A unit in the last place off.
+            # The rounded quotient may be a unit in the last place off.
             share = float(np.nextafter(share, math.inf if found < wanted else 0.0))
         else:
             raise RuntimeError(f"weights: must have a share for rung {wanted} of {count:g} particles, got none")
         self._upload_settings(self._part, share)
 
     def shift_ends(self, offset: float) -> Step:
-        """Add the weights of the shards before to the cumulative weights on the device, and wait."""
+        """Add the weights of all preceding shards to the cumulative weights on the device, and wait."""
         cloud, part = self._cloud, self._part
         if part.size and offset:
             if self._ones is None:
@@ -222,7 +222,7 @@ class Shard:
             (ones, factor), settings = self._ones, np.zeros(SETTINGS)
             settings[TEMPERATURE + 1] = offset
             self._backend.upload(settings, factor)
-            # The kernel adds a multiple of an array to another: these integers are exact.
+            # The kernel adds a multiple of one array to a second one, exactly for these integers.
             self._backend.run((
                 launch("add_scores", flags_if(FLOAT64=True), (cloud.blocks,), log_p=ones,
                        settings=factor, score=cloud.ends, largest=cloud.sums.largest, sensor=1,
@@ -239,7 +239,7 @@ class Shard:
         yield
 
     def reaches(self, other: Shard) -> bool:
-        """Tell whether the device copies from the device of another shard."""
+        """Tell whether the device can copy from the device of another shard."""
         return self._gpu and self._backend.copies_from(other._backend)
 
     def draw(self, stage: Stage, drawn: Part, pieces: Sequence[Piece] | bool) -> Step:
@@ -248,8 +248,8 @@ class Shard:
         Args:
             stage: The stage.
             drawn: Particles to draw.
-            pieces: Poses and cumulative weights of shards in their order; True where the device has taken them, False
-                to draw from the shard's particles alone.
+            pieces: Poses and cumulative weights of all shards in order; True if the device has already taken them,
+                False to draw from the shard's particles alone.
         """
         cloud, found = self._cloud, self._pool
         of: tuple[Any, Any, int] = cloud.poses[stage.source], cloud.ends, self._part.size

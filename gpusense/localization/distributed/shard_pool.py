@@ -1,4 +1,4 @@
-"""Particles of all shards on the device of one, which draws from them."""
+"""Copies of all shards' particles on the device of one shard, which draws from them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class ShardPool:
         self.poses: Any = None
         self.ends: Any = None
         self.count = 0
-        # Of residual resampling: capacity, sums over blocks, and cumulative numbers of copies.
+        # For residual resampling: capacity, sums over blocks, and cumulative numbers of copies.
         self._counted: tuple[int, Any, Any] = (0, None, None)
 
     def reserve(self, count: int, whole: int) -> None:

@@ -1,4 +1,4 @@
-"""Shards that live in a worker's process for filters elsewhere."""
+"""Shards that a worker's process holds for filters in other processes."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def call(name: str, method: str, *arguments: Any) -> Any:
 
 
 def release(name: str) -> None:
-    """Forget a shard of this process."""
+    """Release a shard of this process."""
     _SHARDS.pop(name, None)
 
 

@@ -13,7 +13,7 @@ from gpusense.localization.distributed.shard import Shard
 
 
 class LocalTeam:
-    """Shards in this process: one thread starts the work of all before it waits for the first.
+    """Shards in this process; a single thread starts the work of all before it waits for the first.
 
     Args:
         models: Models of each shard.
@@ -22,7 +22,7 @@ class LocalTeam:
 
     Attributes:
         devices: Selection strings of the devices.
-        direct: Whether particles go from device to device, and not through the host.
+        direct: Whether particles are copied from device to device instead of through the host.
     """
 
     def __init__(self, models: Sequence[Sequence[Any]], capacity: int, residual: bool) -> None:
@@ -31,7 +31,7 @@ class LocalTeam:
         self.direct = all(one.reaches(other) for one in self._shards for other in self._shards)
 
     def each(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """Run a method of all shards with the arguments for each, and return the results."""
+        """Run a method of all shards, each with its arguments, and return the results."""
         steps = [getattr(one, method)(*own) for one, own in zip(self._shards, arguments, strict=True)]
         for one in steps:
             next(one)
@@ -58,7 +58,7 @@ class RemoteTeam:
 
     Attributes:
         devices: Selection strings of the devices.
-        direct: False: particles go through this process.
+        direct: False, since particles are copied through this process.
     """
 
     direct = False
@@ -80,7 +80,7 @@ class RemoteTeam:
         self.devices = [future.result() for future in made]
 
     def each(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """Run a method of all shards with the arguments for each, and return the results."""
+        """Run a method of all shards, each with its arguments, and return the results."""
         running = [
             executor.submit(shard_registry.call, name, method, *own)
             for executor, name, own in zip(self._executors, self._names, arguments, strict=True)
@@ -88,7 +88,7 @@ class RemoteTeam:
         return [future.result() for future in running]
 
     def hand_on(self, source: int) -> None:
-        """Refuse: the shards do not see one another."""
+        """Refuse, since the shards cannot reach each other."""
         raise NotImplementedError
 
     def close(self) -> None:

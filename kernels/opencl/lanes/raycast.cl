@@ -15,7 +15,6 @@ lanes cast_ray_lanes(global const entry *map_table, const Window window, const i
     const lanes speed_x = fabs(dx), speed_y = fabs(dy), inv_x = 1 / speed_x, inv_y = 1 / speed_y;
     const lanes a_x = right ? (lanes)(1 - pose.x) : (lanes)pose.x;
     const lanes a_y = up ? (lanes)(1 - pose.y) : (lanes)pose.y;
-    const int size = (window.rows + 2) * (window.cols + 2);
     ilanes plane = (right ? (ilanes)0 : (ilanes)SECTORS) + (up ? (ilanes)0 : (ilanes)(2 * SECTORS));
 #if SECTORS_2
     plane = speed_y > speed_x ? plane + 1 : plane;
@@ -24,14 +23,24 @@ lanes cast_ray_lanes(global const entry *map_table, const Window window, const i
     plane = speed_y > speed_x ? plane + 2 : plane;
     plane = speed_y > (speed_y > speed_x ? (lanes)(real)2.4142136 : (lanes)(real)0.41421356) * speed_x ? plane + 1 : plane;
 #endif
-    const int stride = window.cols + 2;
-    const ilanes step_x = right ? (ilanes)1 : (ilanes)-1, step_y = up ? (ilanes)stride : (ilanes)-stride;
+    const int stride = GROUP * (window.cols + 2), size = (window.rows + 2 + GROUP - 1) / GROUP * stride;
+    const ilanes step_x = right ? (ilanes)GROUP : (ilanes)-GROUP;
+#if ROW_GROUPS
+    const ilanes step_y = up ? (ilanes)1 : (ilanes)-1, origin = plane * size + GROUP * (cell.x + 1);
+#else
+    const ilanes step_y = up ? (ilanes)stride : (ilanes)-stride;
     const ilanes origin = plane * size + padded(cell.y, cell.x, window.cols);
+#endif
     lanes k_x = COUNT, k_y = COUNT, t = 0, nearest = limit;
     ilanes going = -1;
     for (;;) {
         const ilanes x = as_ilanes(k_x) - FIRST_BITS, y = as_ilanes(k_y) - FIRST_BITS;
+#if ROW_GROUPS
+        const ilanes row = cell.y + 1 + step_y * y;
+        const ilanes at = going ? origin + step_x * x + row + row / GROUP * (stride - GROUP) : (ilanes)0;
+#else
         const ilanes at = going ? origin + step_x * x + step_y * y : (ilanes)0;
+#endif
         const ilanes sides = GATHER(ilanes, map_table, at);
         const ilanes stopped = going & (sides <= OCCUPIED);
         if (any_lane(stopped)) {

@@ -12,7 +12,7 @@ import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.evaluation.tolerances import differing, per_scan
 from gpusense.interface.structs import Caster, RangeScale, Window
-from gpusense.tables.rectangles import empty_rectangles
+from gpusense.tables.rectangles import Planes, empty_rectangles
 
 PRECISIONS = ("float32", "float64")
 # Denormal in float32, denormal in float64 too, and on either side of what a ray takes for 0.
@@ -116,7 +116,10 @@ def test_denormal_direction_components_are_zero(backend, precision):
 
     def cast(selection: str, flushed: bool) -> np.ndarray:
         device = get_backend(selection)
-        table, cells = empty_rectangles(device, obstacles, 1), np.tile(np.array([[5, 3]], np.int32), (len(origins), 1))
+        table, cells = (
+            empty_rectangles(device, obstacles, Planes(1)),
+            np.tile(np.array([[5, 3]], np.int32), (len(origins), 1)),
+        )
         found = []
         for pose, ray in headings:
             if flushed:

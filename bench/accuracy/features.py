@@ -3,7 +3,7 @@
     python bench/accuracy/features.py --backend opencl --output bench/results/features_cpu
 
 ``GPUSENSE_DATA`` names the folder of recorded data. ``simulated``: floors of known geometry (see
-``gpusense/evaluation/feature_scenes.py``: corridors, rooms, doors open, half open and closed, square pillars, poles,
+``tests/support/feature_scenes.py``: corridors, rooms, doors open, half open and closed, square pillars, poles,
 boxes): the share of features that are seen well and found, the share of returned ones that exist, median errors, and
 the squared error over the covariance per degree of freedom (NEES; 1 is right), in the mean without errors beyond
 99.9 % of chi squared, and the share of those. ``ransac``: lines by scikit-image's RANSAC, one after another, beside

@@ -15,7 +15,6 @@ import functools
 import io
 import os
 import shutil
-import sqlite3
 import struct
 import tempfile
 from collections.abc import Callable, Iterator
@@ -244,6 +243,8 @@ def _write(writer: Any, connections: dict[bytes, Any], record: _Record) -> None:
 
 def _sqlite(file: Path, out: Path) -> None:
     """Write the topics and messages of a database up to its cut into a new one."""
+    import sqlite3
+
     padded = out.with_name(f"{out.name}.padded")
     shutil.copyfile(file, padded)
     with padded.open("r+b") as stream:

@@ -1,4 +1,4 @@
-"""Check arguments and convert them. Every message reads ``{argument}: {rule}, got {value}``."""
+"""Check and convert arguments. Every message reads ``{argument}: {rule}, got {value}``."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def real(
         high: Inclusive upper limit.
 
     Raises:
-        TypeError: The value is not a real number; a bool is not one.
+        TypeError: The value is not a real number; bools are refused.
         ValueError: The value is not finite, or breaks a limit.
     """
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
@@ -83,7 +83,7 @@ def integer(name: str, value: object, *, low: int | None = None, high: int | Non
     """Return ``value`` as an int after checking that it is an integer from ``low`` to ``high``, both included.
 
     Raises:
-        TypeError: The value is not an integer; neither a bool nor 2.0 is one.
+        TypeError: The value is not an integer; bools and floats such as 2.0 are refused.
         ValueError: The value breaks a limit.
     """
     if isinstance(value, bool) or not isinstance(value, numbers.Integral):
@@ -112,10 +112,10 @@ def choice(name: str, value: object, options: Sequence[str]) -> str:
 
 
 def boolean(name: str, value: object) -> bool:
-    """Return ``value`` after checking that it is True or False; numbers are neither.
+    """Return ``value`` after checking that it is True or False; 0 and 1 are refused.
 
     Raises:
-        TypeError: It is neither.
+        TypeError: The value is not a bool.
     """
     if not isinstance(value, (bool, np.bool)):
         raise TypeError(f"{name}: must be True or False, got {show(value)}")
@@ -211,18 +211,18 @@ def check_gradients(array: object, name: str, error: Exception) -> None:
 
 
 def nested(name: str, value: object, *, deepest: int, most: int) -> int:
-    """Count the values in mappings, lists and tuples within each other, each time that they occur.
+    """Count the values in nested mappings, lists and tuples; a value that occurs twice counts twice.
 
-    The keys of mappings also count. A text counts once more for every 64 characters.
+    Keys of mappings count as values. A string counts once more for every 64 characters.
 
     Args:
         name: Name of the argument.
         value: The caller's value.
-        deepest: Most levels.
-        most: Most values.
+        deepest: Largest number of levels.
+        most: Largest number of values.
 
     Raises:
-        ValueError: There are more levels, as in a list that contains itself, or more values.
+        ValueError: The value is nested deeper, as a list that contains itself is, or holds more values.
     """
     count = 0
     inner: list[Iterator[Any]] = [iter([value])]
@@ -263,7 +263,7 @@ def existing_file(file: Path) -> Path:
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: The path is a folder, a device or anything else but a regular file.
+        ValueError: The path is not a regular file: a folder or a device, for example.
     """
     # For an impossible name os.path reports a missing file, where Path raises another error.
     if not os.path.exists(file):

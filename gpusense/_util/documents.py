@@ -21,7 +21,7 @@ _TOO_DEEP = f"its parts must be nested at most {DEEPEST} deep, got more"
 
 @functools.cache
 def _base() -> Any:
-    """Return PyYAML's safe loader, the compiled one where it was built."""
+    """Return PyYAML's safe loader: the compiled one where the installation has it."""
     import yaml
 
     return getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -31,7 +31,7 @@ def _base() -> Any:
 def _loader() -> Any:
     """Return the safe loader with decimal numbers.
 
-    YAML 1.1 reads 010 as octal and 1:30 as sexagesimal. ROS reads both with yaml-cpp, by YAML 1.2: ten, and no number.
+    YAML 1.1 reads 010 as octal and 1:30 as sexagesimal. ROS reads them by YAML 1.2 with yaml-cpp: as ten and as text.
     """
 
     class DecimalLoader(_base()):  # type: ignore[misc]
@@ -46,7 +46,7 @@ def _loader() -> Any:
         construct = "construct_yaml_float" if node.tag.endswith("float") else "construct_yaml_int"
         return getattr(loader, construct)(node)
 
-    # PyYAML takes 08 as text.
+    # PyYAML reads 08 as text.
     DecimalLoader.add_implicit_resolver("tag:yaml.org,2002:int", re.compile("[-+]?0[0-9_]+$"), list("-+0"))
     for kind in ("int", "float"):
         DecimalLoader.add_constructor(f"tag:yaml.org,2002:{kind}", decimal)
@@ -56,10 +56,10 @@ def _loader() -> Any:
 def check_yaml(text: str | bytes) -> None:
     """Refuse YAML whose parts are nested too deeply, contain themselves, or grow without bound by aliases.
 
-    The events of the parser are read one by one, so that nothing is expanded.
+    The parser's events are read one by one, so that no alias is expanded.
 
     Raises:
-        ValueError: The document breaks a bound, or is no YAML.
+        ValueError: The document breaks a bound, or is not YAML.
     """
     import yaml
 
@@ -140,7 +140,7 @@ def read_json(file: Path, kind: str) -> Any:
 
     Raises:
         FileNotFoundError: The file is missing.
-        ValueError: The file is too large, or is no JSON.
+        ValueError: The file is too large, or is not JSON.
     """
     text = _bounded(checks.existing_file(file), _LARGEST_JSON_BYTES, kind)
     try:
@@ -154,7 +154,7 @@ def _bounded(file: Path, most: int, kind: str) -> bytes:
     """Return the content of a file.
 
     Raises:
-        ValueError: It has more bytes than ``most``.
+        ValueError: The file has more bytes than ``most``.
     """
     with file.open("rb") as stream:
         text = stream.read(most + 1)

@@ -16,15 +16,15 @@ class Requirement(NamedTuple):
     """A library that gpusense imports late.
 
     Attributes:
-        package: Its package, as pip takes it.
-        extra: The extra of gpusense that has it; empty for a dependency.
+        package: Name of its package for pip.
+        extra: The extra of gpusense that installs it; empty for a required dependency.
     """
 
     package: str
     extra: str = ""
 
 
-# By the module that is imported; a test compares them with pyproject.toml.
+# Keyed by the imported module; a test compares the packages with pyproject.toml.
 REQUIREMENTS = {
     "PIL": Requirement("Pillow"),
     "dask": Requirement("dask[diagnostics,distributed]", "sweep"),
@@ -67,12 +67,12 @@ def check_library(module: str, purpose: str) -> None:
     """Check that a library is installed, without importing it.
 
     Raises:
-        MissingLibraryError: It is absent.
+        MissingLibraryError: The library is absent.
     """
     name = module.partition(".")[0]
     try:
         absent = importlib.util.find_spec(name) is None
-    except ValueError:  # a module that is None, or has no specification
+    except ValueError:  # the module is None in sys.modules, or has no specification
         absent = sys.modules.get(name) is None
     if absent:
         raise missing(name, purpose, ModuleNotFoundError(f"No module named {name!r}", name=name))
@@ -89,7 +89,7 @@ def missing(module: str, purpose: str, error: ImportError) -> MissingLibraryErro
 
 
 def explained(error: ImportError) -> MissingLibraryError | None:
-    """Return the error of one line for a library that gpusense uses; None for a module of another library."""
+    """Return the one-line error for a library that gpusense uses; None for any other library."""
     if isinstance(error, MissingLibraryError):
         return error
     name = (error.name or "").partition(".")[0]
@@ -97,14 +97,14 @@ def explained(error: ImportError) -> MissingLibraryError | None:
 
 
 def install_command(module: str) -> str:
-    """Return the command that installs a library for the running Python, and the one for a checkout of gpusense."""
+    """Return the command that installs a library for the running Python, and the variant for a checkout."""
     needed, pip = REQUIREMENTS[module.partition(".")[0]], _pip()
     command = f"{pip} install {shlex.quote(needed.package)}"
     return f"{command}, or in a checkout of gpusense {pip} install '.[{needed.extra}]'" if needed.extra else command
 
 
 def _pip() -> str:
-    """Return the command of the running Python's pip: ``pip`` where the shell finds that one."""
+    """Return the command that runs this Python's pip: ``pip`` if the shell finds the same one."""
     found = shutil.which("pip")
     own = Path(sys.executable).parent if sys.executable else None
     if own is None or (found is not None and Path(found).parent == own):

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, BinaryIO
 
-# Unfinished files of this process; each is here before it is made and until it is gone.
+# Unfinished files of this process: entered before they are created, removed after they are deleted.
 _UNFINISHED: set[Path] = set()
 
 
@@ -20,7 +20,7 @@ def check_writable(path: Path) -> None:
 
     Raises:
         OSError: The folder is absent or not writable.
-        ValueError: The path names something else than a regular file.
+        ValueError: The path names something other than a regular file.
     """
     if os.path.lexists(path) and not path.is_file():
         raise ValueError(f"{path}: must be a regular file, got another kind")
@@ -65,7 +65,7 @@ def write_several(writers: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
             backup[target].unlink(missing_ok=True)
             _discard(fresh[target])
 
-    # Twice, as an interrupt may come before the first one or end it.
+    # Twice, as an interrupt may come before the first clean-up or end it.
     try:
         try:
             for target, write in writers.items():
@@ -110,17 +110,17 @@ def _discard(fresh: Path) -> None:
 
 @atexit.register
 def _remove_unfinished(process: int = os.getpid()) -> None:
-    """Delete the files that several interrupts in a row have left; a forked child leaves those of its parent."""
+    """Delete the files that several interrupts in a row have left; a forked child does not touch its parent's files."""
     for fresh in tuple(_UNFINISHED) if os.getpid() == process else ():
         with contextlib.suppress(OSError):
             _discard(fresh)
 
 
 def unnamed_file() -> IO[bytes]:
-    """Open a temporary file without a name, in memory where no folder takes one.
+    """Open a temporary file without a name; in memory if no folder can hold it.
 
     Raises:
-        OSError: there is none.
+        OSError: Neither is possible.
     """
     try:
         return tempfile.TemporaryFile()

@@ -1,4 +1,4 @@
-"""Small tables in HTML, as notebooks show objects that have ``_repr_html_``; everything in them is escaped."""
+"""Small HTML tables for ``_repr_html_``, which notebooks show; their contents are escaped."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def card(
 
     Args:
         title: The title, usually the name of a class.
-        rows: Cells of each row. The first one is the row's heading; floats have five digits.
+        rows: Cells of each row. The first cell is the row's heading; floats have five digits.
         head: Headings of the columns; none by default.
         detail: Text below the table that a click opens.
         picture: A PNG beside the table.

@@ -1,4 +1,4 @@
-"""Decompress data within bounds, so that a small file cannot fill memory, a disk or a day."""
+"""Decompress data within bounds, so that a small file cannot exhaust memory, disk or time."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ _PIECE = 1 << 20
 
 
 def most_bytes(compressed: int) -> int:
-    """Return the most bytes that a stream may hold, from the number of its compressed bytes."""
+    """Return the largest allowed size of a stream from its compressed size, both in bytes."""
     return FLOOR + RATIO * compressed
 
 
 def inflated(make: Callable[[], Any], data: bytes, most: int) -> bytes:
-    """Decompress one or several frames that follow each other.
+    """Decompress one frame or several consecutive ones.
 
     Args:
         make: Constructor of a decompressor with the interface of :class:`bz2.BZ2Decompressor`.
         data: The compressed bytes.
-        most: Most bytes of the result.
+        most: Largest size of the result [bytes].
 
     Raises:
         ValueError: The result is longer, or the data end within a frame.

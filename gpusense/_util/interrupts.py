@@ -1,4 +1,4 @@
-"""Interrupts that come where Python would lose them: exceptions in destructors are ignored."""
+"""Interrupts in destructors, where Python would lose them as it ignores exceptions there."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from types import FrameType
 
-# Until the destructor has ended [s].
+# Delay after which the destructor has ended [s].
 _LATER = 0.002
 # Name of functions that are installed as ``sys.unraisablehook``.
 HOOK = "report_unraisable"
@@ -20,7 +20,7 @@ def undisturbed(work: Callable[[], object]) -> None:
     """Run the work of a destructor to its end, and deliver an interrupt that came meanwhile after it.
 
     Args:
-        work: May be repeated; it is the wait for a device.
+        work: A function that may be repeated, such as the wait for a device.
     """
     interrupt: KeyboardInterrupt | None = None
     while True:
@@ -34,11 +34,11 @@ def undisturbed(work: Callable[[], object]) -> None:
 
 
 def deliver_later(number: int) -> None:
-    """Send a signal to the main thread once it has left its destructor, or the hook that reports errors of one.
+    """Send a signal to the main thread once it has left its destructor or the hook that reports errors in destructors.
 
     Python handles signals between bytecodes of the main thread, which may still be the destructor's.
     """
-    # Without the wait for the start of a Thread.
+    # ``threading.Thread`` would wait for its start.
     _thread.start_new_thread(_deliver, (number,))
 
 
@@ -52,7 +52,7 @@ def _deliver(number: int) -> None:
     if sys.platform == "win32":
         _thread.interrupt_main(number)
     else:
-        # Also where the main thread waits for the system, which a signal to another thread does not end.
+        # Only a signal to the main thread interrupts the system call in which it may wait.
         signal.pthread_kill(main, number)
 
 

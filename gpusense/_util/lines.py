@@ -15,17 +15,17 @@ T = TypeVar("T")
 
 MOST_BYTES = 1 << 24
 """Lines have fewer bytes; a longer one is an error before it is read as a whole."""
-# Lines of a compressed file, beside one for each compressed byte.
+# Lines that a compressed file may have in addition to one for each compressed byte.
 _LINES = 1 << 22
 
 
 def numbered_lines(file: Path) -> Iterator[tuple[int, bytes]]:
-    """Read a file line by line; its first bytes tell whether it is compressed.
+    """Read a file line by line; its first bytes show whether it is compressed.
 
     Yields:
         The line's number, from 1 on, and the line with its end.
 
-    A compressed file that is cut off is read up to there, with a warning.
+    A truncated compressed file is read up to its end, with a warning.
 
     Raises:
         ValueError: A line is too long, or a compressed file is broken or grows without bound; the message begins with
@@ -57,7 +57,7 @@ def numbered_lines(file: Path) -> Iterator[tuple[int, bytes]]:
 
 
 def _bounds(file: Path, compressed: bool) -> tuple[float, float]:
-    """Return limits of a compressed file's lines and bytes; infinite ones for a plain file."""
+    """Return the limits of a compressed file's lines and bytes; infinity for a plain file."""
     if not compressed:
         return float("inf"), float("inf")
     size = file.stat().st_size
@@ -67,8 +67,8 @@ def _bounds(file: Path, compressed: bool) -> tuple[float, float]:
 def until_cut(file: Path, read: Callable[[Iterator[tuple[int, bytes]]], Iterator[T]]) -> Iterator[T]:
     """Yield the records that a function reads from the lines of a file.
 
-    A last line without an end that breaks the format is cut off: of a recorder that was killed, or a copy that was
-    interrupted. It is left out with a warning, unless it is the first record.
+    A last line that has no line break and breaks the format was truncated, by a killed recorder or an interrupted copy.
+    It is left out with a warning, unless it is the first record.
 
     Args:
         file: The file.

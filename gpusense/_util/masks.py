@@ -11,14 +11,14 @@ _NUMBERS = {int, float, np.float32, np.float64}
 
 
 def is_masked(value: object) -> bool:
-    """Return whether a value is a masked array, or a list or tuple with one in it, however deep."""
+    """Return whether a value is a masked array, or a list or tuple that holds one at any depth."""
     if type(value) is np.ndarray:
         return False
     library = sys.modules.get("numpy.ma")
     if library is None:
         return False
     if isinstance(value, (list, tuple)):
-        # Lists of numbers are long: only their types are looked at.
+        # Lists of numbers are long: only their types are inspected.
         kinds = set(map(type, value))
         if kinds <= _NUMBERS:
             return False

@@ -1,4 +1,4 @@
-"""The memory that this process may still take, and checks before large allocations."""
+"""The memory that is free for this process, and checks before large allocations."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def check_room(name: str, needed: int, what: str) -> None:
         what: Contents of the memory, such as ``"20000 x 20000 cells"``.
 
     Raises:
-        MemoryError: Less is available.
+        MemoryError: Less memory is free.
     """
     room = available()
     if room is not None and needed > room:
@@ -52,7 +52,7 @@ def _machine() -> int | None:
 
 
 def _container() -> int | None:
-    """Return the room below the limit of a container; pages that it can drop count as taken."""
+    """Return the memory left below a container's limit; reclaimable pages count as used."""
     for limit, usage in _CGROUPS:
         with contextlib.suppress(OSError, ValueError):
             return int(limit.read_text(encoding="ascii")) - int(usage.read_text(encoding="ascii"))
@@ -60,7 +60,7 @@ def _container() -> int | None:
 
 
 def _limit() -> int | None:
-    """Return the room below the limit of this process's address space."""
+    """Return the memory left below the limit of this process's address space."""
     with contextlib.suppress(ImportError, OSError, ValueError, IndexError):
         import resource
 

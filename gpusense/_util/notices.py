@@ -1,4 +1,4 @@
-"""Warn at the user's line of code, whatever depth of this package finds the reason."""
+"""Warn at the user's line of code, at whatever depth of this package the reason lies."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ _PACKAGE = __name__.partition(".")[0]
 
 
 def warn_user(message: str, category: type[Warning] = UserWarning) -> None:
-    """Warn at the nearest frame outside this package, so that Python shows a message once for each place that calls.
+    """Warn at the nearest frame outside this package, so that Python shows a message once for each calling line.
 
     Args:
         message: The message.
-        category: Its category.
+        category: Class of the warning.
     """
     level, frame = 2, sys._getframe(1)
     while frame.f_back is not None and _is_own(str(frame.f_globals.get("__name__", ""))):

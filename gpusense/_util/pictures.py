@@ -1,4 +1,4 @@
-"""Pictures of results: a result names its picture, and the package's root maps names to drawing functions."""
+"""Pictures of results: a result names its picture, and the root of the package registers a drawing function by name."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ _DRAWERS: dict[str, Drawer] = {}
 
 
 def register(name: str, drawer: Drawer) -> None:
-    """Set the function that draws a picture and writes it to a path."""
+    """Register the function that draws a named picture and writes it to a path."""
     _DRAWERS[name] = drawer
 
 
 def draw(name: str, result: Any, path: str | os.PathLike[str]) -> None:
-    """Draw a picture of a result, and write it to a path."""
+    """Draw the named picture of a result, and write it to a path."""
     _DRAWERS[name](result, path)

@@ -1,8 +1,8 @@
 """Folders in which other users cannot replace files, and bounded reads of regular files.
 
-Code that is loaded from a folder is as trustworthy as whoever can write there. Writers are the folder's owner, users
-whom its mode lets write, and users who can rename a folder above it. Systems without such owners, as Windows, protect
-users' folders by other rules; there only the kind of a folder is checked.
+Code that is loaded from a folder is as trustworthy as everyone who can write there. Writers are the folder's owner,
+users whom its mode lets write, and users who can rename a folder above it. Windows and other systems without such
+owners protect users' folders by other rules; there only the file type is checked.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ _HAS_OWNERS = hasattr(os, "geteuid")
 
 
 class UnsafeFolderError(PermissionError):
-    """A folder that another user could change; the text names the folder and the rule."""
+    """A folder that another user could change; the message names the folder and the rule."""
 
 
 def make_private(folder: Path) -> None:
-    """Make a folder and those above it, each for this user alone where it is absent, and check it.
+    """Make a folder and its missing parents, each for this user alone, and check it.
 
     Args:
         folder: As for :func:`check_private`. Nothing is made where another user could replace it.
 
     Raises:
-        UnsafeFolderError: as of :func:`check_private`.
-        OSError: it cannot be made.
+        UnsafeFolderError: As for :func:`check_private`.
+        OSError: The folder cannot be made.
     """
     absent = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]
     if absent and _HAS_OWNERS:
@@ -45,12 +45,12 @@ def check_private(folder: Path) -> None:
     """Check that only this user can change the files of a folder, or put another folder in its place.
 
     Args:
-        folder: An absolute path without symbolic links above it, as of ``os.path.realpath``.
+        folder: An absolute path without symbolic links above it, as ``os.path.realpath`` returns.
 
     Raises:
-        UnsafeFolderError: it is no real directory, has another owner, is writable by other users, or a folder above it
-            lets them rename it.
-        OSError: it is absent.
+        UnsafeFolderError: The folder is no real directory, has another owner, is writable by other users, or can be
+            renamed by them.
+        OSError: The folder is absent.
     """
     status = os.lstat(folder)
     if not stat.S_ISDIR(status.st_mode):
@@ -67,20 +67,20 @@ def check_private(folder: Path) -> None:
 
 
 def _check_parents(folder: Path) -> None:
-    """Check that other users can rename none of the folders that lead to a folder, nor the folder.
+    """Check that other users can rename neither a folder nor any folder above it.
 
     Raises:
-        UnsafeFolderError: they can.
+        UnsafeFolderError: They can.
     """
     for child, parent in zip((folder, *folder.parents), folder.parents, strict=False):
         _check_parent(parent, child.name)
 
 
 def _check_parent(folder: Path, child: str) -> None:
-    """Check that in a folder only this user and root can rename the files of these two.
+    """Check that only this user and root can rename the files that they own in a folder.
 
     Raises:
-        UnsafeFolderError: other users can.
+        UnsafeFolderError: Other users can.
     """
     status = os.stat(folder)
     if not _is_trusted(status.st_uid):
@@ -96,9 +96,9 @@ def _check_parent(folder: Path, child: str) -> None:
 
 
 def _is_trusted(owner: int) -> bool:
-    """Return whether a user may do as this one: it is this user, or root.
+    """Return whether a file's owner is this user or root.
 
-    Within a user namespace the owners outside of it, root among them, appear as one user that has no processes.
+    In a user namespace all owners outside it, including root, appear as one user that has no processes.
     """
     if owner in (0, os.geteuid()):
         return True
@@ -113,7 +113,7 @@ def _is_trusted(owner: int) -> bool:
 
 
 def _is_group_of_one(group: int) -> bool:
-    """Return whether a group is root's, or the one of this user's name that many systems make for each user."""
+    """Return whether a group is root's, or this user's private group, which has the user's name."""
     if group == 0:
         return True
     import grp
@@ -127,25 +127,25 @@ def _is_group_of_one(group: int) -> bool:
 
 
 def read_regular(path: Path, most: int, *, touch: bool = False, head: int | None = None) -> bytes:
-    """Read a regular file of this user; anything else in its place is not opened, or not read.
+    """Read a regular file that this user owns; anything else in its place is not read.
 
     Args:
-        path: The file. A symbolic link is not followed, and a FIFO is not waited for.
-        most: The most bytes that it may have.
-        touch: Whether to set its times to now, where that is possible.
-        head: The number of bytes to read, from the beginning; all of them by default.
+        path: The file. Symbolic links are not followed, and a FIFO does not block.
+        most: Largest size of the file [bytes].
+        touch: Whether to set the file's times to now, where that is possible.
+        head: Number of leading bytes to read; all by default.
 
     Raises:
-        OSError: it is absent, is no regular file of this user, or is larger.
+        OSError: The file is absent, is not a regular file of this user, or is too large.
     """
-    # Opening some devices has effects, so the kind is checked before; only a check afterwards is of the opened file
-    # itself.
+    # Opening some devices has side effects, so the file type is checked before; the check afterwards holds for the
+    # opened file itself.
     _check_regular(os.lstat(path), path, most)
     flags = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
     with os.fdopen(os.open(path, os.O_RDONLY | flags), "rb") as file:
         _check_regular(os.fstat(file.fileno()), path, most)
         if touch and os.utime in os.supports_fd:
-            # A file system that is read-only keeps the times.
+            # On a read-only file system the times stay.
             with contextlib.suppress(OSError):
                 os.utime(file.fileno())
         data = file.read(most + 1 if head is None else head)
@@ -158,7 +158,7 @@ def _check_regular(status: os.stat_result, path: Path, most: int) -> None:
     """Check the kind, the owner and the size of a file.
 
     Raises:
-        OSError: it is no regular file of this user, or is larger than ``most`` bytes.
+        OSError: The file is not a regular file of this user, or is larger than ``most`` bytes.
     """
     if not stat.S_ISREG(status.st_mode):
         raise OSError(f"{path} must be a regular file, got another kind")

@@ -1,4 +1,4 @@
-"""Types of arguments: names that are one of a few, and arrays of any library."""
+"""Types of arguments: literal names, and arrays of any library."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class SupportsCuda(Protocol):
 
     @property
     def __cuda_array_interface__(self) -> dict[str, Any]:
-        """The array's place, shape and type."""
+        """The array's address, shape and type."""
 
 
 AnyArray: TypeAlias = ArrayLike | SupportsDLPack | SupportsCuda

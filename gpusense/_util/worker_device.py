@@ -1,4 +1,4 @@
-"""The device of a worker's process, which whoever starts the worker may have chosen."""
+"""The device of a worker process, which the starting process may choose."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ DEVICE = "GPUSENSE_SWEEP_DEVICE"
 
 
 def device_of(device: str) -> str:
-    """Return the device of this process as a worker, if it was started with one, else the one that is asked for."""
+    """Return the device with which this process was started as a worker; without one, the requested device."""
     return os.environ.get(DEVICE) or device

@@ -11,8 +11,8 @@ class CasterEntry:
 
     Attributes:
         name: Its name for users.
-        file: The kernel file of its ``cast_ray``, of one name in OpenCL, Warp and NumPy.
-        flag: The flag of kernels that cast with it; empty for the exact caster.
+        file: The kernel file with its ``cast_ray``; the name is the same in OpenCL, Warp and NumPy.
+        flag: The flag that selects it in kernels; empty for the exact caster.
         code: The meaning of the flag.
     """
 
@@ -22,7 +22,7 @@ class CasterEntry:
     code: str = ""
 
 
-# Its class, with its knobs, error and memory, is in gpusense/tables/casters.py.
+# The caster's class, with its knobs, error and memory, is in gpusense/tables/casters.py.
 ENTRIES = {
     entry.name: entry
     for entry in (

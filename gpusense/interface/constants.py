@@ -1,4 +1,4 @@
-"""Constants of kernels that the host needs: the kernel files hold the same numbers."""
+"""Constants of kernels that the host needs; the kernel files repeat them."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ LINE_NUMBERS, CIRCLE_NUMBERS = 6, 10
 
 
 def strands_in(terms: int) -> int:
-    """Return the strands of a number of terms: STRANDS of each whole block, and at most as many of the rest."""
+    """Return the number of strands of some terms: STRANDS per whole block, at most one per remaining term."""
     return terms // BLOCK_TERMS * STRANDS + min(terms % BLOCK_TERMS, STRANDS)
 
 
@@ -57,15 +57,15 @@ SHARE, THRESHOLD, SCALE, PER_BEAM_SCALE, SLOW_RATE, FAST_RATE, MOST_INJECTED, ST
 TEMPERATURE = 27
 # Kinds of draws, by the setting STRATIFIED.
 SYSTEMATIC, INDEPENDENT, RESIDUAL = 0, 1, 2
-# Factor of all rungs of a stage: 1, or less where even the last rung leaves too few particles with weight.
+# Factor of all rungs of a stage: 1, or less if even the last rung leaves too few particles with weight.
 DEPTH = 60
-# Where a filter is split: index of the first particle here, particles of the whole filter now and in the next step; the
-# last two are 0 where all particles are here.
+# For a filter over several devices: index of this device's first particle, and particles of the whole filter now and in
+# the next step; both counts are 0 on a single device.
 FIRST, WHOLE, DRAWN = 61, 62, 63
 SETTINGS = 64
 # Streams of random numbers within a step; each stage of a correction has DRAW_STREAMS further streams.
 MOTION_STREAM, DRAW_STREAM, DRAW_STREAMS = 0, 16, 4
-# Kernel file sampling: its stream of random numbers, one further for each beam; numbers of a mixture; numbers of its
+# Kernel file sampling: first of its streams of random numbers, one per beam; numbers of a mixture; numbers of its
 # settings by place. DRAW_SEED takes 2 places.
 READING_STREAM, DRAW_TERMS = 1 << 30, 9
 DRAW_SEED, DRAW_STEP, DRAW_FIRST, DRAW_PER_SCAN, DRAW_RANGE_MAX, DRAW_TOP, DRAW_MARGIN, DRAW_SETTINGS = 0, *range(2, 9)

@@ -1,8 +1,8 @@
-"""The preprocessor of kernel sources: it keeps the branches that a set of flags takes.
+"""The preprocessor of kernel sources: keep the branches that a set of flags selects.
 
 ``#if FLAG``, ``#if !FLAG``, ``#elif``, ``#else`` and ``#endif`` are resolved here, nested as in C. ``#define`` and
-``#pragma`` are left to the compiler, and a kernel may define no name of a flag. All other directives are refused: a
-compiler would resolve them without knowing the flags.
+``#pragma`` are left to the compiler, and a kernel must not define the name of a flag. All other directives are refused:
+a compiler would resolve them without knowing the flags.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ _PASSED = ("define", "pragma")
 
 @dataclass
 class _Branches:
-    """An ``#if`` with its branches so far.
+    """An open ``#if`` and the state of its branches.
 
     Attributes:
-        line: Its line.
-        taken: Whether the present branch is kept.
-        done: Whether this branch or an earlier one is.
-        ended: Whether ``#else`` has come.
+        line: Line number of the ``#if``.
+        taken: Whether the current branch is kept.
+        done: Whether this branch or an earlier one is kept.
+        ended: Whether ``#else`` has been read.
     """
 
     line: int
@@ -45,14 +45,14 @@ def resolve(text: str, flags: frozenset[str], name: str = "source") -> str:
         name: Name of the file for messages.
 
     Raises:
-        ValueError: A condition that is not a single known flag, a directive that is not resolved here, or unbalanced
-            ones; the message begins with file and line.
+        ValueError: A condition is not a single known flag, or a directive is unknown or unbalanced; the message
+            begins with file and line.
     """
     kept: list[str] = []
     open_branches: list[_Branches] = []
     continued = False
     for number, line in enumerate(text.splitlines(), 1):
-        # A line that continues a macro is no directive.
+        # A line that continues a macro is not a directive.
         match = None if continued else _DIRECTIVE.match(line)
         continued = line.endswith("\\")
         keep = all(each.taken for each in open_branches)
@@ -70,10 +70,10 @@ def resolve(text: str, flags: frozenset[str], name: str = "source") -> str:
 def _directive(
     where: str, number: int, word: str, rest: str, flags: frozenset[str], open_branches: list[_Branches]
 ) -> bool:
-    """Take a directive into account, and return whether it is left to the compiler.
+    """Process a directive, and return whether it is left to the compiler.
 
     Raises:
-        ValueError: see :func:`resolve`.
+        ValueError: See :func:`resolve`.
     """
     if word in _PASSED:
         defined = re.match(r"\w*", rest)
@@ -107,7 +107,7 @@ def _is_true(where: str, condition: str, flags: frozenset[str]) -> bool:
     """Return whether a condition holds.
 
     Raises:
-        ValueError: It is not a single known flag.
+        ValueError: The condition is not a single known flag.
     """
     match = _CONDITION.match(condition)
     if match is None or match.group(2) not in FLAGS:

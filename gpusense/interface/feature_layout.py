@@ -8,12 +8,12 @@ RANGE_AT, RANGE_LOW, COSINE, SINE, COSINE_LOW, SINE_LOW, SIGNATURE_AT, SIGNATURE
 # positive.
 RANGE_SCALE, RANGE_SCALE_LOW, BEARING_SCALE, BEARING_SCALE_LOW, SIGNATURE_SCALE, SIGNATURE_SCALE_LOW = range(8, 14)
 PEAK, PEAK_LOW, FALSE_POSITIVE = 14, 15, 16
-# From the bearing to the upper end of the field of view.
+# Angle from the bearing to the upper end of the field of view.
 UPPER, UPPER_LOW = 17, 18
 # Only landmarks within RADIUS of the point REACH along the bearing, and no nearer than HOLE, have a density that is not
 # negligible; RADIUS is negative where none has.
 REACH, RADIUS, HOLE = 19, 20, 21
-# The sensor's limits for components that a feature does not measure: the distance, the cosine of the angle to the axis.
+# The sensor's limits for components that a feature does not measure: distance, and cosine of the angle to the axis.
 FARTHEST, AXIS = 22, 23
 # sigma sqrt 2 of range and bearing, infinite for components that were not measured; the log of the largest possible
 # density; and the largest error of squared distances.

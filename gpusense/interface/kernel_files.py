@@ -21,7 +21,7 @@ def kernel_root() -> Path:
     """Return the folder that holds ``opencl/`` and ``warp/``.
 
     Raises:
-        FileNotFoundError: the folder is neither inside the package nor beside it.
+        FileNotFoundError: The folder is neither inside the package nor beside it.
     """
     package = Path(__file__).resolve().parents[1]
     candidates = (package / "kernels", package.parent / "kernels")
@@ -36,10 +36,10 @@ def opencl_source(name: str) -> str:
     """Return the text of ``opencl/<name>.cl``.
 
     Args:
-        name: The file's name without its ending, with its folder if it lies in one: ``"beam"``, ``"lanes/beam"``.
+        name: The file's name with its subfolder and without its suffix: ``"beam"``, ``"lanes/beam"``.
 
     Raises:
-        FileNotFoundError: there is no such file; the message lists the names of all files.
+        FileNotFoundError: No such file exists; the message lists the names of all files.
     """
     folder = kernel_root() / "opencl"
     try:
@@ -64,17 +64,17 @@ def warp_module(name: str) -> ModuleType:
     """Import ``warp/<name>.py`` as ``gpusense.kernels.warp.<name>``.
 
     Args:
-        name: The file's name without its ending.
+        name: The file's name without its suffix.
 
     Raises:
-        ModuleNotFoundError: there is no such file, or Warp is not installed.
+        ModuleNotFoundError: No such file exists, or Warp is not installed.
     """
     _register_package()
     return importlib.import_module(f"{_PACKAGE}.warp.{name}")
 
 
 def _register_package() -> None:
-    """Import the kernel folder as the package ``gpusense.kernels``, whatever its place."""
+    """Import the kernel folder as the package ``gpusense.kernels``, wherever it lies."""
     with _LOCK:
         if _PACKAGE in sys.modules:
             return

@@ -1,8 +1,8 @@
-"""The flag of kernels in lanes, which compute several particles or beams at once on devices that ask for them."""
+"""The flag of kernels in lanes, which compute several particles or beams at once on devices that prefer them."""
 
 from __future__ import annotations
 
-# Flags with which a kernel has no body in lanes; sets of flags, at least one of which it requires.
+# By kernel: flags with which it has no body in lanes, and sets of flags of which it requires at least one.
 _SCALAR = frozenset({"FLOAT64", "ALL_READINGS", "EXACT_EXPONENT", "CUBES"})
 _NEVER: dict[str, frozenset[str]] = {
     "cast_ranges": frozenset(),

@@ -1,6 +1,6 @@
 """Launches: a kernel, its flags, its size, and its arguments by name.
 
-A program is a tuple of launches. It is data: tests read it, backends run it or record it.
+A program is a tuple of launches. It is plain data that tests can read and backends can run or record.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ _NUMBERS = (int, float, np.integer, np.floating)
 
 
 class Launch(NamedTuple):
-    """One start of a kernel.
+    """A launch of a kernel.
 
     Attributes:
         kernel: Its name in the signature table.
         flags: Flags of its code.
-        size: Work-items along each axis of the row's launch shape.
+        size: Number of work-items along each axis of the row's launch shape.
         arguments: Buffers, scalars and structs in the order of the row.
     """
 
@@ -57,10 +57,10 @@ def launch(kernel: str, flags: Iterable[str], size: tuple[int, ...], /, **argume
         kernel: Its name in the signature table.
         flags: Flags of its code.
         size: Work-items along each axis.
-        **arguments: Every argument of the row: an array's buffer, an integer, a real number, or a struct.
+        **arguments: All arguments of the row, each a buffer, an integer, a real number or a struct.
 
     Raises:
-        TypeError: an argument is missing, unknown, or of the wrong type; the message names it.
+        TypeError: An argument is missing, unknown or of the wrong type; the message names it.
     """
     row = _ROWS.get(kernel) or _row(kernel)
     if len(arguments) != len(row.names):
@@ -87,15 +87,15 @@ class _Row:
         self._kernel, self._row = kernel, row
         self.names = tuple(argument.name for argument in row.arguments)
         self.take = itemgetter(*self.names)
-        # Types that passed the check, which calls repeat.
+        # Types that have passed the check, as calls repeat them.
         self.accepted: set[tuple[type, ...]] = set()
 
     def check(self, types: tuple[type, ...]) -> None:
-        """Hold the types of arguments to the row.
+        """Check the types of arguments against the row.
 
         Raises:
-            TypeError: a number in place of a buffer, a buffer in place of a number, a real number in place of an
-                integer, or another struct.
+            TypeError: A number replaces a buffer, a buffer a number, a real number an integer, or a struct is of
+                another type.
         """
         for argument, kind in zip(self._row.arguments, types, strict=True):
             is_number = issubclass(kind, _NUMBERS)

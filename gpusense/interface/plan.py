@@ -1,7 +1,7 @@
 """The scene plan: the parts of a computation that a scene does not need, the reasons, and the savings.
 
-Flags choose the code of a kernel; tuned numbers are arguments. The plan follows from the scene: parameters, scanner,
-map, the last scan and cloud. With ``specialize=False`` nothing is left out, and results are the same.
+Flags choose the code of a kernel; tuned numbers are arguments. The plan follows from the scene, which is parameters,
+scanner, map, and the last scan and cloud. With ``specialize=False`` nothing is left out, and results do not change.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ class Omission:
     Attributes:
         what: The part that a scene does not need.
         why: The reason, with the numbers that decide it.
-        saves: The computation, storage or copies that are saved.
-        flags: Flags of the scoring kernel that the part would add.
-        ends: Flags that it would take away.
+        saves: The saved computation, storage or copies.
+        flags: Flags that the part would add to the scoring kernel.
+        ends: Flags that the part would remove.
     """
 
     what: str
@@ -31,7 +31,7 @@ class Omission:
 
 @dataclass(frozen=True)
 class Note:
-    """A part that is kept, or that another choice would leave out."""
+    """A part that is kept, or that another choice of the user would leave out."""
 
     what: str
     why: str
@@ -47,7 +47,7 @@ class Plan:
         omissions: The parts that are left out.
         kept: The parts that the scene needs, and why.
         could_go: Parts that another choice of the user would leave out.
-        measured: Measured savings of omissions [s], by their names.
+        measured: Measured savings [s] by the name of the omission.
     """
 
     title: str
@@ -87,10 +87,10 @@ def share(part: float, whole: float) -> str:
 
 
 def component_notes(components: Iterable[tuple[str, float, str]]) -> tuple[list[Omission], list[Note]]:
-    """Return the components of a mixture with weight 0, and with a weight above 0.
+    """Return the components of a mixture that are left out (weight 0), and those that are kept.
 
     Args:
-        components: (parameter, its weight, cost of its component per particle-beam).
+        components: (name of the weight, its value, cost of the component per particle-beam).
     """
     omissions, kept = [], []
     for name, weight, cost in components:
@@ -104,7 +104,7 @@ def component_notes(components: Iterable[tuple[str, float, str]]) -> tuple[list[
 
 
 def precision_notes(precision: str) -> tuple[list[Note], list[Note]]:
-    """Return the precision as a part that is kept, and as one that could go."""
+    """Return the notes on precision: the kept one, and a lower one that the user could choose."""
     if precision == "float32":
         return [], []
     return [Note("float64", "precision='float64'")], [Note("float64", "precision='float32' needs half of the bytes")]
@@ -115,8 +115,8 @@ def launch_omissions(code: frozenset[str], least_ordered: tuple[int, int] | None
 
     Args:
         code: The flags of the last call.
-        least_ordered: Rays and particles from which the particles of a beam model are put in order; None where a device
-            or a model puts none in order.
+        least_ordered: Least numbers of rays and particles from which a beam model orders particles; None for devices
+            and models that never do.
     """
     omissions = [ORDINARY_HEADINGS] if code and "HUGE_HEADINGS" not in code else []
     if "ROUNDED_CELLS" in code:

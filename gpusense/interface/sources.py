@@ -1,4 +1,4 @@
-"""OpenCL source of one program: prelude, the files a kernel requires in order, and only the branches its spec needs.
+"""OpenCL source of a program: prelude, required files in order, and only the branches that the flags select.
 
 A kernel's parameters are written from its row of the signature table: its file says ``kernel void name(ARGUMENTS)``.
 """
@@ -33,9 +33,9 @@ _REQUIRES = re.compile(r"^// requires: (.*)$", re.MULTILINE)
 
 
 def prelude(*, float64: bool, doubles: bool = False) -> str:
-    """Return the head of every program: it forbids contraction and defines ``real``.
+    """Return the head of every program, which forbids contraction and defines ``real``.
 
-    FUSES says whether the device multiplies and adds at once; elsewhere ``fma`` is a call.
+    FUSES says whether the device has a fused multiply-add; elsewhere ``fma`` is a slow call.
 
     Args:
         float64: Whether ``real`` is float64.
@@ -66,7 +66,7 @@ def source_text(file: str) -> str:
     """Return the text of a kernel file with the parameters of its kernels.
 
     Raises:
-        ValueError: a kernel has no row in the signature table.
+        ValueError: A kernel has no row in the signature table.
     """
     return _with_parameters(opencl_source(file), file)
 
@@ -88,8 +88,8 @@ def required_files(name: str, flags: frozenset[str] = frozenset()) -> list[str]:
     """List the files of a kernel file's program, the file itself last.
 
     With ``IN_LANES``, ``lanes/<name>`` replaces ``<name>`` where there is such a file. Names in ``// requires:`` are
-    taken as they stand, so a file in lanes names files of both folders. ``caster`` stands for the caster of the
-    flags, and ``lanes/caster`` for its body in lanes or, where it has none, for ``lanes/other_caster``.
+    taken literally, so a file in lanes may name files of both folders. ``caster`` stands for the caster of the flags,
+    and ``lanes/caster`` for its body in lanes or, where it has none, for ``lanes/other_caster``.
     """
     return _with_requirements(f"lanes/{name}" if _in_lanes(name, flags) else name, flags)
 
@@ -136,12 +136,12 @@ def _words(text: str) -> frozenset[str]:
 
 @functools.lru_cache(maxsize=512)
 def _resolved(text: str, flags: frozenset[str], name: str) -> str:
-    """Return a source with the branches that flags take."""
+    """Return a source with the branches that the flags select."""
     return resolve(text, flags, name)
 
 
 def _kept(file: str, flags: frozenset[str]) -> str:
-    """Return the branches of a kernel file that flags take; those that it does not name make no difference."""
+    """Return a kernel file with the branches that the flags select; the file need not name all flags."""
     text = source_text(file)
     return _resolved(text, flags & _words(text), f"{file}.cl")
 
@@ -156,9 +156,9 @@ def assemble(file: str, flags: frozenset[str]) -> str:
 
 
 def with_places(log: str, source: str) -> str:
-    """Return a compiler's log in which places of the assembled source, ``<kernel>:114:``, read ``raycast.cl:48:``.
+    """Return a compiler's log with places of the assembled source, ``<kernel>:114:``, replaced by ``raycast.cl:48:``.
 
-    Most drivers heed the ``#line`` directives of a source; NVIDIA's counts the lines of the whole.
+    Most drivers follow the ``#line`` directives of a source; NVIDIA's counts lines of the assembled source.
     """
 
     def place(match: re.Match[str]) -> str:

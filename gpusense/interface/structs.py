@@ -47,7 +47,7 @@ class Caster(NamedTuple):
 
 
 class RangeScale(NamedTuple):
-    """Longest distance that is looked for [cells], size of a cell and largest range [m]."""
+    """Longest distance to search [cells], size of a cell and largest range [m]."""
 
     limit: real
     resolution: real
@@ -55,7 +55,7 @@ class RangeScale(NamedTuple):
 
 
 class Cone(NamedTuple):
-    """Rays of a sensor's cone, and the least cosine of an angle of incidence that returns."""
+    """Number of rays of a sensor's cone, and the least cosine of an angle of incidence with a return."""
 
     rays: int
     critical: real
@@ -77,7 +77,7 @@ class Score(NamedTuple):
 
 
 class ScanBatch(NamedTuple):
-    """Particles of each scan, and particles of earlier launches."""
+    """Number of particles of each scan, and of earlier launches."""
 
     per_scan: int
     ahead: int
@@ -118,7 +118,7 @@ class SensorView(NamedTuple):
 
 
 class ScoreTable(NamedTuple):
-    """Tables of one size, one behind the other, each with a margin [cells]; see the kernel file ``search``."""
+    """Consecutive tables of one size, each with a margin [cells]; see the kernel file ``search``."""
 
     tables: int
     rows: int
@@ -156,7 +156,7 @@ STRUCTS: dict[str, type[tuple[Any, ...]]] = {
 
 def fields(struct: str) -> dict[str, str]:
     """Return the types of a struct's fields, ``int``, ``real`` or ``double``, by name."""
-    # NamedTuple makes forward references of annotations that are strings.
+    # NamedTuple turns string annotations into forward references.
     kinds = STRUCTS[struct].__annotations__.items()
     return {name: str(getattr(kind, "__forward_arg__", kind)) for name, kind in kinds}
 
@@ -183,7 +183,7 @@ def declaration(struct: str) -> str:
 
 @functools.cache
 def layout(struct: str, precision: np.dtype) -> str:
-    """Return the format of ``struct.pack`` for a struct as C compilers lay it out: aligned, and padded at the end."""
+    """Return the format of ``struct.pack`` with the layout of C compilers: aligned, and padded at the end."""
     types = dtypes(struct, precision)
     widest = max(types, key=lambda kind: kind.itemsize)
     return "@" + "".join(kind.char for kind in types) + f"0{widest.char}"

@@ -1,4 +1,4 @@
-"""The numbers of a mixture as arguments of kernels: the domain of their sum, and their rounding."""
+"""The numbers of a mixture as kernel arguments: whether densities or logarithms are summed, and rounding."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 # Above this peak [1/m] the rounding errors of an exponent may exceed the tolerance beside a log density near 0.
 HIGH_PEAK = 64.0
-# A density in a linear sum must be far above the size at which the other densities underflow, with or without
+# The uniform density of a linear sum must be far above the size at which the other densities underflow, with or without
 # denormals.
 _SMALLEST_DENSITY = {np.dtype(np.float32): 1e-30, np.dtype(np.float64): 1e-290}
 
@@ -22,11 +22,11 @@ def rounded_terms(terms: list[float], real: np.dtype) -> np.ndarray:
     """Return the numbers of a mixture in a model's precision, then the rounding errors of the first two.
 
     Raises:
-        ValueError: sigma_hit or lambda_short is too small or too large for the precision.
+        ValueError: Sigma_hit or lambda_short is too small or too large for the precision.
     """
     with np.errstate(over="ignore"):
         rounded = np.array(terms).astype(real)
-    # Logarithms of weights of 0 are -inf; nothing else may be infinite.
+    # Logarithms of zero weights are -inf; no other number may be infinite.
     if np.isposinf(rounded).any() or rounded[1] < np.finfo(real).tiny:
         raise ValueError(f"parameters: sigma_hit and lambda_short must fit {real.name}, got terms {terms}")
     with np.errstate(invalid="ignore"):

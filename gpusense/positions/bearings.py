@@ -26,11 +26,11 @@ def triangulate(
 
     With a known heading two beacons suffice: their lines of sight intersect in closed form. Without it three suffice,
     see :func:`triangulate_triangle`. With more beacons the solution is the global minimum of ``sum of rho(weight
-    (residual / sigma)^2)``, reached by Gauss-Newton steps from linear solutions and from the closed forms of pairs or
+    (residual / sigma)^2)``, reached by Gauss-Newton steps from linear solutions and from closed forms of pairs or
     triples. Lines of sight are rays: a beacon behind its bearing is no solution. With ``sigma``, all minima are
     returned whose costs the noise cannot distinguish from the best.
 
-    A call takes one set of measurements. Coordinates may be as large as those of UTM.
+    A call takes one set of measurements. Coordinates may be as large as in UTM.
 
     Args:
         xy: (M, 2) positions of the beacons [m].
@@ -41,13 +41,13 @@ def triangulate(
             sigma = 1 rad, to be multiplied by the variance.
         weights: (M,) factors >= 0 of the squared residuals; 0 leaves a beacon out. By default 1.
         loss: "linear", "soft_l1", "huber", "cauchy" or "arctan", as in ``scipy.optimize.least_squares``. It is ignored
-            for only as many bearings as unknowns.
+            if there are no more bearings than unknowns.
         loss_scale: Residual at which a robust loss bends [sigma, or rad without sigma], > 0.
 
     Returns:
         Positions (S, 2) for a known heading, else poses (S, 3). Statuses: "unique", "ambiguous", "at a beacon",
-        "singular"; without solutions "parallel", "in line", "coincident", "circle" and "behind". "behind" of more
-        bearings than unknowns has a solution.
+        "singular"; without solutions "parallel", "in line", "coincident", "circle" and "behind". With more bearings
+        than unknowns, "behind" has a solution.
 
     Raises:
         TypeError: An argument has the wrong type.
@@ -143,8 +143,8 @@ def _triple_blur(problem: Problem, triples: NDArray[np.intp], state: Floats | No
     Args:
         problem: The measurements.
         triples: (N, 3) beacons.
-        state: A pose; None for a robot as far away as the beacons are from one another. The rounding of coordinates
-            turns the direction to a near beacon most.
+        state: A pose; None for a robot as far from the beacons as these are from each other. The rounding of
+            coordinates has the largest effect on the direction to a near beacon.
 
     The terms m_i exp(-i b_i) sin(b_j - b_k) change with the sines by |m_i| cos(b_j - b_k) times the error of an angle.
     This is larger than the terms themselves where the beacons are seen in nearly one direction.
@@ -173,7 +173,7 @@ def _line_or_circle(problem: Problem) -> str:
 
 
 def _on_circle(problem: Problem, triples: NDArray[np.intp], clarity: Floats, fix: PositionFix) -> PositionFix:
-    """Return a result, or none with the status "circle" where one circle holds the beacons and the robot, to rounding.
+    """Return a result, or an empty one with status "circle" if one circle holds the beacons and the robot.
 
     Bearings of unknown heading have a singular Jacobian only there.
     """
@@ -185,7 +185,7 @@ def _on_circle(problem: Problem, triples: NDArray[np.intp], clarity: Floats, fix
 
 
 def _no_solution(problem: Problem) -> str:
-    """Return the status if beacons or lines of sight leave no point or infinitely many, else ""."""
+    """Return the status if beacons or lines of sight determine no point or infinitely many, else ""."""
     assert problem.bearings is not None
     places = np.unique(problem.xy, axis=0)
     if len(places) == 1 or (problem.heading is None and len(places) == 2):

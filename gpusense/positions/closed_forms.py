@@ -30,7 +30,7 @@ def two_circles(
     """Intersect pairs of circles ("Distances Only, No Uncertainty").
 
     With the beacons at 0 and a on the x axis, x = (a^2 + d1^2 - d2^2) / 2a and y = +-sqrt(d1^2 - x^2). These formulas
-    lose digits if the triangle of the two beacons and the robot is flat. Here x is measured from the beacon with the
+    lose digits if the triangle of the beacons and the robot is flat. Here x is measured from the beacon with the
     smaller range, as ((a - d2)(a + d2) + d1^2) / 2a, and y is the height of the triangle, 2 area / a, with Kahan's area
     ("Miscalculating Area and Angles of a Needle-like Triangle", 2014), in which only the sides themselves cancel.
 
@@ -43,10 +43,10 @@ def two_circles(
         noise: Rounding error of the inputs' coordinates, a length.
 
     Returns:
-        (N, 2) points, first the one to the left of the direction from ``first`` to ``second``; and (N,) statuses: "two"
-        (the circles intersect), "tangent", "disjoint", "contained" (one inside the other) or "coincident" (one centre).
-        Without an intersection both points are the nearest one on the line of centres (least squares); NaN for one
-        centre.
+        (N, 2) points, beginning with the point to the left of the direction from ``first`` to ``second``; and (N,)
+        statuses: "two" (the circles intersect), "tangent", "disjoint", "contained" (one inside the other) or
+        "coincident" (one centre). Without an intersection both points are the nearest one on the line of centres (least
+        squares); NaN for one centre.
     """
     base = second - first
     a = np.abs(base)
@@ -62,7 +62,7 @@ def two_circles(
         x = np.where(swap, a - x, x)
         gap = a - d1 - d2
         apart = d1 + gap * share
-        # Contained: seen from the larger circle's centre, the nearest points lie beyond that of the smaller circle.
+        # Contained: seen from the larger circle's centre, the nearest points lie beyond the smaller circle's centre.
         inside = np.where(swap, d1 - (d1 - d2 - a) * share, -(d1 + (d2 - d1 - a) * share))
         status = np.where(gap > tolerance, "disjoint", np.where(slack < -tolerance, "contained", "two"))
         status = np.where((status == "two") & (slack <= tolerance), "tangent", status)

@@ -37,7 +37,7 @@ def locate(
     points onto the beacons, of all beacons and of pairs, and from the intersections of pairs of circles. All minima are
     returned whose costs the noise cannot distinguish from the best.
 
-    A call takes one set of measurements. Coordinates may be as large as those of UTM.
+    A call takes one set of measurements. Coordinates may be as large as in UTM.
 
     Args:
         xy: (M, 2) positions of the beacons [m].

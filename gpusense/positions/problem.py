@@ -30,11 +30,12 @@ LOSSES: dict[str, Callable[[Floats], tuple[Floats, Floats, Floats]]] = {
     "cauchy": lambda z: (np.log1p(z), 1 / (1 + z), -1 / (1 + z) ** 2),
     "arctan": lambda z: (np.arctan(z), 1 / (1 + z * z), -2 * z / (1 + z * z) ** 2),
 }
-# Condition number from which a Jacobian is singular: it is rounded to about 1e-16.
+# Condition number from which on a Jacobian counts as singular, as it is rounded to about 1e-16.
 SINGULAR = 1e12
-# A robot nearer to a beacon than this, in the scene's spread, stands at it: rounding of 1e-15 grows in bad geometry.
+# A robot nearer to a beacon than this share of the scene's spread stands at it: in bad geometry rounding of 1e-15 grows
+# to this.
 TOUCH = 1e-12
-# Most subsets of the beacons whose closed forms are starts.
+# Largest number of subsets of the beacons whose closed forms are starts.
 STARTS = 300
 
 
@@ -86,7 +87,7 @@ class Problem:
 
     @functools.cached_property
     def touch(self) -> float:
-        """Distance from a beacon up to which the robot stands at it, where the direction to it is rounding error."""
+        """Distance up to which the robot stands at a beacon, where its direction is rounding error."""
         return max(TOUCH * self.spread, 4 * self.noise)
 
     def at_beacon(self, state: Floats) -> bool:
@@ -136,7 +137,7 @@ class Problem:
         return np.sqrt(np.tile(self.weights, 2) if both else self.weights) / self.sigmas
 
     def rho(self, scaled: Floats) -> tuple[Floats, Floats]:
-        """Return the losses of scaled residuals, and the weights that a robust loss leaves them."""
+        """Return the losses of scaled residuals, and their weights under a robust loss."""
         value, slope, _ = LOSSES[self.loss]((scaled / self.loss_scale) ** 2)
         return value * self.loss_scale**2, slope
 
@@ -275,7 +276,7 @@ def make_problem(
             raise ValueError(f"weights: must be > 0 for at least {least} {noun}{reason}, got {np.count_nonzero(used)}")
         raise ValueError(f"xy: must hold at least {least} {noun}{reason}, got {count}")
     positions, factors = positions[used], factors[used]
-    # The middle of the box is rounded as little as the beacons; differences of near numbers are exact.
+    # The middle of the box is rounded as finely as the beacons; differences of near numbers are exact.
     origin = positions.min(axis=0) / 2 + positions.max(axis=0) / 2
     return Problem(
         positions - origin,

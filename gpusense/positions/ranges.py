@@ -29,13 +29,13 @@ def trilaterate(
     solution and from the intersections of pairs of circles. For beacons in line the mirror image is the second
     solution. With ``sigma``, all minima are returned whose costs the noise cannot distinguish from the best.
 
-    A call takes one set of measurements. Coordinates may be as large as those of UTM.
+    A call takes one set of measurements. Coordinates may be as large as in UTM.
 
     Args:
         xy: (M, 2) positions of the beacons [m], M >= 2.
         ranges: (M,) measured distances [m], >= 0.
-        sigma: Standard deviation of the ranges [m], one or (M,), > 0. None if unknown: the covariance is then that of
-            sigma = 1 m, to be multiplied by the variance.
+        sigma: Standard deviation of the ranges [m], one or (M,), > 0. None if unknown: the covariance is then for sigma
+            = 1 m, to be multiplied by the variance.
         weights: (M,) factors >= 0 of the squared residuals; 0 leaves a beacon out. By default 1.
         loss: "linear" (least squares), "soft_l1", "huber", "cauchy" or "arctan", as in
             ``scipy.optimize.least_squares``. It is ignored for two beacons, which cannot show an outlier.
@@ -47,7 +47,8 @@ def trilaterate(
 
     Raises:
         TypeError: An argument has the wrong type.
-        ValueError: A shape or value breaks its rule, or fewer than two beacons are left: a circle of solutions.
+        ValueError: A shape or value breaks its rule, or fewer than two beacons are left, which leaves a circle of
+            solutions.
 
     Source: lectures, "Distances Only, No Uncertainty"; Thrun, Burgard and Fox, *Probabilistic Robotics*, section 6.6.
 
@@ -114,7 +115,7 @@ def _beside_line(problem: Problem, starts: Floats, line: tuple[Floats, Floats], 
     left = starts + (np.abs(aside := (starts - point) @ normal) - aside)[:, None] * normal
     states, costs = minima(problem, left)
     aside = (states - point) @ normal
-    # Nearer to the line than the root of the rounding error, a solution and its image are the same.
+    # A solution nearer to the line than the root of the rounding error is its own image.
     off = np.abs(aside) > 1e-7 * problem.spread
     states, costs = distinct(problem, states[off] + (np.abs(aside) - aside)[off, None] * normal)
     rounding = (1e-14 * problem.spread * problem.scales.max()) ** 2 * len(problem.xy)

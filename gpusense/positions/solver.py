@@ -9,10 +9,11 @@ import numpy as np
 from gpusense.positions.closed_forms import wrap
 from gpusense.positions.problem import LOSSES, Floats, Problem
 
-# Most starts followed to their minima, and the least distance between them, in the scene's spread (or radians).
+# Largest number of starts followed to their minima, and the least distance between them, in spreads of the scene (or
+# radians).
 FOLLOWED = 8
 APART = 0.05
-# Minima nearer to each other than this count as one.
+# Minima nearer to each other than this count as the same.
 SAME = 1e-6
 # Relative changes at which the search stops: coarse from the starts, then down to rounding from the lowest minima.
 COARSE, FINE = 1e-4, 1e-15
@@ -72,8 +73,8 @@ def minima(
 
     Args:
         problem: The measurements.
-        starts: (N, d) states; those that are not finite are left out. The best are followed, each at least APART from
-            those before it.
+        starts: (N, d) states; non-finite states are left out. The best states are followed, each at least APART from
+            the previous ones.
         line: See :func:`descend`.
 
     Returns:
@@ -125,14 +126,14 @@ def pick(states: Floats, costs: Floats, *, known_sigma: bool) -> tuple[Floats, s
 def in_line(points: Floats, noise: float) -> tuple[Floats, Floats] | None:
     """Return the line through points: a point and a unit vector, from the first point to the farthest.
 
-    None if the points are not in line, to rounding. The points must not all be at one place.
+    Return None if the points are not in line within rounding. They must not all coincide.
     """
     offset = points - points[0]
     away = np.hypot(offset[:, 0], offset[:, 1])
     far = int(np.argmax(away))
     direction = offset[far] / away[far]
     aside = np.abs(offset[:, 1] * direction[0] - offset[:, 0] * direction[1])
-    # Coordinates are rounded on both ends of an offset, and the farthest one turns the line.
+    # Both ends of an offset are rounded, and the rounding of the farthest point turns the line.
     return (points[0], direction) if aside.max() <= 8 * noise else None
 
 

@@ -1,7 +1,7 @@
-"""Densities of sensors that know where they are: a position in the plane, and a heading.
+"""Densities of absolute sensors, which measure a position in the plane or a heading.
 
-A position is normal around the truth. A heading is wrapped normal, sum_k N(r + 2 pi k; 0, sigma): computed up to sigma
-= 1.5 by its largest terms, beyond that by its Fourier series (1 + 2 sum_n q^(n n) cos n r) / (2 pi) with q =
+A position is normal around the truth. A heading is wrapped normal, sum_k N(r + 2 pi k; 0, sigma): computed by its
+largest terms up to sigma = 1.5, and beyond that by its Fourier series (1 + 2 sum_n q^(n n) cos n r) / (2 pi) with q =
 exp(-sigma^2 / 2). Or a heading is von Mises, exp(kappa cos r) / (2 pi I0(kappa)) with kappa cos r = kappa - 2 kappa
 sin^2(r / 2). Mardia and Jupp, *Directional Statistics* (2000), section 3.5. z_rand is the weight of a uniform density
 (RAND).
@@ -38,7 +38,7 @@ def half_sine(residual: Pair) -> Pair:
 
 
 def log_other_turns(residual: Pair, decay: float) -> np.ndarray:
-    """Return the log of the sum over all turns over the normal of the nearest turn."""
+    """Return the log of the ratio of the sum over all turns to the normal of the nearest turn."""
     real = residual[0].dtype.type
     half, size = real(HALF_TURN), np.abs(residual[0])
     low = np.where(residual[0] < 0, -residual[1], residual[1])
@@ -51,7 +51,7 @@ def log_other_turns(residual: Pair, decay: float) -> np.ndarray:
 
 
 def log_waves(residual: Pair, terms: np.ndarray) -> np.ndarray:
-    """Return the log of the Fourier series over its first term, by Clenshaw's recurrence."""
+    """Return the log of the ratio of the Fourier series to its first term, by Clenshaw's recurrence."""
     real = residual[0].dtype.type
     s = half_sine(residual)[0]
     cosine = 1 - 2 * s * s

@@ -24,14 +24,14 @@ from gpusense.reference.offsets import distance_pair, offset
 SCALE, SCALE_LOW, PEAK, PEAK_LOW, RANDOM, RANGE_MAX = range(6)
 WIDE_SCALE, WIDE_SCALE_LOW, WIDE_PEAK, WIDE_PEAK_LOW = range(6, 10)
 OFFSET, OFFSET_LOW, POWER, T_SCALE, ARC, ODD = range(6, 12)
-# From here on an arc is a quarter turn to the last bit; the square of its tangent is still finite.
+# From this tangent on an arc is a quarter turn to the last bit; the tangent's square is still finite.
 STEEPEST = 1e18
 
 
 def log_normal(
     residual: Pair, near: np.ndarray, far: np.ndarray, terms: np.ndarray, first: int, peak: int
 ) -> np.ndarray:
-    """Return the log of a truncated normal; near and far are the distances of its mean from the ends."""
+    """Return the log of a truncated normal; near and far are the distances from its mean to the ends."""
     scale = np.asarray(terms[first]), np.asarray(terms[first + 1])
     exponent = bounded_square(pair_product(residual, scale))
     mass = terms.dtype.type(0.5) * (erf(near * terms[first]) + erf(far * terms[first]))

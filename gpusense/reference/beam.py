@@ -115,7 +115,7 @@ def score_beams(
             )  # fmt: skip
         expected = ranges.reshape(end - begin, rays)[:, ray_of]
         z = np.broadcast_to(reading[:readings], expected.shape)
-        # Rays need not be cast farther than their limits; here they are, and cut.
+        # Devices cast rays up to their limits only; here ranges are cut there.
         limit = ray_limit(flags, z, terms, scale)
         expected = np.where(limit < scale.limit, np.fmin(expected, limit * scale.resolution), expected)
         term = reading_term(flags, z, expected, bin_terms, sensor, tables, scale.range_max)

@@ -12,7 +12,8 @@ import numpy as np
 
 from gpusense.interface.constants import CIRCLE_NUMBERS
 
-# Steps of a fit, the first of them by distances from the circle, and the smallest cosine of an angle of incidence.
+# Steps of a fit; the first steps, which minimise distances from the circle; the smallest cosine of an angle of
+# incidence.
 CIRCLE_STEPS, RADIAL_STEPS, STEEPEST = 25, 8, 0.1
 WHOLE_TURN = 6.283185307179586
 
@@ -45,7 +46,7 @@ def arc_guess(mine: np.ndarray) -> np.ndarray:
 
 
 def side_of(mine: np.ndarray, edge: np.ndarray, guess: np.ndarray) -> float:
-    """Return -1 where beams meet the near side of a circle, as that of a pole, and 1 for the far side."""
+    """Return -1 where beams meet the near side of a circle, as at a pole, and 1 for the far side."""
     if edge[2] > 0:
         return -1.0
     beyond = np.sum((mine[:, 0] * guess[0] + mine[:, 1] * guess[1]) / mine[:, 3] - mine[:, 3])
@@ -69,8 +70,8 @@ def circle_sums(
 ) -> np.ndarray:
     """Return the cost of a circle, its gradient (3) and its information (6: xx, xy, xr, yy, yr, rr).
 
-    Beams meet its near side (-1) or its far side (1); those that pass it by are compared with their nearest place.
-    Radial errors are distances from the circle.
+    Beams meet its near side (-1) or its far side (1); a beam that passes the circle is compared with its nearest point
+    to it. Radial errors are distances from the circle.
     """
     x, y, radius = circle
     r = mine[:, 3]

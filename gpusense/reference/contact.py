@@ -17,8 +17,8 @@ from gpusense.reference.error_free import Pair, pair_product, two_product, two_s
 from gpusense.reference.log_terms import bounded_square, either
 
 NO_OBSTACLE = (1 << 31) - 1
-# 1 / (sigma sqrt 2), the gap of touching centres, the cell's side; logs of p_contact and p_false, and of 1 minus each
-# of them.
+# 1 / (sigma sqrt 2), the gap of touching centres, the cell's side; logs of p_contact and p_false; logs of 1 - p_contact
+# and 1 - p_false.
 SCALE, SCALE_LOW, REACH, REACH_LOW, SIDE, SIDE_LOW, HIT_TERM, FALSE_TERM, MISS_TERM, NO_HIT_TERM = range(10)
 # Gap in cells where there is no obstacle.
 FAR_CELLS = 1e9

@@ -1,7 +1,7 @@
 """Exact squared Euclidean distance transform in cells, in integers.
 
-The device kernels follow Meijster, Roerdink and Hesselink (2000). Here the second pass visits every row in turn: it is
-plain to read, and the farthest obstacle bounds it.
+The device kernels follow Meijster, Roerdink and Hesselink (2000). Here the second pass visits every row in turn, which
+is simple to read and bounded by the farthest obstacle.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def distance_envelope(
     line_stride: int,
     step: int,
 ) -> None:
-    """Find the lowest of all parabolas of its line at each cell (second pass)."""
+    """Find the lowest parabola of a line at each of its cells (second pass)."""
     across = _lines(along, lines, length, line_stride, step)
     out = _lines(squared, lines, length, line_stride, step)
     for block in range(0, lines, BLOCK):

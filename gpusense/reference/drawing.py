@@ -1,11 +1,11 @@
 """Resampling of particles from exact cumulative weights, with jitter between stages and injected poses.
 
 Systematic resampling draws at (n + u) / N of the total, stratified resampling at (n + u_n) / N: *Probabilistic
-Robotics* table 4.4, and Kitagawa (1996). Residual resampling copies each particle as often as the whole part of its
-expected number says, and draws the rest by the residual weights (Liu and Chen 1998). Between two stages of a correction
-a drawn pose moves by a fraction of the difference of two other poses, so that the spread of the moves follows the
-cloud's (differential evolution: ter Braak 2006); differences between separate clusters are shortened. Injected poses
-come from a pool: free cells, or the modes of a likelihood map.
+Robotics* table 4.4, and Kitagawa (1996). Residual resampling copies each particle by the integer part of its expected
+number of copies, and draws the rest by the residual weights (Liu and Chen 1998). Between two stages of a correction a
+drawn pose moves by a fraction of the difference between two other poses, so that moves scale with the spread of the
+cloud (differential evolution: ter Braak 2006); differences between separate clusters are shortened. Injected poses come
+from a pool: free cells, or the modes of a likelihood map.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def count_copies(
     drawn: int,
     stage: int,
 ) -> None:
-    """Count the certain copies of each block; the other columns are 0."""
+    """Count the deterministic copies of each block; the other columns are 0."""
     copies = copies_of(ends[:particles], state[stage * STAGE + TOTAL], drawn)
     table = sums[: blocks * WEIGHT_SUMS].reshape(blocks, WEIGHT_SUMS)
     table[:] = 0.0
@@ -57,7 +57,7 @@ def set_copies(
     drawn: int,
     stage: int,
 ) -> None:
-    """Set the cumulative numbers of certain copies."""
+    """Set the cumulative numbers of deterministic copies."""
     copies[:particles] = np.cumsum(copies_of(ends[:particles], state[stage * STAGE + TOTAL], drawn))
 
 

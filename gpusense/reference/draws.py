@@ -37,7 +37,7 @@ def found_at(ends: np.ndarray, mark: np.ndarray, particles: int) -> np.ndarray:
 
 
 def copies_of(ends: np.ndarray, total: float, drawn: int) -> np.ndarray:
-    """Return the copies that residual resampling makes for certain: the whole part of the expected number of each."""
+    """Return the deterministic copies of residual resampling: the integer part of each expected number of copies."""
     weight = np.diff(ends, prepend=0.0)
     return np.floor(drawn * weight / total) if total > 0.0 else np.zeros_like(weight)
 
@@ -47,7 +47,7 @@ def found_residual(
 ) -> np.ndarray:
     """Return the first index whose cumulative residual weight exceeds a fraction of all residual weights."""
     rest = ends[:particles] - copies[:particles] * (total / drawn)
-    # Roundings may leave a sum below the one before it: search as devices do.
+    # Rounding may leave a sum below its predecessor: search as devices do.
     mark, low, high = fraction * rest[-1], np.zeros(len(fraction), np.int64), np.full(len(fraction), particles - 1)
     while (low < high).any():
         middle = (low + high) // 2
@@ -57,7 +57,7 @@ def found_residual(
 
 
 def mark_of(fraction: np.ndarray, total: float) -> np.ndarray:
-    """Return the mark at a fraction of the total, below the total."""
+    """Return the mark at a fraction of the total, clamped to below the total."""
     return np.minimum(np.floor(fraction * total), total - 1.0)
 
 
@@ -96,7 +96,7 @@ def words_of(settings: np.ndarray, stage: int, index: np.ndarray, stream: int) -
 
 
 def start_of(settings: np.ndarray, stage: int, index: np.ndarray) -> np.ndarray:
-    """Return the random numbers of the marks of draws; that of index 0 serves all draws of systematic resampling."""
+    """Return the random numbers of the marks of draws; systematic resampling uses that of index 0 for all."""
     return uniform_of(words_of(settings, stage, index, 0)[0])
 
 

@@ -94,8 +94,8 @@ def nearest_echo(
         caster: The knobs of the caster.
 
     Returns:
-        (M,) distances in cells, limit where nothing returns, and cosines and sines of angles of incidence, 2 and 0
-        there: more than any cosine, so that the first of the bins may be for such beams alone.
+        (M,) distances in cells, limit where nothing returns, and cosines and sines of angles of incidence. Without a
+        return these are 2 and 0: 2 exceeds every cosine, so that the first bin can be for such beams alone.
     """
     real = pose.dtype.type
     nearest = np.full(len(cell), limit, pose.dtype)
@@ -133,7 +133,7 @@ def cast_echoes(
 ) -> None:
     """Cast the cones of all particles to expected ranges and angles of incidence, NaN without a return.
 
-    With COSINES, the cosines take the place of the angles; 2 without a return.
+    With COSINES, cosines replace the angles; 2 without a return.
     """
     block = max(BLOCK // max(rays, 1), 1)
     for first in range(0, particles, block):

@@ -11,7 +11,7 @@ import numpy as np
 
 LOG2_HIGH, LOG2_LOW = 0.6931471803691238, 1.9082149292705877e-10
 INVERSE_LOG2 = 1.4426950408889634
-# 1.5 * 2^52: a sum with it is rounded to an integer.
+# 1.5 * 2^52: adding it rounds to an integer.
 ROUNDER = 6755399441055744.0
 # Below this exponent the result is 0.
 LEAST_EXPONENT = -700.0

@@ -1,7 +1,7 @@
 """The cell of the likelihood field's table in which a beam's end point lies, and the point's place within that cell.
 
-Cells must be the same on every device and in every precision. Kernels compute end points near an edge again with twice
-the digits; the reference computes all of them so.
+Cells must be the same on every device and in every precision. Kernels recompute end points near an edge with twice the
+digits; the reference computes all end points so.
 """
 
 from __future__ import annotations

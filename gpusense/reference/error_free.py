@@ -1,4 +1,4 @@
-"""Error-free transformations: the rounding error of an operation is kept in a second number.
+"""Error-free transformations: a second number holds the rounding error of an operation.
 
 Source: Knuth (``two_sum``), Dekker and Veltkamp (``two_product``).
 """
@@ -22,20 +22,20 @@ def two_sum(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def ordered_sum(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``a + b = sum + error`` exactly, where a has no smaller exponent than b: Dekker's sum."""
+    """Return ``a + b = sum + error`` exactly, where a's exponent is at least b's: Dekker's sum."""
     total = a + b
     return total, b - (total - a)
 
 
 def high_half(a: np.ndarray) -> np.ndarray:
-    """Return the leading bits of a float, few enough that a product of two such halves is exact."""
+    """Return the leading bits of a float, so few that the product of two such halves is exact."""
     splitter = a.dtype.type(134217729 if a.dtype == np.float64 else 4097)
     scaled = splitter * a
     return scaled - (scaled - a)
 
 
 def two_product(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``a * b = product + error`` exactly, short of overflow and underflow."""
+    """Return ``a * b = product + error`` exactly, barring overflow and underflow."""
     product = a * b
     a_high, b_high = high_half(a), high_half(b)
     a_low, b_low = a - a_high, b - b_high
@@ -45,8 +45,8 @@ def two_product(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def pair_sum(a: Pair, b: Pair) -> Pair:
     """Add two numbers of two parts each, to about twice the working precision.
 
-    Where the first parts cancel, the sum is no smaller than the last bit of either, so its exponent is no smaller
-    than that of the second parts.
+    Where the first parts cancel, their sum is at least the last bit of either, so its exponent is at least that of the
+    second parts.
     """
     total, error = two_sum(a[0], b[0])
     return ordered_sum(total, error + (a[1] + b[1]))

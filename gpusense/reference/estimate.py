@@ -1,9 +1,9 @@
 """Weighted mean, circular in the heading, and covariance of a cloud of particles.
 
-Sums are relative to the first particle. While no heading is farther than a right angle from the first one, covariances
-follow from them; otherwise a second pass is relative to the mean. Mardia and Jupp, *Directional Statistics*
-(2000), section 2.2. In a block of particles every eighth one belongs to a lane; the lanes are summed in the order of
-their particles, and then added one after the other.
+Sums are relative to the first particle. If no heading is more than a right angle from the first particle's, covariances
+follow from these sums; otherwise a second pass is relative to the mean. Mardia and Jupp, *Directional Statistics*
+(2000), section 2.2. In a block, every eighth particle belongs to the same lane; each lane is summed in the order of its
+particles, and the lanes are then added in order.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ def sum_poses(
         for k, column in enumerate(columns):
             padded = np.zeros((-(-(end - begin) // ESTIMATE_LANES), ESTIMATE_LANES))
             padded.reshape(-1)[: end - begin] = column[begin:end]
-            # One after the other, as on devices.
+            # In order, as on devices.
             rows[:, k] = np.cumsum(np.cumsum(padded, axis=0)[-1].reshape(each, lanes), axis=1)[:, -1]
 
 
 def finish_estimate(
     flags: frozenset[str], poses: np.ndarray, sums: np.ndarray, estimate: np.ndarray, groups: int, second_pass: int
 ) -> None:
-    """Write the mean pose, the covariance about it, and whether headings ask for a second pass; or the second pass."""
+    """Write the mean pose, its covariance, and whether headings require a second pass; or write the second pass."""
     total = np.cumsum(sums[: groups * ESTIMATE_SUMS].reshape(groups, ESTIMATE_SUMS), axis=0)[-1]
     weight = total[0] if total[0] > 0.0 else 1.0
     x, y, angle = total[1] / weight, total[2] / weight, total[5] / weight

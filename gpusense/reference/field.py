@@ -1,6 +1,6 @@
 """Likelihood field of a whole scan (book table 6.3): one look-up at each beam's end point.
 
-The table is padded by a ring of two cells for everything outside the grid, so no look-up needs a bounds test.
+A ring of two cells around the table stands for everything outside the grid, so no look-up needs a bounds test.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ def fill_field(
 ) -> None:
     """Fill cells of the table from squared distances; density has a value for each squared distance up to the cap.
 
-    They are height x width cells, the first of them at begin. The first cell is (from_row, from_col) of the grid; cells
-    outside the grid get beyond.
+    There are height x width cells, which begin at index begin of the table and at cell (from_row, from_col) of the
+    grid; cells outside the grid get beyond.
     """
     size = table.itemsize
     out = np.lib.stride_tricks.as_strided(table[begin:], (height, width), (stride * size, size))
@@ -109,7 +109,7 @@ def field_blocks(
     spread: int,
     batch: structs.ScanBatch,
 ) -> None:
-    """Write the sums of blocks of readings to parts[n + block * particles]; GPUs compute them one by one."""
+    """Write the sums of blocks of readings to parts[n + block * particles]; on GPUs a work-item takes single blocks."""
     if "SCANS" in flags:
         for scan, part in particles_of_scans(particles, batch):
             first, last = start[scan], start[scan + 1]

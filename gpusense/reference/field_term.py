@@ -41,7 +41,7 @@ def bilinear(
 
 
 def field_square(flags: frozenset[str], distance: Pair, terms: np.ndarray) -> Pair:
-    """Return the exponent of a normal in two parts: where the peak is high, exponent and log peak nearly cancel.
+    """Return the exponent of a normal in two parts, since for a high peak exponent and log peak nearly cancel.
 
     ``terms`` = (hit, 1 / (2 sigma^2), rand, log z_max, the low parts of terms 0 and 1, two numbers of the shape of a
     hit). hit is the peak of its density, z_hit / (sigma sqrt(2 pi)) for a normal, and rand is z_rand / range_max, or

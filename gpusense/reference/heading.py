@@ -1,9 +1,9 @@
 """Cosine and sine of a heading in float64 with +, - and * alone, so that every device gives the same bits.
 
 A heading is reduced to r + low, |r| <= pi/4, and a count of quarter turns modulo 4: up to 2^20 rad by subtracting the
-count times pi/2 in four parts (Cody and Waite), beyond that by the product with the bits of 2/pi that matter, in
-integers (Payne and Hanek). Then sin r = r + r z S(z) and cos r = 1 - z/2 + z^2 C(z) with z = r^2.
-``bench/derive/heading_constants.py`` derives the constants.
+count times pi/2 in four parts (Cody and Waite), beyond that by an integer product with the relevant bits of 2/pi (Payne
+and Hanek). Then sin r = r + r z S(z) and cos r = 1 - z/2 + z^2 C(z) with z = r^2. ``bench/derive/heading_constants.py``
+derives the constants.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from gpusense.interface.constants import LARGEST_HEADING
 from gpusense.reference.error_free import Pair, pair_product, two_sum
 
 TWO_OVER_PI = 0.6366197723675814
-# 1.5 * 2^52: a sum with it is rounded to an integer.
+# 1.5 * 2^52: adding it rounds to an integer.
 ROUNDER = 6755399441055744.0
 # pi/2 in three parts of 33 bits and a rounded one, and as the sum of two rounded numbers.
 QUARTER_1, QUARTER_2 = 1.5707963267341256, 6.077100506303966e-11
@@ -52,11 +52,11 @@ def reduce_huge(theta: np.ndarray) -> tuple[np.ndarray, Pair]:
     bits = np.abs(theta).view(np.uint64)
     mantissa = (bits & np.uint64(0xFFFFFFFFFFFFF)) | np.uint64(0x10000000000000)
     low_half, high_half = mantissa & np.uint64(0xFFFFFFFF), mantissa >> np.uint64(32)
-    # Bits of 2/pi that make whole turns are left out: times the last bit of the mantissa, the window's first bit is
-    # half a turn.
+    # Bits of 2/pi that contribute whole turns are left out: the window's first bit times the last bit of the mantissa
+    # is half a turn.
     first = (bits >> np.uint64(52)).astype(np.int64) - (1075 - 62)
     word, shift = first >> 5, (first & 31).astype(np.uint64)
-    # turns = mantissa * window modulo 2^192, of which the upper four words stay.
+    # turns = mantissa * window modulo 2^192, of which the upper four words are kept.
     turn_1, turn_2, turn_3, turn_4, carry_1, carry_2, below = (np.zeros_like(bits) for _ in range(7))
     for k in (5, 4, 3, 2, 1, 0):
         both = WORDS[word + k] << np.uint64(32) | WORDS[word + k + 1]
@@ -82,7 +82,7 @@ def reduce_huge(theta: np.ndarray) -> tuple[np.ndarray, Pair]:
 
 
 def cos_sin(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return cosines and sines of float64 headings; where one is not finite they have no meaning but are not NaN."""
+    """Return cosines and sines of float64 headings; meaningless, but not NaN, for headings that are not finite."""
     huge = ~(np.abs(theta) <= LARGEST_HEADING)
     any_huge = huge.any()
     quadrant, (r, low) = reduce_ordinary(np.where(huge, 0.0, theta) if any_huge else theta)

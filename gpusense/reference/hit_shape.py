@@ -1,4 +1,4 @@
-"""Shape of the density of a hit, as a change of the normal's exponent t = u^2 / 2 at a distance of u scales.
+"""Shape of the density of a hit, as a function of the normal's exponent t = u^2 / 2 at a distance of u scales.
 
 The density falls from its peak by the factor exp(-E). A normal has E = t and the weight E'(t) = 1. STUDENT: Student's t
 with nu degrees of freedom has E = power log(1 + rate t), power = (nu + 1) / 2, rate = 2 / nu, and the weight
@@ -36,12 +36,12 @@ def shape_weight(flags: frozenset[str], t: np.ndarray, numbers: np.ndarray) -> n
 
 
 def shape_bend(flags: frozenset[str], square: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-    """Return -E''(t) over the weight, times u^2, from the weight times u^2."""
+    """Return ``-u^2 E''(t) / E'(t)`` from ``square = u^2 E'(t)``."""
     return square * (1 / numbers[0]) if "STUDENT" in flags else np.zeros_like(square)
 
 
 def half_mass(flags: frozenset[str], b: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-    """Return the mass between the mean and a distance; kernels need no formula of it."""
+    """Return the mass between the mean and a distance; kernels need no formula for it."""
     if "STUDENT" not in flags:
         raise ValueError(f"flags: must be those of a shape with a mass, got {sorted(flags)}")
     power, rate = numbers

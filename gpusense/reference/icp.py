@@ -1,6 +1,6 @@
 """Scan matching by point-to-line ICP with exact nearest points.
 
-The points of a scan are sorted by bearing. Kernels search from the bearing of a place outwards, until no point farther
+The points of a scan are sorted by bearing. Kernels search outwards from the bearing of a place, until no point farther
 in bearing can be nearer; the reference compares all points.
 
 Lines: see lines.py, and Censi (2008), "An ICP variant using a point-to-line metric". Weights: Cauchy's while the scale
@@ -15,7 +15,7 @@ from gpusense.interface import structs
 from gpusense.interface.constants import MATCH_RESULT
 from gpusense.reference.icp_step import FULL_TURN, MATCH_BLOCKS, bearing_of, block_squares, points_before, solve
 
-# Weight in the score of a point that the other scan did not see; one that disagrees has 1.
+# Weight in the score of a point that the other scan did not see; a point that disagrees has weight 1.
 UNSEEN = 0.13
 
 
@@ -56,8 +56,8 @@ def agreement(
 ) -> np.ndarray:  # fmt: skip
     """Return how well every stride-th point of one scan agrees with every skip-th point of another scan.
 
-    The four numbers are the sum of agreements, points that the other scan should see, points that contradict it because
-    it saw through them, and points that it did not see. ``pose`` is (x, y, cos, sin).
+    The four numbers are the sum of agreements, points that the other scan should see, points through which it saw, and
+    points that it did not see. ``pose`` is (x, y, cos, sin).
     """
     p = other[::stride]
     x = pose[2] * p[:, 0] - pose[3] * p[:, 1] + pose[0]
@@ -97,7 +97,7 @@ def match_scans(
     the reference take part until capture radius and scale have shrunk, with ``thin`` also afterwards. With ``one_way``
     the reference's points do not count in the score. A result is the pose (3), the score, iterations, whether the last
     step was below ten tolerances, the information (6), its part that is due to errors of the lines (6), pairs, sum of
-    weights, weighted sum of squared errors, points that the other scan should see, points that contradict it, points
+    weights, weighted sum of squared errors, points that the other scan should see, points through which it saw, points
     that it did not see, and for blocks of 1, 2, 4 to 128 successive points the sum of squares of the blocks' sums of
     weighted errors (8), 0 with ``thin``; the last step (3).
     """

@@ -1,6 +1,6 @@
-"""Steps of point-to-line ICP that bodies of one place and of several at once share.
+"""Steps of point-to-line ICP that scalar bodies and bodies in lanes share.
 
-They are places among the bearings of a scan, the normal equations, and sums of blocks of points.
+They find places among the bearings of a scan, solve the normal equations, and sum blocks of points.
 
 Blocks: Flyvbjerg and Petersen (1989), "Error estimates on averages of correlated data".
 """
@@ -21,7 +21,7 @@ def bearing_of(place: np.ndarray) -> np.ndarray:
 
 
 def points_before(point: np.ndarray, bearing: np.ndarray) -> np.ndarray:
-    """Return the numbers of points of a scan whose bearings are less than some bearings."""
+    """Return, for each bearing, the number of points of a scan with smaller bearings."""
     return np.searchsorted(point[:, 2], bearing, side="left")
 
 

@@ -44,7 +44,7 @@ def candidates(
 
 
 def near(off: Quad, turned: Quad, feature: np.ndarray) -> np.ndarray:
-    """Return whether landmarks lie in a feature's disc, and within the limits of what the feature does not measure."""
+    """Return whether landmarks lie in a feature's disc, and within limits for components that it does not measure."""
     reach, radius, hole = feature[REACH], feature[RADIUS], feature[HOLE]
     x, y = off[0] - reach * turned[0], off[2] - reach * turned[2]
     squared = off[0] * off[0] + off[2] * off[2]
@@ -57,7 +57,7 @@ def may_match(
     flags: frozenset[str], off: Quad, turned: Quad, feature: np.ndarray, normal: np.ndarray, signature: np.ndarray,
     j: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Return whether features may be landmarks j: near their end points, or for lines turned alike and overlapping."""
+    """Return whether features may be landmarks j: near an end point, or for lines of like direction and overlapping."""
     if "LINE" in flags:
         return overlaps(off, turned, feature, facing(normal[j], signature[j], turned), signature[j])
     return near(off, turned, feature)
@@ -86,7 +86,7 @@ def search(
     arcs: np.ndarray,
     buckets: structs.Buckets,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return per particle the log density, that of the likeliest landmark, and the index of that landmark.
+    """Return per particle the log density, the log density of the likeliest landmark, and its index.
 
     The log density is that of the likeliest landmark, or with MARGINAL of all landmarks.
     """
@@ -117,7 +117,7 @@ def search(
             holder, sizes = n[heads], np.diff(np.append(heads, len(n)))
             most = np.maximum.reduceat(value, heads)
             best[holder] = log_p[holder] = most
-            # The first of equals.
+            # The first of equally likely landmarks.
             at_most = np.where(value == np.repeat(most, sizes), np.arange(len(n)), len(n))
             chosen[holder] = j[np.minimum.reduceat(at_most, heads)]
             if "MARGINAL" in flags:

@@ -20,7 +20,7 @@ from gpusense.reference.landmarks import direction, sensor_place
 from gpusense.reference.log_terms import either
 from gpusense.reference.offsets import offset
 
-# A landmark's part of a density is larger than the false positive's from twice the latter on.
+# A landmark's part of a density exceeds the false positive's if the density is more than twice the latter.
 LOG_2 = 0.69314718055994531
 
 

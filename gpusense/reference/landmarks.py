@@ -5,7 +5,7 @@
 d and b_j are the landmark's distance and bearing from the sensor; differences of bearings are wrapped to (-pi, pi]. m
 is the mass of a component on the measurable interval: [0, range_max], the field of view, the span of signatures.
 Components that were not measured are left out. Positions, directions and quantities derived from them are sums of two
-numbers, since a relative error of eps in a distance of 20 m is far too much beside a deviation of 1 cm.
+numbers, since a relative error of eps in a distance of 20 m is too large for a deviation of 1 cm.
 
 A feature is FEATURE numbers, which are named below, in the same order in all three languages. A place is (x, its low
 part, y, its low part), and so are an offset and a direction.
@@ -52,7 +52,7 @@ def negative_where(when: np.ndarray, a: Pair) -> Pair:
 
 
 def at_places(quad: Quad, places: np.ndarray | slice) -> Quad:
-    """Select some of many offsets, places or directions."""
+    """Select a subset of offsets, places or directions."""
     return quad[0][places], quad[1][places], quad[2][places], quad[3][places]
 
 

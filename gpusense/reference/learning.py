@@ -73,7 +73,7 @@ def add_pair(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: 
     w = x_0 * x_0 * pull_0 + x_1 * x_1 * pull_1
     bend = shape_bend(flags, square, numbers)
     hit = r_hit > 0
-    # A mean that is clamped does not move with the bias.
+    # A clamped mean does not move with the bias.
     moved = hit & (mean == expected + terms[10])
     square = np.where(hit, square, 0)
     h_s = np.where(hit, square - 1 + t, 0)

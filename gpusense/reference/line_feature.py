@@ -7,8 +7,8 @@ and rho its distance (Siegwart, Nourbakhsh and Scaramuzza, *Introduction to Auto
 4.7). alpha_j and rho_j are those of the map's line at the particle; alpha - alpha_j is wrapped to (-pi, pi]. (alpha,
 rho) and (alpha + pi, -rho) are one line: where a line of the map is seen from both sides, the normal nearer to the
 feature's counts. m is the mass of the distance on [0, range_max]. By Cholesky's factor of C the exponent is (a da)^2 +
-(b da + c dr)^2 with a = BEARING_SCALE, b = MIXED_SCALE and c = RANGE_SCALE. A feature may be a line of the map if it
-overlaps that, projected on it: a scan shows a wall only as far as it is in sight. A line of the map has its middle as
+(b da + c dr)^2 with a = BEARING_SCALE, b = MIXED_SCALE and c = RANGE_SCALE. A feature may be a line of the map if its
+projection overlaps that line: a scan shows only the visible part of a wall. A line of the map has its middle as
 landmark, its normal away from the free side, and (half length, 1 if it is seen from both sides, 0, 0) as signature.
 """
 
@@ -39,7 +39,7 @@ from gpusense.reference.offsets import Quad
 
 
 def facing(normal: np.ndarray, signature: np.ndarray, turned: Quad) -> Quad:
-    """Return the normals of lines of the map on the side from which a feature sees them."""
+    """Return the normals of lines of the map on the side that faces a feature's sensor."""
     x, x_low, y, y_low = normal.T
     back = (signature[:, 1] > 0) & (x * turned[0] + y * turned[2] < 0)
     sign = np.where(back, -1, 1).astype(normal.dtype)
@@ -47,7 +47,7 @@ def facing(normal: np.ndarray, signature: np.ndarray, turned: Quad) -> Quad:
 
 
 def overlaps(off: Quad, turned: Quad, feature: np.ndarray, normal: Quad, signature: np.ndarray) -> np.ndarray:
-    """Return whether a feature is turned like lines of the map, and overlaps them."""
+    """Return whether a feature has about the direction of lines of the map, and overlaps them."""
     cosine = normal[0] * turned[0] + normal[2] * turned[2]
     sine = normal[0] * turned[2] - normal[2] * turned[0]
     foot = feature[RANGE_AT] * sine - (normal[0] * off[2] - normal[2] * off[0])
@@ -59,8 +59,8 @@ def overlaps(off: Quad, turned: Quad, feature: np.ndarray, normal: Quad, signatu
 def distance_mass(d: Pair, scale: float, signature: np.ndarray, terms: np.ndarray) -> np.ndarray:
     """Return the mass of the normal around lines' distances d on [0, range_max]; d is clamped to it.
 
-    A line that is seen from both sides has two forms, (alpha_j, d) and (alpha_j + pi, -d): the mass of both is that of
-    d on [-range_max, range_max].
+    A line that is seen from both sides has two forms, (alpha_j, d) and (alpha_j + pi, -d): together they have the mass
+    of d on [-range_max, range_max].
     """
     lower = np.where(signature[:, 1] > 0, -terms[0], 0).astype(terms.dtype)
     width = terms[0] - lower

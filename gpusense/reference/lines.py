@@ -25,10 +25,10 @@ def fit_lines(
 ) -> None:
     """Fit a line to each point of the chosen scans and ``reach`` neighbours on either side.
 
-    Up to ``most`` neighbours within a distance of ``width`` take part. None of them is farther from the last one than
-    ``slack`` plus ``ratio`` times its range, nor than ``gap`` in bearing. A line is a unit normal, an offset, and 1 /
-    (sum of squared distances along the line). A point without neighbours has the line across its beam, -1 in place of
-    that sum, and no pairs.
+    Up to ``most`` neighbours within a distance of ``width`` take part. Each lies within ``slack`` plus ``ratio`` times
+    its range of the previous one, and within ``gap`` of it in bearing. A line is a unit normal, an offset, and 1 / (sum
+    of squared distances along the line). A point without neighbours has a line perpendicular to its beam, -1 in place
+    of that sum, and no pairs.
     """
     for scan in which[:chosen]:
         mine = point[start[scan] : start[scan + 1]]

@@ -21,9 +21,9 @@ SMALLEST_RANGE = 1e-37
 
 
 def last_range(z: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """Return the expected ranges of readings from which on log p does not change by a bit.
+    """Return the expected ranges of readings beyond which log p is constant to the last bit.
 
-    It is that of p_rand, or of p_short far from its end: an obstacle farther away changes nothing.
+    There log p is that of p_rand, or of p_short far from its end, whatever the distance of the obstacle.
     """
     return np.maximum(terms[14] + terms[15] * z, terms[16])
 
@@ -133,7 +133,7 @@ def short_peak(decay: float, expected: np.ndarray) -> np.ndarray:
 def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
     """Return log p(z | z*) of readings in [0, range_max) given expected ranges of the same shape."""
     if "LINEAR" in flags:
-        # p_rand > 0 bounds the sum from below, so each component may underflow, and one logarithm is enough.
+        # p_rand > 0 bounds the sum from below, so components may underflow, and one logarithm suffices.
         p = np.zeros(z.shape, terms.dtype)
         if "HIT" in flags:
             exponent = hit_exponent(flags, z, expected, terms)

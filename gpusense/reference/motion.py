@@ -3,7 +3,7 @@
 Odometry model: Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), table 5.6; velocity model: table 5.3. Each of
 the four parts is normal, with a mean and a deviation in the settings. An arc of the velocity model (VELOCITY_MODEL)
 turns by twice the first part; its chord is the arc's length times sin(a) / a. With probability REVERSE the translation
-goes the other direction: some odometers count wheel turns without a sign.
+goes the other direction: some odometers count wheel turns without their sign.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from gpusense.reference.philox import normal_pair, random_words, uniform_of
 
 SMALL_ARC = 1e-4
 WHOLE_TURN, HALF_TURN = 6.283185307179586, 3.141592653589793
-# A whole turn beyond HALF_TURN, rounded down.
+# A full turn more than HALF_TURN, rounded down.
 FARTHEST_ONCE = 9.424777960769378
 
 
@@ -29,12 +29,12 @@ def chord_of(length: np.ndarray, half_turn: np.ndarray) -> np.ndarray:
 
 
 def wrap_once(theta: np.ndarray) -> np.ndarray:
-    """Return a heading less than a turn beyond [-pi, pi] in that interval."""
+    """Wrap headings that are less than a turn outside [-pi, pi] to that interval."""
     return np.where(theta > HALF_TURN, theta - WHOLE_TURN, np.where(theta < -HALF_TURN, theta + WHOLE_TURN, theta))
 
 
 def wrap_any(theta: np.ndarray) -> np.ndarray:
-    """Return any heading in [-pi, pi]: more than a turn beyond it goes by its cosine and sine."""
+    """Wrap any heading to [-pi, pi]; headings more than a turn outside it by their cosine and sine."""
     far = np.abs(theta) > FARTHEST_ONCE
     wrapped = wrap_once(theta)
     if far.any():

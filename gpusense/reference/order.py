@@ -1,6 +1,7 @@
 """An order of particles in which neighbours have similar positions and headings.
 
-Their rays then meet the same cells, and on a GPU none waits long for another. The order changes no result.
+Their rays then read the same cells and have similar lengths, so work-items of a GPU wait less for each other. The order
+changes no result.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def order_bounds(
 
 
 def part_of(value: np.ndarray, least: int, most: int, real: np.dtype) -> np.ndarray:
-    """Return the index of one of BINS equal parts of the bounds; values beyond them belong to the outermost."""
+    """Return the index of one of BINS equal parts of the bounds; values beyond them belong to the outermost parts."""
     part = (value.astype(real) - real.type(least)) * (real.type(BINS) / (real.type(most) - real.type(least) + 1))
     return np.clip(part.astype(np.int64), 0, BINS - 1)
 

@@ -1,4 +1,4 @@
-"""Random numbers by a counter, so that a particle's numbers depend on seed, step, stream and its index alone.
+"""Counter-based random numbers: a particle's numbers depend only on seed, step, stream and its index.
 
 Philox 4x32-10: Salmon, Moraes, Dror and Shaw, *Parallel random numbers: as easy as 1, 2, 3* (2011). Normal deviates are
 those of Box and Muller: sqrt(-2 log u) (cos 2 pi v, sin 2 pi v). The counter is (particle, step, stream, 0).
@@ -33,7 +33,7 @@ def random_words(counter: Words, key_0: int, key_1: int) -> Words:
 
 
 def uniform_of(word: np.ndarray) -> np.ndarray:
-    """Return a number in (0, 1): the centre of one of 2^32 intervals."""
+    """Return numbers in (0, 1), the centres of 2^32 intervals."""
     return (word.astype(np.float64) + 0.5) * WORD
 
 

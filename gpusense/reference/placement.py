@@ -10,7 +10,7 @@ import numpy as np
 from gpusense.interface import structs
 from gpusense.reference.heading import cos_sin
 
-# Coordinates are clamped to this many cells: no range reaches as far, and sums of two stay within int32.
+# Coordinates are clamped to this many cells: no range reaches so far, and the sum of two fits int32.
 FARTHEST = float(1 << 30)
 BLOCK = 1 << 12
 
@@ -33,7 +33,7 @@ def place_pose(
     """Place sensors: (M, 3) poses times the scanner's mount, without its yaw, which belongs to the bearings.
 
     ``pose_low`` gets the rounding errors (low parts) of ``pose``. ``pose_status``, which the caller clears, becomes 1
-    at (0) if a pose is not finite, and at (1) if a sensor is outside the window. A pose that is not finite becomes the
+    at index 0 if a pose is not finite, and at index 1 if a sensor is outside the window. A non-finite pose becomes the
     farthest cell, fraction 0 and heading (1, 0): it sees nothing, and its indices stay in bounds.
     """
     real = pose.dtype.type
@@ -62,7 +62,7 @@ def place_pose(
     rounded = exact.astype(real)
     # A fraction just below 1 may round to 1, which would be the next cell.
     rounded[:2] = np.minimum(rounded[:2], np.nextafter(real(1), real(0)))
-    # Column by column: faster than a transpose at once.
+    # Column by column, which is faster than a transposed copy.
     for axis in range(2):
         pose_cell[:, axis] = cell[axis]
     for column in range(4):

@@ -56,9 +56,9 @@ def make_ray(pose: np.ndarray, ray: np.ndarray) -> Ray:
 
 
 def crossed(t: np.ndarray, speed: np.ndarray, a: np.ndarray, inv: np.ndarray, until: np.ndarray | bool) -> np.ndarray:
-    """Count the boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or with until also those at t.
+    """Count the boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or with ``until`` at most t.
 
-    The coordinate at t, rounded to nearest, is the only boundary that can be in doubt.
+    Only the boundary nearest to the coordinate at t can be in doubt.
     """
     k = np.maximum(np.rint(t * speed - a), 0)
     here = (k + a) * inv
@@ -107,9 +107,9 @@ def start_casts(
     """Return the start of all walks, and the ranges that are known before any cell is read.
 
     Returns:
-        Cells of the origins (2, M); boundaries crossed (2, M) and distances (M,) as of ``start_walk``; ranges found so
-        far (M,), which are limit, or 0 for origins outside the grid where that is occupied; and the indices of the rays
-        that are still to be walked.
+        Cells of the origins (2, M); boundaries crossed (2, M) and distances (M,) as of ``start_walk``; ranges known so
+        far (M,), which are limit, or 0 for origins outside the grid where the outside is occupied; and the indices of
+        the rays that remain to be walked.
     """
     origin = cell.T.astype(np.int64)
     k, t = start_walk(flags, r, cell, window, limit)
@@ -142,7 +142,7 @@ def angle_bin(direction: np.ndarray, bins: int) -> np.ndarray:
 
 
 def expected_range(flags: frozenset[str], t: np.ndarray, scale: structs.RangeScale) -> np.ndarray:
-    """Convert a distance in cells to metres, exactly range_max where nothing is nearer, or met with AMCL_LINES."""
+    """Convert distances in cells to metres: exactly range_max where no obstacle is nearer, or none with AMCL_LINES."""
     if "AMCL_LINES" in flags:
         return np.where(t == scale.limit, scale.range_max, t * scale.resolution)
     return np.where(t >= scale.limit, scale.range_max, np.minimum(t * scale.resolution, scale.range_max))

@@ -1,8 +1,8 @@
 """Counts of hits and misses of cells, of which the log-odds of an occupancy grid are sums (book section 9.2).
 
-Start and end of a ray are cells and places inside them in units of 1/4096 cell, and the walk from cell to cell compares
-products of integers, so that all backends visit the same cells. A ray misses each cell that it leaves. Its last cell is
-hit where the ray ends at an obstacle, and missed otherwise. A tie, the ray through a corner, steps in x first.
+Start and end of a ray are cells with offsets in units of 1/4096 cell, and the walk from cell to cell compares products
+of integers, so that all backends visit the same cells. A ray misses each cell that it leaves. Its last cell is hit
+where the ray ends at an obstacle, and missed otherwise. A ray through a corner (a tie) steps in x first.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from gpusense.interface.constants import RAY_BITS as BITS
 
 UNIT = 1 << BITS
-# Of the type of counts, without which NumPy adds twenty times slower.
+# Of the counts' dtype; with another one NumPy adds twenty times slower.
 ONE = np.int32(1)
 
 
@@ -22,14 +22,14 @@ def to_boundary(inside: np.ndarray, step: np.ndarray) -> np.ndarray:
 
 
 def has_left(cell: np.ndarray, step: np.ndarray, cells: int) -> np.ndarray:
-    """Return whether a walk has left an axis of some cells, to which it does not return."""
+    """Return whether a walk has left the extent of an axis for good."""
     return np.where(step > 0, cell >= cells, cell < 0)
 
 
 def crossed_before(
     first: np.ndarray, size: np.ndarray, reached: np.ndarray, other: np.ndarray, ties: bool
 ) -> np.ndarray:
-    """Return how many boundaries of an axis a ray crosses before it has come as far as one on the other axis.
+    """Return the number of boundaries of an axis that a ray crosses before a boundary of the other axis.
 
     Products of lengths fit in 64 bits, since rays span at most 2^19 cells.
 
@@ -65,7 +65,7 @@ def count_rays(
     step = np.where(span >= 0, 1, -1)
     size, left = step * span, step * across
     first = to_boundary(begin, step)
-    # The steps that bring the walk to the grid's columns and rows are not taken one by one.
+    # Skip the steps that bring the walk to the grid's columns and rows.
     most = np.array([[cols - 1], [rows - 1]])
     need = np.maximum(np.where(step > 0, -cell, cell - most), 0)
     reached = first + (need - 1) * UNIT
@@ -74,7 +74,7 @@ def count_rays(
     done_y = np.where(need[0] > 0, along_y, 0)
     late = done_y < need[1]
     done = np.stack([np.where(late, along_x, need[0]), np.where(late, need[1], done_y)])
-    # Negative where the next boundary is one in x.
+    # Negative where the next boundary lies in x.
     lead = (first[0] + done[0] * UNIT) * size[1] - (first[1] + done[1] * UNIT) * size[0]
     (size_x, size_y), (step_x, step_y), (left_x, left_y), (col, row) = size, step, left - done, cell + step * done
     ended = np.asarray(hit[:rays]) != 0

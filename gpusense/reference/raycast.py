@@ -19,7 +19,7 @@ GROUP = 8
 def sector_of(sectors: int, speed_x: np.ndarray, speed_y: np.ndarray) -> np.ndarray:
     """Return the sector of a direction within its quadrant, from flat to steep.
 
-    A wrong sector would cost steps, not change the result.
+    A wrong sector would cost steps, but not change the result.
     """
     if sectors == 1:
         return np.zeros(len(speed_x), np.intp)

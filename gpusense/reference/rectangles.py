@@ -1,11 +1,11 @@
-"""Empty rectangles: for each cell and sector of directions, width and height of a rectangle of free cells there.
+"""Empty rectangles: for each cell and sector of directions, width and height of a rectangle of free cells.
 
 The cell is at its corner; sides are at most 255, kept as width + 256 height. A ray may cross such a rectangle in one
-step without missing an obstacle; it is the one in which the ray in the middle of the sector stays longest. After
-anisotropic Chebyshev distance maps (Deakin and Knackstedt 2020), which have squares. Planes are padded by a ring of
-zeros; quadrant q extends to (+x, +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from
-flat to steep. Planes have one row after the other, or groups of rows: a group has the cells of its first column, then
-those of the next one.
+step without missing an obstacle; it is the rectangle in which the ray in the middle of the sector stays longest. The
+idea follows the anisotropic Chebyshev distance maps of Deakin and Knackstedt (2020), which have squares. Planes are
+padded by a ring of zeros; quadrant q extends to (+x, +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2
+or 4 sectors from flat to steep. Planes store rows one after the other, or in groups: a group has the cells of its first
+column, then those of the next column.
 
 Planes can be updated after a change of the cells in rows [top, bottom) and columns [left, right) of the map: only cells
 whose rectangles can contain one of these are computed. The input has a band of rows, from row first on.
@@ -20,7 +20,7 @@ import numpy as np
 from gpusense.reference.bits import cells_left, cells_right, unpacked
 
 LONGEST = 255
-# The entry of an occupied cell; the ring has 0.
+# The entry of an occupied cell; ring cells have 0.
 OCCUPIED = 1
 RECTANGLE_REACH = 254
 
@@ -41,7 +41,7 @@ def reach_begin(way: int, low: int) -> int:
 
 
 def reach_end(way: int, high: int, size: int) -> int:
-    """Return one beyond the last cell whose rectangle, extending that way, can contain one before the cell high."""
+    """Return one beyond the last cell whose rectangle, extending that way, can contain a cell before high."""
     return high if way > 0 else min(high + RECTANGLE_REACH, size)
 
 

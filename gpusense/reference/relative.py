@@ -1,6 +1,6 @@
 """Poses relative to a point and headings relative to an angle, in float64 as sums of two numbers, then rounded.
 
-The difference of large coordinates, or of many turns, is small, and small numbers keep their digits in any precision.
+Differences of large coordinates or of many turns are small, and small numbers keep their digits in any precision.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def place_relative(
 ) -> None:
     """Place sensors relative to an origin: x, its low part, y, its low part.
 
-    ``pose_status``, which the caller clears, becomes 1 at (0) if a pose is not finite; its place is the origin.
+    ``pose_status``, which the caller clears, becomes 1 at index 0 if a pose is not finite; its place is the origin.
     """
     all_poses = poses.reshape(-1)[: 3 * particles].reshape(-1, 3).astype(np.float64)
     finite: np.ndarray = np.asarray(np.isfinite(all_poses).all(axis=1))

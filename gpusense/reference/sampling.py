@@ -1,14 +1,15 @@
 """Readings drawn from the beam model, or from a table of a sensor, given their expected ranges.
 
 Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), section 6.3.1: a component is drawn by its weight, and a
-reading by inverting the component's distribution function. p_hit's is the normal on both sides of its mean, each with
-the mass that lies within [0, range_max]. Masses are sums of positive terms: x phi(x) (1 + x^2 / 3 + x^4 / 15 + ...),
-and beyond SERIES_END one half less the continued fraction of Laplace. Quantiles are those of Wichura, *Algorithm AS
-241* (1988). p_short's is 1 - u (1 - exp(-lambda z*)), written as a sum of positive terms, or a series where lambda z*
-is small. All of it is float64 of +, -, *, / and sqrt, so that every device draws the same bits.
+reading by inverting the component's distribution function. For p_hit it is the normal on both sides of its mean, each
+with its mass on [0, range_max]. Masses are sums of positive terms: x phi(x) (1 + x^2 / 3 + x^4 / 15 + ...), and beyond
+SERIES_END one half less the continued fraction of Laplace. Quantiles are those of Wichura, *Algorithm AS 241* (1988).
+For p_short it is 1 - u (1 - exp(-lambda z*)), written as a sum of positive terms, or as a series where lambda z* is
+small. Everything is computed in float64 by +, -, *, / and sqrt, so that every device draws the same bits.
 
 Other shapes of hits than the normal (MASS_TABLE) have a table of masses and one of quantiles: cells of equal width in
-log(1 + b), b = u / sqrt 2, and in -log(1 - 2 mass), with the numbers of a polynomial in the share of the cell.
+log(1 + b), b = u / sqrt 2, and in -log(1 - 2 mass), with the coefficients of a polynomial in the position within the
+cell.
 
 ``mixture`` = (z_hit, z_short, z_max, z_rand, sigma_hit, sigma_growth, range_bias, lambda_short, place of the tables) of
 each bin of angles of incidence, and then the tables. ``chances`` = for each bin of expected ranges, the cumulative
@@ -80,7 +81,7 @@ SHORT_SERIES = 1e-4
 
 
 def fine_uniform(high: np.ndarray, low: np.ndarray) -> np.ndarray:
-    """Return a number in (0, 1) from two words: the centre of one of 2^52 intervals."""
+    """Return numbers in (0, 1) from two words, the centres of 2^52 intervals."""
     whole = high.astype(np.float64) * HALF_WORD + (low >> np.uint64(12)).astype(np.float64)
     return (whole + 0.5) * FINE
 
@@ -213,7 +214,7 @@ def reading_of(
 def cell_reading_of(
     u: np.ndarray, v: np.ndarray, column: np.ndarray, chances: np.ndarray, cells: int, range_max: float, margin: float
 ) -> np.ndarray:
-    """Return readings drawn from a table: uniform in a bin that is drawn, away from its ends by a margin of the bin."""
+    """Return readings drawn from a table: uniform in a drawn bin, at a margin from the bin's ends."""
     table = chances.reshape(cells + 1, cells + 1)
     mark = u * table[column, cells]
     low, high = np.zeros(len(u), np.int64), np.full(len(u), cells)
@@ -237,7 +238,7 @@ def draw_readings(
     tables: structs.MixtureTables,
     scale: structs.RangeScale,
 ) -> None:
-    """Replace expected ranges by readings; ``incidence`` holds cosines, and ``edges`` those between bins."""
+    """Replace expected ranges by readings; ``incidence`` holds cosines, and ``edges`` the cosines between bins."""
     count, limit, top = particles * rays, settings[DRAW_RANGE_MAX], settings[DRAW_TOP]
     for begin in range(0, count, BLOCK):
         part = slice(begin, min(begin + BLOCK, count))

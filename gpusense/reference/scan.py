@@ -1,8 +1,8 @@
 """Placement of poses and readings that lie on the device.
 
-Readings are selected and placed as ``gpusense.models.scan.classed`` does it on the host. Readings without information
-are left out and the rest is moved up, so that sums over blocks of readings have the same bits. The places that remain
-at the end get missing readings (nan), which add nothing.
+Readings are selected and placed as ``gpusense.models.scan.classed`` does it on the host. Uninformative readings are
+left out and the others move up, so that sums over blocks of readings have the same bits. The places that remain at the
+end get missing readings (nan), which add nothing.
 """
 
 from __future__ import annotations

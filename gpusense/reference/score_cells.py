@@ -1,4 +1,4 @@
-"""Cells of tables of scores, which lie one behind the other, each with a margin of cells beyond the map around it."""
+"""Cells of consecutive tables of scores, each with a margin of cells around the map."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from gpusense.interface.structs import ScoreTable
 
-# Columns of a run that a kernel in vectors reads at once; the margin holds one.
+# Columns of a run that a kernel in lanes reads at once; the margin holds one run.
 RUN = 16
 
 

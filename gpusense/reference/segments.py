@@ -15,11 +15,11 @@ from gpusense.interface.constants import LINE_NUMBERS
 
 # Passes of merging and of moving ends; Gauss-Newton steps of a line.
 PASSES, STEPS = 2, 5
-# A segment whose cost per point is larger is split where that is best, even if one split alone does not pay.
+# A segment with a larger cost per point is split at its best point, even if a single split does not pay.
 POOR = 3.0
 # Rows are parallel up to this.
 PARALLEL = 1e-6
-# Splits that lower the cost equally but for this share of it, more than float32 rounds, are tied: the first counts.
+# Splits whose costs differ by less than this share, which exceeds float32 rounding, are tied: the first counts.
 TIED = 3e-7
 
 
@@ -62,7 +62,7 @@ def cost_of(point: np.ndarray, first: int, last: int, sigma: float) -> float:
 
 
 def best_split(point: np.ndarray, first: int, last: int, sigma: float, penalty: float) -> tuple[int, float, float]:
-    """Return the first point of the second of two lines that lower the cost most, by how much, and the whole cost.
+    """Return the first point of the second line of the best split, how much it saves, and the cost without it.
 
     The point is -1 if no split can lower the cost by ``penalty``.
     """
@@ -105,7 +105,7 @@ def split_scan(
 def merge_segments(
     point: np.ndarray, first: int, last: int, stop: np.ndarray, sigma: float, penalty: float, gap: float
 ) -> None:
-    """Merge neighbours of which a single line costs less than ``penalty`` more."""
+    """Merge neighbours that a single line fits at an extra cost below ``penalty``."""
     i = first
     while i < last and stop[i] < last:
         j = stop[i]

@@ -1,10 +1,9 @@
 """Weights of particles from the log-likelihoods of sensors, at the highest temperature that leaves enough particles.
 
-w_k = v exp(b_k (l - max l)), where v is the weight before, l the sum over sensors of temperature times log p, and b_k
-= d b / 2^k a ladder of depth d. The first rung with an effective sample size (sum w)^2 / sum w^2 of at least SHARE of
-that before is taken; what is left of b belongs to the next stage of the correction (annealing: Neal, *Annealed
-importance sampling*, 2001). Weights are rounded to integers below 2^53 / N, so that sums of them are exact in any
-order.
+w_k = v exp(b_k (l - max l)), where v is the weight before, l the sum over sensors of temperature times log p, and b_k =
+d b / 2^k a ladder of depth d. The first rung whose effective sample size (sum w)^2 / sum w^2 is at least SHARE of the
+previous one is taken; the rest of b is left to the next stage of the correction (annealing: Neal, *Annealed importance
+sampling*, 2001). Weights are rounded to integers below 2^53 / N, so that their sums are exact in any order.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ def add_scores(
 
 
 def join_scores(flags: frozenset[str], scores: np.ndarray, largest: np.ndarray, blocks: int, fan: int) -> None:
-    """Find the largest score of each ``fan`` blocks."""
+    """Find the largest score of every ``fan`` blocks."""
     starts = np.arange(0, blocks, fan)
     largest[: len(starts)] = np.maximum.reduceat(scores[:blocks], starts)
 
@@ -74,7 +73,7 @@ def weigh_particles(
 
 
 def join_rows(flags: frozenset[str], sums: np.ndarray, joined: np.ndarray, rows: int, columns: int, fan: int) -> None:
-    """Add up each ``fan`` rows of sums, one after the other; a row becomes the sum of those before it in its group."""
+    """Add up every ``fan`` rows of sums in order; a row becomes the sum of the rows before it in its group."""
     table = sums[: rows * columns].reshape(rows, columns)
     for group, begin in enumerate(range(0, rows, fan)):
         part = table[begin : begin + fan]

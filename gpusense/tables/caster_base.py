@@ -52,7 +52,7 @@ class Caster(ABC):
     Attributes:
         name: Name that selects the caster with its default knobs, and its entry in the registry.
         exact: Whether its ranges are exact.
-        error: ``"exact"``, or the bound of its error.
+        error: ``"exact"``, or the bound on its error.
         memory: Memory on the device, in words.
         precomputation: Work on the map before the first ray, in words.
         knobs: Parameters that trade error for time, in words.
@@ -75,7 +75,7 @@ class Caster(ABC):
 
     @property
     def beyond(self) -> int:
-        """Cells beyond the longest range that matter."""
+        """Number of cells beyond the longest range that can change a result."""
         return 0
 
     @property

@@ -28,7 +28,7 @@ __all__ = ["CASTERS", "Bresenham", "Caster", "Cddt", "Dda", "Exact", "Lookup", "
 _BYTE, _SHORT, _SINGLE = (np.dtype(name) for name in (np.uint8, np.uint16, np.float32))
 # Rays per launch that fills a look-up table, so that a launch takes about a second.
 _TILE = {"cpu": 1 << 22, "gpu": 1 << 30}
-# Flags of the lines of other programs.
+# Flags of other programs' lines.
 _LINES = {"amcl": "AMCL_LINES", "beluga": "BELUGA_LINES"}
 
 
@@ -74,9 +74,9 @@ class Bresenham(Caster):
     """Bresenham's line from cell to cell.
 
     Args:
-        lines: None; ``"amcl"`` for the lines of nav2_amcl, which look one cell beyond the ray's end and may be longer
-            than range_max; or ``"beluga"`` for Beluga's, where a line midway between two cells takes the straight one,
-            and rays from outside the grid meet nothing.
+        lines: None; ``"amcl"`` for the lines of nav2_amcl, which extend one cell beyond the ray's end and may be longer
+            than range_max; or ``"beluga"`` for Beluga's, which go straight midway between two cells, and meet nothing
+            from outside the grid.
 
     Raises:
         TypeError, ValueError: ``lines`` is neither None nor one of these words.
@@ -114,10 +114,10 @@ class March(Caster):
     """Ray marching through the distance field.
 
     Args:
-        tolerance: Least step [cells], 0.001 to 10: a smaller one is more exact and slower.
-        rule: ``"safe"`` shortens steps by sqrt(2) cells, so that only the least step can pass an obstacle.
-            ``"centre"`` steps by the distance between cell centres, as range_libc and f1tenth_gym do: it is faster and
-            misses corners.
+        tolerance: Least step [cells], 0.001 to 10: smaller steps are more exact and slower.
+        rule: ``"safe"`` shortens steps by sqrt(2) cells, so that only the least step can pass an obstacle. ``"centre"``
+            steps by the distance between cell centres, as range_libc and f1tenth_gym do: it is faster, but misses
+            corners.
 
     Raises:
         TypeError, ValueError: A knob has the wrong type, or is out of range.
@@ -261,7 +261,7 @@ CASTERS = {caster.name: caster for caster in _ALL}
 
 
 def choose(argument: str, value: object, lines: str | None = None) -> Caster:
-    """Return a caster by its name, Bresenham's with some program's lines; a caster is returned as it is.
+    """Return a caster by name, Bresenham with the lines of a program; a caster is returned unchanged.
 
     Raises:
         TypeError: The value is neither a name nor a caster.

@@ -28,7 +28,7 @@ def directional_table(obstacles: np.ndarray, bins: int, *, pruned: bool, outside
     """
     rows, cols = obstacles.shape
     row, col = _exposed(np.pad(obstacles, 1, constant_values=outside), outside)
-    # One more line at each end, since corners of cells lie on borders of lines.
+    # One extra line at each end, since corners of cells lie on borders of lines.
     lines = math.ceil(math.hypot(rows + 2, cols + 2)) + 3
     firsts, cosines = np.empty((bins, lines), np.int64), np.empty((bins, 3), np.int64)
     begins, total = [], 0
@@ -81,7 +81,7 @@ def _projected(col: np.ndarray, row: np.ndarray, cos: float, sin: float) -> tupl
     """
     along, across = (col + 0.5) * cos + (row + 0.5) * sin, (row + 0.5) * cos - (col + 0.5) * sin
     half = (abs(cos) + abs(sin)) / 2
-    # A cell that touches a line with a corner only is not on it.
+    # A cell that only touches a line with a corner is not on the line.
     low, high = np.floor(across - half + 1e-9).astype(np.int64), np.floor(across + half - 1e-9).astype(np.int64)
     lines, begins, ends = [], [], []
     for i in range(int(np.max(high - low, initial=0)) + 1):
@@ -105,7 +105,7 @@ def _begin_outside(line: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.n
 
     Obstacles are in the order of lines and beginnings.
     """
-    # The largest end so far, line by line: each line is lifted above the line before it.
+    # Running maximum of the ends within each line: an offset lifts each line above the previous one.
     lift = (np.max(end) - np.min(begin) + 1) * (line - line[0])
     largest_end = np.maximum.accumulate(end + lift)
     separate = np.ones(len(line), bool)

@@ -1,7 +1,7 @@
 """Squared distances to the nearest obstacle, computed on a device.
 
-Processors run few long work-items, one per line. GPUs run one work-item per cell, on bits that the host packs: an
-eighth of the bytes to transfer.
+Processors run few long work-items, one per line. GPUs run one work-item per cell, on bits that the host packs, which is
+an eighth of the bytes to transfer.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from gpusense.world.windows import Window
 RING = 2
 # Most entries of the table from squared distances to values; with more, values are computed on the host.
 _LONGEST_DENSITY = 1 << 22
-# Largest share of a window's cells that is refreshed; a larger change makes the table again.
+# Largest share of a window's cells that is refreshed; a larger change rebuilds the table.
 _LARGEST_REFRESH = 0.5
 
 
@@ -53,7 +53,7 @@ class FieldTable:
         self._real, self._parameters, self._resolution, self._range_max = real, parameters, resolution, range_max
         self._log_table, self._flags = log_table, flags
         self._peer = weights if isinstance(weights, Peer) else None
-        # Cells of a fixed density have this term.
+        # Term of the cells of a fixed density.
         self._overlay: float | None = None
         if isinstance(weights, Beluga) and weights.overlaid:
             self._overlay = float(weights.terms(weights.overlay(parameters, range_max)))
@@ -98,7 +98,7 @@ class FieldTable:
             changed: Part of the window that holds all changed obstacles.
 
         Returns:
-            False if making the table again is faster.
+            False if rebuilding the table is faster.
         """
         rows, cols = obstacles.shape
         density = None if self._overlay is not None else self._density_of(rows, cols)

@@ -18,7 +18,7 @@ from gpusense._util.files import write_whole
 _LONGEST_HEADER = 4096
 _DTYPE = np.dtype("<u2")
 _FORMAT = "gpusense lookup 2"
-# Without a checksum.
+# First line of the old format, which has no checksum.
 _OLD_FORMAT = "gpusense lookup 1"
 
 
@@ -68,7 +68,7 @@ def read_lookup(path: Path, obstacles: np.ndarray, limit: float, outside: str, b
 
     Raises:
         OSError: The file cannot be read.
-        ValueError: The file is no table, is damaged, belongs to other inputs, or is of an old format.
+        ValueError: The file is not a table, is damaged, belongs to other inputs, or has an old format.
     """
     required = describe(obstacles, limit, outside, bins)
     count = obstacles.size * bins
@@ -95,7 +95,7 @@ def _header(line: bytes, path: Path) -> dict[str, Any]:
     """Return the header in the first line of a file.
 
     Raises:
-        ValueError: The file is no table, or one of an old format.
+        ValueError: The file is not a table, or has an old format.
     """
     try:
         header = json.loads(line)

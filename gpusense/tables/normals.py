@@ -26,9 +26,9 @@ from gpusense.world.windows import Window, whole
 # Radius of the disc of cells [cells]. A square has longer diagonals. On slanted walls the mean error of a disc's normal
 # is 1.5 degrees; a radius of 3 gives 2.5.
 RADIUS = 4
-# Largest ratio of the smaller variance to the larger one for which a principal direction counts.
+# Largest ratio of the smaller to the larger variance for which a principal direction is used.
 _ROUND = 0.5
-# Fewest occupied cells in the disc, the cell itself included, that make a surface.
+# Fewest occupied cells in the disc, including the cell itself, that form a surface.
 _FEWEST = 3
 # Cells per strip that is computed at once.
 _STRIP = 1 << 21
@@ -43,12 +43,12 @@ def surface_normals(grid: OccupancyGrid, *, unknown: Space = "free", outside: Sp
 
     The face of a cell that a beam hits does not have the direction of a slanted wall. A cell's normal is therefore
     perpendicular to a line through up to 17 sides of the surrounding wall cells. The line ends at corners, so normals
-    are right up to the cell next to a corner: within 4 cells of one they are off by 2 degrees in the mean. Elsewhere on
-    straight walls they are off by 0.8 degrees at any angle, and by 5 at most. A cell in a corner has the normal of one
-    wall, or one between both. Where the outline is not straight, the normal is the direction of least variance
-    (principal components) of the occupied cells within 4 cells, or without one, as at posts, the direction in which
-    occupied cells become fewer. A cell has no normal if fewer than two other occupied cells are nearby, if there is no
-    such direction either, or if no free cell touches one of its sides.
+    are right up to the cell next to a corner: within 4 cells of a corner their mean error is 2 degrees. Elsewhere on
+    straight walls it is 0.8 degrees at any angle, and at most 5. A cell in a corner has the normal of one wall, or one
+    between both. Where the outline is not straight, the normal is the direction of least variance (principal
+    components) of the occupied cells within 4 cells, or without one, as at posts, the direction in which occupied cells
+    become fewer. A cell has no normal if fewer than two other occupied cells are nearby, if no such direction exists
+    either, or if no free cell touches one of its sides.
 
     Args:
         grid: The map.
@@ -151,8 +151,8 @@ def _disc_normals(obstacles: np.ndarray) -> np.ndarray:
 def _replace_straight(normals: np.ndarray, obstacles: np.ndarray) -> None:
     """Replace the normals of cells at straight pieces of an obstacle's outline, up to its corners.
 
-    Of a cell's sides those with the longest straight piece count. At the corner of a block these are two, and the
-    normal lies between theirs.
+    The sides of a cell with the longest straight piece count. At the corner of a block two sides count, and the normal
+    lies between their normals.
 
     Args:
         normals: (H, W, 2) normals.

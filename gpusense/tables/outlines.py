@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# Outward directions of a cell's sides (column, row). Along a side one walks in the next direction, obstacles to the
-# left.
+# Outward directions of a cell's sides (column, row). The outline follows a side in the next direction, with obstacles
+# to the left.
 _DIRECTIONS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
 
 
@@ -34,9 +34,9 @@ class Span:
     advance: float | None = None
 
 
-# Earlier spans are preferred; among the windows of a span, the least residual. Nearly symmetric windows come first. A
-# window to one side is for corners only: on a bend it would show the direction of another place. A straight strip of
-# cells has residuals up to 0.09. Discs from a radius of 5 cells on pass as bends.
+# Earlier spans are preferred, and within a span the window with the least residual. Nearly symmetric windows come
+# first. One-sided windows are for corners only: on a bend they would have the direction of another place. A straight
+# strip of cells has residuals up to 0.09. Discs from a radius of 5 cells on pass as bends.
 SPANS = (Span(17, 8, 0.1), Span(11, 5, 0.1), Span(13, 0, 0.1, 2.0), Span(9, 0, 0.05, 1.2), Span(5, 0, 0.01, 0.8))
 CORNER = 5
 # Farthest side along the outline that a normal depends on.
@@ -78,11 +78,11 @@ class Outlines:
         self.following = _following(obstacles, number, direction, row, col)
         self.preceding = np.arange(len(row), dtype=np.int32)
         self.preceding[self.following] = np.arange(len(row))
-        # Doubled, so that sums are exact.
+        # Doubled coordinates, so that sums are exact.
         self._middle = 2 * np.stack([col, row], axis=1) + self.outward
 
     def straight_normals(self, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the normals of the straight pieces of outline that hold M sides.
+        """Compute the normals of the straight pieces of outline that contain M sides.
 
         Returns:
             (M, 2) unit vectors towards the free side, NaN where the outline is not straight, and (M,) the index of the

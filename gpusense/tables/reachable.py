@@ -1,4 +1,4 @@
-"""A table of the reachable window of a map, held on a device and made again when the cloud leaves the window."""
+"""A table of the reachable window of a map, held on a device and rebuilt when the cloud leaves the window."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ def obstacles_of(grid: OccupancyGrid, unknown: str) -> np.ndarray:
 
 
 class TableMemoryError(MemoryError):
-    """Error of a device that cannot hold a map's table; smaller pieces of a cloud would not help."""
+    """Error of a device that cannot hold a map's table, whatever the size of the cloud."""
 
 
 @dataclass(frozen=True)
 class _State:
-    """The map and its table; a change replaces all of it by one assignment, so that no interrupt can split it.
+    """The map and its table; a single assignment replaces both, so that no interrupt can separate them.
 
     Attributes:
         grid: The map.
-        obstacles: (H, W) mask of the map; None where an update that was interrupted may have written them.
+        obstacles: (H, W) mask of the map; None if an interrupted update may have written to it.
         shared: Whether the array of obstacles belongs to the grid and is read-only.
         table: The table; None without one.
         window: The table's window.
@@ -54,7 +54,7 @@ class _State:
 class ReachableMap:
     """A map and the table of its reachable window on a device.
 
-    An interrupt or an error leaves the map as it was before the call or as it is after it, never in between.
+    After an interrupt or an error the map is as before or as after the call, never in between.
 
     Args:
         backend: The device.
@@ -65,7 +65,7 @@ class ReachableMap:
         prepare: Function that makes the table of a window from its (rows, cols) obstacles.
         crop: Whether to prepare the reachable window only; False prepares the whole map.
         refresh: Function that updates a table in place after obstacles changed in a part of its window, and returns
-            whether it did; after False the table is made again.
+            whether it did; otherwise the table is rebuilt.
         obstacles_of: Function that returns the mask of a grid's obstacles, from the grid and ``unknown``.
         neighbors: Cells around a cell on which its state in the mask depends.
     """
@@ -92,7 +92,7 @@ class ReachableMap:
 
     @property
     def grid(self) -> OccupancyGrid:
-        """The map as it is."""
+        """The current map."""
         return self._state.grid
 
     @property
@@ -116,15 +116,15 @@ class ReachableMap:
 
     @property
     def version(self) -> int:
-        """Number that grows whenever the map changes, or the table is dropped or made again."""
+        """Number that grows whenever the map changes, or the table is dropped or rebuilt."""
         return self._state.version
 
     def drop(self) -> None:
-        """Drop the table; the next call makes it again."""
+        """Drop the table; the next call rebuilds it."""
         self._state = replace(self._state, table=None, version=self.version + 1)
 
     def ensure(self, corners: Corners | None) -> tuple[Buffer, Window]:
-        """Return the table and its window; make both again if a sensor can reach beyond the window.
+        """Return the table and its window; rebuild both if a sensor can reach beyond the window.
 
         Args:
             corners: Poses whose box holds all poses; None for poses anywhere.
@@ -140,7 +140,7 @@ class ReachableMap:
             window = self._whole
         window = self._whole if window == self._whole else window
         if window != self.window or self._state.table is None:
-            # Both tables together may not fit the device.
+            # The device may not hold both tables at once.
             self._state = replace(self._state, table=None, window=None)
             try:
                 table = self._prepare(self._backend, window.cut(self.obstacles))
@@ -151,7 +151,7 @@ class ReachableMap:
         return self._state.table, window
 
     def update(self, cells: object, place: object) -> OccupancyGrid:
-        """Replace cells of the map; update the table now, or drop it so that the next call makes it again.
+        """Replace cells of the map; update the table now, or drop it so that the next call rebuilds it.
 
         Args:
             cells: (h, w) occupancies.
@@ -172,7 +172,8 @@ class ReachableMap:
             return grid
         obstacles = self.obstacles.copy() if self._state.shared else self.obstacles
         table = self._state.table
-        # The old map without obstacles and table: both are written in place, and an interrupt would leave them half so.
+        # Drop obstacles and table of the old map first: both are written in place, and an interrupt would leave them
+        # half written.
         self._state = replace(self._state, obstacles=None, table=None, version=self.version + 1)
         part.cut(obstacles)[...] = patched
         table = self._refreshed(table, obstacles, changed.moved(part.row, part.col))
@@ -180,7 +181,7 @@ class ReachableMap:
         return grid
 
     def _refreshed(self, table: Buffer, obstacles: np.ndarray, changed: Window) -> Buffer:
-        """Return a table after obstacles changed in a part of the map; None where it must be made again."""
+        """Return a table after obstacles changed in a part of the map; None if it must be rebuilt."""
         window = self.window
         if window is None or table is None or (near := window.shared(changed)) is None:
             return table
@@ -201,7 +202,7 @@ class ReachableMap:
         return self._mask_of(grid, self._unknown)
 
     def omission(self, bytes_per_cell: float) -> Omission | None:
-        """Describe the part of the map outside the window; None if there is none, or no cloud has come yet."""
+        """Describe the part of the map outside the window; None if it is empty, or before the first cloud."""
         everything = windows.whole(self.grid)
         if self.window is None or self.window == everything:
             return None

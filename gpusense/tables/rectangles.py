@@ -56,9 +56,10 @@ class Planes:
 def planes_of(backend: Backend, rows: int, cols: int) -> Planes:
     """Return the planes of a map on a device.
 
-    GPUs gain most from sectors, since neighbouring rays wait for the slowest one, and from groups of rows, since their
-    caches limit rays: groups halve what is read. On a map that exceeds the caches, four sectors are no faster than two
-    and take twice the memory. Kernels index the cells of all planes in 32 bits, which limits the number of sectors.
+    GPUs gain most from sectors, since neighbouring rays wait for the slowest of them, and from groups of rows, since
+    their caches limit rays: groups halve what is read. On a map that exceeds the caches, four sectors are no faster
+    than two and take twice the memory. Kernels index the cells of all planes in 32 bits, which limits the number of
+    sectors.
     """
     gpu = backend.info.kind == "gpu"
     sectors = 1 if backend.info.backend == "numpy" else 4 if gpu and rows * cols <= _MANY_CELLS else 2
@@ -82,9 +83,9 @@ def empty_rectangles(
     Args:
         backend: The device.
         obstacles: (rows, cols) bool.
-        planes: Their form.
+        planes: How the rectangles are stored.
         rectangles: Planes of the map before the change, refreshed in place; None makes new planes.
-        changed: Window whose obstacles changed; None is all of the map.
+        changed: Window whose obstacles changed; None for the whole map.
     """
     rows, cols = obstacles.shape
     check_size(rows, cols)
@@ -92,8 +93,8 @@ def empty_rectangles(
         rectangles = backend.empty(planes.entries(rows, cols), _SHORT, zero=True)
         changed = Window(0, 0, rows, cols)
     top, left, bottom, right = changed.row, changed.col, changed.row + changed.rows, changed.col + changed.cols
-    # A rectangle that changes begins at most RECTANGLE_REACH cells before the changed obstacles and ends at most that
-    # far behind them; the same holds in the opposite directions.
+    # A rectangle that changes begins at most RECTANGLE_REACH cells before the changed obstacles and ends at most as far
+    # behind them, in both directions.
     first, begin = max(top - RECTANGLE_REACH, 0), max(left - RECTANGLE_REACH, 0)
     end = min(right + RECTANGLE_REACH, cols)
     near = obstacles[first : bottom + RECTANGLE_REACH]

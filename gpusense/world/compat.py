@@ -1,7 +1,7 @@
 """The weights of nav2_amcl and Beluga, for ``compat="amcl"`` and ``compat="beluga"``.
 
 ``BeamModel(..., compat="amcl")`` and ``LikelihoodFieldModel(..., compat="beluga")`` return the logarithm of the factor
-by which these programs multiply a particle's weight. These factors are no likelihoods:
+by which these programs multiply a particle's weight. These factors are not likelihoods:
 
 ========  ======================  =====================================================================
 peer      model                   weight
@@ -14,18 +14,19 @@ beluga    likelihood field        ``1 + sum p^3``, the normal density normalised
 beluga    likelihood field, prob  ``product p``, the normal density normalised for an unbounded range
 ========  ======================  =====================================================================
 
-*Readings.* amcl: a reading of at most range_min (-inf too) is a max reading, and NaN is left out. Its beam model scores
-a reading of exactly range_max as ``z_hit exp(...) + z_max``, and a longer one as ``z_hit exp(...)``, which is 0 for
-+inf; its likelihood field leaves out both. Beluga: a reading outside [range_min, range_max] is left out, +inf too. Its
-beam model scores a reading of exactly range_max as ``z_hit p_hit + z_max``; its likelihood field takes it for a range.
+*Readings.* amcl: a reading of at most range_min, including -inf, is a max reading, and NaN is left out. Its beam model
+scores a reading of exactly range_max as ``z_hit exp(...) + z_max``, and a longer one as ``z_hit exp(...)``, which is 0
+for +inf; its likelihood field leaves out both. Beluga: a reading outside [range_min, range_max] is left out, also +inf.
+Its beam model scores a reading of exactly range_max as ``z_hit p_hit + z_max``; its likelihood field treats it as a
+range.
 
 *Cells.* 0 is free and 100 is occupied. All other values (-1, and intermediate ones of maps in mode ``scale``) are
-neither: they stop beams in the beam models but are no obstacles in the likelihood fields. ``occupied_threshold`` has no
-effect.
+neither: they stop beams in the beam models but are not obstacles in the likelihood fields. ``occupied_threshold`` has
+no effect.
 
-*Beams* of the beam models follow Bresenham's lines, see ``gpusense.casters.Bresenham``. amcl's look one cell beyond the
-ray's end, and distances between cells may exceed range_max; the map's edge stops them, and a particle off the map has
-ranges of 0. Beluga's have range_max beyond the map's edge, and at a particle off the map.
+*Beams* of the beam models follow Bresenham's lines, see ``gpusense.casters.Bresenham``. amcl's lines extend one cell
+beyond the ray's end, and distances between cells may exceed range_max; the map's edge stops them, and a particle off
+the map has ranges of 0. Beluga's ranges are range_max beyond the map's edge and for a particle off the map.
 
 *Likelihood fields.* An end point off the map counts as ``max_distance`` for amcl and as a density of ``1 / range_max``
 for Beluga. Cells hold float32 numbers: amcl's distances, Beluga's densities.
@@ -161,10 +162,10 @@ class Beluga(Peer):
     Args:
         prob: Whether the likelihood field is ``likelihood_field_prob``, a product of densities.
         model_unknown_space: Whether unknown cells have the density ``1 / range_max`` in the likelihood field, if that
-            is more than a cell at ``max_distance`` has; with ``only_obstacle_boundaries`` also occupied cells without a
-            free neighbour.
+            exceeds the density of a cell at ``max_distance``; with ``only_obstacle_boundaries`` also occupied cells
+            without a free neighbour.
         only_obstacle_boundaries: Whether only occupied cells beside a free cell are obstacles of the likelihood field.
-            None is the node's default: True, but False with ``prob``, to which the node does not hand it.
+            None is the node's default: True, but False with ``prob``, to which the node does not pass the option.
 
     Raises:
         TypeError: An option has the wrong type.
@@ -182,7 +183,7 @@ class Beluga(Peer):
     only_obstacle_boundaries: bool | None = None
 
     name = "beluga"
-    # The defaults of the library's headers, which the node overrides.
+    # Defaults of the library's headers; the node overrides them.
     library: ClassVar[BeamWeights] = BeamWeights(z_short=0.5, z_rand=0.05)
 
     def __post_init__(self) -> None:
@@ -234,11 +235,11 @@ class Beluga(Peer):
         return float(np.float32(RandomDensity(range_max).peak(1)))
 
     def overlay(self, p: LikelihoodFieldParameters, range_max: float) -> float:
-        """Return the density of OVERLAID cells, that of a squared distance computed from ``1 / range_max``."""
+        """Return the density of OVERLAID cells, by the squared distance that Beluga computes from ``1 / range_max``."""
         farthest = np.float32(p.max_distance * p.max_distance)
         rand = RandomDensity(range_max)
         share = (rand.peak(1) - rand.peak(p.z_rand)) / _amplitude(p) if p.z_hit > 0 else 0.0
-        # Without a share of the normal density there is no such distance.
+        # Without a normal part in the mixture no such distance exists.
         background = np.float32(-2 * p.sigma_hit * p.sigma_hit * math.log(share)) if share > 0 else farthest
         return float(_normalised(np.minimum(background, farthest), p, range_max))
 
@@ -248,7 +249,7 @@ LIKELIHOOD = Likelihood()
 
 
 def choose(compat: object) -> Likelihood:
-    """Return the peer that ``compat`` is or names; the book's likelihood for None.
+    """Return the peer that ``compat`` names, or ``compat`` if it is a peer; the book's likelihood for None.
 
     Raises:
         TypeError: ``compat`` is neither None, a string nor a peer.
@@ -260,11 +261,11 @@ def choose(compat: object) -> Likelihood:
 
 
 def check_weights(parameters: BeamParameters | LikelihoodFieldParameters, compat: object) -> None:
-    """Check that parameters whose weights need not sum to 1 are used with ``compat`` only, and normal hits with it.
+    """Check that peers' weights are used only with ``compat``, and only normal hits with it.
 
     Raises:
-        ValueError: ``parameters`` are a peer's weights and ``compat`` is None, or their hits have another shape than a
-            peer's.
+        ValueError: ``parameters`` are a peer's weights and ``compat`` is None, or the shape of their hits differs from
+            the peer's.
     """
     if compat is not None and parameters.hit != "normal":
         raise ValueError(f"hit: must be 'normal' with compat, as in that program, got {parameters.hit!r}")

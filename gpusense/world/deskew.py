@@ -1,4 +1,4 @@
-"""Motion of the robot while a scan is measured: beams are measured one after the other, evenly in time."""
+"""Motion of the robot during a scan, whose beams are measured one after the other at equal intervals."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from gpusense.world.scanner import Reading, Scanner, classes
 
 Floats = NDArray[np.float64]
 
-# Two neighbouring readings lie on one surface if their ranges differ by less than this share of a range, and [m].
+# Two neighbouring readings lie on one surface if their ranges differ by less than this share of a range plus this
+# length [m].
 _RATIO, _SLACK = 0.1, 0.05
 # A beam has a reading only if one was measured within this many steps between bearings.
 _FARTHEST = 1.5
 
 
 def check_motion(name: str, motion: object, scans: int) -> Floats | None:
-    """Return the motions during S scans, (S, 3); None where there is none.
+    """Return the motions during S scans, (S, 3); None without motion.
 
     Args:
         name: The argument's name.
@@ -28,7 +29,7 @@ def check_motion(name: str, motion: object, scans: int) -> Floats | None:
         scans: S.
 
     Raises:
-        TypeError, ValueError: another kind or shape, or values that are not finite.
+        TypeError, ValueError: The type or the shape is wrong, or a value is not finite.
     """
     if motion is None:
         return None
@@ -38,13 +39,14 @@ def check_motion(name: str, motion: object, scans: int) -> Floats | None:
 
 
 def beam_poses(motion: Floats, beams: int) -> tuple[Floats, Floats]:
-    """Return the robot's pose at each beam in its frame at the first one, for constant velocities.
+    """Return the robot's pose at each beam in its frame at the first beam, for constant velocities.
 
-    A robot with constant velocities moves on an arc; the chord to a share f of an arc that turns by theta has the
-    length sin(f theta / 2) / sin(theta / 2) of the whole chord, and is turned by (f - 1) theta / 2 from it.
+    A robot with constant velocities moves on an arc. For an arc that turns by theta, the chord to a fraction f of it
+    has sin(f theta / 2) / sin(theta / 2) of the length of the whole chord, and is turned by (f - 1) theta / 2 from
+    that.
 
     Args:
-        motion: (S, 3) pose at the last beam in the frame at the first one [m, m, rad].
+        motion: (S, 3) pose at the last beam in the frame at the first beam [m, m, rad].
         beams: K.
 
     Returns:
@@ -64,7 +66,7 @@ def sensor_points(ranges: Floats, scanner: Scanner, motion: Floats) -> Floats:
     """Return the end points of (S, K) readings in a frame at the sensor at the first beam, with the robot's axes.
 
     Args:
-        ranges: Readings [m]; end points of those that are no hits have no meaning.
+        ranges: Readings [m]; the end points of max and missing readings are meaningless.
         scanner: The scanner.
         motion: (S, 3) motions during the scans.
 
@@ -91,14 +93,14 @@ def deskew_scan(ranges: ArrayLike, scanner: Scanner, motion: ArrayLike) -> Float
     Args:
         ranges: (K,) readings [m], or (S, K).
         scanner: The scanner.
-        motion: (3,) or (S, 3) pose of the robot at the last beam in its frame at the first one [m, m, rad], from
+        motion: (3,) or (S, 3) pose of the robot at the last beam in its frame at the first beam [m, m, rad], from
             odometry.
 
     Returns:
         (K,) or (S, K) readings [m]; NaN for beams along which nothing was measured.
 
     Raises:
-        TypeError, ValueError: an argument is of the wrong kind or breaks its rule; the message names it.
+        TypeError, ValueError: An argument has the wrong type or breaks its rule; the message names it.
 
     Example:
         >>> import gpusense as gs

@@ -1,10 +1,9 @@
-"""Density of a likelihood field on the host: the one home of its formula (*Probabilistic Robotics* table 6.3).
+"""Density of a likelihood field on the host, whose formula stands here alone (*Probabilistic Robotics* table 6.3).
 
     p(d) = z_hit f(d) + z_rand / range_max
 
 for the distance d [m] from the end point of a reading to the nearest obstacle, with f the density of a hit of scale
-sigma_hit around 0 (``world.hit_shapes``). Kernels have the same formula, each in its language, and get their numbers
-here.
+sigma_hit around 0 (``world.hit_shapes``). Kernels have the same formula in their languages, and get their numbers here.
 """
 
 from __future__ import annotations
@@ -52,12 +51,12 @@ class FieldDensity:
 
     @property
     def peak(self) -> float:
-        """Density of a hit at distance 0 [1/m], with its weight; 0 where the weight is."""
+        """Weighted density of a hit at distance 0 [1/m]; 0 for a weight of 0."""
         return self.shape.peak(self.parameters.z_hit, self.sigma)
 
     @property
     def log_peak(self) -> float:
-        """Logarithm of ``peak``, which may be below the smallest number."""
+        """Logarithm of ``peak``; finite also where ``peak`` underflows."""
         return log_weight(self.parameters.z_hit) - math.log(self.sigma) - self.shape.log_width
 
     @property
@@ -67,7 +66,7 @@ class FieldDensity:
 
     @property
     def rand(self) -> float:
-        """Density of random readings [1/m], with their weight."""
+        """Weighted density of random readings [1/m]."""
         return RandomDensity(self.range_max).peak(self.parameters.z_rand)
 
     @property
@@ -77,25 +76,25 @@ class FieldDensity:
 
     @property
     def is_sharp(self) -> bool:
-        """Tell whether kernels need the exponent in two parts, because the density has a sharp peak."""
+        """Return whether kernels need the exponent in two parts, because the density has a sharp peak."""
         return self.peak > HIGH_PEAK
 
     def is_linear(self, real: np.dtype) -> bool:
-        """Tell whether kernels sum densities, and not their logarithms."""
+        """Return whether kernels sum densities rather than logarithms."""
         return sums_linearly(self.rand, self.peak, real)
 
     def terms(self, real: np.dtype) -> np.ndarray:
         """Return the numbers of the kernel file ``field_term``, for a sum of densities or of logarithms.
 
         Raises:
-            ValueError: sigma_hit is too small or too large for the precision.
+            ValueError: Sigma_hit is too small or too large for the precision.
         """
         hit, rand = (self.peak, self.rand) if self.is_linear(real) else (self.log_peak, self.log_rand)
         terms = rounded_terms([hit, self.rate, rand, NoReturn(self.parameters.z_max).number], real)
         return np.append(terms, np.array(self.shape.numbers, real))
 
     def capped(self, distance: Floats) -> Floats:
-        """Return distances, at most those beyond which all count as equal."""
+        """Return distances, clamped to the largest one that the field distinguishes."""
         return np.minimum(distance, self.parameters.max_distance)
 
     def log(self, distance: Floats) -> Floats:

@@ -1,7 +1,7 @@
-"""Convert poses and bearings to a grid's frame in float64, split them, and only then round them.
+"""Convert poses and bearings to a grid's frame in float64, and split them before rounding.
 
-A pose becomes an integer cell, the fraction of that cell, and the cosine and sine of its heading. Precision then does
-not depend on the size of the map or of its coordinates. The kernel ``place_poses`` places poses on a device; this
+A pose becomes an integer cell, the fraction of that cell, and the cosine and sine of its heading. Precision then
+depends neither on the size of the map nor on its coordinates. The kernel ``place_poses`` places poses on a device; this
 module places them on the host by the kernel's reference. Both give the same bits.
 """
 
@@ -21,7 +21,7 @@ Mount = tuple[float, float, float]
 
 
 class Cells(Protocol):
-    """Square cells that poses are placed in: an occupancy grid, or buckets of landmarks."""
+    """Square cells in which poses are placed: an occupancy grid, or buckets of landmarks."""
 
     @property
     def origin(self) -> tuple[float, float, float]:

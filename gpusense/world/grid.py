@@ -68,7 +68,7 @@ class OccupancyGrid:
     def _place(
         self, cells: NDArray[np.int8], resolution: object, origin: object, occupied_threshold: object
     ) -> OccupancyGrid:
-        """Take checked cells, and check everything else."""
+        """Store checked cells, after checking all other arguments."""
         self._cells = cells
         self._resolution = check_resolution(resolution)
         self._origin = check_origin(origin)
@@ -182,7 +182,7 @@ class OccupancyGrid:
         checks.choice("unknown", unknown, ("free", "occupied"))
         if unknown == "free":
             return self.occupied
-        # One pass: as a byte, -1 is above every threshold.
+        # A single comparison: as an unsigned byte, -1 exceeds every threshold.
         return self._cells.view(np.uint8) >= self._occupied_threshold
 
     def with_cells(self, cells: ArrayLike, region: ArrayLike) -> OccupancyGrid:
@@ -217,7 +217,7 @@ class OccupancyGrid:
         """Return the centres of cells in the world.
 
         Args:
-            rows: (M,) integer rows. They may lie outside the grid, whose lattice has no end.
+            rows: (M,) integer rows. They may lie outside the grid.
             cols: (M,) integer columns.
 
         Returns:
@@ -296,7 +296,7 @@ class OccupancyGrid:
         return card("OccupancyGrid", table, picture=thumbnail(self.unknown, self.occupied))
 
     def __reduce__(self) -> tuple[Callable[..., OccupancyGrid], tuple[Any, ...]]:
-        # Copies and pickles call the constructor, so that their cells are read-only too.
+        # Copies and pickles call the constructor, so that their cells are also read-only.
         make = functools.partial(OccupancyGrid, occupied_threshold=self._occupied_threshold)
         return make, (self._cells, self._resolution, self._origin)
 
@@ -305,8 +305,8 @@ def check_resolution(value: object) -> float:
     """Return the side of a cell after checking its bounds [m].
 
     Raises:
-        TypeError: It is no real number.
-        ValueError: It is out of bounds.
+        TypeError: The value is not a real number.
+        ValueError: The value is out of bounds.
     """
     return checks.real("resolution", value, low=SMALLEST_RESOLUTION, high=LARGEST_RESOLUTION)
 
@@ -315,8 +315,8 @@ def check_origin(value: object) -> tuple[float, float, float]:
     """Return the pose of a map after checking it [m, m, rad].
 
     Raises:
-        TypeError: It holds no real numbers.
-        ValueError: It has another shape, a value is not finite, or a coordinate is out of bounds.
+        TypeError: The value does not hold real numbers.
+        ValueError: The shape is wrong, a value is not finite, or a coordinate is out of bounds.
     """
     x, y, yaw = checks.array("origin", value, (3,)).tolist()
     for index, coordinate in enumerate((x, y)):
@@ -327,10 +327,10 @@ def check_origin(value: object) -> tuple[float, float, float]:
 def grid_of_checked(
     cells: NDArray[np.int8], resolution: object, origin: object, *, occupied_threshold: int
 ) -> OccupancyGrid:
-    """Make a map of (H, W) occupancies that are known to be valid; they are kept without a copy, and read-only.
+    """Make a map of (H, W) occupancies that are known to be valid; the array is not copied, and becomes read-only.
 
     Raises:
-        TypeError, ValueError: Another argument breaks a rule of :class:`OccupancyGrid`.
+        TypeError, ValueError: An argument other than the cells breaks a rule of :class:`OccupancyGrid`.
     """
     kept = np.ascontiguousarray(cells)
     kept.setflags(write=False)

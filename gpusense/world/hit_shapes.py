@@ -1,9 +1,9 @@
-"""Densities of a correct range on the host: the one home of each, with its numbers for kernels.
+"""Densities of a correct range on the host; each formula stands here alone, with its numbers for kernels.
 
 A hit of scale sigma has the density ``exp(-E(u)) / (width sigma)`` at u = (z - mean) / sigma; it is symmetric and falls
-with |u|. Models truncate it to [0, range_max] or not, weigh it, and mix it with other causes. Models, tables, searches,
-pictures, simulations and fits get all that they need from :class:`HitShape`. Kernels have E in their file ``hit_shape``
-and get all other numbers from here.
+with |u|. Models weight it, mix it with other causes, and may truncate it to [0, range_max]. Models, tables, searches,
+pictures, simulations and fits use it through :class:`HitShape` alone. Kernels have E in their file ``hit_shape`` and
+get all other numbers here.
 
 A shape is registered in :data:`SHAPES` under its name, the value of ``hit=`` in the parameters of scan models.
 CONTRIBUTING.md has the recipe for another shape.
@@ -22,10 +22,12 @@ from numpy.typing import NDArray
 Floats = NDArray[Any]
 HitName: TypeAlias = Literal["normal", "student"]
 
-# Smallest and largest degrees of freedom of Student's t; beyond the largest it is the normal in float32.
+# Smallest and largest degrees of freedom of Student's t; beyond the largest it equals the normal in float32.
 LEAST_DOF, MOST_DOF = 1.0, 1e6
-# From this half of the degrees of freedom on the ratio of gamma functions is its asymptotic series.
+# For half of the degrees of freedom above this, the ratio of gamma functions is its asymptotic series.
 _SERIES_FROM = 30.0
+# From here on erf is 1 in float64.
+_ERF_IS_ONE = 6.0
 # The largest number below one half.
 _MOST_HALF = math.nextafter(0.5, 0)
 
@@ -33,12 +35,14 @@ _MOST_HALF = math.nextafter(0.5, 0)
 class HitShape(ABC):
     """The density of a correct range, of scale 1 around 0.
 
+    A subclass has at most one fitted parameter, since fits on a device move a single coordinate.
+
     Attributes:
         flags: Flags of the kernels that evaluate it.
         tabulated: Whether kernels look up the mass in a table, which the host makes of ``half_mass``.
         fitted: Names of the parameters that a fit finds beside the scale.
         limits: (P, 2) smallest and largest coordinate of a fit; P is 0 or 1.
-        starts: (S, P + 1) coordinates from which a fit starts, and the factor of a normal's scale there.
+        starts: (S, P + 1) coordinates from which a fit starts, each with a factor for the scale of the fitted normal.
     """
 
     flags: ClassVar[frozenset[str]]
@@ -46,6 +50,20 @@ class HitShape(ABC):
     fitted: ClassVar[tuple[str, ...]] = ()
     limits: ClassVar[tuple[tuple[float, float], ...]] = ()
     starts: ClassVar[tuple[tuple[float, ...], ...]] = ((1.0,),)
+
+    def __init_subclass__(cls) -> None:
+        """Check the numbers of fitted parameters, limits and coordinates of starts.
+
+        Raises:
+            TypeError: They differ, or are more than one.
+        """
+        super().__init_subclass__()
+        counts = {len(cls.fitted), len(cls.limits), *(len(start) - 1 for start in cls.starts)}
+        if len(counts) > 1 or max(counts) > 1:
+            raise TypeError(
+                f"{cls.__name__}: must have at most one fitted parameter, with limits and a coordinate of each start, "
+                f"got fitted={cls.fitted}, limits={cls.limits}, starts={cls.starts}"
+            )
 
     @classmethod
     @abstractmethod
@@ -78,12 +96,12 @@ class HitShape(ABC):
 
     @property
     def numbers(self) -> tuple[float, float]:
-        """The numbers of the kernel file ``hit_shape``."""
+        """Return the numbers of the kernel file ``hit_shape``."""
         return 0.0, 0.0
 
     @abstractmethod
     def exponent(self, u: Floats) -> Floats:
-        """Return E(u) = -log of the density over that at 0."""
+        """Return E(u), minus the log of the ratio of the density to its value at 0."""
 
     @abstractmethod
     def slope(self, u: Floats) -> Floats:
@@ -99,7 +117,7 @@ class HitShape(ABC):
 
     @abstractmethod
     def drawn(self, share: Floats, low: Floats, high: Floats) -> Floats:
-        """Return the u below which a share of the mass between -low <= 0 and high >= 0 lies."""
+        """Return the u below which a given share of the mass between -low <= 0 and high >= 0 lies."""
 
     @abstractmethod
     def quantile(self, level: Floats) -> Floats:
@@ -151,9 +169,13 @@ class NormalHit(HitShape):
 
     def half_mass(self, u: Floats) -> Floats:
         """See HitShape.half_mass."""
+        scaled = u * u.dtype.type(math.sqrt(0.5))
+        if scaled.min(initial=np.inf) >= _ERF_IS_ONE:
+            # SciPy, which takes as long to load as a whole call of a model, is not needed.
+            return np.full_like(scaled, 0.5)
         from scipy.special import erf
 
-        return u.dtype.type(0.5) * erf(u * u.dtype.type(math.sqrt(0.5)))
+        return u.dtype.type(0.5) * erf(scaled)
 
     def drawn(self, share: Floats, low: Floats, high: Floats) -> Floats:
         """See HitShape.drawn."""
@@ -172,7 +194,7 @@ class NormalHit(HitShape):
 
 @dataclass(frozen=True)
 class StudentHit(HitShape):
-    """Student's t with ``dof`` degrees of freedom, whose heavy tails take readings that a normal calls impossible.
+    """Student's t with ``dof`` degrees of freedom, whose heavy tails explain readings that a normal makes impossible.
 
     E = (dof + 1) / 2 log(1 + u^2 / dof); with infinite dof it is the normal. It is a normal whose inverse variance is
     drawn from a gamma distribution (Lange, Little and Taylor, "Robust statistical modeling using the t distribution",
@@ -183,7 +205,7 @@ class StudentHit(HitShape):
 
     flags = frozenset({"STUDENT", "MASS_TABLE"})
     fitted = ("hit_dof",)
-    # The coordinate is 1 / dof: the normal is at an end of its interval, not infinitely far.
+    # The coordinate is 1 / dof: the normal lies at the end of a finite interval.
     limits = ((1 / MOST_DOF, 1 / LEAST_DOF),)
     starts = ((0.8, 0.4), (0.3, 0.7), (0.03, 1.0))
 
@@ -253,7 +275,7 @@ class StudentHit(HitShape):
         """See HitShape.quantile."""
         from scipy.special import betaincinv
 
-        # The inverse of the nearer end of the incomplete beta function has the digits, for few and many degrees.
+        # Invert the incomplete beta function from its nearer end, which keeps the digits for small and large dof.
         middle = 3.0
         near = betaincinv(0.5, 0.5 * self.dof, -np.expm1(-np.minimum(level, middle)))
         far = betaincinv(0.5 * self.dof, 0.5, np.exp(-np.maximum(level, middle)))
@@ -277,7 +299,7 @@ def _student_half_mass(u: Floats, dof: float) -> Floats:
 
 SHAPES: dict[str, type[HitShape]] = {"normal": NormalHit, "student": StudentHit}
 NORMAL = NormalHit()
-# Parameters of scan models that describe a shape beside its scale.
+# Parameters of scan models that describe a shape, apart from its scale.
 SHAPE_PARAMETERS = ("hit", *dict.fromkeys(name for shape in SHAPES.values() for name in shape.fitted))
 
 

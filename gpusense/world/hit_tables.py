@@ -1,8 +1,8 @@
 """Tables of mass and quantiles for hit shapes whose kernels have no closed form.
 
 A table has cells of equal width in the logarithmic coordinate log(1 + b), b = u / sqrt 2 for a distance of u scales, or
--log(1 - 2 m) for a mass m between the mean and a distance. In each cell it has the numbers of a polynomial in the share
-of the cell, the lowest power first, which agrees with the function at the cell's start.
+-log(1 - 2 m) for a mass m between the mean and a distance. Each cell has the coefficients, lowest power first, of a
+polynomial in the position within the cell; it is exact at the cell's start.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _ROOT_TWO = math.sqrt(2)
 
 
 class TabulatedHit:
-    """A shape whose masses are looked up; all else is the shape's."""
+    """A shape whose masses are looked up in a table; everything else is delegated to the shape."""
 
     def __init__(self, shape: HitShape) -> None:
         self._shape, self._table = shape, mass_table(shape, np.dtype(np.float64))
@@ -32,7 +32,7 @@ class TabulatedHit:
     @classmethod
     @functools.lru_cache(maxsize=16)
     def of_shape(cls, shape: HitShape) -> Any:
-        """Return the shape with a table, which is kept for its next use."""
+        """Return the shape with a table; the table is cached."""
         return cls(shape)
 
     def half_mass(self, u: Floats) -> Floats:
@@ -62,7 +62,7 @@ def mass_tables(shapes: Sequence[HitShape], terms: list[np.ndarray], real: np.dt
 
 @functools.lru_cache(maxsize=32)
 def mass_table(shape: HitShape, real: np.dtype) -> np.ndarray:
-    """Return the masses between the mean and a distance, by log(1 + b); the table is kept, and read-only."""
+    """Return the table of masses between the mean and a distance, by log(1 + b); it is cached and read-only."""
     table = _table(lambda at: shape.half_mass(_ROOT_TWO * np.expm1(at)), real)
     table.flags.writeable = False
     return table
@@ -93,7 +93,7 @@ def _table(function: Callable[[Floats], Floats], real: np.dtype) -> np.ndarray:
     cells, per_log, powers = TABLE_CELLS[size], TABLE_PER_LOG[size], TABLE_POWERS[size]
     places = np.arange(cells)[:, None]
     start = function(places / per_log)
-    # The rest, divided by the share of the cell, at the nodes of Chebyshev.
+    # Interpolate the remainder, divided by the position within the cell, at Chebyshev nodes.
     share = 0.5 + 0.5 * np.cos(math.pi * (np.arange(powers - 1) + 0.5) / (powers - 1))
     rest = (function((places + share) / per_log) - start) / share
     powers_of_share = share[:, None] ** np.arange(powers - 1)

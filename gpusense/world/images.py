@@ -2,7 +2,7 @@
 
 Pixels, bytes and memory are checked before anything is decoded: memory is allocated only for data that the file holds.
 
-Greys are those of nav2_map_server 1.4 to 1.5, which reads images with the 16-bit build of GraphicsMagick 1.3.
+Greys equal those of nav2_map_server 1.4 to 1.5, which reads images with the 16-bit build of GraphicsMagick 1.3.
 """
 
 from __future__ import annotations
@@ -29,8 +29,7 @@ _MAX_PILLOW_WIDTH = 1 << 26  # keeps a strip of one row below Pillow's limit on 
 _DIGITS = b"0123456789 "
 _BLANKS_TO_SPACES = bytes.maketrans(b"\t\n\v\f\r", b"     ")
 
-# Bytes of a pixel that Pillow decodes, by colour type and whether it has 16 bits: grey and palettes; other types take
-# 4.
+# Bytes of a pixel decoded by Pillow, by colour type (grey, palette) and whether it has 16 bits; other types take 4.
 _PNG_BYTES = {(0, False): 1, (3, False): 1, (0, True): 2}
 
 # Shares of red, green and blue in a grey, in thousandths (ITU-R BT.601).
@@ -92,7 +91,7 @@ def _check_memory(file: Path, rows: int, cols: int, pixel: int = 0) -> None:
     """Check that an image of ``pixel`` bytes a pixel, if it is decoded as a whole, and its cells fit into memory.
 
     Raises:
-        MemoryError: They do not.
+        MemoryError: They do not fit.
     """
     check_room(str(file), rows * cols * (1 + pixel) + _STRIPS_BYTES, f"{rows} x {cols} cells")
 
@@ -157,7 +156,7 @@ def _pnm_header(stream: BinaryIO, file: Path) -> list[int]:
 
 
 class _PlainValues:
-    """The decimal numbers of a stream, taken one strip after the other."""
+    """The decimal numbers of a stream, read strip by strip."""
 
     def __init__(self, stream: BinaryIO, file: Path, count: int) -> None:
         self._stream, self._file, self._count = stream, file, count
@@ -167,7 +166,7 @@ class _PlainValues:
         """Return the next numbers.
 
         Raises:
-            ValueError: The stream has something else, or too few of them.
+            ValueError: The stream holds something else, or too few numbers.
         """
         blocks, have = [self._ready], len(self._ready)
         while have < number:
@@ -203,7 +202,7 @@ def _decoding(file: Path, kind: str) -> Iterator[None]:
 def _check_png(stream: BinaryIO, header: tuple[int, ...]) -> None:
     """Check, in little memory, that the image data of a PNG inflates to the size in its header.
 
-    Pillow allocates by the header, and leaves missing pixels black: they would become walls.
+    Pillow allocates by the header, and leaves missing pixels black, which would become walls.
     """
     cols, rows, depth, colour, _, _, interlace = header
     bits = depth * {2: 3, 4: 2, 6: 4}.get(colour, 1)

@@ -1,4 +1,4 @@
-"""Maps of landmarks, and the square buckets in which kernels search for near ones."""
+"""Maps of landmarks, and the square buckets in which kernels search for nearby landmarks."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Buckets:
         shape: Rows and columns of buckets.
         start: (rows * columns + 1,) int32 place of the first landmark of each bucket.
         index: (M,) int32 index in the map of the landmark at each place.
-        place_of: (M,) int32 place of each landmark: the inverse of ``index``.
+        place_of: (M,) int32 place of each landmark; the inverse of ``index``.
         position: (M, 2) float64 positions relative to the origin, by place.
     """
 
@@ -88,7 +88,7 @@ class Buckets:
 
 
 def make_buckets(landmarks: LandmarkMap) -> Buckets:
-    """Sort landmarks into buckets of about two each.
+    """Sort landmarks into buckets with about two landmarks each.
 
     Raises:
         ValueError: The landmarks span an infinite distance.

@@ -26,7 +26,7 @@ class Likelihood:
         unknown: ``"free"`` or ``"occupied"``: state of unknown cells for the beam model.
         caster: Default caster of the beam model.
         is_peer: Whether weights are those of a peer.
-        cubes: Whether the likelihood field sums cubes of densities, in place of logarithms.
+        cubes: Whether the likelihood field sums cubes of densities instead of logarithms.
         overlaid: Whether the likelihood field has cells of a fixed density.
         neighbors: Cells around a cell on which its state in a mask depends.
     """

@@ -1,4 +1,4 @@
-"""Maps of lines: straight walls, with the side from which they are seen."""
+"""Maps of lines: straight walls, with the sides from which they are visible."""
 
 from __future__ import annotations
 

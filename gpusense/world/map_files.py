@@ -54,13 +54,13 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
 
     Numbers of the YAML file are decimal, as nav2 reads them: 010 is ten, and 1:30 is refused.
 
-    The image's bottom row is ``cells[0]``. Its content determines its format: PGM (P2, P5; 8 or 16 bits), PPM (P3,
-    P6), PNG (1 to 16 bits; grey, palette or colour, with or without alpha) or uncompressed BMP. Of a 16-bit value the
-    grey keeps the upper 8 bits of its fraction of white. Three images differ from nav2's: a 16-bit PNG with colours or
-    alpha counts with its upper 8 bits only, the transparent colour of an 8-bit RGB PNG is unknown, and a PGM may have
-    any maximum. Memory is allocated only after the file has proved to hold the pixels that its header claims (at most
-    2^29), and enough memory is free: a byte for each cell, and for PNG and BMP one more for each grey pixel, two for 16
-    bits, or four for a colour.
+    The image's bottom row is ``cells[0]``. The content of the image determines its format: PGM (P2, P5; 8 or 16 bits),
+    PPM (P3, P6), PNG (1 to 16 bits; grey, palette or colour, with or without alpha) or uncompressed BMP. Of a 16-bit
+    value the grey keeps the upper 8 bits of its fraction of white. Three images differ from nav2's: a 16-bit PNG with
+    colours or alpha counts with its upper 8 bits only, the transparent colour of an 8-bit RGB PNG is unknown, and a PGM
+    may have any maximum. Memory is allocated only after two checks: the file holds the pixels that its header claims
+    (at most 2^29), and enough memory is free. A cell takes a byte; PNG and BMP take one more for each grey pixel, two
+    with 16 bits, or four in colour.
 
     A file ``.dat`` or ``.dat.gz`` has a line for each x with the probabilities that the cells are free, or -1 for
     unknown, and possibly a header with the resolution, else 0.1 m; its cells are ``round(100 (1 - p))``.
@@ -127,14 +127,14 @@ def write_map(
     The image has the YAML file's name with the suffix of its format. Modes:
 
     - ``"trinary"``: map_saver's greys, 254 for free, 0 for occupied, 205 for unknown cells (``free_thresh`` 0.196). The
-      image can be looked at and edited. :func:`read_map` returns the same free, occupied and unknown cells, of 0, 100
+    image can be viewed and edited. :func:`read_map` returns the same free, occupied and unknown cells, of 0, 100
       and -1.
-    - ``"scale"``: from white, 0 per cent, to black; unknown cells are transparent, which takes a PNG. Cells come back
-      equal.
-    - ``"raw"``: the per cent as greys, so almost black, and 255 for unknown. Cells come back equal.
-    - None: trinary for a grid of 0, 100 and unknown, else raw, so that cells come back equal.
+    - ``"scale"``: from white, 0 per cent, to black; unknown cells are transparent, which requires a PNG. Cells are read
+    back unchanged.
+    - ``"raw"``: per cent as greys, which look almost black, and 255 for unknown. Cells are read back unchanged.
+    - None: trinary for a grid of 0, 100 and unknown, else raw, so that cells are read back unchanged.
 
-    The format has no place for ``occupied_threshold``, which decides in mode trinary.
+    The format does not store ``occupied_threshold``, which decides between free and occupied in mode trinary.
 
     Args:
         grid: The map.
@@ -234,7 +234,7 @@ def _image(file: Path, name: str) -> Path:
     """Return the image that a YAML file names.
 
     Raises:
-        FileNotFoundError, ValueError: It is missing, or no regular file; the message names both files.
+        FileNotFoundError, ValueError: The image is missing, or not a regular file; the message names both files.
     """
     try:
         return checks.existing_file(file.parent / name)

@@ -16,7 +16,7 @@ _UNKNOWN = 255  # the byte of the cell -1
 
 
 class Painting(NamedTuple):
-    """Pixels of a map, topmost row first, and the keys of its YAML file by which they are read.
+    """Pixels of a map, topmost row first, and the keys of the YAML file for reading them.
 
     Attributes:
         mode: Mode of map_server.
@@ -34,7 +34,7 @@ class Painting(NamedTuple):
 
 
 def paint(grid: OccupancyGrid, mode: MapMode | None) -> Painting:
-    """Paint a map in a mode; None keeps each cell: trinary for a map of 0, 100 and unknown, else raw."""
+    """Paint a map in a mode; None chooses a lossless one: trinary for a map of 0, 100 and unknown, else raw."""
     cells = grid.cells
     if mode is None:
         plain = sum(np.count_nonzero(cells == value) for value in (0, 100, -1)) == cells.size

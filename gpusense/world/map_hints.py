@@ -8,15 +8,15 @@ from pathlib import Path
 from gpusense._util.documents import read_mapping
 
 _ENDINGS = (".pgm", ".ppm", ".pnm", ".png", ".bmp", ".jpg", ".jpeg", ".tif", ".tiff")
-# YAML files of a folder that are read to find the one of an image.
+# YAML files of a folder that are read to find the file of an image.
 _MOST = 50
 
 
 def check_no_image(file: Path) -> None:
-    """Refuse an image where the YAML file of a map is wanted.
+    """Refuse an image in place of the YAML file of a map.
 
     Raises:
-        ValueError: it is an image; the message names the YAML file that belongs to it, where there is one.
+        ValueError: The file is an image; the message names the YAML file that belongs to it, if any.
     """
     if file.suffix.lower() not in _ENDINGS:
         return

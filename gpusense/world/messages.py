@@ -22,7 +22,7 @@ def field(name: str, message: object, path: str) -> Any:
     Args:
         name: Name of the argument, for errors.
         message: An object with attributes, or a mapping with keys.
-        path: The field's name; dots lead into parts.
+        path: The field's name, with dots before names of nested fields.
 
     Raises:
         TypeError: The message has no such field.
@@ -39,8 +39,8 @@ def real_field(name: str, message: object, path: str) -> float:
     """Return a field that is a finite real number.
 
     Raises:
-        TypeError: It is absent or no number.
-        ValueError: It is not finite.
+        TypeError: The field is absent or not a number.
+        ValueError: The number is not finite.
     """
     value = field(name, message, path)
     return checks.real(f"{name}.{path}", value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value)
@@ -61,7 +61,7 @@ def rotation_of(name: str, quaternion: object) -> np.ndarray:
     """Return the (3, 3) rotation matrix of a quaternion with fields x, y, z and w.
 
     Raises:
-        TypeError: A field is absent or no number.
+        TypeError: A field is absent or not a number.
         ValueError: The quaternion is not finite, or 0.
     """
     x, y, z, w = (real_field(name, quaternion, each) for each in "xyzw")
@@ -80,7 +80,7 @@ def planar_pose(name: str, pose: object) -> tuple[float, float, float]:
     """Return (x, y, yaw) of a pose with fields position and orientation.
 
     Raises:
-        TypeError: A field is absent or no number.
+        TypeError: A field is absent or not a number.
         ValueError: The pose is not level, or not finite.
     """
     rotation = rotation_of(f"{name}.orientation", field(name, pose, "orientation"))
@@ -92,12 +92,12 @@ def planar_pose(name: str, pose: object) -> tuple[float, float, float]:
 
 
 def distinct_beams(step: float, count: int) -> int:
-    """Return the number of beams without a last one that points where the first one does."""
+    """Return the number of beams, less one if the last beam has the direction of the first."""
     return count - 1 if count > 2 and abs(abs(step) * (count - 1) - 2 * math.pi) < 0.5 * abs(step) else count
 
 
 def spread_readings(message: object, places: int, upside_down: bool = False) -> NDArray[np.float64]:
-    """Return the readings of a ``sensor_msgs/LaserScan`` on evenly spaced bearings all round; NaN between them.
+    """Return the readings of a ``sensor_msgs/LaserScan`` on evenly spaced bearings of a full turn; NaN in gaps.
 
     Args:
         message: The scan.
@@ -117,7 +117,7 @@ def laser_geometry(message: object) -> dict[str, Any]:
     """Return angle_min, angle_increment, count, range_min and range_max of a ``sensor_msgs/LaserScan``.
 
     Raises:
-        TypeError: A field is absent or no number.
+        TypeError: A field is absent or not a number.
         ValueError: A value is not finite, or several beams have the same bearing.
     """
     names = ("angle_min", "angle_increment", "range_min", "range_max")

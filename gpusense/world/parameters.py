@@ -73,7 +73,7 @@ class _HitParameters(_Parameters):
         self._check("hit_dof", low=LEAST_DOF, high=MOST_DOF)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields by name, as plain numbers and strings; the shape of hits only where it is not normal."""
+        """Return the fields by name, as plain numbers and strings; the shape of hits only if it is not normal."""
         values = super().to_dict()
         shape = ("hit", *SHAPES[self.hit].fitted) if self.hit != "normal" else ()
         return {name: value for name, value in values.items() if name in shape or name not in SHAPE_PARAMETERS}
@@ -127,7 +127,7 @@ class BeamParameters(_HitParameters):
         self._check_hit()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields by name; range_bias and sigma_growth where they are not 0, hit where it is not normal."""
+        """Return the fields by name; range_bias and sigma_growth only if not 0, hit only if not normal."""
         values = super().to_dict()
         return {name: value for name, value in values.items() if value or name not in ("range_bias", "sigma_growth")}
 
@@ -250,7 +250,7 @@ class LikelihoodFieldParameters(_HitParameters):
 class LandmarkParameters(_Parameters):
     """Parameters of the landmark model, *Probabilistic Robotics* section 6.6.
 
-    A standard deviation of None leaves that part of every feature out.
+    A standard deviation of None ignores that component of every feature.
 
     Raises:
         TypeError: A value has the wrong type for its field.

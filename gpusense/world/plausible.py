@@ -1,6 +1,6 @@
-"""Notice values that are legal but cannot be meant: degrees for radians, millimetres for metres, places off the map.
+"""Notice values that are legal but implausible: degrees for radians, millimetres for metres, places off the map.
 
-Such values compute as semantics demand. A warning names the likely cause, once. Geometry is checked when it is made,
+Results are those of the values. A warning names the likely cause, once. Geometry is checked at its construction, and
 readings in a scanner's first scans.
 """
 
@@ -13,17 +13,18 @@ from numpy.typing import NDArray
 
 from gpusense._util.notices import warn_user
 
-# A heading or bearing beyond a turn; rounding of float32 counts as none [rad].
+# A heading or bearing beyond a turn, with a margin for float32 rounding [rad].
 _TURN = 2 * math.pi * (1 + 1e-6)
-# Sides of cells beyond which a map is one in other units [m].
+# Side of cells beyond which a map is probably in other units [m].
 _LARGEST_CELL = 1.0
-# A range beyond any scanner of a robot, and one that is doubtful in a map much smaller [m].
+# A range beyond any robot's scanner, and a range that is doubtful in a much smaller map [m].
 _FARTHEST, _FAR = 1e4, 1e3
 # Largest distance of a scanner from the robot's centre [m].
 _LARGEST_MOUNT = 100.0
-# Calls with scans of a scanner that are looked at.
+# Number of first calls with a scanner's scans that are checked.
 _CALLS = 32
-# Readings beyond these multiples of range_max or of the map are in other units; a code for "no return" is one value.
+# Readings beyond these multiples of range_max or of the map are in other units; a single such value may be a code for
+# "no return".
 _TIMES_RANGE, _TIMES_MAP, _VALUES = 10.0, 100.0, 3
 
 
@@ -47,7 +48,7 @@ def _notice(text: str) -> None:
 
 
 def look_at_bearings(name: str, bearings: NDArray[np.float64] | None) -> None:
-    """Warn of bearings that span more than a turn, or lie more than two turns from 0 [rad]; None are none."""
+    """Warn of bearings that span more than a turn, or lie more than two turns from 0 [rad]; None is skipped."""
     if bearings is None or not bearings.size:
         return
     low, high = float(bearings.min()), float(bearings.max())
@@ -111,8 +112,8 @@ def look_at_readings(name: str, ranges: NDArray[np.floating], range_max: float, 
     Args:
         name: Name of the argument.
         ranges: Readings of one scan or of several, of any value [m].
-        range_max: Of the scanner [m].
-        size: Diagonal of the map [m], where there is one.
+        range_max: Longest range of the scanner [m].
+        size: Diagonal of the map [m]; None without a map.
 
     Returns:
         Whether there was a reason for a warning.
@@ -138,13 +139,13 @@ def look_at_readings(name: str, ranges: NDArray[np.floating], range_max: float, 
 
 
 class FirstScans:
-    """The first scans of a scanner, which are looked at until one is doubtful; later ones cost nothing.
+    """The first scans of a scanner, which are checked until one is doubtful; later scans cost nothing.
 
     Args:
-        range_max: Of the scanner [m].
+        range_max: Longest range of the scanner [m].
 
     Attributes:
-        left: Calls that are still looked at.
+        left: Number of further calls to check.
     """
 
     __slots__ = ("_range_max", "left")
@@ -153,7 +154,7 @@ class FirstScans:
         self._range_max, self.left = range_max, _CALLS
 
     def look_at(self, name: str, ranges: NDArray[np.floating], size: float | None = None) -> None:
-        """Warn of readings that cannot be meant; arguments as for :func:`look_at_readings`."""
+        """Warn of implausible readings; arguments as for :func:`look_at_readings`."""
         if not self.left:
             return
         self.left -= 1
@@ -166,7 +167,7 @@ def look_at_start(pose: NDArray[np.float64], inside: bool, bounds: tuple[float, 
     """Warn of a start off the map, or with a heading in degrees.
 
     Args:
-        pose: (3,) the start [m, m, rad].
+        pose: (3,) start [m, m, rad].
         inside: Whether it lies on the map.
         bounds: (x_min, y_min, x_max, y_max) of the map [m].
     """

@@ -1,8 +1,8 @@
-"""Densities of the causes of a range beside a correct one: an unexpected obstacle, no return, a random reading.
+"""Densities of the other causes of a range: an unexpected obstacle, no return, a random reading.
 
-This is the one home of each on the host (*Probabilistic Robotics*, equations 6.7 to 6.11); ``world.hit_shapes`` is that
-of correct ranges. Models, tables, simulations and fits call it, and kernels get their numbers from it. Arguments are
-floats or arrays that broadcast; float32 throughout gives float32.
+On the host their formulas stand here alone (*Probabilistic Robotics*, equations 6.7 to 6.11); densities of correct
+ranges are in ``world.hit_shapes``. Models, tables, simulations and fits call them, and kernels get their numbers from
+them. Arguments are floats or arrays that broadcast; float32 throughout gives float32.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from gpusense.interface.terms import log_weight
 
 Floats = NDArray[Any]
 
-# Decays lambda z* within which the mean of an obstacle's distance is that of its formula to rounding.
+# Range of decays lambda z* in which the formula of an obstacle's mean distance is accurate to rounding.
 _LEAST_DECAY, _MOST_DECAY = 1e-9, 700.0
-# Below this decay the distribution is uniform to rounding.
+# Below this decay the distribution is uniform within rounding.
 _UNIFORM = 1e-12
 
 
@@ -27,7 +27,7 @@ class ShortDensity:
     """An exponential density on [0, z*], of an unexpected obstacle before the expected range z*.
 
     Attributes:
-        rate: lambda_short, >= 0 [1/m]; 0 is the uniform density. Kernels take it as it is.
+        rate: lambda_short, >= 0 [1/m]; 0 is the uniform density. Kernels take the same number.
     """
 
     def __init__(self, rate: Any) -> None:
@@ -38,15 +38,15 @@ class ShortDensity:
         return weight * self.rate
 
     def settled(self, digits: int) -> float:
-        """Return the expected range from which on the normaliser is constant to a number of binary digits [m]."""
+        """Return the expected range beyond which the normaliser is constant to a number of binary digits [m]."""
         return digits * math.log(2) / self.rate
 
     def log_pdf(self, z: Floats, expected: Floats) -> Floats:
         """Return the log density [log 1/m]; -inf outside [0, z*] and where z* <= 0.
 
         With x = rate z*, it is ``log(x / (1 - exp(-x))) - log z* - rate z`` for x <= 1 and ``log(rate / (1 - exp(-x)))
-        - rate z`` above, ``1 - exp(-x)`` being ``-expm1(-x)``: no difference of nearly equal numbers, and no two
-        logarithms that nearly cancel. The first factor is 1 at x = 0.
+        - rate z`` above, where ``1 - exp(-x)`` is ``-expm1(-x)``: neither nearly equal numbers nor nearly equal
+        logarithms are subtracted. The first factor is 1 at x = 0.
         """
         with np.errstate(all="ignore"):
             x = self.rate * expected
@@ -65,7 +65,7 @@ class ShortDensity:
         return self.mean(expected) - self.rate * z
 
     def log_mass(self, begin: Floats, width: Any, expected: Floats) -> Floats:
-        """Return the log mass in [begin, begin + width], within [0, z*]; -inf beyond."""
+        """Return the log mass in [begin, begin + width] within [0, z*]; -inf outside."""
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.log(-np.expm1(-self.rate * width)) - np.log(-np.expm1(-self.rate * expected)) - self.rate * begin
             flat = np.broadcast_to(np.log(width) - np.log(expected), np.shape(share))

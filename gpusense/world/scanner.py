@@ -36,8 +36,8 @@ class Reading(enum.IntEnum):
 class Scanner:
     """Immutable geometry of a planar range scanner; compared and hashed by value.
 
-    A sonar is a scanner whose beams are cones: its expected range is the nearest return among ``cone_rays`` rays that
-    are spread evenly over the cone's width, both edges included. Smooth walls are mirrors to sound: with
+    A sonar is a scanner whose beams are cones: its expected range is the nearest return among ``cone_rays`` rays,
+    spread evenly over the cone's width with both edges included. Smooth walls are mirrors to sound: with
     ``critical_incidence``, a ray that meets a wall at a larger angle of incidence (see ``RayCaster.incidence``) has no
     return. Only beam models use cones; a likelihood field scores the end point on each cone's axis.
 
@@ -150,9 +150,9 @@ class Scanner:
     def from_laser_scan(cls, message: Any, mount: ArrayLike = (0.0, 0.0, 0.0)) -> Scanner:
         """Make the scanner of a ``sensor_msgs/LaserScan``, without ROS.
 
-        Beam k has the bearing ``angle_min + k angle_increment``. There is one for each of ``ranges``, also for a last
-        beam that points where the first one does, so that ``message.ranges`` are readings of this scanner. REP-117's
-        infinities and NaN are classified by :func:`classify`.
+        Beam k has the bearing ``angle_min + k angle_increment``. Each of ``ranges`` has a beam, even if the last beam
+        has the direction of the first, so that ``message.ranges`` are readings of this scanner. REP-117's infinities
+        and NaN are classified by :func:`classify`.
 
         Args:
             message: Any object or mapping with the message's fields angle_min, angle_increment, range_min, range_max
@@ -238,7 +238,7 @@ class Scanner:
         )
 
     def __reduce__(self) -> tuple[Callable[..., Scanner], tuple[Any, ...]]:
-        # Copies and pickles call the constructor, so that their bearings are read-only too.
+        # Copies and pickles call the constructor, so that their bearings are also read-only.
         sonar = functools.partial(
             Scanner, cone=self._cone, cone_rays=self._cone_rays, critical_incidence=self._critical
         )
@@ -284,6 +284,14 @@ def classify(ranges: ArrayLike, scanner: Scanner) -> NDArray[np.uint8]:
         rule = f"shape must be ({scanner.count},) or (S, {scanner.count})"
         raise ValueError(f"ranges: {rule}, got {checks.shape_text(z.shape)}")
     return classes(z, scanner.range_min, scanner.range_max)
+
+
+def hits(z: NDArray[np.floating], range_min: float, range_max: float) -> NDArray[np.bool]:
+    """Return which readings of any shape are of the class ``HIT``; see :func:`classify`."""
+    with np.errstate(over="ignore"):  # range_max may exceed float16
+        nearest, farthest = z.dtype.type(range_min), z.dtype.type(range_max)
+    near_enough: NDArray[np.bool] = (z < farthest) & (z >= nearest)
+    return near_enough & (z > 0) if range_min > 0 else near_enough
 
 
 def classes(z: NDArray[np.floating], range_min: float, range_max: float) -> NDArray[np.uint8]:

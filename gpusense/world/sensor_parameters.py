@@ -11,9 +11,9 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.world.parameters import _Parameters
 
-# Limit of degrees of freedom: up to it the mass of Student's t is a short sum; beyond it the t is nearly normal.
+# Largest degrees of freedom: up to it the mass of Student's t is a short sum; beyond it the t is nearly normal.
 MOST_DEGREES = 100
-# Largest standard deviation of the angle of a line [rad]: half a turn is 9 of them.
+# Largest standard deviation of a line's angle [rad]: a ninth of half a turn.
 LARGEST_ANGLE_DEVIATION = 0.349
 
 
@@ -28,7 +28,7 @@ def check_covariance(name: str, value: object) -> tuple[tuple[float, float], tup
     if abs(c[0, 1] - c[1, 0]) > 1e-9 * np.sqrt(abs(c[0, 0] * c[1, 1])):
         raise ValueError(f"{name}: must be symmetric, got {checks.show(c.tolist())}")
     xx, yy, off = float(c[0, 0]), float(c[1, 1]), float(c[0, 1] / 2 + c[1, 0] / 2)
-    # In exact arithmetic, because models take the square root of the difference.
+    # Exact arithmetic, because models take the square root of the difference.
     if not (xx > 0 and yy > 0 and Fraction(off) ** 2 < Fraction(xx) * Fraction(yy)):
         raise ValueError(f"{name}: must be positive definite, got {checks.show(c.tolist())}")
     return (xx, off), (off, yy)
@@ -45,7 +45,7 @@ class PositionParameters(_Parameters):
 
     Raises:
         TypeError: A value has the wrong type for its field.
-        ValueError: A value breaks its field's rule, both sigma and covariance are given, or the weights do not sum to 1
+        ValueError: A value breaks its field's rule, both sigma and covariance are set, or the weights do not sum to 1
             within 1e-6.
 
     Example:

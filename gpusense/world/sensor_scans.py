@@ -23,8 +23,8 @@ class SensorScans:
     Attributes:
         scanners: The scanners.
         sensor: (S,) index of the scanner of each scan.
-        rows: Of each scanner, the indices of its scans, ascending.
-        readings: Of each scanner, the readings (S_l, K_l) of these scans [m].
+        rows: For each scanner, the ascending indices of its scans.
+        readings: For each scanner, the readings (S_l, K_l) of these scans [m].
     """
 
     scanners: tuple[Scanner, ...]
@@ -44,16 +44,18 @@ class SensorScans:
 
 
 def check_scans(scans: Any, scanner: Scanner | Sequence[Scanner], sensor: Any, read: Reader) -> SensorScans:
-    """Return S scans by their scanners.
+    """Group S scans by scanner.
 
     Args:
-        scans: (S, K) readings of one scanner, or S readings of several, each of its scanner's length [m].
+        scans: (S, K) readings of one scanner, or S scans of several scanners, each with its scanner's number of
+            readings [m].
         scanner: The scanner, or L scanners.
         sensor: (S,) indices of the scanners; None for one scanner.
-        read: Returns the checked readings of one scanner by the name "scans", their value and the scanner.
+        read: Function that checks and returns the readings of one scanner, from the argument's name, its value and the
+            scanner.
 
     Raises:
-        TypeError, ValueError: an argument is of the wrong kind or breaks its rule; the message names it.
+        TypeError, ValueError: An argument has the wrong type or breaks its rule; the message names it.
     """
     if isinstance(scanner, Scanner):
         if sensor is not None:
@@ -85,7 +87,7 @@ def _check_sensor(sensor: Any, scans: int, scanners: int) -> Integers:
     """Return the scanner of each scan.
 
     Raises:
-        TypeError, ValueError: not S indices of scanners.
+        TypeError, ValueError: The value is not S indices of scanners.
     """
     if sensor is None:
         if scanners == 1:

@@ -2,7 +2,7 @@
 
 The text has a line for each x, with a number for each y: the probability that a cell is free, or -1 for unknown. A
 header may come first: lines ``robot_specifications->NAME VALUE``, among them ``resolution`` in centimetres, and
-``global_map[0]: COLUMNS ROWS``. Cells have 0.1 m without a resolution. The corner of the first cell is (0, 0).
+``global_map[0]: COLUMNS ROWS``. Without a resolution cells have sides of 0.1 m. The corner of the first cell is (0, 0).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def read_probabilities(file: Path, *, occupied_threshold: int) -> OccupancyGrid:
 
 
 def _fields(where: str, line: bytes) -> list[bytes]:
-    """Return the fields of a line, which are short: as an array, all are as long as the longest.
+    """Return the fields of a line; all must be short, since an array pads each to the longest.
 
     Raises:
         ValueError: A field is longer than any number.
@@ -74,7 +74,7 @@ def _cells(where: str, fields: list[bytes]) -> np.ndarray:
 
 
 def _first(fields: list[bytes], wrong: np.ndarray) -> str:
-    """Return the first wrong field, or the whole of a line that is not of numbers, shortened."""
+    """Return the first wrong field, or the whole line if it does not consist of numbers, shortened."""
     text = fields[int(np.argmax(wrong))] if len(wrong) == len(fields) else b" ".join(fields[:4])
     return text.decode(errors="replace")[:40]
 

@@ -1,4 +1,4 @@
-"""Windows of a map: the part that a cloud of particles can reach. The rest is left out until the cloud moves there."""
+"""Windows of a map: the part within reach of a cloud of particles. The rest is left out until the cloud moves there."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def extent(grid: Cells, corners: Corners, mount: Mount) -> tuple[float, float, f
     size, margin = grid.resolution, math.hypot(mount[0], mount[1]) / grid.resolution
     cos, sin = math.cos(yaw), math.sin(yaw)
     cols, rows = [], []
-    # Two opposite corners bound a box that is not turned.
+    # Two opposite corners bound an axis-aligned box.
     for corner in corners if yaw != 0.0 else corners[::3]:
         x, y = corner[0] - from_x, corner[1] - from_y
         if yaw != 0.0:

@@ -1,8 +1,8 @@
-// Densities of sensors that know where they are: a position in the plane, and a heading. A position is normal around
-// the truth. A heading is wrapped normal, sum_k N(r + 2 pi k; 0, sigma): computed up to sigma = 1.5 by its largest
-// terms, beyond that by its Fourier series (1 + 2 sum_n q^(n n) cos n r) / (2 pi) with q = exp(-sigma^2 / 2). Or a
-// heading is von Mises, exp(kappa cos r) / (2 pi I0(kappa)) with kappa cos r = kappa - 2 kappa sin^2(r / 2). Mardia and
-// Jupp, Directional Statistics (2000), section 3.5. z_rand is the weight of a uniform density (RAND).
+// Densities of absolute sensors, which measure a position in the plane or a heading. A position is normal around the
+// truth. A heading is wrapped normal, sum_k N(r + 2 pi k; 0, sigma): computed by its largest terms up to sigma = 1.5,
+// and beyond that by its Fourier series (1 + 2 sum_n q^(n n) cos n r) / (2 pi) with q = exp(-sigma^2 / 2). Or a heading
+// is von Mises, exp(kappa cos r) / (2 pi I0(kappa)) with kappa cos r = kappa - 2 kappa sin^2(r / 2). Mardia and Jupp,
+// Directional Statistics (2000), section 3.5. z_rand is the weight of a uniform density (RAND).
 // requires: error_free log_terms
 
 // Distributions of a heading: sum of normals, its Fourier series, von Mises.
@@ -40,7 +40,7 @@ real2 half_sine(const real2 residual) {
     return two_sum(x.x, x.y + x.x * (z * series));
 }
 
-// Return the log of the sum over all turns over the normal of the nearest turn.
+// Return the log of the ratio of the sum over all turns to the normal of the nearest turn.
 real log_other_turns(const real2 residual, const real decay) {
     const real size = fabs(residual.x), low = residual.x < 0 ? -residual.y : residual.y;
     const real rest = fmax((HALF_TURN - size) + (HALF_TURN_LOW - low), (real)0);
@@ -54,7 +54,7 @@ real log_other_turns(const real2 residual, const real decay) {
     return log_one_plus(others);
 }
 
-// Return the log of the Fourier series over its first term, by Clenshaw's recurrence.
+// Return the log of the ratio of the Fourier series to its first term, by Clenshaw's recurrence.
 real log_waves(const real2 residual, global const real *terms) {
     const real s = half_sine(residual).x, cosine = 1 - 2 * s * s;
     real newer = 0, older = 0;

@@ -29,12 +29,12 @@
 #define T_SCALE 9
 #define ARC 10
 #define ODD 11
-// From here on an arc is a quarter turn to the last bit; the square of its tangent is still finite.
+// From this tangent on an arc is a quarter turn to the last bit; the tangent's square is still finite.
 #define STEEPEST ((real)1e18)
 // From here on the error function is 1 to the last bit.
 #define ERF_ONE ((real)(FLOAT64 ? 6 : 4))
 
-// Return the log of a truncated normal; near and far are the distances of its mean from the ends.
+// Return the log of a truncated normal; near and far are the distances from its mean to the ends.
 real log_normal(const real2 residual, const real near, const real far, global const real *terms, const int first,
                 const int peak) {
     const real scale = terms[first], below = near * scale, above = far * scale;

@@ -1,7 +1,7 @@
 // Expected range by Bresenham's line (1965) from the origin's cell to the cell at the ray's end, as in nav2_amcl and
 // Beluga. Distances are from cell centre to cell centre, and a line may pass between two cells that touch at a corner.
-// The table holds 1 for occupied cells in a ring of twos. A line midway between two cells takes the one aside, with
-// BELUGA_LINES the straight one. With AMCL_LINES a line goes on for a cell beyond its end.
+// The table holds 1 for occupied cells in a ring of twos. A line midway between two cells steps diagonally, with
+// BELUGA_LINES straight ahead. With AMCL_LINES a line goes on for a cell beyond its end.
 // requires: rectangles ray
 
 typedef uchar entry;

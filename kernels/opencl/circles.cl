@@ -5,7 +5,8 @@
 // beam and the next one, are measurements of asin(radius / distance). Levenberg's and Marquardt's steps minimise the sum
 // of squares over centre and radius.
 
-// Steps of a fit, the first of them by distances from the circle, and the smallest cosine of an angle of incidence.
+// Steps of a fit; the first steps, which minimise distances from the circle; the smallest cosine of an angle of
+// incidence.
 #define CIRCLE_STEPS 25
 #define RADIAL_STEPS 8
 #define STEEPEST ((real)0.1)
@@ -67,7 +68,7 @@ real4 arc_guess(const Part *mine) {
     return (real4)(mean.x + a, mean.y + b, sqrt(a * a + b * b + sum / (real)mine->count), 0);
 }
 
-// Return -1 where beams meet the near side of a circle, as that of a pole, and 1 for the far side.
+// Return -1 where beams meet the near side of a circle, as at a pole, and 1 for the far side.
 real side_of(const Part *mine, const real4 guess) {
     if (mine->edge.z > 0) return -1;
     real beyond = 0;
@@ -103,7 +104,7 @@ void edge_row(Sums *sums, const real4 circle, const real place, const real devia
 }
 
 // Return the cost of a circle, its gradient and its information. Beams meet its near side (-1) or its far side (1);
-// those that pass it by are compared with their nearest place. Radial errors are distances from the circle.
+// a beam that passes the circle is compared with its nearest point to it. Radial errors are distances from the circle.
 Sums circle_sums(const Part *mine, const real side, const real4 circle, const int radial) {
     Sums sums = {0, 0, 0, 0, 0, 0, 0, 0, 0, 0};
     const real sigma = mine->sigma, least = STEEPEST * circle.z * (STEEPEST * circle.z);

@@ -5,8 +5,8 @@
 // requires: error_free end_point log_terms
 
 #define NO_OBSTACLE 0x7fffffff
-// 1 / (sigma sqrt 2), the gap of touching centres, the cell's side; logs of p_contact and p_false, and of 1 minus each
-// of them.
+// 1 / (sigma sqrt 2), the gap of touching centres, the cell's side; logs of p_contact and p_false; logs of 1 -
+// p_contact and 1 - p_false.
 #define SCALE 0
 #define SCALE_LOW 1
 #define REACH 2

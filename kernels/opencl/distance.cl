@@ -75,7 +75,7 @@ kernel void distance_envelope(ARGUMENTS) {
 #define FAR 46341
 #define BLOCK_BITS 5
 #define BLOCK_ROWS (1 << BLOCK_BITS)
-// Rows read between two decisions, so that reads need not wait for one another.
+// Rows read between two decisions, so that reads do not wait for each other.
 #define STEP_ROWS 4
 
 // First pass: count the cells to the nearest occupied cell of the same row, FAR where it is over reach. One work-item

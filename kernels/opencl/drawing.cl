@@ -1,15 +1,15 @@
-// Resampling of particles from exact cumulative weights, with jitter between stages and injected poses.
-// Systematic resampling draws at (n + u) / N of the total, stratified resampling at (n + u_n) / N: "Probabilistic
-// Robotics" table 4.4, and Kitagawa (1996). Residual resampling copies each particle as often as the whole part of its
-// expected number says, and draws the rest by the residual weights (Liu and Chen 1998). Between two stages of a
-// correction a drawn pose moves by a fraction of the difference of two others, whose spread is that of the cloud
-// (differential evolution: ter Braak 2006); differences between separate clusters are shortened. Injected poses come from
-// a pool: free cells, or the modes of a likelihood map.
+// Resampling of particles from exact cumulative weights, with jitter between stages and injected poses. Systematic
+// resampling draws at (n + u) / N of the total, stratified resampling at (n + u_n) / N: "Probabilistic Robotics" table
+// 4.4, and Kitagawa (1996). Residual resampling copies each particle by the integer part of its expected number of
+// copies, and draws the rest by the residual weights (Liu and Chen 1998). Between two stages of a correction a drawn
+// pose moves by a fraction of the difference between two other poses, so that moves scale with the spread of the cloud
+// (differential evolution: ter Braak 2006); differences between separate clusters are shortened. Injected poses come
+// from a pool: free cells, or the modes of a likelihood map.
 // requires: draws
 
 #define WEIGHT_SUMS 17
 
-// Count the certain copies of a block; the other columns are 0: one work-item takes a block.
+// Count the deterministic copies of a block; the other columns are 0: one work-item takes a block.
 kernel void count_copies(ARGUMENTS) {
     const int b = get_global_id(0), begin = b * block;
     if (begin >= particles) return;
@@ -21,7 +21,7 @@ kernel void count_copies(ARGUMENTS) {
     for (int k = 0; k < WEIGHT_SUMS; k++) row[k] = k == 0 ? sum : 0.0;
 }
 
-// Set the cumulative numbers of certain copies: one work-item takes a block.
+// Set the cumulative numbers of deterministic copies: one work-item takes a block.
 kernel void set_copies(ARGUMENTS) {
     const int b = get_global_id(0), begin = b * block;
     if (begin >= particles) return;

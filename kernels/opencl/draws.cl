@@ -30,7 +30,7 @@ int found_at(global const double *ends, const double mark, const int particles) 
     return low;
 }
 
-// Return the copies that residual resampling makes for certain: the whole part of the expected number.
+// Return the deterministic copies of residual resampling: the integer part of the expected number of copies.
 double copies_of(global const double *ends, const double total, const int drawn, const int n) {
     const double weight = ends[n] - (n > 0 ? ends[n - 1] : 0.0);
     return total > 0.0 ? floor((double)drawn * weight / total) : 0.0;
@@ -50,7 +50,7 @@ int found_residual(global const double *ends, global const double *copies, const
     return low;
 }
 
-// Return the mark at a fraction of the total, below the total.
+// Return the mark at a fraction of the total, clamped to below the total.
 double mark_of(const double fraction, const double total) {
     const double mark = floor(fraction * total);
     return mark < total - 1.0 ? mark : total - 1.0;
@@ -79,7 +79,7 @@ uint4 words_of(global const double *settings, const int stage, const uint index,
     return random_words(counter, (uint)settings[SEED], (uint)settings[SEED + 1]);
 }
 
-// Return the random number of a draw's mark; that of index 0 serves all draws of systematic resampling.
+// Return the random number of a draw's mark; systematic resampling uses the number of index 0 for all draws.
 double start_of(global const double *settings, const int stage, const uint index) {
     return uniform_of(words_of(settings, stage, index, 0).x);
 }

@@ -5,8 +5,8 @@
 // requires: caster mixture
 
 #if CONES
-// Distance in cells, and cosine and sine of the angle of incidence. Without a return these are limit, 2 and 0: 2 is
-// more than any cosine, so that the first bin can be for such beams alone.
+// Distance in cells, and cosine and sine of the angle of incidence. Without a return these are limit, 2 and 0: 2
+// exceeds every cosine, so that the first bin can be for such beams alone.
 typedef struct {
     real t, cosine, sine;
 } Echo;

@@ -39,7 +39,7 @@
 // Return exp(x) for x <= 700; 0 below LEAST_EXPONENT.
 double exp_of(const double x) {
     const double held = x > LEAST_EXPONENT ? x : 0.0;
-    // 1.5 * 2^52: a sum with it is rounded to an integer.
+    // 1.5 * 2^52: adding it rounds to an integer.
     const double count = (held * INVERSE_LOG2 + 6755399441055744.0) - 6755399441055744.0;
     const double r = (held - count * LOG2_HIGH) - count * LOG2_LOW;
     const double high = ((((EXP_0 * r + EXP_1) * r + EXP_2) * r + EXP_3) * r + EXP_4) * r + EXP_5;

@@ -1,6 +1,6 @@
 // The cell of the likelihood field's table in which a beam's end point lies, and the point's place within that cell.
 // Cells must be the same on every device and in every precision: an end point nearer to an edge than guard, the bound
-// of its rounding errors, is computed again with twice the digits.
+// of its rounding errors, is recomputed with twice the digits.
 // requires: error_free
 
 #define FIELD_RING 2
@@ -54,8 +54,8 @@ typedef struct {
 } EndPoint;
 
 // Return the end point of a beam. point is the reading times the beam's (cos, sin), in cells; shift moves cell centres
-// onto corners. An end point nearer to a cell's edge than guard, the bound of its rounding errors, is computed again
-// with twice the digits.
+// onto corners. An end point nearer to a cell's edge than guard, the bound of its rounding errors, is recomputed with
+// twice the digits.
 EndPoint end_point(const real4 pose, const real4 pose_low, const real2 point, const real2 point_low, const real shift,
                    const real guard) {
     EndPoint end;

@@ -1,4 +1,4 @@
-// Error-free transformations: the rounding error of an operation is kept in a second number. Source: Knuth (two_sum),
+// Error-free transformations: a second number holds the rounding error of an operation. Source: Knuth (two_sum),
 // Dekker and Veltkamp (two_product). They need FP_CONTRACT OFF and no fast-math.
 
 // Return a + b = sum.x + sum.y exactly.
@@ -8,19 +8,19 @@ real2 two_sum(const real a, const real b) {
     return (real2)(sum, (a - (sum - shift)) + (b - shift));
 }
 
-// Return a + b = sum.x + sum.y exactly, where a has no smaller exponent than b: Dekker's sum.
+// Return a + b = sum.x + sum.y exactly, where a's exponent is at least b's: Dekker's sum.
 real2 ordered_sum(const real a, const real b) {
     const real sum = a + b;
     return (real2)(sum, b - (sum - a));
 }
 
-// Return the leading bits of a float, few enough that a product of two such halves is exact.
+// Return the leading bits of a float, so few that the product of two such halves is exact.
 real high_half(const real a) {
     const real scaled = SPLITTER * a;
     return scaled - (scaled - a);
 }
 
-// Return a * b = product.x + product.y exactly, short of overflow and underflow: by a fused multiply-add where the
+// Return a * b = product.x + product.y exactly, barring overflow and underflow: by a fused multiply-add where the
 // device has one.
 real2 two_product(const real a, const real b) {
     const real product = a * b;
@@ -31,8 +31,8 @@ real2 two_product(const real a, const real b) {
     return (real2)(product, error);
 }
 
-// Add two numbers of two parts each, to about twice the working precision. Where the first parts cancel, their sum still
-// is no smaller than the last bit of either, so it has no smaller exponent than the second parts.
+// Add two numbers of two parts each, to about twice the working precision. Where the first parts cancel, their sum is
+// at least the last bit of either, so its exponent is at least that of the second parts.
 real2 pair_sum(const real2 a, const real2 b) {
     const real2 sum = two_sum(a.x, b.x);
     return ordered_sum(sum.x, sum.y + (a.y + b.y));

@@ -1,13 +1,13 @@
-// Likelihood field of a whole scan (book table 6.3): one look-up at each beam's end point. The table is padded by a
-// ring of two cells for everything outside the grid, so no look-up needs a bounds test.
+// Likelihood field of a whole scan (book table 6.3): one look-up at each beam's end point. A ring of two cells around
+// the table stands for everything outside the grid, so no look-up needs a bounds test.
 // requires: field_term
 
 // Particles per work-group of field_blocks.
 #define GROUP 64
 
-// Fill width x height cells of the table, the first of them at begin, from squared distances: density has a value for
-// each squared distance up to the cap. The first cell is (from_col, from_row) of the grid; cells outside the grid get
-// beyond.
+// Fill width x height cells of the table from squared distances: density has a value for each squared distance up to
+// the cap. The cells begin at index begin of the table and at cell (from_col, from_row) of the grid; cells outside the
+// grid get beyond.
 kernel void fill_field(ARGUMENTS) {
     const int i = get_global_id(0), j = get_global_id(1), col = from_col + i, row = from_row + j;
     if (i >= width || j >= height) return;

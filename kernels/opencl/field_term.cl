@@ -24,7 +24,7 @@ real2 bilinear(global const real *table, const int2 cell, const EndPoint end, co
 #endif
 
 #if !LOG_TABLE
-// Return the exponent of a normal in two parts: where the peak is high, exponent and log peak nearly cancel. terms[8]
+// Return the exponent of a normal in two parts, since for a high peak exponent and log peak nearly cancel. terms[8]
 // = {hit, 1 / (2 sigma^2), rand, log z_max, the low parts of terms 0 and 1, two numbers of the shape of a hit}. hit is
 // the peak of its density, z_hit / (sigma sqrt(2 pi)) for a normal, and rand is z_rand / range_max, or their logarithms
 // in the log domain.

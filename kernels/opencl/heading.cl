@@ -1,13 +1,13 @@
 // Cosine and sine of a heading in float64 with +, - and * alone, so that every device gives the same bits. A heading is
 // reduced to r + low, |r| <= pi/4, and a count of quarter turns modulo 4: up to 2^20 rad by subtracting the count times
-// pi/2 in four parts (Cody and Waite), beyond that by the product with the bits of 2/pi that matter, in integers (Payne
-// and Hanek). Then sin r = r + r z S(z) and cos r = 1 - z/2 + z^2 C(z) with z = r^2. bench/derive/heading_constants.py derives
-// the constants.
+// pi/2 in four parts (Cody and Waite), beyond that by an integer product with the relevant bits of 2/pi (Payne and
+// Hanek). Then sin r = r + r z S(z) and cos r = 1 - z/2 + z^2 C(z) with z = r^2. bench/derive/heading_constants.py
+// derives the constants.
 
 // Up to this heading the counts of quarter turns have 20 bits.
 #define LARGEST_HEADING 1048576.0
 #define TWO_OVER_PI 0.6366197723675814
-// 1.5 * 2^52: a sum with it is rounded to an integer.
+// 1.5 * 2^52: adding it rounds to an integer.
 #define ROUNDER 6755399441055744.0
 // pi/2 in three parts of 33 bits and a rounded one, and as the sum of two rounded numbers.
 #define QUARTER_1 1.5707963267341256
@@ -87,11 +87,11 @@ Turn reduce_huge(const double theta) {
     const ulong bits = as_ulong(fabs(theta));
     const ulong mantissa = (bits & 0xFFFFFFFFFFFFFUL) | 0x10000000000000UL;
     const ulong low_half = mantissa & 0xFFFFFFFFUL, high_half = mantissa >> 32;
-    // Bits of 2/pi that make whole turns are left out: times the last bit of the mantissa, the window's first bit is
-    // half a turn.
+    // Bits of 2/pi that contribute whole turns are left out: the window's first bit times the last bit of the mantissa
+    // is half a turn.
     const int first = (int)(bits >> 52) - (1075 - 62);
     const int word = first >> 5, shift = first & 31;
-    // turns = mantissa * window modulo 2^192, of which the upper four words stay.
+    // turns = mantissa * window modulo 2^192, of which the upper four words are kept.
     ulong turn_1 = 0, turn_2 = 0, turn_3 = 0, turn_4 = 0, carry_1 = 0, carry_2 = 0, below = 0;
     for (int k = 5; k >= 0; k--) {
         const ulong words = (ulong)WORDS[word + k] << 32 | WORDS[word + k + 1];
@@ -119,7 +119,7 @@ Turn reduce_huge(const double theta) {
 }
 #endif
 
-// Return (cosine, sine) of a heading; for a heading that is not finite they have no meaning but are not NaN.
+// Return (cosine, sine) of a heading; for a heading that is not finite they are meaningless, but not NaN.
 double2 cos_sin(const double theta) {
 #if HUGE_HEADINGS
     const Turn turn = fabs(theta) <= LARGEST_HEADING ? reduce_ordinary(theta) : reduce_huge(theta);

@@ -1,8 +1,8 @@
-// Shape of the density of a hit, as a change of the normal's exponent t = u^2 / 2 at a distance of u scales: the density
-// falls from its peak by the factor exp(-E). A normal has E = t and the weight E'(t) = 1. STUDENT: Student's t with nu
-// degrees of freedom has E = power log(1 + rate t), power = (nu + 1) / 2, rate = 2 / nu, and the weight
-// (nu + 1) / (nu + u^2). The mass between the mean and a distance, b = u / sqrt 2, comes from a table (MASS_TABLE), whose
-// cells have the numbers of a polynomial in the share of the cell, by log(1 + b).
+// Shape of the density of a hit, as a function of the normal's exponent t = u^2 / 2 at a distance of u scales: the
+// density falls from its peak by the factor exp(-E). A normal has E = t and the weight E'(t) = 1. STUDENT: Student's t
+// with nu degrees of freedom has E = power log(1 + rate t), power = (nu + 1) / 2, rate = 2 / nu, and the weight (nu +
+// 1) / (nu + u^2). The mass between the mean and a distance, b = u / sqrt 2, comes from a table (MASS_TABLE), whose
+// cells of log(1 + b) have the coefficients of a polynomial in the position within the cell.
 // requires: error_free
 
 #define TABLE_CELLS (FLOAT64 ? 1024 : 256)
@@ -33,7 +33,7 @@ real shape_weight(const real t, const real power, const real rate) {
 #endif
 }
 
-// Return -E''(t) over the weight, times u^2, from the weight times u^2.
+// Return ``-u^2 E''(t) / E'(t)`` from ``square = u^2 E'(t)``.
 real shape_bend(const real square, const real power) {
 #if STUDENT
     return square * (1 / power);

@@ -1,17 +1,17 @@
 // Scan matching by point-to-line ICP. The nearest point is exact: the points of a scan are sorted by bearing, and a
-// search from the bearing of a place outwards ends where no point farther in bearing can be nearer.
-// Lines: see lines.cl, and Censi (2008), "An ICP variant using a point-to-line metric". Weights: Cauchy's while the
-// scale shrinks, then Geman and McClure's, (1 / (1 + (e / c)^2))^2.
+// search outwards from the bearing of a place ends where no point farther in bearing can be nearer. Lines: see
+// lines.cl, and Censi (2008), "An ICP variant using a point-to-line metric". Weights: Cauchy's while the scale shrinks,
+// then Geman and McClure's, (1 / (1 + (e / c)^2))^2.
 // requires: icp_step
 
 // Numbers of a result: pose (3), score, iterations, whether the last step was below ten tolerances, information (6),
 // and its part that is due to errors of the lines (6), pairs, sum of weights, weighted sum of squared errors, points
-// that the other scan should see, points that contradict it, points that it did not see, and for blocks of 1, 2, 4 to
+// that the other scan should see, points through which it saw, points that it did not see, and for blocks of 1, 2, 4 to
 // 128 successive points the sum of squares of the blocks' sums of weighted errors (8), 0 with thin; the last step (3).
 #define MATCH_RESULT 35
 // Rounding errors of bounds are far below this share.
 #define ALMOST ((real)0.999)
-// Weight in the score of a point that the other scan did not see; one that disagrees has 1.
+// Weight in the score of a point that the other scan did not see; a point that disagrees has weight 1.
 #define UNSEEN ((real)0.13)
 
 // Return the nearest of every skip-th point of a scan that is nearer than the square root of squared, -1 without one;
@@ -73,8 +73,8 @@ real add_pairing(real *sums, const real4 line, const real2 place, const real2 ar
 }
 
 // Return how well every stride-th point of one scan agrees with every skip-th point of another scan: sum of agreements,
-// points that the other scan should see, points that contradict it because it saw through them, and points that it did
-// not see. pose is (x, y, cos, sin).
+// points that the other scan should see, points through which it saw, and points that it did not see. pose is (x, y,
+// cos, sin).
 real4 agreement(global const real4 *point, global const real4 *line, const int count, global const real4 *other,
                 const int others, const int stride, const int skip, const real4 pose, const real near, const real gap) {
     const real scale = near / 3;

@@ -1,4 +1,4 @@
-// Steps of point-to-line ICP that bodies of one place and of several at once share: places among the bearings of a
+// Steps of point-to-line ICP that scalar bodies and bodies in lanes share: places among the bearings of a
 // scan, the normal equations, and sums of blocks of points.
 // Blocks: Flyvbjerg and Petersen (1989), "Error estimates on averages of correlated data".
 
@@ -14,8 +14,8 @@ real bearing_of(const real2 place) {
     return bearing < 0 ? bearing + FULL_TURN : bearing;
 }
 
-// Return the number of points among count skip-th points of a scan whose bearing is less than a bearing: walk from a
-// guess, which for neighbours is the number of the one before, but for a full turn.
+// Return the number of points among count skip-th points of a scan with a smaller bearing: walk from a guess, which for
+// neighbours is the previous number, up to a full turn.
 int points_before(global const real4 *point, const int count, const int skip, const real bearing, const int guess) {
     int i = guess;
     if (4 * bearing < FULL_TURN && 4 * guess > 3 * count) i = 0;

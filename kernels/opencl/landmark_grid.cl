@@ -1,6 +1,6 @@
 // Search for the landmarks near the end point of a feature, book table 6.5. Landmarks lie in square buckets, row by
 // row; start[i] is the first landmark of bucket i. A search visits the buckets that a disc around the feature's end
-// point touches, and evaluates the landmarks within the disc; others have a negligible density.
+// point touches, and evaluates the landmarks within the disc; landmarks outside have a negligible density.
 // requires: error_free landmarks line_feature
 
 // A sum of densities is relative to one of them, until another is larger by a factor of e^RELATIVE.
@@ -41,7 +41,7 @@ real squared_reach(const real exponent, global const real *feature) {
     return (real)1.01 * (r * r + z * (z + r) * (b * b)) + feature[SLACK];
 }
 
-// Return whether a feature may be landmark j: near its end point, or for lines turned alike and overlapping.
+// Return whether a feature may be landmark j: near its end point, or for lines similar in direction and overlapping.
 int may_match(const real4 off, const real4 turned, global const real *feature, global const real4 *normal,
               global const real4 *signature, const int j, const real most) {
 #if LINE

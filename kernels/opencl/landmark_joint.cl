@@ -8,7 +8,7 @@
 
 // Largest number of features.
 #define MOST_FEATURES 8
-// A landmark's part of a density is larger than the false positive's from twice the latter on.
+// A landmark's part of a density exceeds the false positive's if the density is more than twice the latter.
 #define LOG_2 ((real)0.69314718055994531)
 
 // Find the best joint association: one work-item takes a particle. choice[s] has the landmark of each feature of set s,

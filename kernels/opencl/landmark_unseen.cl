@@ -1,4 +1,4 @@
-// Negative information: landmarks that the sensor should see from a pose, but that belong to no feature.
+// Negative information: landmarks that the sensor should see from a pose, but that match no feature.
 // requires: error_free landmarks landmark_grid
 
 // Return whether a landmark is within range, and its angle to the sensor's axis has a cosine of at least least.

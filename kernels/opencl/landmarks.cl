@@ -3,7 +3,7 @@
 // d and b_j are the landmark's distance and bearing from the sensor; differences of bearings are wrapped to (-pi, pi].
 // m is the mass of a component on the measurable interval: [0, range_max], the field of view, the span of signatures.
 // Components that were not measured are left out. Positions, directions and quantities derived from them are sums of
-// two numbers, since a relative error of eps in a distance of 20 m is far too much beside a deviation of 1 cm. A
+// two numbers, since a relative error of eps in a distance of 20 m is too large for a deviation of 1 cm. A
 // feature is FEATURE numbers, which are named below, in the same order in all three languages. A place is (x, its low
 // part, y, its low part), and so are an offset and a direction. terms[4] = {range_max, its low part, field of view,
 // density of a bearing at zero range over that of its peak and scale}.
@@ -29,7 +29,7 @@
 #define PEAK 14
 #define PEAK_LOW 15
 #define FALSE_POSITIVE 16
-// From the bearing to the upper end of the field of view.
+// Angle from the bearing to the upper end of the field of view.
 #define UPPER 17
 #define UPPER_LOW 18
 // Only landmarks within RADIUS of the point REACH along the bearing, and no nearer than HOLE, have a density that is

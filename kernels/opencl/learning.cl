@@ -66,7 +66,7 @@ void add_pair(const real z, const real expected, global const real *terms, real 
         h_ss = square * (bend - 2) - t + w + t * t;
         h_sm = pull * (bend - 2) - p + q;
         h_mm = weight * (bend - 1) + v + p * p;
-        // A mean that is clamped does not move with the bias.
+        // A clamped mean does not move with the bias.
         if (mean != expected + terms[10]) h_m = h_sm = h_mm = 0;
     }
     if (r.z > 0) {

@@ -6,9 +6,9 @@
 // (alpha, rho) and (alpha + pi, -rho) are one line: where a line of the map is seen from both sides, the normal nearer
 // to the feature's counts. m is the mass of the distance on [0, range_max]. By Cholesky's factor of C the exponent is
 // (a da)^2 + (b da + c dr)^2 with a = BEARING_SCALE, b = MIXED_SCALE and c = RANGE_SCALE. A feature may be a line of
-// the map if it overlaps that, projected on it: a scan shows a wall only as far as it is in sight. A line of the map
-// has its middle as landmark, its normal away from the free side, and (half length, 1 if it is seen from both sides, 0,
-// 0) as signature.
+// the map if its projection overlaps that line: a scan shows only the visible part of a wall. A line of the map has its
+// middle as landmark, its normal away from the free side, and (half length, 1 if it is seen from both sides, 0, 0) as
+// signature.
 // requires: error_free landmarks offsets
 
 // The factor of the angle in the second exponent; places of the ends along the line, from the foot of the normal.
@@ -18,12 +18,12 @@
 #define LAST_END 18
 
 #if LINE
-// Return the normal of a line of the map on the side from which a feature sees it.
+// Return the normal of a line of the map on the side that faces a feature's sensor.
 real4 facing(const real4 normal, const real4 signature, const real4 turned) {
     return signature.y > 0 && normal.x * turned.x + normal.z * turned.z < 0 ? -normal : normal;
 }
 
-// Return whether a feature is turned like a line of the map, and overlaps it.
+// Return whether a feature has about the direction of a line of the map, and overlaps it.
 int overlaps(const real4 off, const real4 turned, global const real *feature, const real4 normal,
              const real4 signature) {
     const real cosine = normal.x * turned.x + normal.z * turned.z;
@@ -34,7 +34,7 @@ int overlaps(const real4 off, const real4 turned, global const real *feature, co
 }
 
 // Return the mass of the normal around a line's distance d on [0, range_max]; d is clamped to it. A line that is seen
-// from both sides has two forms, (alpha_j, d) and (alpha_j + pi, -d): the mass of both is that of d on [-range_max,
+// from both sides has two forms, (alpha_j, d) and (alpha_j + pi, -d): together they have the mass of d on [-range_max,
 // range_max].
 real distance_mass(const real2 d, const real scale, const real4 signature, global const real *terms) {
     const real lower = signature.y > 0 ? -terms[0] : (real)0, width = terms[0] - lower;

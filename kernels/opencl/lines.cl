@@ -3,9 +3,9 @@
 #define WHOLE_TURN ((real)6.283185307179586)
 
 // Fit a line to each point and reach neighbours on either side, up to most within a distance of width, none of them
-// farther from the last one than slack plus ratio times its range, nor than gap in bearing: unit normal, offset, and
-// 1 / (sum of squared distances along the line). A point without neighbours has the line across its beam, -1 in place
-// of that sum, and no pairs. One work-item takes a point of one of the chosen scans.
+// farther from the last one than slack plus ratio times its range, nor than gap in bearing: unit normal, offset, and 1
+// / (sum of squared distances along the line). A point without neighbours has a line perpendicular to its beam, -1 in
+// place of that sum, and no pairs. One work-item takes a point of one of the chosen scans.
 kernel void fit_lines(ARGUMENTS) {
     const int k = get_global_id(0), scan = which[get_global_id(1)];
     const int first = start[scan], count = start[scan + 1] - first;

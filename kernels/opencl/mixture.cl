@@ -15,8 +15,8 @@
 #define SMALLEST_RANGE ((real)1e-37)
 
 #if STOPS
-// Return the expected range of a reading from which on log p is that of p_rand, or of p_short far from its end, to the
-// last bit: an obstacle farther away changes nothing.
+// Return the expected range of a reading beyond which log p is constant to the last bit: there it is that of p_rand, or
+// of p_short far from its end, whatever the distance of the obstacle.
 real last_range(const real z, global const real *terms) {
     const real last = terms[14] + terms[15] * z;
     return last > terms[16] ? last : terms[16];
@@ -25,7 +25,7 @@ real last_range(const real z, global const real *terms) {
 
 #if HIT
 // Return the mass of the untruncated normal around z* on [0, range_max], a sum of positive terms, so nothing cancels.
-// Most ranges are far from both ends and most others far from one of them; rays without an obstacle are at one end.
+// Most ranges are far from both ends, and nearly all from at least one; rays without an obstacle are at one end.
 real hit_mass(const real expected, const real erf_scale, const real range_max) {
     const real below = expected * erf_scale, above = (range_max - expected) * erf_scale;
     const real nearer = below < above ? below : above, farther = below < above ? above : below;
@@ -149,8 +149,7 @@ real short_peak(const real lambda, const real expected) {
 #endif
 
 #if LINEAR
-// Return log p(z | z*). p_rand > 0 bounds the sum from below, so each component may underflow, and one logarithm is
-// enough.
+// Return log p(z | z*). p_rand > 0 bounds the sum from below, so components may underflow, and one logarithm suffices.
 real log_density(const real z, const real expected, global const real *terms) {
     real p = 0;
 #if HIT

@@ -2,7 +2,7 @@
 // Odometry model: Thrun, Burgard and Fox, "Probabilistic Robotics" (2005), table 5.6; velocity model: table 5.3. Each
 // of the four parts is normal, with a mean and a deviation in the settings. An arc of the velocity model
 // (VELOCITY_MODEL) turns by twice the first part; its chord is the arc's length times sin(a) / a. With probability
-// REVERSE the translation goes the other direction: some odometers count wheel turns without a sign.
+// REVERSE the translation goes the other direction: some odometers count wheel turns without their sign.
 // requires: philox
 
 #define SEED 0
@@ -15,7 +15,7 @@
 #define VELOCITY_MODEL 1
 #define SMALL_ARC 1e-4
 #define WHOLE_TURN 6.283185307179586
-// A whole turn beyond HALF_TURN, rounded down.
+// A full turn more than HALF_TURN, rounded down.
 #define FARTHEST_ONCE 9.424777960769378
 
 // Return the chord of an arc that turns by twice half_turn.
@@ -24,12 +24,12 @@ double chord_of(const double length, const double half_turn) {
     return length * (cos_sin(half_turn).y / half_turn);
 }
 
-// Return a heading less than a turn beyond [-pi, pi] in that interval.
+// Wrap headings that are less than a turn outside [-pi, pi] to that interval.
 double wrap_once(const double theta) {
     return theta > HALF_TURN ? theta - WHOLE_TURN : theta < -HALF_TURN ? theta + WHOLE_TURN : theta;
 }
 
-// Return any heading in [-pi, pi]: more than a turn beyond it goes by its cosine and sine.
+// Wrap any heading to [-pi, pi]; headings more than a turn outside it by their cosine and sine.
 double wrap_any(const double theta) {
     if (!(fabs(theta) > FARTHEST_ONCE)) return wrap_once(theta);
     const double2 turn = cos_sin(theta);

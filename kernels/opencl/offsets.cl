@@ -1,5 +1,5 @@
-// Offsets between places in sums of two numbers: a relative error of eps in 20 m is too much beside a deviation of 1
-// cm. A place is (x, its low part, y, its low part), and so is an offset.
+// Offsets between places in sums of two numbers: a relative error of eps in 20 m is too large for a deviation of 1 cm.
+// A place is (x, its low part, y, its low part), and so is an offset.
 // requires: error_free
 
 // Return the offset from a sensor to a landmark or beacon, which has x, y, and the low parts of both.

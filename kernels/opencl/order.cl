@@ -1,5 +1,5 @@
-// An order of particles in which neighbours have similar positions and headings. Their rays then meet the same cells,
-// and none waits long for another. The order changes no result.
+// An order of particles in which neighbours have similar positions and headings. Their rays then read the same cells
+// and have similar lengths, so work-items wait less for each other. The order changes no result.
 // requires: ray
 
 // Sampled particles; bins per axis (rows, columns, headings); and bins per work-item of order_starts.
@@ -36,7 +36,7 @@ kernel void order_bounds(ARGUMENTS) {
     atomic_max(&bounds[5], turn);
 }
 
-// Return the index of one of BINS equal parts of the bounds; values beyond them belong to the outermost.
+// Return the index of one of BINS equal parts of the bounds; values beyond them belong to the outermost parts.
 int part_of(const int value, const int least, const int most) {
     const real part = ((real)value - (real)least) * ((real)BINS / ((real)most - (real)least + 1));
     return part < 0 ? 0 : part >= BINS ? BINS - 1 : (int)part;

@@ -1,4 +1,4 @@
-// Random numbers by a counter, so that a particle's numbers depend on seed, step, stream and its index alone.
+// Counter-based random numbers: a particle's numbers depend only on seed, step, stream and its index.
 // Philox 4x32-10: Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3" (2011). Normal deviates
 // are those of Box and Muller: sqrt(-2 log u) (cos 2 pi v, sin 2 pi v). The counter is (particle, step, stream, 0).
 // requires: elementary heading
@@ -26,7 +26,7 @@ uint4 random_words(const uint4 counter, const uint key_0, const uint key_1) {
     return c;
 }
 
-// Return a number in (0, 1): the centre of one of 2^32 intervals.
+// Return numbers in (0, 1), the centres of 2^32 intervals.
 double uniform_of(const uint word) { return ((double)word + 0.5) * WORD; }
 
 // Return two independent standard normal deviates.

@@ -8,7 +8,7 @@ typedef float coordinate;
 typedef double coordinate;
 #endif
 
-// Coordinates are clamped to this many cells: no range reaches as far, and sums of two stay within int32.
+// Coordinates are clamped to this many cells: no range reaches so far, and the sum of two fits int32.
 #define FARTHEST 1073741824.0
 #if FLOAT64
 #define BELOW_ONE 0x1.fffffffffffffp-1
@@ -29,9 +29,9 @@ double floor_cells(const double position) {
 }
 
 // Place a sensor: a pose times the scanner's mount, without its yaw, which belongs to the bearings. pose_low gets the
-// rounding errors (low parts) of pose. pose_status, which the caller clears, becomes 1 at (0) if a pose is not finite,
-// and at (1) if a sensor is outside the window. A pose that is not finite becomes the farthest cell, fraction 0 and heading
-// (1, 0): it sees nothing, and its indices stay in bounds.
+// rounding errors (low parts) of pose. pose_status, which the caller clears, becomes 1 at index 0 if a pose is not
+// finite, and at index 1 if a sensor is outside the window. A non-finite pose becomes the farthest cell, fraction 0 and
+// heading (1, 0): it sees nothing, and its indices stay in bounds.
 void place_pose(const int particle, global const coordinate *poses, global int2 *pose_cell, global real4 *pose,
                 global real4 *pose_low, global int *pose_status, const Frame frame, const Window window) {
     const long first = 3 * (long)particle;

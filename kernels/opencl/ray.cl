@@ -61,8 +61,8 @@ Ray make_ray(const real4 pose, const real2 ray) {
 // Return k of a count.
 int whole(const real count) { return (int)((uint)as_bits(count) - FIRST); }
 
-// Count the boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or with until also those at t. The
-// coordinate at t, rounded to nearest, is the only boundary that can be in doubt.
+// Count the boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or with ``until`` at most t. Only the
+// boundary nearest to the coordinate at t can be in doubt.
 real crossed(const real t, const real speed, const real a, const real inv, const int until) {
     const real place = (t * speed - a) + COUNT, count = place > COUNT ? place : COUNT;
     const real here = ((count - COUNT) + a) * inv;
@@ -112,7 +112,8 @@ int angle_bin(const real2 direction, const int bins) {
     return bin >= bins ? bin - bins : bin;
 }
 
-// Convert a distance in cells to metres, exactly range_max where nothing is nearer, or met with AMCL_LINES.
+// Convert a distance in cells to metres, exactly range_max where nothing is nearer, or with AMCL_LINES where nothing is
+// met.
 real expected_range(const real t, const RangeScale scale) {
     const real range = t * scale.resolution;
 #if AMCL_LINES

@@ -1,7 +1,7 @@
 // Counts of hits and misses of cells, of which the log-odds of an occupancy grid are sums (book section 9.2). Start and
-// end of a ray are cells and places inside them in units of 1/4096 cell, and the walk from cell to cell compares
-// products of integers, so that all backends visit the same cells. A ray misses each cell that it leaves. Its last cell
-// is hit where the ray ends at an obstacle, and missed otherwise. A tie, the ray through a corner, steps in x first.
+// end of a ray are cells with offsets in units of 1/4096 cell, and the walk from cell to cell compares products of
+// integers, so that all backends visit the same cells. A ray misses each cell that it leaves. Its last cell is hit
+// where the ray ends at an obstacle, and missed otherwise. A ray through a corner (a tie) steps in x first.
 
 // Fraction bits of a coordinate.
 #define BITS 12
@@ -12,12 +12,12 @@ int to_boundary(const int inside, const int step) {
     return step > 0 ? UNIT - inside : inside;
 }
 
-// Return whether a walk has left an axis of some cells, to which it does not return.
+// Return whether a walk has left the extent of an axis for good.
 bool has_left(const int cell, const int step, const int cells) {
     return step > 0 ? cell >= cells : cell < 0;
 }
 
-// Return how many boundaries of an axis a ray crosses before it has come as far as another boundary on the other axis.
+// Return the number of boundaries of an axis that a ray crosses before a boundary of the other axis.
 // Products of lengths fit in 64 bits, since rays span at most 2^19 cells.
 long crossed_before(const int first, const long size, const long reached, const long other, const int ties) {
     const long room = reached * size - first * other - (1 - ties);
@@ -36,7 +36,7 @@ kernel void count_rays(ARGUMENTS) {
     const long size_x = step_x * span_x, size_y = step_y * span_y;
     int left_x = step_x * across.x, left_y = step_y * across.y;
     const int first_x = to_boundary(begin.x, step_x), first_y = to_boundary(begin.y, step_y);
-    // The steps that bring the walk to the grid's columns and rows are not taken one by one.
+    // Skip the steps that bring the walk to the grid's columns and rows.
     const int need_x = max(step_x > 0 ? -col : col - (cols - 1), 0);
     const int need_y = max(step_y > 0 ? -row : row - (rows - 1), 0);
     if (need_x > left_x || need_y > left_y) return;
@@ -49,7 +49,7 @@ kernel void count_rays(ARGUMENTS) {
     }
     col += step_x * (int)done_x, row += step_y * (int)done_y;
     left_x -= (int)done_x, left_y -= (int)done_y;
-    // Negative where the next boundary is one in x.
+    // Negative where the next boundary lies in x.
     long lead = (first_x + done_x * UNIT) * size_y - (first_y + done_y * UNIT) * size_x;
     while (!has_left(col, step_x, cols) && !has_left(row, step_y, rows)) {
         const bool at_end = left_x + left_y == 0;

@@ -15,8 +15,8 @@ typedef ushort entry;
 #endif
 #endif
 
-// Return the sector of a direction within its quadrant, from flat to steep. A wrong sector would cost steps, not change
-// the result.
+// Return the sector of a direction within its quadrant, from flat to steep. A wrong sector would cost steps, but not
+// change the result.
 int sector_of(const real speed_x, const real speed_y) {
 #if SECTORS_4
     const int steep = speed_y > speed_x;

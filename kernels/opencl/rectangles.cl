@@ -1,11 +1,12 @@
 // Empty rectangles: for each cell and each sector of directions, width and height of a rectangle of free cells that has
 // the cell at its corner and extends in that direction. Both are at most 255, stored as width + 256 height. A ray may
 // cross the rectangle in one step without missing an obstacle. Of all such rectangles it is the one in which the ray in
-// the middle of the sector stays longest. After anisotropic Chebyshev distance maps (Deakin and Knackstedt 2020), which
-// have squares. Planes are padded by a ring of zeros, so a walk that leaves the grid stops. Quadrant q extends to (+x,
-// +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from flat to steep, with a plane for
-// each. Planes have one row after the other, or groups of rows: a group has the cells of its first column, then those
-// of the next one, so that cells above one another lie as close together as those beside one another.
+// the middle of the sector stays longest. The idea follows the anisotropic Chebyshev distance maps of Deakin and
+// Knackstedt (2020), which have squares. Planes are padded by a ring of zeros, so a walk that leaves the grid stops.
+// Quadrant q extends to (+x, +y), (-x, +y), (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from flat
+// to steep, with a plane for each. Planes store rows one after the other, or in groups: a group has the cells of its
+// first column, then those of the next column, so that cells above one another lie as close together as cells beside
+// one another.
 //
 // Planes can be updated after a change of the cells in rows [top, bottom) and columns [left, right) of the map: only
 // cells whose rectangles can contain one of these are computed. For new planes all cells have changed. The input has a
@@ -123,7 +124,7 @@ kernel void rectangles_scan(ARGUMENTS) {
     int width = LONGEST, sector = 0, height = 1;
     int2 middle = slope(sectors, 0);
     while (sector < sectors) {
-        // While no sector can end, read four rows between two decisions, so that reads need not wait for one another.
+        // While no sector can end, read four rows between two decisions, so that reads do not wait for each other.
         if (height + 3 <= room) {
             global const uchar *next = run + (height - 1) * step;
             const int four = min(min((int)next[0], (int)next[step]), min((int)next[2 * step], (int)next[3 * step]));

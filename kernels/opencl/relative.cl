@@ -1,6 +1,5 @@
 // Poses relative to a point and headings relative to an angle, in float64 as sums of two numbers, rounded at the end.
-// The difference of large coordinates, or of many turns, is small, and small numbers keep their digits in any
-// precision.
+// Differences of large coordinates or of many turns are small, and small numbers keep their digits in any precision.
 // requires: heading
 
 #if POSES_FLOAT32
@@ -42,7 +41,7 @@ real2 rounded_place(const double2 at) {
 }
 
 // Place sensors relative to an origin: x, its low part, y, its low part. One work-item takes a particle. pose_status,
-// which the caller clears, becomes 1 at (0) if a pose is not finite; its place is the origin.
+// which the caller clears, becomes 1 at index 0 if a pose is not finite; its place is the origin.
 kernel void place_relative(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;

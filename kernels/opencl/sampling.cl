@@ -1,14 +1,15 @@
-// Readings drawn from the beam model, or from a table of a sensor, given their expected ranges.
-// Thrun, Burgard and Fox, "Probabilistic Robotics" (2005), section 6.3.1: a component is drawn by its weight, and a
-// reading by inverting the component's distribution function. p_hit's is the normal on both sides of its mean, each
-// with the mass that lies within [0, range_max]. Masses are sums of positive terms: x phi(x) (1 + x^2 / 3 + x^4 / 15 +
-// ...), and beyond SERIES_END one half less the continued fraction of Laplace. Quantiles are those of Wichura,
-// "Algorithm AS 241" (1988). p_short's is 1 - u (1 - exp(-lambda z*)), written as a sum of positive terms, or a series
-// where lambda z* is small. All of it is float64 of +, -, *, / and sqrt, so that every device draws the same bits.
-// Other shapes of hits than the normal (MASS_TABLE) have a table of masses and one of quantiles: cells of equal width in
-// log(1 + b), b = u / sqrt 2, and in -log(1 - 2 mass), with the numbers of a polynomial in the share of the cell.
-// mixture = (z_hit, z_short, z_max, z_rand, sigma_hit, sigma_growth, range_bias, lambda_short, place of the tables) of each
-// bin of angles of incidence, and then the tables. chances = for each bin of expected ranges, the cumulative probabilities of the bins of readings.
+// Readings drawn from the beam model, or from a table of a sensor, given their expected ranges. Thrun, Burgard and Fox,
+// "Probabilistic Robotics" (2005), section 6.3.1: a component is drawn by its weight, and a reading by inverting the
+// component's distribution function. For p_hit it is the normal on both sides of its mean, each with its mass on [0,
+// range_max]. Masses are sums of positive terms: x phi(x) (1 + x^2 / 3 + x^4 / 15 + ...), and beyond SERIES_END one
+// half less the continued fraction of Laplace. Quantiles are those of Wichura, "Algorithm AS 241" (1988). For p_short
+// it is 1 - u (1 - exp(-lambda z*)), written as a sum of positive terms, or as a series where lambda z* is small.
+// Everything is computed in float64 by +, -, *, / and sqrt, so that every device draws the same bits. Other shapes of
+// hits than the normal (MASS_TABLE) have a table of masses and one of quantiles: cells of equal width in log(1 + b), b
+// = u / sqrt 2, and in -log(1 - 2 mass), with the coefficients of a polynomial in the position within the cell. mixture
+// = (z_hit, z_short, z_max, z_rand, sigma_hit, sigma_growth, range_bias, lambda_short, place of the tables) of each bin
+// of angles of incidence, and then the tables. chances = for each bin of expected ranges, the cumulative probabilities
+// of the bins of readings.
 // requires: philox sensor_table
 
 #define READING_STREAM 1073741824u
@@ -70,7 +71,7 @@ constant double OUTERMOST_UNDER[8] = {
 // Below this lambda z* the distribution of p_short is a series.
 #define SHORT_SERIES 1e-4
 
-// Return a number in (0, 1) from two words: the centre of one of 2^52 intervals.
+// Return numbers in (0, 1) from two words, the centres of 2^52 intervals.
 double fine_uniform(const uint high, const uint low) {
     return (((double)high * HALF_WORD + (double)(low >> 12)) + 0.5) * FINE;
 }
@@ -178,7 +179,7 @@ double reading_of(const double u, const double v, const double expected, global 
     return mark < third ? (double)INFINITY : v * range_max;
 }
 
-// Return a reading drawn from a table: uniform in a bin that is drawn, away from its ends by a margin of the bin.
+// Return a reading drawn from a table: uniform in a drawn bin, at a margin from the bin's ends.
 double cell_reading_of(const double u, const double v, const int column, global const double *chances, const int cells,
                        const double range_max, const double margin) {
     global const double *row = chances + (long)column * (cells + 1);
@@ -196,8 +197,8 @@ double cell_reading_of(const double u, const double v, const int column, global 
     return ((double)low + (margin + v * (1.0 - 2.0 * margin))) * (range_max / (double)cells);
 }
 
-// Replace expected ranges by readings; incidence holds cosines, and edges those between bins. One work-item takes a
-// particle and ray.
+// Replace expected ranges by readings; incidence holds cosines, and edges the cosines between bins. One work-item takes
+// a particle and ray.
 kernel void draw_readings(ARGUMENTS) {
     const int k = get_global_id(0), i = get_global_id(1);
     if (k >= rays || i >= particles) return;

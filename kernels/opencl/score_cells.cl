@@ -1,6 +1,6 @@
-// Cells of tables of scores, which lie one behind the other, each with a margin of cells beyond the map around it.
+// Cells of consecutive tables of scores, each with a margin of cells around the map.
 
-// Columns of a run that a kernel in vectors reads at once; the margin holds one.
+// Columns of a run that a kernel in lanes reads at once; the margin holds one run.
 #define RUN 16
 
 // Return the rows of a table with its margin.

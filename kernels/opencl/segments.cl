@@ -10,11 +10,11 @@
 // Passes of merging and of moving ends; Gauss-Newton steps of a line.
 #define PASSES 2
 #define STEPS 5
-// A segment whose cost per point is larger is split where that is best, even if one split alone does not pay.
+// A segment with a larger cost per point is split at its best point, even if a single split does not pay.
 #define POOR ((real)3)
 // Rows are parallel up to this.
 #define PARALLEL ((real)1e-6)
-// Splits that lower the cost equally but for this share of it, more than float32 rounds, are tied: the first counts.
+// Splits whose costs differ by less than this share, which exceeds float32 rounding, are tied: the first counts.
 #define TIED ((real)3e-7)
 #define LINE_NUMBERS 6
 
@@ -67,8 +67,8 @@ real cost_of(global const real4 *point, const int first, const int last, const r
     return rows.cost;
 }
 
-// Return the first point of the second of two lines that lower the cost most, by how much, and the whole cost. The point
-// is -1 if no split can lower the cost by penalty.
+// Return the first point of the second line of the best split, by how much it lowers the cost, and the unsplit cost.
+// The point is -1 if no split can lower the cost by penalty.
 int best_split(global const real4 *point, const int first, const int last, global real *cost, const real sigma,
                const real penalty, real *gain, real *total) {
     Rows rows = {0, 0, 0, 0, 0, 0};
@@ -123,7 +123,7 @@ void split_scan(global const real4 *point, const int first, const int last, glob
     }
 }
 
-// Merge neighbours of which a single line costs less than penalty more.
+// Merge neighbours that a single line fits at an extra cost below penalty.
 void merge_segments(global const real4 *point, const int first, const int last, global int *stop, const real sigma,
                     const real penalty, const real gap) {
     int i = first;

@@ -1,7 +1,7 @@
-// The ladder of temperatures of a correction, and the state of its stages: b_k = d b / 2^k, where b is what earlier
-// stages have left. See weighing.cl.
-// The depth d is 1. Where the last rung leaves too few particles, the host weighs the stage again with a lower one.
-// Recovery: augmented MCL, "Probabilistic Robotics" table 8.3, with the mean likelihood per beam.
+// The ladder of temperatures of a correction, and the state of its stages: b_k = d b / 2^k, where b is the part of the
+// temperature that is left. See weighing.cl. The depth d is 1. If the last rung leaves too few particles, the host
+// repeats the stage with a smaller d. Recovery: augmented MCL, "Probabilistic Robotics" table 8.3, with the mean
+// likelihood per beam.
 // requires: elementary
 
 #define SHARE 19

@@ -1,9 +1,9 @@
 // Weights of particles from the log-likelihoods of sensors, at the highest temperature that leaves enough particles.
 // w_k = v exp(b_k (l - max l)), where v is the weight before, l the sum over sensors of temperature times log p, and
-// b_k = d b / 2^k a ladder of depth d. The first rung with an effective sample size (sum w)^2 / sum w^2 of at least
-// SHARE of that before is taken; what is left of b belongs to the next stage of the correction (annealing: Neal,
-// "Annealed importance sampling", 2001). Weights are rounded to integers below 2^53 / N, so that sums of them are exact
-// in any order.
+// b_k = d b / 2^k a ladder of depth d. The first rung whose effective sample size (sum w)^2 / sum w^2 is at least SHARE
+// of the previous one is taken; the rest of b is left to the next stage of the correction (annealing: Neal, "Annealed
+// importance sampling", 2001). Weights are rounded to integers below 2^53 / N, so that their sums are exact in any
+// order.
 // requires: tempering
 
 // Rows that a work-item reads before it adds any up.
@@ -26,7 +26,7 @@ kernel void add_scores(ARGUMENTS) {
     largest[b] = high;
 }
 
-// Find the largest score of each fan blocks: one work-item takes a group of blocks.
+// Find the largest score of every fan blocks: one work-item takes a group of blocks.
 kernel void join_scores(ARGUMENTS) {
     const int g = get_global_id(0), begin = g * fan;
     if (begin >= blocks) return;
@@ -61,7 +61,7 @@ kernel void weigh_particles(ARGUMENTS) {
     if (b == 0) highest[0] = high;
 }
 
-// Add up each fan rows of sums, one after the other; a row becomes the sum of those before it in its group: one work-item
+// Add up every fan rows of sums in order; a row becomes the sum of the rows before it in its group: one work-item
 // takes a column of a group.
 kernel void join_rows(ARGUMENTS) {
     const int i = get_global_id(0), begin = i / columns * fan, end = min(begin + fan, rows);

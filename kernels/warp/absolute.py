@@ -1,7 +1,7 @@
-"""Densities of sensors that know where they are: a position in the plane, and a heading.
+"""Densities of absolute sensors, which measure a position in the plane or a heading.
 
-A position is normal around the truth. A heading is wrapped normal, sum_k N(r + 2 pi k; 0, sigma): computed up to sigma
-= 1.5 by its largest terms, beyond that by its Fourier series (1 + 2 sum_n q^(n n) cos n r) / (2 pi) with q =
+A position is normal around the truth. A heading is wrapped normal, sum_k N(r + 2 pi k; 0, sigma): computed by its
+largest terms up to sigma = 1.5, and beyond that by its Fourier series (1 + 2 sum_n q^(n n) cos n r) / (2 pi) with q =
 exp(-sigma^2 / 2). Or a heading is von Mises, exp(kappa cos r) / (2 pi I0(kappa)) with kappa cos r = kappa - 2 kappa
 sin^2(r / 2). Mardia and Jupp, *Directional Statistics* (2000), section 3.5. z_rand is the weight of a uniform density
 (RAND).
@@ -55,7 +55,7 @@ def make(name, flags):
         series = S0 + z * (S1 + z * (S2 + z * (S3 + z * (S4 + z * higher))))
         return two_sum(x, HALF * residual.y + x * (z * series))
 
-    # Return the log of the sum over all turns over the normal of the nearest turn.
+    # Return the log of the ratio of the sum over all turns to the normal of the nearest turn.
     @wp.func
     def log_other_turns(residual: vec2, decay: real):
         size = wp.abs(residual.x)
@@ -75,7 +75,7 @@ def make(name, flags):
             k += 1
         return log_one_plus(others)
 
-    # Return the log of the Fourier series over its first term, by Clenshaw's recurrence.
+    # Return the log of the ratio of the Fourier series to its first term, by Clenshaw's recurrence.
     @wp.func
     def log_waves(residual: vec2, terms: wp.array(dtype=real)):
         sine = half_sine(residual)

@@ -39,13 +39,13 @@ def make(name, flags):
     pair_sum, pair_product = exact.pair_sum, exact.pair_product
     bounded_square, either = logs.bounded_square, logs.either
     ZERO, HALF, ONE = real(0.0), real(0.5), real(1.0)
-    # From here on an arc is a quarter turn to the last bit; the square of its tangent is still finite.
+    # From this tangent on an arc is a quarter turn to the last bit; the tangent's square is still finite.
     STEEPEST = real(1e18)
     # From here on the error function is 1 to the last bit.
     ERF_ONE = real(6.0 if "FLOAT64" in flags else 4.0)
     RAND = "RAND" in flags
 
-    # Return the log of a truncated normal; near and far are the distances of its mean from the ends.
+    # Return the log of a truncated normal; near and far are the distances from its mean to the ends.
     @wp.func
     def log_normal(residual: vec2, near: real, far: real, terms: wp.array(dtype=real), first: wp.int32, peak: wp.int32):
         scale = terms[first]

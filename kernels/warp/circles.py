@@ -100,7 +100,7 @@ def functions(flags):
             guess = vec3(mean_x + a, mean_y + b, wp.sqrt(a * a + b * b + total / real(mine.count)))
         return guess
 
-    # Return -1 where beams meet the near side of a circle, as that of a pole, and 1 for the far side.
+    # Return -1 where beams meet the near side of a circle, as at a pole, and 1 for the far side.
     @wp.func
     def side_of(point: wp.array(dtype=vec4), mine: Part, guess: vec3):
         beyond = real(0.0)
@@ -134,7 +134,8 @@ def functions(flags):
         )  # fmt: skip
 
     # Return the cost of a circle, its gradient and its information. Beams meet its near side (-1) or its far side (1);
-    # those that pass it by are compared with their nearest place. Radial errors are distances from the circle.
+    # a beam that passes the circle is compared with its nearest point to it. Radial errors are distances from the
+    # circle.
     @wp.func
     def circle_sums(point: wp.array(dtype=vec4), mine: Part, side: real, circle: vec3, radial: wp.int32):
         sums = sums10()

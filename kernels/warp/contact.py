@@ -14,8 +14,8 @@ from . import end_point, error_free, log_terms
 from .prelude import kernel, precision
 
 NO_OBSTACLE = wp.constant(0x7FFFFFFF)
-# 1 / (sigma sqrt 2), the gap of touching centres, the cell's side; logs of p_contact and p_false, and of 1 minus each
-# of them.
+# 1 / (sigma sqrt 2), the gap of touching centres, the cell's side; logs of p_contact and p_false; logs of 1 - p_contact
+# and 1 - p_false.
 SCALE, SCALE_LOW, REACH, REACH_LOW = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
 SIDE, SIDE_LOW, HIT_TERM, FALSE_TERM = wp.constant(4), wp.constant(5), wp.constant(6), wp.constant(7)
 MISS_TERM, NO_HIT_TERM = wp.constant(8), wp.constant(9)

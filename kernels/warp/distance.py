@@ -92,7 +92,7 @@ def distance_envelope(along, starts, squared, lines, length, line_stride, step):
 FAR = wp.constant(46341)
 BLOCK_BITS = wp.constant(5)
 BLOCK_ROWS = wp.constant(32)
-# Rows read between two decisions, so that reads need not wait for one another.
+# Rows read between two decisions, so that reads do not wait for each other.
 STEP_ROWS = wp.constant(4)
 
 

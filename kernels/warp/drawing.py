@@ -1,11 +1,11 @@
 """Resampling of particles from exact cumulative weights, with jitter between stages and injected poses.
 
 Systematic resampling draws at (n + u) / N of the total, stratified resampling at (n + u_n) / N: *Probabilistic
-Robotics* table 4.4, and Kitagawa (1996). Residual resampling copies each particle as often as the whole part of its
-expected number says, and draws the rest by the residual weights (Liu and Chen 1998). Between two stages of a
-correction a drawn pose moves by a fraction of the difference of two others, whose spread is that of the cloud
-(differential evolution: ter Braak 2006); differences between separate clusters are shortened. Injected poses come from
-a pool: free cells, or the modes of a likelihood map.
+Robotics* table 4.4, and Kitagawa (1996). Residual resampling copies each particle by the integer part of its expected
+number of copies, and draws the rest by the residual weights (Liu and Chen 1998). Between two stages of a correction a
+drawn pose moves by a fraction of the difference between two other poses, so that moves scale with the spread of the
+cloud (differential evolution: ter Braak 2006); differences between separate clusters are shortened. Injected poses come
+from a pool: free cells, or the modes of a likelihood map.
 """
 
 import functools
@@ -28,7 +28,7 @@ def make(name, flags):
     copy_particle, draw_particle = of.copy_particle, of.draw_particle
     copies_of, found_residual = of.copies_of, of.found_residual
 
-    # Count the certain copies of a block; the other columns are 0: one work-item takes a block.
+    # Count the deterministic copies of a block; the other columns are 0: one work-item takes a block.
     @kernel(flags)
     def count_copies(ends, state, sums, particles, block, blocks, drawn, stage):
         b = wp.tid()
@@ -43,7 +43,7 @@ def make(name, flags):
         for k in range(1, WEIGHT_SUMS):
             sums[b * WEIGHT_SUMS + k] = ZERO
 
-    # Set the cumulative numbers of certain copies: one work-item takes a block.
+    # Set the cumulative numbers of deterministic copies: one work-item takes a block.
     @kernel(flags)
     def set_copies(ends, state, sums, joined, copies, particles, block, blocks, fan, drawn, stage):
         b = wp.tid()

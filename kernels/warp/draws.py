@@ -37,7 +37,7 @@ def functions(flags):
                 low = middle + 1
         return low
 
-    # Return the copies that residual resampling makes for certain: the whole part of the expected number.
+    # Return the deterministic copies of residual resampling: the integer part of the expected number of copies.
     @wp.func
     def copies_of(ends: wp.array(dtype=wp.float64), total: wp.float64, drawn: wp.int32, n: wp.int32):
         weight = ends[n]
@@ -70,7 +70,7 @@ def functions(flags):
                 low = middle + 1
         return low
 
-    # Return the mark at a fraction of the total, below the total.
+    # Return the mark at a fraction of the total, clamped to below the total.
     @wp.func
     def mark_of(fraction: wp.float64, total: wp.float64):
         return wp.min(wp.floor(fraction * total), total - ONE)
@@ -111,7 +111,7 @@ def functions(flags):
         step = wp.uint32(settings[STEP])
         return random_words(index, step, of_stage, wp.uint32(settings[SEED]), wp.uint32(settings[SEED + 1]))
 
-    # Return the random number of a draw's mark; that of index 0 serves all draws of systematic resampling.
+    # Return the random number of a draw's mark; systematic resampling uses the number of index 0 for all draws.
     @wp.func
     def start_of(settings: wp.array(dtype=wp.float64), stage: wp.int32, index: wp.uint32):
         words = words_of(settings, stage, index, 0)

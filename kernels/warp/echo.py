@@ -36,8 +36,8 @@ def functions(flags):
     ZERO, ONE, TWO = real(0.0), real(1.0), real(2.0)
     NOWHERE = real(math.nan)
 
-    # Distance in cells, and cosine and sine of the angle of incidence. Without a return these are limit, 2 and 0: 2 is
-    # more than any cosine, so that the first bin can be for such beams alone.
+    # Distance in cells, and cosine and sine of the angle of incidence. Without a return these are limit, 2 and 0: 2
+    # exceeds every cosine, so that the first bin can be for such beams alone.
     @wp.struct
     class Echo:
         t: real

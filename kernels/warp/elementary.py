@@ -9,7 +9,7 @@ import warp as wp
 
 LOG2_HIGH, LOG2_LOW = wp.constant(wp.float64(0.6931471803691238)), wp.constant(wp.float64(1.9082149292705877e-10))
 INVERSE_LOG2 = wp.constant(wp.float64(1.4426950408889634))
-# 1.5 * 2^52: a sum with it is rounded to an integer.
+# 1.5 * 2^52: adding it rounds to an integer.
 ROUNDER = wp.constant(wp.float64(6755399441055744.0))
 # Below this exponent the result is 0.
 LEAST_EXPONENT = wp.constant(wp.float64(-700.0))

@@ -1,7 +1,7 @@
 """The cell of the likelihood field's table in which a beam's end point lies, and the point's place within that cell.
 
 Cells must be the same on every device and in every precision: an end point nearer to an edge than guard, the bound of
-its rounding errors, is computed again with twice the digits.
+its rounding errors, is recomputed with twice the digits.
 """
 
 import functools
@@ -89,7 +89,7 @@ def functions(flags):
 
     # Return the end point of a beam. point is the reading times the beam's (cos, sin), in cells; shift moves cell
     # centres onto corners. An end point nearer to a cell's edge than guard, the bound of its rounding errors, is
-    # computed again with twice the digits.
+    # recomputed with twice the digits.
     @wp.func
     def end_point(pose: vec4, pose_low: vec4, point: vec2, point_low: vec2, shift: real, guard: real):
         end = EndPoint()

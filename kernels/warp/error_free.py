@@ -1,4 +1,4 @@
-"""Error-free transformations: the rounding error of an operation is kept in a second number.
+"""Error-free transformations: a second number holds the rounding error of an operation.
 
 Source: Knuth (two_sum), Dekker and Veltkamp (two_product). They need fuse_fp and fast_math off.
 """
@@ -34,19 +34,19 @@ def functions(flags):
         shift = total - a
         return vec2(total, (a - (total - shift)) + (b - shift))
 
-    # Return a + b = sum.x + sum.y exactly, where a has no smaller exponent than b: Dekker's sum.
+    # Return a + b = sum.x + sum.y exactly, where a's exponent is at least b's: Dekker's sum.
     @wp.func
     def ordered_sum(a: real, b: real):
         total = a + b
         return vec2(total, b - (total - a))
 
-    # Return the leading bits of a float, few enough that a product of two such halves is exact.
+    # Return the leading bits of a float, so few that the product of two such halves is exact.
     @wp.func
     def high_half(a: real):
         scaled = SPLITTER * a
         return scaled - (scaled - a)
 
-    # Return a * b = product.x + product.y exactly, short of overflow and underflow: by a fused multiply-add where the
+    # Return a * b = product.x + product.y exactly, barring overflow and underflow: by a fused multiply-add where the
     # device has one.
     @wp.func
     def two_product(a: real, b: real):
@@ -61,7 +61,7 @@ def functions(flags):
         return vec2(product, error)
 
     # Add two numbers of two parts each, to about twice the working precision. Where the first parts cancel, their sum
-    # still is no smaller than the last bit of either, so it has no smaller exponent than the second parts.
+    # is at least the last bit of either, so its exponent is at least that of the second parts.
     @wp.func
     def pair_sum(a: vec2, b: vec2):
         total = two_sum(a.x, b.x)

@@ -1,9 +1,9 @@
 """Weighted mean, circular in the heading, and covariance of a cloud of particles.
 
-Sums are relative to the first particle. While no heading is farther than a right angle from the first one, covariances
-follow from them; otherwise a second pass is relative to the mean. Mardia and Jupp, *Directional Statistics*
-(2000), section 2.2. In a block of particles every eighth one belongs to a lane; the lanes are summed in the order of
-their particles, and then added one after the other.
+Sums are relative to the first particle. If no heading is more than a right angle from the first particle's, covariances
+follow from these sums; otherwise a second pass is relative to the mean. Mardia and Jupp, *Directional Statistics*
+(2000), section 2.2. In a block, every eighth particle belongs to the same lane; each lane is summed in the order of its
+particles, and the lanes are then added in order.
 """
 
 import functools
@@ -70,8 +70,8 @@ def make(name, flags):
         for k in range(13):
             sums[i * ESTIMATE_SUMS + k] = total[k]
 
-    # Write the mean pose and the covariance about it from the sums of all groups, and whether headings ask for a
-    # second pass; that pass writes the covariance only. One work-item takes all.
+    # Write the mean pose and the covariance about it from the sums of all groups, and whether headings require a second
+    # pass; that pass writes the covariance only. One work-item takes all.
     @kernel(flags)
     def finish_estimate(poses, sums, estimate, groups, second_pass):
         i = wp.tid()

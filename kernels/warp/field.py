@@ -1,6 +1,6 @@
 """Likelihood field of a whole scan (book table 6.3): one look-up at each beam's end point.
 
-The table is padded by a ring of two cells for everything outside the grid, so no look-up needs a bounds test. It has
+A ring of two cells around the table stands for everything outside the grid, so no look-up needs a bounds test. It has
 fewer than 2^31 cells, and a launch fewer than 2^31 parts, so indices fit int32.
 """
 
@@ -41,9 +41,9 @@ def make(name, flags):
     two_at = reader(vec2, 2)
     block_cells = wp.types.vector(length=BLOCK_TERMS, dtype=wp.int32)
 
-    # Fill width x height cells of the table, the first of them at begin, from squared distances: density has a value
-    # for each squared distance up to the cap. The first cell is (from_col, from_row) of the grid; cells outside the
-    # grid get beyond.
+    # Fill width x height cells of the table from squared distances: density has a value for each squared distance up to
+    # the cap. The cells begin at index begin of the table and at cell (from_col, from_row) of the grid; cells outside
+    # the grid get beyond.
     @kernel(flags)
     def fill_field(squared, density, table, rows, cols, cap, beyond, from_col, from_row, width, height, begin, stride):
         j, i = wp.tid()

@@ -56,7 +56,7 @@ def functions(flags):
         high = between(end.to_next_x, c, end.rest_x, d)
         return between(end.to_next_y, low, end.rest_y, high)
 
-    # Return the exponent of a normal in two parts: where the peak is high, exponent and log peak nearly cancel.
+    # Return the exponent of a normal in two parts, since for a high peak exponent and log peak nearly cancel.
     # terms[8] = {hit, 1 / (2 sigma^2), rand, log z_max, the low parts of terms 0 and 1, two numbers of the shape of a
     # hit}. hit is the peak of its density, z_hit / (sigma sqrt(2 pi)) for a normal, and rand is z_rand / range_max, or
     # their logarithms in the log domain.

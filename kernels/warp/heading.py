@@ -1,9 +1,9 @@
 """Cosine and sine of a heading in float64 with +, - and * alone, so that every device gives the same bits.
 
 A heading is reduced to r + low, |r| <= pi/4, and a count of quarter turns modulo 4: up to 2^20 rad by subtracting the
-count times pi/2 in four parts (Cody and Waite), beyond that by the product with the bits of 2/pi that matter, in
-integers (Payne and Hanek). Then sin r = r + r z S(z) and cos r = 1 - z/2 + z^2 C(z) with z = r^2.
-``bench/derive/heading_constants.py`` derives the constants.
+count times pi/2 in four parts (Cody and Waite), beyond that by an integer product with the relevant bits of 2/pi (Payne
+and Hanek). Then sin r = r + r z S(z) and cos r = 1 - z/2 + z^2 C(z) with z = r^2. ``bench/derive/heading_constants.py``
+derives the constants.
 """
 
 import functools
@@ -16,7 +16,7 @@ from . import error_free
 # Up to this heading the counts of quarter turns have 20 bits.
 LARGEST_HEADING = wp.constant(wp.float64(1048576.0))
 TWO_OVER_PI = wp.constant(wp.float64(0.6366197723675814))
-# 1.5 * 2^52: a sum with it is rounded to an integer.
+# 1.5 * 2^52: adding it rounds to an integer.
 ROUNDER = wp.constant(wp.float64(6755399441055744.0))
 # pi/2 in three parts of 33 bits and a rounded one, and as the sum of two rounded numbers.
 QUARTER_1 = wp.constant(wp.float64(1.5707963267341256))
@@ -82,12 +82,12 @@ def functions(flags):
         mantissa = (bits & MASK_52) | ONE_52
         low_half = mantissa & MASK_32
         high_half = mantissa >> wp.uint64(32)
-        # Bits of 2/pi that make whole turns are left out: times the last bit of the mantissa, the window's first bit is
-        # half a turn.
+        # Bits of 2/pi that contribute whole turns are left out: the window's first bit times the last bit of the
+        # mantissa is half a turn.
         first = int(bits >> wp.uint64(52)) - (1075 - 62)
         word = first >> 5
         shift = wp.uint64(first & 31)
-        # turns = mantissa * window modulo 2^192, of which the upper four words stay.
+        # turns = mantissa * window modulo 2^192, of which the upper four words are kept.
         turn_1 = wp.uint64(0)
         turn_2 = wp.uint64(0)
         turn_3 = wp.uint64(0)
@@ -124,7 +124,7 @@ def functions(flags):
         back = theta < ZERO
         return wp.where(back, -quadrant, quadrant) & 3, wp.where(back, wp.vec2d(-angle.x, -angle.y), angle)
 
-    # Return (cosine, sine) of a heading; for a heading that is not finite they have no meaning but are not NaN.
+    # Return (cosine, sine) of a heading; for a heading that is not finite they are meaningless, but not NaN.
     @wp.func
     def cos_sin(theta: wp.float64):
         quadrant = int(0)

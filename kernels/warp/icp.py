@@ -1,7 +1,7 @@
 """Scan matching by point-to-line ICP.
 
-The nearest point is exact: the points of a scan are sorted by bearing, and a search from the bearing of a place
-outwards ends where no point farther in bearing can be nearer.
+The nearest point is exact: the points of a scan are sorted by bearing, and a search outwards from the bearing of a
+place ends where no point farther in bearing can be nearer.
 
 Lines: see lines.py, and Censi (2008), "An ICP variant using a point-to-line metric". Weights: Cauchy's while the scale
 shrinks, then Geman and McClure's, (1 / (1 + (e / c)^2))^2.
@@ -16,10 +16,10 @@ from . import icp_step
 from .icp_step import MATCH_BLOCKS
 from .prelude import kernel, precision, work_item
 
-# Numbers of a result: pose (3), score, iterations, whether the last step was below ten tolerances, information (6),
-# and its part that is due to errors of the lines (6), pairs, sum of weights, weighted sum of squared errors, points
-# that the other scan should see, points that contradict it, points that it did not see, and for blocks of 1, 2, 4 to
-# 128 successive points the sum of squares of the blocks' sums of weighted errors (8), 0 with thin; the last step (3).
+# Numbers of a result: pose (3), score, iterations, whether the last step was below ten tolerances, information (6), and
+# its part that is due to errors of the lines (6), pairs, sum of weights, weighted sum of squared errors, points that
+# the other scan should see, points through which it saw, points that it did not see, and for blocks of 1, 2, 4 to 128
+# successive points the sum of squares of the blocks' sums of weighted errors (8), 0 with thin; the last step (3).
 MATCH_RESULT = wp.constant(35)
 
 
@@ -116,8 +116,8 @@ def functions(flags):
         return sums, weight * error
 
     # Return how well every stride-th point of one scan agrees with every skip-th point of another scan: sum of
-    # agreements, points that the other scan should see, points that contradict it because it saw through them, and
-    # points that it did not see. pose is (x, y, cos, sin).
+    # agreements, points that the other scan should see, points through which it saw, and points that it did not see.
+    # pose is (x, y, cos, sin).
     @wp.func
     def agreement(
         point: wp.array(dtype=vec4),
@@ -175,7 +175,7 @@ def make(name, flags):
     Blocks, add_to_blocks, close_blocks = step.Blocks, step.add_to_blocks, step.close_blocks
     ZERO, ONE, HALF = real(0.0), real(1.0), real(0.5)
     TENTH, TEN, LARGEST_TURN, QUIET_TURN = real(0.1), real(10.0), real(0.3), real(0.03)
-    # Weight in the score of a point that the other scan did not see; one that disagrees has 1.
+    # Weight in the score of a point that the other scan did not see; a point that disagrees has weight 1.
     UNSEEN = real(0.13)
 
     # Match scans: one work-item takes a pair (reference, second scan) and a guess (x, y, theta), the pose of the second

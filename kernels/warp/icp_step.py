@@ -1,4 +1,4 @@
-"""Steps of point-to-line ICP that bodies of one place and of several at once share: places among the bearings of a
+"""Steps of point-to-line ICP that scalar bodies and bodies in lanes share: places among the bearings of a
 scan, the normal equations, and sums of blocks of points.
 
 Blocks: Flyvbjerg and Petersen (1989), "Error estimates on averages of correlated data".
@@ -37,8 +37,8 @@ def functions(flags):
             bearing += FULL_TURN
         return bearing
 
-    # Return the number of points of a scan whose bearing is less than a bearing: walk from a guess, which for
-    # neighbours is the number of the one before, but for a full turn.
+    # Return the number of points of a scan with a smaller bearing: walk from a guess, which for neighbours is the
+    # previous number, up to a full turn.
     @wp.func
     def points_before(point: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, bearing: real, guess: wp.int32):
         i = int(guess)

@@ -1,8 +1,8 @@
 """Search for the landmarks near the end point of a feature, book table 6.5.
 
 Landmarks lie in square buckets, row by row; start[i] is the first landmark of bucket i. A search visits the buckets
-that a disc around the feature's end point touches, and evaluates the landmarks within the disc; others have a
-negligible density.
+that a disc around the feature's end point touches, and evaluates the landmarks within the disc; landmarks outside have
+a negligible density.
 """
 
 import functools
@@ -91,7 +91,7 @@ def functions(flags):
             squared = WIDER * (r * r + z * (z + r) * (b * b)) + feature[base + SLACK]
         return squared
 
-    # Return whether a feature may be landmark j: near its end point, or for lines turned alike and overlapping.
+    # Return whether a feature may be landmark j: near its end point, or for lines similar in direction and overlapping.
     @wp.func
     def may_match(
         off: vec4,

@@ -30,7 +30,7 @@ def make(name, flags):
     may_match, log_match = matches.may_match, matches.log_match
     PER_BEAM = "PER_BEAM" in flags
     ZERO, NEVER, EVERYWHERE = real(0.0), real(-math.inf), real(math.inf)
-    # A landmark's part of a density is larger than the false positive's from twice the latter on.
+    # A landmark's part of a density exceeds the false positive's if the density is more than twice the latter.
     LOG_2 = real(0.69314718055994531)
     # Largest number of features.
     LogEach = wp.types.vector(length=8, dtype=real)

@@ -1,4 +1,4 @@
-"""Negative information: landmarks that the sensor should see from a pose, but that belong to no feature."""
+"""Negative information: landmarks that the sensor should see from a pose, but that match no feature."""
 
 import functools
 

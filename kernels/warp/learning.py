@@ -115,7 +115,7 @@ def make(name, flags):
             h_ss = square * (bend - TWO) - t + w + t * t
             h_sm = pull * (bend - TWO) - p + q
             h_mm = weight * (bend - ONE) + v_0 + p * p
-            # A mean that is clamped does not move with the bias.
+            # A clamped mean does not move with the bias.
             if mean != expected + terms[10]:
                 h_m = ZERO
                 h_sm = ZERO

@@ -7,8 +7,8 @@ and rho its distance (Siegwart, Nourbakhsh and Scaramuzza, *Introduction to Auto
 4.7). alpha_j and rho_j are those of the map's line at the particle; alpha - alpha_j is wrapped to (-pi, pi]. (alpha,
 rho) and (alpha + pi, -rho) are one line: where a line of the map is seen from both sides, the normal nearer to the
 feature's counts. m is the mass of the distance on [0, range_max]. By Cholesky's factor of C the exponent is (a da)^2 +
-(b da + c dr)^2 with a = BEARING_SCALE, b = MIXED_SCALE and c = RANGE_SCALE. A feature may be a line of the map if it
-overlaps that, projected on it: a scan shows a wall only as far as it is in sight. A line of the map has its middle as
+(b da + c dr)^2 with a = BEARING_SCALE, b = MIXED_SCALE and c = RANGE_SCALE. A feature may be a line of the map if its
+projection overlaps that line: a scan shows only the visible part of a wall. A line of the map has its middle as
 landmark, its normal away from the free side, and (half length, 1 if it is seen from both sides, 0, 0) as signature.
 """
 
@@ -51,7 +51,7 @@ def functions(flags):
     # From here on the error function is 1 to the last bit.
     ERF_ONE = real(6.0 if "FLOAT64" in flags else 4.0)
 
-    # Return the normal of a line of the map on the side from which a feature sees it.
+    # Return the normal of a line of the map on the side that faces a feature's sensor.
     @wp.func
     def facing(normal: vec4, signature: vec4, turned: vec4):
         seen = normal
@@ -59,7 +59,7 @@ def functions(flags):
             seen = -normal
         return seen
 
-    # Return whether a feature is turned like a line of the map, and overlaps it.
+    # Return whether a feature has about the direction of a line of the map, and overlaps it.
     @wp.func
     def overlaps(off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32, normal: vec4, signature: vec4):
         cosine = normal[0] * turned[0] + normal[2] * turned[2]
@@ -71,7 +71,7 @@ def functions(flags):
         return cosine >= feature[base + AXIS] and beside
 
     # Return the mass of the normal around a line's distance d on [0, range_max]; d is clamped to it. A line that is
-    # seen from both sides has two forms, (alpha_j, d) and (alpha_j + pi, -d): the mass of both is that of d on
+    # seen from both sides has two forms, (alpha_j, d) and (alpha_j + pi, -d): together they have the mass of d on
     # [-range_max, range_max].
     @wp.func
     def distance_mass(d: vec2, scale: real, signature: vec4, terms: wp.array(dtype=real)):

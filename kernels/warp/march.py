@@ -2,8 +2,8 @@
 cell's centre to the nearest obstacle's centre less slack, and at least tolerance.
 
 With slack sqrt(2) only steps of length tolerance may pass an obstacle: a range is too long by at most tolerance, and an
-obstacle is missed only where the ray's path through it is shorter than that. With slack 0, as in other programs, any
-step may pass obstacles.
+obstacle is missed only where the ray's path through it is shorter than tolerance. With slack 0, as in other programs,
+any step may pass obstacles.
 """
 
 import functools

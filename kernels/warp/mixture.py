@@ -48,15 +48,15 @@ def functions(flags):
     TINY = real(1e-30)
     SMALLEST_RANGE = real(1e-37)
 
-    # Return the expected range of a reading from which on log p is that of p_rand, or of p_short far from its end, to
-    # the last bit: an obstacle farther away changes nothing.
+    # Return the expected range of a reading beyond which log p is constant to the last bit: there it is that of p_rand,
+    # or of p_short far from its end, whatever the distance of the obstacle.
     @wp.func
     def last_range(z: real, terms: wp.array(dtype=real)):
         return wp.max(at(terms, 14) + at(terms, 15) * z, at(terms, 16))
 
     # Return the mass of the untruncated normal around z* on [0, range_max], a sum of positive terms, so nothing
-    # cancels. Most ranges are far from both ends and most others far from one of them; rays without an obstacle are at
-    # one end.
+    # cancels. Most ranges are far from both ends, and nearly all from at least one; rays without an obstacle are at one
+    # end.
     @wp.func
     def hit_mass(expected: real, erf_scale: real, range_max: real):
         below = expected * erf_scale
@@ -184,8 +184,8 @@ def functions(flags):
         return above / below
 
     if LINEAR:
-        # Return log p(z | z*). p_rand > 0 bounds the sum from below, so each component may underflow, and one logarithm
-        # is enough.
+        # Return log p(z | z*). p_rand > 0 bounds the sum from below, so components may underflow, and one logarithm
+        # suffices.
         @wp.func
         def log_density(z: real, expected: real, terms: wp.array(dtype=real)):
             p = real(0.0)

@@ -3,7 +3,7 @@
 Odometry model: Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), table 5.6; velocity model: table 5.3. Each of
 the four parts is normal, with a mean and a deviation in the settings. An arc of the velocity model (VELOCITY_MODEL)
 turns by twice the first part; its chord is the arc's length times sin(a) / a. With probability REVERSE the translation
-goes the other direction: some odometers count wheel turns without a sign.
+goes the other direction: some odometers count wheel turns without their sign.
 """
 
 import functools
@@ -21,7 +21,7 @@ MOTION_STREAM, REVERSE_STREAM = wp.constant(wp.uint32(0)), wp.constant(wp.uint32
 VELOCITY_MODEL = wp.constant(1)
 SMALL_ARC, SIX = wp.constant(wp.float64(1e-4)), wp.constant(wp.float64(6.0))
 WHOLE_TURN, HALF_TURN = wp.constant(wp.float64(6.283185307179586)), wp.constant(wp.float64(3.141592653589793))
-# A whole turn beyond HALF_TURN, rounded down.
+# A full turn more than HALF_TURN, rounded down.
 FARTHEST_ONCE = wp.constant(wp.float64(9.424777960769378))
 MINUS_HALF_TURN = wp.constant(wp.float64(-3.141592653589793))
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
@@ -41,13 +41,13 @@ def functions(flags):
             chord = length * (turn.y / half_turn)
         return chord
 
-    # Return a heading less than a turn beyond [-pi, pi] in that interval.
+    # Wrap headings that are less than a turn outside [-pi, pi] to that interval.
     @wp.func
     def wrap_once(theta: wp.float64):
         less = wp.where(theta < MINUS_HALF_TURN, theta + WHOLE_TURN, theta)
         return wp.where(theta > HALF_TURN, theta - WHOLE_TURN, less)
 
-    # Return any heading in [-pi, pi]: more than a turn beyond it goes by its cosine and sine.
+    # Wrap any heading to [-pi, pi]; headings more than a turn outside it by their cosine and sine.
     @wp.func
     def wrap_any(theta: wp.float64):
         wrapped = wrap_once(theta)

@@ -1,5 +1,4 @@
-"""Offsets between places in sums of two numbers: a relative error of eps in 20 m is too much beside a deviation of 1
-cm.
+"""Offsets between places in sums of two numbers: a relative error of eps in 20 m is too large for a deviation of 1 cm.
 
 A place is (x, its low part, y, its low part), and so is an offset.
 """

@@ -1,5 +1,5 @@
-"""An order of particles in which neighbours have similar positions and headings. Their rays then meet the same cells,
-and none waits long for another. The order changes no result.
+"""An order of particles in which neighbours have similar positions and headings. Their rays then read the same cells
+and have similar lengths, so work-items wait less for each other. The order changes no result.
 """
 
 import functools
@@ -59,7 +59,7 @@ def make(name, flags):
         wp.atomic_max(bounds, 4, -turn)
         wp.atomic_max(bounds, 5, turn)
 
-    # Return the index of one of BINS equal parts of the bounds; values beyond them belong to the outermost.
+    # Return the index of one of BINS equal parts of the bounds; values beyond them belong to the outermost parts.
     @wp.func
     def part_of(value: wp.int32, least: wp.int32, most: wp.int32):
         part = (real(value) - real(least)) * (PARTS / (real(most) - real(least) + ONE))

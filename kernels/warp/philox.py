@@ -1,4 +1,4 @@
-"""Random numbers by a counter, so that a particle's numbers depend on seed, step, stream and its index alone.
+"""Counter-based random numbers: a particle's numbers depend only on seed, step, stream and its index.
 
 Philox 4x32-10: Salmon, Moraes, Dror and Shaw, *Parallel random numbers: as easy as 1, 2, 3* (2011). Normal deviates are
 those of Box and Muller: sqrt(-2 log u) (cos 2 pi v, sin 2 pi v). The counter is (particle, step, stream, 0).
@@ -38,7 +38,7 @@ def random_words(particle: wp.uint32, step: wp.uint32, stream: wp.uint32, key_0:
     return c
 
 
-# Return a number in (0, 1): the centre of one of 2^32 intervals.
+# Return numbers in (0, 1), the centres of 2^32 intervals.
 @wp.func
 def uniform_of(word: wp.uint32):
     return (wp.float64(word) + HALF) * WORD

@@ -11,7 +11,7 @@ import warp as wp
 from . import heading
 from .prelude import kernel, precision, work_item
 
-# Coordinates are clamped to this many cells: no range reaches as far, and sums of two stay within int32.
+# Coordinates are clamped to this many cells: no range reaches so far, and the sum of two fits int32.
 FARTHEST, MINUS_FARTHEST = wp.constant(wp.float64(1073741824.0)), wp.constant(wp.float64(-1073741824.0))
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 
@@ -34,8 +34,8 @@ def functions(flags):
     BELOW_ONE = real(1.0 - (2.0**-53 if "FLOAT64" in flags else 2.0**-24))
 
     # Place a sensor: a pose times the scanner's mount, without its yaw, which belongs to the bearings. pose_low gets
-    # the rounding errors (low parts) of pose. pose_status, which the caller clears, becomes 1 at (0) if a pose is not
-    # finite, and at (1) if a sensor is outside the window. A pose that is not finite becomes the farthest cell,
+    # the rounding errors (low parts) of pose. pose_status, which the caller clears, becomes 1 at index 0 if a pose is
+    # not finite, and at index 1 if a sensor is outside the window. A non-finite pose becomes the farthest cell,
     # fraction 0 and heading (1, 0): it sees nothing, and its indices stay in bounds.
     @wp.func
     def place_pose(

@@ -99,8 +99,8 @@ def functions(flags):
     def whole(count: real):
         return wp.int32(as_bits(count) - FIRST)
 
-    # Count the boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or with until also those at t. The
-    # coordinate at t, rounded to nearest, is the only boundary that can be in doubt.
+    # Count the boundaries k = 0, 1, ... whose distance (k + a) * inv is below t, or with ``until`` at most t. Only the
+    # boundary nearest to the coordinate at t can be in doubt.
     @wp.func
     def crossed(t: real, speed: real, a: real, inv: real, until: wp.bool):
         count = wp.max((t * speed - a) + COUNT, COUNT)
@@ -152,7 +152,8 @@ def functions(flags):
         index = int(turn_of(direction) * real(bins) + HALF)
         return wp.where(index >= bins, index - bins, index)
 
-    # Convert a distance in cells to metres, exactly range_max where nothing is nearer, or met with AMCL_LINES.
+    # Convert a distance in cells to metres, exactly range_max where nothing is nearer, or with AMCL_LINES where nothing
+    # is met.
     @wp.func
     def expected_range(t: real, scale: types.RangeScale):
         if AMCL_LINES:

@@ -1,8 +1,8 @@
 """Counts of hits and misses of cells, of which the log-odds of an occupancy grid are sums (book section 9.2).
 
-Start and end of a ray are cells and places inside them in units of 1/4096 cell, and the walk from cell to cell compares
-products of integers, so that all backends visit the same cells. A ray misses each cell that it leaves. Its last cell is
-hit where the ray ends at an obstacle, and missed otherwise. A tie, the ray through a corner, steps in x first.
+Start and end of a ray are cells with offsets in units of 1/4096 cell, and the walk from cell to cell compares products
+of integers, so that all backends visit the same cells. A ray misses each cell that it leaves. Its last cell is hit
+where the ray ends at an obstacle, and missed otherwise. A ray through a corner (a tie) steps in x first.
 """
 
 import warp as wp
@@ -20,13 +20,13 @@ def to_boundary(inside: wp.int32, step: wp.int32):
     return wp.where(step > 0, UNIT - inside, inside)
 
 
-# Return whether a walk has left an axis of some cells, to which it does not return.
+# Return whether a walk has left the extent of an axis for good.
 @wp.func
 def has_left(cell: wp.int32, step: wp.int32, cells: wp.int32):
     return wp.where(step > 0, cell >= cells, cell < 0)
 
 
-# Return how many boundaries of an axis a ray crosses before it has come as far as another boundary on the other axis.
+# Return the number of boundaries of an axis that a ray crosses before a boundary of the other axis.
 # Products of lengths fit in 64 bits, since rays span at most 2^19 cells.
 @wp.func
 def crossed_before(first: wp.int32, size: wp.int64, reached: wp.int64, other: wp.int64, ties: wp.int32):
@@ -58,7 +58,7 @@ def count_rays(start_cell, start_inside, end_cell, end_inside, hit, hits, misses
     left_y = step_y * across.y
     first_x = to_boundary(begin.x, step_x)
     first_y = to_boundary(begin.y, step_y)
-    # The steps that bring the walk to the grid's columns and rows are not taken one by one.
+    # Skip the steps that bring the walk to the grid's columns and rows.
     need_x = wp.max(wp.where(step_x > 0, -col, col - (cols - 1)), 0)
     need_y = wp.max(wp.where(step_y > 0, -row, row - (rows - 1)), 0)
     if need_x > left_x or need_y > left_y:
@@ -76,7 +76,7 @@ def count_rays(start_cell, start_inside, end_cell, end_inside, hit, hits, misses
     row += step_y * wp.int32(done_y)
     left_x -= wp.int32(done_x)
     left_y -= wp.int32(done_y)
-    # Negative where the next boundary is one in x.
+    # Negative where the next boundary lies in x.
     lead = (wp.int64(first_x) + done_x * wp.int64(UNIT)) * size_y
     lead -= (wp.int64(first_y) + done_y * wp.int64(UNIT)) * size_x
     while left_x + left_y > 0 and not has_left(col, step_x, cols) and not has_left(row, step_y, rows):

@@ -37,7 +37,7 @@ def functions(flags):
     ZERO, ABOVE_COUNT = real(0.0), real(float(COUNT) + 1.0)
     FLATTEST, STEEPEST = real(0.41421356), real(2.4142136)
 
-    # Return the sector of a direction within its quadrant, from flat to steep. A wrong sector would cost steps, not
+    # Return the sector of a direction within its quadrant, from flat to steep. A wrong sector would cost steps, but not
     # change the result.
     @wp.func
     def sector_of(speed_x: real, speed_y: real):

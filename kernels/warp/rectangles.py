@@ -1,8 +1,8 @@
 """Empty rectangles: for each cell and each sector of directions, width and height of a rectangle of free cells that has
 the cell at its corner and extends in that direction. Both are at most 255, stored as width + 256 height. A ray may
-cross the rectangle in one step without missing an obstacle. Of all such rectangles it is the one in which the ray in
-the middle of the sector stays longest. After anisotropic Chebyshev distance maps (Deakin and Knackstedt 2020), which
-have squares.
+cross the rectangle in one step without missing an obstacle. Of all such rectangles it is the rectangle in which the ray
+in the middle of the sector stays longest. The idea follows the anisotropic Chebyshev distance maps of Deakin and
+Knackstedt (2020), which have squares.
 
 Planes are padded by a ring of zeros, so a walk that leaves the grid stops. Quadrant q extends to (+x, +y), (-x, +y),
 (+x, -y), (-x, -y) for q = 0, 1, 2, 3, and has 1, 2 or 4 sectors from flat to steep, with a plane for each. All planes
@@ -22,7 +22,7 @@ from .bits import cells_left, cells_right
 from .prelude import kernel
 
 LONGEST = wp.constant(255)
-# The entry of an occupied cell; the ring has 0.
+# The entry of an occupied cell; ring cells have 0.
 OCCUPIED = wp.constant(1)
 # Distance from a changed cell to the farthest cell whose rectangle contains it.
 RECTANGLE_REACH = wp.constant(254)
@@ -181,7 +181,7 @@ def rectangles_scan(runs, rectangles, rows, cols, sectors, first, band, top, lef
     middle = slope(sectors, 0)
     step = dy * cols
     while sector < sectors:
-        # While no sector can end, read four rows between two decisions, so that reads need not wait for one another.
+        # While no sector can end, read four rows between two decisions, so that reads do not wait for each other.
         if height + 3 <= room:
             first_of = run + (height - 1) * step
             a = wp.min(int(runs[first_of]), int(runs[first_of + step]))

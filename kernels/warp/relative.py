@@ -1,6 +1,6 @@
 """Poses relative to a point and headings relative to an angle, in float64 as sums of two numbers, then rounded.
 
-The difference of large coordinates, or of many turns, is small, and small numbers keep their digits in any precision.
+Differences of large coordinates or of many turns are small, and small numbers keep their digits in any precision.
 """
 
 import functools
@@ -58,7 +58,7 @@ def make(name, flags):
         return vec2(rounded, real((high - wp.float64(rounded)) + low))
 
     # Place sensors relative to an origin: x, its low part, y, its low part. One work-item takes a particle.
-    # pose_status, which the caller clears, becomes 1 at (0) if a pose is not finite; its place is the origin.
+    # pose_status, which the caller clears, becomes 1 at index 0 if a pose is not finite; its place is the origin.
     @kernel(flags)
     def place_relative(poses, place, pose_status, origin_x, origin_y, mount_x, mount_y, particles):
         n = wp.tid()

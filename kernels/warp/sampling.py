@@ -1,14 +1,15 @@
 """Readings drawn from the beam model, or from a table of a sensor, given their expected ranges.
 
 Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), section 6.3.1: a component is drawn by its weight, and a
-reading by inverting the component's distribution function. p_hit's is the normal on both sides of its mean, each with
-the mass that lies within [0, range_max]. Masses are sums of positive terms: x phi(x) (1 + x^2 / 3 + x^4 / 15 + ...),
-and beyond SERIES_END one half less the continued fraction of Laplace. Quantiles are those of Wichura, *Algorithm AS
-241* (1988). p_short's is 1 - u (1 - exp(-lambda z*)), written as a sum of positive terms, or a series where lambda z*
-is small. All of it is float64 of +, -, *, / and sqrt, so that every device draws the same bits.
+reading by inverting the component's distribution function. For p_hit it is the normal on both sides of its mean, each
+with its mass on [0, range_max]. Masses are sums of positive terms: x phi(x) (1 + x^2 / 3 + x^4 / 15 + ...), and beyond
+SERIES_END one half less the continued fraction of Laplace. Quantiles are those of Wichura, *Algorithm AS 241* (1988).
+For p_short it is 1 - u (1 - exp(-lambda z*)), written as a sum of positive terms, or as a series where lambda z* is
+small. Everything is computed in float64 by +, -, *, / and sqrt, so that every device draws the same bits.
 
 Other shapes of hits than the normal (MASS_TABLE) have a table of masses and one of quantiles: cells of equal width in
-log(1 + b), b = u / sqrt 2, and in -log(1 - 2 mass), with the numbers of a polynomial in the share of the cell.
+log(1 + b), b = u / sqrt 2, and in -log(1 - 2 mass), with the coefficients of a polynomial in the position within the
+cell.
 
 ``mixture`` = (z_hit, z_short, z_max, z_rand, sigma_hit, sigma_growth, range_bias, lambda_short, place of the tables) of
 each bin of angles of incidence, and then the tables. ``chances`` = for each bin of expected ranges, the cumulative
@@ -91,7 +92,7 @@ OUTERMOST_UNDER = wp.constant(terms_8(
 SHORT_SERIES = wp.constant(wp.float64(1e-4))
 
 
-# Return a number in (0, 1) from two words: the centre of one of 2^52 intervals.
+# Return numbers in (0, 1) from two words, the centres of 2^52 intervals.
 @wp.func
 def fine_uniform(high: wp.uint32, low: wp.uint32):
     return ((wp.float64(high) * HALF_WORD + wp.float64(low >> WORD_SHIFT)) + HALF) * FINE
@@ -220,7 +221,7 @@ def functions(flags):
             return short_of(v, expected, mixture[p + 7])
         return wp.where(mark < third, INFINITE, v * range_max)
 
-    # Return a reading drawn from a table: uniform in a bin that is drawn, away from its ends by a margin of the bin.
+    # Return a reading drawn from a table: uniform in a drawn bin, at a margin from the bin's ends.
     @wp.func
     def cell_reading_of(
         u: wp.float64,
@@ -259,8 +260,8 @@ def make(name, flags):
     SENSOR_TABLE = "SENSOR_TABLE" in flags
     INCIDENCE = "INCIDENCE" in flags
 
-    # Replace expected ranges by readings; incidence holds cosines, and edges those between bins. One work-item takes a
-    # particle and ray; a launch has fewer than 2^31.
+    # Replace expected ranges by readings; incidence holds cosines, and edges the cosines between bins. One work-item
+    # takes a particle and ray; a launch has fewer than 2^31.
     @kernel(flags)
     def draw_readings(incidence, mixture, edges, chances, settings, ranges, particles, rays, tables, scale):
         i, k = wp.tid()

@@ -1,10 +1,10 @@
-"""Cells of tables of scores, which lie one behind the other, each with a margin of cells beyond the map around it."""
+"""Cells of consecutive tables of scores, each with a margin of cells around the map."""
 
 import warp as wp
 
 from .prelude import precision
 
-# Columns of a run that a kernel in vectors reads at once; the margin holds one.
+# Columns of a run that a kernel in lanes reads at once; the margin holds one run.
 RUN = wp.constant(16)
 # The struct has integers only, and so is the same in both precisions.
 ScoreTable = precision(frozenset()).ScoreTable

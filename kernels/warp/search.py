@@ -6,8 +6,8 @@ matching, ICRA 2009). A pooled table holds the largest value of a square of posi
 of all scores in the square (Hess et al., Real-time loop closure in 2D lidar SLAM, ICRA 2016). All sums are those of
 integers: a bound is never below a score that it bounds.
 
-Tables lie one behind the other, each with a margin of cells beyond the map around it. An item is a scan at a heading;
-its points are first[item] to before first[item + 1], each in a table of its own, the image. A folded table holds every
+Tables are consecutive, each with a margin of cells around the map. An item is a scan at a heading; its points are
+first[item] to first[item + 1] - 1, each of which names the table (image) that it reads. A folded table holds every
 period-th cell of a table as an image of its own: shifts by whole periods read neighbours.
 """
 
@@ -17,7 +17,7 @@ from .prelude import kernel
 from .score_cells import cell_index, padded_lines, padded_stride
 
 
-# Write the largest of each cell and those reach rows and columns on. One work-item takes a cell.
+# Write the maximum of each cell and the cells up to reach rows and columns further. One work-item takes a cell.
 @kernel()
 def pool_scores(table, pooled, scores, reach):
     image, line, col = wp.tid()

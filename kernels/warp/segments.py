@@ -27,7 +27,7 @@ def functions(flags):
     # The triangular root of rows that were added (11, 12, right side 1, 22, right side 2), and the cost.
     rows6 = wp.types.vector(length=6, dtype=real)
     ZERO, ONE, NOTHING = real(0.0), real(1.0), real(-1.0)
-    # A segment whose cost per point is larger is split where that is best, even if one split alone does not pay.
+    # A segment with a larger cost per point is split at its best point, even if a single split does not pay.
     POOR = real(3.0)
     # Rows are parallel up to this. Splits that lower the cost equally but for a share of it are tied.
     PARALLEL, TIED, TIED_AT = real(1e-6), real(3e-7), real(1e5)
@@ -93,8 +93,8 @@ def functions(flags):
             rows = with_point(rows, point, i, first, last, sigma)
         return rows[5]
 
-    # Return the first point of the second of two lines that lower the cost most, by how much, and the whole cost. The
-    # point is -1 if no split can lower the cost by penalty.
+    # Return the first point of the second line of the best split, by how much it lowers the cost, and the unsplit cost.
+    # The point is -1 if no split can lower the cost by penalty.
     @wp.func
     def best_split(
         point: wp.array(dtype=vec4), first: wp.int32, last: wp.int32, cost: wp.array(dtype=real), sigma: real,
@@ -151,7 +151,7 @@ def functions(flags):
             else:
                 i = end
 
-    # Merge neighbours of which a single line costs less than penalty more.
+    # Merge neighbours that a single line fits at an extra cost below penalty.
     @wp.func
     def merge_segments(
         point: wp.array(dtype=vec4), first: wp.int32, last: wp.int32, stop: wp.array(dtype=wp.int32), sigma: real,

@@ -1,6 +1,7 @@
-"""The ladder of temperatures of a correction, and the state of its stages: b_k = d b / 2^k, where b is what is left.
+"""The ladder of temperatures of a correction, and the state of its stages: b_k = d b / 2^k, where b is the part of the
+temperature that is left.
 
-The depth d is 1. Where the last rung leaves too few particles, the host weighs the stage again with a lower one.
+The depth d is 1. If the last rung leaves too few particles, the host repeats the stage with a smaller d.
 
 See weighing.py.
 

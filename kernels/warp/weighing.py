@@ -1,10 +1,9 @@
 """Weights of particles from the log-likelihoods of sensors, at the highest temperature that leaves enough particles.
 
-w_k = v exp(b_k (l - max l)), where v is the weight before, l the sum over sensors of temperature times log p, and b_k
-= d b / 2^k a ladder of depth d. The first rung with an effective sample size (sum w)^2 / sum w^2 of at least SHARE of
-that before is taken; what is left of b belongs to the next stage of the correction (annealing: Neal, *Annealed
-importance sampling*, 2001). Weights are rounded to integers below 2^53 / N, so that sums of them are exact in any
-order.
+w_k = v exp(b_k (l - max l)), where v is the weight before, l the sum over sensors of temperature times log p, and b_k =
+d b / 2^k a ladder of depth d. The first rung whose effective sample size (sum w)^2 / sum w^2 is at least SHARE of the
+previous one is taken; the rest of b is left to the next stage of the correction (annealing: Neal, *Annealed importance
+sampling*, 2001). Weights are rounded to integers below 2^53 / N, so that their sums are exact in any order.
 """
 
 import functools
@@ -60,7 +59,7 @@ def make(name, flags):
             high = wp.max(high, value)
         largest[b] = high
 
-    # Find the largest score of each fan blocks: one work-item takes a group of blocks.
+    # Find the largest score of every fan blocks: one work-item takes a group of blocks.
     @kernel(flags)
     def join_scores(scores, largest, blocks, fan):
         g = wp.tid()
@@ -104,7 +103,7 @@ def make(name, flags):
         if b == 0:
             highest[0] = high
 
-    # Add up each fan rows of sums, one after the other; a row becomes the sum of those before it in its group: one
+    # Add up every fan rows of sums in order; a row becomes the sum of the rows before it in its group: one
     # work-item takes a column of a group.
     @kernel(flags)
     def join_rows(sums, joined, rows, columns, fan):

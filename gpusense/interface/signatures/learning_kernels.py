@@ -5,7 +5,7 @@ from __future__ import annotations
 from gpusense.interface.constants import MIXTURE_TERMS
 from gpusense.interface.signatures.rows import Kernel, kernel
 
-# Readings and expected ranges to learn from, in blocks of one length, and the mixture.
+# Readings and expected ranges to learn from, in blocks of equal length, and the mixture.
 _PAIRS = ("real reading [blocks * readings]", "real expected [blocks * readings]", f"real terms [{MIXTURE_TERMS}]")
 
 KERNELS: dict[str, Kernel] = {

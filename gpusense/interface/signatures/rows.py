@@ -46,30 +46,30 @@ class Argument:
 
     @property
     def is_struct(self) -> bool:
-        """Tell whether the argument is a struct."""
+        """Return whether the argument is a struct."""
         return self.type in STRUCTS
 
     @property
     def width(self) -> int:
-        """Numbers per element: 4 for real4."""
+        """Return the numbers per element: 4 for real4."""
         return _WIDTHS[self.type.lstrip("abcdefghijklmnopqrstuvwxyz")]
 
     def elements(self, values: Mapping[str, Any]) -> int:
-        """Return an array's number of elements: its shape sums and multiplies integers, scalars and structs' fields."""
+        """Return an array's number of elements: sums and products of integers, scalars and fields of structs."""
         assert self.shape is not None
         return _evaluate(ast.parse(self.shape, mode="eval").body, values)
 
     def dtype(self, real: np.dtype) -> np.dtype:
-        """NumPy dtype of one number of an array or scalar."""
+        """Return the Return the NumPy dtype of one number of an array or scalar."""
         base = self.type.rstrip("24")
         return real if base == "real" else _SCALARS[base]
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """A kernel: its concept (file), the object that a work-item takes, its arguments, and its work-group size.
+    """A kernel: its file, the objects that a work-item takes, its arguments, and its work-group size.
 
-    A global size's first axis is rounded up to whole groups; the heavier a work-item, the smaller its group. Where a
+    The first axis of a global size is rounded up to whole groups; heavier work-items have smaller groups. Where a
     kernel is compiled with IN_LANES, its groups have ``lanes_group`` work-items, and with ``in_lanes`` each of them
     takes as many neighbours of the first axis as there are lanes. ``apart`` says that no two of its arrays share
     memory, so a compiler need not reload arguments after a write.
@@ -84,12 +84,12 @@ class Kernel:
     apart: bool = False
 
 
-# Particles or beams of a work-item of such a kernel.
+# Particles or beams of a work-item of a kernel in lanes.
 LANES = 16
 
 
 def lanes_of(flags: frozenset[str]) -> int:
-    """How many particles or beams a work-item computes at once."""
+    """Return the number of particles or beams that a work-item computes at once."""
     return LANES if "IN_LANES" in flags else 1
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from gpusense.interface.constants import DRAW_TERMS, MIXTURE_TERMS
 from gpusense.interface.signatures.rows import PLACED, POSES, WINDOW, Kernel, kernel
 
-# Normals of the map's walls and of a ring of cells around it; not read without INCIDENCE.
+# Normals of the cells of the map and of a ring around it; not read without INCIDENCE.
 _NORMALS = ("real2 normals [(window.rows + 2) * (window.cols + 2)]",)
 _CONES = "real2 ray [rays * cone.rays]"
 # A map's table for a caster, which defines its entries and their number.
@@ -22,7 +22,7 @@ _TERMS = (
     f"real terms [{MIXTURE_TERMS} * tables.incidence_bins]", "real edges [tables.incidence_bins]",
     "real sensor [(tables.cells + 1) * (tables.cells + 1)]",
 )  # fmt: skip
-# With SCANS: where the rays or end points of each scan begin, and its constant term.
+# With SCANS: index of the first ray or end point of each scan, and the scan's constant term.
 _SCANS = ("int start [scans + 1]", "real constant_terms [scans]")
 _RESULT = ("out real log_p [particles]", "out real parts [particles * readings]")
 _SCORE = ("Score score", "ScanBatch batch")

@@ -136,7 +136,8 @@ def fit_beacon_parameters(
     """Fit the parameters of ranges to beacons to readings at known poses, by maximum likelihood.
 
     The likelihood is :class:`BeaconModel`'s. Deviations, weights and offsets are fitted; the degrees of freedom of a
-    Student t are fixed. Starts come from the median and the densest part of the residuals, which outliers hardly move.
+    Student t are fixed. Starts come from the median and the densest part of the residuals, which are robust to
+    outliers.
 
     Args:
         poses: (S, 3) robot poses [m, m, rad], or (F, 3) with ``ids``.
@@ -150,7 +151,7 @@ def fit_beacon_parameters(
         bias: ``"common"`` fits one offset of all ranges, ``"each"`` one for each beacon, ``"none"`` keeps it at 0.
         mount: The antenna's position (x, y) on the robot [m].
         blocks: None, or (S,) or (F,) integer labels of poses whose errors are correlated, for standard errors.
-        max_iterations: Most iterations of a search.
+        max_iterations: Largest number of iterations of a search.
         tolerance: The search has converged once it expects to gain less than ``tolerance`` [nats].
 
     Returns:
@@ -219,7 +220,7 @@ def _parameters(problem: _Beacons, theta: Floats, nu: int, mount: tuple[float, f
 
 
 def _half_sample_mode(values: Floats) -> float:
-    """Return the centre of the densest part, found by halving: a start that more than half of outliers do not move.
+    """Return the centre of the densest part, by repeated halving: robust even if more than half are outliers.
 
     Source: Bickel and Fruehwirth (2006), "On a fast, robust estimator of the mode".
     """

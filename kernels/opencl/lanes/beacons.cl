@@ -87,8 +87,7 @@ lanes log_range_lanes(const LanePair d, global const real *beacon, global const 
 #endif
 }
 
-// Sum log p of the ranges over beacons: one work-item takes LANES particles. The last particle of all stands in for
-// missing ones.
+// Sum log p of the ranges over beacons: one work-item takes LANES particles. Missing particles repeat the last one.
 kernel void score_beacons(ARGUMENTS) {
     const int first_particle = LANES * get_global_id(0);
     if (first_particle >= particles) return;

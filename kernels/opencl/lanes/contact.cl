@@ -100,7 +100,7 @@ lanes log_bump_lanes(const ilanes squared, const int pressed, global const real 
     return either_lanes(hit + touching, no_hit + clear);
 }
 
-// Sum log p over segments: one work-item takes LANES particles. The last particle of all stands in for missing ones.
+// Sum log p over segments: one work-item takes LANES particles. Missing particles repeat the last one.
 kernel void score_contact(ARGUMENTS) {
     const int first_particle = LANES * get_global_id(0);
     if (first_particle >= particles) return;

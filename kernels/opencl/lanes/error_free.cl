@@ -12,7 +12,7 @@ LanePair two_sum_lanes(const lanes a, const lanes b) {
     return (LanePair){sum, (a - (sum - shift)) + (b - shift)};
 }
 
-// Return a + b = hi + lo exactly, where a has no smaller exponent than b: Dekker's sum, in half of the operations.
+// Return a + b = hi + lo exactly, where a's exponent is at least b's: Dekker's sum, in half of the operations.
 LanePair ordered_sum_lanes(const lanes a, const lanes b) {
     const lanes sum = a + b;
     return (LanePair){sum, b - (sum - a)};
@@ -24,7 +24,7 @@ LanePair fused_product_lanes(const lanes a, const lanes b) {
     return (LanePair){product, fma(a, b, -product)};
 }
 
-// Return a * b = hi + lo exactly, short of overflow and underflow: by a fused multiply-add where the processor has one.
+// Return a * b = hi + lo exactly, barring overflow and underflow: by a fused multiply-add where the processor has one.
 LanePair two_product_lanes(const lanes a, const lanes b) {
     if (FUSES) return fused_product_lanes(a, b);
     const lanes product = a * b, scaled_a = SPLITTER * a, scaled_b = SPLITTER * b;
@@ -33,8 +33,8 @@ LanePair two_product_lanes(const lanes a, const lanes b) {
     return (LanePair){product, ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low};
 }
 
-// Add two numbers of two parts each, to about twice the working precision. Where the first parts cancel, their sum still
-// is no smaller than the last bit of either, so it has no smaller exponent than the second parts.
+// Add two numbers of two parts each, to about twice the working precision. Where the first parts cancel, their sum is
+// at least the last bit of either, so its exponent is at least that of the second parts.
 LanePair pair_sum_lanes(const LanePair a, const LanePair b) {
     const LanePair sum = two_sum_lanes(a.hi, b.hi);
     return ordered_sum_lanes(sum.hi, sum.lo + (a.lo + b.lo));

@@ -32,7 +32,7 @@ lanes shape_weight_lanes(const lanes t, const lanes power, const lanes rate) {
 #endif
 }
 
-// Return -E''(t) over the weights, times u^2, from the weights times u^2.
+// Return -u^2 E''(t) / E'(t) from square = u^2 E'(t).
 lanes shape_bend_lanes(const lanes square, const real power) {
 #if STUDENT
     return square * (1 / power);

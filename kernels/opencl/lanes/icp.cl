@@ -1,11 +1,11 @@
-// Point-to-line ICP for LANES points of a scan at once: match_scans of icp.cl. The points of a block are
-// neighbours in bearing, and so are their nearest points: all of them are compared with one point of the reference after
-// another, first with those between their bearings, then with those outside that may be nearer than the nearest so far.
+// Point-to-line ICP for LANES points of a scan at once: match_scans of icp.cl. The points of a block are neighbours in
+// bearing, and so are their nearest points: all of them are compared with one point of the reference after another,
+// first with points between their bearings, then with points outside that may be nearer than the nearest so far.
 // requires: icp_step lanes/math
 
 // Numbers of a result; see icp.cl.
 #define MATCH_RESULT 35
-// Weight in the score of a point that the other scan did not see; one that disagrees has 1.
+// Weight in the score of a point that the other scan did not see; a point that disagrees has weight 1.
 #define UNSEEN ((real)0.13)
 // tan(pi / 8). arcsin s < s + ARCSIN s^3. Errors of bearings are far below BEARING_ERROR.
 #define TAN_EIGHTH 0.414213562f

@@ -2,7 +2,7 @@
 // of the scalar kernel.
 // requires: lanes/landmark_grid
 
-// Sum log p over features: one work-item takes LANES particles. The last particle of all stands in for missing ones.
+// Sum log p over features: one work-item takes LANES particles. Missing particles repeat the last one.
 kernel void score_features(ARGUMENTS) {
     const int first_particle = LANES * get_global_id(0);
     if (first_particle >= particles) return;

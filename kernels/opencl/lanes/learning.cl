@@ -57,7 +57,7 @@ void add_pair_lanes(const lanes reading, const lanes expected_range, global cons
         w = x_0 * x_0 * pull_0 + x_1 * x_1 * pull_1;
     }
     const lanes bend = shape_bend_lanes(square, terms[17]);
-    // A mean that is clamped does not move with the bias. Terms of a cause that is impossible may be infinite.
+    // A clamped mean does not move with the bias. Terms of a cause that is impossible may be infinite.
     const ilanes is_hit = r_hit > 0, is_short = r_short > 0, moved = is_hit & ~clamped;
     const lanes h_s = is_hit ? square - 1 + t : (lanes)0, h_m = moved ? pull + slope : (lanes)0;
     const lanes x = terms[4] * expected, f = expected > SMALLEST_RANGE ? expected / length : (lanes)1, left = f - x;

@@ -1,4 +1,5 @@
-// Expected ranges of LANES rays of one pose by marching through the distance field: march.cl in lanes, same bits.
+// Expected ranges of LANES rays of one pose by marching through the distance field: march.cl in lanes, with the same
+// bits.
 // requires: march lanes/rays lanes/each_ray
 
 // Return the distances in cells to points in occupied cells, limits where none is nearer. A lane that has ended reads

@@ -125,8 +125,7 @@ lanes short_length_lanes(const lanes expected, global const real *terms, const i
 #endif
 
 #if LINEAR
-// Return log p(z | z*). p_rand > 0 bounds the sum from below, so each component may underflow, and one logarithm is
-// enough.
+// Return log p(z | z*). p_rand > 0 bounds the sum from below, so components may underflow, and one logarithm suffices.
 lanes log_density_lanes(const lanes z, const lanes expected, global const real *terms, const ilanes bin_at) {
     lanes p = TERM(5);
 #if HIT
@@ -143,7 +142,7 @@ lanes log_density_lanes(const lanes z, const lanes expected, global const real *
     const lanes mass = mass_within_lanes(mean, TERM(2), terms, bin_at, &within);
 #endif
 #if EXACT_EXPONENT
-    // Where the density underflows, the second part may be anything.
+    // Where the density underflows, the second part is arbitrary.
     hit = hit > 0 ? hit * (1 - exponent.lo) : hit;
 #endif
     p += within ? hit : hit / mass;

@@ -22,12 +22,12 @@ doubles chord_of_lanes(const doubles length, const doubles half_turn) {
     return small ? length * (1.0 - half_turn * half_turn / 6.0) : length * (sine / turn);
 }
 
-// Return headings less than a turn beyond [-pi, pi] in that interval.
+// Wrap headings that are less than a turn outside [-pi, pi] to that interval.
 doubles wrap_once_lanes(const doubles theta) {
     return theta > HALF_TURN ? theta - WHOLE_TURN : theta < -HALF_TURN ? theta + WHOLE_TURN : theta;
 }
 
-// Return any headings in [-pi, pi]: those more than a turn beyond it go by their cosines and sines, one by one.
+// Wrap any headings to [-pi, pi]; those more than a turn outside it one by one, by their cosines and sines.
 doubles wrap_any_lanes(const doubles theta) {
     const choices far = (theta > FARTHEST_ONCE) | (theta < -FARTHEST_ONCE);
     doubles wrapped = wrap_once_lanes(theta);

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -41,14 +41,25 @@ GOLDEN = (5**0.5 - 1) / 2
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests of the subset, and as slow the settings beyond the sample of a test."""
     number: Counter[str] = Counter()
+    kept: set[tuple[str, str]] = set()
+    left: dict[tuple[str, str], list[pytest.Item]] = defaultdict(list)
     for item in items:
         sampled = item.get_closest_marker("sampled")
         if sampled is not None:
             function = item.nodeid.split("[")[0]
+            params = item.callspec.params
+            where = function, params.get("backend", params.get("device", ""))
             # Multiples of the golden ratio spread over every parameter, however its values follow one another.
-            if number[function] * GOLDEN % 1 >= sampled.args[0]:
-                item.add_marker("slow")
+            if number[function] * GOLDEN % 1 < sampled.args[0]:
+                kept.add(where)
+            else:
+                left[where].append(item)
             number[function] += 1
+    for where, beyond in left.items():
+        # A sample leaves out no backend.
+        for item in beyond if where in kept else beyond[1:]:
+            item.add_marker("slow")
+    for item in items:
         path = item.path.relative_to(Path(__file__).parent).as_posix()
         slow = item.get_closest_marker("slow") is not None
         if not slow and any(path == part or path.startswith(f"{part}/") for part in QUICK):

@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from gpusense.evaluation.calibration import BINS, FUNCTIONS, posterior_ranks, uniformity
-from gpusense.evaluation.calibration_scenes import MAKERS, make_scene
-
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
 from common import make_parser, note, parse, publish, table
+from support.calibration import BINS, FUNCTIONS, posterior_ranks, uniformity
+from support.calibration_scenes import MAKERS, make_scene
 
 
 def main() -> int:

@@ -17,11 +17,14 @@ reference of jarvis is a track by reflectors, whose clock is not the lasers'; th
 instantaneous: both are read where the error of a row is least, within 0.25 s.
 "held out" is the share of end points up to 20 m of odd scans within 5 and 15 cm of an occupied cell of the even scans'
 map, at the poses of the row with odometry and closures, and at those of the reference.
+The last table has groups of matches of places that agree with one another, taken or not: of those with references for
+their matches, how many have mostly right ones, by evidence. Where the drift does not tell, closures need 6.5.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 import time
 from pathlib import Path
@@ -38,9 +41,15 @@ from chaining_logs import BOTH, Log, load, references
 from chaining_peers import csm_steps, kiss_icp
 from common import make_parser, note, parse, publish, table
 
+from gpusense.chaining.agreement import groups_of
+from gpusense.chaining.chain import Chainer
+from gpusense.chaining.closing import Loops
+
 LOGS = ("intel", "fr079", "csail", "aces", "fhw", "seattle", "jarvis-s3000", "jarvis-nav350", BOTH, "olin")
 LENGTHS = (5, 20, 100)
 LIMIT = 20.0
+# Bounds of the evidence of groups of matches.
+EVIDENCE = (0.0, 4.5, 6.5, 10.0, np.inf)
 
 
 def aligned_error(poses: np.ndarray, truth: np.ndarray) -> float:
@@ -85,24 +94,62 @@ def figures(log: Log, method: str, poses: np.ndarray, seconds: float) -> dict[st
 def chain_row(log: Log, arguments: argparse.Namespace, with_odometry: bool, loops: bool) -> tuple[dict, gs.ScanChain]:
     """Chain a log, and return its figures."""
     begun = time.perf_counter()
-    chain = gs.chain_scans(
+    chainer = Chainer(
         log.ranges, odometry=log.odometry if with_odometry else None, times=log.times, close_loops=loops,
         backend=arguments.backend, **log.arguments,
     )  # fmt: skip
+    for _ in chainer.steps():
+        pass
+    chain = chainer.chain()
     seconds = time.perf_counter() - begun
     name = f"chain, {'with' if with_odometry else 'no'} odometry, {'closures' if loops else 'no closures'}"
     found = figures(log, name, chain.poses, seconds)
     truth, closures = references(log, found["earlier_s"]), chain.closures
-    known = closures[np.isfinite(truth[closures.first] + truth[closures.second]).all(axis=1)]
-    off = np.zeros((0, 3))
-    if len(known):
-        off = gs.pose_difference(gs.pose_difference(truth[known.first], truth[known.second]), known.pose)
-    wrong = (np.hypot(off[:, 0], off[:, 1]) > 0.5) | (np.abs(off[:, 2]) > 0.15)
+    compared, wrong = contradicted(closures, truth)
+    known = closures[compared]
+    found["groups"] = [] if chainer.loops is None else judged_groups(chainer.loops, truth)
     found |= wrong_motions(chain, truth)
-    found |= {"closures": len(closures), "compared": len(off), "contradicted": int(wrong.sum())}
+    found |= {"closures": len(closures), "compared": len(known), "contradicted": int(wrong.sum())}
     shares = [] if log.lasers is not None else [fits(log, chain.poses, truth, *link) for link in places(known[wrong])]
     found |= {"fit_better": sum(one > two for one, two in shares), "shares": shares}
     return found | {"doubtful": int(chain.doubtful.sum()), "key_scans": len(chain.keys)}, chain
+
+
+def contradicted(links: Any, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the links between scans with references, and whether these contradict each."""
+    rows = np.flatnonzero(np.isfinite(truth[links.first] + truth[links.second]).all(axis=1))
+    if not len(rows):
+        return rows, np.zeros(0, bool)
+    off = gs.pose_difference(gs.pose_difference(truth[links.first[rows]], truth[links.second[rows]]), links.pose[rows])
+    return rows, (np.hypot(off[:, 0], off[:, 1]) > 0.5) | (np.abs(off[:, 2]) > 0.15)
+
+
+def judged_groups(loops: Loops, truth: np.ndarray) -> list[dict[str, float]]:
+    """Return evidence, matches with references, and right ones among these of each group that has any."""
+    groups = groups_of(loops.matches, loops.solution.poses)
+    rows, wrong = contradicted(loops.matches.renumbered(loops.nodes), truth)
+    result = []
+    for k, evidence in enumerate(groups.evidence.tolist()):
+        some = groups.group[rows] == k
+        if some.any():
+            result.append({"evidence": evidence, "compared": int(some.sum()), "right": int((some & ~wrong).sum())})
+    return result
+
+
+def groups_table(rows: list[dict[str, Any]]) -> str:
+    """Return the table of right groups by evidence."""
+    bounds = list(itertools.pairwise(EVIDENCE))
+    lines = []
+    for row in rows:
+        if not row.get("groups"):
+            continue
+        cells = []
+        for low, high in bounds:
+            some = [group for group in row["groups"] if low <= group["evidence"] < high]
+            cells.append(f"{sum(2 * g['right'] > g['compared'] for g in some)} of {len(some)}" if some else "-")
+        lines.append([row["log"], "with" if "with odometry" in row["method"] else "no", *cells])
+    names = [f"evidence {low:g} to {high:g}" if np.isfinite(high) else f"from {low:g}" for low, high in bounds]
+    return table(["log", "odometry", *names], lines)
 
 
 def places(closures: Any) -> list[tuple[int, int, np.ndarray]]:
@@ -270,6 +317,7 @@ def main(argv: list[str] | None = None) -> None:
         for made in maps
     ]
     text = table(columns, lines) + "\n\n" + table(["log", "held out: chain", "held out: reference"], held)
+    text += "\n\n" + groups_table(rows)
     publish(__file__, arguments, text, {"rows": rows, "maps": maps})
 
 

@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from chaining_logs import Log, from_scans
 from common import make_parser, note, parse, publish, table
 
-from gpusense.chaining.agreement import largest_group
+from gpusense.chaining.agreement import groups_of
 from gpusense.chaining.chain import Chainer
 
 NAMES = ("acapulco", "aces", "belgioioso", "csail", "fhw", "freiburg-079", "infinite-corridor", "intel", "seattle")
@@ -59,7 +59,9 @@ def joined(one: Log, two: Log, with_odometry: bool, backend: str) -> dict[str, A
     chain, loops = chainer.chain(), chainer.loops
     closures, matches = chain.closures, loops.matches.renumbered(loops.nodes)
     across, between = ((links.first < border) != (links.second < border) for links in (closures, matches))
-    group, evidence = largest_group(loops.matches[between], loops.solution.poses)
+    groups = groups_of(loops.matches[between], loops.solution.poses)
+    most = int(np.argmax(groups.evidence)) if len(groups.evidence) else -1
+    group, evidence = (int((groups.group == most).sum()), float(groups.evidence[most])) if most >= 0 else (0, 0.0)
     return {
         "first": one.name, "second": two.name, "odometry": with_odometry, "scans": len(odometry),
         "within": int((~across).sum()), "across": int(across.sum()), "matches": int(between.sum()),

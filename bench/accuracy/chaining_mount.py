@@ -6,6 +6,10 @@ A chain of each laser is made with odometry and closures. The mount (x, y, headi
 drift over 5 m least against the references of one half of the run are found by Nelder and Mead's method, and judged on
 the other half. "corrected" there is with the mount of the other half; "as stated" with the transforms' one, and the
 clock's offset of the other half as well.
+
+The second table has the headings of mounts that make the motions of quarters of a log over 0.5 m those of its odometry,
+or of its reference: least squares with a robust kernel for the mount (x, y, heading), with factors of distances and
+turns. If odometry told the heading of a mount, its quarters would agree with one another, and with the reference's.
 """
 
 from __future__ import annotations
@@ -15,19 +19,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import least_squares, minimize
 
 import gpusense as gs
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from chaining import drifts
+from chaining import drifts, figures
 from chaining_logs import Log, load, references
 from common import make_parser, parse, publish, table
 
 LASERS = ("jarvis-s3000", "jarvis-nav350")
 LENGTH = 5.0
+# Logs with raw odometry, and the length of motions to which mounts are fitted [m].
+LOGS = (*LASERS, "olin", "aces", "csail")
+MOTION = 0.5
 # First steps of the search [m, m, rad, s].
 STEPS = (0.02, 0.02, 0.01, 0.03)
 
@@ -73,6 +80,34 @@ def measured(log: Log, backend: str) -> list[dict[str, Any]]:
     return rows
 
 
+def heading_of_mount(poses: np.ndarray, others: np.ndarray) -> float:
+    """Return the heading [rad] by which the scanner is mounted otherwise, if poses (S, 3) are to move as others do."""
+    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(others[:, :2], axis=0).T)))
+    first, second = np.arange(len(path)), np.searchsorted(path, path + MOTION)
+    first, second = first[second < len(path)], second[second < len(path)]
+    moved, wanted = (gs.pose_difference(p[first], p[second]) for p in (poses, others))
+
+    def errors(values: np.ndarray) -> np.ndarray:
+        off = np.broadcast_to(values[:3], moved.shape)
+        placed = gs.compose_poses(gs.compose_poses(off, moved), gs.invert_poses(off))
+        miss = placed - wanted * values[[3, 3, 4]]
+        miss[:, 2] = 0.5 * gs.wrap_angle(miss[:, 2])
+        return miss.ravel()
+
+    return float(least_squares(errors, [0.0, 0.0, 0.0, 1.0, 1.0], loss="soft_l1", f_scale=0.01).x[2])
+
+
+def quarters(log: Log, backend: str) -> dict[str, Any]:
+    """Return the headings of the mount by odometry and by references, of each quarter of a log."""
+    chain = gs.chain_scans(log.ranges, odometry=log.odometry, times=log.times, backend=backend, **log.arguments)
+    truth = references(log, figures(log, "", chain.poses, 0.0)["earlier_s"])
+    row: dict[str, Any] = {"log": log.name}
+    for name, others in (("odometry", log.odometry), ("reference", truth)):
+        parts = np.array_split(np.flatnonzero(np.isfinite(others).all(axis=1)), 4)
+        row[name] = [heading_of_mount(chain.poses[part], others[part]) for part in parts]
+    return row
+
+
 def main(argv: list[str] | None = None) -> None:
     """Measure, and publish a table."""
     arguments = parse(make_parser(__doc__, backend="auto", data=True), argv)
@@ -88,7 +123,13 @@ def main(argv: list[str] | None = None) -> None:
         ]
         for row in rows
     ]  # fmt: skip
-    publish(__file__, arguments, table(columns, lines), {"rows": rows})
+    found = [quarters(load(Path(arguments.data), name), arguments.backend) for name in LOGS]
+    headings = [
+        [row["log"], *(", ".join(f"{np.degrees(h):.2f}" for h in row[name]) for name in ("odometry", "reference"))]
+        for row in found
+    ]
+    text = table(columns, lines) + "\n\n" + table(["log", "heading by odometry, deg", "by the reference"], headings)
+    publish(__file__, arguments, text, {"rows": rows, "quarters": found})
 
 
 if __name__ == "__main__":

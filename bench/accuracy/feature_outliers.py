@@ -20,18 +20,19 @@ from scipy.stats import chi2
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.evaluation.feature_scenes import Floor, floor_plan
-from gpusense.evaluation.feature_scores import FREE, score_scan
-from gpusense.evaluation.feature_truth import truth_of
 from gpusense.features.device import ScanDevice
 from gpusense.features.segments import Segments, find_segments
 from gpusense.matching.noise import scan_noise
 from gpusense.matching.points import scan_points
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
 from accuracy.features import scanner_of
 from common import make_parser, parse, publish, table
+from support.feature_scenes import Floor, floor_plan
+from support.feature_scores import FREE, score_scan
+from support.feature_truth import truth_of
 
 SETTINGS = ((360, 0.01), (360, 0.03), (1081, 0.01), (1081, 0.03))
 CAUSES = ("walls that meet", "one beam of another wall", "several beams of other walls", "walls that do not meet")

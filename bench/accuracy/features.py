@@ -3,7 +3,7 @@
     python bench/accuracy/features.py --backend opencl --output bench/results/features_cpu
 
 ``GPUSENSE_DATA`` names the folder of recorded data. ``simulated``: floors of known geometry (see
-``gpusense/evaluation/feature_scenes.py``: corridors, rooms, doors open, half open and closed, square pillars, poles,
+``tests/support/feature_scenes.py``: corridors, rooms, doors open, half open and closed, square pillars, poles,
 boxes): the share of features that are seen well and found, the share of returned ones that exist, median errors, and
 the squared error over the covariance per degree of freedom (NEES; 1 is right), in the mean without errors beyond
 99.9 % of chi squared, and the share of those. ``ransac``: lines by scikit-image's RANSAC, one after another, beside
@@ -27,15 +27,16 @@ import numpy as np
 from scipy.stats import chi2
 
 import gpusense as gs
-from gpusense.evaluation.feature_scenes import floor_plan
-from gpusense.evaluation.feature_scores import FREE, Score, score_scan
-from gpusense.evaluation.feature_truth import truth_of
 from gpusense.features.result import Features
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
 import recordings
 from common import add_repeats, best, make_parser, parse, publish, table
+from support.feature_scenes import floor_plan
+from support.feature_scores import FREE, Score, score_scan
+from support.feature_truth import truth_of
 
 PARTS = ("simulated", "ransac", "real", "localisation", "rates")
 BEAMS, NOISES = (180, 360, 1081), (0.0, 0.01, 0.03, 0.05)

@@ -3,7 +3,8 @@
     python bench/accuracy/matching.py --recorded DATA --backend opencl --output bench/results/matching_cpu
 
 Rows "pairs": the sets of ``matching_pairs`` (300 pairs each; truth from reflectors or corrected poses) from the
-odometry's guess, without a guess, and from the reference +-0.5 m and +-10 degrees. Rows "simulated": exact and noisy
+odometry's guess, without a guess, and from the reference +-0.5 m and +-10 degrees. Rows "single": the same from the
+odometry's guess, each match in a call of its own. Rows "simulated": exact and noisy
 scans of neighbouring poses in six maps, from guesses with such errors. Rows "map": odd scans of logs in the maps of
 their even ones, from such guesses. A match is wrong beyond 0.2 m or 5 degrees. Times are those of one call with all
 matches, the best of ``--repeats``, after a call that compiles; processor times are summed over cores. NEES is the
@@ -17,6 +18,7 @@ import argparse
 import json
 import sys
 import time
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +40,7 @@ REAL_MAPS = ("depot", "levinelobby", "basement_hallways_5cm")
 
 
 REPEATS = 3
+ROWS = ("pairs", "single", "simulated", "map")
 
 
 def timed(call: Any) -> tuple[ScanMatch, float, float]:
@@ -76,15 +79,34 @@ def row(kind: str, name: str, guess: str, backend: str, truth: np.ndarray, call:
     }  # fmt: skip
 
 
-def recorded(data: Path, backend: str, limit: int) -> list[dict[str, Any]]:
+def one_by_one(
+    first: np.ndarray, second: np.ndarray, scanner: gs.Scanner, guess: np.ndarray, backend: str
+) -> ScanMatch:
+    """Return the matches of pairs, each from a call of its own."""
+    calls = zip(first, second, guess, strict=True)
+    matches = [gs.match_scan(before, after, scanner, start, backend=backend) for before, after, start in calls]
+    return ScanMatch(**{f.name: np.stack([getattr(match, f.name) for match in matches]) for f in fields(ScanMatch)})
+
+
+def recorded(data: Path, backend: str, limit: int, chosen: list[str]) -> list[dict[str, Any]]:
     """Return the rows of the recorded pairs."""
-    rows, scans = [], {}
+    rows: list[dict[str, Any]] = []
+    scans: dict[str, tuple[np.ndarray, gs.Scanner]] = {}
+    if not {"pairs", "single"} & {*chosen}:
+        return rows
     for each in json.loads((data / "matching_pairs" / "pairs.json").read_text())["sets"]:
         name, pairs = each["set"], np.array(each["pairs"])[:limit]
         if name not in scans:
             scans[name] = _scans(data, name)
         ranges, scanner = scans[name]
         first, second = ranges[pairs[:, 0].astype(int)], ranges[pairs[:, 1].astype(int)]
+        if "single" in chosen:
+            rows.append(
+                row("single", f"{name} +{each['step']}", "odometry", backend, pairs[:, 2:5],
+                    lambda a=first, b=second, s=scanner, g=pairs[:, 5:8]: one_by_one(a, b, s, g, backend))
+            )  # fmt: skip
+        if "pairs" not in chosen:
+            continue
         for label, guess in {"odometry": pairs[:, 5:8], "none": 0 * pairs[:, 5:8], "perturbed": pairs[:, 8:11]}.items():
             rows.append(
                 row("pairs", f"{name} +{each['step']}", label, backend, pairs[:, 2:5],
@@ -152,7 +174,7 @@ def in_maps(data: Path, backend: str, limit: int, seed: int) -> list[dict[str, A
 def by_turn(found: dict[str, Any]) -> str:
     """Return the NEES of a row's pairs with the least and the largest turn."""
     least, _, largest = found["nees_by_turn"]
-    return f"{least:.1f} / {largest:.1f}" if found["what"] == "pairs" else "-"
+    return f"{least:.1f} / {largest:.1f}" if found["what"] in ("pairs", "single") else "-"
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -160,14 +182,14 @@ def main(argv: list[str] | None = None) -> None:
     parser = make_parser(__doc__, backend="auto")
     parser.add_argument("--recorded", type=Path, help="folder of recorded data; without it generated buildings alone")
     parser.add_argument("--matches", type=int, default=300, help="most matches of a row (default: %(default)s)")
-    parser.add_argument("--rows", action="append", choices=("pairs", "simulated", "map"), help="default: all")
+    parser.add_argument("--rows", action="append", choices=ROWS, help="default: all")
     parser.add_argument("--repeats", type=int, default=3, help="timed calls of each row (default: %(default)s)")
     arguments: argparse.Namespace = parse(parser, argv)
     global REPEATS
     REPEATS = arguments.repeats
     data, backend, most = arguments.recorded, arguments.backend, arguments.matches
-    chosen = arguments.rows or ["pairs", "simulated", "map"]
-    rows = [] if data is None or "pairs" not in chosen else recorded(data, backend, most)
+    chosen = arguments.rows or [*ROWS]
+    rows = [] if data is None else recorded(data, backend, most, chosen)
     rows += simulated(data, backend, most, arguments.seed) if "simulated" in chosen else []
     rows += [] if data is None or "map" not in chosen else in_maps(data, backend, most, arguments.seed)
     lines = [

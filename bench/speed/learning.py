@@ -33,7 +33,6 @@ import numpy as np
 import gpusense as gs
 from gpusense.backends import Backend, BackendInfo, get_backend
 from gpusense.backends.proxy import Proxy
-from gpusense.evaluation.fit_scenes import Scene, learning_scenes
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.em import em_step
 from gpusense.learning.beam.options import make_bounds, open_device
@@ -42,8 +41,10 @@ from gpusense.learning.beam.point import Point, first_guess, random_start
 from gpusense.learning.beam.problem import NO_PRIOR, Problem
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
 from common import add_repeats, best, make_parser, parse, publish, table
+from support.fit_scenes import Scene, learning_scenes
 
 TYPICAL = Scene("typical", gs.BeamParameters(0.7, 0.1, 0.1, 0.1, 0.15, 0.5), 30.0, (0.02, 0.98))
 IDENTIFIED, FALLS, SHARE, NATS = 0.3, 1e-9, 0.95, 1e-4

@@ -105,8 +105,8 @@ def install_command(module: str) -> str:
 
 def _pip() -> str:
     """Return the command that runs this Python's pip: ``pip`` if the shell finds the same one."""
-    found = shutil.which("pip")
-    own = Path(sys.executable).parent if sys.executable else None
-    if own is None or (found is not None and Path(found).parent == own):
+    pip = shutil.which("pip")
+    folder = Path(sys.executable).parent if sys.executable else None
+    if folder is None or (pip is not None and Path(pip).parent == folder):
         return "pip"
     return f"{shlex.quote(sys.executable)} -m pip"

@@ -46,11 +46,11 @@ def card(
 
 def split_options(options: Iterable[str]) -> list[tuple[str, str]]:
     """Return names and values of options as ``repr`` shows them, such as ``caster=Exact()``."""
-    found = []
+    pairs = []
     for option in options:
         name, equals, value = option.partition("=")
-        found.append((name, value) if equals else ("", name))
-    return found
+        pairs.append((name, value) if equals else ("", name))
+    return pairs
 
 
 def pose_rows(pose: NDArray[np.floating], covariance: NDArray[np.floating]) -> list[tuple[object, ...]]:

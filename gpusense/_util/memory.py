@@ -14,8 +14,8 @@ _CGROUPS = (
 
 def available() -> int | None:
     """Return the free memory [bytes] of the machine, its container and this process's limit; None if unknown."""
-    found = [_machine(), _container(), _limit()]
-    known = [size for size in found if size is not None]
+    limits = [_machine(), _container(), _limit()]
+    known = [size for size in limits if size is not None]
     return max(min(known), 0) if known else None
 
 

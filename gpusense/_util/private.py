@@ -120,10 +120,10 @@ def _is_group_of_one(group: int) -> bool:
     import pwd
 
     try:
-        user, found = pwd.getpwuid(os.geteuid()), grp.getgrgid(group)
+        user, owners = pwd.getpwuid(os.geteuid()), grp.getgrgid(group)
     except KeyError:
         return False
-    return found.gr_name == user.pw_name and user.pw_gid == group and set(found.gr_mem) <= {user.pw_name}
+    return owners.gr_name == user.pw_name and user.pw_gid == group and set(owners.gr_mem) <= {user.pw_name}
 
 
 def read_regular(path: Path, most: int, *, touch: bool = False, head: int | None = None) -> bytes:

@@ -1,4 +1,4 @@
-"""Arrays of other libraries: on a device they are used in place, in host memory they become NumPy views.
+"""Arrays of other libraries: device arrays are used in place, host arrays become NumPy views.
 
 Two protocols are read: DLPack (PyTorch, CuPy, JAX, Warp, NumPy) and the CUDA array interface. The registry of backends
 names the libraries whose arrays have neither.
@@ -21,9 +21,9 @@ from gpusense.backends.registry import entry_of_array, selection_for
 
 # DLPack's numbers for memory that the processor reads: host memory, also pinned for CUDA or ROCm.
 _HOST = (1, 3, 11)
-# Poses that make a row whose numbers are reduced side by side, and poses below which they are transposed instead.
+# Number of poses in a row whose numbers are reduced side by side, and number below which poses are transposed instead.
 _WIDTH, _FEW = 256, 1 << 14
-# Least poses whose bounds are worth a thread, and most threads: more wait for one another.
+# Least number of poses whose bounds are worth a thread, and largest number of threads: more wait for each other.
 _SHARE, _MOST_SHARES = 1 << 16, 4
 
 Bounds = tuple[tuple[float, ...], tuple[float, ...]]
@@ -45,8 +45,8 @@ def to_host(array: object, name: str = "poses") -> object:
     """Return a NumPy view of an array of another library in host memory; other objects as they are.
 
     Raises:
-        TypeError: a tensor whose gradients are recorded.
-        ValueError: a masked value.
+        TypeError: A tensor whose gradients are recorded.
+        ValueError: A masked value.
     """
     if isinstance(array, (np.ndarray, list, tuple)):
         return masks.unmasked(name, array)
@@ -60,7 +60,7 @@ def to_host(array: object, name: str = "poses") -> object:
 
 
 def copied_to_host(array: object, backend: Backend, name: str) -> object:
-    """Return readings as a NumPy array, NaN where masked; those on the device are copied, after its work has ended."""
+    """Return readings as a NumPy array, NaN where masked; device arrays are copied after the device has finished."""
     array = masks.filled(array)
     if not on_device(array):
         return to_host(array, name)
@@ -71,8 +71,8 @@ def _adopt(array: Any, backend: Backend, name: str, *, in_place: bool = False) -
     """Return an array on the device as a buffer of the backend.
 
     Raises:
-        TypeError: the backend cannot read it.
-        ValueError: see Backend.adopt.
+        TypeError: The backend cannot read it.
+        ValueError: See Backend.adopt.
     """
     if isinstance(array, Adopted):
         return array
@@ -87,11 +87,11 @@ def _adopt(array: Any, backend: Backend, name: str, *, in_place: bool = False) -
 def host_poses(array: object, name: str, scans: int | None = None) -> tuple[np.ndarray, Bounds]:
     """Return (N, 3) poses in host memory, or the poses of S scans in sequence, and their bounds.
 
-    The poses are C-contiguous float64 numbers. NaN and infinities are found by the bounds, which calls need anyway.
+    The poses are C-contiguous float64 numbers. The bounds, which calls need anyway, reveal NaN and infinities.
 
     Raises:
-        TypeError: not numbers.
-        ValueError: another shape, or a value that is not finite.
+        TypeError: Not numbers.
+        ValueError: Another shape, or a value that is not finite.
     """
     read = array if type(array) is np.ndarray else to_host(array, name)
     shape = ("N", 3) if scans is None else (scans, "N", 3)
@@ -106,10 +106,10 @@ def host_poses(array: object, name: str, scans: int | None = None) -> tuple[np.n
 
 
 def bounds_of(poses: np.ndarray) -> Bounds:
-    """Return the least and the largest of each column of (N, 3) poses, 0 for no poses; NaN where a column holds one.
+    """Return the minimum and maximum of each column of (N, 3) poses; 0 without poses, NaN for a column with NaN.
 
-    Columns of three are slow to reduce; rows are not. Few poses are transposed. Of many, each 256 neighbours are a row,
-    and rows are reduced one after the other, by several threads where there are very many.
+    Columns of three are slow to reduce; rows are not. Few poses are transposed. Many poses form rows of 256 neighbours,
+    and rows are reduced one after the other, by several threads for very many poses.
     """
     count = len(poses)
     if not count:
@@ -128,7 +128,7 @@ def bounds_of(poses: np.ndarray) -> Bounds:
             helpers.finish(started)
         low = np.minimum.reduce([part[0] for part in parts])
         high = np.maximum.reduce([part[1] for part in parts])
-    # Both keep NaN.
+    # Both functions propagate NaN.
     return tuple(low.tolist()), tuple(high.tolist())
 
 
@@ -155,8 +155,8 @@ def adopt_poses(
         A flat buffer, the number of all poses, whether they are float32, and the owner of the memory.
 
     Raises:
-        TypeError: not float32 or float64, or not on the backend's device.
-        ValueError: another shape, not C-contiguous, or misaligned where no copy may be made.
+        TypeError: Not float32 or float64, or not on the backend's device.
+        ValueError: Another shape, not C-contiguous, or misaligned where no copy may be made.
     """
     adopted = _adopt(array, backend, name, in_place=in_place)
     if not backend.info.float64:
@@ -172,8 +172,8 @@ def adopt_readings(array: object, backend: Backend, beams: int, *, in_place: boo
     """Return (K,) ranges on the device.
 
     Raises:
-        TypeError: not float32 or float64, or not on the backend's device.
-        ValueError: another shape, not C-contiguous, or misaligned where no copy may be made.
+        TypeError: Not float32 or float64, or not on the backend's device.
+        ValueError: Another shape, not C-contiguous, or misaligned where no copy may be made.
     """
     adopted = _adopt(array, backend, "ranges", in_place=in_place)
     if adopted.shape != (beams,):
@@ -186,8 +186,8 @@ def _check_numbers(adopted: Adopted, name: str) -> None:
     """Refuse numbers of another type than float32 or float64, and arrays that are not C-contiguous.
 
     Raises:
-        TypeError: another type.
-        ValueError: not C-contiguous.
+        TypeError: Another type.
+        ValueError: Not C-contiguous.
     """
     if adopted.dtype not in (np.float32, np.float64):
         dtype = adopted.dtype.name if adopted.dtype.isnative else adopted.dtype.str
@@ -225,8 +225,8 @@ def check_out(out: object, shape: tuple[int, ...], real: np.dtype, backend: Back
     """Return the memory of ``out=``: a NumPy array, or a flat buffer on the device; None where ``out`` is None.
 
     Raises:
-        TypeError: not an array of the precision in the memory where the poses are.
-        ValueError: another shape, not C-contiguous, or read-only.
+        TypeError: Not an array of the precision in the memory where the poses are.
+        ValueError: Another shape, not C-contiguous, or read-only.
     """
     if out is None:
         return None
@@ -250,11 +250,11 @@ def check_out(out: object, shape: tuple[int, ...], real: np.dtype, backend: Back
 def _check_result(
     dtype: np.dtype, shape: tuple[int, ...], usable: bool, real: np.dtype, wanted: tuple[int, ...]
 ) -> None:
-    """Hold ``out`` to its rules.
+    """Check ``out`` against its rules.
 
     Raises:
-        TypeError: another precision.
-        ValueError: another shape, or of no use for writing.
+        TypeError: Another precision.
+        ValueError: Another shape, or of no use for writing.
     """
     if dtype != real:
         raise TypeError(f"out: must hold {real.name}, got {dtype.name}")

@@ -1,7 +1,7 @@
-"""A backend: a device that holds buffers and runs programs, and no science.
+"""A backend: a device that holds buffers and runs programs, without knowledge of models.
 
-Buffers are opaque: models only pass them on. Kernels are named by the signature table. Every backend has every method.
-A method of an ability that it lacks does nothing, where that is correct, or raises an error.
+Buffers are opaque: models only pass them on. The signature table names the kernels. Every backend has every method;
+without the ability that a method needs, the method does nothing if that is correct, or raises an error.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Adopted:
         dtype: Type of its numbers.
         strides: Bytes from one number to the next along each axis.
         contiguous: Whether it is C-contiguous.
-        to_host: Copies it to the host, after all work that was started before.
+        to_host: Function that copies it to the host, after all earlier work.
         owner: The object that keeps the memory alive.
     """
 
@@ -67,9 +67,9 @@ class Backend(ABC):
 
     @abstractmethod
     def upload(self, array: np.ndarray, out: Buffer | None = None, *, wait: bool = True) -> Buffer:
-        """Copy a C-contiguous array to the device, into the head of ``out`` if that is not None.
+        """Copy a C-contiguous array to the device, into the beginning of ``out`` if that is not None.
 
-        Without ``wait`` the array must stay as it is until ``synchronize`` has returned.
+        Without ``wait`` the array must not change until ``synchronize`` has returned.
         """
 
     @abstractmethod
@@ -77,18 +77,18 @@ class Backend(ABC):
         """Allocate a buffer of ``count`` numbers, cleared with ``zero``.
 
         Raises:
-            MemoryError: the device cannot hold it.
+            MemoryError: The device cannot hold it.
         """
 
     @abstractmethod
     def download(self, buffer: Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
-        """Copy the head of a buffer into a C-contiguous array, after everything that was started before.
+        """Copy the beginning of a buffer into a C-contiguous array, after all earlier work.
 
         Without ``wait`` the array must stay alive, and is not filled, until ``synchronize`` has returned.
         """
 
     def empty_result(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-        """Return a new host array for a result; large ones have the memory of earlier results that are gone."""
+        """Return a new host array for a result; large arrays reuse the memory of earlier results that were freed."""
         return np.empty(shape, dtype)
 
     @abstractmethod
@@ -96,14 +96,14 @@ class Backend(ABC):
         """Return ``count`` numbers of a buffer from number ``first`` on as ``dtype``, without a copy.
 
         Raises:
-            ValueError: parts cannot begin there; see ``alignment``.
+            ValueError: Parts cannot begin there; see ``alignment``.
         """
 
     # ---- programs
 
     @abstractmethod
     def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
-        """Return a kernel by its name, specialised by flags; it is compiled once and kept."""
+        """Return a kernel by its name, specialised by flags; it is compiled once and cached."""
 
     @abstractmethod
     def source(self, kernel: str, flags: frozenset[str]) -> str:
@@ -123,31 +123,31 @@ class Backend(ABC):
         return _ProgramRecording(self, program)
 
     def replay(self, recording: Recording) -> None:
-        """Start a recording as part of this thread's batch, or at once where it has none."""
+        """Start a recording as part of this thread's batch, or at once without a batch."""
         recording()
 
     @property
     def replays(self) -> bool:
-        """Tell whether to record bound calls of few particles, although a recording must copy their NumPy arrays."""
+        """Return whether to record bound calls of few particles, although a recording must copy their NumPy arrays."""
         return False
 
-    # ---- batches: where starts take longer than small work, the work of a call is started together
+    # ---- batches: if a start takes longer than small work, the work of a call is started at once
 
     def begin_batch(self) -> None:  # noqa: B027
-        """Put this thread's launches and copies off from now on; ``submit`` or ``synchronize`` starts them in order.
+        """Defer this thread's launches and copies from now on; ``submit`` or ``synchronize`` starts them in order.
 
-        A blocking copy first starts everything before it, so the order of a call is kept.
+        A blocking copy first starts all deferred work, so the order of a call is preserved.
         """
 
     def submit(self) -> None:  # noqa: B027
-        """Start the launches and copies of this thread's batch; it goes on."""
+        """Start the launches and copies of this thread's batch, and continue the batch."""
 
     def end_batch(self) -> None:  # noqa: B027
         """Start the launches and copies of this thread's batch, and end it."""
 
     @property
     def in_batch(self) -> bool:
-        """Tell whether this thread has a batch."""
+        """Return whether this thread has a batch."""
         return False
 
     def address(self, buffer: Buffer) -> int:
@@ -158,21 +158,21 @@ class Backend(ABC):
         """Refuse a forked child of the process that opened the device.
 
         Raises:
-            RuntimeError: this process is such a child.
+            RuntimeError: This process is such a child.
         """
 
     # ---- arrays of other libraries in the memory of the device
 
     def reads(self, array: object) -> bool:
-        """Return whether an array on a device is of a library whose arrays this device may take."""
+        """Return whether a device array belongs to a library whose arrays this device may use."""
         return False
 
     def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
         """Return an array of another library without a copy; a misaligned one is copied unless ``in_place``.
 
         Raises:
-            TypeError: it is not in this device's memory, or does not hold numbers.
-            ValueError: it must be used in place, and cannot.
+            TypeError: It is not in this device's memory, or does not hold numbers.
+            ValueError: It must be used in place, and cannot.
         """
         raise TypeError(f"{name}: must be in host memory for {self.info.selection}, got an array on a device")
 
@@ -190,15 +190,15 @@ class Backend(ABC):
         return self.empty(count, dtype)
 
     def copy(self, source: Buffer, target: Buffer, size: int, *, begin: int = 0, to: int = 0) -> None:
-        """Start to copy ``size`` bytes of a buffer from byte ``begin`` on into another, from byte ``to`` on."""
+        """Start copying ``size`` bytes of a buffer from byte ``begin`` on into another, from byte ``to`` on."""
         raise TypeError(f"{self.info.selection} does not copy between buffers")
 
     def copies_from(self, other: Backend) -> bool:
-        """Return whether ``copy`` takes buffers of another device, whose work on them has ended, as source."""
+        """Return whether ``copy`` accepts source buffers of another device, whose work on them has ended."""
         return other is self
 
     def lend(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
-        """Return a buffer as an array of the library that the backend is made with."""
+        """Return a buffer as an array of the backend's library."""
         raise TypeError(f"{self.info.selection} does not lend buffers")
 
 

@@ -2,9 +2,9 @@
 
 Entries are in gpusense's folder (see :mod:`gpusense.backends.folders`). An entry is one file that is named by a hash of
 its key and written by rename. It begins with that hash and a checksum of hash and contents, so neither damage nor an
-exchange of two files passes. The oldest entries go when the folder holds more than it may; only a file with the name
-and the head of an entry is deleted. Where the folder is not safe or cannot be written, a private temporary folder takes
-its place and one line of the log names it. A cache never stops a run.
+exchange of two files goes unnoticed. The oldest entries are evicted when the folder exceeds its limit; only a file with
+the name and the head of an entry is deleted. If the folder is not safe or not writable, a private temporary folder
+replaces it and one line of the log names it. A cache never stops a run.
 
 PoCL and Warp keep compiled kernels in folders without checksums. Each process gives them an empty folder (see
 :mod:`gpusense.backends.scratch`), and copies kernels there from entries, and new ones back into entries.
@@ -32,7 +32,7 @@ from gpusense.backends.processor import fingerprint
 
 MAX_BYTES = 256 << 20
 MAX_ENTRIES = 1024
-# Of one entry; the largest that was seen has 4 MiB.
+# Largest size of an entry; the largest entry so far had 4 MiB.
 MAX_ENTRY_BYTES = 64 << 20
 _MAGIC = b"gpusense entry 3\n"
 _DIGEST = hashlib.sha256().digest_size
@@ -40,14 +40,14 @@ _DIGEST = hashlib.sha256().digest_size
 _HEAD = len(_MAGIC) + 2 * _DIGEST
 _NAME = re.compile(r"([0-9a-f]{64})\.gpusense")
 _UNFINISHED = re.compile(r"([0-9a-f]{64})-[a-z0-9_]{8}\.new")
-# Bytes, as most entries have.
+# Typical size of an entry [bytes].
 _SMALL = 64 << 10
 # Seconds after which an unfinished file belongs to a process that was killed.
 _STALE = 3600
 
 
 def _folders() -> Iterator[tuple[Place, Path]]:
-    """Yield the folder in the chosen place, and the one among temporary files where that does not take files."""
+    """Yield the folder in the chosen place, then the temporary one in case no file can be written there."""
     chosen = folders.chosen_place()
     if chosen is None:
         return
@@ -63,13 +63,13 @@ def _folders() -> Iterator[tuple[Place, Path]]:
             return
 
 
-# Folders that did not take an entry.
+# Folders in which an entry could not be written.
 _failed: set[str] = set()
 
 
 @functools.lru_cache(maxsize=64)
 def _takes_files(place: Place, folder: Path) -> bool:
-    """Return whether a folder takes a small file."""
+    """Return whether a small file can be written in a folder."""
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(bytes(_SMALL))
@@ -94,7 +94,7 @@ def _head(digest: bytes, payload: bytes) -> bytes:
 
 
 def load_entry(key: str) -> bytes | None:
-    """Return the contents of an entry; None where there is none, it is damaged, or another's file is in its place."""
+    """Return the contents of an entry; None if it is absent or damaged, or its file belongs to another user."""
     digest = _digest(key)
     for _, folder in _folders():
         try:
@@ -109,7 +109,7 @@ def load_entry(key: str) -> bytes | None:
 
 
 def store_entry(key: str, payload: bytes) -> None:
-    """Keep an entry where a folder takes it; a failure is reported once for each folder."""
+    """Write an entry if a folder allows it; a failure is reported once for each folder."""
     if len(payload) > MAX_ENTRY_BYTES - _HEAD:
         return
     for place, folder in _folders():
@@ -131,7 +131,7 @@ def _write(folder: Path, name: str, data: bytes) -> None:
     """Write an entry by rename, and evict old entries where the folder exceeds its limit.
 
     Raises:
-        OSError: the folder does not take it, or something else than a file is in its place.
+        OSError: The folder is not writable, or something other than a file is in the entry's place.
     """
     with contextlib.suppress(FileNotFoundError):
         if not stat.S_ISREG(os.lstat(folder / name).st_mode):
@@ -149,15 +149,15 @@ def _write(folder: Path, name: str, data: bytes) -> None:
 
 
 def _evict(path: Path) -> None:
-    """Remove a file that has the name and the head of an entry, or of one that was begun; leave any other."""
+    """Remove a file that has the name and the head of an entry, complete or unfinished; leave all other files."""
     name = _NAME.fullmatch(path.name) or _UNFINISHED.fullmatch(path.name)
     if name is None:
         return
     with contextlib.suppress(OSError):
         expected = _MAGIC + bytes.fromhex(name[1])
-        found = read_regular(path, MAX_ENTRY_BYTES, head=len(expected))
+        head = read_regular(path, MAX_ENTRY_BYTES, head=len(expected))
         # A process may be killed before it has written the head.
-        if found == expected or (path.suffix == ".new" and expected.startswith(found)):
+        if head == expected or (path.suffix == ".new" and expected.startswith(head)):
             path.unlink()
 
 
@@ -193,7 +193,7 @@ class BinaryCache:
 
     def __init__(self, info: BackendInfo) -> None:
         parts = ["program", info.backend, info.name, info.driver, __version__]
-        # GPUs' programs are the same on every host.
+        # Programs for GPUs do not depend on the host.
         self._device = "\n".join([*parts, fingerprint() if info.kind == "cpu" else ""])
 
     def key(self, source: str, options: Sequence[str]) -> str:
@@ -201,11 +201,11 @@ class BinaryCache:
         return "\0".join([self._device, *options, source])
 
     def load(self, source: str, options: Sequence[str]) -> bytes | None:
-        """Return the compiled program, or None where there is none or it is damaged."""
+        """Return the compiled program, or None if it is absent or damaged."""
         return load_entry(self.key(source, options))
 
     def store(self, source: str, options: Sequence[str], payload: bytes) -> None:
-        """Keep a compiled program."""
+        """Store a compiled program."""
         if payload:
             store_entry(self.key(source, options), payload)
 

@@ -1,7 +1,7 @@
-"""The devices among which ``"auto"`` chooses, the fastest first, and those that failed on the way.
+"""The devices among which ``"auto"`` chooses, the fastest first, and the devices that failed.
 
-Each device is tried in turn: its library is loaded, its verdict is asked for, it is opened. A device that fails gives
-way to the next slower one, and NumPy, which needs no driver, is the last. The failures are reported in one line.
+Each device is tried in turn: its library is loaded, its verdict is obtained, and it is opened. If a device fails, the
+next slower one follows, and NumPy, which needs no driver, is the last. The failures are reported in one line.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ class Failure:
     """A device that was passed over, or a backend without one.
 
     Attributes:
-        selection: Its selection string; empty where there is none.
+        selection: Its selection string; empty without one.
         reason: The reason, with the remedy.
         line: Device and reason, as messages have them.
-        lasting: Whether a verdict says so that was made before, and reported then.
+        lasting: Whether the reason is an earlier verdict, which was reported when it was made.
     """
 
     selection: str
@@ -49,7 +49,7 @@ class Chain:
     failures: list[Failure] = field(default_factory=list)
 
     def __iter__(self) -> Iterator[Device]:
-        """Yield devices; the library of a slower class is not loaded before it must."""
+        """Yield devices; the library of a slower class is loaded only when needed."""
         waiting: list[Device] = []
         entries = sorted(ENTRIES, key=lambda one: one.best)
         while entries or waiting:
@@ -68,7 +68,7 @@ class Chain:
         self.failures.append(Failure(device.selection, reason, f"{_name_of(device)}: {reason}", False))
 
     def report(self, chosen: Device, held: list[str]) -> None:
-        """Leave in the list of this choice's warnings those to be shown, with one line about all failures.
+        """Reduce the list of this choice's warnings to those to be shown, with one line about all failures.
 
         Where NumPy is chosen although faster backends are installed, every process prints this line, alone: NumPy
         compiles nothing, so other warnings mean nothing. Else a verdict is reported by the process that makes it.
@@ -84,17 +84,17 @@ class Chain:
             held.append(f"'auto' is {chosen.selection} ({chosen.name}): {'; '.join(one.line for one in fresh)}")
 
     def _present(self, entry: Entry) -> list[Device]:
-        """Return the devices of a backend that may be chosen; note why one that is installed has none."""
-        found, absent = listing.present(entry)
-        found = [device for device in found if device.kind != "simulator"]
-        if not found and importlib.util.find_spec(entry.package) is not None:
+        """Return the devices of a backend that may be chosen; note why an installed backend has none."""
+        devices, absent = listing.present(entry)
+        devices = [device for device in devices if device.kind != "simulator"]
+        if not devices and importlib.util.find_spec(entry.package) is not None:
             for part in absent:
                 self.failures.append(Failure("", part.reason, f"{part.name}: {part.reason}", True))
-        return found
+        return devices
 
 
 def best_of(candidates: list[Device], failures: list[Failure] | None = None) -> Device | None:
-    """Return the usable device of the fastest class, and of several there the one that scores scans fastest.
+    """Return the usable device of the fastest class; among several, the device that scores scans fastest.
 
     The rates were measured with the proofs. A device that is faster by less than ``NOTICED`` is not chosen, so that
     runs do not change between devices.
@@ -126,7 +126,7 @@ def _name_of(device: Device) -> str:
 
 
 def _verdict_of(device: Device) -> Verdict:
-    """Return the verdict on a device that is present; a failure on the way to one is a verdict too."""
+    """Return the verdict on a device that is present; a failure to obtain one is also a verdict."""
     library, info, handle = listing.lookup(device.selection)
     try:
         return listing.verdict_on(info, handle, library)

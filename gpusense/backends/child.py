@@ -1,7 +1,7 @@
-"""Child processes for work with a driver: one that crashes or hangs does no harm to the user's process.
+"""Child processes for work with a driver, whose crash or hang does not harm the user's process.
 
-A driver may also end its process as if all were well, so a child's end says nothing: its last report repeats a number
-that it was sent.
+A driver may also end its process with exit status 0, so the status proves nothing: the child's last report must repeat
+a number that it was sent.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from typing import IO, Any
 
 from gpusense._util.files import unnamed_file
 
-# Seconds; a first compilation takes some three on a common processor.
+# Default time limit [s]; a first compilation takes about 3 s on a common processor.
 _LIMIT = 60.0
 # A child that waits for a processor gets more time, at most this number of limits.
 _MOST_LIMITS = 10
 MARK = "gpusense-child "
-# Bytes of a child's output that are looked through for reports.
+# Bytes of a child's output that are searched for reports.
 _MOST_OUTPUT = 16 << 20
 _START = (
     "import sys, json; job = json.loads(sys.stdin.readline()); sys.path[:] = job['path']; "
     "from gpusense.backends.child import main; main(job)"
 )
-# Signals that come from outside: they are no failure of the driver.
+# Signals from outside, which are not a failure of the driver.
 _FOREIGN = tuple(getattr(signal, name) for name in ("SIGKILL", "SIGTERM", "SIGINT", "SIGHUP") if hasattr(signal, name))
-# Failures of the machine's state and not of the driver.
+# Failures due to the state of the machine, not to the driver.
 PASSING = re.compile(
     r"No space left|is full|quota|Permission denied|Read-only file|[Oo]ut of memory|MemoryError|allocate|takes \d+ MiB"
 )
@@ -50,8 +50,8 @@ class Outcome:
     Attributes:
         said: Its reports, in order, without the last one.
         failure: The failure in one line; empty where it ended well.
-        conclusive: False where something else than the driver may have ended it.
-        started: False where the system started no child.
+        conclusive: False if something other than the driver may have ended it.
+        started: False if the system started no child.
     """
 
     said: list[dict[str, Any]]
@@ -83,7 +83,7 @@ def time_limit() -> float:
     """Return the time limit of a child [s]: ``$GPUSENSE_PROOF_SECONDS``.
 
     Raises:
-        ValueError: the variable is not a positive number.
+        ValueError: The variable is not a positive number.
     """
     text = os.environ.get("GPUSENSE_PROOF_SECONDS", "")
     try:
@@ -115,7 +115,7 @@ def run_text(arguments: list[str], job: dict[str, Any], variables: dict[str, str
             with the ``token`` that is added to the job.
         variables: Further variables of its environment.
     """
-    # The child starts no children.
+    # The child must not start children.
     environment = os.environ | {"GPUSENSE_PROOF": "off"} | (variables or {})
     command = [sys.executable, *arguments]
     limit, token = time_limit(), secrets.token_hex(16)
@@ -225,7 +225,7 @@ def main(job: dict[str, Any]) -> None:
     with contextlib.suppress(ImportError, ValueError, OSError):
         import resource
 
-        # A process that is expected to die leaves no image of its memory.
+        # A process that is expected to die must not dump core.
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
     def report(values: dict[str, Any]) -> None:

@@ -4,7 +4,7 @@ The place is ``$GPUSENSE_CACHE_DIR``, else ``$XDG_CACHE_HOME/gpusense``, else th
 ``~/.cache/gpusense`` on Linux, ``~/Library/Caches/gpusense`` on macOS, and below ``%LOCALAPPDATA%`` on Windows.
 ``GPUSENSE_CACHE=off`` switches the cache off. A place may hold files of other programs: gpusense reads, writes and
 deletes only in the folder ``gpusense-kernels`` there, which has a marker file. Kernels are code, so it must be this
-user's, and no other user may write in it or rename a folder above it, whichever variable chose the place.
+user's, and no other user may write in it or rename a folder above it, whatever variable chose the place.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _MARKER_TEXT = (
 )
 # The folders that were checked, for a user; no other user can change them afterwards.
 _checked: set[tuple[str, int]] = set()
-# Folders that were reported.
+# Folders that have been reported.
 _reported: set[str] = set()
 
 
@@ -74,8 +74,8 @@ def own_folder(place: Path) -> Path:
     """Return gpusense's folder in a place; make it where it is absent.
 
     Raises:
-        UnsafeFolderError: another user could change it, or it holds files and no marker.
-        OSError: it cannot be made.
+        UnsafeFolderError: Another user could change it, or it holds files and no marker.
+        OSError: It cannot be made.
     """
     folder = Path(os.path.realpath(place)) / OWN
     key = str(folder), _user()
@@ -90,8 +90,8 @@ def private_folder(place: Path) -> Path:
     """Return a folder of this user alone, made where it is absent.
 
     Raises:
-        UnsafeFolderError: another user could change it.
-        OSError: it cannot be made.
+        UnsafeFolderError: Another user could change it.
+        OSError: It cannot be made.
     """
     folder = Path(os.path.realpath(place.parent)) / place.name
     make_private(folder)
@@ -99,7 +99,7 @@ def private_folder(place: Path) -> Path:
 
 
 def report(place: Place, error: OSError) -> None:
-    """Report once that a place is not used, or takes no files."""
+    """Report once that a place is not used or not writable."""
     if str(place.folder) not in _reported:
         _reported.add(str(place.folder))
         rule = reason_of(error)
@@ -120,12 +120,12 @@ def _user() -> int:
 def _mark(folder: Path) -> None:
     """Write the marker of an empty folder; check that any other folder has it.
 
-    Between any two steps this process may be killed, or another process may look. So files come after a whole marker
-    only, and a marker that was begun is completed by whoever finds nothing else.
+    This process may be killed, or another may look, between any two steps. Therefore files are written only after a
+    complete marker, and a process that finds only an unfinished marker completes it.
 
     Raises:
-        UnsafeFolderError: the folder holds something and no marker.
-        OSError: the marker cannot be written.
+        UnsafeFolderError: The folder holds something and no marker.
+        OSError: The marker cannot be written.
     """
     if _marker(folder) == _MARKER_TEXT:
         return
@@ -145,7 +145,7 @@ def _mark(folder: Path) -> None:
 
 
 def _marker(folder: Path) -> bytes | None:
-    """Return the contents of a folder's marker: empty where there is none, None where its place is taken."""
+    """Return the contents of a folder's marker: empty without one, None if something else is in its place."""
     try:
         return read_regular(folder / MARKER, 4096)
     except FileNotFoundError:

@@ -1,6 +1,6 @@
 """Threads that share the host's part of large work: launches on the processor, copies, and bounds of poses.
 
-NumPy and Warp release Python's lock while they work on large arrays, so the threads run side by side.
+NumPy and Warp release Python's lock while they work on large arrays, so the threads run in parallel.
 """
 
 from __future__ import annotations

@@ -19,8 +19,9 @@ class BackendInfo:
         memory: Bytes of device memory.
         max_buffer: Bytes of the largest buffer.
         float64: Whether float64 kernels exist on it.
-        lanes: 1 leaves it to the compiler to compute several particles or beams at once, more asks for kernels that do.
-        vector_loops: Whether the compiler makes vectors of a work-item's loops over readings, and not of work-items.
+        lanes: Particles or beams that a work-item of kernels in lanes computes at once; 1 leaves vectors to the
+            compiler.
+        vector_loops: Whether the compiler vectorises a work-item's loops over readings rather than over work-items.
         target: The processor for which the driver compiles, by its compiler's name; empty where it is not known.
         graphs: Whether the launches and copies of a call are a batch, which is replayed as one graph once it repeats.
 
@@ -57,7 +58,7 @@ class ProcessBound:
         """Refuse a forked child, where the driver would hang or corrupt memory.
 
         Raises:
-            RuntimeError: this process is not the one that opened the device.
+            RuntimeError: This process is not the one that opened the device.
         """
         if os.getpid() != self._process:
             raise RuntimeError(

@@ -10,11 +10,11 @@ from gpusense.backends.info import BackendInfo
 
 
 class Absent(NamedTuple):
-    """A part of a backend that this machine lacks.
+    """A part of a backend that is missing on this machine.
 
     Attributes:
         name: The library or device that is absent.
-        kind: The kind of device that it would give, ``"cpu"`` or ``"gpu"``.
+        kind: The kind of device that it would provide, ``"cpu"`` or ``"gpu"``.
         reason: The reason, with the remedy.
     """
 
@@ -32,7 +32,7 @@ class Library(ABC):
 
     @abstractmethod
     def open(self, info: BackendInfo, handle: Any) -> Backend:
-        """Open a device with the lanes and precisions that ``info`` says."""
+        """Open a device with the lanes and precisions of ``info``."""
 
     def absent(self) -> list[Absent]:
         """Return the parts of the library that this machine lacks, such as drivers that cannot be loaded."""
@@ -47,7 +47,7 @@ class Library(ABC):
         return f"no driver offers a device: {install or 'install or update the driver of its vendor'}"
 
     def is_simulator(self, info: BackendInfo) -> bool:
-        """Return whether a device checks or emulates: it computes correctly, but is too slow to be chosen unasked."""
+        """Return whether a device is a checker or an emulator: correct, but too slow to be chosen unasked."""
         return False
 
     def trouble(self, handle: Any) -> str:
@@ -80,6 +80,6 @@ class Library(ABC):
         """Return a backend that works on a user's queue.
 
         Raises:
-            ValueError: the queue is not an in-order queue.
+            ValueError: The queue is not an in-order queue.
         """
         raise NotImplementedError(f"{type(self).__name__} takes no queues of users")

@@ -22,7 +22,7 @@ class Device:
         name: The name of the device, or of the absent part.
         kind: ``"cpu"``, ``"gpu"`` or ``"simulator"``.
         available: Whether a model can run on it.
-        reason: Why not, with the remedy; empty where it is available. Where only some kernels can run, the reason.
+        reason: Why not, with the remedy; or why only some kernels can run. Empty if it is fully available.
         selection: The value of ``backend=``; empty where it is absent.
         driver: The name and version of the compiler's driver; empty where kernels are not compiled.
         lanes: Particles or beams that one work-item computes at once; 1 leaves that to the compiler.
@@ -51,10 +51,10 @@ class Device:
 def devices(*, anew: bool = False) -> list[Device]:
     """Return every device of this machine, and every backend that is absent with the reason and the remedy.
 
-    A device that was not met before is proved first, which takes some seconds; see :mod:`gpusense.backends.proof`.
+    A new device is proved first, which takes some seconds; see :mod:`gpusense.backends.proof`.
 
     Args:
-        anew: Load all drivers and prove all devices again, as after a change that the keys of verdicts do not show.
+        anew: Load all drivers and prove all devices again, for changes that are not part of the verdicts' keys.
 
     Example:
         >>> import gpusense as gs
@@ -65,7 +65,7 @@ def devices(*, anew: bool = False) -> list[Device]:
 
 
 def present(entry: Entry) -> tuple[list[Device], list[Device]]:
-    """Return the devices of a backend, on which there need be no verdict yet, and its absent parts."""
+    """Return the devices of a backend, possibly still without verdicts, and its absent parts."""
     library, absent = _absence(entry)
     return ([] if library is None else [_device(info, library) for info, _ in _listed(library)[0]]), absent
 
@@ -74,7 +74,7 @@ def lookup(selection: str) -> tuple[Library, BackendInfo, Any]:
     """Return the library, the description and the handle of a device by its selection string.
 
     Raises:
-        ValueError: the library cannot be imported, or has no such device.
+        ValueError: The library cannot be imported, or has no such device.
     """
     library, reason = registry.load(BY_NAME[selection.partition(":")[0]])
     if library is None:
@@ -86,7 +86,7 @@ def lookup(selection: str) -> tuple[Library, BackendInfo, Any]:
 
 
 def verdict_on(info: BackendInfo, handle: Any, library: Library, *, anew: bool = False) -> Verdict:
-    """Return the verdict on a device; simulators are slow and selected by name only, so they are trusted."""
+    """Return the verdict on a device; simulators are slow and selected only by name, so they are trusted."""
     if not BY_NAME[info.backend].compiles or library.is_simulator(info):
         return proof.trust(info)
     if trouble := library.trouble(handle):
@@ -98,7 +98,7 @@ def open_device(info: BackendInfo) -> Backend:
     """Open a device without a verdict, with the lanes and precisions that ``info`` says.
 
     Raises:
-        RuntimeError: its selection string means another device.
+        RuntimeError: Its selection string now means another device.
     """
     library, other, handle = lookup(info.selection)
     if (other.name, other.driver) != (info.name, info.driver):
@@ -140,7 +140,7 @@ def _absence(entry: Entry, *, anew: bool = False) -> tuple[Library | None, list[
 
 
 def _listed(library: Library) -> tuple[list[tuple[BackendInfo, Any]], str]:
-    """Return the devices of a library, and why it cannot list any; the reason is empty where it can."""
+    """Return the devices of a library, and the reason if it cannot list any, else an empty text."""
     try:
         return library.list_devices(), ""
     except Exception as error:

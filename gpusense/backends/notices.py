@@ -22,7 +22,7 @@ def warn(text: str) -> None:
 
 @contextlib.contextmanager
 def held() -> Iterator[list[str]]:
-    """Hold back this thread's warnings; yield the list of them. Those that are left in it are logged on leaving."""
+    """Hold back this thread's warnings and yield their list; warnings left in the list are logged on exit."""
     before: list[str] | None = getattr(_thread, "held", None)
     lines: list[str] = []
     _thread.held = lines

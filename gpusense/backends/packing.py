@@ -10,12 +10,12 @@ import zipfile
 import zlib
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-# Of the files of one entry, in all.
+# Largest total size of the files of an entry.
 _MOST_BYTES = 256 << 20
 
 
 class RefusedError(ValueError):
-    """Packed files that are whole and not wanted."""
+    """Packed files that are intact but exceed a limit."""
 
 
 def pack(files: dict[str, bytes]) -> bytes:
@@ -32,7 +32,7 @@ def unpack(payload: bytes) -> dict[str, bytes]:
     """Return the files of :func:`pack`.
 
     Raises:
-        ValueError: a path leads out of the folder, the files are too large, or the contents are no packed files.
+        ValueError: A path leads out of the folder, the files are too large, or the contents are no packed files.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(payload)) as archive:
@@ -56,7 +56,7 @@ def _read_all(archive: zipfile.ZipFile) -> dict[str, bytes]:
     """Return all files of an archive, whatever sizes it claims.
 
     Raises:
-        RefusedError: they are too large.
+        RefusedError: They are too large.
     """
     files, left = {}, _MOST_BYTES
     for name in archive.namelist():
@@ -72,7 +72,7 @@ def write_files(folder: Path, files: dict[str, bytes]) -> None:
     """Write files below a folder, each by rename.
 
     Raises:
-        OSError: the folder does not take them.
+        OSError: The folder does not take them.
     """
     for name, data in files.items():
         path = folder / name

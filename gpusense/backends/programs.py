@@ -1,13 +1,13 @@
 """The programs of earlier calls, which repeated calls start again.
 
 A cache belongs to one owner (a workspace, a bound call, the particles of a filter), holds strong references to its
-programs and to the buffers that they use, and is held by its owner alone. Nothing that it holds refers to the owner, so
-programs and their memory go with it at once, without the garbage collector. They go earlier:
+programs and their buffers, and is referenced only by its owner. Nothing in it refers to the owner, so programs and
+their memory are freed with the owner at once, without the garbage collector. They are freed earlier:
 
-- the oldest one where there are too many,
-- all of them where the owner clears the cache: it replaces a buffer that they use, or the table of the map.
+- the oldest one when there are too many,
+- all of them when the owner clears the cache, because it replaces a buffer that they use, or the table of the map.
 
-The owner's lock also serves the cache, since programs share the owner's buffers. A forked child must not use the
+The owner's lock also protects the cache, since programs share the owner's buffers. A forked child must not use the
 device, and its first start of a program is an error (``Backend.check_process``).
 """
 
@@ -27,7 +27,7 @@ class ProgramCache(Generic[T]):
     """Programs by their keys, in the form in which their owner starts them.
 
     Args:
-        most: Most programs that are kept.
+        most: Largest number of programs that are kept.
     """
 
     def __init__(self, most: int) -> None:
@@ -39,7 +39,7 @@ class ProgramCache(Generic[T]):
         return len(self._kept)
 
     def keep(self, key: Hashable, program: T) -> T:
-        """Keep the program of a key, which determines it, and return it."""
+        """Store the program of a key, which determines it, and return it."""
         while len(self._kept) >= self._most:
             del self._kept[next(iter(self._kept))]
         self._kept[key] = program
@@ -117,7 +117,7 @@ class RepeatedPrograms:
 
     Args:
         backend: The device.
-        most: Most programs that are kept.
+        most: Largest number of programs that are kept.
     """
 
     def __init__(self, backend: Backend, most: int) -> None:

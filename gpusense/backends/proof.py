@@ -1,11 +1,11 @@
 """Verdicts on devices: a child compiles and runs kernels of each family on a device before this process trusts it.
 
-A compiler that does not know a processor aborts, hangs or makes wrong code, in the process that calls it. So the first
-time that a device, its driver, the processor and this version of gpusense are met, a child computes a small scene and
-compares it with NumPy. A family of kernels that fails is not used: lanes are replaced by narrower ones and then by
-scalar kernels, float64 counts as absent, and a device whose scalar kernels fail is unusable. The verdict is kept in the
-cache, and so are the programs that the child compiled. ``GPUSENSE_PROOF=off`` trusts every driver. Where no child can
-be started, a device without a kept verdict is trusted, and the log says so.
+A compiler that does not know a processor aborts, hangs or makes wrong code in the process that calls it. Therefore a
+child computes a small scene and compares it with NumPy, once for each combination of device, driver, processor and
+version of gpusense. A family of kernels that fails is not used: lanes are replaced by narrower ones and then by scalar
+kernels, float64 counts as absent, and a device whose scalar kernels fail is unusable. The verdict is kept in the cache,
+and so are the programs that the child compiled. ``GPUSENSE_PROOF=off`` trusts every driver. If no child can be started,
+a device without a cached verdict is trusted, and the log says so.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _PROVE = "gpusense.evaluation.proof:prove"
 _LOG = logging.getLogger("gpusense")
 # Remedies by the words of a failure.
 _REMEDIES = (
-    # These say themselves what helps.
+    # These failures already name the remedy.
     (r"compiled kernels need a folder|PoCL was used before", ""),
     (
         r'"ld" doesn\'t exist|linker command failed',
@@ -51,12 +51,12 @@ class Verdict:
 
     Attributes:
         usable: Whether models can run on it.
-        lanes: Lanes of kernels in vectors that were proved; 1 where only scalar ones were.
+        lanes: Lanes that were proved; 1 if only scalar kernels were.
         float64: Whether float64 kernels were proved.
         reason: The failures, empty where nothing failed.
         remedy: The remedy for them.
-        rate: Calls of a scan per second, by which devices of one class are ranked; 0 where not measured.
-        passing: Whether the failure is one of the machine's state, without a proof; such a verdict is not kept.
+        rate: Calls of a scan per second, by which devices of a class are ranked; 0 if not measured.
+        passing: Whether the failure is due to the state of the machine, without a proof; such a verdict is not cached.
     """
 
     usable: bool
@@ -88,7 +88,7 @@ def verdict_on(info: BackendInfo, *, setup: Any = None, anew: bool = False) -> V
     Args:
         info: The device.
         setup: The preparation of the child; see ``library.Library.child_setup``.
-        anew: Whether the kept verdict is dropped.
+        anew: Whether the cached verdict is dropped.
     """
     if child.is_off():
         return trust(info)
@@ -124,7 +124,7 @@ def summary(info: BackendInfo, verdict: Verdict) -> str:
 
 
 def with_remedy(reason: str, remedy: str) -> str:
-    """Return a failure and its remedy, where there is one, in one line."""
+    """Return a failure and its remedy, if any, in one line."""
     return f"{reason}; {remedy}" if remedy else reason
 
 
@@ -145,7 +145,7 @@ def _key(info: BackendInfo) -> str:
 
 
 def _load(key: str) -> Verdict | None:
-    """Return the kept verdict; None where there is none or it is damaged."""
+    """Return the cached verdict; None if it is absent or damaged."""
     payload = load_entry(key)
     if payload is None:
         return None
@@ -190,7 +190,7 @@ def _verdict(info: BackendInfo, failures: list[str], outcome: child.Outcome) -> 
 
 
 def _failure(outcome: child.Outcome) -> tuple[str, str]:
-    """Return the family that failed, empty where none did, and its failure in words."""
+    """Return the family that failed and its failure in words; empty texts if none failed."""
     begun = ""
     for report in outcome.said:
         begun = str(report.get("begin", begun))

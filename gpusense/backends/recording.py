@@ -19,7 +19,7 @@ class Recording(ABC):
 
     @abstractmethod
     def explain(self) -> str:
-        """Return in one line how it is started: as one graph, or one by one, with the reason."""
+        """Return in one line how it is started: as one graph, or launch by launch with the reason."""
 
 
 def pluralize(number: int, noun: str) -> str:

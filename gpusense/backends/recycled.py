@@ -1,7 +1,7 @@
-"""Memory of large results on the host, which later results of the same size use again.
+"""Memory of large results on the host, which later results of the same size reuse.
 
 A new array of 144 MB costs some 35 000 page faults, which take several times as long as the copy of the ranges into it.
-So the memory of a result goes back to its device's store when the last array that shows it is gone.
+Therefore the memory of a result returns to its device's store when the last array on it is freed.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-# Least bytes of a result whose memory is kept; blocks, and bytes of them, that wait for the next results.
+# Least size of a result whose memory is kept [bytes]; largest number and total size [bytes] of blocks that wait for
+# reuse.
 LEAST, _MOST_BLOCKS, _MOST_BYTES = 1 << 20, 2, 512 << 20
 
 
@@ -20,11 +21,11 @@ class ResultMemory:
     """Memory that waits for the next results."""
 
     def __init__(self) -> None:
-        # By their identity: one step takes a block out, so no two threads take the same.
+        # Keyed by identity: a single step takes a block out, so no two threads take the same block.
         self._free: dict[int, np.ndarray] = {}
 
     def empty(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-        """Return an array of any contents that shares its memory with no other."""
+        """Return an uninitialised array that shares its memory with no other array."""
         size = math.prod(shape) * dtype.itemsize
         if size < LEAST:
             return np.empty(shape, dtype)
@@ -36,7 +37,7 @@ class ResultMemory:
         return np.asarray(_Loan(self, block)).view(dtype).reshape(shape)
 
     def take_back(self, block: np.ndarray) -> None:
-        """Keep the block of a result that is gone; the oldest ones go where there are too many."""
+        """Keep the block of a freed result; the oldest blocks are dropped if there are too many."""
         self._free[id(block)] = block
         while len(self._free) > _MOST_BLOCKS or sum(one.nbytes for one in [*self._free.values()]) > _MOST_BYTES:
             self._free.pop(next(iter([*self._free]), 0), None)

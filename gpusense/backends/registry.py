@@ -1,13 +1,12 @@
 """The table of backends: one entry and one folder for each.
 
 An entry holds the facts about a backend before its library is loaded. The module that it names holds ``LIBRARY``, of
-the class in ``library.py``, through which devices are listed, proved and opened. Nothing else names a backend.
+the class in ``library.py``, through which devices are listed, proved and opened. No other module names a backend.
 """
 
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 import importlib.util
 import platform
 import sys
@@ -51,7 +50,7 @@ class Entry:
 
     @property
     def has_parts(self) -> bool:
-        """Tell whether a selection string may name a device after the backend's name."""
+        """Return whether a selection string may name a device after the backend's name."""
         return any(":" in selection for selection in self.selections)
 
     @property
@@ -119,9 +118,12 @@ def remedy(entry: Entry) -> str:
 
 def _is_installed(distribution: str) -> bool:
     """Return whether a distribution is installed, by the name under which pip knows it."""
+    # Loads the library of e-mails.
+    from importlib import metadata
+
     try:
-        return bool(importlib.metadata.version(distribution))
-    except importlib.metadata.PackageNotFoundError:
+        return bool(metadata.version(distribution))
+    except metadata.PackageNotFoundError:
         return False
 
 
@@ -134,7 +136,7 @@ def set_up_child(name: str, setup: Any) -> None:
     """Prepare a backend in a child as its parent's is; see :meth:`gpusense.backends.library.Library.child_setup`.
 
     Raises:
-        RuntimeError: the library cannot be imported.
+        RuntimeError: The library cannot be imported.
     """
     library, reason = load(BY_NAME[name])
     if library is None:
@@ -143,7 +145,7 @@ def set_up_child(name: str, setup: Any) -> None:
 
 
 def entry_of_array(array: object) -> Entry | None:
-    """Return the backend whose library an array on a device is of, where its class says so; else None."""
+    """Return the backend to whose library a device array belongs, by its class; None for other arrays."""
     for entry in ENTRIES:
         module = sys.modules.get(entry.array_module) if entry.array_module else None
         if module is not None and isinstance(array, module.Array):

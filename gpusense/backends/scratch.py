@@ -1,9 +1,9 @@
 """A folder of this process for the compiled kernels of drivers, which is removed when the process ends.
 
-Drivers do not check the files in their folders: one that another process left half-written, or that a disk has damaged,
-ends the run. So every process begins with an empty folder, and only files whose checksums hold are copied into
-it (see :mod:`gpusense.backends.cache`). Only this user may change it. Its name, owner and lock file distinguish it from
-other folders, which are never removed.
+Drivers do not check the files in their folders: a half-written or damaged file ends the run. Therefore every process
+begins with an empty folder, and only files whose checksums hold are copied into it (see
+:mod:`gpusense.backends.cache`). Only this user may change it. Its name, owner and lock file distinguish it from other
+folders, which are never removed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from gpusense.backends import folders
 _PREFIX = "gpusense-run-"
 _NAME = re.compile(rf"{_PREFIX}[a-z0-9_]{{8}}")
 _LOCK_FILE = "lock"
-# Bytes that must be free: kernels of a long run, with room for the compiler's temporary files.
+# Free space that is required [bytes]: for the kernels of a long run and the compiler's temporary files.
 _NEEDED = 16 << 20
 # Seconds after which a folder whose lock is free belongs to a process that was killed.
 _STALE = 600
@@ -38,10 +38,10 @@ def scratch_folder(*, executable: bool = True) -> Path:
     """Return this process's folder.
 
     Args:
-        executable: Whether the system must let code run that is loaded from there; some drivers read files instead.
+        executable: Whether the system must allow code from there to run; some drivers only read the files.
 
     Raises:
-        OSError: there is no such folder.
+        OSError: There is no such folder.
     """
     if not executable:
         with contextlib.suppress(OSError):
@@ -94,7 +94,7 @@ def _make(parent: Path, *, executable: bool) -> Path:
     """Make a folder below ``parent`` that other processes do not remove while this one lives.
 
     Raises:
-        OSError: it is not writable, has too little room, could be replaced by other users, or no code may run from it.
+        OSError: It is not writable, has too little room, could be replaced by other users, or no code may run from it.
     """
     folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=parent))
     with contextlib.ExitStack() as failing:
@@ -122,7 +122,7 @@ def _lock(file: Any) -> None:
     """Lock a file until it is closed or this process ends.
 
     Raises:
-        OSError: another process has locked it, or the system has no such locks.
+        OSError: Another process has locked it, or the system has no such locks.
     """
     try:
         import fcntl
@@ -135,7 +135,7 @@ def _check_room(folder: Path, *, executable: bool) -> None:
     """Write a file to check the room of a folder; the figures of a file system do not show quotas.
 
     Raises:
-        OSError: the folder does not take it, or the system does not let code run from it.
+        OSError: The folder does not take it, or the system does not let code run from it.
     """
     probe = folder / "probe"
     with open(probe, "w+b") as file:
@@ -152,7 +152,7 @@ def _check_code(handle: int) -> None:
     """Map a page of a file as code, as loading a library does.
 
     Raises:
-        OSError: the system refuses, as on a file system that is mounted without execution.
+        OSError: The system refuses, as on a file system that is mounted without execution.
     """
     if not sys.platform.startswith("linux"):
         return
@@ -182,18 +182,18 @@ def _remove_killed(folder: Path) -> None:
     """Remove the folder of a killed process: it is old and private, and its lock file is whole and free.
 
     Raises:
-        OSError: it is not.
+        OSError: It is not.
     """
     if time.time() - folder.lstat().st_mtime < _STALE:
         return
     check_private(folder)
     names, expected = os.listdir(folder), _lock_text(folder.name)
     if not names:
-        # Killed before it made the lock file. Only an empty folder is removed by this.
+        # The process was killed before it made the lock file. This removes only an empty folder.
         folder.rmdir()
         return
-    found = read_regular(folder / _LOCK_FILE, len(expected))
-    if found != expected and not (names == [_LOCK_FILE] and expected.startswith(found)):
+    content = read_regular(folder / _LOCK_FILE, len(expected))
+    if content != expected and not (names == [_LOCK_FILE] and expected.startswith(content)):
         return
     flags = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     with os.fdopen(os.open(folder / _LOCK_FILE, flags), "r+b") as lock:

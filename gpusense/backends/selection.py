@@ -5,8 +5,8 @@ Selection strings: ``"auto"``, ``"numpy"``, ``"opencl"``, ``"opencl:P:D"`` (plat
 selects its device, and a backend that works on that queue. ``"auto"`` is the value of ``$GPUSENSE_BACKEND``, and else
 the fastest device that is proved and opens (see :mod:`gpusense.backends.proof`, :mod:`gpusense.backends.chain`).
 
-A selection string is looked up once. A forked process, and a change of the variables on which devices depend, make it
-look anew.
+A selection string is looked up once. It is looked up again in a forked process, and after a change of the variables on
+which devices depend.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ VARIABLES = (
     VARIABLE, "GPUSENSE_PROOF", "GPUSENSE_CACHE", "GPUSENSE_CACHE_DIR", "XDG_CACHE_HOME", "TMPDIR", "POCL_DEVICES",
     "OCL_ICD_VENDORS", "OCL_ICD_FILENAMES", "OPENCL_VENDOR_PATH", "CUDA_VISIBLE_DEVICES",
 )  # fmt: skip
-# As the dictionary of ``os.environ`` has them.
+# As keys of the dictionary in ``os.environ``.
 _KEYS = tuple(map(getattr(os.environ, "encodekey", str), VARIABLES))
 
 _LOCK = threading.Lock()
@@ -60,10 +60,10 @@ def get_backend(selection: Selection = "auto") -> Backend:
         selection: See :mod:`gpusense.backends.selection`; a backend is returned as it is.
 
     Raises:
-        TypeError: the selection is neither a string nor a queue.
-        ValueError: the selection names nothing, or a device that is absent or unusable, or is a queue that is not an
-            in-order queue. No other device is taken in its place, but for ``"auto"``.
-        RuntimeError: the device was opened before this process was forked.
+        TypeError: The selection is neither a string nor a queue.
+        ValueError: The selection names nothing, or a device that is absent or unusable, or is a queue that is not an
+            in-order queue. No other device replaces it, except for ``"auto"``.
+        RuntimeError: The device was opened before this process was forked.
 
     Example:
         >>> from gpusense.backends import get_backend
@@ -74,8 +74,8 @@ def get_backend(selection: Selection = "auto") -> Backend:
         True
     """
     if isinstance(selection, str):
-        key, found = _looks
-        if key == _circumstances() and (backend := found.get(selection)) is not None:
+        key, backends = _looks
+        if key == _circumstances() and (backend := backends.get(selection)) is not None:
             return backend
         return _look(selection)
     return selection if isinstance(selection, Backend) else _opened_queue(selection)
@@ -87,7 +87,7 @@ def default_failures() -> list[tuple[str, str]]:
 
 
 def forget() -> None:
-    """Forget the meaning of selection strings; they are looked up anew, and devices may be opened again."""
+    """Forget the meaning of selection strings; they are looked up again, and devices may be reopened."""
     global _looks
     with _LOCK:
         _looks = ((), {})
@@ -98,7 +98,7 @@ def forget() -> None:
 def _circumstances() -> tuple[Any, ...]:
     """Return the key on which the meaning of a selection string depends: the process, and environment variables.
 
-    To look up a variable that is not set takes ``os.environ`` more than a microsecond, its dictionary a tenth of one.
+    Looking up an unset variable takes more than a microsecond in ``os.environ``, and a tenth of that in its dictionary.
     """
     values = getattr(os.environ, "_data", None)
     if not isinstance(values, dict):
@@ -129,7 +129,7 @@ def _look(selection: str) -> Backend:
 def _opened(selection: str) -> Backend:
     """Return the backend of a user's selection string."""
     with _LOCK:
-        # Before any driver is asked: in a forked child even listing devices may hang.
+        # Checked before any driver is used: in a forked child even listing devices may hang.
         for opened in _OPENED:
             if selection.partition(":")[0] in ("auto", opened.info.backend):
                 opened.check_process()
@@ -143,7 +143,7 @@ def _open_fastest() -> Backend:
     """Open the fastest device that opens, and report those that were passed over.
 
     Raises:
-        ValueError: there is none, not even NumPy.
+        ValueError: There is none, not even NumPy.
     """
     chain = Chain()
     with notices.held() as lines:
@@ -168,7 +168,7 @@ def _open(selection: str) -> Backend:
     """Open the device of a listed selection string.
 
     Raises:
-        ValueError: it is unusable.
+        ValueError: It is unusable.
     """
     library, info, handle = listing.lookup(selection)
     verdict = listing.verdict_on(info, handle, library)
@@ -194,7 +194,7 @@ def _library_of_queue(candidate: object) -> tuple[Library, int]:
     """Return the library and the key of a user's queue.
 
     Raises:
-        TypeError: it is no queue.
+        TypeError: It is no queue.
     """
     kinds = [entry for entry in ENTRIES if entry.queue]
     for entry in kinds:
@@ -210,7 +210,7 @@ def _open_queue(queue: Any, library: Library) -> Backend:
     """Open a user's queue.
 
     Raises:
-        ValueError: its device is unusable, or it is not an in-order queue.
+        ValueError: Its device is unusable, or it is not an in-order queue.
     """
     info, handle = library.device_of_queue(queue)
     verdict = proof.trust(info)
@@ -248,7 +248,7 @@ def _choose(entry: Entry, rest: str, present: list[Device], absent: list[Device]
         if not real:
             others = "".join(f"; {part.name}: {part.reason}" for part in absent)
             raise ValueError(f"backend: only simulators are present and must be named, got {show(selection)}{others}")
-        # Where none is usable, opening the first one says why.
+        # If none is usable, opening the first one gives the reason.
         return (best_of(real) or real[0]).selection
     if entry.by_name:
         matches = _named(rest, present)

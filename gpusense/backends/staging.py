@@ -20,9 +20,10 @@ from gpusense.backends import helpers
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
-# Bytes of a slot, slots, and slots that the threads fill or empty while the device works on the others.
+# Size of a slot [bytes], number of slots, and number of slots that threads fill or empty while the device works on the
+# rest.
 SLOT, SLOTS, _AHEAD = 4 << 20, 16, 12
-# Least bytes of a copy for which pieces pay, and of a piece.
+# Least sizes of a copy for which pieces pay, and of a piece [bytes].
 LEAST, _LEAST_PIECE = 8 << 20, 1 << 20
 # Threads below which a driver's own copy is faster.
 _LEAST_THREADS = 4
@@ -32,18 +33,18 @@ class Slot(ABC):
     """A piece of page-locked memory.
 
     Attributes:
-        bytes: It as an array of the host.
+        bytes: The memory as an array of the host.
     """
 
     bytes: np.ndarray
 
     @abstractmethod
     def to_device(self, buffer: Any, first: int, size: int) -> None:
-        """Start to copy ``size`` bytes of the slot into a buffer, from its byte ``first`` on."""
+        """Start copying ``size`` bytes of the slot into a buffer, from its byte ``first`` on."""
 
     @abstractmethod
     def to_host(self, buffer: Any, first: int, size: int) -> None:
-        """Start to copy ``size`` bytes of a buffer, from its byte ``first`` on, into the slot."""
+        """Start copying ``size`` bytes of a buffer, from its byte ``first`` on, into the slot."""
 
     @abstractmethod
     def wait(self) -> None:
@@ -65,7 +66,7 @@ class Staging:
         """Copy a C-contiguous array to the head of a buffer; the array may change afterwards.
 
         Returns:
-            False where a plain copy is better, and nothing was copied.
+            False if a plain copy is faster; nothing was copied then.
         """
         return self._run(array, buffer, _send)
 
@@ -73,12 +74,12 @@ class Staging:
         """Copy the head of a buffer into a C-contiguous array, which is full on return.
 
         Returns:
-            False where a plain copy is better, and nothing was copied.
+            False if a plain copy is faster; nothing was copied then.
         """
         return self._run(out, buffer, _receive)
 
     def _run(self, array: np.ndarray, buffer: Any, copy: Callable[..., None]) -> bool:
-        """Copy an array by a function, where that pays and no other thread has the slots."""
+        """Copy an array by a function, if that pays and no other thread uses the slots."""
         if array.nbytes < LEAST or helpers.threads() < _LEAST_THREADS or not self._lock.acquire(blocking=False):
             return False
         started: list[Future[None]] = []

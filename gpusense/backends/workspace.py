@@ -12,7 +12,7 @@ from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.programs import ChangingProgram, ProgramCache, RecordedProgram
 from gpusense.interface.launches import Program
 
-# Programs of earlier calls that are kept.
+# Number of programs of earlier calls that are kept.
 _MOST_KEPT = 64
 # Numbers between the beginnings of arrays that are uploaded as one: at least 256 bytes.
 _ALIGNED = 64
@@ -29,7 +29,7 @@ class _Result:
     ) -> None:  # fmt: skip
         self._space, self._backend, self._target, self._first, self._count = space, backend, target, first, count
         self._begin = begin = first * dtype.itemsize
-        # Parts cannot begin at any byte.
+        # Parts can begin only at aligned bytes.
         self._in_place = not isinstance(target, np.ndarray) and begin % backend.alignment == 0
         if isinstance(target, np.ndarray):
             self._buffer = space.empty(name, count, dtype)
@@ -59,7 +59,7 @@ class Workspace:
         self._buffers: dict[tuple[str, np.dtype], tuple[int, Buffer]] = {}
         # Host arrays that unfinished copies read or write.
         self._busy: list[np.ndarray] = []
-        # Programs of earlier calls, by everything on which they depend.
+        # Programs of earlier calls, keyed by everything on which they depend.
         self._programs = ProgramCache[ChangingProgram | RecordedProgram](_MOST_KEPT)
         self._version = 0
         self._parts: dict[Hashable, list[Buffer]] = {}
@@ -75,7 +75,7 @@ class Workspace:
             if self._backend.info.graphs:
                 self._backend.end_batch()
         finally:
-            # Not earlier: launches of the batch may write the flag.
+            # Not earlier, since launches of the batch may write the flag.
             if kind is not None:
                 self.abandon()
 
@@ -86,7 +86,7 @@ class Workspace:
             del self._buffers[POSE_STATUS]
 
     def submit(self) -> None:
-        """Start the work of the call so far."""
+        """Start the work of the call that is deferred so far."""
         self._backend.submit()
 
     def run(
@@ -97,7 +97,7 @@ class Workspace:
         Args:
             key: All sizes and flags on which the program depends, and all numbers that seldom change.
             changing: Arguments that change from call to call, by name: numbers, and buffers of other owners.
-            make: Returns the program.
+            make: Function that returns the program.
             version: The version of the map's table; programs of other versions are dropped.
 
         Returns:
@@ -106,11 +106,11 @@ class Workspace:
         backend = self._backend
         records = backend.info.graphs and backend.in_batch
         if version != self._version:
-            # In this order: an interrupt in between must not leave programs of the old table.
+            # In this order, so that an interrupt in between leaves no programs of the old table.
             self._programs.clear()
             self._version = version
         if records:
-            # A recording keeps its numbers, and no buffer alive: their addresses tell it apart.
+            # A recording keeps its numbers, but no buffer, alive: addresses of buffers identify it.
             key = (key, *map(self._identity, changing.values()))
             kept = self._programs.get((records, key)) or self._programs.keep(
                 (records, key), RecordedProgram(backend, make())
@@ -131,7 +131,7 @@ class Workspace:
 
         Args:
             name: Its name in this workspace.
-            count: Numbers.
+            count: Number of elements.
             dtype: Their type.
             zero: Clear a new buffer.
             lent: Allocate a new buffer that can be lent.
@@ -154,7 +154,7 @@ class Workspace:
         self._buffers[name, dtype] = (count, buffer)
 
     def upload(self, name: str, array: np.ndarray) -> Buffer:
-        """Start to copy a host array into the head of a named buffer; the array must not change until ``wait``."""
+        """Start copying a host array into the beginning of a named buffer; the array must not change until ``wait``."""
         array = np.ascontiguousarray(array)
         self._busy.append(array)
         capacity, buffer = self._buffers.get((name, array.dtype), (0, None))
@@ -191,9 +191,14 @@ class Workspace:
         return _Result(self, self._backend, name, target, first, count, dtype)
 
     def download(self, buffer: Buffer, out: np.ndarray) -> None:
-        """Start to copy the head of a buffer into a C-contiguous array, which is filled after ``wait``."""
+        """Start copying the beginning of a buffer into a C-contiguous array, which is filled after ``wait``."""
         self._busy.append(out)
         self._backend.download(buffer, out, wait=False)
+
+    def read(self, buffer: Buffer, out: np.ndarray) -> None:
+        """Copy the head of a buffer into a C-contiguous array, after all copies and launches, and wait for it."""
+        self._backend.download(buffer, out)
+        self._busy.clear()
 
     def wait(self) -> None:
         """Wait for all copies and launches."""

@@ -8,7 +8,7 @@ beyond the expected drift, the drift cannot confirm a match, so a group with mor
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,20 +47,36 @@ def agreeing(matches: Links, poses: Floats, strict: Flags) -> Flags:
     while True:
         kept = _supported(table, kept)
         lone = kept & strict
-        group, _, evidence, scans = _groups(table, lone, matches)
+        group, evidence, scans = _groups(table, lone, matches)
         lone[lone] = ((evidence < _EVIDENCE) | (scans < _SCANS))[group]
         if not lone.any():
             return kept
         kept = kept & ~lone
 
 
-def largest_group(matches: Links, poses: Floats) -> tuple[int, float]:
-    """Return the size and the evidence of the group of agreeing matches with the most evidence."""
+class Groups(NamedTuple):
+    """Groups of matches that agree with one another, directly or through further matches.
+
+    Attributes:
+        group: (L,) number of the group of each match; -1 where too few agree with it.
+        evidence: (G,) evidence of each group.
+        scans: (G,) number of different scans on the side where these are fewer.
+    """
+
+    group: Integers
+    evidence: Floats
+    scans: Integers
+
+
+def groups_of(matches: Links, poses: Floats) -> Groups:
+    """Return the groups of matches of places, given the poses (K, 3) of the key scans."""
+    group = np.full(len(matches), -1)
     if not len(matches):
-        return 0, 0.0
+        return Groups(group, np.zeros(0), _NONE)
     table = _consistent(matches, poses)
-    _, size, evidence, _ = _groups(table, _supported(table, np.ones(len(matches), bool)), matches)
-    return max(zip(size.tolist(), evidence.tolist(), strict=True), key=lambda group: group[1], default=(0, 0.0))
+    kept = _supported(table, np.ones(len(matches), bool))
+    group[kept], evidence, scans = _groups(table, kept, matches)
+    return Groups(group, evidence, scans)
 
 
 def _supported(table: Any, kept: Flags) -> Flags:
@@ -72,18 +88,13 @@ def _supported(table: Any, kept: Flags) -> Flags:
         kept = fewer
 
 
-def _groups(table: Any, kept: Flags, matches: Links) -> tuple[Integers, Integers, Floats, Integers]:
-    """Return groups of kept matches that agree, directly or through further matches.
-
-    Returns:
-        The number of the group of each of the kept matches; of each group the number of matches, their evidence, and
-        the number of different scans on the side where these are fewer.
-    """
+def _groups(table: Any, kept: Flags, matches: Links) -> Groups:
+    """Return the groups of the kept matches only, which are fewer than L."""
     from scipy.sparse.csgraph import connected_components
 
     rows = np.flatnonzero(kept)
     if not len(rows):
-        return _NONE, _NONE, np.zeros(0), _NONE
+        return Groups(_NONE, np.zeros(0), _NONE)
     count, found = connected_components(table[rows][:, rows], directed=False)
     group: Integers = np.asarray(found, np.int64)
     evidence = np.bincount(group, -np.log10(1 - np.minimum(matches.p_right[rows], _MOST_RIGHT)), count)
@@ -91,8 +102,7 @@ def _groups(table: Any, kept: Flags, matches: Links) -> tuple[Integers, Integers
         np.bincount(np.unique(np.stack([group, ends[rows]]), axis=1)[0], minlength=count)
         for ends in (matches.first, matches.second)
     ]
-    size, fewer = np.bincount(group, minlength=count).astype(np.int64), np.minimum(*scans).astype(np.int64)
-    return group, size, evidence.astype(np.float64), fewer
+    return Groups(group, evidence.astype(np.float64), np.minimum(*scans).astype(np.int64))
 
 
 def _consistent(matches: Links, poses: Floats) -> Any:

@@ -36,16 +36,19 @@ class Drift:
         solution: The poses and links.
         most: Most poses whose joint covariance is kept, at least 3; any other pose takes the covariance of the nearest
             kept pose before it.
+        anchors: (A,) numbers of the kept poses, ascending from 0, in place of a choice of ``most``.
 
     Attributes:
         anchors: (A,) numbers of the kept poses, ascending.
     """
 
-    def __init__(self, solution: Solution, most: int = _ANCHORS) -> None:
+    def __init__(self, solution: Solution, most: int = _ANCHORS, anchors: Integers | None = None) -> None:
         poses, links, count = solution.poses, solution.links, len(solution.poses)
         self._poses = poses
-        spread = _spread_of_steps(solution) if count > most else np.zeros((0, 3, 3))
-        self.anchors = anchors = _anchors_of(spread, most) if count > most else np.arange(count)
+        spread = _spread_of_steps(solution) if count > 1 else np.zeros((0, 3, 3))
+        if anchors is None:
+            anchors = _anchors_of(spread, most) if count > most else np.arange(count)
+        self.anchors = anchors
         self._joint = np.zeros((len(anchors), 3, len(anchors), 3))
         if count < 2:
             return

@@ -20,7 +20,7 @@ BACKEND_HELP = (
     "opencl:<platform>:<device>, warp:cpu or warp:cuda:<number>; 'gpusense devices' lists the devices"
 )
 
-# Library that writes files of an ending, and the subject of the message where it is absent.
+# Library that writes files with a suffix, and the subject of the message if it is absent.
 _PICTURE = ("matplotlib", "a picture")
 _WRITERS = {".png": _PICTURE, ".pdf": _PICTURE, ".svg": _PICTURE, ".rrd": ("rerun", "a recording for Rerun")}
 
@@ -64,7 +64,7 @@ def open_backends(selections: Sequence[str] | None) -> tuple[list[Backend], list
         selections: Selection strings, or None.
 
     Returns:
-        Backends, each once, and the errors of devices that were not selected by name.
+        Distinct backends, and the errors of devices that were not selected by name.
 
     Raises:
         ValueError: a selection names no device that is present.
@@ -146,7 +146,7 @@ def output_path(*suffixes: str) -> Callable[[str], Path]:
     The library that writes the file must also be installed.
 
     Args:
-        suffixes: Allowed endings, such as ``".png"``; none allows every ending.
+        suffixes: Allowed suffixes, such as ``".png"``; none allows every suffix.
     """
 
     def convert(text: str) -> Path:
@@ -165,7 +165,7 @@ def output_path(*suffixes: str) -> Callable[[str], Path]:
 
 
 def check_writer(suffix: str) -> None:
-    """Check that the library that writes files of an ending is installed.
+    """Check that the library that writes files with a suffix is installed.
 
     Raises:
         argparse.ArgumentTypeError: it is absent; the message has the command that installs it.

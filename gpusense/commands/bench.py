@@ -30,6 +30,8 @@ DEFAULTS: dict[str, Any] = {"particles": None, "checked": 512, "beams": 360, "re
 QUICK: dict[str, Any] = {"particles": 128, "checked": 128, "beams": 60, "repeats": 20, "seed": 0}
 # Measuring time after which a quick run begins no further point, and its longest time to build a table [s].
 _QUICK_DEADLINE, _QUICK_BUILD = 40.0, 3.0
+# Tables that take longer [s] are built once in a quick run; their times then include compiling.
+_QUICK_TWICE = 0.1
 
 _EPILOG = """\
 Every method with every value of its knob computes the same ranges and scores the same scan, for particles over the
@@ -50,6 +52,8 @@ At the end stands, for each device and problem, which method to take: the fastes
 or the most exact with a call of at most --max-time. Nats are the KL divergence of the posterior, lengths the shift of
 its mean, both at a comparable temperature; percents are rays wrong by more than a cell, cells the range error that 95 %
 of the rays keep. The times are of calls of --particles times --beams.
+
+--quick builds a table that takes more than 0.1 s once, and its time to build then includes compiling.
 
 --compare OLD repeats the measurements of the old report, with its particles, beams and seed unless options change
 them, and lists points that became slower or less exact; --compare OLD NEW compares two reports without measuring.
@@ -211,7 +215,8 @@ def make_plan(args: argparse.Namespace, old: Mapping[str, Any] | None) -> tuple[
         sources(args.scene or _names(old, args), args.map, quick=quick), backends, chosen,
         args.precision or (PRECISIONS[:1] if quick else PRECISIONS),
         build_limit=args.build_limit or (_QUICK_BUILD if quick else 60.0),
-        seconds=args.seconds, deadline=_QUICK_DEADLINE if quick else float("inf"), **numbers,
+        seconds=args.seconds, deadline=_QUICK_DEADLINE if quick else float("inf"),
+        slow_to_make=_QUICK_TWICE if quick else None, **numbers,
     )  # fmt: skip
     return plan, [*_absent_devices(args.backend), *failures, *absent]
 

@@ -64,7 +64,7 @@ class Layout(argparse.RawDescriptionHelpFormatter):
 def _short_warnings() -> Iterator[None]:
     """Print a warning as one line, without the place in the source that raised it, and once.
 
-    Python forgets which warnings it has shown where a library changes the filters, as some do on import.
+    Python forgets its shown warnings when a library changes the filters, as some do on import.
     """
     shown: set[tuple[str, type[Warning]]] = set()
 
@@ -121,7 +121,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _failed(error: Exception) -> int:
-    """Print an error as one line; with its traceback where the environment asks for it."""
+    """Print an error as one line, with its traceback if the environment requests it."""
     if os.environ.get(TRACEBACK):
         raise error
     _settle()

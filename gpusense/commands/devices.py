@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _with_failures(listed: list[Device]) -> list[Device]:
-    """Return the devices; devices that ``"auto"`` has tried in vain count as unusable, with the reason."""
+    """Return the devices; devices that ``"auto"`` failed to open count as unusable, with the reason."""
     from gpusense.backends import default_failures
 
     reasons = {selection: reason for selection, reason in default_failures() if selection}

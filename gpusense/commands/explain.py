@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from gpusense.world.scanner import Scanner
 
 NAME = "explain"
-HELP = "Report what the kernels leave out for a scene, what they keep and what could go, each with the reason."
+HELP = "Report the parts that the kernels leave out, keep or could leave out for a scene, each with the reason."
 
 _EPILOG = """\
 The scene is a map, a scan of a log, the model's parameters, and 2000 particles in the free cells of the map. Without
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_model(parser)
     add("--caster", choices=get_args(CasterName), help="method of the expected ranges; beam model only")
     add("--measure", action="store_true", help="time the scene with and without each part")
-    add("--sources", action="store_true", help="print the text of the kernels as compiled for the scene, too")
+    add("--sources", action="store_true", help="also print the text of the kernels as compiled for the scene")
     add_parameters(parser)
     add_seed(parser)
     add_backend(parser)
@@ -82,7 +82,7 @@ def _scene(args: argparse.Namespace) -> tuple[OccupancyGrid, Scanner, np.ndarray
     """Return the map, the scanner and the readings.
 
     Raises:
-        ValueError: a log without a map, a map without a free place, or a log with fewer scans.
+        ValueError: there is a log without a map, the map has no free place, or the log has fewer scans.
     """
     import numpy as np
 

@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add_log(parser, "a log with scans", required=False)
     add_reference(parser)
-    add("--map-in", type=Path, metavar="YAML", help="a map_server map, of which landmarks are made instead of a log")
+    add("--map-in", type=Path, metavar="YAML", help="a map_server map from which landmarks are made, instead of a log")
     add("--kinds", nargs="+", choices=("line", "corner", "door", "hallway", "pole", "reflector"),
         metavar="KIND", help="line, corner, door, hallway, pole, reflector (default: all)")  # fmt: skip
     add("--noise", type=positive_number, metavar="M",
@@ -104,7 +104,7 @@ def _landmark_kinds(args: argparse.Namespace) -> tuple[str, ...]:
 
 
 def _of_map(args: argparse.Namespace) -> int:
-    """Make landmarks of a map."""
+    """Make landmarks from a map."""
     from gpusense.features.landmarks import landmarks_of_map
     from gpusense.world.map_files import read_map
 

@@ -184,7 +184,7 @@ def _fit(args: argparse.Namespace, data: RangeData, motion: MotionFit | None, pa
 
 
 def _motion(args: argparse.Namespace) -> MotionFit | None:
-    """Learn the noise of the odometry from the chosen scans; None where it is not asked for."""
+    """Learn the noise of the odometry from the chosen scans; None if it is not requested."""
     from gpusense.evaluation.steps import read_steps, references_to_learn_from, with_references
     from gpusense.evaluation.trajectory_files import read_tum
     from gpusense.localization.motion_fit import fit_odometry_motion

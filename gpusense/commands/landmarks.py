@@ -40,8 +40,8 @@ The folder holds files in the format of the UTIAS MRCLAM data, plain or with .gz
   RobotN_Odometry.dat       time v w                           RobotN_Measurement.dat time barcode range bearing
   RobotN_Groundtruth.dat    time x y heading
 Parameters are fitted at the logged poses. A particle filter then starts around the first logged pose (0.5 m, 0.3 rad)
-and uses odometry and readings only: with --known also the recorded landmark of each reading, with --unknown not. The
-map is used unchanged: readings of exchanged landmarks count as false positives.
+and uses only odometry and readings; with --known also the recorded landmark of each reading. The map is used unchanged:
+readings of exchanged landmarks count as false positives.
 
 The filter's motion noise is that of the odometry and a random walk. The walk of the heading is measured at the logged
 poses unless --drift gives it: runs with poor odometry need a large one, and with a small one the robot gets lost.
@@ -73,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "[rad^2/rad^2] and by translation [rad^2/m^2], of translations by translation and by turns "
         "(default: 0.09 0.01 0.04 0.0004)")  # fmt: skip
     add("--reverse", type=_probability, metavar="P",
-        help="probability that a translation went the other direction (default: 0)")  # fmt: skip
+        help="probability that a translation was reversed (default: 0)")  # fmt: skip
     add("--drift", type=not_negative_number, nargs=2, metavar=("M", "RAD"),
         help="random walks of the translation [m/sqrt(s)] and of the heading [rad/sqrt(s)] "
         "(default: 0.01 and the measured error of the odometer's heading)")  # fmt: skip
@@ -108,7 +108,7 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError(f"--field-of-view: must be in (0, 2 pi], got {args.field_of_view:g}")
     recorded = read_mrclam(args.folder, args.robot, range_max=args.range_max, field_of_view=args.field_of_view)
     recorded_run = landmark_runs.first_scans(recorded, args.scans)
-    # Suspicions need the recorded landmarks, with --unknown too.
+    # Suspicions need the recorded landmarks, also with --unknown.
     known_fit = landmark_runs.fit_run(recorded_run)
     suspicions = landmark_runs.suspicions(recorded_run, known_fit)
     fit = known_fit if args.known else landmark_runs.fit_run(recorded_run, known=False)

@@ -22,7 +22,7 @@ from gpusense.evaluation.machine import machine
 NAME = "likelihood-map"
 HELP = "Draw the likelihood of a scan over all positions and headings of a map."
 
-# Modes that are printed.
+# Number of printed modes.
 _MODES = 5
 
 _EPILOG = """\

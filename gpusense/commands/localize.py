@@ -91,13 +91,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="variance of slips to the side per squared turn [m^2/rad^2] "
         f"(default: {DEFAULTS.sideways})")  # fmt: skip
     add("--reverse", type=not_negative_number, metavar="P",
-        help=f"probability that a translation went the other direction (default: {DEFAULTS.reverse})")  # fmt: skip
+        help=f"probability that a translation was reversed (default: {DEFAULTS.reverse})")  # fmt: skip
     add("--fit-motion", action="store_true", help="learn the motion noise from the reference poses of this log first")
     add("--recovery", choices=("sensor", "augmented", "none"),
         help="where scans contradict the pose: search for a rival that must win by later scans, or inject particles "
         f"anywhere, or neither (default: {DEFAULTS.recovery})")  # fmt: skip
     add("--beam-skip", type=positive_number, metavar="P",
-        help="leave out beams, such as of people, that less than this share of the particles explains")  # fmt: skip
+        help="leave out beams, such as on people, that less than this share of the particles explains")  # fmt: skip
     add_choice(parser)
     add_backend(parser)
     add_seed(parser)
@@ -141,7 +141,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _recording(args: argparse.Namespace, pf: ParticleFilter) -> Recording | None:
-    """Begin a recording; None where none is asked for.
+    """Begin a recording; None if none is requested.
 
     Raises:
         ImportError: the library is not installed.

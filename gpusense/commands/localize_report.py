@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from gpusense.plots.viewer import Recording
 
 
-# Figures that are no single number.
+# Figures that are not a single number.
 _NO_NUMBER = ("rank_histogram", "verdict", "evidence")
 
 
@@ -32,7 +32,7 @@ def report(
         args: Options of the command.
         pf: The filter after the last scan.
         track: Estimates of the scans so far.
-        chosen: Number of scans that the options choose.
+        chosen: Number of scans chosen by the options.
         recording: Recording for the viewer, or None.
 
     Returns:
@@ -126,9 +126,9 @@ def _ranks(histogram: list[float]) -> str:
 
 
 def _verdict(result: dict[str, Any], deviations: list[float]) -> str:
-    """Return the verdict with its evidence, and the likely cause where there is one."""
+    """Return the verdict with its evidence, and the likely cause if there is one."""
     p_lost = f"p_lost {result['p_lost']:.2g}"
-    # A cloud that lies apart needs no reading to be uncertain.
+    # A spread-out cloud is uncertain even without a reading.
     if result["explained_at_end"] is None and result["p_lost"] <= 0.5:
         return f"none, no scan at the end has a reading to judge by; {result['verdict']}, {p_lost}"
     if result["verdict"] == "tracking":

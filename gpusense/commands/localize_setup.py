@@ -40,10 +40,10 @@ def read_parameters(args: argparse.Namespace) -> Localization:
 
 
 def read_chosen(args: argparse.Namespace, read: Localization) -> list[Step]:
-    """Read the chosen scans, with the poses of ``--reference`` where it is given.
+    """Read the chosen scans, with the poses of ``--reference`` if it is given.
 
     Raises:
-        ValueError: a file breaks its format, or has no scan or pose of these.
+        ValueError: a file breaks its format, or has no chosen scan or pose.
     """
     from gpusense.evaluation.steps import read_steps, with_references
     from gpusense.evaluation.trajectory_files import read_tum
@@ -66,7 +66,7 @@ def read_chosen(args: argparse.Namespace, read: Localization) -> list[Step]:
 
 
 def _limited(steps: list[Step], near: float | None, far: float | None) -> list[Step]:
-    """Return steps whose scanners have at least a range_min and at most a range_max, as nav2_amcl limits scans."""
+    """Return steps with scanners limited to a range_min and a range_max, as nav2_amcl limits scans."""
     scanners: dict[Scanner, Scanner] = {}
     for step in steps:
         if (one := step.scan.scanner) not in scanners:
@@ -125,7 +125,7 @@ def make_filter(args: argparse.Namespace, grid: OccupancyGrid, steps: list[Step]
 
 
 def _motion(args: argparse.Namespace, steps: list[Step], read: Localization) -> MotionModel:
-    """Return the motion model of the options, and of the file of parameters where an option is not given.
+    """Return the motion model from the options, or from the file of parameters for missing options.
 
     Raises:
         ValueError: there are no logged poses to learn from, or a number breaks its rule.

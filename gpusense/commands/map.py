@@ -152,7 +152,7 @@ def _report(
 
 
 def _build(builder: MapBuilder) -> tuple[float, KeyboardInterrupt | None]:
-    """Count all rays, and return the share of the work that is done, and what has stopped it; None at the end."""
+    """Count all rays; return the finished share of the work, and the signal that stopped it or None."""
     done = 0.0
     with progress(max(builder.parts, 1)) as step:
         try:

@@ -1,4 +1,4 @@
-"""Poses of a log's scans by a chain of matches, for ``gpusense map``: options, run, files and words."""
+"""Poses of a log's scans by a chain of matches, for ``gpusense map``: options, run, files and report."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ _COLUMNS = "scan,time,x,y,theta,var_x,cov_xy,cov_xtheta,var_y,cov_ytheta,var_the
 
 @dataclass
 class ChainedScans:
-    """Scans with poses of a chain.
+    """Scans with poses from a chain.
 
     Attributes:
         scans: The scans that were chained, with their poses.
         chain: The chain.
-        seconds: Time that it took.
-        stop: The signal that ended it; None at its end.
+        seconds: Time of the chain [s].
+        stop: Signal that interrupted the chain; None if it is complete.
     """
 
     scans: Scans
@@ -62,10 +62,10 @@ def add_chain(parser: argparse.ArgumentParser) -> None:
 
 
 def check_chain(args: argparse.Namespace) -> None:
-    """Check that a chain and a trajectory are not both asked for.
+    """Check that a chain and a trajectory are not both requested.
 
     Raises:
-        ValueError: they are.
+        ValueError: both are requested.
     """
     if args.chain and args.reference is not None:
         raise ValueError("--chain: must not be used with --reference, which has the poses, got both")
@@ -111,7 +111,7 @@ def chain_log(args: argparse.Namespace, scans: Scans, sensor: list[int]) -> Chai
                 done = chainer.scans
         except KeyboardInterrupt as signal:
             stop = signal
-            sys.stderr.write(f"gpusense: {word_of(stop)}: the map is made of what is chained so far\n")
+            sys.stderr.write(f"gpusense: {word_of(stop)}: the map holds the scans chained so far\n")
     chain = chainer.chain()
     placed = [
         (index, replace(scan, pose=tuple(pose)))
@@ -121,7 +121,7 @@ def chain_log(args: argparse.Namespace, scans: Scans, sensor: list[int]) -> Chai
 
 
 def _odometry(scans: Scans) -> np.ndarray | None:
-    """Return the odometry of scans; None, with a word, where the log has none or it never changes."""
+    """Return the odometry of scans; None, with a message, if the log has none or it never changes."""
     poses = np.array([scan.odometry for _, scan in scans])
     if len(poses) > 1 and (poses == poses[0]).all():
         sys.stderr.write("gpusense: the odometry of the log never changes: the scans are chained without it\n")
@@ -130,15 +130,15 @@ def _odometry(scans: Scans) -> np.ndarray | None:
 
 
 def write_chain(args: argparse.Namespace, chained: ChainedScans, grid: OccupancyGrid) -> None:
-    """Write the trajectory, the poses with covariances, and the picture, where asked for."""
+    """Write the requested files: trajectory, poses with covariances, picture."""
     from gpusense.evaluation.trajectory_files import write_tum
 
     if args.tum is not None:
-        # Where beams are listed in reverse, poses are those at the end of scans.
+        # If beams are listed in reverse, poses are those at the end of scans.
         at = np.array([scan.time for _, scan in chained.scans]) + chained.chain.later
         rows = np.arange(len(at))
         if len(np.unique(chained.chain.sensor)) > 1:
-            # One pose of each time of several lasers.
+            # Write one pose for each time of several lasers.
             rows = np.unique(at, return_index=True)[1]
         times, indices = scan_times(at[rows].tolist())
         write_tum(args.tum, times, chained.chain.poses[rows], indices=indices)
@@ -180,7 +180,7 @@ def document(args: argparse.Namespace, chained: ChainedScans) -> dict[str, Any]:
 
 
 def words(args: argparse.Namespace, chained: ChainedScans) -> str:
-    """Return the facts of a chain in words, and the files that were written."""
+    """Describe a chain in words, with the written files."""
     lines = [f"{chained.chain.explain()}\nchained in {chained.seconds:.1f} s"]
     lines += [f"written: {getattr(args, name)}" for name in ("tum", "poses") if getattr(args, name)]
     lines += [f"drawn: {args.plot}"] if args.plot else []

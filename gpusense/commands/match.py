@@ -1,4 +1,4 @@
-"""Run ``gpusense match``: match the scans of a recorded log to one another, or to a map."""
+"""Run ``gpusense match``: match the scans of a recorded log to each other, or to a map."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ def _write(path: Path, matches: LogMatches) -> None:
 
 
 def _write_tum(path: Path, scans: list[tuple[int, Scan]], matches: LogMatches) -> None:
-    """Write the trajectory of the matched scans, from the first one's logged pose or odometry on."""
+    """Write the trajectory of the matched scans, starting at the first one's logged pose or odometry."""
     from gpusense.evaluation.matching import trajectory
     from gpusense.evaluation.trajectory_files import write_tum
 

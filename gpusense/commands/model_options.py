@@ -1,4 +1,4 @@
-"""Options that choose a beam model or a likelihood field and its parameters, and the parameters that they choose."""
+"""Options that choose a beam model or a likelihood field, and the parameters that they select."""
 
 from __future__ import annotations
 

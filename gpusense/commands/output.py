@@ -37,7 +37,7 @@ def _plain(value: Any) -> Any:
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequence[str] = ()) -> None:
     """Print a table: by rich on a terminal, as plain text elsewhere.
 
-    On a terminal that is too narrow, each row becomes a paragraph of one value a line.
+    On a terminal that is too narrow, each row becomes a paragraph with one value per line.
 
     Args:
         columns: Names of the columns.
@@ -77,7 +77,7 @@ class TableStream:
         Args:
             columns: Names of the columns, each with its least width.
             left: Names of the columns that are left-aligned.
-            optional: Names of the columns that are left out on narrow terminals, the first one first.
+            optional: Names of the columns that are left out on narrow terminals, in this order.
         """
         self._widths = {name: max(width, len(name)) for name, width in columns.items()}
         self._left = left
@@ -108,7 +108,7 @@ def terminal_width() -> int:
 
 
 def paragraph_lines(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Format rows as paragraphs of one value a line, without empty values."""
+    """Format rows as paragraphs with one value per line, without empty values."""
     widest = max(map(len, columns))
     lines = []
     for row in rows:

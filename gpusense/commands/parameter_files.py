@@ -27,12 +27,12 @@ def read_beam_parameters(path: Path) -> BeamParameters:
 
 @dataclass(frozen=True)
 class Localization:
-    """Parameters of a file for a localisation.
+    """Parameters for a localisation, from a file.
 
     Attributes:
-        sensor: Parameters of the beam model or the likelihood field; None where the file has none.
-        noise: Arguments of :class:`OdometryMotion`; none where the file has none.
-        nav2: The options of nav2_amcl's node, where the file is one of nav2.
+        sensor: Parameters of the beam model or the likelihood field; None if the file has none.
+        noise: Arguments of :class:`OdometryMotion`; empty if the file has none.
+        nav2: The options of nav2_amcl's node, if the file is one of nav2.
     """
 
     sensor: BeamParameters | LikelihoodFieldParameters | None
@@ -141,5 +141,5 @@ def parameters_yaml(result: FitResult) -> str:
 
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:
-    """Return a mapping with lists in place of tuples."""
+    """Return a mapping with lists instead of tuples."""
     return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}

@@ -1,4 +1,4 @@
-"""The scans of a log for a command: the choice of lasers, and poses from the log or from a trajectory."""
+"""Scans of a log for a command: the choice of lasers, and poses from the log or a trajectory."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def add_log(parser: argparse.ArgumentParser, what: str, *, required: bool = True
     Args:
         parser: The parser of a command.
         what: The log and its contents in words, with an article.
-        required: Whether it must be given.
-        several: The use of lasers in words, where the command takes several.
+        required: Whether the option is required.
+        several: The use of lasers in words, if the command takes several.
     """
     add = parser.add_argument
     add("--log", required=required, type=Path, metavar="FILE", help=f"{what}: {FORMATS}")
@@ -137,7 +137,7 @@ def read_scans_of_lasers(args: argparse.Namespace) -> tuple[list[tuple[int, Scan
     from gpusense.evaluation.steps import read_steps
 
     if len(args.topic) < 2:
-        # Scans of other scanners do not matter where they have no pose.
+        # Scans of other scanners may lack poses.
         topic = args.topic[0] if args.topic else None
         scans = read_scans(argparse.Namespace(**{**vars(args), "topic": topic}), posed=False)
         return scans, [0] * len(scans)
@@ -166,7 +166,7 @@ def scanners_of(scans: list[tuple[int, Scan]], sensor: list[int]) -> dict[str, A
 
 
 def _referenced(args: argparse.Namespace, scans: list[Scan]) -> list[tuple[int, Scan]]:
-    """Return the scans whose pose the trajectory of ``--reference`` has, with their numbers."""
+    """Return the scans with poses in the trajectory of ``--reference``, and their numbers."""
     from gpusense.evaluation.trajectory_files import poses_at, read_tum
 
     poses = poses_at([scan.time for scan in scans], *read_tum(args.reference))
@@ -181,9 +181,9 @@ def _referenced(args: argparse.Namespace, scans: list[Scan]) -> list[tuple[int, 
 
 
 def scan_times(times: list[float]) -> tuple[list[float], bool]:
-    """Return the times of scans for a trajectory; where they do not increase, as readers demand, indices and True."""
+    """Return the times of scans for a trajectory; if they do not increase, as readers require, indices and True."""
     if all(one < two for one, two in itertools.pairwise(times)):
         return times, False
-    rule = "the times of the log do not increase: the trajectory has the indices of the scans in their place"
+    rule = "the times of the log do not increase: the trajectory has the indices of the scans instead"
     sys.stderr.write(f"gpusense: --tum: {rule}\n")
     return [float(i) for i in range(len(times))], True

@@ -121,7 +121,7 @@ def _score(
     scoring: LogScoring,
     fitness: FitnessOfLog,
 ) -> None:
-    """Score the scans, and print a row for each as it comes."""
+    """Score the scans, and print a row for each as soon as it is ready."""
     # Rows on a terminal show the progress.
     shown = not args.json and is_terminal(sys.stdout)
     optional = (*(("backend",) if len(models) == 1 else ()), "beams", "effective", "error [rad]")
@@ -151,7 +151,7 @@ def _draw(path: Path, grid: OccupancyGrid, score: BackendScore, pose: str) -> No
 
 
 def make_models(args: argparse.Namespace, grid: OccupancyGrid, scans: list[tuple[int, Scan]]) -> list[Model]:
-    """Make the model on each backend, each device once, with one temperature.
+    """Make the model on each distinct backend, with one temperature.
 
     Raises:
         ValueError: a backend is absent, or a parameter breaks its rule or belongs to the other model.

@@ -1,4 +1,4 @@
-"""Run ``gpusense selftest``: compare the backends of this machine with the float64 truth and with one another."""
+"""Run ``gpusense selftest``: compare this machine's backends with the float64 truth and with each other."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from gpusense.evaluation.tolerances import Check
 
 NAME = "selftest"
-HELP = "Check that the backends present agree with the float64 truth and with one another."
+HELP = "Check that the backends present agree with the float64 truth and with each other."
 
 BREACH = 1
 
@@ -105,7 +105,7 @@ def _run_stiff(args: argparse.Namespace) -> int:
 
 
 def _kept(stop: KeyboardInterrupt, results: Sequence[object]) -> KeyboardInterrupt:
-    """Return the interrupt that stopped the comparisons, to be raised once the results so far are printed.
+    """Return the interrupt that stopped the comparisons, to be raised after the results so far are printed.
 
     Raises:
         KeyboardInterrupt: there is none.
@@ -128,7 +128,7 @@ def _print_head(backends: Sequence[Backend]) -> None:
 
 
 def _run_pairs(args: argparse.Namespace) -> int:
-    """Compare the backends with the truth and with one another."""
+    """Compare the backends with the truth and with each other."""
     from gpusense.backends import devices
     from gpusense.evaluation import selftest
 

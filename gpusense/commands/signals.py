@@ -1,4 +1,4 @@
-"""Signals that end a command, which keeps its results so far, reports this in a line, and leaves no unfinished file.
+"""Signals that end a command, which keeps its results so far, reports the end in one line, and leaves no partial file.
 
 Ctrl-C, a hang-up of the terminal, and the signal by which containers and ``timeout`` end a program all raise
 exceptions. Only the command line installs handlers, in the main thread, and puts the old ones back.
@@ -17,13 +17,13 @@ from typing import Any
 
 from gpusense._util import interrupts
 
-# Signals that end a command, with the word for the end. One that the caller ignores, as nohup does, stays ignored.
+# Signals that end a command, with the word for the end. Signals that the caller ignores, as nohup does, stay ignored.
 _WORDS = {name: word for name, word in (("SIGINT", "interrupted"), ("SIGTERM", "terminated"), ("SIGHUP", "hung up"))
           if hasattr(signal, name)}  # fmt: skip
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal has asked the command to end.
+    """A signal that requests the end of the command.
 
     Attributes:
         number: The signal.
@@ -35,7 +35,7 @@ class Stopped(KeyboardInterrupt):
 
 
 def code_of(stop: KeyboardInterrupt) -> int:
-    """Return the exit code of a command that was stopped: 128 and the number of the signal, as of a shell."""
+    """Return the exit code of a stopped command: 128 plus the number of the signal, as in a shell."""
     return 128 + (stop.number if isinstance(stop, Stopped) else signal.SIGINT)
 
 
@@ -48,7 +48,7 @@ def word_of(stop: KeyboardInterrupt) -> str:
 def stopping() -> Iterator[None]:
     """Turn the signals that end a command into :class:`Stopped`; in other threads than the main one do nothing.
 
-    An exception in a destructor or a callback is ignored by Python. A signal that comes there is delivered again.
+    Python ignores an exception in a destructor or a callback. A signal that arrives there is delivered again.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -57,7 +57,7 @@ def stopping() -> Iterator[None]:
 
     def stop(number: int, frame: FrameType | None) -> None:
         if os.getpid() != process:
-            # A forked child ends as it would without this handler.
+            # A forked child ends as without this handler.
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
             return

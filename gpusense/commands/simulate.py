@@ -53,13 +53,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--map", type=Path, metavar="YAML", help="a map_server map: the map that the robot has")
     source.add_argument("--world", metavar="NAME", help="a generated map instead: office, corridor, hall or twins, "
-                        "or one of these with a seed of its own, as in office:3")  # fmt: skip
+                        "or one of these with a separate seed, as in office:3")  # fmt: skip
     add("--log-out", required=True, type=Path, metavar="FILE", help="the log to write")
     add("--format", choices=("carmen", "ros1", "ros2"),
         help="a CARMEN log, compressed where the name ends in .gz; a bag of ROS 1 (.bag); a new folder with a bag of "
         "ROS 2 (default: by the name, ros1 for .bag and carmen for others)")  # fmt: skip
     add("--map-out", type=output_path(".yaml"), metavar="YAML", help="write the robot's map")
-    add("--world-out", type=output_path(".yaml"), metavar="YAML", help="write the world as it is, without people")
+    add("--world-out", type=output_path(".yaml"), metavar="YAML", help="write the true world, without people")
     add("--tum", type=output_path(".tum", ".txt"), metavar="FILE", help="write the true poses of the robot")
     _add_run(parser)
     _add_world(parser)
@@ -81,18 +81,18 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     add("--clearance", type=not_negative_number, default=0.35, metavar="M",
         help="least distance from walls [m] (default: 0.35)")  # fmt: skip
     add("--kidnaps", type=whole_number(low=0), default=0, metavar="N",
-        help="how often the robot is carried elsewhere without odometry (default: 0)")  # fmt: skip
+        help="number of times that the robot is carried elsewhere without odometry (default: 0)")  # fmt: skip
 
 
 def _add_world(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--true-map", type=Path, metavar="YAML", help="the world as it is, in place of the robot's map with changes")
+    add("--true-map", type=Path, metavar="YAML", help="the true world, instead of the robot's map with changes")
     add("--people", type=whole_number(low=0, high=1000), default=0, metavar="N",
         help="people who walk near the robot (default: 0)")  # fmt: skip
     share: dict[str, Any] = dict(type=not_negative_number, default=0.0, metavar="SHARE")
-    add("--hidden", **share, help="share of the beams that further people hide, up to 0.9 (default: 0)")
-    add("--moved", **share, help="share of the walls that have moved by 0.5 to 2 m (default: 0)")
-    add("--removed", **share, help="share of the walls that have gone (default: 0)")
+    add("--hidden", **share, help="share of the beams that additional people hide, up to 0.9 (default: 0)")
+    add("--moved", **share, help="share of the walls that are moved by 0.5 to 2 m (default: 0)")
+    add("--removed", **share, help="share of the walls that are removed (default: 0)")
     add("--added", **share, help="new furniture, as a share of the walls (default: 0)")
     add("--glass", **share, help="share of the walls through which beams pass (default: 0)")
 
@@ -147,7 +147,7 @@ def _check_output(args: argparse.Namespace) -> str:
     """Return the format of the log, and check that it can be written before any work is done.
 
     Raises:
-        ValueError, OSError: it cannot.
+        ValueError, OSError: it cannot be written.
     """
     from gpusense._util.files import check_writable
     from gpusense.evaluation.simulation.files import kind_of
@@ -168,7 +168,7 @@ def _generated(name: str, seed: int) -> OccupancyGrid:
     """Return a generated world by a name such as ``office`` or ``office:3``.
 
     Raises:
-        ValueError: there is none of this name.
+        ValueError: there is no world of this name.
     """
     from gpusense.evaluation.named_worlds import WORLDS
 

@@ -28,9 +28,9 @@ HELP = "Run many jobs from a plan, on processes or a Dask cluster, into a table 
 FAILED = 1
 LOCAL = "local"
 _TLS = {
-    "ca": "certificate of the authority that has signed those of the cluster",
+    "ca": "certificate of the authority that has signed the cluster's certificates",
     "cert": "certificate of this client",
-    "key": "its private key",
+    "key": "private key of this client",
 }
 
 _EPILOG = """\
@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("plan", type=Path, metavar="PLAN", help="the plan, a YAML file")
     add("--table", type=Path, metavar="FILE",
         help="the table, .csv or .parquet (default: the plan's name with .csv, in this folder)")  # fmt: skip
-    add("--resume", action="store_true", help="keep the rows of an existing table, and run the other jobs")
+    add("--resume", action="store_true", help="keep the rows of an existing table, and run the remaining jobs")
     add("--retry-failed", action="store_true", help="with --resume: run failed jobs again")
     add("--root", type=Path, metavar="FOLDER", help="folder of maps and logs (default: the plan's)")
     add("--dask", metavar="ADDRESS", help="a Dask scheduler, such as tcp://10.0.0.1:8786, or 'local' for a new cluster")
@@ -76,12 +76,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--job-timeout", type=positive_number, metavar="SECONDS",
         help="longest time of a job, which then fails, and its worker is replaced (default: none)")  # fmt: skip
     add("--memory-limit", type=_memory, metavar="SIZE",
-        help="most memory of a worker, such as 4GB; it is ended beyond, and its job started again, "
+        help="most memory of a worker, such as 4GB; a worker beyond it is ended, and its job started again, "
         "up to --attempts times (default: none)")  # fmt: skip
     add("--list", action="store_true", help="print the jobs with their keys, and run none")
     add_json(parser)
     add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
-        help="draw error against run time, a point a job")  # fmt: skip
+        help="draw error against run time, with a point for each job")  # fmt: skip
 
 
 def _memory(text: str) -> int:
@@ -146,7 +146,7 @@ def _swept(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Sweep:
                     sys.stderr.write(f"gpusense: job {row['key']} failed: {row['error']}\n")
             step(f"{row['model']} {Path(row['log']).name}, {failures} failed")
 
-        # The default device of workers.
+        # Set the default device of workers.
         backend = args.device[0] if args.device else "auto"
         try:
             return run_jobs(
@@ -156,7 +156,7 @@ def _swept(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Sweep:
         except ImportError as error:
             raise ValueError(str(error)) from None
         except KeyboardInterrupt:
-            sys.stderr.write(f"gpusense: {args.table} has the finished jobs: --resume runs the others\n")
+            sys.stderr.write(f"gpusense: {args.table} has the finished jobs: --resume runs the remaining ones\n")
             raise
 
 
@@ -165,8 +165,8 @@ def _executor(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Iterator[Execu
     """Make the executor of the options, and end it afterwards.
 
     Raises:
-        OSError: no cluster at the address.
-        ValueError: options that exclude each other.
+        OSError: there is no cluster at the address.
+        ValueError: options exclude each other.
     """
     from gpusense.sweeps.executors import ProcessExecutor
 

@@ -50,21 +50,21 @@ class Agreement:
 
 
 def ranks(values: Array) -> Floats:
-    """Return ranks from the smallest value on; ties have their mean rank."""
+    """Return ranks, 1 for the smallest value; ties have their mean rank."""
     _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
     last = np.cumsum(counts)
     return (last - (counts - 1) / 2)[inverse]
 
 
 def correlation(left: Floats, right: Floats) -> float:
-    """Return Pearson's correlation, for ranks Spearman's; where a side is constant, 1 if both are equal, else 0."""
+    """Return Pearson's correlation, for ranks Spearman's; if a side is constant, 1 for equal sides, else 0."""
     a, b = left - left.mean(), right - right.mean()
     size = math.sqrt(float(a @ a) * float(b @ b))
     return float(a @ b) / size if size else float(np.array_equal(left, right))
 
 
 def largest_gap(left: Array, right: Array) -> float:
-    """Return the largest lead, in the right scores, of a particle over one that the left scores rank before it."""
+    """Return the largest lead in the right scores between two particles that the left scores rank the other way."""
     order = np.lexsort((-right, -left))
     b = right[order].astype(np.float64)
     lowest = np.minimum.accumulate(b)

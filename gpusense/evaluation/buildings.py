@@ -36,7 +36,7 @@ def building(seed: int = 0, size: tuple[float, float] = (30.0, 20.0), resolution
         A grid with its origin at (0, 0, 0) whose cells are 0 (free), 100 (occupied) or -1 (unknown).
 
     Raises:
-        TypeError, ValueError: an argument is not of the kind described, or breaks its rule.
+        TypeError, ValueError: an argument has the wrong type or breaks its rule.
 
     Example:
         >>> import gpusense as gs
@@ -63,7 +63,7 @@ def building(seed: int = 0, size: tuple[float, float] = (30.0, 20.0), resolution
 
 
 def _fit_out(drawing: _Drawing, rng: Rng, rooms: list[_Room]) -> None:
-    """Draw rooms with doors, pillars and furniture; the largest is the hall, and one other room is shut."""
+    """Draw rooms with doors, pillars and furniture; the largest room is the hall, and one further room is shut."""
     hall = max(range(len(rooms)), key=lambda i: rooms[i].area)
     shut = (hall + int(rng.integers(1, len(rooms)))) % len(rooms)
     for i, room in enumerate(rooms):

@@ -1,4 +1,4 @@
-"""Whether estimated poses are as certain as they say: coverage, interval width, NEES and ranks.
+"""Measure whether estimated poses are as certain as stated: coverage, interval width, NEES and ranks.
 
 For a calibrated filter, regions of probability p contain the share p of the true poses, the normalised squared error
 (NEES) has the quantiles of chi-square with 3 degrees of freedom, and ranks of the truth are uniform. Regions are
@@ -34,7 +34,7 @@ def nees_of(differences: Floats, covariances: Floats) -> Floats:
 
 
 def rank_of(particles: Floats, weights: Floats, truth: Floats) -> Floats:
-    """Return the weights of the particles behind, to the right of and clockwise of the true pose; (3,), each 0 to 1.
+    """Return the weights (3,) of the particles behind, to the right of and clockwise of the true pose, each 0 to 1.
 
     Args:
         particles: (N, 3) poses.

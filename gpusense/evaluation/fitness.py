@@ -1,4 +1,4 @@
-"""Whether the poses of a log fit a map, and the temperature that its scans call for."""
+"""Judge whether the poses of a log fit a map, and determine the temperature of its scans."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from gpusense.localization.temperature import BeamCorrelation, learn_from_scan
 from gpusense.localization.words import LOST, TRACKING, Word
 from gpusense.logs import Scan
 
-# Random poses of a scan, and the stream of their random numbers.
+# Number of random poses per scan, and the stream of their random numbers.
 _RANDOM, _STREAM = 64, 1
-# Least share of the random poses that a logged pose excels: 1/2 by chance.
+# Least share of random poses that a right logged pose excels; it is 1/2 by chance.
 LEAST_BETTER = 0.9
 # The share b of random poses that score lower has the density EXCELS b^(EXCELS - 1) at right poses, and 1 at wrong
 # poses; the log-likelihood ratio is limited.
@@ -29,14 +29,15 @@ _EXCELS, _LIMIT = 20, 3.0
 
 @dataclass(frozen=True)
 class Fitness:
-    """How well the logged poses explain their scans.
+    """Agreement of logged poses with their scans.
 
     Attributes:
-        scans: Scans that tell anything.
+        scans: Number of scans that give evidence.
         explained: Median share of the beams that the logged poses explain; None without such scans.
-        better: Median share of poses anywhere in the free space at which a scan is less likely, or None.
-        p_lost: Median over the scans of the probability that the logged pose is wrong, or None.
-        evidence: Beams of all scans.
+        better: Median share of poses anywhere in the free space at which a scan is less likely; None without such
+            scans.
+        p_lost: Median over the scans of the probability that the logged pose is wrong; None without such scans.
+        evidence: Evidence of the beams of all scans.
     """
 
     scans: int
@@ -47,7 +48,7 @@ class Fitness:
 
     @property
     def verdict(self) -> Word:
-        """Return "tracking" for a log of this map, "lost" for one of another map, and "uncertain" between."""
+        """Return "tracking" for a log of this map, "lost" for a log of another map, and "uncertain" in between."""
         if self.p_lost is None:
             return "uncertain"
         if self.p_lost > LOST:
@@ -57,7 +58,7 @@ class Fitness:
 
     @property
     def fits(self) -> bool:
-        """Tell whether the log is one of this map; False where no scan could be judged."""
+        """Tell whether the log belongs to this map; False if no scan could be judged."""
         return self.verdict == "tracking"
 
 
@@ -78,14 +79,14 @@ class FitnessOfLog:
         self._p_lost: list[float] = []
 
     def add(self, index: int, scan: Scan) -> float:
-        """Return the share of a scan's beams that its logged pose explains; NaN where the map could explain none."""
+        """Add a scan; return the share of its beams that its logged pose explains, NaN if the map can explain none."""
         random = np.random.default_rng((self._seed, index, _STREAM))
         pose = np.array(scan.pose, np.float64)
         poses = np.vstack([pose[None], cloud_uniform(self._model.grid, _RANDOM, random)])
         log_p = self._model.log_likelihood(poses, scan.ranges)
         found = passages(self._model.grid, scan.scanner, pose, np.asarray(scan.ranges, np.float64))
         share, ratio, better = explained_of_scan([found]), ratio_of_scan([found]), math.nan
-        # Readings that are equally likely or impossible everywhere tell nothing.
+        # Readings that are equally likely or impossible everywhere are no evidence.
         if np.isfinite(log_p).any() and (log_p != log_p[0]).any():
             better = float(np.mean(log_p[1:] < log_p[0]))
             ratio += _ratio_of_rank(better)
@@ -122,7 +123,7 @@ def temperature_of_log(model: Model, scans: Sequence[tuple[int, Scan]], *, most:
     Args:
         model: A model on the map, with temperature 1.
         scans: Scans with poses, and their indices.
-        most: Scans to learn from: the first ones.
+        most: Most scans to learn from, taken from the beginning.
     """
     correlation = BeamCorrelation()
     for _, scan in scans[:most]:

@@ -19,7 +19,7 @@ from gpusense.world.scanner import Reading
 
 Floats = NDArray[np.float64]
 
-# Readings that are scored at once.
+# Number of readings that are scored at once.
 _BLOCK = 1 << 17
 
 
@@ -30,9 +30,9 @@ class HeldOut:
     Attributes:
         name: Source of the parameters.
         parameters: The parameters, with weights that sum to 1.
-        per_beam: Mean log-likelihood of a reading [nats]; -inf where a reading is impossible.
+        per_beam: Mean log-likelihood of a reading [nats]; -inf if a reading is impossible.
         error: Standard error of ``per_beam``, over blocks.
-        gain: Mean log-likelihood of the fitted parameters minus ``per_beam`` [nats]; 0 for the fitted ones. Where the
+        gain: Mean log-likelihood of the fitted parameters minus ``per_beam`` [nats]; 0 for the fitted ones. If the
             fitted parameters make a reading impossible, the softened ones replace them.
         gain_error: Standard error of ``gain``, over blocks; NaN for fewer than 2 blocks.
         impossible: Number of readings that are impossible.
@@ -84,9 +84,9 @@ def compare_held_out(
 ) -> list[HeldOut]:
     """Score held-out readings with fitted parameters and with the defaults of nav2_amcl and Beluga.
 
-    All likelihoods use the book's normalised mixture, not the weights that these programs compute. Where the fitted
+    All likelihoods use the book's normalised mixture, not the weights that these programs compute. If the fitted
     parameters make a held-out reading impossible, a row of softened parameters follows, and gains refer to it. The fit
-    by angles of incidence is another row, softened in the same way; its gain is negative where it is better.
+    by angles of incidence is a further row, softened in the same way; its gain is negative if it is better.
 
     Args:
         fitted: Parameters fitted without ``data``.
@@ -181,7 +181,7 @@ def log_densities(parameters: BeamParameters, data: RangeData) -> Floats:
 def block_mean(values: Floats, block: NDArray[np.int64]) -> tuple[float, float]:
     """Return the mean of all values and its standard error, as of a ratio of sums over blocks.
 
-    The standard error is NaN for fewer than 2 blocks, or where a value is not finite.
+    The standard error is NaN for fewer than 2 blocks, or if a value is not finite.
     """
     if not np.isfinite(values).all():
         with np.errstate(invalid="ignore"):

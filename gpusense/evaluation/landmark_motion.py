@@ -15,7 +15,7 @@ from gpusense.localization.pose_algebra import wrap_angle
 from gpusense.logs.records import LandmarkRun
 
 ALPHA = (0.09, 0.01, 0.04, 0.0004)
-# Random walk of the position [m / sqrt(s)], and the least of the heading where it is measured [rad / sqrt(s)].
+# Random walk of the position [m / sqrt(s)], and the least measured random walk of the heading [rad / sqrt(s)].
 DRIFT, LEAST_DRIFT_HEADING = 0.01, 0.02
 # Time over which the heading's walk is measured [s].
 _WINDOW = 5.0
@@ -29,8 +29,8 @@ class DriftingOdometry:
     takes the odometry before and after the step, and its duration [s].
 
     Attributes:
-        alpha: (4,) noise as of :class:`OdometryMotion`.
-        reverse: Probability that the translation went the other direction.
+        alpha: (4,) noise, see :class:`OdometryMotion`.
+        reverse: Probability that the translation had the opposite direction.
         drift: Random walk of the translation [m / sqrt(s)].
         drift_heading: Random walk of the heading [rad / sqrt(s)].
 
@@ -55,7 +55,7 @@ class DriftingOdometry:
         if len(arguments) != 3:
             raise TypeError(f"predict: must have two poses of the odometer and a duration, got {len(arguments)} values")
         root = math.sqrt(checks.real("seconds", arguments[2], low=0))
-        # Two turns of a step share the heading's walk.
+        # The two turns of a step share the heading's walk.
         least = (self.drift * root, self.drift_heading * root / math.sqrt(2))
         return OdometryMotion(self.alpha, self.reverse, least, sideways=0.0).sampled(*arguments[:2])
 
@@ -83,14 +83,14 @@ def run_motion(
     drift: tuple[float, float] | None = None,
     fit: bool = False,
 ) -> DriftingOdometry:
-    """Return the motion noise of a run: the numbers given, the rest from the run.
+    """Return the motion noise of a run, with missing numbers taken from the run.
 
     Args:
         run: The run.
         alpha: (4,) noise of the odometry; None for ``ALPHA``.
         reverse: Probability of a reverse; None for 0.
         drift: Random walks of translation and heading; None for ``DRIFT`` and the measured walk of the heading.
-        fit: Learn ``alpha`` and ``reverse`` by :func:`fit_odometry_motion` where they are None.
+        fit: Whether to learn ``alpha`` and ``reverse`` by :func:`fit_odometry_motion` if they are None.
     """
     if fit and (alpha is None or reverse is None):
         found = fit_odometry_motion(run.odometry, run.truth, systematic=False).motion

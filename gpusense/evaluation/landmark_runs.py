@@ -22,7 +22,7 @@ from gpusense.world.parameters import LandmarkParameters
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Lower bound of z_false for a filter: a fit of clean data gives 0, and the next feature may be a false positive.
+# Lower bound of z_false for a filter, since a fit of clean data gives 0, and the next feature may be a false positive.
 LEAST_FALSE = 0.01
 
 
@@ -40,7 +40,7 @@ class Track:
         error_heading: (S,) absolute error of the heading [rad].
         degenerate: Number of scans that are impossible at every particle.
         time: (S,) time of each scan [s].
-        gain: (S,) logarithm by which the particles predict recent features better than chance [nats for a feature].
+        gain: (S,) gain of the particles over chance in predicting recent features [nats per feature].
         scans_lost: (S,) whether p_lost is above 0.5 after each scan.
         p_lost: (S,) probability that the estimate is off by more than 1 m or 0.5 rad.
     """
@@ -61,7 +61,7 @@ class Track:
 
     @property
     def lost_since(self) -> float | None:
-        """Time from which the filter is lost to the end, after the first scan [s]; None where it is not lost."""
+        """Time after the first scan from which the filter is lost to the end [s]; None if it is not lost."""
         if not self.lost:
             return None
         found = np.flatnonzero(~self.scans_lost)
@@ -89,7 +89,7 @@ def fit_run(run: LandmarkRun, *, known: bool = True, bias: bool = False) -> Land
     Args:
         run: The run.
         known: Whether the fit uses the recorded landmark of each feature.
-        bias: Whether offsets of range and bearing are fitted too.
+        bias: Whether offsets of range and bearing are also fitted.
     """
     return fit_landmark_parameters(
         run.truth, run.features, run.landmarks, correspondence=run.ids if known else None, scan=run.scan,
@@ -103,7 +103,7 @@ def suspicions(run: LandmarkRun, fit: LandmarkFit) -> Suspicions:
 
 
 def usable(parameters: LandmarkParameters) -> LandmarkParameters:
-    """Return the parameters with ``z_false`` raised to ``LEAST_FALSE`` at least."""
+    """Return the parameters with ``z_false`` raised to at least ``LEAST_FALSE``."""
     z = max(parameters.z_false, LEAST_FALSE)
     return parameters.replace(z_false=z, z_detect=1 - z)
 
@@ -196,7 +196,7 @@ def repaired(run: LandmarkRun, suspected: Suspicions) -> LandmarkRun:
 
 
 def first_scans(run: LandmarkRun, count: int | None) -> LandmarkRun:
-    """Return a run of the first ``count`` scans; all where it is None."""
+    """Return a run of the first ``count`` scans; None for all."""
     if count is None or count >= len(run.time):
         return run
     kept = run.scan < count

@@ -1,4 +1,4 @@
-"""Matches of a recorded log: pairs of scans, or scans and a map, with errors against the logged poses."""
+"""Match the scans of a recorded log with each other or with a map, and compare with the logged poses."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from gpusense.world.grid import OccupancyGrid
 
 Floats = NDArray[np.float64]
 
-# Matches of a call: a run can be interrupted between calls, and keeps the results so far.
+# Matches per call; a run can be interrupted between calls, and keeps the results so far.
 _BATCH = 50
-# A match is wrong beyond these errors [m], [rad].
+# Largest errors of a right match [m, rad].
 WRONG, WRONG_TURN = 0.2, math.radians(5.0)
 
 
@@ -33,7 +33,7 @@ class LogMatches:
         indices: (S, 2) indices of the reference scan, -1 for a map, and of the second scan.
         guess: (S, 3) guesses.
         match: The matches.
-        logged: (S, 3) logged poses in the frame of the matches; NaN where the log has none.
+        logged: (S, 3) logged poses in the frame of the matches; NaN if the log has none.
     """
 
     indices: NDArray[np.int64]
@@ -77,7 +77,7 @@ def match_log(
     seed: int,
     noise: float | None = None,
 ) -> Iterator[LogMatches]:
-    """Match each scan of a log to the one before, or all scans to a map; yield the matches of each call.
+    """Match each scan of a log to its predecessor, or all scans to a map; yield the matches of each call.
 
     Args:
         scans: Indices and scans of one scanner.
@@ -133,7 +133,7 @@ def trajectory(matches: LogMatches, first: Floats) -> Floats:
 
     Args:
         matches: Matches of a log.
-        first: (3,) pose of the first scan, which matches to a map have themselves [m, m, rad].
+        first: (3,) pose of the first scan [m, m, rad]; not used for matches to a map.
     """
     usable = matches.match.converged[:, None]
     steps = np.where(usable, matches.match.pose, matches.guess)
@@ -154,7 +154,7 @@ def joined(parts: list[LogMatches]) -> LogMatches:
 
 
 def summary(matches: LogMatches) -> dict[str, object]:
-    """Return counts of statuses, and medians and 95th percentiles of errors; None without logged poses."""
+    """Return counts of statuses, and medians and 95th percentiles of errors, which are None without logged poses."""
     names, counts = np.unique(matches.match.status, return_counts=True)
     result: dict[str, object] = {
         "matches": len(matches.match),

@@ -19,8 +19,8 @@ def named_world(name: str, seed: int = 0) -> OccupancyGrid:
 
     Args:
         name: ``"office"``, a floor of rooms with furniture on both sides of a corridor (:func:`building`);
-            ``"corridor"``, 40 m long without any feature but its ends and two doors; ``"hall"``, 30 x 20 m with rows
-            of shelves that look alike; ``"twins"``, two rooms that are equal after half a turn, but for one pillar.
+            ``"corridor"``, 40 m long, featureless except for its ends and two doors; ``"hall"``, 30 x 20 m with rows of
+            shelves that look alike; ``"twins"``, two rooms that are equal after half a turn, except for one pillar.
         seed: Seed of the random parts: rooms and furniture, positions of doors, missing shelves, the position of the
             pillar.
 
@@ -28,7 +28,7 @@ def named_world(name: str, seed: int = 0) -> OccupancyGrid:
         A grid with its origin at (0, 0, 0) and cells of 0.05 m that are 0, 100 or -1.
 
     Raises:
-        TypeError, ValueError: an argument is not of the kind described, or breaks its rule.
+        TypeError, ValueError: an argument has the wrong type or breaks its rule.
 
     Example:
         >>> import gpusense as gs

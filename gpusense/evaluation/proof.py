@@ -25,13 +25,13 @@ from gpusense.world.scanner import Scanner
 Report = Callable[[dict[str, Any]], None]
 _BEAMS = 24
 _POSES = 70
-# Poses and seconds of the calls that are timed.
+# Number of poses and seconds of the timed calls.
 _TIMED_POSES = 4000
 _TIMED_SECONDS = 0.05
 
 
 class Scene:
-    """A room with pillars and an unknown corner, a scan, and poses, some of them in walls."""
+    """A room with pillars and an unknown corner, a scan, and poses, some of which lie in walls."""
 
     def __init__(self) -> None:
         random = np.random.default_rng(0)
@@ -61,7 +61,7 @@ def prove(job: dict[str, Any], report: Report) -> None:
     report({"begin": SCALAR})
     device = open_device(info)
     models = VECTORS if info.lanes > 1 else SCALAR
-    # Poses are placed in float64 where a device has it, for float32 models too.
+    # Poses are placed in float64 if a device has it, even for float32 models.
     checks = [(SCALAR, _tables), *([(FLOAT64, _float64)] if info.float64 else []), (models, _models)]
     for family, check in checks:
         report({"begin": family})
@@ -73,7 +73,7 @@ def prove(job: dict[str, Any], report: Report) -> None:
 
 
 def _tables(scene: Scene, device: Backend, numpy: Backend) -> str:
-    """Compare distance transforms, whose kernels have no bodies in vectors."""
+    """Compare distance transforms, whose kernels have no lanes."""
     computed, expected = (
         distance_transform(scene.obstacles, squared=True, backend=backend) for backend in (device, numpy)
     )
@@ -119,7 +119,7 @@ def _float64(scene: Scene, device: Backend, numpy: Backend) -> str:
 
 
 def _difference(tolerance: Tolerance, computed: np.ndarray, expected: np.ndarray) -> str:
-    """Describe the difference of results; return an empty text where the tolerance allows it."""
+    """Describe the difference of results; return an empty string if the tolerance allows it."""
     difference = tolerance.difference(computed, expected)
     if difference <= tolerance.value:
         return ""

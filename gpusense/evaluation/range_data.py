@@ -1,4 +1,4 @@
-"""Read data to learn from: readings with their expected ranges.
+"""Read training data: readings with their expected ranges.
 
 Expected ranges are cast at the poses of a log, or come with the readings in a file. Errors within a scan and between
 neighbouring scans are correlated, so data are grouped in blocks, and every other block may be held out.
@@ -135,7 +135,7 @@ def data_of_pairs(
         path: The file, plain or compressed by gzip (.gz).
         range_max: Readings of at least this are "no return" [m].
         range_min: Readings below this are missing [m].
-        every: Stride: every ``every``-th pair is taken, from ``offset`` on.
+        every: Stride: every ``every``-th pair is taken, starting at ``offset``.
         offset: Index of the first pair.
         limit: Largest number of pairs; None for all.
         block: Neighbouring pairs per block.
@@ -155,7 +155,7 @@ def data_of_pairs(
 
 
 def _chosen_rows(file: Any, every: int, offset: int, limit: int | None) -> Floats:
-    """Read (n, 2) or (n, 3) numbers: every ``every``-th row from ``offset`` on, ``limit`` of them at most."""
+    """Read (n, 2) or (n, 3) numbers: every ``every``-th row from ``offset``, at most ``limit`` rows."""
     parts, seen, kept = [], 0, 0
     for rows in _number_rows(file):
         first = max(offset - seen, 0) if seen <= offset else (offset - seen) % every

@@ -121,7 +121,8 @@ def replay(launch: Launch, like: np.ndarray | None = None) -> tuple[np.ndarray, 
     """Compute the truth of a launch: the float64 reference on its rounded inputs and expected ranges.
 
     An end point nearer to a cell's edge than float32 resolves with twice its digits may belong to either cell: the
-    replay takes the cell whose log-likelihood is nearer to ``like``. Bins of angles of incidence are treated alike.
+    replay takes the cell whose log-likelihood is nearer to ``like``. Bins of angles of incidence are treated in the
+    same way.
 
     Args:
         launch: A recorded launch.
@@ -142,7 +143,8 @@ def replay(launch: Launch, like: np.ndarray | None = None) -> tuple[np.ndarray, 
                 moved = _replay_beams(launch, values, aside)
                 parts = np.where(np.abs(moved - like) < np.abs(parts - like), moved, parts)
         if launch.kernel == "score_field" and "BILINEAR" not in launch.flags and like is not None:
-            # Error bound of an end point with twice the digits: eps times the bound of plain arithmetic, 8 eps a cell.
+            # Error bound of an end point with twice the digits: eps times the bound of plain arithmetic, 8 eps per
+            # cell.
             size = np.max(np.abs(values["point"]), initial=0.0, where=np.isfinite(values["point"]))
             guard = 8 * float(np.finfo(np.float32).eps) ** 2 * (size + 2)
             for shift in itertools.product((-guard, guard), repeat=2):
@@ -153,7 +155,7 @@ def replay(launch: Launch, like: np.ndarray | None = None) -> tuple[np.ndarray, 
 
 
 def _as_float64(value: Any) -> Any:
-    """Return real numbers, also those of a struct, in float64; other values as they are."""
+    """Return real numbers, including those of a struct, in float64, and other values unchanged."""
     if isinstance(value, tuple):
         made: type[Any] = type(value)
         return made(*map(_as_float64, value))
@@ -172,7 +174,7 @@ def _replay_beams(launch: Launch, values: dict[str, Any], shift: float = 0.0) ->
         cosine = np.where(np.isnan(angle), 2, np.cos(angle) + shift)
         terms = incidence_terms(terms, values["edges"], values["tables"].incidence_bins, cosine)
     if "SENSOR_TABLE" in launch.flags:
-        # In the launch's precision: otherwise a range next to a bin's border would fall into another bin.
+        # Use the launch's precision, since a range next to a bin's border could otherwise fall into another bin.
         sensor, tables, scale = (launch.values[name] for name in ("sensor", "tables", "scale"))
         rounded = np.broadcast_to(launch.values["reading"], expected.shape), launch.expected[:, ray_of]
         parts = tabulated_density(*rounded, sensor, tables, scale.range_max).astype(np.float64)

@@ -75,9 +75,9 @@ class ScanScore:
     Attributes:
         index: Index of the scan in its log, from 0.
         pose: The logged pose.
-        rank: Rank of the logged pose, 1 the best; the mean rank where particles tie with it.
+        rank: Rank of the logged pose, 1 for the best; the mean rank if particles tie with it.
         percentile: Share of the other particles that score worse, with half of the ties [%].
-        mean: Weighted mean of the other particles, its heading by the circular mean; None where all weights are 0.
+        mean: Weighted mean of the other particles, with the circular mean of headings; None if all weights are 0.
         error_position: Distance of the mean from the logged pose [m], or None.
         error_heading: Absolute difference of heading, 0 to pi [rad], or None.
         effective: Effective sample size of the other particles, or None.
@@ -115,7 +115,7 @@ class BackendScore:
 
     @property
     def particle_beams_per_second(self) -> float | None:
-        """Return evaluated readings per second; of several scans the first, which compiles, is left out."""
+        """Return evaluated readings per second; the first of several scans, which compiles, is left out."""
         steady = self.scans[1:] or self.scans
         seconds = sum(scan.seconds for scan in steady)
         return self.particles * sum(scan.beams for scan in steady) / seconds if seconds > 0 else None
@@ -151,7 +151,7 @@ def score_scan(index: int, poses: Floats, log_p: Array, beams: int, seconds: flo
 
 
 def summary(score: BackendScore) -> dict[str, Any]:
-    """Return medians, 90 % quantiles and extremes over a backend's scans; None where no scan has a value."""
+    """Return medians, 90 % quantiles and extremes over a backend's scans; None if no scan has a value."""
 
     def over_scans(pick: Callable[[ScanScore], float | None], take: Callable[[Sequence[float]], float]) -> float | None:
         values = [value for value in map(pick, score.scans) if value is not None]
@@ -187,7 +187,7 @@ def chosen_scans(
     topic: str | None = None,
     mount: ArrayLike | None = None,
 ) -> list[tuple[int, Scan]]:
-    """Read scans of a log with their indices: ``offset``, ``offset + every``, ..., ``limit`` of them at most.
+    """Read scans of a log with their indices: ``offset``, ``offset + every``, ..., at most ``limit`` scans.
 
     Args:
         path: The log.
@@ -195,7 +195,7 @@ def chosen_scans(
         every: Stride of the scans.
         offset: Index of the first scan.
         limit: Largest number of scans; None for all.
-        topic: The laser, see :func:`gpusense.logs.merge.read_laser`; None for the only or main one.
+        topic: The laser, see :func:`gpusense.logs.merge.read_laser`; None for the only or main laser.
         mount: Pose of a bag's laser on the robot [m, m, rad]; None takes the mount from the bag's transforms.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Compare the backends of this machine: each with the float64 truth on its rounded inputs, and in pairs."""
+"""Compare each backend of this machine with the float64 truth on its rounded inputs, and the backends in pairs."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _MODELS: dict[str, tuple[Callable[..., BeamModel | LikelihoodFieldModel], dict[s
         },
     ),
 }
-# Width of a sonar's cone [rad], and the angle of incidence beyond which a wall reflects sound away [rad].
+# Width of a sonar's cone, and the angle of incidence beyond which a wall reflects sound away [rad].
 _CONE, _CRITICAL = 0.2, 1.1
 
 
@@ -87,7 +87,7 @@ def built_in_scene(seed: int = 0) -> Scene:
 
 
 Results = dict[str, tuple[np.ndarray, Tolerance]]
-# Copies of the scene's poses in one call on a GPU: enough for the models to order them.
+# Copies of the scene's poses in one call on a GPU, enough for the models to order them.
 _REPEATS = 192
 
 
@@ -189,7 +189,7 @@ def _ranges(backend: Backend, scene: Scene, precision: Precision, *, sonar: bool
         ring = _model(_SONAR, scene, backend, precision)
         assert isinstance(ring, BeamModel)
         results[f"{precision} ranges of cones"] = ring.expected_ranges(scene.poses), ranges
-        # A cone without return has no angle: -1 stands for it, which is no angle of incidence.
+        # A cone without return has no angle of incidence; -1 marks it.
         results[angles.name] = np.nan_to_num(ring.incidence(scene.poses), nan=-1.0), angles
     return results
 

@@ -1,4 +1,4 @@
-"""Scans of a log as a filter takes them: with raw odometry, and with reference poses to compare estimates with."""
+"""Scans of a log for a filter: with raw odometry, and with reference poses for comparison."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gpusense.logs.merge import read_lasers
 from gpusense.world.scanner import Scanner
 
 Floats = NDArray[np.float64]
-# Logged poses count as copied odometry where no step differs by more than this [m, rad].
+# Logged poses count as copied odometry if no step differs by more than this [m, rad].
 _SAME = 1e-4
 _LEAST_KNOWN = 3
 
@@ -29,8 +29,8 @@ class Step:
         index: Index of the scan in the log.
         scan: The scan.
         odometry: Pose by raw odometry alone [m, m, rad].
-        sensor: Index of its laser.
-        reference: Pose of the robot to compare estimates with, by default the logged one; None where none is known.
+        sensor: Index of the scan's laser.
+        reference: Pose of the robot for comparison with estimates, by default the logged one; None if unknown.
     """
 
     index: int
@@ -52,8 +52,8 @@ def read_steps(
 ) -> list[Step]:
     """Read scans of a log with raw odometry.
 
-    Logs with corrected poses often have a copy of them in place of the odometry, and wheel readings between the scans
-    that start at the corrected pose of the scan before. The odometry is then chained from these readings.
+    Logs with corrected poses often repeat them as odometry, with wheel readings between the scans that start at the
+    corrected pose of the previous scan. The odometry is then chained from these readings.
 
     Args:
         path: The log.
@@ -61,11 +61,11 @@ def read_steps(
         every: Stride of the scans of each laser.
         offset: Index of the first scan of each laser.
         limit: Largest number of scans; None for all. Nothing is read after the last one.
-        sensors: Its lasers: topics of a bag, front or rear of a CARMEN log; none for its only or main laser.
-        mount: Pose of a bag's only laser on the robot [m, m, rad]; None for those of the bag's transforms.
+        sensors: Lasers of the log: topics of a bag, front or rear of a CARMEN log; none for its only or main laser.
+        mount: Pose of a bag's only laser on the robot [m, m, rad]; None takes the mounts from the bag's transforms.
 
     Raises:
-        ValueError: the log breaks its format, has no scan of these, or a laser changes its geometry.
+        ValueError: the log breaks its format, has no chosen scan, or a laser changes its geometry.
         FileNotFoundError: the log is missing.
     """
     chained, last, between = np.zeros(3), None, None
@@ -96,7 +96,7 @@ def read_steps(
 
 
 def repeats_odometry(steps: Sequence[Step]) -> bool:
-    """Return whether the reference poses are those of the odometry, as in a log without corrections."""
+    """Return whether the reference poses repeat the odometry, as in a log without corrections."""
     known = [step for step in steps if step.reference is not None]
     if len(known) < max(len(steps), 2):
         return False
@@ -105,12 +105,12 @@ def repeats_odometry(steps: Sequence[Step]) -> bool:
     moved = pose_difference(odometry[:-1], odometry[1:])
     difference = pose_difference(references[:-1], references[1:]) - moved
     difference[:, 2] = wrap_angle(difference[:, 2])
-    # A robot that stands has the same steps by any account.
+    # A robot at rest has equal steps in both.
     return bool(np.abs(moved).max() > _SAME and np.abs(difference).max() <= _SAME)
 
 
 def references_to_learn_from(steps: Sequence[Step]) -> tuple[list[Pose], list[Pose]]:
-    """Return odometry and reference poses of all steps, to learn the noise of the odometry; NaN without a reference.
+    """Return odometry and reference poses of all steps, for a fit of the odometry's noise; NaN without a reference.
 
     Raises:
         ValueError: there are fewer than three, or they are the odometry's own poses.

@@ -103,7 +103,7 @@ def density_grid(backend: Selection, precision: str) -> Densities:
     """Evaluate the density grid in the kernel ``score_beams``.
 
     The map is one row of cells with a wall. Eight particles face it from distances that are exact in cells: inside the
-    wall, an ulp before it, and further up to beyond range_max. Deviations and rates are rounded to the precision first,
+    wall, an ulp before it, and farther, to beyond range_max. Deviations and rates are rounded to the precision first,
     so that device and truth have the same inputs.
     """
     device, real, obstacles = get_backend(backend), np.dtype(precision), np.arange(48)[None] >= 40
@@ -161,7 +161,7 @@ def _grid_readings(p: BeamParameters, expected: Floats, ulp: float) -> Floats:
 
 
 def error_in_eps(computed: ArrayLike, truth: ArrayLike, precision: str) -> Floats:
-    """Return errors in eps (1 + |log p|) of a precision; infinite where only one is infinite, or one is NaN."""
+    """Return errors in eps (1 + |log p|) of a precision; infinite if only one side is infinite or a side is NaN."""
     a, b = np.asarray(computed, np.float64), np.asarray(truth, np.float64)
     with np.errstate(all="ignore"):
         error = np.abs(a - b) / (1 + np.abs(b)) / float(np.finfo(precision).eps)

@@ -22,16 +22,16 @@ class Case:
     """A scene that is extreme in one respect.
 
     Attributes:
-        name: The respect.
+        name: The extreme property.
         grid: The map.
         local: (N, 3) poses in the grid's frame [cells, cells, rad].
         beams: Beams of a scanner with a field of view of 360 degrees.
         readings: Readings that a scan repeats [cells]; None for the first pose's expected ranges, with missing and max
             readings.
         options: Arguments of the models, such as ``outside``.
-        weights: z_hit, z_short, z_max and z_rand.
+        weights: Weights z_hit, z_short, z_max and z_rand.
         sigma: Standard deviation [cells].
-        constant: log p where every particle has the same; else None.
+        constant: log p if all particles have the same value; else None.
     """
 
     name: str

@@ -46,8 +46,8 @@ class Tolerance:
     def difference(self, computed: ArrayLike, truth: ArrayLike) -> float:
         """Return the largest difference of two arrays of one shape in the tolerance's unit.
 
-        Units that count compare bits: NaN equals NaN, and -0 does not equal 0. In other units equal values differ by
-        0, infinite ones included; a NaN, or an infinity on one side only, differs infinitely.
+        In units that count, bits are compared: NaN equals NaN, and -0 does not equal 0. In other units equal values
+        differ by 0, including infinite ones; a NaN, or an infinity on one side only, gives an infinite difference.
 
         Args:
             computed: The array to check.
@@ -223,8 +223,8 @@ def per_scan(parts: ArrayLike, dtype: DTypeLike, *, fixed: float = 0.0, temperat
     """Return the largest error of a scan's log-likelihood that follows from its beams' bounds and from the summation.
 
     BLOCK_TERMS terms are added plainly, with an error of (BLOCK_TERMS - 1) / 2 eps of the sum of their magnitudes.
-    Blocks are added with compensation, with the square of a plain sum's relative error. The final sum and its product
-    with the temperature round once each. float64 has a separate, wider rule.
+    Blocks are added with compensation, whose relative error is the square of a plain sum's. The final sum and its
+    product with the temperature round once each. float64 has a separate, wider rule.
 
     Args:
         parts: (..., K) log-likelihoods of the beams before the temperature.

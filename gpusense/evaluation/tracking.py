@@ -1,4 +1,4 @@
-"""Localise a robot along a recorded log, and judge the track: errors, coverage, time to converge, times of a step."""
+"""Localise a robot along a recorded log, and evaluate the track: errors, coverage, time to converge, time per step."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from gpusense.localization.pose_algebra import pose_difference, wrap_angle
 from gpusense.localization.words import WORDS, Word
 
 Floats = NDArray[np.float64]
-# A track has converged where the next scans are within these of the truth [m, rad].
+# Largest errors of the next scans of a converged track [m, rad].
 CONVERGED, CONVERGED_TURN, CONVERGED_SCANS = 1.0, math.radians(20), 5
-# Most scans from which the verdict at the end is taken.
+# Most scans that give the verdict at the end.
 _TAIL = 10
 # Deviations of a tracking start: x, y [m] and heading [rad].
 START = DEFAULTS.start
@@ -32,13 +32,13 @@ class Track:
     """Estimated poses along a log.
 
     Attributes:
-        steps: Scans so far.
+        steps: Steps so far.
         poses: Estimated poses.
-        covariances: Their covariances.
+        covariances: Covariances of the estimates.
         ranks: Ranks of the reference poses among the particles (:func:`rank_of`), of the steps that have one.
         sizes: Effective sample sizes.
         p_lost: Probabilities that the estimates are off by more than 1 m or 0.5 rad.
-        verdicts: Verdicts: "tracking", "uncertain" or "lost".
+        verdicts: "tracking", "uncertain" or "lost" for each estimate.
         explained: Shares of beams that the estimates explain; NaN for a scan without beams.
         temperatures: Temperatures.
         seconds: Seconds of each step: predict, score, resample, estimate.
@@ -68,14 +68,14 @@ class Track:
 
     @property
     def references(self) -> Floats | None:
-        """(S, 3) reference poses, NaN where none is known; None if none is."""
+        """(S, 3) reference poses, NaN where unknown; None without any."""
         unknown = (math.nan,) * 3
         known = [unknown if step.reference is None else step.reference for step in self.steps]
         poses = np.array(known, np.float64).reshape(-1, 3)
         return poses if np.isfinite(poses).any() else None
 
     def differences(self) -> Floats | None:
-        """Return (S, 3) estimates less reference poses, headings wrapped, NaN where none is known; None if none is."""
+        """Return (S, 3) estimates less reference poses, headings wrapped, NaN where unknown; None without any."""
         references = self.references
         if references is None:
             return None
@@ -84,7 +84,7 @@ class Track:
         return difference
 
     def errors(self) -> tuple[Floats, Floats] | None:
-        """Return the errors of position [m] and heading [rad] of each scan, as :meth:`differences`."""
+        """Return the errors of position [m] and heading [rad] of each scan; see :meth:`differences`."""
         difference = self.differences()
         return None if difference is None else (np.hypot(*difference[:, :2].T), np.abs(difference[:, 2]))
 
@@ -101,8 +101,8 @@ def start(
 
     Args:
         pf: The filter.
-        steps: Its scans.
-        everywhere: Whether it begins anywhere on the map.
+        steps: Steps of the filter.
+        everywhere: Whether the filter starts anywhere on the map.
         pose: The pose; None for the first reference pose.
         covariance: (3, 3) covariance of the start; None for the usual one.
 
@@ -120,7 +120,7 @@ def start(
 
 
 def follow(pf: ParticleFilter, steps: Iterable[Step], track: Track) -> Iterable[Step]:
-    """Run a filter along a log; yield each step once the track has it."""
+    """Run a filter along a log; yield each step after it was added to the track."""
     pf.time_scoring()
     for step in steps:
         times = [time.perf_counter()]
@@ -155,8 +155,7 @@ def follow(pf: ParticleFilter, steps: Iterable[Step], track: Track) -> Iterable[
 def summary(track: Track) -> dict[str, Any]:
     """Return figures of a track: errors, coverage, convergence, verdict and times.
 
-    Figures against reference poses are None without them, and so is the median share of explained beams where no scan
-    has beams.
+    Figures against reference poses are None without them, as is the median share of explained beams without beams.
     """
     count = len(track.steps)
     seconds = np.array(track.seconds).reshape(-1, 4) * 1000
@@ -189,7 +188,7 @@ def summary(track: Track) -> dict[str, Any]:
 
 
 def _median(shares: Sequence[float]) -> float | None:
-    """Return the median of the shares that are known; None without one."""
+    """Return the median of the known shares; None without any."""
     known = [share for share in shares if not math.isnan(share)]
     return float(np.median(known)) if known else None
 
@@ -219,7 +218,7 @@ _WITH_REFERENCE = (
 
 
 def _converged(position: Floats, heading: Floats) -> int | None:
-    """Return the first scan from which the next ones are near the truth; None if there is none."""
+    """Return the first scan after which the next ones are near the truth; None without one."""
     near = (position < CONVERGED) & (heading < CONVERGED_TURN)
     length = min(CONVERGED_SCANS, len(near))
     return next((i for i in range(len(near) - length + 1) if near[i : i + length].all()), None)

@@ -17,11 +17,11 @@ from gpusense.localization.pose_algebra import wrap_angle
 from gpusense.logs import Pose
 
 Floats = NDArray[np.float64]
-# A pose lies between two of a trajectory that are no further apart [s], or is one at the same time.
+# Largest time between two poses of a trajectory that are interpolated, and between equal times [s].
 _FARTHEST, _SAME_TIME = 0.5, 1e-3
 # Largest coordinate [m]; those of UTM reach 1e7.
 _LARGEST = 1e9
-# Comment of a trajectory with indices of scans in place of times.
+# Comment of a trajectory with indices of scans instead of times.
 _INDICES = "# indices of scans, not times"
 
 
@@ -32,7 +32,7 @@ def write_tum(path: Path, times: Iterable[float], poses: Iterable[Floats], *, in
         path: The file.
         times: Times [s].
         poses: Poses (x, y [m], theta), as many.
-        indices: Whether the times are indices of scans; a comment says so then.
+        indices: Whether the times are indices of scans, which a comment then states.
 
     Raises:
         OSError, ValueError: the file cannot be written.
@@ -78,8 +78,8 @@ def read_tum(path: Path) -> tuple[Floats, Floats]:
     """Read a TUM trajectory: times (T,) [s] and poses (T, 3), with headings from the quaternions.
 
     Raises:
-        ValueError: a line has not eight finite numbers, there is none, a quaternion is 0, a coordinate is over 1e9 m,
-            or times do not increase.
+        ValueError: a line has not eight finite numbers, there is no line, a quaternion is 0, a coordinate exceeds 1e9
+            m, or times do not increase.
         FileNotFoundError: the file is missing.
     """
     rows = np.array(list(_numbers(path))).reshape(-1, 8)
@@ -101,7 +101,7 @@ def read_tum(path: Path) -> tuple[Floats, Floats]:
 def poses_at(scans: Sequence[float], times: Floats, poses: Floats) -> list[Pose | None]:
     """Return the poses of a trajectory at the times of scans; None where none is near.
 
-    A pose between two of the trajectory at most half a second apart is interpolated.
+    Between two poses of the trajectory that are at most half a second apart, poses are interpolated.
 
     Args:
         scans: Times of the scans [s], at least one.
@@ -119,7 +119,7 @@ def poses_at(scans: Sequence[float], times: Floats, poses: Floats) -> list[Pose 
 
 
 def _pose_at(time: float, times: Floats, poses: Floats) -> Pose | None:
-    """Return the pose of a trajectory at a time; None where none is near."""
+    """Return the pose of a trajectory at a time; None if none is near."""
     after = int(np.searchsorted(times, time))
     near = [k for k in (after - 1, after) if 0 <= k < len(times)]
     nearest = min(near, key=lambda k: abs(times[k] - time))

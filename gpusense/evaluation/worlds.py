@@ -197,7 +197,7 @@ def sample_readings(expected: ArrayLike, range_max: float, parameters: BeamParam
 
 def _in_cells(grid: OccupancyGrid, rows: NDArray[np.intp], cols: NDArray[np.intp], rng: Rng) -> Floats:
     """Draw (M, 3) poses, uniform within their cells and over all headings."""
-    # A margin of 5e-7 cells: rounding moves no pose across a cell's edge.
+    # With a margin of 5e-7 cells, rounding moves no pose across a cell's edge.
     u, v = (rng.random((2, len(rows))) - 0.5) * grid.resolution * (1 - 1e-6)
     c, s = math.cos(grid.origin[2]), math.sin(grid.origin[2])
     xy = grid.cell_centers(rows, cols) + np.stack([c * u - s * v, s * u + c * v], axis=1)

@@ -22,7 +22,7 @@ def rounded_terms(terms: list[float], real: np.dtype) -> np.ndarray:
     """Return the numbers of a mixture in a model's precision, then the rounding errors of the first two.
 
     Raises:
-        ValueError: sigma_hit or lambda_short is too small or too large for the precision.
+        ValueError: Sigma_hit or lambda_short is too small or too large for the precision.
     """
     with np.errstate(over="ignore"):
         rounded = np.array(terms).astype(real)

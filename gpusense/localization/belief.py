@@ -16,6 +16,15 @@ variance the exact increment of the log odds is then
 so a standing robot gains almost nothing from its hundredth scan, and a change is detected at once (Hamilton, "A new
 approach to the economic analysis of nonstationary time series", *Econometrica* 57 (1989), treats such regimes).
 
+Some wrong places look like the right one: scans agree there as well, and none of them is evidence. ``ALIKE`` is the
+prior share of such places among wrong ones. A place ceases to look alike at the rates of ``ALIKE_LENGTH`` and
+``ALIKE_TURN``. So with the share a that still looks alike, an increment i of the log odds becomes
+
+    log(a + (1 - a) e^i),   a <- a / (a + (1 - a) e^i),
+
+and a short log leaves the probability of "wrong" at or above a share ``ALIKE`` of its prior odds, however well scans
+agree.
+
 A search, as after a start anywhere, chooses a place because the scans agree with it. So this agreement is no new
 evidence: it counts as repeated from the previous scan. A contradiction counts in full.
 """
@@ -31,6 +40,8 @@ START = 0.1
 PER_SCAN, PER_METRE, FOUND, WIDE = 1e-3, 2e-3, 0.003, 0.05
 # Correlation of the ratios of two scans at one place, and the distance and turn over which it falls to 1 / e [m, rad].
 STAYS, LENGTH, TURN = 0.95, 2.0, 1.0
+# Prior share of wrong places that look like the right one; distance and turn over which it falls to 1 / e [m, rad].
+ALIKE, ALIKE_LENGTH, ALIKE_TURN = 0.12, 8.0, 2.0
 # One in this many searches on a right map finds a wrong place; most wrong places that count.
 MISSES, MOST_PLACES = 8, 2
 # Longest motion from one scan to the next that counts [m]; a longer one is a jump of the localiser.
@@ -46,6 +57,7 @@ class Belief(NamedTuple):
         pose: Pose at which that scan was judged; None before.
         scans: Scans since that one.
         chosen: Whether the next pose is one that scans choose among many.
+        alike: Share of "wrong" that looks like the right place.
     """
 
     log_odds: float = math.log(START / (1 - START))
@@ -53,6 +65,7 @@ class Belief(NamedTuple):
     pose: tuple[float, float, float] | None = None
     scans: int = 0
     chosen: bool = False
+    alike: float = ALIKE
 
     @property
     def wrong(self) -> float:
@@ -74,7 +87,7 @@ class Belief(NamedTuple):
 
     def widened(self) -> Belief:
         """Return the belief after scans without a common pose: the next pose may be anywhere."""
-        return Belief(self._moved(WIDE, WIDE, min(self.scans, 100)), chosen=True)
+        return Belief(self._moved(WIDE, WIDE, min(self.scans, 100))[0], chosen=True)
 
     def judged(self, pose: tuple[float, float, float], ratio: float) -> Belief:
         """Return the belief after a scan.
@@ -91,14 +104,18 @@ class Belief(NamedTuple):
             turn = abs(math.remainder(pose[2] - self.pose[2], math.tau))
             rho = STAYS * math.exp(-way / LENGTH - turn / TURN)
         lost = 1 - math.exp(-PER_SCAN * self.scans - PER_METRE * min(way, _FASTEST * self.scans))
-        log_odds = self._moved(lost, 1 - (1 - FOUND) ** self.scans, 1)
+        log_odds, alike = self._moved(lost, 1 - (1 - FOUND) ** self.scans, 1)
         if math.isnan(ratio):
-            return self._replace(log_odds=log_odds, scans=0)
-        return Belief(log_odds + (ratio - rho * before) / (1 + rho), ratio, pose, 0)
+            return self._replace(log_odds=log_odds, scans=0, alike=alike)
+        alike *= math.exp(-way / ALIKE_LENGTH - turn / ALIKE_TURN)
+        change = alike + (1 - alike) * math.exp((ratio - rho * before) / (1 + rho))
+        return Belief(log_odds + math.log(change), ratio, pose, 0, alike=alike / change)
 
-    def _moved(self, lost: float, found: float, times: int) -> float:
-        """Return the log odds after transitions."""
-        wrong = self.wrong
+    def _moved(self, lost: float, found: float, times: int) -> tuple[float, float]:
+        """Return the log odds, and the share that looks alike, after transitions."""
+        wrong, alike = self.wrong, self.alike
         for _ in range(times):
-            wrong = wrong * (1 - found) + (1 - wrong) * lost
-        return math.log(wrong) - math.log1p(-wrong)
+            stays, added = wrong * (1 - found), (1 - wrong) * lost
+            wrong = stays + added
+            alike = (stays * alike + added * ALIKE) / wrong
+        return math.log(wrong) - math.log1p(-wrong), alike

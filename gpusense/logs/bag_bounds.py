@@ -1,7 +1,7 @@
-"""Bounds for the library rosbags, which decompresses chunks and reads YAML without any.
+"""Set bounds for the library rosbags, which decompresses chunks and reads YAML without limits.
 
-A bag of a few kilobytes could fill memory or the disk. The library has tables of its decompressors; their entries are
-replaced by ones with a bound, for the whole process and once. Sound bags are read as before.
+A bag of a few kilobytes could fill memory or the disk. The entries of the library's tables of decompressors are
+replaced by bounded ones, once and for the whole process. Sound bags are read as before.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gpusense._util.documents import check_yaml
 from gpusense._util.inflate import inflated, most_bytes
 
 LARGEST_CHUNK = 1 << 29
-"""Most bytes of a chunk or message of a bag, decompressed."""
+"""Most bytes of a decompressed chunk or message of a bag."""
 _LARGEST_METADATA = 1 << 24
 
 
@@ -30,7 +30,7 @@ def check_metadata(folder: Path) -> None:
     """Check the size and the aliases of a ROS 2 bag's ``metadata.yaml``.
 
     Raises:
-        ValueError: it is too large, or grows without bound.
+        ValueError: The file is too large, or its aliases expand without bound.
     """
     file = folder / "metadata.yaml"
     with file.open("rb") as stream:
@@ -42,10 +42,10 @@ def check_metadata(folder: Path) -> None:
 
 @functools.cache
 def install() -> None:
-    """Replace the library's decompressors and its parser of nested YAML by ones with bounds.
+    """Replace the library's decompressors and its parser of nested YAML by bounded ones.
 
     Raises:
-        ImportError: rosbags, or a table of it, is absent.
+        ImportError: rosbags or one of its tables is absent.
     """
     lz4 = importlib.import_module("lz4.frame").LZ4FrameDecompressor
     reader1, reader2, mcap, sqlite = (
@@ -73,7 +73,7 @@ def _table(module: Any, name: str) -> Any:
     """Return a table of the library.
 
     Raises:
-        ImportError: this version has none, so that its decompression cannot be bounded.
+        ImportError: this version has no such table, so its decompression cannot be bounded.
     """
     table = getattr(module, name, None)
     if not isinstance(table, dict):
@@ -101,7 +101,7 @@ def _qos(parse: Callable[[Any], Any], profiles: Any) -> Any:
 
 
 class _Bounded(io.RawIOBase):
-    """A compressed file that is read up to a bound, and no further than the disk has room for."""
+    """A compressed file that is read up to a bound, which depends on the free space of the disk."""
 
     def __init__(self, opened: Callable[..., Any], file: Any, mode: str) -> None:
         self._inner = opened(file, mode)

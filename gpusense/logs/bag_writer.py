@@ -22,12 +22,12 @@ _LASER, _BASE, _ODOM = "laser", "base_link", "odom"
 def write_bag(path: Path, scans: Iterable[Scan], *, first: bool) -> None:
     """Write scans on ``/scan``, odometry on ``/odom`` and ``/tf``, and the laser's mount on ``/tf_static``.
 
-    No return is an infinity (REP-117). The frames are odom, base_link and laser.
+    "No return" is written as infinity (REP-117). The frames are odom, base_link and laser.
 
     Args:
-        path: The bag: a file of ROS 1, or a folder of ROS 2 (sqlite3), which must not exist.
+        path: The bag: a file for ROS 1, or a folder for ROS 2 (sqlite3), which must not exist.
         scans: Scans with the robot's odometry; their poses are not written.
-        first: Whether the bag is one of ROS 1.
+        first: Whether the bag is for ROS 1.
 
     Raises:
         ValueError: the folder exists, or a scanner's bearings have uneven steps.
@@ -46,9 +46,9 @@ def check_bag(path: Path, *, first: bool) -> None:
     """Check that a bag can be written.
 
     Raises:
-        ValueError: The folder of a ROS 2 bag exists, or the name is one of another kind of bag.
+        ValueError: The folder of a ROS 2 bag exists, or the name is that of another kind of bag.
         ImportError: The library rosbags is absent.
-        FileNotFoundError: There is no folder to write it to.
+        FileNotFoundError: The bag's parent folder is missing.
     """
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path.parent}: must be a folder, got none")
@@ -101,7 +101,7 @@ class _Writer:
         step = (float(bearings[-1]) - first) / max(len(bearings) - 1, 1)
         if np.abs(bearings - (first + step * np.arange(len(bearings)))).max(initial=0.0) > 1e-9:
             raise ValueError("bearings: must have even steps in a LaserScan, got uneven ones")
-        # Rounding must not turn a range into no return.
+        # Rounding must not turn a range into "no return".
         nearer = np.minimum(scan.ranges.astype(np.float32), np.nextafter(np.float32(scanner.range_max), np.float32(0)))
         ranges = np.where(scan.ranges >= scanner.range_max, np.float32(np.inf), nearer)
         self._put(
@@ -112,7 +112,7 @@ class _Writer:
         )  # fmt: skip
 
     def odometry(self, time: float, pose: Pose) -> None:
-        """Write an Odometry message; the velocities are 0, and the covariances unknown."""
+        """Write an Odometry message with velocities 0 and unknown covariances."""
         place = self._make("Pose", position=self._make("Point", x=pose[0], y=pose[1], z=0.0),
                            orientation=self._quaternion(pose[2]))  # fmt: skip
         still = self._make("Vector3", x=0.0, y=0.0, z=0.0)

@@ -1,7 +1,7 @@
 """Open rosbags through the library rosbags and yield messages of known types, with errors that name file and place.
 
 A bag's message definitions are never used, because a library would turn them into code: messages are decoded by the
-layouts that come with rosbags, and by one that is defined here.
+layouts that come with rosbags, and by one layout that is defined here.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def messages(path: Path, wanted: Mapping[str, set[str] | None]) -> Iterator[Mess
 
     Args:
         path: The bag.
-        wanted: Topics of each type of message; None for all topics.
+        wanted: Wanted topics of each type of message; None for all topics.
 
     Raises:
         ValueError: The bag or a message is broken; the error names the file, the topic and the message's number.

@@ -14,13 +14,13 @@ Each message ends with the time of measurement, the host and the logger's time. 
 front laser, RLASER and ROBOTLASER2 from the rear laser. Every other line is skipped.
 
 * ``Scan.time`` and ``Odometry.time`` are the time of measurement.
-* ``Scan.pose`` is the laser's pose. In a log that went through SLAM it is the corrected pose; in a raw log it is the
-  odometry's. The file does not distinguish the two.
+* ``Scan.pose`` is the laser's pose. In a log processed by SLAM it is the corrected pose, in a raw log the odometry's.
+    The file does not distinguish them.
 * The scanner's mount is (0, 0, 0), since the poses are those of the laser.
 * FLASER and RLASER state no bearings. They start at -90 degrees, counter-clockwise, in steps of 180/n degrees, or of 1,
   0.5 or 0.25 degrees if that is within 1 %: 1 degree for 180 or 181 beams, 0.5 for 360 or 361.
-* ROBOTLASER states angles with six decimals. If field of view and resolution agree to these, bearings are spaced by the
-  field of view over n - 1, which multiplies no rounding error; else by the resolution.
+* ROBOTLASER states angles with six decimals. If field of view and resolution agree within this rounding, bearings are
+    spaced by the field of view over n - 1, which multiplies no rounding error; otherwise by the resolution.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ def _robot_laser(
 
 
 def _count(where: str, fields: Sequence[bytes], index: int) -> int:
-    """Return the count in ``fields[index]`` after checking that as many values follow."""
+    """Return the count in ``fields[index]``, after a check that this many values follow."""
     name = fields[0].decode()
     left = len(fields) - index - 1
     text = fields[index].decode(errors="replace") if left >= 0 else ""

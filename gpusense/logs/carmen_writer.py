@@ -23,7 +23,7 @@ _EVEN = 1e-9
 def write_carmen(path: Path, scans: Iterable[Scan]) -> None:
     """Write scans as messages ODOM and ROBOTLASER1, compressed where the name ends in ``.gz``.
 
-    Readings have four decimals; no return is the scanner's ``range_max``. A scan without a pose is written with its
+    Readings have four decimals; "no return" is the scanner's ``range_max``. A scan without a pose is written with its
     odometry. The format has no mount and no missing readings.
 
     Args:
@@ -61,7 +61,7 @@ def _numbers(values: Iterable[float], decimals: int) -> str:
 
 
 def _within(scan: Scan) -> Iterable[float]:
-    """Return readings such that a range below range_max stays below it when it is rounded."""
+    """Return readings in which ranges below range_max stay below it after rounding."""
     if np.isnan(scan.ranges).any():
         raise ValueError(f"ranges: must be no NaN in a CARMEN log, got one in the scan at {scan.time}")
     limit, unit = scan.scanner.range_max, 10.0**-_READING

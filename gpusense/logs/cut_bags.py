@@ -1,8 +1,8 @@
-"""Bags that are cut off: of a recorder that was killed, a disk that was full, a copy that was interrupted.
+"""Recover bags that are cut off by a killed recorder, a full disk or an interrupted copy.
 
-Such a bag has no index, or one of a longer file. A new bag is made of its messages up to the cut, in a temporary folder
-that is deleted at the end of the process. Nothing is allocated on the word of a header: lengths are compared with the
-file.
+Such a bag has no index, or the index of a longer file. A new bag is made from its messages up to the cut, in a
+temporary folder that is deleted at the end of the process. Lengths in headers are compared with the file before
+anything is allocated.
 
 Formats: https://wiki.ros.org/Bags/Format/2.0, https://mcap.dev/spec, https://www.sqlite.org/fileformat.html.
 """
@@ -15,7 +15,6 @@ import functools
 import io
 import os
 import shutil
-import sqlite3
 import struct
 import tempfile
 from collections.abc import Callable, Iterator
@@ -23,15 +22,15 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 _MCAP, _ROS1, _SQLITE = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n", b"SQLite format 3\0"
-# Kinds of records in MCAP: header, schema, channel, message, chunk; in ROS 1: message, chunk, connection.
+# Kinds of records in MCAP (header, schema, channel, message, chunk), and in ROS 1 (message, chunk, connection).
 _M_HEADER, _M_SCHEMA, _M_CHANNEL, _M_MESSAGE, _M_CHUNK = 1, 3, 4, 5, 6
 _R_MESSAGE, _R_CHUNK, _R_CONNECTION = 2, 5, 7
-# Most bytes of a chunk after decompression; recorders make chunks of about a megabyte.
+# Most bytes of a decompressed chunk; recorders make chunks of about a megabyte.
 _LARGEST = 1 << 30
 
 
 class _Record(NamedTuple):
-    """A record: its kind, its fields by name (of ROS 1), and its data, cut off where the file ends."""
+    """A record: kind, fields by name (in ROS 1), and data, cut off at the end of the file."""
 
     kind: int
     fields: dict[bytes, bytes]
@@ -40,7 +39,7 @@ class _Record(NamedTuple):
 
 
 def uncut(path: Path) -> Path | None:
-    """Return a bag of the messages up to the cut of one that is cut off; None for any other kind.
+    """Return a bag of the messages up to the cut; None for a bag that is not cut off.
 
     Args:
         path: The bag: a file, or a folder with ``metadata.yaml``.
@@ -80,7 +79,7 @@ def _uncut(path: Path, stats: tuple[tuple[Path, int, int], ...]) -> Path | None:
 
 
 def _folder() -> Path:
-    """Make a folder that is kept until the end of the process."""
+    """Make a folder that exists until the end of the process."""
     made = tempfile.TemporaryDirectory(prefix="gpusense-bag-")
     _FOLDERS.append(made)
     return Path(made.name)
@@ -106,7 +105,7 @@ def _mcap(file: Path, size: int, out: Path) -> None:
             if record.kind <= _M_CHUNK and record.whole:
                 _put(target, record)
             elif record.kind == _M_CHUNK:
-                # Messages may stand outside chunks.
+                # Messages may also lie outside chunks.
                 for inner in _mcap_messages(record.data):
                     _put(target, inner)
         # The end of the data, and the end of a file without an index.
@@ -118,18 +117,18 @@ def _put(target: BinaryIO, record: _Record) -> None:
 
 
 def _mcap_records(stream: BinaryIO, end: int) -> Iterator[_Record]:
-    """Yield records up to the end, the last one perhaps in part; the end of the data ends them."""
+    """Yield records up to the end of the data; the last one may be partial."""
     while len(head := stream.read(9)) == 9:
         kind, length = struct.unpack("<BQ", head)
         left = end - stream.tell()
         if not 0 < kind < 0x0F or kind == 2:
-            # The end of the data, or no record.
+            # This is the end of the data, or no record.
             return
         yield _Record(kind, {}, stream.read(min(length, left)), length <= left)
 
 
 def _mcap_messages(chunk: bytes) -> Iterator[_Record]:
-    """Yield the whole records of a chunk that is cut off."""
+    """Yield the complete records of a chunk that is cut off."""
     if len(chunk) < 32:
         return
     length = struct.unpack("<I", chunk[28:32])[0]
@@ -142,7 +141,7 @@ def _mcap_messages(chunk: bytes) -> Iterator[_Record]:
 
 
 def _decompressed(data: bytes, compression: bytes) -> bytes:
-    """Return as much of compressed data as can be read, without an end."""
+    """Decompress as much of truncated data as possible."""
     if compression in (b"", b"none"):
         return data
     stream: Any
@@ -182,7 +181,7 @@ def _ros1(file: Path, size: int, out: Path) -> None:
 
 
 def _is_cut_ros1(file: Path, size: int) -> bool:
-    """Return whether the index, whose place the first record has, is absent or not whole."""
+    """Return whether the index, whose place is in the first record, is absent or incomplete."""
     with file.open("rb") as stream:
         stream.seek(len(_ROS1))
         place = next((record.fields.get(b"index_pos", b"") for record in _ros1_records(stream, size)), b"")
@@ -195,7 +194,7 @@ def _is_cut_ros1(file: Path, size: int) -> bool:
 
 
 def _ros1_records(stream: BinaryIO, end: int) -> Iterator[_Record]:
-    """Yield records up to the end, the last one perhaps in part."""
+    """Yield records up to the end; the last one may be partial."""
     while len(head := stream.read(4)) == 4:
         (length,) = struct.unpack("<I", head)
         left = end - stream.tell()
@@ -225,7 +224,7 @@ def _fields(header: bytes) -> dict[bytes, bytes]:
 
 
 def _write(writer: Any, connections: dict[bytes, Any], record: _Record) -> None:
-    """Write a message of a chunk, or begin the connection of messages."""
+    """Write a message of a chunk, or add a connection."""
     key = record.fields.get(b"conn", b"")
     if record.kind == _R_CONNECTION and key not in connections:
         told = _fields(record.data)
@@ -244,6 +243,8 @@ def _write(writer: Any, connections: dict[bytes, Any], record: _Record) -> None:
 
 def _sqlite(file: Path, out: Path) -> None:
     """Write the topics and messages of a database up to its cut into a new one."""
+    import sqlite3
+
     padded = out.with_name(f"{out.name}.padded")
     shutil.copyfile(file, padded)
     with padded.open("r+b") as stream:
@@ -251,7 +252,7 @@ def _sqlite(file: Path, out: Path) -> None:
         page = struct.unpack(">H", stream.read(2))[0]
         stream.seek(28)
         pages = struct.unpack(">I", stream.read(4))[0]
-        # A hole in the file; no memory.
+        # The file has a hole, or memory is short.
         stream.truncate((65536 if page == 1 else page) * pages)
     with contextlib.closing(sqlite3.connect(f"file:{padded}?mode=ro&immutable=1", uri=True)) as source, \
             contextlib.closing(sqlite3.connect(out)) as target:  # fmt: skip

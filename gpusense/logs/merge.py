@@ -26,14 +26,14 @@ def read_laser(
 
     Args:
         path: The log, as for :func:`gpusense.read_log`.
-        topic: Topic of the laser in a ROS bag; ``"front"`` or ``"rear"`` for a CARMEN log. None is the laser that
+        topic: Topic of the laser in a ROS bag; ``"front"`` or ``"rear"`` for a CARMEN log. None for the laser that
             ``read_log`` takes.
         range_max: Readings of at least this are "no return" [m]; None for the log's.
         mount: Pose of a bag's laser on the robot [m, m, rad]; None takes the mount from the bag's transforms.
 
     Raises:
         FileNotFoundError: The log is missing.
-        ValueError: A laser that the log does not have, or a broken log.
+        ValueError: The log has no such laser, or is broken.
     """
     form = format_of(checks.path("path", path))
     records = _records(form, path, topic, range_max=range_max, mount=mount, odometry=False)
@@ -51,17 +51,17 @@ def read_lasers(
 
     Args:
         path: The log, as for :func:`gpusense.read_log`.
-        sensors: Topics of the lasers of a ROS bag, whose transforms have their mounts; ``"front"`` or ``"rear"`` for a
-            CARMEN log, which states no mounts. None of them is the laser that ``read_log`` takes.
+        sensors: Topics of the lasers of a ROS bag, whose transforms give their mounts; ``"front"`` or ``"rear"`` for a
+            CARMEN log, which states no mounts. None for the laser that ``read_log`` takes.
         range_max: Readings of at least this are "no return" [m]; None for the log's.
-        mount: Pose of a bag's only laser on the robot [m, m, rad]; None for those of the bag's transforms.
+        mount: Pose of a bag's only laser on the robot [m, m, rad]; None takes the mounts from the bag's transforms.
 
     Yields:
-        The index of a laser in ``sensors``, and its scan; 0 and a reading of the odometry.
+        The index of a laser in ``sensors`` with its scan, or 0 with a reading of the odometry.
 
     Raises:
         FileNotFoundError: The log is missing.
-        ValueError: A laser that the log does not have, a mount for several lasers, or a broken log.
+        ValueError: The log has no such laser or is broken, or a mount is passed for several lasers.
     """
     for index, name in enumerate(sensors):
         if name in sensors[:index]:
@@ -89,7 +89,7 @@ def _records(
     mount: ArrayLike | None,
     odometry: bool,
 ) -> Iterator[Scan | Odometry]:
-    """Read the records of one laser, which None leaves to ``read_log``.
+    """Read the records of one laser; None for the laser that ``read_log`` takes.
 
     Raises:
         ValueError: The log's format has no such laser.

@@ -10,10 +10,10 @@ RobotN_Measurement.dat      time [s], barcode, range [m], bearing [rad]
 RobotN_Groundtruth.dat      time [s], x, y [m], heading [rad]
 ==========================  ===========================================================================
 
-Each file may be compressed by gzip, with .gz after its name. Measurements carry barcodes, not subjects. Subjects that
-are no landmarks are other robots. Readings of other robots and of unlisted barcodes are left out and counted. Readings
-of one time form a scan. Logged poses and odometry are interpolated at this time, headings along the shorter arc.
-Readings before the first logged pose or after the last are left out.
+Each file may be compressed by gzip, with .gz after its name. Measurements have barcodes instead of subjects. Subjects
+that are no landmarks are robots. Readings of robots and of unlisted barcodes are left out and counted. Readings at one
+time form a scan. Logged poses and odometry are interpolated at this time, headings along the shorter arc. Readings
+before the first logged pose or after the last are left out.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from gpusense._util.lines import until_cut
 from gpusense.logs.records import Floats, Integers, LandmarkRun
 from gpusense.world.landmarks import LandmarkMap
 
-# Indices of subjects that are no landmark: another robot, and the owner of an unlisted barcode.
+# Indices of subjects that are no landmarks: another robot, and the owner of an unlisted barcode.
 _ROBOT, _UNKNOWN = -1, -2
 
 

@@ -21,11 +21,11 @@ class Format:
     """A format of logs.
 
     Attributes:
-        name: Its name in messages, with an article.
+        name: Name of the format in messages, with an article.
         module: The module whose function ``read(file, *, range_max, odometry, rear)`` yields its records.
-        suffixes: The ends of its files' names; empty for the format of all files that no other claims.
-        begins: The first bytes of its text files, in place of suffixes.
-        folder: Whether a folder with this file in it is a log of this format; "" for no folder.
+        suffixes: Suffixes of its files; empty for the format of all files that no other format claims.
+        begins: First bytes of its text files, instead of suffixes.
+        folder: File in a folder that makes the folder a log of this format; "" if logs are no folders.
         topics: Whether ``read`` also takes ``topic`` and ``mount``.
     """
 
@@ -37,7 +37,7 @@ class Format:
     topics: bool = False
 
     def claims(self, file: Path) -> bool:
-        """Return whether a file has a name, or a beginning, of this format."""
+        """Return whether a file has a suffix or the first bytes of this format."""
         if file.is_dir():
             return bool(self.folder) and (file / self.folder).is_file()
         if self.begins:
@@ -45,7 +45,7 @@ class Format:
         return not self.suffixes or file.name.lower().endswith(self.suffixes)
 
 
-# The first format that claims a file reads it.
+# The first format that claims a file is used.
 FORMATS = (
     Format("a ROS 1 bag", "gpusense.logs.ros", (".bag",), topics=True),
     Format("a ROS 2 bag", "gpusense.logs.ros", (".db3", ".mcap"), folder="metadata.yaml", topics=True),
@@ -98,12 +98,12 @@ def read_log(
         range_max: Readings of at least ``range_max`` are "no return" [m]. None takes the limit from the log: the value
             stated in each message, or, for old messages without one, the largest reading of the log. If that reading
             occurs at least three times, it is the scanner's code for "no return"; else the limit is the next float64
-            above it, so that every reading is a return. This takes a first pass over the file.
+            above it, so that every reading is a return. This requires a first pass over the file.
         odometry: Whether to also yield :class:`Odometry` records.
         rear: Whether to yield the scans of the rear laser of a CARMEN log instead of those of the front laser.
         topic: Topic of the scans in a ROS bag; None takes ``/scan``, or the only one.
         mount: Pose (x, y, theta) of a ROS bag's laser on the robot [m, m, rad]; None takes it from the bag's fixed
-            transforms. A warning says where these contradict a given mount, or where there are none and (0, 0, 0) is
+            transforms. A warning reports that these contradict the given mount, or that there are none and (0, 0, 0) is
             assumed; see also :func:`check_mount`.
 
     Returns:
@@ -142,7 +142,7 @@ def format_of(file: Path) -> Format:
 
     Raises:
         FileNotFoundError: It is missing.
-        ValueError: A folder that is no ROS 2 bag.
+        ValueError: It is a folder but no ROS 2 bag.
     """
     if not file.is_dir():
         checks.existing_file(file)

@@ -39,10 +39,10 @@ class Scan:
     """The robot's corrected pose in the world [m, m, rad]; the laser's in a CARMEN log, which has no mount. None if the
     log has none."""
     duration: float = 0.0
-    """Time from the first beam to the last one [s]; 0 where the log does not tell."""
+    """Time from the first beam to the last one [s]; 0 if the log does not state it."""
 
     intensities: NDArray[np.float32] | None = None
-    """(K,) intensities of the readings in the scanner's unit, read-only; None where the log has none."""
+    """(K,) intensities of the readings in the scanner's unit, read-only; None if the log has none."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ranges", masks.filled(self.ranges))
@@ -82,7 +82,7 @@ class LandmarkRun:
         ids: (F,) landmark of each feature according to the recording.
         range_max: Largest range of the sensor [m].
         field_of_view: Field of view of the sensor [rad].
-        left_out: Numbers of readings that are no feature of the map, by reason.
+        left_out: Numbers of readings that belong to no landmark of the map, by reason.
     """
 
     landmarks: LandmarkMap

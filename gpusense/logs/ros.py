@@ -9,15 +9,16 @@ tf2_msgs/TFMessage             fixed transforms from the robot's base to the las
                                messages, the moving transform from ``odom`` gives odometry
 =============================  ========================================================================================
 
-All other messages are skipped without being decoded; the message definitions that a bag brings are not used.
+All other messages are skipped without being decoded; message definitions within a bag are not used.
 
-* Times come from the header, or from the log where the header has none. Odometry is interpolated at a scan's time,
-  headings along the shorter arc; before the first and after the last message it is the nearest one's. A log without
+* Times come from the header, or from the log if the header has none. Odometry is interpolated at a scan's time,
+    headings along the shorter arc; before the first and after the last message, the nearest message's is used. A log
+    without
   odometry has (0, 0, 0). ``Scan.pose`` is None.
 * The robot's base is the child frame of odometry, else ``base_footprint`` or ``base_link``. Without a chain of
-  transforms the mount is (0, 0, 0), and a warning says so. A laser that is mounted upside down has bearings that run
-  clockwise.
-* A last beam that points where the first one does is dropped. A reading of exactly 0 becomes NaN, as it means "none" to
+    transforms the mount is (0, 0, 0), with a warning. The bearings of a laser that is mounted upside down run
+    clockwise.
+* A last beam with the direction of the first one is dropped. A reading of exactly 0 becomes NaN, as it means "none" to
   all drivers. Other readings are those of the message: infinities are "no return", NaN is missing (REP-117).
 * Some lasers change the number and bearings of their beams from scan to scan. All scans then share one scanner with
 bearings every 0.25 degrees all round. Each reading takes the nearest bearing; the remaining readings are NaN, which
@@ -54,7 +55,7 @@ from gpusense.world.scanner import Scanner
 _BASES = ("base_footprint", "base_link")
 # Beams of the common scanner of scans whose beams vary.
 _PLACES = 1440
-# Longest time of a scan that is believed [s].
+# Longest plausible time of a scan [s].
 _LONGEST = 2.0
 # Mounts that are further apart than this contradict each other [m, rad].
 _APART = (0.02, math.radians(2))
@@ -65,7 +66,7 @@ Geometry = tuple[float, float, int, float, float]
 
 @dataclass
 class _Bag:
-    """Everything of a bag but its scans' readings.
+    """Contents of a bag, without the readings of its scans.
 
     Attributes:
         topic: Topic of the scans.
@@ -159,7 +160,7 @@ def _scan_topic(path: Path, known: list[str], topic: str | None) -> str:
     """Return the topic of the scans.
 
     Raises:
-        ValueError: There is none, or the choice is the user's.
+        ValueError: There is no such topic, or the user must choose one.
     """
     if not known:
         raise ValueError(f"{path}: must hold sensor_msgs/LaserScan messages, got none")
@@ -190,7 +191,7 @@ def _odometry_pose(message: object) -> Pose:
 
 
 def _mount(path: Path, bag: _Bag, given: Pose | None) -> tuple[Pose, bool]:
-    """Return the laser's mount, and whether it is upside down; warn where a given mount contradicts the transforms."""
+    """Return the laser's mount, and whether it is upside down; warn if a given mount contradicts the transforms."""
     bases = [bag.base] if bag.base else list(_BASES)
     found = [matrix for base in bases if (matrix := bag.transforms.between(base, bag.frame)) is not None]
     if not found:
@@ -239,7 +240,7 @@ def _readings(message: object, scanner: Scanner, common: bool, upside_down: bool
 
 
 def _intensities(message: object, beams: int) -> NDArray[np.float32] | None:
-    """Return the intensities of a scan, read-only; None where it has none, or all are the same."""
+    """Return the intensities of a scan, read-only; None if it has none, or all are equal."""
     try:
         light = np.array(field_of("message", message, "intensities"), np.float32)
     except (TypeError, ValueError):
@@ -252,7 +253,7 @@ def _intensities(message: object, beams: int) -> NDArray[np.float32] | None:
 
 
 def _duration(message: object, beams: int) -> float:
-    """Return the time from the first beam to the last one [s]; 0 where the message does not tell it plausibly."""
+    """Return the time from the first beam to the last one [s]; 0 if the message states no plausible one."""
     try:
         lasted = real_field("message", message, "time_increment") * (beams - 1)
     except (TypeError, ValueError):
@@ -261,7 +262,7 @@ def _duration(message: object, beams: int) -> float:
 
 
 def _pose_at(time: float, times: Floats, poses: Floats) -> Pose:
-    """Return the pose at a time, between those before and after; (0, 0, 0) without any."""
+    """Interpolate a pose at a time; return (0, 0, 0) without poses."""
     if not len(times):
         return 0.0, 0.0, 0.0
     x, y, theta = (float(np.interp(time, times, column)) for column in poses.T)

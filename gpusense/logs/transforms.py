@@ -1,4 +1,4 @@
-"""Static transforms between the frames of a robot: the pose of a laser on its base, and how data contradict it."""
+"""Static transforms between the frames of a robot: the pose of a laser on its base, and a check of it against data."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Transforms:
     """Transforms of a log: the fixed ones, and the frames that move.
 
     Attributes:
-        fixed: (4, 4) matrix of each pair (parent, child), as long as it does not change.
+        fixed: (4, 4) matrix of each pair (parent, child) whose transform does not change.
         moving: Pairs whose transform changed.
     """
 
@@ -33,14 +33,14 @@ class Transforms:
     moving: set[tuple[str, str]] = field(default_factory=set)
 
     def add(self, parent: str, child: str, matrix: Floats) -> None:
-        """Take a transform in."""
+        """Add a transform."""
         pair = parent.lstrip("/"), child.lstrip("/")
         known = self.fixed.setdefault(pair, matrix)
         if np.abs(known - matrix).max() > _FIXED:
             self.moving.add(pair)
 
     def between(self, base: str, frame: str) -> Floats | None:
-        """Return the (4, 4) pose of a frame in the base's, along fixed transforms; None without a chain of these."""
+        """Return the (4, 4) pose of a frame in the base's along fixed transforms; None without a chain of them."""
         links: dict[str, list[tuple[str, Floats]]] = {}
         for (parent, child), matrix in self.fixed.items():
             if (parent, child) not in self.moving:
@@ -78,11 +78,11 @@ def planar_mount(matrix: Floats) -> tuple[Pose, bool]:
 
 
 def check_mount(scans: Sequence[Scan]) -> str | None:
-    """Return how the scans of a moving robot contradict their scanner's mount, in words; None if they do not.
+    """Describe how the scans of a moving robot contradict their scanner's mount; None if they agree with it.
 
-    Pairs of scans between which the robot drove without much turning are laid over each other by odometry, for 24
-    headings of the laser. If a heading other than the mount's brings end points at least twice as close, and closer
-    than 5 cm in the median, the mount contradicts the data. Positions of the laser are not checked.
+    Pairs of scans between which the robot drove without much turning are overlaid by odometry, for 24 headings of the
+    laser. If a heading other than the mount's brings end points at least twice as close, and closer than 5 cm in the
+    median, the mount contradicts the data. The laser's position is not checked.
 
     Args:
         scans: Scans in the order of time, with odometry.

@@ -83,7 +83,6 @@ def match_pairs(
             _repeat(device, sensor, best, options, most, points.gap)
         noisy = _straighten(device, best.result, points, pairs, options)
         sums = tested(device, best.result, points, pairs, options, noisy)
-        space.wait()
     return _finished(best, sums, pairs, points, options, mount)
 
 
@@ -213,7 +212,9 @@ def to_sensor(pose: np.ndarray, mount: tuple[float, float]) -> np.ndarray:
     """Convert relative poses of robot frames to poses of frames at the sensors with the robots' axes."""
     x, y = mount
     c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-    return np.stack([pose[:, 0] + c * x - s * y - x, pose[:, 1] + s * x + c * y - y, pose[:, 2]], axis=1)
+    sensor = np.array(pose)
+    sensor[:, 0], sensor[:, 1] = pose[:, 0] + c * x - s * y - x, pose[:, 1] + s * x + c * y - y
+    return sensor
 
 
 def _finished(
@@ -225,9 +226,11 @@ def _finished(
     x, y = mount
     theta = wrapped(result[:, 2])
     c, s = np.cos(theta), np.sin(theta)
-    pose = np.stack([result[:, 0] - c * x + s * y + x, result[:, 1] - s * x - c * y + y, theta], axis=1)
+    pose = np.empty((len(result), 3))
+    pose[:, 0], pose[:, 1], pose[:, 2] = result[:, 0] - c * x + s * y + x, result[:, 1] - s * x - c * y + y, theta
     # Derivative of the sensor's pose with respect to the robot's.
-    moved = np.tile(np.eye(3), (len(pose), 1, 1))
+    moved = np.zeros((len(pose), 3, 3))
+    moved[:, range(3), range(3)] = 1
     moved[:, 0, 2], moved[:, 1, 2] = -s * x - c * y, c * x - s * y
     found, factor = sums.found, sums.factor
     final = moved.transpose(0, 2, 1) @ found.information @ moved / factor[:, None, None]

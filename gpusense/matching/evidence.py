@@ -45,11 +45,14 @@ def pair_evidence(result: np.ndarray, lost: np.ndarray, other: np.ndarray, noise
     pairs, weights = np.maximum(result[:, 18], 1), result[:, 19]
     rough = np.sqrt(result[:, 20] / np.maximum(weights, 1e-30)) / max(noise, 1e-6)
     common = np.maximum(seen + through, 1)
+    evidence = np.empty((len(result), len(NAMES)))
     values = (
         1 - result[:, 3], through / common, seen / np.maximum(common + unseen, 1), pairs, np.minimum(rough, 20.0),
         1 - weights / pairs, lost, np.isfinite(other).all(axis=1), 0 * lost,
     )  # fmt: skip
-    return np.stack(values, axis=1)
+    for column, value in enumerate(values):
+        evidence[:, column] = value
+    return evidence
 
 
 def features_of(evidence: np.ndarray) -> np.ndarray:

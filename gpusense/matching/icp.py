@@ -12,7 +12,7 @@ from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import MATCH_RESULT
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
-from gpusense.interface.launches import launch
+from gpusense.interface.launches import Program, launch
 from gpusense.interface.structs import MatchRules
 from gpusense.matching.points import GAP, ScanPoints
 
@@ -71,10 +71,12 @@ class IcpPairs:
         self._point, self._start = space.upload("match points", point), space.upload("match start", points.start)
         self._line = space.empty("match lines", point.size, real)
         self._most, self._gap, self._noise = int(points.counts.max(initial=0)), points.gap, noise
+        # Launches that start with the next match, so that its copies need not wait for them.
+        self._fits: Program = ()
         self.fit_lines(WIDTH)
 
     def fit_lines(self, width: float, pairs: np.ndarray | None = None) -> None:
-        """Fit lines to the points of all scans, or of the scans of some pairs.
+        """Fit lines to the points of all scans, or of the scans of some pairs, from the next match on.
 
         Args:
             width: Half their length [m]; shorter where points are missing.
@@ -82,6 +84,9 @@ class IcpPairs:
         """
         if not self._most:
             return
+        # A fit to all scans replaces an earlier one.
+        if pairs is not None and self._fits:
+            self._backend.run(self._fits)
         scans = np.arange(self._counts[0], dtype=np.int32) if pairs is None else np.unique(self._pairs[pairs])
         flags = with_lanes_flag(self._backend.info.lanes, "fit_lines", self._flags)
         lines = launch(
@@ -92,7 +97,7 @@ class IcpPairs:
             ratio=max(_RATIO, _STEPS * self._gap / GAP), slack=max(_SLACK, _SLACK_DEVIATIONS * self._noise),
             width=width, gap=self._gap,
         )  # fmt: skip
-        self._backend.run((lines,))
+        self._fits = (lines,)
 
     def run(self, pairs: np.ndarray, guesses: np.ndarray, rules: MatchRules) -> np.ndarray:
         """Match some pairs from several guesses each.
@@ -128,6 +133,6 @@ class IcpPairs:
             pair=space.upload("match pairs", self._pairs[pairs]), guess=space.upload("match guesses", padded),
             result=buffer, scans=self._counts[0], points=self._counts[1], pairs=count, starts=starts, rules=rules,
         )  # fmt: skip
-        self._backend.run((matching,))
-        space.download(buffer, result)
-        space.wait()
+        fits, self._fits = self._fits, ()
+        self._backend.run((*fits, matching))
+        space.read(buffer, result)

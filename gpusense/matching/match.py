@@ -183,8 +183,11 @@ def _to_scans(
         first, second = _still(first, scanner, before), _still(second, scanner, motion)
         return match_by_maps(first, second, scanner, poses, method, device, precision, options)
     real = np.dtype(precision)
-    moved = [np.zeros((len(scans), 3)) if m is None else m for scans, m in ((first, before), (second, motion))]
-    points = scan_points(np.concatenate([first, second]), scanner, real, np.concatenate(moved))
+    moved = None
+    if before is not None or motion is not None:
+        both = (first, before), (second, motion)
+        moved = np.concatenate([np.zeros((len(scans), 3)) if m is None else m for scans, m in both])
+    points = scan_points(np.concatenate([first, second]), scanner, real, moved)
     pairs = np.stack([np.arange(len(second)) % max(len(first), 1), len(first) + np.arange(len(second))], axis=1)
     match = match_pairs(device, real, points, pairs, poses, method, options, scanner.mount[:2])
     return judged(match, poses, options)

@@ -13,7 +13,7 @@ import functools
 import numpy as np
 
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.scanner import Reading, Scanner, classes
+from gpusense.world.scanner import Scanner, hits
 
 # Most beams of a scan that are evaluated, and least beams for an estimate.
 _PLACES, _LEAST = 120, 12
@@ -35,7 +35,7 @@ def scan_noise(ranges: np.ndarray, scanner: Scanner) -> np.ndarray:
         return np.full(len(ranges), np.nan)
     place, left, right = _neighbors(scanner)
     readings = ranges.astype(np.float64)
-    hit = classes(readings, scanner.range_min, scanner.range_max) == Reading.HIT
+    hit = hits(readings, scanner.range_min, scanner.range_max)
     z = [readings[:, place + k] for k in (-1, 0, 1)]
     use = hit[:, place - 1] & hit[:, place] & hit[:, place + 1]
     with np.errstate(divide="ignore", invalid="ignore"):

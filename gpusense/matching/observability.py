@@ -86,7 +86,9 @@ def observed_information(
 
 def balance_of(lever: np.ndarray) -> np.ndarray:
     """Return (S, 3) factors that turn x, y and ``lever`` times the heading into x, y and the heading."""
-    return np.stack([np.ones_like(lever), np.ones_like(lever), 1 / lever], axis=1)
+    factors = np.ones((len(lever), 3))
+    factors[:, 2] = 1 / lever
+    return factors
 
 
 def without(information: np.ndarray, lost: np.ndarray, made_up: np.ndarray) -> np.ndarray:
@@ -165,7 +167,10 @@ def axes_of(information: np.ndarray, lever: np.ndarray) -> tuple[np.ndarray, np.
     return values, vectors
 
 
-def covariance_of(information: np.ndarray, lever: np.ndarray, reach: tuple[float, float]) -> np.ndarray:
+def covariance_of(
+    information: np.ndarray, lever: np.ndarray, reach: tuple[float, float],
+    known_axes: tuple[np.ndarray, np.ndarray] | None = None,
+) -> np.ndarray:  # fmt: skip
     """Return the covariance (S, 3, 3) of an information: its inverse, infinite in every coordinate that is lost.
 
     A coordinate is lost if positions along a lost direction within ``reach`` of each other differ in it by more than
@@ -175,9 +180,10 @@ def covariance_of(information: np.ndarray, lever: np.ndarray, reach: tuple[float
         information: (S, 3, 3), 0 along lost directions.
         lever: (S,) length by which headings are multiplied [m].
         reach: Farthest distance [m] and angle [rad] from the guess.
+        known_axes: The result of ``axes_of``, where it is known.
     """
     scale = balance_of(lever)
-    values, vectors = axes_of(information, lever)
+    values, vectors = axes_of(information, lever) if known_axes is None else known_axes
     gone = values == 0
     axes = vectors * scale[:, :, None]
     inverse = np.where(gone, 0, 1 / np.where(gone, 1, values))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -104,6 +105,13 @@ def check_options(noise: object, capture: object, window: object) -> MatchOption
     Raises:
         TypeError, ValueError: an option breaks its rule.
     """
+    if type(noise) is type(capture) is float and type(window) is tuple and {*map(type, window)} == {float}:
+        return _of_numbers(noise, capture, window)
+    return _checked(noise, capture, window)
+
+
+def _checked(noise: object, capture: object, window: object) -> MatchOptions:
+    """Check options of any kind; see ``check_options``."""
     values = checks.array("window", window, (2,))
     reach = checks.real("window[0]", float(values[0]), low=0.0)
     turn = checks.real("window[1]", float(values[1]), low=0.0, high=math.pi + 1e-9)
@@ -113,6 +121,10 @@ def check_options(noise: object, capture: object, window: object) -> MatchOption
     if reach > 20 * options.capture:
         raise ValueError(f"window: must reach at most 20 times capture = {options.capture}, got {reach}")
     return options
+
+
+# Most calls repeat the options of the one before.
+_of_numbers = functools.lru_cache(maxsize=16)(_checked)
 
 
 def check_guess(guess: object, matches: int | None, farthest: float = _FARTHEST) -> np.ndarray:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpusense.world.deskew import sensor_points
-from gpusense.world.scanner import Reading, Scanner, classes
+from gpusense.world.scanner import Scanner, hits
 
 _FULL_TURN = 2 * math.pi
 # Points nearer than this have no bearing [m].
@@ -36,7 +36,7 @@ class ScanPoints:
     gap: float
     squares: np.ndarray
 
-    @property
+    @functools.cached_property
     def counts(self) -> np.ndarray:
         """(S,) points of each scan."""
         return np.diff(self.start)
@@ -80,9 +80,10 @@ def scan_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype, motion: np
     """
     if motion is not None and motion.any():
         return _moved_points(ranges, scanner, real, motion)
-    order, bearing, cosine, sine = _beams_by_angle(scanner, real)
+    order, bearing, cosine, sine, gap = _beams_by_angle(scanner, real)
     z = ranges[:, order]
-    hit = (classes(z, scanner.range_min, scanner.range_max) == Reading.HIT) & (z > _NEAREST)
+    # Columns taken in an order lie in memory one after another; sums of squares go along rows.
+    hit = np.ascontiguousarray(hits(z, scanner.range_min, scanner.range_max)) & (z > _NEAREST)
     z = np.where(hit, z, 0).astype(np.float64, copy=False)
     everything = np.empty((*z.shape, 4), real)
     np.multiply(z, cosine, out=everything[..., 0], casting="same_kind")
@@ -92,32 +93,38 @@ def scan_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype, motion: np
     # View each point as a single item, so that a mask selects whole points.
     items = everything.view(np.dtype((np.void, 4 * everything.itemsize)))[..., 0]
     point = items[hit].view(real).reshape(-1, 4)
-    return _points(point, hit, bearing, np.einsum("sk,sk->s", z, z))
+    return _points(point, hit, gap, np.einsum("sk,sk->s", z, z))
 
 
 @functools.lru_cache(maxsize=16)
-def _beams_by_angle(scanner: Scanner, real: np.dtype) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the order of beams by their angles, and the angles in a precision, cosines and sines in this order."""
+def _beams_by_angle(scanner: Scanner, real: np.dtype) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return the order of beams by their angles; angles in a precision, cosines, sines in this order; and the gap."""
     angle = np.mod(scanner.bearings + scanner.mount[2], _FULL_TURN)
     order = np.argsort(angle, kind="stable")
     angle = angle[order]
-    return order, angle.astype(real), np.cos(angle), np.sin(angle)
+    rounded = angle.astype(real)
+    return order, rounded, np.cos(angle), np.sin(angle), _gap_of(rounded)
+
+
+def _gap_of(bearing: np.ndarray) -> float:
+    """Return the largest step that hides nothing between ascending bearings."""
+    steps = np.diff(bearing.astype(np.float64))
+    return GAP * float(np.median(steps)) if len(steps) else _FULL_TURN
 
 
 def _moved_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype, motion: np.ndarray) -> ScanPoints:
     """Return the points of scans of a robot that moves."""
-    hit = (classes(ranges, scanner.range_min, scanner.range_max) == Reading.HIT) & (ranges > _NEAREST)
+    hit = hits(ranges, scanner.range_min, scanner.range_max) & (ranges > _NEAREST)
     place = sensor_points(ranges.astype(np.float64), scanner, motion)[hit]
     direction = np.mod(np.arctan2(place[:, 1], place[:, 0]), _FULL_TURN)
     point = np.column_stack([place, direction, np.hypot(*place.T)]).astype(real)
     order = np.lexsort((direction, np.nonzero(hit)[0]))
     squares = np.bincount(np.nonzero(hit)[0], np.square(place).sum(axis=1), len(hit))
-    return _points(point[order], hit, np.sort(np.mod(scanner.bearings, _FULL_TURN)), squares)
+    return _points(point[order], hit, _gap_of(np.sort(np.mod(scanner.bearings, _FULL_TURN))), squares)
 
 
-def _points(point: np.ndarray, hit: np.ndarray, bearing: np.ndarray, squares: np.ndarray) -> ScanPoints:
-    """Return points with the starts of their scans, and the gap of a scanner's ascending bearings."""
-    start = np.append(0, np.cumsum(np.count_nonzero(hit, axis=1))).astype(np.int32)
-    steps = np.diff(bearing.astype(np.float64))
-    gap = GAP * float(np.median(steps)) if len(steps) else _FULL_TURN
+def _points(point: np.ndarray, hit: np.ndarray, gap: float, squares: np.ndarray) -> ScanPoints:
+    """Return points with the starts of their scans."""
+    start = np.zeros(len(hit) + 1, np.int32)
+    np.cumsum(np.count_nonzero(hit, axis=1), out=start[1:])
     return ScanPoints(np.ascontiguousarray(point), start, gap, squares)

@@ -30,6 +30,15 @@ USABLE = ("converged", "unobservable", "ambiguous")
 """Statuses of poses that may be used along their observed directions."""
 
 
+def is_usable(status: str | NDArray[np.str_]) -> NDArray[np.bool]:
+    """Return whether statuses are of poses that may be used along their observed directions."""
+    named = np.asarray(status)
+    usable = named == USABLE[0]
+    for name in USABLE[1:]:
+        usable = usable | (named == name)
+    return usable
+
+
 @dataclass(frozen=True, eq=False)
 class ScanMatch:
     """The pose of a scan in the frame of an earlier scan or of a map, from :func:`gpusense.match_scan`.
@@ -87,7 +96,7 @@ class ScanMatch:
     @property
     def usable(self) -> NDArray[np.bool]:
         """Whether the pose may be used along its observed directions, with ``information``. For S matches (S,)."""
-        return np.isin(self.status, USABLE)
+        return is_usable(self.status)
 
     def __len__(self) -> int:
         if self.pose.ndim == 1:

@@ -166,7 +166,6 @@ def observable_directions(
         device.fit_lines(max(WIDTH, LONG_WIDTH * options.noise))
         rules = options.rules(int(points.counts.max(initial=0)), points.gap)
         result = device.run(everything, np.zeros((len(pose), 1, 3)), rules)[:, 0].astype(np.float64)
-        space.wait()
     turned = _turned(pose[:, 2], scanner.mount[:2])
     information, doubt = (turned @ symmetric(result[:, at : at + 6]) @ turned.transpose(0, 2, 1) for at in (6, 12))
     lever = points.rms_range(everything)

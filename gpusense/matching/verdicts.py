@@ -13,7 +13,7 @@ from gpusense.matching.icp import LONG_WIDTH, WIDTH, IcpPairs, points_of_line, s
 from gpusense.matching.observability import Observed, axes_of, covariance_of
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import ScanPoints
-from gpusense.matching.result import USABLE, ScanMatch
+from gpusense.matching.result import ScanMatch, is_usable
 from gpusense.matching.uncertainty import inflation_of, observed_pairs, symmetric, variance_of
 
 # Distances from guesses are relative to windows of at least this [m].
@@ -87,7 +87,7 @@ def concluded(
         pairs: (S,) sums of weights.
         options: The window and the noise.
     """
-    usable = np.isin(status, USABLE)
+    usable = is_usable(status)
     two = usable & np.isfinite(other).all(axis=1)
     offset = np.where(two[:, None], other, 0.0)
     # The covariance plus a quarter of the offset's square, by Woodbury's identity.
@@ -96,9 +96,11 @@ def concluded(
     status = np.where(two, "ambiguous", status)
     values, vectors = axes_of(information, lever)
     shares = values * (factor / np.maximum(pairs, 1))[:, None]
+    # The axes of the information that is kept, where all of it is.
+    axes = (values, vectors) if usable.all() else None
     information = np.where(usable[:, None, None], information, 0.0)
     return ScanMatch(
-        pose, covariance_of(information, lever, options.window), information, np.zeros(len(pose)), score,
+        pose, covariance_of(information, lever, options.window, axes), information, np.zeros(len(pose)), score,
         iterations.astype(np.int64), shares, vectors.transpose(0, 2, 1), lever, np.full(len(pose), options.noise),
         evidence, status,
     )  # fmt: skip
@@ -116,11 +118,14 @@ def judged(match: ScanMatch, guess: np.ndarray, options: MatchOptions) -> ScanMa
     evidence = match.evidence.copy()
     evidence[:, -1] = np.hypot(offset[:, 0], offset[:, 1]) / max(options.window[0], _LEAST_WINDOW)
     status, outside = np.asarray(match.status), options.is_outside(offset)
-    p_right = np.where(match.usable & ~outside, probability_right(evidence), 0.0)
+    usable = match.usable
+    p_right = np.where(usable & ~outside, probability_right(evidence), 0.0)
     least = np.where(status == "converged", DOUBTED, DOUBTED_PARTLY)
-    status = np.where(match.usable & (p_right < least), "doubtful", status)
-    status = np.where(match.usable & outside, "outside window", status)
-    failed = ~np.isin(status, USABLE)[:, None, None]
+    status = np.where(usable & (p_right < least), "doubtful", status)
+    status = np.where(usable & outside, "outside window", status)
+    if is_usable(status).all():
+        return replace(match, evidence=evidence, p_right=p_right, status=status)
+    failed = ~is_usable(status)[:, None, None]
     return replace(
         match, evidence=evidence, p_right=p_right, status=status, information=np.where(failed, 0.0, match.information),
         covariance=np.where(failed, np.where(np.eye(3) > 0, np.inf, 0.0), match.covariance),
@@ -137,5 +142,4 @@ def pair_sums(
     with lock, space:
         device = IcpPairs(backend, real, points, pairs, options.noise, space)
         result = device.run(np.arange(len(pairs)), np.zeros((len(pairs), 1, 3)), rules)[:, 0]
-        space.wait()
     return result

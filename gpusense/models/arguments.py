@@ -22,8 +22,8 @@ def check_scene(grid: object, range_max: float) -> OccupancyGrid:
     """Return the map, after a check of its cells against the range.
 
     Raises:
-        TypeError: not an OccupancyGrid.
-        ValueError: more than 1 048 576 cells per range_max.
+        TypeError: Not an OccupancyGrid.
+        ValueError: More than 1 048 576 cells per range_max.
     """
     if not isinstance(grid, OccupancyGrid):
         raise TypeError(f"grid: must be an OccupancyGrid, got {checks.show(grid)}")
@@ -44,7 +44,7 @@ def real_dtype(precision: str, backend: Backend) -> np.dtype:
     """Return the NumPy dtype of a precision on a device.
 
     Raises:
-        TypeError, ValueError: an unknown precision, or float64 on a device without it.
+        TypeError, ValueError: An unknown precision, or float64 on a device without it.
     """
     dtype = np.dtype(checks.choice("precision", precision, ("float32", "float64")))
     if dtype == np.float64 and not backend.info.float64:
@@ -60,7 +60,7 @@ def check_absent(where: str, **options: object) -> None:
         **options: Their values.
 
     Raises:
-        ValueError: an option is set.
+        ValueError: An option is set.
     """
     for name, value in options.items():
         if value is not None:
@@ -71,7 +71,7 @@ def check_discrete(model: SensorTable, scanner: Scanner, compat: object, sensor_
     """Refuse options that contradict a discrete model.
 
     Raises:
-        ValueError: the scanner has another range_max, or an option of the mixture is set.
+        ValueError: The scanner has another range_max, or an option of the mixture is set.
     """
     check_absent("with a DiscreteBeamModel", compat=compat, sensor_table=sensor_table)
     if isinstance(scanner, Scanner) and scanner.range_max != model.range_max:

@@ -27,7 +27,7 @@ class Pickled(ABC):
 
     @abstractmethod
     def _arguments(self) -> dict[str, Any]:
-        """Return the arguments of the constructor but ``backend``, by name, with the map as it is now."""
+        """Return the arguments of the constructor except ``backend`` by name, with the current map."""
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         asked = self._selection if isinstance(self._selection, str) else self.backend.info.selection

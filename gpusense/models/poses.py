@@ -43,11 +43,11 @@ class Poses:
         in_place: An array on the device must be used without a copy, now and later.
 
     Attributes:
-        hull: Corners of the box of poses on the device, where their owner knows them; only the table follows from them.
+        hull: Corners of the box of poses on the device, if their owner knows them; they affect only the table.
 
     Raises:
-        TypeError: not numbers, or an array that this device cannot read.
-        ValueError: another shape, or, of arrays that are not on the device, a value that is not finite.
+        TypeError: Not numbers, or an array that this device cannot read.
+        ValueError: Another shape, or, of arrays that are not on the device, a value that is not finite.
     """
 
     hull: Corners | None = None

@@ -10,21 +10,22 @@ from gpusense.backends import Backend
 from gpusense.backends.workspace import POSE_STATUS, Workspace
 from gpusense.tables.reachable import TableMemoryError
 
-# Most particles of one launch: they fill a device and fit its memory (44 bytes each).
+# Largest number of particles of a launch: they fill a device and fit its memory (44 bytes each).
 CHUNK = 1 << 20
-# Most bytes of a result with a number per particle and beam; on a GPU a share of its memory, where that is more. More
-# particles in one order read more of the same cache lines.
+# Largest size of a result with a number per particle and beam [bytes]; on a GPU a share of its memory, if that is more.
+# The more particles are ordered together, the more cache lines they share.
 CHUNK_BYTES, CHUNK_SHARE = 320 << 20, 32
-# Most particle-beams of one launch on a processor: a call can be interrupted between launches, every few seconds.
+# Largest number of particle-beams of a launch on a processor: a call can be interrupted between launches, every few
+# seconds.
 CHUNK_WORK = 1 << 24
-# Least particles of a piece that is tried again after one that does not fit.
+# Smallest number of particles of a piece that is retried after a piece that did not fit.
 SMALLEST_CHUNK = 256
-# Pieces are multiples of this number of particles, unless they are smaller: so every device can address their buffers.
+# Larger pieces are multiples of this number of particles, so that every device can address their parts of buffers.
 _ROUND = 256
 
 
 def chunk_of(backend: Backend, beams: int, itemsize: float = 0) -> int:
-    """Return the most particles of one launch.
+    """Return the largest number of particles of a launch.
 
     Args:
         backend: The device.
@@ -63,7 +64,7 @@ class Piece:
 
 
 def run_pieces(space: Workspace, whole: Piece, most: int, score: Callable[[Piece], None]) -> None:
-    """Score particles in pieces; a piece that does not fit into memory is tried again with half the particles.
+    """Score particles in pieces; a piece that does not fit into memory is retried with half the particles.
 
     Args:
         space: Holds the buffers, which are freed before a second try.
@@ -72,7 +73,7 @@ def run_pieces(space: Workspace, whole: Piece, most: int, score: Callable[[Piece
         score: Runs the program of a piece.
 
     Raises:
-        MemoryError: the smallest piece does not fit, or the map's table does not; the table is tried only once. The
+        MemoryError: The smallest piece does not fit, or the map's table does not; the table is tried only once. The
             owner of the workspace still works for smaller calls.
     """
     begin, piece = whole.begin, whole
@@ -101,7 +102,7 @@ def _end(begin: int, end: int, per_scan: int, most: int) -> int:
 
 
 def _halved(piece: Piece) -> int:
-    """Return the particles of the next try, 0 where there is none."""
+    """Return the number of particles of the next try; 0 without one."""
     if piece.count > piece.per_scan:
         return max(piece.count // 2, piece.per_scan)
     return 0 if piece.count <= SMALLEST_CHUNK else max(piece.count // 2 // _ROUND * _ROUND, SMALLEST_CHUNK)
@@ -111,7 +112,7 @@ def finish(space: Workspace, on_device: bool, name: str = "poses") -> None:
     """Wait for a call to end.
 
     Raises:
-        ValueError: a device pose of the call was not finite.
+        ValueError: A device pose of the call was not finite.
     """
     if on_device:
         finish_all([(space, True)], name)
@@ -127,7 +128,7 @@ def finish_all(spaces: Sequence[tuple[Workspace, bool]], name: str = "poses") ->
         name: Name of the poses in messages.
 
     Raises:
-        ValueError: a device pose of the call was not finite.
+        ValueError: A device pose of the call was not finite.
     """
     flag, dtype = POSE_STATUS
     states = [np.zeros(2, dtype) for _ in spaces]

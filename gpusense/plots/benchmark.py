@@ -99,7 +99,7 @@ def work_precision(points: Sequence[Point], style: Style, measure: Sequence[str]
 
 
 def place(point: Point, kind: str, name: str) -> float | None:
-    """Return a point's position on the axis of errors; 0 is the strip of exact, None the strip of failed points."""
+    """Return a point's position on the axis of errors; 0 for the strip of exact points, None for failed points."""
     error = error_of(point, kind, name)
     if error is None:
         return None

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PATH, CLOSED, DOUBTED, KEY = "#4c78a8", "#3c8d4f", "#e4572e", "#1f3552"
-# Ellipses that are drawn of positions.
+# Number of ellipses that are drawn.
 _ELLIPSES = 40
 
 

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 FREE, UNKNOWN, OCCUPIED = "#ffffff", "#dfe3e8", "#4a5568"
 BEAM, ROBOT, FRAME = "#0077b6", "#d7263d", "#9aa5b1"
-# From unlikely to likely with falling lightness: readable on paper, in grey and under colour blindness.
+# Colours from unlikely to likely with falling lightness, readable on paper, in grey and under colour blindness.
 SCALE = ("#eef1f5", "#ffd166", "#f3722c", "#b5179e", "#3a0ca3")
-# Dots per inch of a saved image; clouds of points are rasterised in vector formats too.
+# Dots per inch of a saved image; clouds of points are also rasterised in vector formats.
 DPI = 150
 
 
@@ -168,7 +168,7 @@ def add_colour_bar(ax: Axes, mappable: Any, label: str) -> None:
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> None:
-    """Write a figure atomically, in the format of the path's ending.
+    """Write a figure atomically, in the format of the path's suffix.
 
     Args:
         figure: The figure.
@@ -176,7 +176,7 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> None:
 
     Raises:
         OSError: the file cannot be written.
-        ValueError: the ending names no format.
+        ValueError: the suffix names no format.
     """
     target = checks.path("path", path)
     kind = target.suffix.lower().removeprefix(".")

@@ -22,7 +22,7 @@ def error_page(rows: Sequence[Row], shown: Mapping[str, Sequence[str]] | None = 
     Args:
         rows: Rows of reports.
         shown: By need the texts of the measures that the page offers; None for all.
-        text: A line about the machine, below the title.
+        text: Line about the machine below the title.
     """
     origins = list(dict.fromkeys(row.origin for row in rows))
     lines = ",\n".join(_json(_plain(row, origins, shown)) for row in rows)

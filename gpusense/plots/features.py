@@ -71,7 +71,7 @@ def _draw_one(ax: Axes, kind: str, pose: tuple[float, float, float], size: float
     if kind in ("pole", "reflector"):
         ax.add_patch(Circle((x, y), max(size, 0.03), fill=False, color=colour, linewidth=2.0, zorder=5, label=label))
     elif kind in ("line", "door"):
-        # A door's theta is the direction across.
+        # A door's theta is the direction across it.
         ahead, aside = (c, s) if kind == "line" else (-s, c)
         ends = np.array([[x, y]]) + np.array([[-0.5], [0.5]]) * size * np.array([[ahead, aside]])
         wide, alpha = (1.6, 1.0) if kind == "line" else (5.0, 0.55)
@@ -136,7 +136,7 @@ def features_figure(features: Features, ranges: ArrayLike, scanner: Scanner) -> 
 
 
 def landmarks_figure(landmarks: FeatureMap, grid: OccupancyGrid | None = None) -> Figure:
-    """Draw landmarks, over a map where there is one, as a figure.
+    """Draw landmarks, over a map if there is one, as a figure.
 
     Args:
         landmarks: The landmarks.

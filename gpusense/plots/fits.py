@@ -30,7 +30,7 @@ _DRAWN = 10_000
 
 
 def distances_of(data: RangeData, count: int = 3) -> list[float]:
-    """Choose expected ranges, well apart, with many readings around each: quantiles of the expected ranges [m]."""
+    """Choose distinct expected ranges with many readings around each, as quantiles of the expected ranges [m]."""
     known = data.expected[(data.kinds != Reading.MISSING) & (data.expected < data.range_max)]
     if not len(known):
         return []
@@ -65,7 +65,7 @@ def readings_figure(data: RangeData, distances: list[float]) -> Figure:
     edge = min(data.range_max, 2.5 * max(distances, default=data.range_max))
     for place, distance in enumerate(distances):
         near, width = _near(data, distance)
-        # Readings beyond, and those without return, are drawn on the upper edge.
+        # Readings beyond the axis, and readings without return, are drawn on its upper edge.
         z = np.minimum(np.where(data.kinds == Reading.MAX, edge, data.ranges)[near], edge)
         z = z[:: max(-(-len(z) // _DRAWN), 1)]
         right.plot(
@@ -193,14 +193,14 @@ def _near(data: RangeData, distance: float) -> tuple[NDArray[np.bool], float]:
 
 
 def _spaced(values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """Return ``count`` of the values at most, evenly spaced in rank, from the least to the largest."""
+    """Return at most ``count`` of the values, evenly spaced in rank, from the least to the largest."""
     if not len(values):
         return values
     return np.sort(values)[np.linspace(0, len(values) - 1, min(count, len(values))).astype(int)]
 
 
 def _top(data: RangeData) -> float:
-    """Return an upper limit for axes that holds most ranges [m]; an office is small beside a laser's 80 m."""
+    """Return an upper limit for axes that includes most ranges [m]; an office is small compared with a laser's 80 m."""
     ranges = data.ranges[data.kinds == Reading.HIT]
     known = np.concatenate([ranges, data.expected[data.expected < data.range_max]])
     return min(1.1 * float(np.quantile(known, 0.995)), data.range_max) if len(known) else data.range_max

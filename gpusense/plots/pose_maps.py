@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.image import AxesImage
 
-# Cells around the end points of a scan's field.
+# Margin of cells around the end points of a scan's field.
 _MARGIN = 10
 
 
@@ -58,7 +58,7 @@ def draw_pose_likelihood(ax: Axes, likelihood: PoseLikelihood, *, depth: float |
 
 
 def pose_likelihood_figure(likelihood: PoseLikelihood, path: str | os.PathLike[str]) -> None:
-    """Draw likelihoods over the map's outlines, with the modes of nearly the best likelihood, and write the picture.
+    """Draw likelihoods over the map's outlines, with the modes near the best likelihood, and write the picture.
 
     Args:
         likelihood: A result of :func:`gpusense.pose_likelihood`.
@@ -117,7 +117,7 @@ def draw_scan_field(
     *,
     resolution: float = 0.05,
 ) -> AxesImage:
-    """Draw the likelihood field of a scan, whose end points are the obstacles, in the robot's frame (figure 6.9).
+    """Draw the likelihood field of a scan, with end points as obstacles, in the robot's frame (figure 6.9).
 
     Args:
         ax: Axes to draw onto.

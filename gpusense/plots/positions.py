@@ -1,7 +1,7 @@
 """Draw possible positions from ranges or bearings of beacons, without uncertainty and with it.
 
-The pictures of the lectures' "Distances Only" and "Bearings Only". As in ``drawing``, Matplotlib is imported on first
-use, and each function draws onto a Matplotlib ``Axes``.
+The pictures follow the lectures' "Distances Only" and "Bearings Only". As in ``drawing``, Matplotlib is imported on
+first use, and each function draws onto a Matplotlib ``Axes``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-# Root of the 95 % quantile of chi-squared with two degrees of freedom: the semi-axes of an ellipse, in sigmas.
+# Root of the 95 % quantile of chi-squared with two degrees of freedom: semi-axes of an ellipse [sigmas].
 SIGMAS_95 = 2.4477468306808166
 # Points of a curve.
 FINE = 721
@@ -49,8 +49,8 @@ def position_log_density(
         ranges: (M,) [m], or None.
         bearings: (M,) [rad], or None.
         heading: The robot's heading [rad], or None.
-        sigma_range: Standard deviation of the ranges [m], one or (M,), > 0; it must be given with them.
-        sigma_bearing: Standard deviation of the bearings [rad], likewise.
+        sigma_range: Standard deviation of the ranges [m], one or (M,), > 0; required with ranges.
+        sigma_bearing: Standard deviation of the bearings [rad], one or (M,), > 0; required with bearings.
 
     Returns:
         (...) log densities, natural logarithm.
@@ -87,12 +87,12 @@ def position_log_density(
 
 
 def _best_headings(problem: Problem, states: Floats) -> Floats:
-    """Return (N,) the heading that fits the bearings best at each of (N, 2) positions [rad]."""
+    """Return the headings (N,) that fit the bearings best at (N, 2) positions [rad]."""
     assert problem.bearings is not None
     offset = problem.points - (states[:, :1] + 1j * states[:, 1:])
     weight = problem.sigma_bearing**-2.0
     heading = np.angle((weight * np.exp(1j * (np.angle(offset) - problem.bearings))).sum(axis=1))
-    # From the circular mean to the mean of the wrapped residuals.
+    # Refine the circular mean by the mean of the wrapped residuals.
     for _ in range(2):
         residuals = problem.residuals(np.column_stack([states, heading]))[:, -len(weight) :]
         heading = heading - (residuals @ weight) / weight.sum()
@@ -231,7 +231,7 @@ def draw_position_density(
 
 
 def tile_centers(extent: tuple[float, float, float, float], count: int) -> Floats:
-    """Return (R, C, 2) the middles of square tiles over an extent [m].
+    """Return the middles (R, C, 2) of square tiles over an extent [m].
 
     Args:
         extent: x_min, x_max, y_min, y_max [m].

@@ -1,4 +1,4 @@
-"""Draw the scores of a log: logged and estimated poses on the map, and how percentiles and errors are distributed."""
+"""Draw the scores of a log: logged and estimated poses on the map, and histograms of percentiles and errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Draw a sweep: error against run time, a point a job."""
+"""Draw a sweep: error against run time, with a point for each job."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LABELS = {
 
 
 def sweep_figure(columns: Mapping[str, Sequence[Any]]) -> Figure:
-    """Draw the jobs of a table: models differ in colour, the values of another axis in shape.
+    """Draw the jobs of a table, with a colour for each model and a shape for each value of a second axis.
 
     Args:
         columns: Columns of a table, as :func:`gpusense.sweep.read_table` returns them.
@@ -62,7 +62,7 @@ def sweep_figure(columns: Mapping[str, Sequence[Any]]) -> Figure:
 
 
 def _axes(columns: Mapping[str, Sequence[Any]]) -> tuple[str, str]:
-    """Return the columns that colours and shapes stand for: models, labelled axes, particles; or empty."""
+    """Return the columns that colours and shapes represent: models, labelled axes, particles, or empty."""
     labelled = {name: 1 for name in columns if name.startswith("axis.")}
     candidates = {"model": 0, **labelled, "axis.log": 2, "particles": 3}
     varied = {name: len(set(columns[name])) for name in candidates if name in columns}

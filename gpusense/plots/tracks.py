@@ -29,7 +29,7 @@ def track_figure(pf: ParticleFilter, track: Track) -> Figure:
     draw_map(ax, pf.grid)
     poses, references = np.array(track.poses).reshape(-1, 3), track.references
     if references is not None:
-        # Single poses among unknown ones have no line.
+        # Single known poses among unknown ones have no line.
         style = "-" if np.isfinite(references).all() else "."
         ax.plot(references[:, 0], references[:, 1], style, color=LOGGED, lw=1.6, label="reference pose")
     ax.plot(poses[:, 0], poses[:, 1], "-", color=ESTIMATED, lw=0.8, label="estimate")

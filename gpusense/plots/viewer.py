@@ -46,7 +46,7 @@ class Recording:
         """Record the last scan of a track.
 
         Args:
-            pf: The filter after it.
+            pf: The filter after the scan.
             track: The track.
             step: The scan.
         """
@@ -64,7 +64,7 @@ class Recording:
         self._stream.log("p_lost", rr.Scalars(float(track.p_lost[-1])))
 
     def write(self, track: Track, path: Path) -> None:
-        """Write the recording as a file .rrd, whole or not at all.
+        """Write the recording atomically as a file .rrd.
 
         Args:
             track: The whole track, whose paths are added.

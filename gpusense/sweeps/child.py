@@ -1,6 +1,6 @@
-"""The process of a worker: it runs one call at a time, whose payload and answer are pickles.
+"""The process of a worker runs one call at a time; payloads and answers are pickles.
 
-Only its supervisor reads the answers. ``gpusense/sweeps/supervised.py`` is the other end.
+Only its supervisor, ``gpusense/sweeps/supervised.py``, reads the answers.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from gpusense.sweeps.worker import error_text
 
 # Messages before an answer: the process has started, and it has begun a call.
 READY, BEGUN = b"ready", b"begun"
-# The kernel ends workers before their supervisor where memory is short.
+# The system ends workers before their supervisor when memory is short.
 _EXPENDABLE = "500"
-# Seconds between two looks for the parent, beside the notice of its end.
+# Seconds between two checks for the parent, in addition to the notice of its end.
 _LOOK = 5.0
 
 
 def serve(link: Connection, device: str) -> None:
-    """Run the calls that come over a link, until it closes.
+    """Run the calls that arrive over a link, until it closes.
 
     Args:
-        link: To the supervisor.
+        link: Link to the supervisor.
         device: Selection string of the worker's device; empty leaves that of the environment.
     """
     _detach(link)
@@ -49,17 +49,17 @@ def serve(link: Connection, device: str) -> None:
 
 
 def _answer(payload: bytes) -> bytes:
-    """Run a call, and return the pickle of whether it succeeded with its result or error."""
+    """Run a call, and return the pickle of its success and of its result or error."""
     try:
         function, args, kwargs = pickle.loads(payload)
         return pickle.dumps((True, function(*args, **kwargs)))
     except BaseException as error:
-        # Of the job, whatever it is: Ctrl-C is the parent's, and SystemExit must not end the process.
+        # Any error belongs to the job: Ctrl-C is handled by the parent, and SystemExit must not end the process.
         return _failure(error)
 
 
 def _failure(error: BaseException) -> bytes:
-    """Return the pickle of an error that the other end can read; an error that does not survive as a RuntimeError."""
+    """Return the pickle of an error; an error that cannot be unpickled becomes a RuntimeError."""
     with contextlib.suppress(Exception):
         error.add_note(f"in the worker:\n{''.join(traceback.format_exception(error))}")
         dumped = pickle.dumps((False, error))
@@ -69,7 +69,7 @@ def _failure(error: BaseException) -> bytes:
 
 
 def _detach(link: Connection) -> None:
-    """Make the process end with its parent, and not with the parent's Ctrl-C."""
+    """Make the process end with its parent, but not by the parent's Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # A job may start further processes, which must not hold the link open.
     multiprocessing.current_process().daemon = False
@@ -89,7 +89,7 @@ def _detach(link: Connection) -> None:
 
 
 def _end_with(parent: Any) -> None:
-    """Wait for the parent's end, and end."""
+    """Wait for the end of the parent, and end the process."""
     while not multiprocessing.connection.wait([parent.sentinel], _LOOK):
         if os.getppid() != parent.pid:
             break
@@ -97,7 +97,7 @@ def _end_with(parent: Any) -> None:
 
 
 def _end_in_kernel(sentinel: int) -> None:
-    """Let the kernel end the process with its parent, also in a job that never lets another thread run."""
+    """Let the system end the process with its parent, even in a job that never lets another thread run."""
     if sys.platform == "linux":
         import fcntl
 

@@ -1,4 +1,4 @@
-"""Sweeps on Dask: a cluster of this machine, which listens on the loopback only, or one at an address.
+"""Sweeps on Dask: on a cluster on this machine, which listens on the loopback only, or on a cluster at an address.
 
 A Dask cluster runs what its clients send: whoever reaches its ports executes code there. ``docs/sweeps.md`` has the
 consequences.
@@ -27,7 +27,7 @@ from gpusense.sweeps.remote import Found, Link, RemoteWorker
 from gpusense.sweeps.supervised import limits_of
 from gpusense.sweeps.watch import Watch
 
-# Seconds for the scheduler to answer, and for workers to end what they run.
+# Seconds for the scheduler to answer, and for workers to end their jobs.
 _ANSWER, _GOODBYE = 5.0, 10.0
 
 
@@ -35,21 +35,22 @@ class DaskExecutor(Executor):
     """Jobs on a Dask cluster, one at a time on each worker, in a process that the worker supervises.
 
     Workers of a cluster at an address are started by ``GPUSENSE_SWEEP_DEVICE=warp:cuda:0 dask worker ADDRESS
-    --nthreads 1 --resources gpusense=1``, one for each device. Where any worker declares this resource, workers without
-    it take no jobs.
+    --nthreads 1 --resources gpusense=1``, one for each device. If any worker declares this resource, workers without it
+    take no jobs.
 
     Args:
-        address: Of a scheduler, such as ``"tcp://10.0.0.1:8786"``; None starts a cluster in this process, whose
+        address: Address of a scheduler, such as ``"tcp://10.0.0.1:8786"``; None starts a cluster in this process, whose
             scheduler, workers and dashboard listen on 127.0.0.1 only.
-        devices: Of a cluster that is started: selection strings, one for each worker, or the number of workers.
-        security: A ``distributed.Security`` with certificates for TLS; None has those of Dask's configuration, if any.
-        timeout: Longest time to connect, and to wait for a worker where there is none [s].
-        job_timeout: As that of :class:`ProcessExecutor`.
-        memory_limit: As that of :class:`ProcessExecutor`; the memory limit of a Dask worker also holds for its jobs.
+        devices: Devices of a cluster that is started: selection strings, one for each worker, or the number of workers.
+        security: A ``distributed.Security`` with certificates for TLS; None takes the certificates of Dask's
+            configuration, if any.
+        timeout: Longest time to connect, and to wait for a worker if there is none [s].
+        job_timeout: See :class:`ProcessExecutor`.
+        memory_limit: See :class:`ProcessExecutor`; the memory limit of a Dask worker also applies to its jobs.
 
     Attributes:
-        slots: Workers.
-        address: Of the scheduler.
+        slots: Number of workers.
+        address: Address of the scheduler.
         dashboard: Address of the dashboard; empty without one.
 
     Raises:
@@ -94,16 +95,16 @@ class DaskExecutor(Executor):
             raise
 
     def _connect(self, address: str | None, names: list[str], security: Any, patience: float) -> None:
-        """Start a cluster or reach the one at the address, and wait for a worker.
+        """Start a cluster or connect to the one at the address, and wait for a worker.
 
         Raises:
             ImportError: a worker lacks gpusense.
-            OSError: none is there.
+            OSError: there is no worker.
         """
         import distributed
 
-        # A client that is garbage closes itself when it is collected. Collected during another client's start, it would
-        # wait forever for a lock that this thread holds.
+        # A discarded client closes itself when it is collected. If that happened during the start of another client, it
+        # would wait forever for a lock that this thread holds.
         gc.collect()
         try:
             self._cluster = None if address is not None else local_cluster(names, security)
@@ -132,7 +133,7 @@ class DaskExecutor(Executor):
         return super().__exit__(kind, error, trace)
 
     def _workers(self) -> Mapping[str, Any] | None:
-        """Return the scheduler's list of workers; None where it does not answer."""
+        """Return the scheduler's list of workers; None if it does not answer."""
         try:
             answer = self._client.sync(_identity, self._client, callback_timeout=_ANSWER)
         except Exception:
@@ -153,7 +154,7 @@ class DaskExecutor(Executor):
 
     @property
     def slots(self) -> int:
-        """Jobs that run at once: the workers that were there a second ago."""
+        """Number of jobs that run at once: the workers of a second ago."""
         return len(self._watched.workers)
 
     @property
@@ -169,20 +170,20 @@ class DaskExecutor(Executor):
 
     @property
     def alive(self) -> bool:
-        """Whether the scheduler is there."""
+        """Whether the scheduler is running."""
         return bool(self._client.status == "running" and not self._client.scheduler_comm.comm.closed())
 
     @property
     def _ended(self) -> str:
-        """Why there is no scheduler any more; empty as long as there is one."""
+        """Reason why the scheduler has ended; empty while it runs."""
         return "" if self.alive else "the scheduler has ended"
 
     def send(self, contents: Mapping[str, Any]) -> None:
-        """Send maps and the bytes of logs once to each worker, also to those that join later."""
+        """Send maps and the bytes of logs once to each worker, including workers that join later."""
         self._client.register_plugin(_plugin(self._name, dict(contents)), name=f"gpusense-{self._name}")
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Queue a function for the next free worker; where this ends, the future raises :class:`WorkerDied`."""
+        """Queue a function for the next free worker; if the worker ends, the future raises :class:`WorkerDied`."""
         return self._watched.submit(_payload(fn, args, kwargs))
 
     def on_each(self) -> list[Executor]:
@@ -190,13 +191,13 @@ class DaskExecutor(Executor):
         return [_OneWorker(one, f"{self._name}-each") for one in list(self._watched.workers.values())]
 
     def terminate(self) -> None:
-        """End the jobs that run, and leave the cluster."""
+        """End the running jobs, and leave the cluster."""
         if self._watch is not None:
             self._watch.lose("the executor has been shut down")
         self._leave()
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Leave the cluster after the jobs that run, and end it if it was started here."""
+        """Leave the cluster after the running jobs, and end it if it was started here."""
         if self._watch is not None and not self._watch.lost:
             if self._ended:
                 self._watch.lose(self._ended)
@@ -208,10 +209,10 @@ class DaskExecutor(Executor):
         self.terminate()
 
     def _leave(self) -> None:
-        # A client without its scheduler would log that it no longer reconnects.
+        # A client without a scheduler would log that it no longer reconnects.
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
         if self._client is not None and self.alive:
-            # Workers end the processes of this executor; those that do not answer are not waited for.
+            # Workers end the processes of this executor; workers that do not answer are not awaited.
             thread = threading.Thread(target=self._say_goodbye, daemon=True)
             thread.start()
             thread.join(_GOODBYE)
@@ -227,7 +228,7 @@ class DaskExecutor(Executor):
 
 
 async def _identity(client: Any) -> Any:
-    """Return what a scheduler says about itself and its workers."""
+    """Return a scheduler's description of itself and its workers."""
     return await client.scheduler.identity(n_workers=-1)
 
 
@@ -249,7 +250,7 @@ class _OneWorker(Executor):
 
 
 def _payload(fn: Callable[..., Any], args: Any, kwargs: Any) -> bytes:
-    """Return the pickle of a call, also of a function that another machine cannot import."""
+    """Return the pickle of a call, even of a function that another machine cannot import."""
     import cloudpickle
 
     return bytes(cloudpickle.dumps((fn, args, kwargs)))
@@ -263,7 +264,7 @@ def _plugin(name: str, contents: dict[str, Any]) -> Any:
         """Maps and logs of a sweep."""
 
         def setup(self, worker: Any) -> None:
-            """Keep them for the processes of the worker."""
+            """Keep the contents for the processes of the worker."""
             on_worker.open_pool(worker, name, contents)
 
         def teardown(self, worker: Any) -> None:

@@ -1,4 +1,4 @@
-"""How the workers of a sweep end, as exceptions."""
+"""Exceptions for the ways in which workers of a sweep end."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ class WorkerDied(BrokenExecutor):
     """A worker ended while it ran a job.
 
     Args:
-        how: How it ended, such as "by SIGSEGV" or "with exit code 3".
-        memory: The most memory that it was seen to use in the job [bytes]; 0 where unknown.
-        outside: Whether the cause may lie outside the job: a signal of another process, or a machine that was lost.
+        how: Way in which it ended, such as "by SIGSEGV" or "with exit code 3".
+        memory: Largest memory observed during the job [bytes]; 0 if unknown.
+        outside: Whether the cause may lie outside the job: a signal of another process, or the loss of a machine.
 
     Example:
         >>> import gpusense as gs
@@ -42,7 +42,7 @@ class JobTimeout(WorkerDied):
 
 
 def death(code: int | None, memory: int, short: bool) -> WorkerDied:
-    """Return how a process with an exit code ended."""
+    """Return the exception for a process that ended with an exit code."""
     if code is None:
         return WorkerDied(memory=memory, outside=True)
     if code >= 0:

@@ -1,7 +1,8 @@
-"""Executors of the standard library's shape: in this process, in processes, or on a Dask cluster.
+"""Executors with the standard library's interface: in this process, in processes, or on a Dask cluster.
 
-``submit(function, *arguments)`` returns a ``concurrent.futures.Future``. Each has ``slots``, the jobs that it runs at
-once. A worker that dies raises :class:`WorkerDied` in the future of its job, and the executor replaces it.
+``submit(function, *arguments)`` returns a ``concurrent.futures.Future``. Each has ``slots``, the number of jobs that it
+runs at once. The death of a worker raises :class:`WorkerDied` in the future of its job, and the executor replaces the
+worker.
 """
 
 from __future__ import annotations
@@ -42,24 +43,24 @@ class SerialExecutor(Executor):
 
 
 class ProcessExecutor(Executor):
-    """Processes that are started by spawn, one for each device.
+    """Run jobs in spawned processes, one for each device.
 
-    A process runs one job at a time. One that ends in its job raises :class:`WorkerDied` in the job's future and is
-    replaced. Where the ``with`` block ends by an exception, Ctrl-C among them, the processes are ended at once.
+    A process runs one job at a time. If it ends during its job, it raises :class:`WorkerDied` in the job's future and
+    is replaced. If the ``with`` block ends by an exception, such as Ctrl-C, the processes are ended at once.
 
     Args:
         devices: Selection strings of the devices, one for each process; or the number of processes, which then use the
             sweep's device.
         job_timeout: Longest time of a job [s]; its process is ended and replaced, and its future raises
-            :class:`JobTimeout`. None for any.
-        memory_limit: Most resident memory of a process [bytes], looked at 20 times a second; a process beyond it is
-            ended as above, with :class:`WorkerDied`. None for any.
+            :class:`JobTimeout`. None for no limit.
+        memory_limit: Most resident memory of a process [bytes], checked 20 times a second; a process beyond it is ended
+            and replaced, with :class:`WorkerDied`. None for no limit.
 
     Attributes:
         slots: Number of processes.
 
     Raises:
-        TypeError, ValueError: no process, no texts, or a limit that breaks its rule.
+        TypeError, ValueError: ``devices`` has no process or holds no strings, or a limit breaks its rule.
 
     Example:
         >>> import gpusense as gs
@@ -77,7 +78,7 @@ class ProcessExecutor(Executor):
         self._limits = limits_of(job_timeout, memory_limit)
         self._names = device_names(devices)
         self.slots = len(self._names)
-        # A thread for each process hands it one job after the other.
+        # A thread for each process hands it one job after another.
         self._threads = ThreadPoolExecutor(self.slots, thread_name_prefix="gpusense-sweep")
         self._free: queue.SimpleQueue[Supervised] = queue.SimpleQueue()
         self._all = [Supervised(name) for name in self._names]
@@ -108,17 +109,17 @@ class ProcessExecutor(Executor):
 
     @property
     def processes(self) -> tuple[int, ...]:
-        """Identifiers of the processes that run now."""
+        """Identifiers of the running processes."""
         return tuple(number for one in self._all for number in one.processes)
 
     def terminate(self) -> None:
-        """End the processes at once, with the jobs that they run."""
+        """End the processes at once, together with their jobs."""
         self._threads.shutdown(wait=False, cancel_futures=True)
         for one in self._all:
             one.close(wait=False)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes after the jobs that they run."""
+        """End the processes after their running jobs."""
         self._threads.shutdown(wait=wait, cancel_futures=cancel_futures)
         if not wait:
             threading.Thread(target=self.shutdown, name="gpusense-sweep-end").start()
@@ -128,7 +129,7 @@ class ProcessExecutor(Executor):
 
 
 def device_names(devices: int | Sequence[str]) -> list[str]:
-    """Return the selection string of each worker; empty ones for a number of workers.
+    """Return the selection string of each worker; empty strings for a number of workers.
 
     Raises:
         TypeError, ValueError: no worker, or no texts.

@@ -1,4 +1,4 @@
-"""A job of a sweep: what to run on which map and log, as plain frozen data."""
+"""A job of a sweep, as plain frozen data: a task with a map, a log and options."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gpusense._util import checks
 
 Pairs = tuple[tuple[str, Any], ...]
 _SCALARS = (bool, int, float, str)
-# Values in the options of a job, and levels of mappings and lists in them.
+# Most values in the options of a job, and most levels of mappings and lists in them.
 MOST_VALUES, DEEPEST = 100_000, 32
 
 
@@ -34,8 +34,8 @@ class Job:
         labels: Names of the axes of the plan and of this job's place on them. They do not change the key.
 
     Raises:
-        TypeError, ValueError: a field of another type, an option that is not plain, or more than 100 000 values in
-            options.
+        TypeError, ValueError: a field has the wrong type, an option is not plain, or options hold more than 100 000
+            values.
 
     Example:
         >>> import gpusense as gs
@@ -69,7 +69,7 @@ class Job:
 
     @functools.cached_property
     def key(self) -> str:
-        """Sixteen hexadecimal digits that stand for everything but the labels."""
+        """Sixteen hexadecimal digits that identify the job, labels excepted."""
         plain = [self.task, self.map, self.log, self.model, self.seed, self.options]
         return hashlib.sha256(json.dumps(plain, allow_nan=False).encode()).hexdigest()[:16]
 
@@ -79,7 +79,7 @@ class Job:
         return dict(self.options)
 
     def option(self, name: str, default: Any = None) -> Any:
-        """Return an option, or a default where the job has none or None."""
+        """Return an option, or a default if it is absent or None."""
         value = self.by_name.get(name)
         return default if value is None else value
 
@@ -90,10 +90,10 @@ class Job:
 
 
 def _pairs(name: str, values: Any) -> Pairs:
-    """Return a mapping or pairs as pairs of names and plain values; inner mappings get dotted names.
+    """Return a mapping or pairs as pairs of names and plain values; names of inner mappings are dotted.
 
     Raises:
-        TypeError, ValueError: a name that is no text, or a value that is not plain.
+        TypeError, ValueError: a name is no string, or a value is not plain.
     """
     items: Any = tuple(values.items()) if isinstance(values, Mapping) else values
     if not isinstance(items, (tuple, list)):
@@ -114,7 +114,7 @@ def _plain(name: str, value: Any) -> Any:
     """Return a plain value; a list as a tuple.
 
     Raises:
-        TypeError, ValueError: another type, or a number that is not finite.
+        TypeError, ValueError: the value has another type, or is a number that is not finite.
     """
     if isinstance(value, (list, tuple)):
         return tuple(_plain(name, one) for one in value)

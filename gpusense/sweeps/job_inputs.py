@@ -1,4 +1,4 @@
-"""Maps and logs that a sweep sends to workers on other machines, each once."""
+"""Maps and logs that a sweep sends once to each worker on another machine."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 from gpusense._util import checks
 from gpusense.sweeps.job import Job
 
-# A log larger than this is for a shared file system [bytes].
+# Largest log that is sent [bytes]; larger logs need a shared file system.
 LARGEST = 1 << 30
 
 
 def contents_of(jobs: Iterable[Job], root: str | Path) -> dict[str, Any]:
-    """Return the maps of jobs, read, and the bytes of their logs, by the paths that the jobs name.
+    """Read the maps and the bytes of the logs of jobs, by the paths that the jobs name.
 
     Args:
         jobs: The jobs.

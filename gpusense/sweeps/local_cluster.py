@@ -1,4 +1,4 @@
-"""A Dask cluster in this process, and the certificates of one elsewhere."""
+"""Start a Dask cluster in this process, and read the certificates of a remote one."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any
 from gpusense.sweeps import on_worker
 
 LOOPBACK = "127.0.0.1"
-# Resource of a Dask worker that stands for its device: a job takes one.
+# Resource of a Dask worker that represents its device; a job takes one.
 RESOURCE = "gpusense"
 ABSENT = "dask: must be installed for this executor: pip install 'gpusense[sweep]'"
 
 
 def local_cluster(names: list[str], security: Any) -> Any:
-    """Start a cluster in this process, all ports on the loopback; its workers supervise processes."""
+    """Start a cluster in this process, with all ports on the loopback; its workers supervise processes."""
     import dask
     import distributed
 
@@ -25,7 +25,7 @@ def local_cluster(names: list[str], security: Any) -> Any:
     }
     options = {**common, "nthreads": 1, "resources": {RESOURCE: 1}, "memory_limit": 0, "dashboard": False}
     specification = {index: {"cls": distributed.Worker, "options": options} for index in range(len(names))}
-    # Workers in this process are not lost, however long the machine sleeps.
+    # Workers in this process are never lost, even if the machine sleeps for long.
     with dask.config.set({"distributed.scheduler.worker-ttl": None}):
         cluster = distributed.SpecCluster(
             scheduler=scheduler, workers=specification, silence_logs=50, asynchronous=False, security=security
@@ -38,9 +38,9 @@ def security_of(authority: Path, certificate: Path, key: Path) -> Any:
     """Return the TLS settings of a client, from files in PEM.
 
     Args:
-        authority: Certificate of the authority that has signed those of the cluster.
+        authority: Certificate of the authority that has signed the cluster's certificates.
         certificate: Certificate of the client.
-        key: Its private key.
+        key: Private key of the client.
 
     Raises:
         ImportError: Dask is not installed.

@@ -1,4 +1,4 @@
-"""Memory of processes, and sizes in bytes as texts."""
+"""Memory of processes, and sizes in bytes as strings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _SIZE = re.compile(r"(\d{1,15}(?:\.\d{1,9})?) ?([A-Z]{0,3})")
 
 
 def memory_of(process: int) -> int:
-    """Return the resident memory of a process [bytes]; 0 where it has ended, or without psutil outside Linux."""
+    """Return the resident memory of a process [bytes]; 0 if it has ended, or without psutil outside Linux."""
     if os.path.exists("/proc/self/statm"):
         try:
             with open(f"/proc/{process}/statm", "rb") as file:
@@ -32,7 +32,7 @@ def memory_of(process: int) -> int:
 
 
 def shortages() -> int:
-    """Return how many processes the kernel has ended for want of memory, where it says so."""
+    """Return the number of processes that the system has ended for lack of memory, as far as it reports them."""
     try:
         with open("/proc/vmstat", "rb") as file:
             return next((int(line.split()[1]) for line in file if line.startswith(b"oom_kill ")), 0)
@@ -41,10 +41,10 @@ def shortages() -> int:
 
 
 def size(name: str, text: str) -> int:
-    """Return the bytes of a text such as "500 MB" or "4GiB".
+    """Return the number of bytes of a size such as "500 MB" or "4GiB".
 
     Raises:
-        ValueError: it is no such text.
+        ValueError: ``text`` is no such size.
     """
     match = _SIZE.fullmatch(text.strip().upper())
     if match is None or match[2] not in _UNITS or float(match[1]) * _UNITS[match[2]] < 1:
@@ -53,7 +53,7 @@ def size(name: str, text: str) -> int:
 
 
 def size_text(count: int) -> str:
-    """Return a number of bytes as a text."""
+    """Format a number of bytes."""
     for unit in ("TB", "GB", "MB", "kB"):
         if count >= _UNITS[unit.upper()]:
             return f"{count / _UNITS[unit.upper()]:.4g} {unit}"

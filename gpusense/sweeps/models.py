@@ -1,4 +1,4 @@
-"""Models of the jobs of a sweep, from their options."""
+"""Make the models of a sweep's jobs from their options."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ if TYPE_CHECKING:
     from gpusense.world.scanner import Scanner
 
 MODELS = ("field", "beam", "discrete")
-# Options of a model, beside those below "parameters" and "training".
+# Options of a model outside "parameters" and "training".
 MODEL_OPTIONS = ("beams", "bins", "fit", "precision", "range_max")
 _BINS = 600
 
 
 def model_of(job: Job, store: Store, scanner: Scanner, *, temperature: float = 1.0) -> Any:
-    """Return the model of a job, which the worker keeps.
+    """Return the model of a job; the worker keeps it.
 
-    A likelihood field has the defaults of ``gpusense localize``, a beam model those of ``BeamParameters``;
+    A likelihood field has the defaults of ``gpusense localize``, a beam model the defaults of ``BeamParameters``;
     ``parameters.*`` replace them. ``fit: true`` learns a beam model from the logged poses of the scans that
-    ``training.*`` choose, and a discrete model is learned from them unless it has parameters.
+    ``training.*`` choose. A discrete model without parameters is also learned from these scans.
 
     Args:
         job: The job.
-        store: The worker's.
+        store: Store of the worker.
         scanner: The scanner of the log.
         temperature: Factor of log-likelihoods.
 

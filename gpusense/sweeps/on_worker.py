@@ -1,4 +1,4 @@
-"""Supervise, in a Dask worker, the process that runs the jobs of an executor."""
+"""Supervise the process that runs an executor's jobs, within a Dask worker."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from typing import Any
 from gpusense.sweeps.supervised import Limits, Supervised, pickled
 from gpusense.sweeps.worker import receive
 
-# Pools of this process by worker and executor: a cluster of one machine has several workers in a process.
+# Pools of this process by worker and executor, since a cluster on one machine has several workers in a process.
 _POOLS: dict[tuple[str, str], Pool] = {}
 _LOCK = threading.Lock()
-# Devices of the Dask workers in this process; any other worker has the device of its environment.
+# Devices of the Dask workers in this process; other workers use the device of their environment.
 DEVICES: dict[str, str] = {}
 
-# An answer: its pickle, or how the worker failed.
+# An answer: its pickle, or the failure of the worker.
 Answer = bytes | BrokenExecutor
 
 
 class Pool:
-    """Processes of a Dask worker for one executor; jobs that run at the same time have one each."""
+    """Processes of a Dask worker for one executor; simultaneous jobs have a process each."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -33,13 +33,13 @@ class Pool:
         self._folder: tempfile.TemporaryDirectory[str] | None = None
 
     def receive(self, contents: Mapping[str, Any]) -> None:
-        """Keep maps and the bytes of logs, which each process gets; logs as files, which outlive it."""
+        """Keep maps and logs for each process; logs are stored as files, which outlive a process."""
         self._folder = tempfile.TemporaryDirectory(prefix="gpusense-sweep-")
         kept: dict[str, Any] = {}
         for index, (path, content) in enumerate(contents.items()):
             kept[path] = content
             if isinstance(content, bytes):
-                # Only the endings are the sender's: they select the format.
+                # Only the suffixes are taken from the sender, since they select the format.
                 kept[path] = Path(self._folder.name) / f"{index}{''.join(Path(path).suffixes[-2:])}"
                 kept[path].write_bytes(content)
         self._first = [pickled(receive, (kept,), {})]
@@ -58,7 +58,7 @@ class Pool:
                 self._free.append(process)
 
     def close(self) -> None:
-        """End the processes at once, with the jobs that they run."""
+        """End the processes at once, together with their jobs."""
         with self._lock:
             processes = list(self._all)
         for one in processes:
@@ -68,16 +68,16 @@ class Pool:
 
 
 def answer(executor: str, place: str, payload: bytes, limits: Limits) -> Answer | None:
-    """Run a call in a process of the Dask worker that runs this.
+    """Run a call in a process of the present Dask worker.
 
     Args:
         executor: Name of the executor.
-        place: Folder of the worker that was meant: Dask would repeat the call on one that has its address since.
+        place: Folder of the intended worker, since Dask would repeat the call on a later worker with its address.
         payload: The call.
-        limits: Limits of the job; the memory limit of the Dask worker holds as well.
+        limits: Limits of the job; the memory limit of the Dask worker also applies.
 
     Returns:
-        The pickle of the result, how the process ended, or None where another worker was meant.
+        The pickle of the result, the end of the process, or None if another worker was intended.
     """
     import distributed
 
@@ -96,7 +96,7 @@ def answer(executor: str, place: str, payload: bytes, limits: Limits) -> Answer 
 
 
 def _wanted(worker: Any, task: str) -> bool:
-    """Tell whether a task of a Dask worker is still wanted: Dask forgets those of a client that has been killed."""
+    """Tell whether a task of a Dask worker is still wanted; Dask forgets the tasks of a killed client."""
     try:
         return bool(worker.state.tasks[task].state == "executing")
     except KeyError:
@@ -116,7 +116,7 @@ def open_pool(worker: Any, executor: str, contents: Mapping[str, Any]) -> None:
 
 
 def close_pools(executor: str, worker: Any = None) -> None:
-    """End the processes of an executor, also those of single workers, on one worker or on all of this process."""
+    """End the processes of an executor, including those of single workers, on one worker or on all in this process."""
     with _LOCK:
         keys = [key for key in _POOLS if key[1].startswith(executor) and (worker is None or key[0] == worker.id)]
         pools = [_POOLS.pop(key) for key in keys]

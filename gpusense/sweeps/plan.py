@@ -1,4 +1,4 @@
-"""Plans of sweeps: a YAML file with axes, of which each combination is a job."""
+"""Plans of sweeps: YAML files with axes whose combinations are the jobs."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from gpusense._util.documents import read_mapping
 from gpusense.sweeps.job import DEEPEST, MOST_VALUES, Job
 from gpusense.sweeps.tasks import TASKS, check_options
 
-# Jobs of a plan.
+# Most jobs of a plan.
 MOST_JOBS = 1_000_000
-# Values of options in all jobs of a plan.
+# Most values of options in all jobs of a plan.
 _MOST_VALUES = 50_000_000
 _FIELDS = ("map", "log", "model", "seed")
 _NAMES = ("task", "options", "axes")
@@ -26,7 +26,7 @@ def read_plan(path: str | os.PathLike[str]) -> tuple[Job, ...]:
 
     The file has ``task``, ``options`` of all jobs, and ``axes``. An axis is a list of values of the option or field of
     its name, or a mapping from labels to mappings of several; ``seed`` may be the number of seeds, from 0. The last
-    axis changes fastest. A plan names nothing that is executed: its task is one of the package.
+    axis changes fastest. A plan cannot name code to execute, since its task is one of the package.
 
     Args:
         path: A YAML file of plain values.
@@ -36,7 +36,7 @@ def read_plan(path: str | os.PathLike[str]) -> tuple[Job, ...]:
 
     Raises:
         FileNotFoundError: the file is missing.
-        ValueError: the file is no plan, names an unknown option, or has more than a million jobs.
+        ValueError: The file is no plan, names an unknown option, or has more than a million jobs.
     """
     file = checks.existing_file(checks.path("path", path))
     document = read_mapping(file)
@@ -50,7 +50,7 @@ def jobs_of(document: Mapping[Any, Any]) -> tuple[Job, ...]:
     """Return the jobs of a plan's mapping.
 
     Raises:
-        TypeError, ValueError: it is no plan.
+        TypeError, ValueError: ``document`` is no plan.
     """
     unknown = [name for name in document if name not in _NAMES]
     if unknown:
@@ -81,10 +81,10 @@ def jobs_of(document: Mapping[Any, Any]) -> tuple[Job, ...]:
 
 
 def _check_size(common: Any, sides: Mapping[str, list[tuple[Any, dict[str, Any]]]], count: int) -> None:
-    """Bound the options of all jobs before one is made.
+    """Bound the options of all jobs before any is made.
 
     Raises:
-        ValueError: they are too many, or nested too deeply.
+        ValueError: the options are too many, or nested too deeply.
     """
     values = count * checks.nested("options", common, deepest=DEEPEST, most=MOST_VALUES)
     for name, side in sides.items():
@@ -98,7 +98,7 @@ def _axis(name: str, values: Any) -> list[tuple[Any, dict[str, Any]]]:
     """Return the labels of an axis, each with its fields and options.
 
     Raises:
-        TypeError, ValueError: it is none.
+        TypeError, ValueError: ``values`` is no axis.
     """
     if name == "seed" and isinstance(values, int) and not isinstance(values, bool):
         values = list(range(checks.integer("axes.seed", values, low=1, high=MOST_JOBS)))

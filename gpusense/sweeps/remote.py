@@ -1,7 +1,7 @@
-"""Calls on single workers of a Dask cluster, one at a time on each.
+"""Run calls on single workers of a Dask cluster, one at a time on each.
 
-Dask would repeat a task whose worker has ended, and blame it on all tasks that wait there. So each call is a task for
-one worker, which gets the next one after its answer: where that worker ends, only the caller repeats the call.
+Dask would repeat a task whose worker has ended, and charge the end to all tasks that wait there. So each call is a task
+for one worker, which gets the next call after its answer. If the worker ends, only the caller repeats the call.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from gpusense.sweeps.deaths import WorkerDied
 from gpusense.sweeps.supervised import Limits, result_of
 from gpusense.sweeps.worker import error_text
 
-# Seconds between two looks at the scheduler's list of workers.
+# Seconds between two checks of the scheduler's list of workers.
 LOOK = 1.0
 # Seconds to wait for a finished call's result before asking whether it still exists, and how often.
 _FETCH, _FETCHES = 2.0, 15
 
 
 class Unusable(RuntimeError):
-    """A Dask worker cannot run calls: it lacks a package, or has another version of one."""
+    """A Dask worker cannot run calls, because it lacks a package or has another version of it."""
 
 
 class Found(NamedTuple):
     """A worker in the scheduler's list.
 
     Attributes:
-        address: Its address.
-        place: Its folder, which no other worker has had.
-        ready: Whether it begins tasks; one that pauses or retires only ends those that it runs.
+        address: Address of the worker.
+        place: Folder of the worker, which no other worker has had.
+        ready: Whether it starts tasks; a pausing or retiring worker only finishes its running ones.
     """
 
     address: str
@@ -41,14 +41,14 @@ class Found(NamedTuple):
 
 
 class Link(NamedTuple):
-    """Everything that calls on workers share.
+    """Everything that is common to calls on workers.
 
     Attributes:
         client: The Dask client.
         name: Name of the executor.
         limits: Limits of a job.
-        options: Of each Dask task: the resources that it takes.
-        lost: Returns why there is no cluster any more, or an empty text.
+        options: Options of each Dask task: the resources that it takes.
+        lost: Returns the reason why the cluster is lost, or an empty string.
     """
 
     client: Any
@@ -59,15 +59,15 @@ class Link(NamedTuple):
 
 
 class RemoteWorker:
-    """One Dask worker, as long as it lives.
+    """One Dask worker during its lifetime.
 
     Args:
-        link: To its cluster.
+        link: Link to its cluster.
         found: The worker.
 
     Attributes:
-        address: Its address.
-        place: Its folder.
+        address: Address of the worker.
+        place: Folder of the worker.
         ready: Whether it begins tasks.
         gone: Set once the worker has left the cluster.
     """
@@ -82,10 +82,10 @@ class RemoteWorker:
 
         Args:
             payload: The call.
-            name: Of processes that run no other calls; those of the executor otherwise.
+            name: Name of processes reserved for these calls; empty for the executor's processes.
 
         Raises:
-            OSError: the cluster has gone.
+            OSError: the cluster is lost.
             WorkerDied: the process of the call, or the Dask worker, has ended.
         """
         link = self._link
@@ -106,8 +106,8 @@ class RemoteWorker:
     def _awaited(self, remote: Any) -> on_worker.Answer | None:
         """Return the answer of a task.
 
-        The answer waits in the memory of its worker. Where that ends before the answer is fetched, the task is not
-        repeated, as no other worker may run it.
+        The answer waits in the memory of its worker. If the worker ends before the answer is fetched, the task is not
+        repeated, since no other worker may run it.
         """
         done = threading.Event()
         remote.add_done_callback(lambda _: done.set())
@@ -126,7 +126,7 @@ class RemoteWorker:
         raise WorkerDied("before its result was fetched", outside=True)
 
     def _check(self) -> None:
-        """Raise where the worker or its cluster has gone."""
+        """Raise an error if the worker or its cluster is gone."""
         lost = self._link.lost()
         if lost:
             raise OSError(lost)
@@ -134,7 +134,7 @@ class RemoteWorker:
             raise WorkerDied(f"with its Dask worker at {self.address}", outside=True)
 
     def _failure(self, error: BaseException) -> Exception:
-        """Return the meaning of a Dask task's error; errors of jobs arrive as answers."""
+        """Translate a Dask task's error; errors of jobs arrive as answers instead."""
         import distributed
 
         self._check()

@@ -18,21 +18,21 @@ from gpusense.sweeps.starts import Ended, Starts, SweepLost
 from gpusense.sweeps.table import DONE, FAILED, Row, Table
 from gpusense.sweeps.worker import work
 
-# Jobs that wait for each slot of an executor, so that it never idles.
+# Jobs that are queued for each slot of an executor, so that it never idles.
 _QUEUED = 2
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep that has ended.
+    """Summary of a finished sweep.
 
     Attributes:
         table: The table's CSV file.
         jobs: Jobs of the sweep.
-        done: Jobs that ran now and succeeded.
-        failed: Jobs that ran now and failed; their rows have the error.
-        skipped: Jobs whose rows were in the table already.
-        repeated: Runs that ended with their worker and were started again.
+        done: Number of jobs that ran and succeeded.
+        failed: Number of jobs that ran and failed; their rows have the error.
+        skipped: Number of jobs whose rows were already in the table.
+        repeated: Number of starts that ended with their worker and were repeated.
 
     Example:
         >>> import gpusense as gs
@@ -63,19 +63,19 @@ def run(
 ) -> Sweep:
     """Run jobs, and append a row to a table as soon as each ends.
 
-    A job that raises, also ``SystemExit``, becomes a row with its error. A job whose worker ends is started again, up
-    to ``attempts`` times; then its row says how the worker ended. One that has exceeded the executor's ``job_timeout``
-    is not started again. Where the cause of an end may lie outside the job (SIGKILL, a lost machine), its last start
-    comes after all other jobs and alone, so that no sound job fails by its neighbours. If the executor itself ends, or
-    after Ctrl-C, finished jobs stay in the table, and ``resume=True`` runs the remaining jobs.
+    A job that raises, even ``SystemExit``, becomes a row with its error. A job whose worker ends is started again, up
+    to ``attempts`` times; then its row has the end of the worker as its error. A job that has exceeded the executor's
+    ``job_timeout`` is not started again. If the cause of an end may lie outside the job (SIGKILL, a lost machine), its
+    last start comes after all other jobs and alone, so that no job fails because of its neighbours. If the executor
+    itself ends, or after Ctrl-C, finished jobs stay in the table, and ``resume=True`` runs the remaining jobs.
 
     Args:
         jobs: The jobs; equal ones run once.
         table: A ``.csv`` or ``.parquet`` file. Rows come in the order in which jobs end, and in the order of
             the jobs once all have ended.
-        executor: Of the shape of ``concurrent.futures.Executor``, such as :class:`ProcessExecutor` or
-            :class:`DaskExecutor`; None runs the jobs here, where one that ends its process ends the sweep. It is not
-            shut down.
+        executor: An executor with the interface of ``concurrent.futures.Executor``, such as :class:`ProcessExecutor` or
+            :class:`DaskExecutor`, which is not shut down. None runs the jobs in this process, and a job that ends it
+            ends the sweep.
         root: Folder of maps and logs, on the machine of each worker unless they are sent.
         backend: Selection string of the device, for workers without a chosen device.
         resume: Keep the rows of an existing table, and skip their jobs.
@@ -86,7 +86,7 @@ def run(
 
     Raises:
         FileExistsError: the table exists, and ``resume`` is false.
-        SweepLost: the executor has ended.
+        SweepLost: The executor has ended.
         TypeError, ValueError: an argument breaks its rule.
 
     Example:
@@ -120,7 +120,7 @@ def run(
             for ended in starts.ended(lambda: size or _window(chosen)):
                 record(ended)
         except (KeyboardInterrupt, SweepLost):
-            # Keep the results of jobs that have ended.
+            # Keep the results of finished jobs.
             for ended in starts.left():
                 record(ended)
             raise
@@ -132,7 +132,7 @@ def run(
 
 
 def _window(executor: Executor) -> int:
-    """Return the jobs to submit at once, which follow the workers of a cluster that grows or shrinks."""
+    """Return the number of jobs to submit at once, by the present number of workers."""
     try:
         return _QUEUED * max(int(getattr(executor, "slots", os.cpu_count() or 1)), 1)
     except (OSError, RuntimeError, TimeoutError) as error:

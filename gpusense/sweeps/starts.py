@@ -1,4 +1,4 @@
-"""The starts of the jobs of a sweep: each is counted once, and ends with a row or another start."""
+"""Count the starts of a sweep's jobs; each start ends with a row or with another start."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Ended(NamedTuple):
 
     Attributes:
         job: The job.
-        outcome: Its result.
-        starts: How often it was started.
+        outcome: Result of the job.
+        starts: Number of starts.
     """
 
     job: Job
@@ -31,7 +31,7 @@ class Ended(NamedTuple):
 
 
 class Starts:
-    """The jobs of a sweep on their way through an executor.
+    """The jobs of a sweep as they pass through an executor.
 
     Args:
         jobs: The jobs.
@@ -42,7 +42,7 @@ class Starts:
     def __init__(self, jobs: Iterable[Job], submit: Callable[[Job], Future[Any]], most: int) -> None:
         self._submit, self._most = submit, most
         self._waiting = deque((job, 0) for job in jobs)
-        # Jobs whose last start is to have no neighbours.
+        # Jobs whose last start must be alone.
         self._suspects: deque[tuple[Job, int]] = deque()
         self._running: dict[Future[Any], tuple[Job, int]] = {}
 
@@ -65,11 +65,11 @@ class Starts:
                 ended = self._ended(future)
                 if ended is not None:
                     yield ended
-                # Only now: where the row was interrupted, the job is still there.
+                # Remove it only now, so that the job is kept if writing its row was interrupted.
                 del self._running[future]
 
     def left(self) -> Iterator[Ended]:
-        """Yield the jobs of a sweep that ends which have a result and no row."""
+        """Yield the jobs with a result but no row, at the end of a sweep."""
         for future in [one for one in self._running if one.done() and not one.cancelled()]:
             if future.exception() is None:
                 yield Ended(self._running[future][0], future.result(), self._running[future][1])
@@ -86,7 +86,7 @@ class Starts:
         jobs.popleft()
 
     def _ended(self, future: Future[Any]) -> Ended | None:
-        """Return how a job has ended; None where it is started again.
+        """Return the end of a job; None if it is started again.
 
         Raises:
             SweepLost: the executor has ended.
@@ -103,7 +103,7 @@ class Starts:
             return None
         if isinstance(error, (BrokenExecutor, CancelledError, OSError)):
             raise SweepLost(f"executor: has ended before the sweep: {error_text(error)}") from error
-        # The result of the job cannot be sent, or its worker cannot run it.
+        # The job's result cannot be sent, or its worker cannot run it.
         return Ended(job, _failed(error_text(error)), starts)
 
 

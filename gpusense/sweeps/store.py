@@ -1,4 +1,4 @@
-"""Maps, logs, and models with their compiled kernels, which a worker of a sweep keeps between jobs."""
+"""Cache of maps, logs, and models with their compiled kernels, which a sweep's worker keeps between jobs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from gpusense.logs import Scan
     from gpusense.world.grid import OccupancyGrid
 
-# Objects of a kind that are kept: maps, logs, models.
+# Most objects of each kind that are kept: maps, logs, models.
 _KEPT = 4
 
 
@@ -28,8 +28,8 @@ class Store:
         device: Selection string of the worker's device.
 
     Attributes:
-        device: It.
-        reads: How often a map or a log was read or a model was made.
+        device: Selection string of the worker's device.
+        reads: Number of maps and logs that were read and of models that were made.
     """
 
     def __init__(self, root: str | Path, device: str = "auto") -> None:
@@ -49,7 +49,7 @@ class Store:
         folder = Path(self._folder.name)
         for index, (path, content) in enumerate(sent.items(), len(self._sent)):
             if isinstance(content, bytes):
-                # Only the endings are the sender's: they select the format.
+                # Only the suffixes are taken from the sender, since they select the format.
                 file = folder / f"{index}{''.join(Path(path).suffixes[-2:])}"
                 file.write_bytes(content)
                 self._sent[path] = file
@@ -84,7 +84,7 @@ class Store:
         return self.keep("logs", key, lambda: read_steps(self.path(job.log), sensors=sensors, **chosen))
 
     def scans(self, job: Job, group: str = "") -> list[tuple[int, Scan]]:
-        """Return the scans of a job that have logged poses; those of the options below a dotted name, if given."""
+        """Return the scans of a job with logged poses; ``group`` names the options that choose them."""
         from gpusense.evaluation.scoring import chosen_scans, with_poses
 
         chosen, topic, path = _chosen(job, group), _topic(job), self.path(job.log)
@@ -92,7 +92,7 @@ class Store:
         return self.keep("logs", key, lambda: with_poses(chosen_scans(path, topic=topic, **chosen), path))
 
     def keep(self, kind: str, key: Hashable, make: Callable[[], Any]) -> Any:
-        """Return an object of a kind; make it where it is not kept."""
+        """Return an object of a kind, made if it is not kept."""
         kept = self._kept.setdefault(kind, OrderedDict())
         if key not in kept:
             kept[key] = make()
@@ -109,10 +109,10 @@ _ALL = {"every": 1, "offset": 0, "limit": None}
 
 
 def _topic(job: Job) -> str | None:
-    """Return the option ``topic``, the laser of the log; None for its only or main one.
+    """Return the option ``topic``, the laser of the log; None for its only or main laser.
 
     Raises:
-        ValueError: it is no text.
+        ValueError: it is no string.
     """
     topic = job.option("topic")
     if topic is not None and not isinstance(topic, str):

@@ -1,7 +1,7 @@
-"""A worker's process under supervision: it is started, watched while it runs a call, ended and replaced.
+"""Supervise a worker's process: start it, watch it during a call, end and replace it.
 
-All executors run their jobs in such processes, those on Dask in processes of the Dask workers. A process runs one call
-at a time, so that its end is charged to this call and to no other.
+All executors run their jobs in such processes; with Dask these belong to the Dask workers. A process runs one call at a
+time, so that its end is charged to this call alone.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from gpusense.sweeps.child import BEGUN, READY, serve
 from gpusense.sweeps.deaths import JobTimeout, WorkerDied, death
 from gpusense.sweeps.memory import memory_of, shortages, size_text
 
-# Processes that may end before they take a call, one after another.
+# Processes in a row that may end before they take a call.
 _STARTS = 3
-# Seconds between two looks at a process that runs a call; with a memory limit.
+# Seconds between two checks of a process that runs a call, without and with a memory limit.
 _LOOK, _LOOK_MEMORY = 0.25, 0.05
-# Seconds for a process to end by itself, and for one that has closed its link; seconds between two looks at it.
+# Seconds for a process to end by itself, and after it has closed its link; seconds between two checks.
 _GRACE, _CLOSING, _SOON = 10.0, 2.0, 0.005
 
 
@@ -37,8 +37,8 @@ class Limits(NamedTuple):
     """Limits of a job.
 
     Attributes:
-        seconds: Longest time; None for any.
-        memory: Most resident memory of its process [bytes]; None for any.
+        seconds: Longest time; None for no limit.
+        memory: Most resident memory of its process [bytes]; None for no limit.
     """
 
     seconds: float | None = None
@@ -46,7 +46,7 @@ class Limits(NamedTuple):
 
 
 def limits_of(job_timeout: float | None, memory_limit: int | None) -> Limits:
-    """Return the limits of an executor's arguments.
+    """Return the limits from an executor's arguments.
 
     Raises:
         TypeError, ValueError: an argument breaks its rule, or the memory of processes is unknown on this system.
@@ -59,7 +59,7 @@ def limits_of(job_timeout: float | None, memory_limit: int | None) -> Limits:
 
 
 class Supervised:
-    """One process, which is started on use and again after its end.
+    """One process, which is started on first use and again after its end.
 
     Args:
         device: Selection string of its device; empty leaves that of the environment.
@@ -100,7 +100,7 @@ class Supervised:
         raise BrokenExecutor(f"{rule}, got {_STARTS} that ended {ended.how}")
 
     def _begun(self, payload: bytes) -> bool:
-        """Hand a call to the process, started if need be; tell whether the process has begun it."""
+        """Hand a call to the process, which is started if necessary; return whether the process has begun the call."""
         if self._process is not None and not self._alive():
             self._buried()
         try:
@@ -144,7 +144,7 @@ class Supervised:
         while True:
             try:
                 if wait([self._link, self._process.sentinel], _LOOK) or not self._alive():
-                    # The link still holds messages from before its end.
+                    # The link may still hold messages from before the process's end.
                     return bytes(self._link.recv_bytes()) if self._link.poll() else None
             except (EOFError, OSError):
                 return None
@@ -174,12 +174,12 @@ class Supervised:
                 raise JobTimeout(f"after the limit of {limits.seconds:g} s", most)
 
     def _buried(self, memory: int = 0, short: int = 0, *, forced: bool = False) -> WorkerDied:
-        """End the process with all that it has started, and return how it ended."""
+        """End the process and everything that it has started, and return the exception for its end."""
         process = self._process
         if process is None:
             return WorkerDied("before it started")
         if not forced:
-            # Its link closes a little before it has ended.
+            # Its link closes slightly before the process ends.
             _await_end(process, _CLOSING)
         self.kill()
         _await_end(process, _GRACE)
@@ -191,19 +191,19 @@ class Supervised:
         return death(code, memory, shortages() > short)
 
     def kill(self) -> None:
-        """End the process at once, with all that it has started."""
+        """End the process at once, with everything that it has started."""
         process = self._process
         if process is None or process.pid is None:
             return
         if sys.platform != "win32":
-            # Its group, while no other process can take its number.
+            # End its group while no other process can take its number.
             with contextlib.suppress(OSError):
                 os.killpg(process.pid, signal.SIGKILL)
         with contextlib.suppress(OSError):
             process.kill()
 
     def close(self, wait: bool = True) -> None:
-        """End the process, which runs no call; without waiting also one that does."""
+        """End the process after its call or, without waiting, also during a call."""
         with self._lock:
             self._closed = True
             process, link = self._process, self._link
@@ -218,7 +218,7 @@ class Supervised:
 
 
 def _await_end(process: Any, seconds: float) -> None:
-    """Wait until a process has ended, and leave it to be reaped where the system can."""
+    """Wait until a process has ended, without reaping it where the system allows that."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         if sys.platform == "linux":
@@ -226,7 +226,7 @@ def _await_end(process: Any, seconds: float) -> None:
                 if os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None:
                     return
             except ChildProcessError:
-                # Reaped already, by whomever.
+                # It has already been reaped.
                 return
         elif process.exitcode is not None:
             return
@@ -234,7 +234,7 @@ def _await_end(process: Any, seconds: float) -> None:
 
 
 def pickled(function: Callable[..., Any], args: Any, kwargs: Any) -> bytes:
-    """Return the payload of a call of a function of a module."""
+    """Return the payload of a call to a module's function."""
     from multiprocessing.reduction import ForkingPickler
 
     return bytes(ForkingPickler.dumps((function, args, kwargs)))
@@ -250,13 +250,13 @@ def result_of(answer: bytes) -> Any:
 
 @contextlib.contextmanager
 def _parent_of_processes() -> Iterator[None]:
-    """Let this process start child processes that do not receive Ctrl-C while they start."""
-    # Workers of Dask are daemons, which may not start processes unless they say otherwise.
+    """Allow this process to start child processes that do not receive Ctrl-C while they start."""
+    # Workers of Dask are daemons, which may not start processes by default.
     multiprocessing.current_process().daemon = False
     if sys.platform == "win32":
         yield
         return
-    # Once it runs, it would admit Ctrl-C.
+    # Started later, it would receive Ctrl-C.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:

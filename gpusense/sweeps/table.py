@@ -1,6 +1,6 @@
 """The table of a sweep: a CSV file to which whole lines are appended, and a Parquet file once the sweep ends.
 
-A crash can leave a torn last line, which is cut off when the file is opened again. All other lines are whole.
+A crash can leave a torn last line, which is cut off when the file is opened again. All other lines are complete.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gpusense.sweeps.job import Job
 from gpusense.sweeps.worker import Outcome
 
 Row = dict[str, str]
-# Columns of every table, before those of options, labels and results.
+# Columns of every table, before the columns of options, labels and results.
 FIRST = ("key", "status", "task", "map", "log", "model", "seed")
 LAST = ("seconds", "cpu_seconds", "attempts", "worker", "device", "error")
 DONE, FAILED = "done", "failed"
@@ -45,7 +45,7 @@ class Table:
         FileExistsError: the file exists, and ``resume`` is false.
         ImportError: Parquet without pyarrow.
         OSError: the folder is absent or not writable, or another sweep writes this table.
-        ValueError: another ending, or a file that is no table.
+        ValueError: the suffix is unknown, or the file is no table.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, resume: bool = False) -> None:
@@ -82,7 +82,7 @@ class Table:
         self._stream.close()
 
     def _load(self) -> None:
-        """Read the rows, and cut a torn last line off."""
+        """Read the rows, and cut off a torn last line."""
         self._stream.seek(0)
         data = self._stream.read()
         whole = data.rfind(b"\n") + 1
@@ -106,12 +106,12 @@ class Table:
         return row
 
     def _merged(self, row: Iterable[str]) -> tuple[str, ...]:
-        """Return the columns with those of a row."""
+        """Return the columns extended by those of a row."""
         middle = [name for name in (*self.columns, *row) if name not in (*FIRST, *LAST)]
         return (*FIRST, *dict.fromkeys(middle), *LAST)
 
     def _rewrite(self, rows: Iterable[Row], columns: tuple[str, ...]) -> None:
-        """Replace the file by one of these rows."""
+        """Replace the file by one with these rows."""
         text = _lines(columns, [dict(zip(columns, columns, strict=True)), *rows])
         write_whole(self.path, lambda stream: stream.write(text))
         self._stream.close()
@@ -150,13 +150,13 @@ def row_of(job: Job, outcome: Outcome, attempts: int) -> Row:
 
 
 def read_table(path: str | os.PathLike[str]) -> dict[str, list[Any]]:
-    """Read the table of a sweep, also of one that still runs.
+    """Read the table of a sweep, which may still be running.
 
     Args:
         path: A CSV or Parquet file of a sweep.
 
     Returns:
-        The columns by name: numbers, booleans and texts; None where a job has no value. The last row of a job counts.
+        The columns by name: numbers, booleans and strings; None where a job has no value. The last row of a job counts.
 
     Raises:
         FileNotFoundError: the file is missing.
@@ -173,7 +173,7 @@ def read_table(path: str | os.PathLike[str]) -> dict[str, list[Any]]:
 
 
 def columns_of(names: Sequence[str], rows: Sequence[Mapping[str, str]]) -> dict[str, list[Any]]:
-    """Return the columns of rows as values: each column of one type, texts where its cells differ."""
+    """Return the columns of rows as values: each column has one type, strings if the types of its cells differ."""
     columns: dict[str, list[Any]] = {}
     for name in names:
         cells = [row.get(name, "") for row in rows]
@@ -202,7 +202,7 @@ def _value(cell: str) -> Any:
 
 
 def _text(value: Any) -> str:
-    """Return the text of a cell, on one line; numbers come back with all bits."""
+    """Format a cell on one line; numbers can be read back with all bits."""
     if value is None:
         return ""
     if isinstance(value, bool):
@@ -224,7 +224,7 @@ def _parsed(data: bytes, path: Path) -> tuple[tuple[str, ...], list[Row]]:
     """Return columns and rows of whole lines.
 
     Raises:
-        ValueError: they are no table of a sweep.
+        ValueError: ``data`` is no table of a sweep.
     """
     try:
         lines = list(csv.reader(io.StringIO(data.decode(), newline=""), strict=True))
@@ -242,7 +242,7 @@ def _parsed(data: bytes, path: Path) -> tuple[tuple[str, ...], list[Row]]:
 
 
 def _opened(path: Path) -> BinaryIO:
-    """Open a table for reading and appending, and keep other sweeps away from it.
+    """Open a table for reading and appending, and lock it against other sweeps.
 
     Raises:
         OSError: another process writes it.

@@ -1,4 +1,4 @@
-"""Tasks of the jobs of a sweep: localise along a log, score its scans, fit parameters to it."""
+"""Tasks of a sweep's jobs: localise along a log, score its scans, fit parameters to it."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Task(NamedTuple):
     """A task.
 
     Attributes:
-        run: Runs a job with what the worker keeps, and returns the columns of its row.
-        options: Names of its options, without those of the model.
+        run: Runs a job with the worker's store, and returns the columns of its row.
+        options: Names of the task's options, without the model's.
         error: Column that a plot shows against run time.
     """
 
@@ -48,7 +48,7 @@ def localize(job: Job, store: Store) -> Values:
     track = Track()
     for _ in follow(pf, steps, track):
         pass
-    # The median step leaves out the first, which compiles.
+    # The median leaves out the first step, which compiles.
     return {**summary(track), "ms_step": float(1000 * np.median(np.sum(track.seconds, axis=1)))}
 
 
@@ -111,7 +111,7 @@ def task_of(job: Job) -> Callable[[Job, Store], Values]:
     """Return the function of a job's task.
 
     Raises:
-        ValueError: no such task or function.
+        ValueError: there is no such task or function.
     """
     if ":" not in job.task:
         return TASKS[checks.choice("task", job.task, tuple(TASKS))].run
@@ -142,5 +142,5 @@ _TIMINGS = ("seconds", "cpu_seconds", "worker", "device", "attempts", "memory_mb
 
 
 def is_timing(column: str) -> bool:
-    """Tell whether a column depends on time or place, and so differs between two runs of a job."""
+    """Tell whether a column depends on time or place, so that it differs between two runs of a job."""
     return column.startswith("ms_") or column in _TIMINGS

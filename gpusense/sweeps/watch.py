@@ -1,4 +1,4 @@
-"""The watch over the workers of a Dask cluster, which hands them calls."""
+"""Watch the workers of a Dask cluster, and hand them calls."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Call(NamedTuple):
     """A call that waits for a worker.
 
     Attributes:
-        payload: Its pickle.
-        future: Its result.
+        payload: Pickle of the call.
+        future: Future of its result.
     """
 
     payload: bytes
@@ -30,16 +30,16 @@ class Call(NamedTuple):
 
 
 class Watch:
-    """The workers of a cluster, as they come and go, each with a thread that hands it one call after the other.
+    """The present workers of a cluster, each with a thread that hands it one call after another.
 
     Args:
-        link: To the cluster.
-        workers: Returns the usable workers now; None where the scheduler does not answer.
-        ended: Returns why there is no scheduler any more, or an empty text.
+        link: Link to the cluster.
+        workers: Returns the usable workers now; None if the scheduler does not answer.
+        ended: Returns the reason why the scheduler has ended, or an empty string.
         patience: Longest time without a worker, or without an answer of the scheduler [s].
 
     Attributes:
-        lost: Why there is no cluster any more; empty as long as there is one.
+        lost: Reason why the cluster is lost; empty while it exists.
         workers: The workers by their folders.
     """
 
@@ -65,7 +65,7 @@ class Watch:
         """Queue a call for the next free worker.
 
         Raises:
-            RuntimeError: there is no cluster any more.
+            RuntimeError: the cluster is lost.
         """
         future: Future[Any] = Future()
         with self._lock:
@@ -77,7 +77,7 @@ class Watch:
         return future
 
     def _return(self, call: Call) -> None:
-        """Queue a call again, which its worker has not begun."""
+        """Queue again a call that its worker has not begun."""
         with self._lock:
             if not self.lost:
                 self._calls.put(call)
@@ -86,12 +86,12 @@ class Watch:
 
     @property
     def open(self) -> list[Future[Any]]:
-        """Calls without a result."""
+        """Number of calls without a result."""
         with self._lock:
             return list(self._open)
 
     def lose(self, reason: str) -> None:
-        """End all calls, and take none any more."""
+        """End all calls, and accept no further ones."""
         with self._lock:
             self.lost = self.lost or reason
         self._end.set()
@@ -100,11 +100,11 @@ class Watch:
                 _refuse(self._calls.get_nowait(), self.lost)
 
     def _look(self) -> None:
-        """Follow the workers of the cluster, until it is lost."""
+        """Follow the workers of the cluster until it is lost."""
         try:
             self._follow()
         except Exception as error:
-            # Nothing may wait for a watch that has ended.
+            # Nothing may wait for a finished watch.
             _LOG.error("sweep: the workers could not be followed", exc_info=True)
             self.lose(f"the workers could not be followed: {error_text(error)}")
 
@@ -129,7 +129,7 @@ class Watch:
                 _LOG.warning("sweep: no worker is left, waiting %g s for one", self._patience)
 
     def _match(self, found: list[Found]) -> None:
-        """Take workers in that are new, and let those go that have left."""
+        """Add new workers, and remove those that have left."""
         listed = {one.place: one for one in found if one.place not in self._refused}
         for place in [place for place in self.workers if place not in listed]:
             self.workers.pop(place).gone.set()
@@ -141,7 +141,7 @@ class Watch:
                 threading.Thread(target=self._serve, args=(worker,), name="gpusense-sweep", daemon=True).start()
 
     def _serve(self, worker: RemoteWorker) -> None:
-        """Hand calls to a worker, one after the other, as long as it lives."""
+        """Hand calls to a worker one after another while it lives."""
         for call in self._taken(worker):
             if not _claimed(call):
                 continue
@@ -171,7 +171,7 @@ class Watch:
 
 
 def _claimed(call: Call) -> bool:
-    """Tell whether a call is still wanted, and keep it from being cancelled; another worker may have claimed it."""
+    """Claim a call so that it cannot be cancelled; return whether it is still wanted and unclaimed."""
     return call.future.running() or call.future.set_running_or_notify_cancel()
 
 

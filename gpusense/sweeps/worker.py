@@ -1,4 +1,4 @@
-"""The function that runs a job on a worker, whatever started the worker."""
+"""Run jobs on a worker, independent of the executor that started it."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class Outcome(NamedTuple):
     Attributes:
         values: Columns of its row by name; empty after a failure.
         error: The error in one line; empty after success.
-        trace: Where the error was raised, for a log.
-        seconds: Time of the job.
-        cpu_seconds: Processor time of the worker's process meanwhile.
-        worker: Host and process.
+        trace: Traceback of the error, for a log.
+        seconds: Time of the job [s].
+        cpu_seconds: Processor time of the worker's process during the job [s].
+        worker: Host and process of the worker.
         device: Selection string of the device.
     """
 
@@ -41,15 +41,15 @@ class Outcome(NamedTuple):
     device: str
 
 
-# A worker runs one job at a time, as its device and its store serve one.
+# A worker runs one job at a time, since its device and its store serve only one.
 _LOCK = threading.Lock()
-# Stores by root, device and sweep: files may have changed since another sweep.
+# Stores by root, device and sweep, since files may change between sweeps.
 _STORES: dict[tuple[str, str, str], Store] = {}
 _SENT: dict[str, Any] = {}
 
 
 def receive(sent: Mapping[str, Any]) -> None:
-    """Keep maps and logs that were sent, for all jobs of this process."""
+    """Keep the sent maps and logs for all jobs of this process."""
     with _LOCK:
         _SENT.update(sent)
         _STORES.clear()
@@ -62,7 +62,7 @@ def work(job: Job, root: str, device: str, sweep: str = "") -> Outcome:
         job: The job.
         root: Folder of its files.
         device: Selection string of the device, for a worker without a chosen device.
-        sweep: Name of the sweep; files that a worker has read for another sweep are read again.
+        sweep: Name of the sweep; files read for another sweep are read again.
     """
     chosen = device_of(device)
     with _LOCK:
@@ -77,17 +77,17 @@ def work(job: Job, root: str, device: str, sweep: str = "") -> Outcome:
         try:
             values = {name: _plain(value) for name, value in task_of(job)(job, _STORES[key]).items()}
         except KeyboardInterrupt:
-            # In this process the user's, who ends the sweep.
+            # In this process the interrupt is the user's, and ends the sweep.
             raise
         except BaseException as problem:
-            # SystemExit is also an error of the job, and not the end of the worker.
+            # SystemExit is also an error of the job, and does not end the worker.
             error, trace = error_text(problem), traceback.format_exc()
         seconds, cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
     return Outcome(values, error, trace, seconds, cpu, f"{platform.node()}:{os.getpid()}", chosen)
 
 
 def error_text(error: BaseException) -> str:
-    """Return an error as the text of a row, on one line."""
+    """Format an error for a row, on one line."""
     try:
         text = f"{type(error).__name__}: {error}"
     except Exception:
@@ -96,5 +96,5 @@ def error_text(error: BaseException) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return NumPy's numbers as Python's."""
+    """Convert NumPy's numbers to Python's."""
     return value.item() if hasattr(value, "item") else value

@@ -87,7 +87,7 @@ class FieldDensity:
         """Return the numbers of the kernel file ``field_term``, for a sum of densities or of logarithms.
 
         Raises:
-            ValueError: sigma_hit is too small or too large for the precision.
+            ValueError: Sigma_hit is too small or too large for the precision.
         """
         hit, rand = (self.peak, self.rand) if self.is_linear(real) else (self.log_peak, self.log_rand)
         terms = rounded_terms([hit, self.rate, rand, NoReturn(self.parameters.z_max).number], real)

@@ -26,12 +26,16 @@ HitName: TypeAlias = Literal["normal", "student"]
 LEAST_DOF, MOST_DOF = 1.0, 1e6
 # For half of the degrees of freedom above this, the ratio of gamma functions is its asymptotic series.
 _SERIES_FROM = 30.0
+# From here on erf is 1 in float64.
+_ERF_IS_ONE = 6.0
 # The largest number below one half.
 _MOST_HALF = math.nextafter(0.5, 0)
 
 
 class HitShape(ABC):
     """The density of a correct range, of scale 1 around 0.
+
+    A subclass has at most one fitted parameter, since fits on a device move a single coordinate.
 
     Attributes:
         flags: Flags of the kernels that evaluate it.
@@ -46,6 +50,20 @@ class HitShape(ABC):
     fitted: ClassVar[tuple[str, ...]] = ()
     limits: ClassVar[tuple[tuple[float, float], ...]] = ()
     starts: ClassVar[tuple[tuple[float, ...], ...]] = ((1.0,),)
+
+    def __init_subclass__(cls) -> None:
+        """Check the numbers of fitted parameters, limits and coordinates of starts.
+
+        Raises:
+            TypeError: They differ, or are more than one.
+        """
+        super().__init_subclass__()
+        counts = {len(cls.fitted), len(cls.limits), *(len(start) - 1 for start in cls.starts)}
+        if len(counts) > 1 or max(counts) > 1:
+            raise TypeError(
+                f"{cls.__name__}: must have at most one fitted parameter, with limits and a coordinate of each start, "
+                f"got fitted={cls.fitted}, limits={cls.limits}, starts={cls.starts}"
+            )
 
     @classmethod
     @abstractmethod
@@ -151,9 +169,13 @@ class NormalHit(HitShape):
 
     def half_mass(self, u: Floats) -> Floats:
         """See HitShape.half_mass."""
+        scaled = u * u.dtype.type(math.sqrt(0.5))
+        if scaled.min(initial=np.inf) >= _ERF_IS_ONE:
+            # SciPy, which takes as long to load as a whole call of a model, is not needed.
+            return np.full_like(scaled, 0.5)
         from scipy.special import erf
 
-        return u.dtype.type(0.5) * erf(u * u.dtype.type(math.sqrt(0.5)))
+        return u.dtype.type(0.5) * erf(scaled)
 
     def drawn(self, share: Floats, low: Floats, high: Floats) -> Floats:
         """See HitShape.drawn."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gpusense.chaining.agreement import agreeing, largest_group
+from gpusense.chaining.agreement import agreeing, groups_of
 from gpusense.chaining.closing import joined_breaks
 from gpusense.chaining.links import CLOSURE, Links
 from gpusense.localization.pose_algebra import compose_poses, pose_difference
@@ -28,6 +28,7 @@ def test_two_matches_do_not_suffice_and_a_wrong_one_is_left_out() -> None:
     poses, links = passages([0.95] * 5)
     links.pose[3] += (1.0, 0.0, 0.2)
     assert agreeing(links, poses, np.zeros(5, bool)).tolist() == [True, True, True, False, True]
+    assert groups_of(links, poses).group.tolist() == [0, 0, 0, -1, 0]
     assert not len(agreeing(links[:0], poses, np.zeros(0, bool)))
 
 
@@ -36,9 +37,10 @@ def test_where_the_drift_tells_nothing_a_group_needs_evidence(right: list[float]
     poses, links = passages(right)
     assert agreeing(links, poses, np.zeros(len(right), bool)).all()
     assert agreeing(links, poses, np.ones(len(right), bool)).tolist() == [taken] * len(right)
-    size, evidence = largest_group(links, poses)
-    assert size == len(right)
-    assert evidence == pytest.approx(-np.log10(1 - np.array(right)).sum())
+    found = groups_of(links, poses)
+    assert found.group.tolist() == [0] * len(right)
+    assert found.evidence == pytest.approx([-np.log10(1 - np.array(right)).sum()])
+    assert found.scans.tolist() == [len(right)]
     # Matches that need none do not count for those that do.
     mixed = np.arange(len(right)) < 2
     assert agreeing(links, poses, mixed).tolist() == [False] * 2 + [len(right) > 4] * (len(right) - 2)

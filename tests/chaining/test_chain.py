@@ -220,7 +220,7 @@ def test_large_motions_without_odometry_are_found_or_said(step: float, range_max
     wrong = (np.hypot(off[:, 0], off[:, 1]) > 0.3) | (np.abs(off[:, 2]) > 0.15)
     assert chain.doubtful[1:][wrong].all()
     assert "contested" in {doubt.reason for doubt in chain.doubts}
-    assert "after another motion" in chain.explain()
+    assert "for a second motion" in chain.explain()
 
 
 def test_a_failed_match_is_bridged_over(needs) -> None:

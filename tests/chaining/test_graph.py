@@ -168,3 +168,30 @@ def test_breaks_of_a_long_graph_are_seen_between_its_anchors() -> None:
         assert deviation[2] < 0.05
     # Up to 300 poses nothing is left out.
     assert len(Drift(solve(found.poses[:300], links[:299])).anchors) == 300
+
+
+def test_closures_of_eliminated_poses_count_between_kept_ones() -> None:
+    # Two passages of a circle, each pose linked to the next two, with closures between passages.
+    count, lap = 120, 60
+    angle = 2 * np.pi * np.arange(count) / lap
+    poses = np.stack([5 * np.cos(angle), 5 * np.sin(angle), angle + np.pi / 2], axis=1)
+    first = np.concatenate([np.arange(count - 1), np.arange(count - 2)])
+    second = np.concatenate([np.arange(1, count), np.arange(2, count)])
+    moved = pose_difference(poses[first], poses[second])
+    links = Links.of(MATCH, first, second, moved, np.tile(np.diag([1e4, 2e4, 4e4]), (len(first), 1, 1)))
+    again = np.arange(1, lap - 1, 3)
+    moved = pose_difference(poses[again], poses[again + lap + 1])
+    # As along a corridor nothing is known along x.
+    closures = Links.of(
+        CLOSURE, again, again + lap + 1, moved, np.tile(np.diag([0.0, 900.0, 900.0]), (len(again), 1, 1))
+    )
+    plain, found = solve(poses, links), solve(poses, Links.joined([links, closures]))
+    reduced, exact = Drift(found, most=30), Drift(found, most=count)
+    a, b = np.triu_indices(len(reduced.anchors), 1)
+    pairs = reduced.anchors[a], reduced.anchors[b]
+    far = np.abs(pairs[1] - pairs[0] - lap) < 10
+    wide = np.linalg.det(exact.relative(*pairs))
+    ratio = np.linalg.det(reduced.relative(*pairs)) / wide
+    assert 0.9 < ratio.min() < ratio.max() < 1.5
+    # Without closures the second passage has drifted.
+    assert (np.linalg.det(Drift(plain, most=30).relative(*pairs)) / wide)[far].min() > 20

@@ -9,11 +9,11 @@ import math
 import numpy as np
 import pytest
 from support.command_line import error_of
+from support.feature_scenes import floor_plan
 
 import gpusense as gs
 from gpusense.commands import features as command
 from gpusense.commands.cli import main
-from gpusense.evaluation.feature_scenes import floor_plan
 
 SCANNER = gs.Scanner.uniform(angle_min=-math.pi / 2, angle_increment=math.pi / 360, count=361, range_max=20.0)
 SCANS = 12

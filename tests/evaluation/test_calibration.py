@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.calibration import assert_uniform
+from support.calibration import assert_uniform, posterior_ranks
+from support.calibration_scenes import MAKERS, make_scene
 
 import gpusense as gs
-from gpusense.evaluation.calibration import posterior_ranks
-from gpusense.evaluation.calibration_scenes import MAKERS, make_scene
 
 RUNS = 300
 

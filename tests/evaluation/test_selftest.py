@@ -275,6 +275,8 @@ score_beams, log_density = beam.score_beams, mixture.log_density
 )
 def test_a_breach_is_detected(capsys, monkeypatch, module, name, broken, quantity):
     monkeypatch.setattr(module, name, broken)
+    whole = selftest.built_in_scene()
+    monkeypatch.setattr(selftest, "built_in_scene", lambda: dataclasses.replace(whole, poses=whole.poses[::9]))
     partner = others()[0] if name in ("cast_ranges", "cast_echoes") else "numpy"
     code, out, _ = run(capsys, "--backend", "numpy", "--backend", partner, "--json")
     document = json.loads(out)

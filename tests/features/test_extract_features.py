@@ -8,12 +8,12 @@ import math
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from support.feature_scenes import Floor, floor_plan
+from support.feature_scores import Score, score_scan
+from support.feature_truth import truth_of
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.evaluation.feature_scenes import Floor, floor_plan
-from gpusense.evaluation.feature_scores import Score, score_scan
-from gpusense.evaluation.feature_truth import truth_of
 
 KINDS = ("line", "corner", "door", "hallway", "pole")
 

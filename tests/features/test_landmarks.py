@@ -8,9 +8,9 @@ import math
 
 import numpy as np
 import pytest
+from support.feature_scenes import floor_plan
 
 import gpusense as gs
-from gpusense.evaluation.feature_scenes import floor_plan
 
 SCANNER = gs.Scanner.uniform(angle_min=-2.35, angle_increment=math.radians(0.5), count=540, range_max=12.0)
 FLOOR = floor_plan(2)

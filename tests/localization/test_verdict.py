@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import gpusense as gs
-from gpusense.localization.belief import FOUND, LENGTH, PER_METRE, PER_SCAN, STAYS, Belief
+from gpusense.localization.belief import ALIKE, ALIKE_LENGTH, FOUND, LENGTH, PER_METRE, PER_SCAN, STAYS, Belief
 from gpusense.localization.passages import AGREES, NOTHING, SHORT, THROUGH, VANISHED, passages
 from gpusense.localization.ratio import LIMITS, explained_of_scan, ratio_of_scan
 from gpusense.localization.spread import share_off, share_off_of
@@ -125,7 +125,7 @@ def test_the_belief_is_the_exact_filter_of_two_states():
         ratios = rng.normal(mean, math.sqrt(2 * mean), 6)
         covariance = 2 * mean * rho ** np.abs(np.subtract.outer(np.arange(6), np.arange(6)))
         exact = 2 * mean * np.ones(6) @ np.linalg.solve(covariance, ratios)
-        belief = Belief()
+        belief = Belief(alike=0.0)
         start = belief.log_odds
         for k, ratio in enumerate(ratios):
             belief = belief.judged((gap * k, 0.0, 0.0), float(ratio))
@@ -155,9 +155,32 @@ def test_agreement_with_a_place_that_scans_have_chosen_is_no_evidence():
     against = Belief.anywhere().counted().judged((0.0, 0.0, 0.0), 3.0)
     assert against.wrong > 0.9
     moved = found
-    for k in range(1, 8):
+    for k in range(1, 40):
         moved = moved.counted().judged((0.5 * k, 0.0, 0.0), -3.0)
     assert moved.wrong < 0.05
+
+
+def test_a_short_log_leaves_places_that_look_alike():
+    """Agreement excludes wrong places that differ; the others remain until the robot has seen more."""
+    near = far = Belief.anywhere()
+    for k in range(1, 30):
+        near = near.counted().judged((0.01 * k, 0.0, 0.0), -4.0)
+        far = far.counted().judged((0.6 * k, 0.2 * k, 0.1 * k), -4.0)
+    least = ALIKE / (1 + ALIKE)
+    assert least < near.wrong < 0.35 and far.wrong < 0.4 * least
+    # Without scans in between the share is that of Bayes' rule.
+    one = Belief(0.0, 0.0, (0.0, 0.0, 0.0)).judged((9.0, 0.0, 0.0), -3.0)
+    alike = ALIKE * math.exp(-9.0 / ALIKE_LENGTH)
+    assert one.wrong / (1 - one.wrong) == pytest.approx(alike + (1 - alike) * math.exp(one_step(9.0, -3.0)))
+    # A pose that looks alike and is contradicted is found out within a few scans.
+    for k in range(1, 4):
+        near = near.counted().judged((0.3 + 1.0 * k, 0.0, 0.0), 3.0)
+    assert near.wrong > 0.85
+
+
+def one_step(way, ratio):
+    """Return the increment of the log odds by a ratio after one of 0."""
+    return ratio / (1 + STAYS * math.exp(-way / LENGTH))
 
 
 def test_the_share_of_a_spread_is_that_of_drawn_poses():

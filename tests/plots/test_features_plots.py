@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 import pytest
+from support.feature_scenes import floor_plan
 
 import gpusense as gs
-from gpusense.evaluation.feature_scenes import floor_plan
 
 
 def test_all_kinds_are_drawn_with_one_label_each():

@@ -5,13 +5,14 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
 from support.bench_scripts import BENCH, run_script
 
 import gpusense as gs
+from gpusense.chaining.links import CLOSURE, Links
 
 ROWS = 6
 
@@ -57,6 +58,19 @@ def test_closures_are_compared_with_references_by_end_points(script: ModuleType,
     assert script.fits(log, log.truth, log.truth, 96, 104, wrong) == (at_reference, at_closure)
 
 
+def test_groups_of_matches_are_judged_by_references(script: ModuleType) -> None:
+    truth = np.stack([np.tile(0.8 * np.arange(12), 2), np.zeros(24), np.zeros(24)], axis=1)
+    at = np.arange(8)
+    pose = gs.pose_difference(truth[at], truth[at + 12])
+    pose[4:] += (2.0, 0.0, 0.0)
+    matches = Links.of(CLOSURE, at, at + 12, pose, np.tile(np.eye(3), (8, 1, 1)), 0.99)
+    loops = SimpleNamespace(matches=matches, solution=SimpleNamespace(poses=truth), nodes=np.arange(24))
+    known = truth.copy()
+    known[2] = np.nan
+    groups = script.judged_groups(loops, known)
+    assert sorted((g["compared"], g["right"]) for g in groups) == [(3, 3), (4, 0)]
+
+
 @pytest.mark.slow
 def test_growth_is_counted(needs: Callable[[str], str], data_dir: Path, tmp_path: Path) -> None:
     arguments = ["--data", str(data_dir), "--log", "seattle", "--most", "1", "--backend", needs("opencl")]
@@ -97,6 +111,7 @@ def test_the_mount_of_a_scanner_is_found(monkeypatch: pytest.MonkeyPatch) -> Non
     wrong = mount.remounted(truth, np.array(scanner.mount) + off, -off)
     found = mount.fitted(log, wrong, slice(0, 100), (0.02, 0.02, 0.01, 0.0))
     assert np.abs(found - (*off, 0.05)).max() < 2e-3
+    assert mount.heading_of_mount(wrong, truth) == pytest.approx(off[2], abs=1e-4)
     steps = mount.drifts(wrong[100:], truth[100:], 5.0)
     assert (
         mount.drifts(mount.remounted(wrong, np.array(scanner.mount), found[:3])[100:], truth[100:], 5.0)[0]

@@ -22,7 +22,7 @@ def describe() -> BackendInfo:
 
 
 class NumpyBackend(Backend):
-    """Runs the reference kernels on the host."""
+    """The host, on which the reference kernels run."""
 
     def __init__(self, info: BackendInfo | None = None) -> None:
         self.info = describe() if info is None else info

@@ -21,7 +21,7 @@ def check_in_order(queue: cl.CommandQueue, name: str) -> None:
     """Refuse a queue that is not an in-order queue.
 
     Raises:
-        ValueError: its commands may run in another order than they were queued.
+        ValueError: Its commands may run in another order than they were queued.
     """
     if queue.properties & cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE:
         raise ValueError(f"{name}: must be a queue that does commands in their order, got one that does not")
@@ -42,7 +42,7 @@ def part_of(buffer: Buffer, first: int, size: int, alignment: int) -> Buffer:
     """Return ``size`` bytes of a buffer from byte ``first`` on, without a copy.
 
     Raises:
-        ValueError: parts cannot begin at this byte.
+        ValueError: Parts cannot begin at this byte.
     """
     if first == 0 or size == 0:
         return buffer

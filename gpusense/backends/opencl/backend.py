@@ -127,7 +127,7 @@ class OpenCLBackend(ProcessBound, Backend):
         """Refuse a buffer that is larger than the device's largest.
 
         Raises:
-            MemoryError: it is.
+            MemoryError: It is.
         """
         if size > self.info.max_buffer:
             raise MemoryError(
@@ -240,7 +240,7 @@ class OpenCLBackend(ProcessBound, Backend):
             self.synchronize()
 
     def enqueue(self, kernel: cl.Kernel, size: tuple[int, ...], group: tuple[int, ...]) -> None:
-        """Queue a launch of a kernel whose arguments are set."""
+        """Enqueue a launch of a kernel whose arguments are set."""
         # Before, so that an interrupt leaves no launch uncounted; and after, for a thread that waits in between.
         with self._count:
             self._queued += 1
@@ -267,8 +267,8 @@ class OpenCLBackend(ProcessBound, Backend):
         """Build the program of a kernel file; return it with its key in the cache.
 
         Raises:
-            ValueError: the device lacks float64 and the program needs it.
-            RuntimeError: the driver does not compile it.
+            ValueError: The device lacks float64 and the program needs it.
+            RuntimeError: The driver does not compile it.
         """
         if "FLOAT64" in flags and not self.info.float64:
             raise ValueError(f"precision: must be 'float32' on {self.info.name}, which has no float64, got 'float64'")
@@ -291,7 +291,7 @@ class OpenCLBackend(ProcessBound, Backend):
         return program, key
 
     def _kept(self, source: str) -> cl.Program | None:
-        """Return the program as an earlier run compiled it; None where there is none that the driver accepts."""
+        """Return the program as an earlier run compiled it; None if the driver accepts none."""
         binary = None if self._cache is None else self._cache.load(source, self.options)
         if self._cache is None or binary is None:
             return None

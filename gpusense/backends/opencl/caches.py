@@ -1,4 +1,4 @@
-"""pyopencl's caches, which are switched off: a folder that cannot be written, or a damaged file, ends the run.
+"""pyopencl's caches, which are switched off because a read-only folder or a damaged file would end the run.
 
 pyopencl keeps code that sets kernels' arguments in a database, and programs in files, both without checksums. Programs
 are kept by :mod:`gpusense.backends.cache`, and that code is made in a millisecond.

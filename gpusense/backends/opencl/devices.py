@@ -20,10 +20,10 @@ def list_devices() -> list[tuple[BackendInfo, cl.Device]]:
             platforms = drivers.platforms()
         except RuntimeError:
             return []
-        found = []
+        devices = []
         for p, platform in enumerate(platforms):
-            found += [(_describe(f"opencl:{p}:{d}", one), one) for d, one in enumerate(_devices_of(platform))]
-        _listed[:] = found
+            devices += [(_describe(f"opencl:{p}:{d}", one), one) for d, one in enumerate(_devices_of(platform))]
+        _listed[:] = devices
     return list(_listed)
 
 
@@ -96,10 +96,10 @@ def info_of(device: cl.Device) -> BackendInfo:
 
 
 def _lanes(device: cl.Device) -> int:
-    """Return the lanes of kernels that have bodies in vectors.
+    """Return the lanes of kernels that have bodies in lanes.
 
-    PoCL compiles loops in kernels as they are written. Intel's driver makes vectors of neighbouring work-items, but
-    kernels in vectors were up to three times as fast there. Other drivers for processors were not measured.
+    PoCL compiles loops in kernels as they are written. Intel's driver vectorises over neighbouring work-items, but
+    kernels in lanes were up to three times as fast there. Other drivers for processors were not measured.
     """
     known = pocl.is_pocl(device) or device.platform.name.startswith("Intel")
     if not known or not device.type & cl.device_type.CPU:

@@ -3,9 +3,9 @@
 A driver is a library that an ``.icd`` file names. The loader inside pyopencl's wheel reads the system's files
 (``/etc/OpenCL/vendors`` or ``$OCL_ICD_VENDORS``) and the files beside pyopencl, where PoCL's wheel puts its file.
 
-Intel's runtime for processors comes as a wheel too, but its ``.icd`` file names a folder that exists on no user's
-machine. A new ``.icd`` file takes its place, in a folder with the system's. Loading the library by its path would need
-another loader; writing beside pyopencl would change files that another package owns.
+Intel's runtime for processors is also a wheel, but its ``.icd`` file names a folder that exists on no user's machine. A
+new ``.icd`` file replaces it, in a folder with the system's files. Loading the library by its path would need another
+loader; writing beside pyopencl would change files that another package owns.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def _library(file: Path) -> str:
 def _intel(present: list[Driver]) -> Driver | None:
     """Return Intel's runtime where its wheel is installed and no ``.icd`` file names it."""
     if not sys.platform.startswith("linux") or _place().is_file():
-        # A variable that names one driver is obeyed.
+        # A variable that names a single driver takes precedence.
         return None
     if any(re.search(r"libintelocl\.so", driver.library) for driver in present):
         return None

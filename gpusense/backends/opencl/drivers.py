@@ -1,8 +1,8 @@
 """The OpenCL drivers of this machine that the loader loads.
 
-The loader loads all drivers when it is asked for the first time, so a driver that dies at that point ends the process
-whatever device was wanted. Hence a child loads them first, and a driver that it does not survive is left out. While the
-loader loads, a variable names the folder of the drivers' files (see :mod:`gpusense.backends.opencl.driver_files`).
+The loader loads all drivers at its first use, so a driver that crashes there ends the process, whatever device was
+wanted. Therefore a child loads them first, and a driver that kills the child is left out. While the loader loads, a
+variable names the folder of the drivers' files (see :mod:`gpusense.backends.opencl.driver_files`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from gpusense.backends.opencl.driver_files import Driver
 from gpusense.backends.processor import fingerprint
 from gpusense.backends.scratch import scratch_folder
 
-# Asks the loader for all devices. The child runs nothing else, so that it starts in some 20 ms.
+# Asks the loader for all devices. The child runs nothing else, so that it starts in about 20 ms.
 _LOAD = """
 import ctypes, json, sys
 job = json.loads(sys.stdin.readline())
@@ -51,7 +51,7 @@ class Choice:
     Attributes:
         drivers: The drivers, where the loader does not find them by itself; else None.
         left_out: Drivers that end the process, with the reason.
-        failure: Why none can be loaded; empty where some can.
+        failure: Why no driver can be loaded; empty if some can.
     """
 
     drivers: tuple[Driver, ...] | None
@@ -77,7 +77,7 @@ def platforms() -> list[cl.Platform]:
     """Return the platforms of all drivers that can be loaded.
 
     Raises:
-        RuntimeError: no combination of drivers can be loaded.
+        RuntimeError: No combination of drivers can be loaded.
     """
     global _loaded, _pocl_came_first
     with _lock:
@@ -115,7 +115,7 @@ def choice() -> Choice:
 
 
 def renew() -> None:
-    """Load all drivers in a child again, whatever its kept verdict; a process that has loaded drivers keeps them."""
+    """Load all drivers in a child again, ignoring the cached verdict; a process that has loaded drivers keeps them."""
     global _choice
     with _lock:
         chosen = _chosen(anew=True)
@@ -145,7 +145,7 @@ def _chosen(*, anew: bool = False) -> Choice:
 
 
 def _kept(key: str) -> tuple[tuple[tuple[str, str], ...], str] | None:
-    """Return the drivers that are left out and the failure by the kept verdict; None where it is absent or damaged."""
+    """Return the omitted drivers and the failure from the cached verdict; None if it is absent or damaged."""
     payload = load_entry(key)
     if payload is None:
         return None
@@ -169,14 +169,14 @@ def take(job: list[tuple[str, str]] | None) -> None:
 
 
 def _tried(drivers: tuple[Driver, ...], wanted: tuple[Driver, ...] | None) -> tuple[Choice, bool]:
-    """Load all drivers in a child, and where it dies each alone.
+    """Load all drivers in a child and, if it dies, each driver alone.
 
     Returns:
         The choice, and whether it is to be kept.
     """
     together = _try(wanted)
     if not together.failure or not together.conclusive:
-        # A child that was not started, or was killed from outside, is no failure of a driver.
+        # A child that was not started, or was killed from outside, does not indicate a failure of a driver.
         return Choice(wanted), together.conclusive
     alone = [(str(driver.file), outcome) for driver in drivers if (outcome := _try((driver,))).failure]
     left_out = tuple((name, outcome.failure) for name, outcome in alone)
@@ -188,7 +188,7 @@ def _tried(drivers: tuple[Driver, ...], wanted: tuple[Driver, ...] | None) -> tu
 
 
 def _try(drivers: tuple[Driver, ...] | None) -> child.Outcome:
-    """Load drivers in a child; one that cannot be started, or has no folder, is no verdict."""
+    """Load drivers in a child; a child that cannot start, or has no folder, yields no verdict."""
     try:
         variables = _variables(drivers, kernels=False)
     except OSError:
@@ -229,7 +229,7 @@ def _variables(drivers: tuple[Driver, ...] | None, *, kernels: bool = True) -> d
     """Return the variables by which the loader loads these drivers only, and PoCL keeps kernels in scratch.
 
     Raises:
-        OSError: no folder takes files.
+        OSError: No folder takes files.
     """
     variables = {}
     with contextlib.suppress(OSError):
@@ -250,7 +250,7 @@ def _pocl_folder(*, kernels: bool) -> Path:
     """Return the folder for PoCL; where no code may run it takes part in no run, and keeps PoCL out of other folders.
 
     Raises:
-        OSError: no folder takes files.
+        OSError: No folder takes files.
     """
     if kernels:
         with contextlib.suppress(OSError):

@@ -21,11 +21,11 @@ class Enqueuer(Protocol):
     """A queue of launches."""
 
     def enqueue(self, kernel: cl.Kernel, size: tuple[int, ...], group: tuple[int, ...]) -> None:
-        """Queue a launch of a kernel whose arguments are set."""
+        """Enqueue a launch of a kernel whose arguments are set."""
 
 
 class Launch:
-    """A kernel that binds arguments by the signature table and queues its launch."""
+    """A kernel that binds arguments by the signature table and enqueues its launch."""
 
     def __init__(
         self,
@@ -36,7 +36,7 @@ class Launch:
         first: Callable[[], None] | None = None,
     ) -> None:
         self._backend, self._kernel = backend, kernel
-        # Called once, before the kernel is launched for the first time.
+        # Function that is called once, before the kernel's first launch.
         self._first = first
         self._lanes, self._group = (1, row.group)
         if "IN_LANES" in flags:
@@ -90,7 +90,7 @@ class Launch:
         return BoundLaunch(kernel, *self._sizes(size), arguments)
 
     def _before_first(self) -> None:
-        """Call back before the first launch."""
+        """Call the function for the first launch."""
         if self._first is not None:
             self._first()
             self._first = None

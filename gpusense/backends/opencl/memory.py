@@ -25,7 +25,7 @@ class SharedBuffer(cl.SVMAllocation):
     """Memory that host and device share.
 
     Attributes:
-        bytes: It as an array of the host.
+        bytes: The memory as an array of the host.
     """
 
     def __init__(self, context: cl.Context, size: int, settle: Callable[[], None]) -> None:
@@ -47,7 +47,7 @@ class SharedPart(cl.SVM):  # type: ignore[type-arg]
     """A part of memory that host and device share.
 
     Attributes:
-        bytes: It as an array of the host.
+        bytes: The memory as an array of the host.
     """
 
     def __init__(self, whole: SharedBuffer | SharedPart, first: int, size: int) -> None:
@@ -60,7 +60,7 @@ SHARED = (SharedBuffer, SharedPart)
 
 
 def raise_clearly(error: cl.Error) -> NoReturn:
-    """Raise a driver's code as MemoryError, as RuntimeError where the device is gone, or as it is."""
+    """Raise a driver's error as MemoryError, as RuntimeError if the device is lost, or unchanged."""
     if any(code in str(error) for code in _OUT_OF_MEMORY):
         raise MemoryError(f"the OpenCL device is out of memory: {error}") from error
     if any(code in str(error) for code in _LOST):

@@ -2,13 +2,13 @@
 
 PoCL has its library of OpenCL functions compiled for several processors, and takes the best one whose instruction sets
 the machine has. Before version 5 it compiles kernels for the processor that LLVM names instead, and the two need not
-fit: LLVM 14 takes a Zen 4 for a ``znver3``, without the AVX-512 that the library uses, and a Zen 5 for ``generic``,
+fit: LLVM 14 identifies a Zen 4 as ``znver3``, without the AVX-512 that the library uses, and a Zen 5 as ``generic``,
 which names no processor (pocl issue 1049). Vectors are then passed in other registers than the callee expects, and the
 compiler aborts the process. Version 5 compiles kernels for the processor of its library, which always fits. This module
 does the same for older versions.
 
-They have no setting for it: the environment variable POCL_LLVM_CPU_NAME came with version 5 too, options of the build
-are checked against a list, and the name of the device's processor overrules them. So that name is replaced in PoCL's
+These have no setting for it: the environment variable POCL_LLVM_CPU_NAME also came with version 5, build options are
+checked against a list, and the name of the device's processor overrides them. Therefore that name is replaced in PoCL's
 memory.
 """
 

@@ -21,7 +21,7 @@ from gpusense.backends.cache import load_entry, store_entry
 from gpusense.backends.packing import pack, unpack, write_files
 from gpusense.backends.scratch import scratch_folder
 
-# Files that PoCL reads again: programs, and kernels for one size of groups.
+# Files that PoCL reads again: programs, and kernels for a group size.
 _ENDINGS = (".bc", ".so")
 
 
@@ -65,13 +65,13 @@ class PoclKernels:
             for key in changed:
                 names = frozenset(self._files(key))
                 if names - self._saved.get(key, frozenset()):
-                    # The next process compiles kernels anew that cannot be read.
+                    # The next process recompiles kernels that cannot be read.
                     with contextlib.suppress(OSError):
                         store_entry(key, pack({name: (self.folder / name).read_bytes() for name in names}))
                         self._saved[key] = names
 
     def _save_all(self) -> None:
-        """Save the kernels of all programs as the process ends; a forked child saves none."""
+        """Save the kernels of all programs at exit; a forked child saves none."""
         if os.getpid() != self._process:
             return
         self.changed |= self._folders.keys()
@@ -109,7 +109,7 @@ class PoclKernels:
 
 
 def trouble_of_own_folder() -> str:
-    """Return why the folder is not safe that PoCL chooses by itself; empty where it is, or is absent."""
+    """Return why PoCL's default folder is not safe; empty if it is safe or absent."""
     if chosen := os.environ.get("POCL_CACHE_DIR"):
         folder = chosen
     elif base := os.environ.get("XDG_CACHE_HOME"):
@@ -131,7 +131,7 @@ def pocl_kernels() -> PoclKernels:
     """Return the kernels of this process.
 
     Raises:
-        OSError: no folder takes files.
+        OSError: No folder takes files.
     """
     folder = scratch_folder() / "pocl"
     folder.mkdir(exist_ok=True)

@@ -27,7 +27,7 @@ class BoundLaunch:
 
 
 class OpenCLRecording(Recording):
-    """Launches that are queued together; a stream is a queue of the same context."""
+    """Launches that are enqueued together; a stream is a queue of the same context."""
 
     def __init__(self, queue: cl.CommandQueue, launches: list[BoundLaunch], count: Callable[[int], None]) -> None:
         self._queue, self._launches, self._count = queue, launches, count
@@ -40,14 +40,14 @@ class OpenCLRecording(Recording):
         queue = self._queue if stream is None else self._checked(stream)
         # Before and after; see ``OpenCLBackend.enqueue``.
         self._count(len(self._launches))
-        # Launches of two threads must not interleave.
+        # The launches of two threads must not interleave.
         with self._lock:
             if stream is not None and queue not in self._used:
                 self._used.append(queue)
             try:
                 for launch in self._launches:
                     cl.enqueue_nd_range_kernel(queue, launch.kernel, launch.size, launch.group)
-                # Without this a driver may wait for further commands before it begins.
+                # Flush: a driver may otherwise wait for further commands before it begins.
                 queue.flush()
             except cl.Error as error:
                 raise_clearly(error)
@@ -82,8 +82,8 @@ class OpenCLRecording(Recording):
         """Return a user's queue for the stream of a call.
 
         Raises:
-            TypeError: it is no queue, or one of another context or device.
-            ValueError: it is not an in-order queue.
+            TypeError: It is no queue, or one of another context or device.
+            ValueError: It is not an in-order queue.
         """
         same = isinstance(stream, cl.CommandQueue) and (stream.context, stream.device) == (
             self._queue.context,

@@ -35,7 +35,7 @@ class OpenCLSlot(Slot):
             self._copied = None
 
     def _start(self, target: Any, source: Any, **offset: Any) -> None:
-        """Queue a copy, and let the device begin."""
+        """Enqueue a copy, and let the device begin."""
         with driver_errors():
             self._copied = cl.enqueue_copy(self._queue, target, source, is_blocking=False, **offset)
             self._queue.flush()

@@ -36,7 +36,7 @@ def _view(array: Any, device: wp.Device, name: str) -> wp.array:
     """Return an array of any library as Warp's.
 
     Raises:
-        TypeError: its gradients are recorded, or it holds other numbers than Warp takes.
+        TypeError: Its gradients are recorded, or it holds other numbers than Warp takes.
     """
     if isinstance(array, wp.array):
         return array

@@ -33,7 +33,7 @@ from gpusense.interface.signatures import KERNELS, Kernel
 from gpusense.interface.sources import relevant
 
 _MOST_NUMBERS = (1 << 31) - 1
-# Most bytes of a copy that a thread reads through memory which it keeps for each type.
+# Largest copy that a thread reads through its cached memory of each type [bytes].
 _FEW_BYTES = 1 << 10
 
 
@@ -164,7 +164,7 @@ class WarpBackend(ProcessBound, Backend):
             return
         queue = self.batch()
         if queue is not None:
-            # The copy comes after everything that was put off before.
+            # The copy follows all deferred work.
             self._flush(queue)
         from_size, to_size = (wp.types.type_size_in_bytes(array.dtype) for array in (source, target))
         wp.copy(target, source, dest_offset=to // to_size, src_offset=begin // from_size, count=size // from_size)

@@ -1,4 +1,4 @@
-"""CUDA graphs: a call that repeats an earlier one, to the last pointer and number, is one start.
+"""CUDA graphs: a call that repeats an earlier one, with equal pointers and numbers, is a single start.
 
 A graph keeps pointers and numbers, so steps with equal keys use the first one's graph.
 """
@@ -17,14 +17,14 @@ from gpusense.backends.warp.steps import Step, as_graph, one_by_one, start_each
 
 _LOG = logging.getLogger("gpusense")
 
-# Most graphs; most keys of calls that were started once, and of calls that the driver does not capture.
+# Largest numbers of graphs, of keys of calls that were started once, and of calls that the driver does not capture.
 _MOST_GRAPHS, _MOST_SEEN = 256, 512
 # The least recently used graph is evicted after this number of calls without it, in multiples of ``_MOST_GRAPHS``: a
 # capture takes longer than the starts that it replaces.
 _STALE = 16
 # Longer calls take so long that their starts do not matter.
 _MOST_STEPS = 64
-# Captures that fail one after the other until no more are tried.
+# Number of consecutive failures after which no more captures are tried.
 _MOST_FAILURES = 3
 # Reasons for calls without a graph.
 FIRST = "a graph is captured when it is started again"
@@ -32,12 +32,12 @@ SHORT = "a graph would save nothing"
 
 
 class Capture(NamedTuple):
-    """A try to capture steps.
+    """An attempt to capture steps.
 
     Attributes:
         graph: The graph; None where there is none.
         reason: Why there is none.
-        final: Whether the driver refuses these steps, so that another try is of no use.
+        final: Whether the driver refuses these steps, so that another attempt is useless.
     """
 
     graph: Any
@@ -49,7 +49,7 @@ class GraphCache:
     """Graphs of the calls of one device that repeat, and captures for recordings.
 
     Attributes:
-        refusal: Why no graph is captured any more; empty while captures are tried.
+        refusal: Why no more graphs are captured; empty while captures are attempted.
     """
 
     def __init__(self, device: wp.Device) -> None:
@@ -119,7 +119,7 @@ class GraphCache:
         return self._calls - used > _STALE * _MOST_GRAPHS
 
     def _capture(self, steps: list[Step]) -> Capture:
-        """Capture steps where nothing prevents it.
+        """Capture steps if nothing prevents it.
 
         During a capture Warp refuses to let other threads wait for the device, so only a thread that is alone captures.
         Threads that share launches on the processor wait for no device.
@@ -139,7 +139,7 @@ class GraphCache:
         """Return the graph of steps.
 
         Raises:
-            RuntimeError: the driver does not capture them.
+            RuntimeError: The driver does not capture them.
         """
         if self._device.is_cuda and self._stream is None:
             self._stream = wp.Stream(self._device)

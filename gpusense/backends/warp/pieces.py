@@ -19,8 +19,8 @@ from gpusense.interface.signatures import Argument, Kernel
 
 # The axes of a launch that threads may share, and the argument that counts each.
 _SHARED = {"particle": "particles", "block": "blocks"}
-# Particles times beams that are worth a launch, some 0.4 ms of the fastest kernel, and pieces for each thread: a thread
-# that is held up takes fewer.
+# Least particle-beams of a piece, about 0.4 ms of the fastest kernel, and number of pieces for each thread: a delayed
+# thread takes fewer.
 _PIECE_WORK = 1 << 16
 _PIECES = 2
 
@@ -85,14 +85,14 @@ class SharedLaunch:
                 )
 
         started = []
-        # Where the system starts no more threads, the present ones do the work.
+        # If the system starts no more threads, the running threads do the work.
         with contextlib.suppress(RuntimeError):
             for _ in range(min(helpers.threads(), count) - 1):
                 started.append(helpers.pool(os.getpid()).submit(pieces))
         try:
             pieces()
         finally:
-            # No thread may write any more when this returns, not even after an error: further pieces are dropped.
+            # No thread may write after this returns, even after an error: further pieces are dropped.
             with lock:
                 begins = iter(())
             helpers.finish(started)

@@ -1,8 +1,8 @@
 """Launches and copies of a call, which wait in a queue and are started together.
 
-A call of few particles is short: three launches of some 3 us each. Warp takes 5 us to start a launch and 10 us to start
-a copy, and a copy from or to memory that is not page-locked waits besides. So small arrays are copied through
-page-locked memory, and a call that repeats an earlier one is started as a CUDA graph; see :mod:`.graphs`.
+A call of few particles is short: three launches of about 3 us each. Warp takes 5 us to start a launch and 10 us to
+start a copy, and a copy from or to pageable memory also waits. Therefore small arrays are copied through page-locked
+memory, and a call that repeats an earlier one is started as a CUDA graph; see :mod:`.graphs`.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ import warp as wp
 
 from gpusense.backends.warp.steps import Copy, Step
 
-# Page-locked bytes of a call, and the largest array that is copied through them.
+# Page-locked memory of a call, and the largest array that is copied through it [bytes].
 _MEMORY = 16 << 20
 _LARGEST = 256 << 10
-# Bytes between the beginnings of arrays in that memory.
+# Alignment of arrays in that memory [bytes].
 _ALIGNMENT = 256
-# Views of that memory that are kept.
+# Number of views of that memory that are kept.
 _MOST_VIEWS = 1024
 
 
@@ -44,12 +44,12 @@ class CallQueue:
         self._downloads: list[tuple[np.ndarray, np.ndarray]] = []
 
     def begin(self) -> None:
-        """Begin a new call; the device has ended everything."""
+        """Begin a new call; the device must have ended all work."""
         self.settled, self._used = True, 0
         self._downloads.clear()
 
     def upload(self, array: np.ndarray, out: wp.array) -> bool:
-        """Queue a copy to the device, after which the array may change; return whether there is room for it."""
+        """Enqueue a copy to the device, after which the array may change; return whether there is room for it."""
         room = self._room(array)
         if room is None:
             return False
@@ -58,7 +58,7 @@ class CallQueue:
         return True
 
     def download(self, buffer: wp.array, out: np.ndarray) -> bool:
-        """Queue a copy from the device, which ``deliver`` completes; return whether there is room for it."""
+        """Enqueue a copy from the device, which ``deliver`` completes; return whether there is room for it."""
         room = self._room(out)
         if room is None:
             return False
@@ -67,7 +67,7 @@ class CallQueue:
         return True
 
     def deliver(self) -> None:
-        """Fill the arrays of downloads; the device has ended everything."""
+        """Fill the arrays of downloads; the device must have ended all work."""
         self.settled, self._used = True, 0
         for out, source in self._downloads:
             out[...] = source

@@ -79,7 +79,7 @@ class WarpRecording(Recording, Step):
         """Return a stream of any library, or its address, as Warp's.
 
         Raises:
-            TypeError: it is no stream of this device.
+            TypeError: It is no stream of this device.
         """
         if isinstance(stream, wp.Stream):
             return stream

@@ -47,7 +47,7 @@ def _folder() -> Path:
     """Return this process's folder for Warp's kernels, which Warp reads and does not map as code.
 
     Raises:
-        OSError: no folder takes files.
+        OSError: No folder takes files.
     """
     folder = scratch_folder(executable=False) / "warp"
     folder.mkdir(exist_ok=True)
@@ -65,7 +65,7 @@ def trouble() -> str:
 
 @contextlib.contextmanager
 def settings(*, kernels: bool = True) -> Iterator[None]:
-    """Switch off Warp's greeting and progress and set this process's folder of kernels; restore all on leaving."""
+    """Switch off Warp's greeting and progress and set this process's folder of kernels; restore everything on exit."""
     with LOCK:
         changed: dict[str, Any]
         if hasattr(wp.config, "log_level"):

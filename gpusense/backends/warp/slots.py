@@ -38,7 +38,7 @@ class WarpSlot(Slot):
         self._busy = True
 
     def _part_of(self, buffer: wp.array, first: int, size: int) -> wp.array:
-        """Return some bytes of a buffer that has more bytes than a Warp array may have elements."""
+        """Return some bytes of a buffer whose size in bytes exceeds the elements of a Warp array."""
         return wp.array(ptr=buffer.ptr + first, dtype=wp.uint8, shape=(size,), device=self._device)
 
 

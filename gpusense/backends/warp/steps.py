@@ -15,8 +15,8 @@ class Step(ABC):
 
     Attributes:
         key: The work and its memory: steps of equal keys are the same.
-        launches: Launches in it.
-        copies: Copies in it.
+        launches: Number of launches in it.
+        copies: Number of copies in it.
         reports: Whether it reports how the call with it is started.
     """
 

@@ -33,7 +33,7 @@ SHARING = 0.1
 """Effective sample size of the tempered posterior, as a share of the particles."""
 _HALVINGS = 60
 MOST_FACTOR = 1e6
-"""Largest factor of log-likelihoods that makes weights as sharp as the exact ones."""
+"""Largest factor of log-likelihoods that is tried to make weights as sharp as the exact ones."""
 
 # Particles per piece when the host scores ranges.
 _PIECE = 256
@@ -44,7 +44,7 @@ class UnstableError(ValueError):
 
 
 def truth_device() -> Backend:
-    """Open the fastest device with float64, NumPy if there is no other; simulators are excluded."""
+    """Open the fastest device with float64, or else NumPy; simulators are excluded."""
     best, rank = get_backend("numpy"), len(SPEED_CLASSES)
     for device in devices():
         place = SPEED_CLASSES.index((device.backend, device.kind)) if device.kind != "simulator" else rank
@@ -200,7 +200,7 @@ def fine_errors(truth: Truth, problem: str, log_p: NDArray[np.floating], tempera
         truth: The exact results.
         problem: ``"beam"`` or ``"field"``.
         log_p: The candidate's log-likelihoods of the poses of ``truth.fine(problem)``.
-        temperature: As of :func:`errors`.
+        temperature: See :func:`errors`.
 
     Raises:
         UnstableError: a value is not finite, or the array has the wrong shape.
@@ -265,7 +265,7 @@ def posterior_errors(computed: Floats, right: Floats, poses: Floats) -> dict[str
     mean_p, mean_q = mean_pose(poses, p), mean_pose(poses, q)
     turn = math.remainder(mean_q[2] - mean_p[2], 2 * math.pi)
     return {
-        # The divergence is never negative; rounding of its terms may make the sum so.
+        # The divergence is never negative, but rounding may make the sum negative.
         "kl": max(float(np.sum(p * (log_p - log_q))), 0.0),
         "tv": float(0.5 * np.sum(np.abs(p - q))),
         "shift_m": math.hypot(mean_q[0] - mean_p[0], mean_q[1] - mean_p[1]),
@@ -280,7 +280,7 @@ def _log_sum(values: Floats) -> float:
 
 def mean_pose(poses: Floats, weights: Floats) -> tuple[float, float, float]:
     """Return the weighted mean of x and y, and the weighted circular mean of the headings [m, m, rad]."""
-    # Relative to the first particle: far from the origin a sum would lose digits.
+    # Positions are relative to the first particle, since a sum far from the origin would lose digits.
     x, y = poses[0, :2] + weights @ (poses[:, :2] - poses[0, :2])
     theta = math.atan2(float(weights @ np.sin(poses[:, 2])), float(weights @ np.cos(poses[:, 2])))
     return float(x), float(y), theta

@@ -43,7 +43,7 @@ class Candidate:
         value: The knob's value; None without a knob.
         exact: Whether it computes the exact ranges or the model itself, up to rounding.
         precision: Precision of an outside candidate, for the report.
-        outside: Version and threads of an outside candidate; empty for this package's.
+        outside: Version and threads of an outside candidate; empty for this package's candidates.
         missing: Reason why it cannot run here; such a candidate is listed and not measured.
         temperature: Factor that makes its log-likelihoods comparable with those of all beams: n for every n-th beam.
         code: The Python expression that makes it, for readers of the report.

@@ -1,8 +1,8 @@
-"""Choose the method for an error or a time that one can afford: the fastest exact enough, or the most exact in time.
+"""Choose the method for an affordable error or time: the fastest within the error, or the most exact within the time.
 
-A method is judged over all scenes and clouds of a report at once: by its largest error, and by the geometric mean of
-its times. Methods within ``ALIKE`` of the fastest count as equally fast, so that noise does not decide; of these the
-most exact one is chosen.
+A method is judged over all scenes and clouds of a report together, by its largest error and the geometric mean of its
+times. Methods within ``ALIKE`` of the fastest count as equally fast, so that noise does not decide; the most exact of
+them is chosen.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ ROUNDING = 1e-6
 
 @dataclass(frozen=True)
 class Measure:
-    """A kind of error that a method is chosen by.
+    """A kind of error by which a method is chosen.
 
     Attributes:
         kind, name: Place of the error in a point.
-        unit: Its unit.
+        unit: Unit of the error.
         text: Description.
     """
 
@@ -43,9 +43,9 @@ WRONG = Measure("ranges", "wrong_1", "%", "share of rays wrong by more than one 
 CELLS = Measure("ranges", "p95", "cells", "95th percentile of the range error")
 LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 MEASURES = {"ranges": {"%": WRONG, "cells": CELLS}, "beam": {"nats": KL, "m": SHIFT}, "field": {"nats": KL, "m": SHIFT}}
-"""By problem and unit, the measure that a limit is about; the first is the default."""
+"""By problem and unit, the measure to which a limit applies; the first one is the default."""
 DEFAULTS = {"ranges": ("%", 0.01), "beam": ("nats", 0.01), "field": ("nats", 0.01)}
-"""By problem, the unit and the largest error where none is given."""
+"""By problem, the unit and the largest error if no limit is passed."""
 _QUANTITY = re.compile(r"\s*([0-9.]+(?:[eE][-+]?[0-9]+)?)\s*([a-z%]+)\s*")
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 
@@ -61,7 +61,7 @@ class Entry:
         precision: Precision.
         error: Largest error over scenes and clouds, in the unit of its measure (shares as shares, lengths in metres).
         seconds: Geometric mean of the times of a call [s].
-        code: How it is called.
+        code: Code that makes it.
         exact: Whether it computes the model itself.
     """
 
@@ -175,7 +175,7 @@ def entries(
 
 
 def front(listed: Sequence[Entry]) -> list[Entry]:
-    """Return the entries that no other one beats in error and time, by rising error; errors of rounding are equal."""
+    """Return the entries that no entry beats in error and time, by rising error; errors of rounding are equal."""
     places = [(entry.error if entry.error > ROUNDING else 0.0, entry.seconds) for entry in listed]
     return [listed[i] for i in pareto_front(places)]
 
@@ -192,7 +192,7 @@ def choose(listed: Sequence[Entry], error: float | None, seconds: float | None) 
         seconds: The longest time [s]; None without a limit.
 
     Returns:
-        The entry; None where none is within the limits.
+        The entry; None if no entry is within the limits.
     """
     able = [
         entry
@@ -229,7 +229,7 @@ def time_text(seconds: float) -> str:
 
 
 def answers(points: Sequence[Mapping[str, Any]], wish: Wish) -> list[str]:
-    """Write the lines that say which method to take, for each problem and device of a report.
+    """Write lines that name the method to take, for each problem and device of a report.
 
     Args:
         points: Points of a report.

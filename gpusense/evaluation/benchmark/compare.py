@@ -32,8 +32,8 @@ class Comparison:
         less_exact: Points with an error that grew, and points that no longer work.
         untimed: Number of points whose times are not comparable: another device or number of particles.
         compared: Number of points in both reports.
-        gone: Number of points that only the old report has.
-        others: Scenes of one name whose map, scan or particles differ; their points are not compared.
+        gone: Number of points that are only in the old report.
+        others: Scenes with one name but different maps, scans or particles; their points are not compared.
     """
 
     slower: list[str] = field(default_factory=list)
@@ -78,7 +78,7 @@ def _compare_times(result: Comparison, old: Mapping[str, Any], new: Mapping[str,
     before, now = time_of(old, "call"), time_of(new, "call")
     if before is None or now is None:
         return
-    # On a shared machine one of the two may grow by chance.
+    # On a shared machine either of the two may grow by chance.
     medians = old["time"].get("call_median_s"), new["time"].get("call_median_s")
     growths = [now / before, medians[1] / medians[0] if all(medians) else now / before]
     line = f"{name_of(new)}: {before * 1e3:.4g} ms, now {now * 1e3:.4g} ms ({now / before:.2f} times)"

@@ -16,7 +16,7 @@ HALF = (0.3, 0.3, 0.15)
 """Half widths of the first grid [m, m, rad]."""
 SIDE = 13
 """Poses along each axis."""
-# The grid is fine enough where each deviation is at least this many spacings; it spans this many deviations each way.
+# The grid is fine enough if each deviation is at least this many spacings; it spans this many deviations on each side.
 _FINE, _SPAN = 1.0, 5.0
 _ROUNDS = 10
 

@@ -52,7 +52,7 @@ class Meter(Proxy):
 
     @property
     def live(self) -> int:
-        """Return the bytes of the buffers that are alive."""
+        """Return the number of bytes of all live buffers."""
         # A buffer that only this list holds is free; drivers' buffers do not support weak references.
         kept = [i for i in range(len(self._held)) if sys.getrefcount(self._held[i]) > _ALONE]
         self._held, self._bytes = [self._held[i] for i in kept], [self._bytes[i] for i in kept]
@@ -139,7 +139,8 @@ class Cost:
     Attributes:
         first_s: Making the runner and its first call, compiling included.
         build_s: Time that a second runner, with compiled kernels, takes before its steady state: building the map's
-            tables. Where the first took more than ``SLOW_TO_MAKE`` there is no second, and compiling is included.
+            tables. If the first took more than ``slow_to_make`` of ``measure`` there is no second one, and compiling is
+            included.
         compile_s: First time minus second time: compiling, or loading kernels from a cache on disk. Kernels that this
             process compiled before add nothing. None without a second runner.
         call_min_s, call_q1_s, call_median_s, call_q3_s: A call with NumPy arrays in and out: least time and quartiles.
@@ -180,6 +181,7 @@ def measure(
     poses: np.ndarray,
     repeats: int,
     seconds: float = float("inf"),
+    slow_to_make: float | None = None,
 ) -> tuple[Cost, Runner]:
     """Measure a candidate, and return its runner with built tables.
 
@@ -189,7 +191,9 @@ def measure(
         poses: (N, 3) particles of a call.
         repeats: Most timed calls.
         seconds: Longest time of the timed calls, of which there are at least three [s].
+        slow_to_make: Duration of a first call above which no second runner is made [s]; None: ``SLOW_TO_MAKE``.
     """
+    limit = SLOW_TO_MAKE if slow_to_make is None else slow_to_make
     meter = None if backend is None else Meter(backend)
     begin = time.perf_counter()
     runner, built = _prepared(make, meter, poses)
@@ -205,7 +209,7 @@ def measure(
         meter.launches.clear()
     table = getattr(runner, "table_bytes", None)
     compiling = None
-    if quick and first - min(calls) < SLOW_TO_MAKE:
+    if quick and first - min(calls) < limit:
         # Free the first runner's memory before the second one is made.
         del runner, meter
         begin = time.perf_counter()
@@ -225,7 +229,7 @@ def measure(
 
 
 def quartiles(name: str, seconds: Sequence[float]) -> dict[str, float]:
-    """Return the least of some times and their quartiles, by the names of a :class:`Cost`."""
+    """Return the least and the quartiles of times, by the names of a :class:`Cost`."""
     q1, median, q3 = (float(value) for value in np.quantile(seconds, (0.25, 0.5, 0.75)))
     return {f"{name}_min_s": min(seconds), f"{name}_q1_s": q1, f"{name}_median_s": median, f"{name}_q3_s": q3}
 

@@ -63,8 +63,8 @@ def performance_profile(times: Mapping[Any, Sequence[float | None]]) -> dict[Any
 def profiles_of(points: Sequence[Mapping[str, Any]], timing: str = "call") -> list[dict[str, Any]]:
     """Compute the profiles of a report, one per problem and kind of device; times are not compared across hardware.
 
-    A solver is a method with a fixed knob on one backend in one precision. Of a method's knobs the profile shows the
-    one that solves most problems; of several, the one with the least geometric mean of its ratios to the fastest.
+    A solver is a method with a fixed knob on one backend in one precision. A method's profile has the knob that solves
+    most problems; among several of these, the knob with the least geometric mean of its ratios to the fastest solver.
 
     Args:
         points: Points of a report.

@@ -37,8 +37,8 @@ class Case:
 
     Attributes:
         name: Names of map and cloud.
-        seconds: As of ``Row``.
-        errors: By the text of the measure; only those that are about this cloud.
+        seconds: See :class:`Row`.
+        errors: By the text of the measure; only measures of this cloud.
     """
 
     name: str
@@ -51,21 +51,21 @@ class Row:
     """A method on a device, in one map or in all.
 
     Attributes:
-        need: Its need, a value of ``NEEDS``.
+        need: Need that it serves, a value of ``NEEDS``.
         device: Title of the device.
-        scene: Name of the map; ``ALL`` for the worst error and the mean time of all.
+        scene: Name of the map; ``ALL`` for the worst error and the mean time over all maps.
         method, setting, precision, code: As in the reports.
         seconds: Time of a call, a step or a match: on a processor its CPU time over all cores, on a GPU the least
             elapsed time.
         quartiles: Quartiles of the elapsed times [s]; geometric means over the maps.
         errors: By the text of the measure.
-        units: Their units.
+        units: Units of the errors.
         exact: Whether it computes the model itself.
         outside: Version and threads of another implementation; empty for gpusense.
         work: Rays or readings of a call; 1 for tasks.
-        maps: "8 of 10 clouds" where others were left out, for the time that a table takes; no choice falls on it.
-        cases: Each scene by itself, of a row of all maps.
-        origin: The command that measured it, with date and commit.
+        maps: "8 of 10 clouds" if some were left out because of the time that a table takes; such a row is never chosen.
+        cases: For a row of all maps, each scene by itself.
+        origin: Command that measured it, with date and commit.
     """
 
     need: str
@@ -107,7 +107,7 @@ def title_of(point: Mapping[str, Any], machine: Mapping[str, Any], driver: str =
     Args:
         point: The point.
         machine: The machine of its report.
-        driver: The device's driver, which tells OpenCL runtimes apart.
+        driver: The device's driver, which distinguishes OpenCL runtimes.
         target: The processor for which PoCL compiles; ``"haswell"`` has no AVX-512.
     """
     library = {"opencl": "OpenCL", "warp:cuda": "CUDA", "warp:cpu": "Warp"}
@@ -125,14 +125,14 @@ def title_of(point: Mapping[str, Any], machine: Mapping[str, Any], driver: str =
 def titles_of(
     points: Iterable[Mapping[str, Any]], machine: Mapping[str, Any], devices: Iterable[Mapping[str, Any]] = ()
 ) -> dict[str, str]:
-    """Return a title for each device of some points, by its selection string; of equal titles, each names its device.
+    """Return a title for each device of some points, by selection string; equal titles are extended by device names.
 
     Other implementations, whose selection string is ``"outside"``, have the title of the first processor.
 
     Args:
         points: The points of a report.
-        machine: Its machine.
-        devices: Its devices, whose drivers and targets tell the OpenCL runtimes of one processor apart.
+        machine: Machine of the report.
+        devices: Devices of the report, whose drivers and targets distinguish the OpenCL runtimes of one processor.
     """
     drivers = {device["selection"]: (device["driver"], device.get("target", "")) for device in devices}
     first: dict[str, Mapping[str, Any]] = {}
@@ -196,7 +196,7 @@ def model_rows(report: Mapping[str, Any]) -> list[Row]:
 
 
 def _measured(need: str, point: Mapping[str, Any]) -> dict[str, float]:
-    """Return the errors of a point by their texts, those that are about its cloud."""
+    """Return the errors of a point that concern its cloud, by their texts."""
     places = {text: place for place, cloud, text, _ in MODEL_MEASURES[need] if cloud in ("", point["cloud"])}
     known = {text: error_of(point, *place) for text, place in places.items()}
     return {text: error for text, error in known.items() if error is not None}

@@ -28,7 +28,7 @@ NUMPY_SHARE = 8
 
 
 class LeftOutError(ValueError):
-    """Raised by a candidate that cannot be measured in a scene, such as for the time that its table would take."""
+    """Raised by a candidate that cannot be measured in a scene, for example because its table would take too long."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,7 @@ class Plan:
         seed: Seed of all random numbers.
         build_limit: Longest time to build a table [s]; a point above it is left out.
         deadline: Measuring time, without compiling, after which no further point begins [s].
+        slow_to_make: Duration of a first call above which building includes compiling [s]; None: see ``measure``.
     """
 
     sources: Sequence[MapSource]
@@ -62,6 +63,7 @@ class Plan:
     seconds: float = float("inf")
     build_limit: float = 60.0
     deadline: float = float("inf")
+    slow_to_make: float | None = None
 
     def particles_on(self, backend: Backend | None) -> int:
         """Return N of a timed call on a device; None stands for an outside candidate."""
@@ -191,7 +193,7 @@ def point_of(plan: Plan, job: Job, truth: Truth, cloud: str, reason: str = "") -
     try:
         cost, runner = measure(
             lambda device: candidate.make(scene, device, job.precision), backend, scene.clouds[cloud][:particles],
-            plan.repeats, plan.seconds,
+            plan.repeats, plan.seconds, plan.slow_to_make,
         )  # fmt: skip
         point |= _split(cost)
         point["errors"] = _errors(truth, candidate, runner, fine=cloud == FINE_CLOUD)

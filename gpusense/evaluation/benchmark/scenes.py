@@ -172,7 +172,7 @@ def make_scene(source: MapSource, device: Backend, *, beams: int, particles: int
     key = zlib.crc32(source.name.encode())
     rng = {name: np.random.default_rng([seed, key, i]) for i, name in enumerate(names)}
     pose, expected = _true_pose(source.name, grid, scanner, device, rng["pose"])
-    # Rounded to a tenth of a millimetre, so that the readings are equal on every device that casts them.
+    # Readings are rounded to a tenth of a millimetre, so that they are equal on every device that casts them.
     readings = np.round(sample_readings(expected, RANGE_MAX, BeamParameters(), rng["scan"]), 4)
     clouds = {
         "global": cloud_uniform(grid, particles, rng["global"]),
@@ -199,7 +199,7 @@ def _true_pose(
     caster = RayCaster(grid, scanner.range_max, backend=device, precision=precision)
     expected = np.minimum(caster.cast(poses, scanner.bearings).astype(np.float64), scanner.range_max)
     seen = np.count_nonzero(expected < scanner.range_max, axis=1)
-    # The first pose with enough hits: the one with most hits would always be in the smallest room.
+    # Take the first pose with enough hits, since the pose with most hits would always be in the smallest room.
     chosen = int(np.argmax(seen >= min(2 * scanner.count / 3, seen.max())))
     return poses[chosen], expected[chosen]
 

@@ -47,7 +47,7 @@ def _check_arguments(where: str, arguments: Mapping[str, Any]) -> None:
     """Check the numbers that are defaults of the next run; None means the default of the device.
 
     Raises:
-        ValueError: one is something else, or out of its bounds.
+        ValueError: a value is no number, or out of its bounds.
     """
     for name in _ARGUMENTS:
         value = arguments.get(name)
@@ -78,7 +78,7 @@ def _check_numbers(where: str, point: Mapping[str, Any]) -> None:
     """Check the times and errors of a point, each a number or None.
 
     Raises:
-        ValueError: one is something else, or a time is not above 0.
+        ValueError: a value is neither a number nor None, or a time is not above 0.
     """
     for name in _TIMES if point["time"] else ():
         _check_number(f"{where}.time.{name}", point["time"].get(name), above=0)

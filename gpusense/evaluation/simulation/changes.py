@@ -1,4 +1,4 @@
-"""Change a world after its map was made: walls and furniture that moved, went, came, or are of glass."""
+"""Change a world after its map was made: walls and furniture are moved, removed, added, or become glass."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gpusense.world.grid import OccupancyGrid
 
 Bools = NDArray[np.bool]
 Rng = np.random.Generator
-# Side of the pieces of walls that move, and by how far they move [m].
+# Side of the pieces of walls that move, and the least and largest distance of their move [m].
 _PIECE, _NEAREST, _FARTHEST = 1.0, 0.5, 2.0
 _ATTEMPTS = 8
 # Half sides of new furniture [m].
@@ -30,7 +30,7 @@ def change_world(
     keep: ArrayLike = (),
     clearance: float = 0.35,
 ) -> OccupancyGrid:
-    """Return the world some time after its map was made.
+    """Return the world at a later time than its map.
 
     Walls and furniture are cut into pieces of 1 m. The shares are of the surface: the occupied cells beside a free
     one.
@@ -42,13 +42,13 @@ def change_world(
         removed: Share of the surface whose pieces disappear, from 0 to 1.
         added: Surface of new boxes and round objects on free cells, as a share of the map's, at least 0.
         keep: (T, 2) or (T, 3) positions around which nothing new may stand [m].
-        clearance: How far from them [m].
+        clearance: Distance from these positions that stays free [m].
 
     Returns:
         A grid of the same geometry, whose cells are 0, 100 or unchanged.
 
     Raises:
-        TypeError, ValueError: an argument is not of the kind described, or breaks its rule.
+        TypeError, ValueError: an argument has the wrong type or breaks its rule.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -79,7 +79,7 @@ def change_world(
 
 
 def make_glass(grid: OccupancyGrid, share: float, rng: Rng) -> Bools:
-    """Return the (H, W) occupied cells through which beams pass: pieces of walls with this share of the surface."""
+    """Choose the (H, W) occupied cells through which beams pass: pieces of walls with this share of the surface."""
     glass, surface, taken = np.zeros(grid.shape, bool), surface_of(grid), 0
     wanted = round(checks.real("glass", share, low=0, high=1) * np.count_nonzero(surface))
     for rows, cols in pieces_of(grid, surface, rng):
@@ -91,7 +91,7 @@ def make_glass(grid: OccupancyGrid, share: float, rng: Rng) -> Bools:
 
 
 def surface_of(grid: OccupancyGrid) -> Bools:
-    """Return the (H, W) occupied cells that have a free one beside them."""
+    """Return the (H, W) occupied cells with a free neighbour."""
     free = np.pad(grid.free, 1)
     near = free[:-2, 1:-1] | free[2:, 1:-1] | free[1:-1, :-2] | free[1:-1, 2:]
     surface: Bools = grid.occupied & near
@@ -131,7 +131,7 @@ def _allowed(grid: OccupancyGrid, keep: ArrayLike, clearance: float) -> Bools:
 def _move(
     cells: NDArray[np.int8], allowed: Bools, piece: tuple[NDArray[np.intp], NDArray[np.intp]], side: float, rng: Rng
 ) -> None:
-    """Draw a piece elsewhere, where at least half of it falls on cells that are allowed; nowhere if that fails."""
+    """Draw a piece elsewhere with at least half of it on allowed cells, or nowhere if that fails."""
     for _ in range(_ATTEMPTS):
         length, angle = rng.uniform(_NEAREST, _FARTHEST) / side, rng.uniform(0, math.tau)
         rows = piece[0] + round(length * math.sin(angle))
@@ -145,7 +145,7 @@ def _move(
 
 
 def _furnish(cells: NDArray[np.int8], allowed: Bools, side: float, wanted: int, rng: Rng) -> None:
-    """Draw boxes and discs on allowed cells until they have this many surface cells."""
+    """Draw boxes and discs on allowed cells until they have ``wanted`` surface cells."""
     rows, cols = np.nonzero(allowed)
     for _ in range(100 * wanted):
         if wanted <= 0 or len(rows) == 0:
@@ -162,7 +162,7 @@ def _furnish(cells: NDArray[np.int8], allowed: Bools, side: float, wanted: int, 
 def _shape(
     shape: tuple[int, ...], centre: tuple[int, int], half: NDArray[np.float64], angle: float | None
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return rows and columns of a rotated box, or of a disc where the angle is None; none where it leaves the grid."""
+    """Return rows and columns of a rotated box, or of a disc if the angle is None; none if it leaves the grid."""
     reach = math.ceil(math.hypot(*half))
     v, u = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     if angle is None:

@@ -1,4 +1,4 @@
-"""People near a robot: bodies and legs that walk, and hide what lies behind them."""
+"""People near a robot: walking bodies and legs that hide the background."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ Floats = NDArray[np.float64]
 Rng = np.random.Generator
 # Radii of bodies, and of legs; distance of a leg from the person's middle [m].
 BODY, LEG, STANCE = 0.22, 0.07, 0.13
-# Speeds up to [m/s]; nearest and farthest a person begins; nearer or farther ones leave [m].
+# Largest speed [m/s]; least and largest distance at which a person appears, and beyond which it leaves [m].
 _SPEED, _BEGIN, _FAR, _TOO_NEAR, _TOO_FAR = 1.2, 0.8, 5.0, 0.45, 8.0
-# Room that a person needs from a wall [m]; mean time that a person stays [s]; most people.
+# Distance that a person keeps from walls [m]; mean time that a person stays [s]; most people.
 _ROOM, _STAY, _MOST = 0.3, 20.0, 64
 
 
@@ -33,8 +33,8 @@ class Crowd:
     """People who appear, walk and leave.
 
     Args:
-        people: How many there are at any time, at most.
-        hidden: Share of the beams that further people hide on average.
+        people: Most people at any time.
+        hidden: Share of the beams that additional people hide on average.
         is_free: Whether people can stand at (P, 2) places in the world.
         period: Time between two scans [s].
         rng: Random generator.
@@ -48,7 +48,7 @@ class Crowd:
         self._present: list[_Person] = []
 
     def leave(self) -> None:
-        """Remove all people: the robot is elsewhere."""
+        """Remove all people, since the robot was carried elsewhere."""
         self._present = []
 
     def discs(self) -> Floats:
@@ -66,7 +66,7 @@ class Crowd:
         return np.array(discs).reshape(-1, 3)
 
     def ranges(self, laser: Floats, bearings: Floats, expected: Floats) -> tuple[Floats, NDArray[np.bool]]:
-        """Let time pass until a scan; return its ranges with the people, and which beams they hide.
+        """Advance to the next scan; return its ranges with the people, and the beams that they hide.
 
         Args:
             laser: (3,) pose of the laser.
@@ -106,7 +106,7 @@ class Crowd:
         self._present = stay
 
     def _come(self, laser: Floats, axes: Floats, expected: Floats) -> None:
-        """Add a person whom the laser can see, unless there is no room on the beam that is drawn."""
+        """Add a person in view of the laser, unless there is no room on the drawn beam."""
         rng = self._rng
         k = int(rng.integers(len(axes)))
         farthest = min(float(expected[k]) - _ROOM, _FAR)
@@ -118,7 +118,7 @@ class Crowd:
             self._present.append(_Person(x, y, heading, speed, bool(legs), phase))
 
     def _shortened(self, laser: Floats, bearings: Floats, expected: Floats) -> Floats:
-        """Return the nearer of the expected range and of all discs on the rays of each beam."""
+        """Return the least of the expected range and the ranges to all discs, over the rays of each beam."""
         discs = self.discs()
         if not len(discs):
             return expected.copy()

@@ -25,14 +25,14 @@ def write_run(run: SimulatedRun, path: str | os.PathLike[str], kind: str | None 
     Args:
         run: The run.
         path: The log.
-        kind: ``"carmen"``, compressed where the name ends in ``.gz``, whose poses are the true ones; they are those of
-            the laser, as the format has no mount. ``"ros1"``, a bag of ROS 1 whose name ends in ``.bag``; ``"ros2"``,
-            the folder of a bag of ROS 2, which must not exist: both have the mount, and no true poses. None takes
-            ``"ros1"`` where the name ends in ``.bag``, and else ``"carmen"``.
+        kind: ``"carmen"``, compressed if the name ends in ``.gz``, with true poses of the laser, since the format has
+            no mount. ``"ros1"``, a bag of ROS 1 whose name ends in ``.bag``, or ``"ros2"``, the folder of a bag of ROS
+            2, which must not exist: both have the mount, but no true poses. None takes ``"ros1"`` if the name ends in
+            ``.bag``, and else ``"carmen"``.
 
     Raises:
-        TypeError, ValueError: an argument is not of the kind described, or the format cannot hold the scans.
-        ImportError: a bag, and the library rosbags is absent.
+        TypeError, ValueError: an argument has the wrong type, or the format cannot hold the scans.
+        ImportError: the library rosbags is absent, and the log is a bag.
         OSError: the log cannot be written.
 
     Example:
@@ -58,7 +58,7 @@ def kind_of(path: Path) -> str:
     """Return the format of a log by its name.
 
     Raises:
-        ValueError: the name is that of a file within a bag of ROS 2.
+        ValueError: the name belongs to a file within a bag of ROS 2.
     """
     suffix = path.suffix.lower()
     if suffix in (".db3", ".mcap"):
@@ -73,7 +73,7 @@ def records_of(run: SimulatedRun, *, of_laser: bool = False) -> Iterator[Scan]:
 
     Args:
         run: The run.
-        of_laser: Whether poses and odometry are those of the laser, and the scanner has no mount.
+        of_laser: Whether poses and odometry refer to the laser, so that the scanner has no mount.
     """
     scanner, poses, odometry = run.scanner, run.poses, run.odometry
     if of_laser and any(scanner.mount):

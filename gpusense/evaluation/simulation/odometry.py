@@ -19,14 +19,14 @@ def draw_odometry(
 ) -> Floats:
     """Return the odometer's poses along true poses; the first one is 0.
 
-    Noise has the model's deviations at the true motion. The model's systematic errors are those of the odometer, so
-    that the model corrects them.
+    Noise has the model's deviations at the true motion. The odometer has the model's systematic errors, which the model
+    corrects.
 
     Args:
         poses: (T, 3) true poses.
         motion: The noise.
         rng: Random generator.
-        jumps: (T,) whether the robot was carried to a pose; its odometer shows no motion then.
+        jumps: (T,) whether the robot was carried to a pose, without motion of its odometer.
     """
     odometry = np.zeros_like(poses)
     systematic = motion.systematic if isinstance(motion, OdometryMotion) else (0.0, 0.0, 0.0)

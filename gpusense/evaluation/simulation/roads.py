@@ -12,7 +12,7 @@ from gpusense.world.grid import OccupancyGrid
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool]
 Rng = np.random.Generator
-# Nodes of a lattice are as far apart [m]; a larger map is cut to a window of this half side around the start [m].
+# Distance between nodes of the lattice [m]; half side of the window around the start to which a larger map is cut [m].
 _SPACING, _HALF_WINDOW, _MOST_NODES = 0.1, 30.0, 300_000
 
 
@@ -23,7 +23,7 @@ class Roads:
         grid: The map, whose frame the paths are in.
         free: (H, W) cells where the robot may be.
         clearance: Least distance of a path from every other cell, and from the grid's edge [m].
-        rng: Random generator; it chooses the part by the number of its nodes.
+        rng: Random generator, which chooses a part with probability proportional to the number of its nodes.
 
     Raises:
         ValueError: No two neighbouring nodes have this clearance.
@@ -86,7 +86,7 @@ class Roads:
         return np.concatenate(parts)
 
     def _straightened(self, cells: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Return the corners of a path after each has moved as far along as it can be seen from the one before."""
+        """Shorten a path: each corner moves along to the last point in sight of the previous corner."""
         kept, last = [0], len(cells) - 1
         while kept[-1] < last:
             one = kept[-1]
@@ -105,7 +105,7 @@ class Roads:
 
 
 def _graph_of(chosen: Bools, nodes: NDArray[np.intp]) -> object:
-    """Return the sparse matrix of distances between nodes that are neighbours, also diagonally."""
+    """Return the sparse matrix of distances between neighbouring nodes, diagonals included."""
     from scipy.sparse import csr_matrix
 
     flat = np.full(chosen.size, -1)

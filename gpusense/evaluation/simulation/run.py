@@ -1,4 +1,4 @@
-"""Simulate a robot that drives through a world, and what its laser and its odometer report."""
+"""Simulate a robot that drives through a world, with the readings of its laser and its odometer."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ _RAYS = 1 << 20
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRun:
-    """A run of a robot: what it reports, and the truth.
+    """A run of a robot: readings and truth.
 
     Attributes:
         grid: The map that the robot has.
-        world: The world as it is, without people.
+        world: The true world, without people.
         scanner: The geometry of the laser.
         times: (T,) times of the scans [s].
         poses: (T, 3) true poses of the robot [m, m, rad].
@@ -51,7 +51,7 @@ class SimulatedRun:
         expected: (T, K) ranges in the world with its people, before noise [m]; ``range_max`` where nothing is nearer.
         hidden: (T, K) whether a person hides what lies behind.
         kidnapped: (T,) whether the robot was carried to this pose.
-        people: T arrays (P, 3) of the discs that people are: x, y and radius [m].
+        people: T arrays (P, 3) of people as discs: x, y and radius [m].
     """
 
     grid: OccupancyGrid
@@ -96,38 +96,38 @@ def simulate_run(
     """Simulate a robot that drives between random places of a world.
 
     The robot keeps to cells that are free in the map and in the world. It turns on the spot at the corners of its path.
-    A beam that meets nothing within ``range_max`` gives no return, but for the shares of short and random readings;
+    A beam that meets nothing within ``range_max`` gives no return, apart from the shares of short and random readings;
     all other readings are drawn from the beam model around the range to the nearest wall or person.
 
     Args:
         grid: The map that the robot has.
         scanner: The geometry of its laser, mount and cones included.
-        scans: Number of scans T, at least 1; None for 200 or, with ``path``, for all of its poses; a number takes its
-            first poses.
-        world: The world as it is; None for the map with the changes below. A world that is another building makes
-            ``grid`` a wrong map; the path is then planned in the world alone.
-        path: (T, 3) true poses of the robot in place of a planned path [m, m, rad].
+        scans: Number of scans T, at least 1; None for 200 or, with ``path``, for all of its poses. With ``path`` a
+            number takes its first poses.
+        world: The true world; None for the map with the changes below. With a different building as world, ``grid`` is
+            a wrong map, and the path is planned in the world alone.
+        path: (T, 3) true poses of the robot instead of a planned path [m, m, rad].
         parameters: Mixture of the readings.
         motion: Noise of the odometry.
-        people: How many people walk near the robot.
-        hidden: Share of the beams that further people hide, about, from 0 to 0.9.
-        moved: Share of the walls that have moved, as in :func:`change_world`.
-        removed: Share of the walls that have gone.
+        people: Number of people who walk near the robot.
+        hidden: Approximate share of the beams that additional people hide, from 0 to 0.9.
+        moved: Share of the walls that are moved, as in :func:`change_world`.
+        removed: Share of the walls that are removed.
         added: New furniture, as a share of the walls.
         glass: Share of the world's walls through which beams pass, from 0 to 1.
-        kidnaps: How often the robot is carried to another place, without odometry.
+        kidnaps: Number of times that the robot is carried to another place, without odometry.
         step: Distance between two scans [m], > 0.
         turn: Largest turn between two scans [rad], > 0.
         period: Time between two scans [s], > 0.
         clearance: Least distance of the robot from walls on a planned path [m].
-        seed: Seed of the random numbers: the same arguments give the same run on every device.
+        seed: Seed of the random numbers; equal arguments give equal runs on every device.
         backend: Device that casts the beams; see ``gpusense.devices()``.
 
     Returns:
         The run.
 
     Raises:
-        TypeError, ValueError: an argument is not of the kind described, or breaks its rule.
+        TypeError, ValueError: an argument has the wrong type or breaks its rule.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -146,7 +146,7 @@ def simulate_run(
     room = checks.real("clearance", clearance, low=0)
     rates = checks.real("step", step, above=0), checks.real("turn", turn, above=0)
     _check_kinds(grid, scanner, world, parameters, motion)
-    # Each part has a separate random stream: people do not change the odometry.
+    # Each part has a separate random stream, so that people do not change the odometry.
     streams = np.random.SeedSequence(checks.integer("seed", seed, low=0)).spawn(6)
     changing, driving, slipping, walking, reading, glazing = (np.random.default_rng(one) for one in streams)
     true = world
@@ -196,7 +196,7 @@ def _planned(
     rates: tuple[float, float],
     rng: Rng,
 ) -> tuple[Floats, Bools]:
-    """Return true poses along planned paths, and which of them the robot was carried to."""
+    """Return true poses along planned paths, and whether the robot was carried to each."""
     roads = Roads(world, world.free & grid.free if same else world.free, clearance, rng)
     when = np.zeros(count, bool)
     when[rng.choice(np.arange(1, count), jumps, replace=False)] = True
@@ -213,7 +213,7 @@ def _planned(
 
 
 def _given(path: Floats, jumps: int) -> tuple[Floats, Bools]:
-    """Return the poses of a path; the robot is not carried along it."""
+    """Return the poses of a path without kidnaps."""
     if not len(path):
         raise ValueError("path: must hold at least one pose, got shape (0, 3)")
     if jumps:
@@ -222,7 +222,7 @@ def _given(path: Floats, jumps: int) -> tuple[Floats, Bools]:
 
 
 def _standing(world: OccupancyGrid) -> Callable[[Floats], Bools]:
-    """Return a function that says whether people can stand at (P, 2) places: a free cell of the world."""
+    """Return a function that tells whether people can stand at (P, 2) places, in free cells of the world."""
     free = world.free
 
     def is_free(places: Floats) -> Bools:
@@ -234,7 +234,7 @@ def _standing(world: OccupancyGrid) -> Callable[[Floats], Bools]:
 
 
 def _without_glass(world: OccupancyGrid, share: float, rng: Rng) -> OccupancyGrid:
-    """Return the world as beams meet it."""
+    """Return the world that beams see, without glass."""
     if checks.real("glass", share, low=0, high=1) == 0:
         return world
     cells = np.array(world.cells)
@@ -243,7 +243,7 @@ def _without_glass(world: OccupancyGrid, share: float, rng: Rng) -> OccupancyGri
 
 
 def _cast(world: OccupancyGrid, scanner: Scanner, poses: Floats, backend: Selection) -> Floats:
-    """Return the (T, K) ranges to walls: float32, whose bits are the same on every device."""
+    """Return the (T, K) ranges to walls in float32, with equal bits on every device."""
     model = BeamModel(world, scanner, BeamParameters(), backend=backend, precision="float32")
     each = max(_RAYS // max(scanner.ray_bearings.size, 1), 1)
     parts = [np.asarray(model.expected_ranges(poses[i : i + each])) for i in range(0, len(poses), each)]
@@ -255,7 +255,7 @@ def _cast(world: OccupancyGrid, scanner: Scanner, poses: Floats, backend: Select
 def _with_people(
     walls: Floats, scanner: Scanner, poses: Floats, kidnapped: Bools, crowd: Crowd
 ) -> tuple[Floats, Bools, list[Floats]]:
-    """Return ranges to the nearer of walls and people, the beams that people hide, and the discs they are."""
+    """Return ranges to the nearest wall or person, the beams that people hide, and the people's discs."""
     expected, hidden, discs = walls.copy(), np.zeros(walls.shape, bool), []
     lasers = compose_poses(poses, scanner.mount)
     for t, laser in enumerate(lasers):
@@ -267,7 +267,7 @@ def _with_people(
 
 
 def _readings(expected: Floats, range_max: float, parameters: BeamParameters, rng: Rng) -> Floats:
-    """Draw readings; where nothing is within range, a hit is no return."""
+    """Draw readings; if nothing is within range, a hit becomes "no return"."""
     p = parameters
     nothing = p.replace(z_hit=0.0, z_max=p.z_hit + p.z_max)
     flat = expected.ravel()

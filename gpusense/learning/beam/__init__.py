@@ -2,5 +2,5 @@
 
 ``fit`` and ``incidence`` hold the public functions, with the ``options`` that they share. ``pairs`` classifies the
 readings, ``device_sums`` sums over them on a device, ``problem`` computes the log-likelihood and its derivatives from
-the sums. ``em``, ``book`` and ``searches`` maximise it; ``uncertainty``, ``report`` and ``result`` describe the result.
+the sums. ``em``, ``textbook`` and ``searches`` maximise it; ``blocks``, ``report`` and ``result`` describe the result.
 """

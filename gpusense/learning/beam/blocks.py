@@ -27,7 +27,7 @@ from gpusense.learning.point.densities import by_shape, truncated
 from gpusense.world.range_causes import ShortDensity
 from gpusense.world.scanner import Reading
 
-# Readings whose gradients are computed at once.
+# Number of readings whose gradients are computed at once.
 _PART = 1 << 18
 
 
@@ -70,7 +70,7 @@ def block_scatter(problem: Problem, point: Point) -> Floats:
 
 
 def block_gradients(problem: Problem, point: Point) -> tuple[Floats, NDArray[np.intp]]:
-    """Return the gradient, a row for each block's log-likelihood, and the (B,) numbers of readings."""
+    """Return the gradients of the blocks' log-likelihoods, one per row, and the (B,) numbers of readings."""
     pairs = problem.pairs
     assert pairs.block is not None
     size = int(pairs.block.max(initial=-1)) + 1

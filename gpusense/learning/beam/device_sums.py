@@ -19,7 +19,7 @@ from gpusense.models.scan.mixture import learning_terms
 
 # Length of a row of sums, without and with second derivatives; see kernels/opencl/learning.cl.
 _SUMS = {False: 13, True: 39}
-# Most blocks per pass, fewest pairs per block, and most pairs in one buffer.
+# Largest number of blocks per pass, smallest number of pairs per block, and largest number of pairs in one buffer.
 _BLOCKS = {"cpu": 4096, "gpu": 32768}
 _SHORTEST = 16
 _CHUNK = 1 << 26
@@ -55,7 +55,7 @@ class _Chunk:
 
 
 class DeviceSums:
-    """Pairs on a device and sums over them.
+    """Pairs on a device, and sums over them.
 
     Args:
         backend: The device.

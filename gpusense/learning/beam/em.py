@@ -3,8 +3,8 @@
 The book's M-step (table 6.2, lines 14 and 15) ignores that p_hit is truncated to [0, range_max] and p_short to [0, z*].
 It does not maximise the likelihood, which may fall. The exact M-step solves, for the responsibilities r,
 
-    sum r W u^2 = sum r (1 - T)         sigma_hit: weighted squares are as large as those of a truncated hit
-    lambda sum r z = sum r (1 - v)      lambda_short: lengths are as large as a truncated exponential's
+    sum r W u^2 = sum r (1 - T)         sigma_hit: weighted squares are as large as for a truncated hit
+    lambda sum r z = sum r (1 - v)      lambda_short: lengths are as large as for a truncated exponential
 
 (W, T, v: see ``gpusense.reference.learning``). W is 1 for a normal. For Student's t it is the expected inverse variance
 of a reading that is normal with a random variance, the weight of its EM (Lange, Little and Taylor 1989). The logarithms
@@ -32,7 +32,7 @@ _LONGEST = 2.0
 # Newton steps begin once an EM step gains less than _LITTLE nats, or after _MANY EM steps.
 _LITTLE, _MANY = 0.5, 20
 _HALVINGS = 30
-# Iterations without progress after which the search ends: at a kink, where z* + b is clamped, there is none.
+# Iterations without progress after which the search ends, as at a kink where z* + b is clamped.
 _STILL = 8
 # Remaining gain [nats] below which a Newton step is accepted despite rounding.
 _NEAR = 1e-4
@@ -61,7 +61,7 @@ def climb_em(problem: Problem, start: Point, *, max_iterations: int, tolerance: 
     """Climb until the remaining gain, estimated from the information matrix, is at most ``tolerance`` nats."""
     value = problem.value(start)
     trace = [value.objective]
-    # EM leaves the shape of hits as it is: Newton steps alone, as long as they gain.
+    # EM does not move the shape of hits: take Newton steps alone, as long as they gain.
     has_form = bool(start.shape.limits)
     newton, gains, still = has_form, False, 0
     for iteration in range(1, max_iterations + 1):
@@ -105,7 +105,7 @@ def _shaped(problem: Problem, point: Point, weights: Floats, step: Floats) -> Po
 
 
 def m_step(problem: Problem, value: Value) -> Floats:
-    """Compute the M-step of sigma, rate and offset; a shape whose cause accounts for no reading stays."""
+    """Compute the M-step of sigma, rate and offset; a shape whose cause accounts for no reading does not move."""
     sums, point, prior = value.sums, value.point, problem.prior
     free = problem.free(value)
     step = np.zeros(FORM + len(point.shape.limits))

@@ -71,11 +71,11 @@ def fit_beam_parameters(
             evolution, finished by gradients.
         range_min: Readings below ``range_min`` are missing [m].
         initial: Start of the search; None chooses the best of several from the readings. A cause of weight 0 stays
-            out; shapes beyond their bounds are clamped. The status says if a start from the readings is better.
+            excluded; shapes beyond their bounds are clamped. The status says if a start from the readings is better.
         backend: The device, see :func:`gpusense.devices`.
         precision: ``"float64"`` or ``"float32"``; None is float64 if the device has it.
-        max_iterations: Most iterations of the method; None is 500 for ``"em"``, 60 for ``"em-book"``, 1000 for the
-            rest.
+        max_iterations: Largest number of iterations of the method; None is 500 for ``"em"``, 60 for ``"em-book"``, 1000
+            for the rest.
         tolerance: The method has converged once it expects to gain less than ``tolerance`` [nats].
         restarts: Number of additional random starts; the best result is returned.
         seed: Seed of the random starts and of ``"genetic"``.
@@ -89,8 +89,8 @@ def fit_beam_parameters(
         blocks: Integer label of each reading's block, of the same shape, or None. Readings of different blocks are
             independent; readings of one block (a scan, or several neighbouring scans) need not be. Standard errors are
             then computed over blocks.
-        sigma_bounds: Smallest and largest sigma_hit [m]. None is from the step that readings are rounded to, divided by
-            sqrt(12), or else 1e-6 range_max, to range_max.
+        sigma_bounds: Smallest and largest sigma_hit [m]. None is from the rounding step of the readings over sqrt(12),
+            or without one from 1e-6 range_max, to range_max.
         lambda_bounds: Smallest and largest lambda_short [1/m]. None is 1e-3 / range_max to 1e4 / range_max.
         progress: Whether to show a progress bar on standard error if that is a terminal.
         callback: Function called after each iteration with its number, the log-likelihood and the parameters.
@@ -152,7 +152,7 @@ def fit_pairs(
         device: Sums over the pairs.
         pairs: The readings.
         bounds: Bounds of the shapes.
-        start: The first start; its causes of weight 0 stay out.
+        start: The first start; its causes of weight 0 stay excluded.
         options: Options of the fit.
         prior: Pseudo-readings.
         chosen: Whether the user chose the start, so that no other replaces it.

@@ -1,9 +1,9 @@
 """Fit the growth of the deviation with range, together with all other parameters and the shape of hits.
 
-A correct range has the scale ``sigma_hit + sigma_growth z*``. The device's sums have one deviation, so
-that this search computes every pair's log p and gradient on the host in NumPy, in float64: Newton steps within bounds
-from the normal fit without growth, with shares of its deviation turned into growth, and with the starts of the shape.
-No step lowers the likelihood.
+A correct range has the scale ``sigma_hit + sigma_growth z*``. The device's sums have a single deviation, so this search
+computes the log p and gradient of every pair on the host in float64: Newton steps within bounds from the normal fit
+without growth, with shares of its deviation turned into growth, and with the starts of the shape. No step lowers the
+likelihood.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from gpusense.world.parameters import BeamParameters
 from gpusense.world.range_causes import NoReturn, RandomDensity, ShortDensity
 from gpusense.world.scanner import Reading
 
-# Shares of the deviation at the mean expected range that starts turn into growth; iterations of a search.
+# Shares of the deviation at the mean expected range that become growth in the starts; iterations of a search.
 _SHARES, _ITERATIONS = (0.02, 0.3, 0.7, 0.95), 200
-# Readings from which on a table of masses is faster than the formula.
+# Number of readings above which a table of masses is faster than the formula.
 _MANY = 2000
 _TOP, _RAND, _SHORT, _SIGMA, _GROWTH, _RATE, _BIAS = range(7)
 
@@ -213,7 +213,7 @@ def fit_jointly(
 
 
 def _offset(problem: _Growing, end: Climb, tolerance: float, blocks: NDArray[np.int64] | None) -> tuple[float, float]:
-    """Return the offset that a fit with it would have, and its standard error; NaN if its search did not converge."""
+    """Return the offset from a fit that includes it, and its standard error; NaN if the search did not converge."""
     joint = replace(problem, fit_bias=True)
     best = climb(joint, np.insert(end.theta, _BIAS, 0.0), _ITERATIONS, tolerance)
     if not best.converged:

@@ -29,7 +29,7 @@ from gpusense.world.parameters import BeamParameters, IncidenceParameters
 from gpusense.world.scanner import Reading
 
 _MOST_BINS = 1000
-# Bound of the rounding error of a float32 pi / 2.
+# Bound on the rounding error of a float32 pi / 2.
 _ROUNDING = 1e-6
 
 
@@ -68,7 +68,7 @@ class IncidenceFit:
 
     @property
     def converged(self) -> bool:
-        """Tell whether every fit converged."""
+        """Whether every fit converged."""
         return self.pooled.converged and all(fit.converged for fit in self._all_fits)
 
     @property
@@ -160,7 +160,7 @@ def fit_incidence_parameters(
     incidence, where readings are few; bins of equal count would merge them into one.
 
     Beams that hit no surface have separate parameters, fitted with the same prior. Their expected reading is "no
-    return"; counted in a bin, it would make walls look often missed.
+    return"; counted in a bin, it would mimic walls that are often missed.
 
     Args:
         ranges: Readings z of any shape [m].
@@ -168,14 +168,15 @@ def fit_incidence_parameters(
         incidence: Angles of incidence of the same shape, in [0, pi / 2] [rad]; NaN for a beam that hits no surface.
         range_max: Readings of at least ``range_max`` are "no return" [m].
         bins: Number of bins of equal width, or (B + 1,) edges, rising from 0 to pi / 2 [rad].
-        strength: Pseudo-readings per bin, >= 0; 0 fits every bin by itself. With 0, and without a reading of a beam
+        strength: Pseudo-readings per bin, >= 0; 0 fits every bin independently. With 0, and without a reading of a beam
             that hits no surface, such beams keep the first bin's parameters.
-        method: See :func:`fit_beam_parameters`, as for all following arguments; not ``"em-book"``, which has no prior.
+        method: Method of :func:`fit_beam_parameters`, which describes all following arguments; not ``"em-book"``, which
+            has no prior.
         range_min: Readings below ``range_min`` are missing [m].
         initial: Start of the pooled fit.
         backend: The device.
         precision: ``"float64"`` or ``"float32"``; None is float64 if the device has it.
-        max_iterations: Most iterations of each fit.
+        max_iterations: Largest number of iterations of each fit.
         tolerance: Expected gain below which a fit has converged [nats].
         restarts: Number of additional random starts of each fit.
         seed: Seed of the random starts.

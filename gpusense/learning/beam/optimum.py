@@ -1,9 +1,9 @@
-"""Search for the highest maximum: the best of several starts, and causes that a search left out too early.
+"""Search for the highest maximum: try several starts, and causes that a search dropped too early.
 
 A search may end at a maximum that is not the highest, or drive the weight of a cause to 0, from where no small step
 leads back. Three checks follow each search that begins at a start of our choice:
 
-- A start that was not used, but whose likelihood exceeds the search's end, begins another search.
+- An unused start whose likelihood exceeds the end of the search begins another search.
 - A cause of weight 0 is given the weight of a hundredth of a reading, with each shape of a coarse list. If it then
   accounts for more than this, the likelihood rises with its weight (it is concave in the weight), and the search
   continues with this cause: the condition of optimality of Lindsay (1983) for the components of a mixture.
@@ -26,9 +26,9 @@ from gpusense.learning.beam.starts import choose_starts
 
 # Gain [nats] below which two ends count as the same maximum.
 _SAME = 1e-3
-# Most continued searches.
+# Largest number of continued searches.
 _MOST = 4
-# Shapes per cause that are tried, and weights.
+# Number of shapes per cause, and of weights, that are tried.
 _SHAPES, _WEIGHTS = 9, (1e-4, 1e-3, 1e-2, 0.1, 0.3)
 
 Method = Callable[[Problem, Point, Watch], Climb]
@@ -53,7 +53,7 @@ class Search:
 
         Args:
             start: A start; starts of the same causes are chosen from the readings.
-            more: Further starts, each of which is climbed from.
+            more: Further starts, each followed to its maximum.
             known: Another start, which may lack some of these causes, or None.
         """
         values = [self.problem.value(point) for point in (start, known) if point is not None] + self._others(start)
@@ -128,7 +128,7 @@ class Search:
 
 
 def _shapes(problem: Problem, cause: int) -> list[float | None]:
-    """Return a coarse list of shapes of a cause between their bounds; [None] for a cause without a shape."""
+    """Return a coarse list of shapes of a cause within their bounds; [None] for a cause without a shape."""
     if cause not in (HIT, SHORT):
         return [None]
     low, high = problem.bounds.sigma if cause == HIT else problem.bounds.rate

@@ -114,13 +114,13 @@ def _bounds(name: str, value: tuple[float, float] | None, default: tuple[float, 
 
 
 def start_of(initial: BeamParameters, pairs: Pairs, bounds: Bounds, hit: str) -> Point:
-    """Make the start of a search with normal hits from a user's parameters, without causes that no reading can have.
+    """Make the start of a search with normal hits from a user's parameters, without causes that no reading admits.
 
     Args:
         initial: The parameters.
         pairs: The readings.
         bounds: Bounds of the shapes.
-        hit: Name of the shape of hits that is fitted in the end.
+        hit: Name of the shape of hits that is finally fitted.
 
     Raises:
         ValueError: The remaining causes do not explain the readings, sigma_hit grows with range, or the shape of

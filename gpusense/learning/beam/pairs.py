@@ -12,7 +12,7 @@ from gpusense._util import checks
 from gpusense.world.plausible import look_at_readings
 from gpusense.world.scanner import Reading, classes
 
-# Most readings used to estimate the step that a sensor rounds to.
+# Largest number of readings for estimating a sensor's rounding step.
 _SAMPLE = 20_000
 
 
@@ -26,7 +26,7 @@ class Pairs:
         places: (M,) indices of the hits among all readings.
         kinds: (n,) class of every reading.
         range_max: Longest range [m].
-        quantum: Step that readings are multiples of; 0 if there is none [m].
+        quantum: Rounding step of the readings; 0 without one [m].
         block: (n,) number of each reading's block, or None.
     """
 
@@ -105,9 +105,9 @@ def make_pairs(ranges: ArrayLike, expected: ArrayLike, range_max: float, range_m
 
 
 def quantum_of(reading: NDArray[np.floating]) -> float:
-    """Estimate the step that readings are multiples of; 0 if there is none.
+    """Estimate the rounding step of readings; 0 without one.
 
-    There is a step if readings repeat and all gaps between different readings are whole multiples of the smallest gap.
+    A step exists if readings repeat and all gaps between different readings are integer multiples of the smallest gap.
     Gaps of a few units in the last place of the readings' precision do not count.
     """
     sample = reading[:: max(1, len(reading) // _SAMPLE)]

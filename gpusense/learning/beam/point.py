@@ -2,7 +2,7 @@
 
 Coordinates are (log z_hit, log z_short, log z_max, log z_rand, log sigma_hit, log lambda_short, range_bias). Weights
 are renormalised after every step. Therefore the logarithm of the largest weight stays fixed, and the other weights move
-relative to it. The coordinates of the shape of hits follow, where it has some.
+relative to it. The coordinates of the shape of hits follow, if any.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 HIT, SHORT, MAX, RAND, SIGMA, RATE, BIAS, FORM = range(8)
 NAMES = ("z_hit", "z_short", "z_max", "z_rand", "sigma_hit", "lambda_short", "range_bias")
 
-# Most readings used for a first guess.
+# Largest number of readings for a first guess.
 _SAMPLE = 100_000
 
 

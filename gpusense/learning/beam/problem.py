@@ -1,7 +1,7 @@
 """The log-likelihood of a set of parameters and its derivatives, with the pseudo-readings of a prior.
 
-By Fisher's identity the derivatives of the log-likelihood are those of EM's expected log-likelihood of readings *and*
-causes, at the same parameters. By Louis's identity its second derivatives follow from products of the same terms. One
+By Fisher's identity the log-likelihood has the same derivatives as EM's expected log-likelihood of readings *and*
+causes at the same parameters. By Louis's identity its second derivatives follow from products of the same terms. One
 pass over the pairs therefore suffices for EM, for a search by gradients and for Newton's method. With n readings, w the
 weights, R the sums of responsibilities, y the terms of the gradient for one pair, and c the cause of a shape:
 
@@ -40,7 +40,7 @@ def _levels() -> tuple[Floats, Floats]:
     return share.ravel() / share.sum(), level.ravel()
 
 
-# Shares of pseudo-hits, and levels of their distances: ``HitShape.quantile``; the farthest distance in scales.
+# Shares of pseudo-hits, and levels of their distances (see ``HitShape.quantile``); the farthest distance in scales.
 _LEVELS = _levels()
 _FARTHEST = 1e150
 # Step of differences by log sigma, and by the offset in units of sigma.
@@ -54,8 +54,8 @@ class Prior:
     """Pseudo-readings of each cause, with shapes for hits and short readings.
 
     For the weights this is a Dirichlet density. For hits it is the density of ``counts[0]`` readings distributed by
-    their shape around the offset, for lambda_short that of ``counts[1]`` short readings of mean length 1 / rate; the
-    truncated densities' normalisers count as 1.
+    their shape around the offset; for lambda_short, of ``counts[1]`` short readings with mean length 1 / rate.
+    Normalisers of truncated densities count as 1.
 
     Attributes:
         counts: (4,) pseudo-readings of each cause.
@@ -109,7 +109,7 @@ class Prior:
         return float(pull @ u) - 1, float(pull.sum()) / point.sigma
 
     def _curves(self, point: Point) -> tuple[float, float, float]:
-        """Return its second derivatives: by log sigma, by log sigma and the offset, by the offset."""
+        """Return the second derivatives of that mean: by log sigma, by log sigma and the offset, by the offset."""
         if isinstance(point.shape, NormalHit):
             off = (point.bias - self.bias) / point.sigma**2
             return -2 * self._square(point), 2 * off, -1 / point.sigma**2
@@ -196,7 +196,7 @@ class Problem:
         return self._with_shape(value) if second and point.shape.limits else value
 
     def _value(self, point: Point, second: bool) -> Value:
-        """Evaluate a point, without derivatives by the shape of hits: 0 stands in their places."""
+        """Evaluate a point, with 0 for the derivatives by the shape of hits."""
         sums = self.device.sums(point, information=second)
         top = float(point.weights[MAX])
         log_likelihood = float(sums[0])
@@ -211,7 +211,7 @@ class Problem:
         return Value(point, log_likelihood, objective, totals, gradient, sums, hessian)
 
     def _with_shape(self, value: Value) -> Value:
-        """Return the value with derivatives by the coordinate of the shape, from a parabola through three of them."""
+        """Return the value with derivatives by the coordinate of the shape, from a parabola through three points."""
         point = value.point
         (low, high), at, step = point.shape.limits[0], point.shape.coordinates[0], self._form_step(point)
         middle = min(max(at, low + step), high - step)
@@ -251,7 +251,7 @@ class Problem:
         products += np.triu(products, 1).T
         hessian = np.zeros((7, 7))
         hessian[np.ix_(_PLACES, _PLACES)] = -products
-        # Max readings and pseudo-readings have one possible cause each: they add only n w - n w w'.
+        # Max readings and pseudo-readings each have a single possible cause: they add only n w - n w w'.
         hessian[HIT, HIT] += sums[1]
         hessian[SHORT, SHORT] += sums[2]
         hessian[RAND, RAND] += sums[3]
@@ -273,8 +273,8 @@ class Problem:
     def free(self, value: Value) -> NDArray[np.bool_]:
         """Return the mask of coordinates that may move at a point.
 
-        A weight of 0 stays 0. The largest weight follows from the others. A shape stays at a bound if the gradient
-        points across the bound. The shape of a cause that accounts for no reading also stays.
+        A weight of 0 stays 0. The largest weight follows from the other weights. A shape stays at a bound if the
+        gradient points across the bound. The shape of a cause that accounts for no reading also stays.
         """
         point, bounds = value.point, self.bounds
         free = np.append(point.weights > 0, [True, True, self.fit_bias])
@@ -298,10 +298,10 @@ class Problem:
         return bool(value.totals[HIT] > NOTHING and not held)
 
 
-# Coordinates of the shape of hits below this are small, and steps of differences by them as shares of larger ones, in
-# float32 and float64.
+# Coordinates of the shape of hits below this count as this; steps of differences by larger coordinates as shares of
+# them, in float32 and float64.
 SMALL_FORM, _FORM_STEPS = 0.05, (0.05, 1e-3)
 # A shape within this relative distance of a bound is at the bound.
 _AT = 1e-9
-# A cause that accounts for fewer readings than this does not occur.
+# A cause that accounts for fewer readings than this counts as absent.
 NOTHING = 1e-2

@@ -20,7 +20,7 @@ from gpusense.learning.beam.result import BeamFit
 from gpusense.learning.information import errors_of
 from gpusense.world.scanner import Reading
 
-# Most iterations of the search for an offset that was not fitted.
+# Largest number of iterations of the search for an offset that was not fitted.
 _JOINT = 500
 # Relative step of numerical derivatives by a coordinate of the shape of hits.
 _STEP = 1e-5

@@ -11,9 +11,9 @@ from gpusense.learning.beam.em import Climb, Watch, newton_direction, without_ne
 from gpusense.learning.beam.point import BIAS, RAND, Floats, Point
 from gpusense.learning.beam.problem import Problem, Value
 
-# Bound of a log weight relative to the reference weight: a weight is within e^-25 and e^25 times the reference.
+# Bound on a log weight relative to the reference: weights are between e^-25 and e^25 times the reference weight.
 _WIDEST = 25.0
-# Most rotations of the directions of a stuck hill climb.
+# Largest number of rotations of the directions of a stuck hill climb.
 _TURNS = 5
 
 
@@ -21,7 +21,7 @@ class _Coordinates:
     """The free coordinates of a search as a vector.
 
     They are the logarithms of the weights, log sigma_hit, log lambda_short and the bias / range_max. The weight that is
-    largest at the start, the reference, follows from the normalisation. Causes of weight 0 at the start stay out.
+    largest at the start, the reference, follows from the normalisation. Causes of weight 0 at the start stay excluded.
     """
 
     def __init__(self, problem: Problem, start: Point) -> None:
@@ -135,8 +135,8 @@ def climb_hill(problem: Problem, start: Point, *, max_iterations: int, tolerance
     """Run Powell's method (1964), without derivatives and within bounds, restarted until it gains nothing.
 
     Its line searches make progress in the long, narrow valleys of this likelihood, in which a simplex (Nelder and Mead)
-    collapses; it also accepts bounds. The first directions are the coordinates. If no direction gains but the
-    derivatives show that the end is no optimum, it restarts along randomly rotated directions.
+    collapses; it also accepts bounds. The first directions are the coordinates. If no direction gains but derivatives
+    show that the end is not an optimum, it restarts along randomly rotated directions.
     """
     from scipy.optimize import minimize
 

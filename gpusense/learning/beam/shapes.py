@@ -25,7 +25,7 @@ from gpusense.learning.beam.result import BeamFit
 from gpusense.world.hit_shapes import SHAPES, HitName, shape_of
 from gpusense.world.parameters import BeamParameters
 
-# Readings that choose between the starts, and the gain [nats] below which they have done so.
+# Number of readings for choosing between starts, and the gain [nats] below which the choice is made.
 _SAMPLE, _ROUGHLY = 20_000, 1e-2
 
 
@@ -49,7 +49,7 @@ def fit_shape(
         options: Options of the fit.
         hit: Name of the shape.
         first: Start of the fit.
-        initial: The user's parameters, or None; their shape, where it is this one, is a start as well.
+        initial: The user's parameters, or None; if their shape is this one, it is also a start.
     """
     kind = SHAPES[hit]
     if not pairs.hits or not pairs.expected.any():
@@ -84,7 +84,7 @@ def without_ranges(fit: BeamFit, hit: HitName, growth: bool = False) -> BeamFit:
 
 
 def _sampled(problem: Problem) -> Problem:
-    """Return the problem of some of the readings where there are many."""
+    """Return the problem of a sample of the readings if they are many."""
     pairs = problem.pairs
     every = len(pairs.kinds) // _SAMPLE
     if every < 2:
@@ -94,7 +94,7 @@ def _sampled(problem: Problem) -> Problem:
 
 
 def _climb(problem: Problem, start: Point, options: Options) -> Climb:
-    """Search from a start until it is known which one ends highest."""
+    """Search from a start, as far as needed to rank the starts."""
     tolerance = max(options.tolerance, _ROUGHLY)
     return climb_em(
         problem, start, max_iterations=options.max_iterations, tolerance=tolerance, watch=lambda iteration, value: None

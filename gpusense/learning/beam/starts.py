@@ -26,7 +26,7 @@ from gpusense.learning.beam.pairs import Pairs
 from gpusense.learning.beam.point import HIT, MAX, RAND, SHORT, Bounds, Floats, Point
 from gpusense.world.range_causes import RandomDensity, ShortDensity
 
-# Readings in the sample, steps of each short run, and most starts that are returned.
+# Readings in the sample, steps of each short run, and largest number of returned starts.
 _SAMPLE, _STEPS, _MOST = 1000, 20, 4
 # Shares of correct readings that starts assume.
 _SHARES = (1.0, 0.5, 0.2, 0.05)
@@ -52,7 +52,7 @@ class Sample:
 
     @classmethod
     def of(cls, pairs: Pairs) -> Sample:
-        """Draw hits at random, so that no regular order of beams matters; the seed is fixed."""
+        """Draw hits at random with a fixed seed, so that a regular order of beams has no effect."""
         chosen = np.arange(pairs.hits)
         if pairs.hits > _SAMPLE:
             chosen = np.random.default_rng(0).choice(pairs.hits, _SAMPLE, replace=False)
@@ -152,7 +152,7 @@ def short_runs(
 
 
 def _next_rate(parts: Floats, z: Floats, expected: Floats, rate: Floats, bounds: Bounds) -> Floats:
-    """Return lambda_short for which the lengths of short readings are as large as the truncated exponentials' means.
+    """Return lambda_short at which the mean length of short readings equals the mean of the truncated exponentials.
 
     Args:
         parts: (m, C) responsibilities of short readings.
@@ -180,7 +180,7 @@ def _log_components(sample: Sample, z: Floats, expected: Floats, sigma: Floats, 
 
 
 def _different(one: Point, other: Point) -> bool:
-    """Return whether two points are so far apart that they may lead to different maxima."""
+    """Return whether two points are far enough apart to lead to different maxima."""
     ratios = math.log(one.sigma / other.sigma), math.log(one.rate / other.rate)
     shapes = max(map(abs, ratios)) > math.log(_FACTOR)
     moved = abs(one.bias - other.bias) > min(one.sigma, other.sigma)

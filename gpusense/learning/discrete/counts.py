@@ -14,7 +14,7 @@ from gpusense.learning.discrete.readings import MOST_BINS, bins_of, check_pairs
 
 Floats = NDArray[np.float64]
 
-# Readings that are counted at once.
+# Number of readings that are counted at once.
 _BLOCK = 1 << 20
 
 

@@ -21,8 +21,8 @@ NAMES = ("lambda_short", "lambda_rand", "p_detect", "sigma_hit")
 # Steps of first and second central differences of the mean log-likelihood, which balance rounding and truncation
 # errors.
 _FIRST, _SECOND = 1e-5, 1e-3
-# Largest gradient of the mean log-likelihood that counts as 0: it moves a parameter by less than a hundredth of the
-# standard error of ten million readings.
+# Largest gradient of the mean log-likelihood that counts as 0: it moves a parameter by less than a hundredth of its
+# standard error with ten million readings.
 _FLAT = 2e-6
 # Number of steps of the coarse search that precedes a search with many steps.
 _FEW = 100
@@ -58,7 +58,7 @@ def learn_causes(
 
 
 def _block_counts(data: Counts, ranges: object, expected: object, range_max: float, blocks: object) -> Floats:
-    """Return (3, E) block, index of the cell among the counts, and number of readings, of all that occur.
+    """Return the (3, E) block, index of the cell among the counts, and number of readings of all cells that occur.
 
     Raises:
         TypeError: The labels are not integers.
@@ -142,8 +142,8 @@ def _fit(data: Counts, value: float, theta: Floats, trace: list[float], labels: 
     errors = independent = _standard_errors(data, theta, ~(at_low | at_high))
     blocks = 0 if labels is None else int(labels[0].max()) + 1
     if labels is not None:
-        found = _block_errors(data, theta, ~(at_low | at_high), labels)
-        errors = {name: found[name] if math.isfinite(independent[name]) else math.nan for name in NAMES}
+        over_blocks = _block_errors(data, theta, ~(at_low | at_high), labels)
+        errors = {name: over_blocks[name] if math.isfinite(independent[name]) else math.nan for name in NAMES}
     status = "the gradient vanishes" if converged else "the search ended before the gradient vanished"
     ends = [name for name, end in zip(NAMES, at_low | at_high, strict=True) if end]
     unknown = [name for name, error in errors.items() if math.isnan(error) and name not in ends]
@@ -234,7 +234,7 @@ def _information(data: Counts, theta: Floats, places: NDArray[np.intp]) -> Float
 
 
 def _errors(information: Floats) -> Floats:
-    """Return (m,) standard errors from the (m, m) information; NaN where a flat direction has a part.
+    """Return (m,) standard errors from the (m, m) information; NaN for parameters in a flat direction.
 
     Other parameters keep their standard errors: flat directions are found in the matrix scaled to a diagonal of 1.
     """

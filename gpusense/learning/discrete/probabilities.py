@@ -140,7 +140,7 @@ def _log_hits(bins: int, width: float, sigma: float, rows: Integers) -> Floats:
     An obstacle beyond range_max is expected in the step after the last one.
     """
     spread = log_spread(bins, width, sigma)[np.abs(np.arange(bins) - rows[:, None])]
-    # If all masses of the last row underflow, the nearest step, the last, takes all of it.
+    # If all masses of the last row underflow, the last step, which is nearest, takes the whole mass.
     spread[rows == bins, -1] = np.maximum(spread[rows == bins, -1], -np.finfo(np.float64).max)
     normalised: Floats = spread - logsumexp(spread, axis=1, keepdims=True)
     return normalised

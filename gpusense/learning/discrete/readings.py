@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from gpusense._util import checks
 from gpusense.world.scanner import Reading, classes
 
-# Most steps along a beam: a table of this many takes 134 MB in float64.
+# Largest number of steps along a beam: its table takes 134 MB in float64.
 MOST_BINS = 4096
 
 

@@ -91,8 +91,8 @@ class DiscreteBeamModel(SensorTable):
         millions of readings than for a few.
 
         Args:
-            ranges: Readings of any shape [m]. NaN and values below 0 (-inf too) are missing and left out; values of at
-                least range_max (+inf too) are "no return".
+            ranges: Readings of any shape [m]. NaN and values below 0, including -inf, are missing and left out; values
+                of at least range_max, including +inf, are "no return".
             expected: Expected ranges of the same shape, >= 0 [m]; at least range_max if the map has no obstacle.
             range_max: Readings of at least ``range_max`` are "no return", > 0 [m].
             bins: Number of steps along the beam, 1 to 4096.
@@ -143,8 +143,8 @@ class DiscreteBeamModel(SensorTable):
     def log_probabilities(self) -> NDArray[np.float64]:
         """(bins + 1, bins + 1) log probabilities; read-only.
 
-        Row j is for an obstacle expected in step j, uniformly distributed in it; the last row for none within range.
-        Column i is for a range in step i; the last column for no return. -inf for impossible readings only.
+        Row j is for an obstacle expected in step j, uniformly distributed in it; the last row is for no obstacle within
+        range. Column i is for a range in step i; the last column is for no return. Only impossible readings have -inf.
         """
         table = self._rows(np.float64, density=False)
         table.setflags(write=False)

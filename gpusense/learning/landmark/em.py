@@ -1,9 +1,9 @@
 """Expectation maximisation for the landmark model's parameters, and Newton steps once EM becomes slow.
 
 The E-step computes the probabilities that a feature is each of its possible landmarks, or a false positive. The M-step
-weighs the squares of its residuals by them. Closed forms of the M-step ignore the limits of the sensor, so a step is
-halved until the log-likelihood does not fall. Once EM gains little, Newton steps of the log-likelihood itself follow,
-as for the beam model (``gpusense.learning.beam.em``).
+weights squared residuals by them. Closed forms of the M-step ignore the limits of the sensor, so a step is halved until
+the log-likelihood does not fall. Once EM gains little, Newton steps of the log-likelihood itself follow, as for the
+beam model (``gpusense.learning.beam.em``).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from gpusense.models.landmark.features import wrapped
 from gpusense.world.parameters import LandmarkParameters
 
 SIGMAS = ("sigma_range", "sigma_bearing", "sigma_signature")
-# A cause that accounts for fewer features than this does not occur.
+# A cause that accounts for fewer features than this counts as absent.
 NOTHING = 1e-3
 # Newton steps begin once an EM step gains less than _LITTLE nats, or after _MANY EM steps.
 _LITTLE, _MANY = 0.5, 30
@@ -83,7 +83,7 @@ def climb(
         pairs: Features and landmarks.
         start: Start of the search.
         bias: Whether to also fit offsets of ranges and bearings.
-        max_iterations: Most iterations.
+        max_iterations: Largest number of iterations.
         tolerance: Remaining gain [nats].
 
     Returns:

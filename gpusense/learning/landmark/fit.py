@@ -78,15 +78,15 @@ def fit_landmark_parameters(
         features: (F, 2) ranges [m] and bearings [rad], or (F, 3) with signatures; NaN for missing parts.
         landmarks: The map.
         correspondence: (F,) landmark of each feature, -1 for none; None if unknown.
-        scan: (F,) index of each feature's pose. With it, landmarks in view are counted, also from poses without a
-            feature: p_detect is then the detected share of them.
+        scan: (F,) index of each feature's pose. With it, landmarks in view are counted, also at poses without a
+            feature, and p_detect is their detected share.
         range_max: Largest range of a feature [m].
         field_of_view: Field of view of the sensor, in (0, 2 pi] [rad].
         signature_span: Smallest and largest signature; None is the span of the map's and the features' signatures.
         mount: The sensor's pose (x, y, yaw) on the robot [m, m, rad].
         bias: Whether to also fit offsets of ranges and bearings, which then do not increase the standard deviations.
         initial: Start of the search, without its limits; None guesses it from the residuals.
-        max_iterations: Most iterations.
+        max_iterations: Largest number of iterations.
         tolerance: The search has converged once it expects to gain less than ``tolerance`` [nats].
 
     Returns:

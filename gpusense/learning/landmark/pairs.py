@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 RANGE, BEARING, SIGNATURE, ODDS, RANGE_BIAS, BEARING_BIAS = range(6)
-# Distance up to which a landmark has no bearing [m].
+# Distance within which a landmark has no bearing [m].
 _NO_BEARING = 1e-6
 # Pairs of poses and landmarks that are processed at once.
 _BLOCK = 1 << 20
@@ -68,7 +68,7 @@ class Limits:
 
     @property
     def full_circle(self) -> bool:
-        """Tell whether the field of view is a full circle."""
+        """Whether the field of view is a full circle."""
         return self.half_field >= math.pi
 
 

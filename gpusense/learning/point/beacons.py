@@ -102,20 +102,20 @@ class _Beacons(Problem):
         return log_p, gradient
 
     def _bias(self, theta: Floats) -> Floats:
-        own = theta[self._first :]
+        biases = theta[self._first :]
         if self.biases > 1:
-            return own[self.ids]
-        return np.full(len(self.ranges), own[0] if self.biases else 0.0)
+            return biases[self.ids]
+        return np.full(len(self.ranges), biases[0] if self.biases else 0.0)
 
     def values(self, theta: Floats) -> dict[str, float]:
         values = {"sigma_range": math.exp(theta[0])}
         if self.kind == "mixture":
             values |= {"sigma_heavy": math.exp(theta[2]), "heavy_weight": float(theta[3])}
         values |= {"z_hit": 1 - float(theta[1]), "z_rand": float(theta[1])}
-        own = theta[self._first :]
+        biases = theta[self._first :]
         if self.biases == 1:
-            return values | {"bias": float(own[0])}
-        return values | {f"bias[{i}]": float(bias) for i, bias in enumerate(own)}
+            return values | {"bias": float(biases[0])}
+        return values | {f"bias[{i}]": float(bias) for i, bias in enumerate(biases)}
 
 
 def fit_beacon_parameters(
@@ -136,7 +136,8 @@ def fit_beacon_parameters(
     """Fit the parameters of ranges to beacons to readings at known poses, by maximum likelihood.
 
     The likelihood is :class:`BeaconModel`'s. Deviations, weights and offsets are fitted; the degrees of freedom of a
-    Student t are fixed. Starts come from the median and the densest part of the residuals, which outliers hardly move.
+    Student t are fixed. Starts come from the median and the densest part of the residuals, which are robust to
+    outliers.
 
     Args:
         poses: (S, 3) robot poses [m, m, rad], or (F, 3) with ``ids``.
@@ -150,7 +151,7 @@ def fit_beacon_parameters(
         bias: ``"common"`` fits one offset of all ranges, ``"each"`` one for each beacon, ``"none"`` keeps it at 0.
         mount: The antenna's position (x, y) on the robot [m].
         blocks: None, or (S,) or (F,) integer labels of poses whose errors are correlated, for standard errors.
-        max_iterations: Most iterations of a search.
+        max_iterations: Largest number of iterations of a search.
         tolerance: The search has converged once it expects to gain less than ``tolerance`` [nats].
 
     Returns:
@@ -213,13 +214,13 @@ def _readings(poses: ArrayLike, ranges: ArrayLike, beacons: int, ids: object) ->
 
 def _parameters(problem: _Beacons, theta: Floats, nu: int, mount: tuple[float, float]) -> BeaconParameters:
     values = {name: value for name, value in problem.values(theta).items() if not name.startswith("bias")}
-    own = tuple(theta[problem._first :].tolist())
-    bias = 0.0 if not own else own[0] if len(own) == 1 else own
+    biases = tuple(theta[problem._first :].tolist())
+    bias = 0.0 if not biases else biases[0] if len(biases) == 1 else biases
     return BeaconParameters(**values, bias=bias, kind=problem.kind, nu=nu, range_max=problem.range_max, mount=mount)  # type: ignore[arg-type]
 
 
 def _half_sample_mode(values: Floats) -> float:
-    """Return the centre of the densest part, found by halving: a start that more than half of outliers do not move.
+    """Return the centre of the densest part, by repeated halving: robust even if more than half are outliers.
 
     Source: Bickel and Fruehwirth (2006), "On a fast, robust estimator of the mode".
     """

@@ -20,7 +20,7 @@ from gpusense.models.point.bumper import BumperModel
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.sensor_parameters import BumperParameters
 
-# Deviation with which gaps are read off a model, in cells: its margin around the map is the widest.
+# Deviation with which gaps are read off a model [cells]; it gives the widest margin around the map.
 _WIDE = 16.0
 
 
@@ -91,14 +91,15 @@ def fit_bumper_parameters(
         outline: The robot's outline, as in :class:`BumperModel`.
         segments: The outline's parts, as in :class:`BumperModel`.
         unknown: Whether unknown cells are ``"free"`` (the default) or ``"occupied"``.
-        outside: Whether what lies outside the grid is ``"free"`` (the default) or ``"occupied"``.
+        outside: Whether space outside the grid is ``"free"`` (the default) or ``"occupied"``.
         blocks: None, or (F,) integer labels of poses whose errors are correlated, for standard errors.
-        max_iterations: Most iterations of a search.
+        max_iterations: Largest number of iterations of a search.
         tolerance: The search has converged once it expects to gain less than ``tolerance`` [nats].
         backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
 
     Returns:
-        The fit. Presses far from walls determine p_false, presses well within them p_contact, and those between sigma.
+        The fit. Presses far from walls determine p_false, presses well within walls p_contact, and presses near the
+        surface sigma.
 
     Raises:
         TypeError: An argument has the wrong type.
@@ -140,11 +141,11 @@ def fit_bumper_parameters(
 
 
 def outline_gaps(model: BumperModel, poses: Floats) -> Floats:
-    """Return the (F, B) gaps between each segment of the outline and the nearest obstacle, as the model has them [m].
+    """Return the (F, B) gaps between each segment of the outline and the nearest obstacle, by the model [m].
 
     Args:
         model: A model with p_contact = 1 and p_false = 0: log p of a pressed bumper is log Phi(-gap / sigma), of one
-            that is not pressed log Phi(gap / sigma). The smaller of the two has the digits of the gap.
+            that is not pressed log Phi(gap / sigma). The smaller of the two determines the gap precisely.
         poses: (F, 3) robot poses.
     """
     from scipy.special import ndtri_exp

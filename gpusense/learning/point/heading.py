@@ -76,15 +76,15 @@ def fit_heading_parameters(
 ) -> PointFit[HeadingParameters]:
     """Fit the parameters of heading readings at known poses, by maximum likelihood.
 
-    The likelihood is :class:`HeadingModel`'s; deviation or concentration, weights and offset are fitted. Starts are all
-    round the circle.
+    The likelihood is :class:`HeadingModel`'s; deviation or concentration, weights and offset are fitted. Starts are
+    spread over the full circle.
 
     Args:
         poses: (F, 3) robot poses (x, y, theta) [m, m, rad].
         headings: (F,) readings [rad], any number of turns. NaN and infinities are missing.
         kind: The distribution of correct readings, as in :class:`HeadingParameters`.
         blocks: None, or (F,) integer labels of readings whose errors are correlated, for standard errors.
-        max_iterations: Most iterations of a search.
+        max_iterations: Largest number of iterations of a search.
         tolerance: The search has converged once it expects to gain less than ``tolerance`` [nats].
 
     Returns:

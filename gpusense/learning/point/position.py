@@ -25,7 +25,7 @@ class _Fixes(Problem):
     """Likelihood of fixes by z_rand, a whitening matrix ((a, 0), (b, c)), and the antenna's mount (x, y).
 
     Coordinates are log a, b and log c, or log a alone for one deviation, where c = a and b = 0. b is in units of the
-    spread's inverse. Without a region z_rand stays 0, without a fit of the mount it stays as given.
+    spread's inverse. Without a region z_rand stays 0; without a fit of the mount, the mount is fixed.
     """
 
     per_reading: ClassVar[tuple[str, ...]] = ("errors", "cosines", "sines", "inside")
@@ -77,7 +77,7 @@ class _Fixes(Problem):
         columns = [ratios[1] - ratios[0] if self.area is not None else np.zeros(len(x))]
         columns += [1 - u * u, -v * x, 1 - v * d * y] if self.correlated else [2 - u * u - v * v]
         if self.fit_mount:
-            # -d hit / d error, by the turned axes of the robot.
+            # -d hit / d error, along the rotated axes of the robot.
             g, h = a * u + b * v, d * v
             columns += [g * c + h * s, h * c - g * s]
         return log_p, np.stack([columns[0], *(shares[0] * column for column in columns[1:])], axis=1)
@@ -124,13 +124,13 @@ def fit_position_parameters(
 
     Args:
         poses: (F, 3) robot poses (x, y, theta) in the world [m, m, rad].
-        fixes: (F, 2) measured x and y of the antenna [m]. One that is not finite is missing.
+        fixes: (F, 2) measured x and y of the antenna [m]. A non-finite fix is missing.
         correlated: Whether to fit a covariance matrix in place of one deviation along x and y.
         region: The rectangle of outliers (x_min, y_min, x_max, y_max) in the world [m]; with it their weight is fitted.
         mount: The antenna's position (x, y) on the robot [m], or the start of its fit.
-        fit_mount: Whether to fit the mount, which headings that vary determine.
+        fit_mount: Whether to fit the mount, which requires varying headings.
         blocks: None, or (F,) integer labels of fixes whose errors are correlated, for standard errors.
-        max_iterations: Most iterations of a search.
+        max_iterations: Largest number of iterations of a search.
         tolerance: The search has converged once it expects to gain less than ``tolerance`` [nats].
 
     Returns:
@@ -172,8 +172,8 @@ def fit_position_parameters(
     problem = _Fixes(errors, np.cos(heading), np.sin(heading), inside, correlated, area, start, fit_mount, spread)
     end = maximize(problem, most, least)
     c = problem.covariance(end.theta)
-    found = dict(covariance=c) if correlated else dict(sigma=float(math.exp(-end.theta[1])))
+    noise = dict(covariance=c) if correlated else dict(sigma=float(math.exp(-end.theta[1])))
     rand = float(end.theta[0])
     at = (float(end.theta[-2]), float(end.theta[-1])) if fit_mount else start
-    parameters = PositionParameters(**found, z_hit=1 - rand, z_rand=rand, region=base.region, mount=at)
+    parameters = PositionParameters(**noise, z_hit=1 - rand, z_rand=rand, region=base.region, mount=at)
     return report(problem, end, parameters, numbers, int((~used).sum()))

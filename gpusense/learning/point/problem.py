@@ -53,7 +53,7 @@ class Problem(ABC):
         """Return the parameters by name."""
 
     def part(self, every: int) -> Problem:
-        """Return the problem of each ``every``-th reading."""
+        """Return the problem of every ``every``-th reading."""
         changes: dict[str, Any] = {name: getattr(self, name)[::every] for name in self.per_reading}
         return replace(self, **changes)  # type: ignore[type-var]
 
@@ -106,7 +106,7 @@ def mix(parts: list[tuple[float, Floats]]) -> tuple[Floats, Floats, list[Floats]
     log_p = np.logaddexp.reduce(weighted, axis=0)
     floor = np.where(np.isfinite(log_p), log_p, -1e300)
     shares = np.exp(weighted - floor)
-    # Beyond e^700 a ratio would be infinite; the search needs its sign only.
+    # Beyond e^700 a ratio would overflow; the search needs only its sign.
     ratios = [np.exp(np.minimum(log - floor, 700.0)) for log in logs]
     return log_p, shares, ratios
 
@@ -115,7 +115,7 @@ def check_labels(blocks: object, rows: int) -> Integers:
     """Return (rows,) labels of blocks.
 
     Raises:
-        TypeError: They are not integers.
+        TypeError: The labels are not integers.
         ValueError: The shape differs.
     """
     return checks.array("blocks", blocks, (rows,), dtype=np.int64)

@@ -69,7 +69,7 @@ def _list(names: list[str]) -> str:
 
 
 def _errors(problem: Problem, end: Climb, blocks: Integers | None) -> dict[str, float]:
-    """Return the standard errors by name; NaN for parameters that only coordinates at bounds change."""
+    """Return the standard errors by name; NaN for parameters that depend only on coordinates at bounds."""
     free = end.free
     rows = problem.jacobian(end.theta)[:, free]
     scatter = None if blocks is None else _scatter(problem.log_p(end.theta)[1][:, free], blocks)

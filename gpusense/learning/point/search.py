@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from gpusense.learning.point.problem import Floats, Problem
 
-# Starts that are climbed from, and readings that choose between them.
+# Number of starts that are followed, and of readings for choosing them.
 _CLIMBED, _SAMPLE = 3, 20_000
-# Smallest share of the expected rise that a step must bring, and most halvings.
+# Smallest share of the expected rise that a step must achieve, and largest number of halvings.
 _ARMIJO, _HALVINGS = 1e-4, 50
 # Scaled curvature below this share of the largest counts as none; errors of differences stay below the second.
 _FLAT, _NEGATIVE = 1e-10, 1e-7
@@ -32,7 +32,7 @@ class Climb:
         value: Log-likelihood.
         trace: Log-likelihood at the start and after each iteration.
         converged: Whether the end is a maximum.
-        free: (k,) mask of the coordinates that no bound holds.
+        free: (k,) mask of the coordinates that are not held at a bound.
     """
 
     theta: Floats
@@ -47,7 +47,7 @@ def maximize(problem: Problem, max_iterations: int, tolerance: float, start: Flo
 
     Args:
         problem: The problem.
-        max_iterations: Most iterations of a search.
+        max_iterations: Largest number of iterations of a search.
         tolerance: A search has converged once it expects to gain less than this [nats].
         start: The only start; None for those of the problem.
     """
@@ -76,7 +76,7 @@ def climb(problem: Problem, start: Floats, max_iterations: int, tolerance: float
             break
         moved = _line_search(problem, theta, value, gradient, step)
         if moved is None:
-            # A gain within the rounding errors of the sum cannot be measured.
+            # A gain below the rounding error of the sum cannot be measured.
             converged = top and gain < 1e-12 * max(abs(value), 1.0)
             break
         theta, value, gradient = moved

@@ -27,7 +27,7 @@ from gpusense.models.poses import Frame, Part, PlacedPoses, Poses, place
 from gpusense.world.landmarks import Buckets
 from gpusense.world.windows import Window
 
-# Limits of the joint association: 2^features sets, and every landmark is tried with each of them.
+# Limits of the joint association, which tries every landmark with each of 2^features sets.
 JOINT_FEATURES = 8
 JOINT_LANDMARKS = 1024
 _INT = np.dtype(np.int32)
@@ -62,7 +62,7 @@ class Call:
 def known_features(
     prepared: PreparedFeatures, partner: np.ndarray, buckets: Buckets
 ) -> tuple[PreparedFeatures, np.ndarray, float]:
-    """Return the features with a landmark, the places of these, and the constant term of the false positives.
+    """Return the features with a landmark, the places of their landmarks, and the constant term of the false positives.
 
     Args:
         prepared: The features.
@@ -78,7 +78,7 @@ def known_features(
 
 
 class FeatureModel(PointModel):
-    """Base of the models of features: each belongs to something in the map, or is a false positive.
+    """Base of the models of features, each of which belongs to a landmark or line of the map, or is a false positive.
 
     Subclasses make ``_buckets`` and ``_tables`` of their map.
 
@@ -114,8 +114,8 @@ class FeatureModel(PointModel):
 
     def _arguments(self) -> dict[str, Any]:
         names = (self._name, "association", "mount")
-        own = {name: getattr(self, name) for name in names} | {"specialize": self._specialize}
-        return super()._arguments() | own
+        options = {name: getattr(self, name) for name in names} | {"specialize": self._specialize}
+        return super()._arguments() | options
 
     def _options(self) -> tuple[str, ...]:
         return f"{self._name}={self._count}", f"association={self.association!r}"
@@ -132,7 +132,7 @@ class FeatureModel(PointModel):
         """Return log p of features for each particle, natural logarithm."""
 
     def associate(self, poses: AnyArray, features: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Return what each feature belongs to, for each particle.
+        """Return the landmark or line of each feature, for each particle.
 
         With ``association="sum"`` this is the landmark or line with the largest part of the sum.
 
@@ -145,7 +145,7 @@ class FeatureModel(PointModel):
             terms of the features in the log-likelihood, before the temperature; always NumPy arrays.
 
         Raises:
-            TypeError, ValueError: as ``log_likelihood``.
+            TypeError, ValueError: As ``log_likelihood``.
         """
         _, which, parts = self._evaluate(poses, features, None, each=True)
         return which, parts
@@ -200,7 +200,7 @@ class FeatureModel(PointModel):
     def _evaluate(
         self, poses: object, features: object, correspondence: object, *, each: bool = False, out: Any = None
     ) -> tuple[Any, np.ndarray, np.ndarray]:
-        """Return log p of each particle, and with ``each`` the (N, F) landmarks and terms of the features."""
+        """Return log p of each particle; with ``each`` also the (N, F) landmarks and terms of the features."""
         full, impossible = self._read(arrays.copied_to_host(features, self._backend, "features"))
         call = self._prepare(full, correspondence, each)
         known = correspondence is not None
@@ -212,7 +212,7 @@ class FeatureModel(PointModel):
             impossible=int(impossible.sum()),
             known=known,
         )
-        # Keyed by the first particle of a piece, since a piece that does not fit into memory is tried again in halves.
+        # Keyed by the first particle of a piece, since a piece that does not fit into memory is repeated in halves.
         empty = np.empty((0, len(full)))
         pieces = {-1: (empty.astype(_INT), empty.astype(self._real))}
 

@@ -14,7 +14,7 @@ from gpusense.world.frames import Mount, split
 from gpusense.world.parameters import LandmarkParameters
 from gpusense.world.plausible import look_at_bearings
 
-# Discs are with_lanes_flag by this share, for rounding errors of distances.
+# Discs are widened by this share, for rounding errors of distances.
 _WIDER = 1e-5
 
 
@@ -35,7 +35,7 @@ def _read(features: object, p: LandmarkParameters) -> np.ndarray:
 
 
 def look_at_feature_angles(features: object, column: int, name: str) -> bool:
-    """Warn of angles in a column of features that cannot be meant; return whether there were any."""
+    """Warn of implausible angles in a column of features; return whether there were any."""
     values = np.asarray(features, np.float64)
     angles = values[:, column][np.isfinite(values[:, column])] if values.ndim == 2 else np.zeros(0)
     look_at_bearings(name, angles)
@@ -56,8 +56,8 @@ def possible_features(
     """Return (F, 3) features, all NaN where a part is impossible, and (F,) whether a feature is impossible.
 
     Raises:
-        TypeError: not numbers.
-        ValueError: another shape.
+        TypeError: Not numbers.
+        ValueError: Another shape.
     """
     full = _read(features, p)
     bad = np.asarray(_impossible(full, p, span).any(axis=1))
@@ -69,8 +69,8 @@ def check_features(features: object, p: LandmarkParameters, span: tuple[float, f
     """Return (F, 3) float64 features, NaN for parts not measured or left out; bearings are in [-pi, pi].
 
     Raises:
-        TypeError: not numbers.
-        ValueError: another shape, or a value outside the sensor's limits.
+        TypeError: Not numbers.
+        ValueError: Another shape, or a value outside the sensor's limits.
     """
     full = _read(features, p)
     half, rules = p.field_of_view / 2, [f"range must be in [0, {p.range_max:.15g}] (range_max)"]
@@ -97,8 +97,8 @@ def check_correspondence(correspondence: object, count: int, landmarks: int) -> 
     """Return the (F,) landmark of each feature, -1 for none.
 
     Raises:
-        TypeError: not integers.
-        ValueError: another shape, or an index outside the map.
+        TypeError: Not integers.
+        ValueError: Another shape, or an index outside the map.
     """
     indices = checks.array("correspondence", correspondence, (count,), dtype=np.int64)
     bad = np.flatnonzero((indices < -1) | (indices >= landmarks))
@@ -129,9 +129,9 @@ def reach_of(p: LandmarkParameters, sensor: Sensor, z: float, measured: np.ndarr
     Args:
         p: Deviations and limits.
         sensor: Constants of the sensor.
-        z: The range; not read where it was not measured.
+        z: The range; ignored if it was not measured.
         measured: Whether range, bearing and signature were measured.
-        bound: Largest exponent that matters; infinite where all do.
+        bound: Largest exponent that matters; infinite if all matter.
     """
     if bound < 0:
         return Reach(0.0, -1.0, 0.0)
@@ -146,7 +146,7 @@ def reach_of(p: LandmarkParameters, sensor: Sensor, z: float, measured: np.ndarr
     if not measured[1]:
         return around
     if math.isinf(far):
-        # All landmarks may matter until one is likelier than all beyond some distance.
+        # All landmarks may matter until one is likelier than every landmark beyond some distance.
         return Reach(z, far, 0.0)
     # Of the points of a ring's sector, a corner is farthest from its middle.
     if measured[0]:

@@ -17,11 +17,11 @@ from gpusense.world.sensor_parameters import LARGEST_ANGLE_DEVIATION, LineParame
 ANGLE, DISTANCE, FIRST, LAST, ANGLE_VARIANCE, MIXED, DISTANCE_VARIANCE = range(7)
 # Columns of features: angle and distance; and the ends; and the covariance.
 _COLUMNS = (2, 4, 7)
-# Distance of ends that are not known [m].
+# Distance that stands for unknown ends [m].
 _UNKNOWN_END = 1e9
-# Gates are with_lanes_flag by this share, for rounding errors.
+# Gates are widened by this share, for rounding errors.
 _WIDER = 1e-5
-# Two features may be of one line if their angles differ by less [rad].
+# Two features may belong to the same line if their angles differ by less than this [rad].
 _ALIKE = 0.5
 
 
@@ -29,8 +29,8 @@ def possible_lines(features: object, p: LineParameters) -> tuple[np.ndarray, np.
     """Return (F, 7) lines, all NaN where impossible or not measured, and (F,) whether they are impossible.
 
     Raises:
-        TypeError: not numbers.
-        ValueError: another shape, or a covariance that is not positive semidefinite.
+        TypeError: Not numbers.
+        ValueError: Another shape, or a covariance that is not positive semidefinite.
     """
     values = checks.as_array("features", features, masked=True)
     values = np.zeros((0, 7)) if values.shape == (0,) else checks.array("features", values, finite=False)
@@ -88,10 +88,10 @@ def _whitened(features: np.ndarray, p: LineParameters) -> _Whitened:
     one = features[:, ANGLE_VARIANCE] + p.sigma_angle**2
     both = features[:, MIXED] + middle * p.sigma_angle**2
     slope = both / one
-    # The model's part first: what the lever adds to it cancels.
+    # The model's part first: the contribution of the lever cancels.
     across = p.sigma_distance**2 + (middle - slope) ** 2 * p.sigma_angle**2
-    own = features[:, DISTANCE_VARIANCE] - 2 * slope * features[:, MIXED] + slope**2 * features[:, ANGLE_VARIANCE]
-    rest = across + np.maximum(own, 0.0)
+    measured = features[:, DISTANCE_VARIANCE] - 2 * slope * features[:, MIXED] + slope**2 * features[:, ANGLE_VARIANCE]
+    rest = across + np.maximum(measured, 0.0)
     a, c = np.sqrt(0.5 / one), np.sqrt(0.5 / rest)
     return _Whitened(a, -slope * c, c, slope, np.sqrt(rest + slope**2 * one))
 
@@ -117,7 +117,7 @@ def prepare_lines(
         extent: Largest coordinate of the map in its buckets' frame [m].
         longest: Half the length of the longest line of the map [m].
         gated: Whether to bound the lines that can matter.
-        grouped: Most features among which those that overlap are looked for.
+        grouped: Largest number of features among which overlaps are searched.
     """
     columns = np.flatnonzero(~np.isnan(features[:, ANGLE]))
     kept = features[columns]
@@ -152,7 +152,7 @@ def _gate(
     numbers: np.ndarray, kept: np.ndarray, w: _Whitened, p: LineParameters, real: np.dtype, *, extent: float,
     longest: float, gated: bool,
 ) -> None:  # fmt: skip
-    """Write the bounds of the lines whose density is at least eps of a false positive's, times 1 / e.
+    """Write the bounds of the lines whose density is at least eps / e of a false positive's.
 
     The middle of such a line is in a disc around the foot of the feature's normal: some point of the feature between
     its ends is opposite to a point of the line.
@@ -179,7 +179,8 @@ def _gate(
 def _groups(kept: np.ndarray) -> np.ndarray:
     """Return the group of each feature; features that overlap, directly or through a chain, share a group.
 
-    Features of one line overlap if projections of one on the other have a part in common, and their angles are alike.
+    Features of one line overlap if the projection of one on the other shares a part with it, and their angles are
+    similar.
     """
     from scipy.sparse.csgraph import connected_components
 

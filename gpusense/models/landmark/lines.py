@@ -30,9 +30,9 @@ class LineModel(FeatureModel):
 
     A line is ``x cos(angle) + y sin(angle) = distance`` in the robot's frame; its angle is the direction of the normal
     that points away from the scanner. Each adds ``log(z_detect p(f | j) + z_false / (2 pi range_max))`` with a normal
-    density p(f | j) of angle and distance; docs/landmarks.md defines it. A line may be a wall that it overlaps, when
-    projected on it. The places of the ends do not matter otherwise: a scan shows a wall only as far as it is in sight.
-    The wall j is known from ``correspondence``, or chosen by ``association``.
+    density p(f | j) of angle and distance; docs/landmarks.md defines it. A line may be a wall if its projection on the
+    wall overlaps it. Otherwise the places of the ends do not matter, since a scan shows only the visible part of a
+    wall. The wall j is known from ``correspondence``, or chosen by ``association``.
 
     Args:
         lines: The map.
@@ -45,11 +45,11 @@ class LineModel(FeatureModel):
         mount: Pose (x, y, yaw) of the features' frame on the robot [m, m, rad]; ``extract_features`` returns lines in
             the robot's frame.
         temperature: In (0, 1]: multiplies the sum over lines.
-        specialize: False leaves nothing out: same numbers, slower.
+        specialize: False leaves nothing out, for the same numbers at lower speed.
 
     Raises:
-        TypeError: an argument is of the wrong kind.
-        ValueError: an argument breaks its rule, or the device is absent; the message names both.
+        TypeError: An argument is of the wrong kind.
+        ValueError: An argument breaks its rule, or the device is absent; the message names both.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -123,8 +123,8 @@ class LineModel(FeatureModel):
             (N,) log-likelihoods in the model's precision: densities in 1 / (rad m) for each line.
 
         Raises:
-            TypeError: an argument does not hold numbers, or indices that are no integers.
-            ValueError: a wrong shape, a pose that is not finite, a covariance that is not positive semidefinite, an
+            TypeError: An argument does not hold numbers, or indices that are no integers.
+            ValueError: A wrong shape, a pose that is not finite, a covariance that is not positive semidefinite, an
                 index outside the map, or more than 8 lines for a joint association.
         """
         return cast(np.ndarray, self._evaluate(poses, features, correspondence, out=out)[0])
@@ -135,22 +135,23 @@ class LineModel(FeatureModel):
         """Draw lines from p(f | x, m) at each pose, on the host in float64; see ``BeamModel.sample``.
 
         Without ``correspondence`` every wall that is seen from its side, with a part within range_max, gives a line
-        with probability p_detect. Walls hide nothing. With it, a line of each wall that it names, detected for certain.
-        With probability z_false a line is a false positive, uniform in angle and distance.
+        with probability p_detect. Walls hide nothing. With ``correspondence``, each wall in it gives a line for
+        certain. With probability z_false a line is a false positive, uniform in angle and distance.
 
         Args:
             poses: (N, 3) or (S, N, 3) robot poses in the world [m, m, rad].
             seed: Seed of the random numbers, 0 to 2^64 - 1.
-            step: Step of a run, 0 to 2^31 - 1: other steps have other numbers.
+            step: Step of a run, 0 to 2^31 - 1; each step has different random numbers.
             correspondence: None, or (F,) indices of walls, -1 for a false positive.
 
         Returns:
             (N, M, 4) or (N, F, 4) angles [rad], distances and places of the ends [m]; (S, N, ...) for S scans. A NumPy
-            array of float64, NaN for what is not detected or lies beyond the limits; ``log_likelihood`` leaves it out.
+            array of float64, NaN for lines that are not detected or lie beyond the limits; ``log_likelihood`` leaves
+            them out.
 
         Raises:
-            TypeError: an argument does not hold numbers of its kind.
-            ValueError: a wrong shape, a pose that is not finite, a seed or step beyond its limits, or an index outside
+            TypeError: An argument does not hold numbers of its kind.
+            ValueError: A wrong shape, a pose that is not finite, a seed or step beyond its limits, or an index outside
                 the map.
 
         Example:

@@ -53,11 +53,11 @@ class LandmarkModel(FeatureModel):
         negative: Whether landmarks in view without a feature add ``log(1 - p_detect)`` each; not with ``"sum"``.
         mount: The sensor's pose (x, y, yaw) on the robot [m, m, rad].
         temperature: In (0, 1]: multiplies the sum over features. 1 is the book's plain product.
-        specialize: False leaves nothing out: same numbers, slower.
+        specialize: False leaves nothing out, for the same numbers at lower speed.
 
     Raises:
-        TypeError: an argument is of the wrong kind.
-        ValueError: an argument breaks its rule, or the device is absent; the message names both.
+        TypeError: An argument is of the wrong kind.
+        ValueError: An argument breaks its rule, or the device is absent; the message names both.
 
     Example:
         >>> import gpusense as gs
@@ -130,8 +130,8 @@ class LandmarkModel(FeatureModel):
             the measured parts.
 
         Raises:
-            TypeError: an argument does not hold numbers, or indices that are no integers.
-            ValueError: a wrong shape, a pose that is not finite, an index outside the map, or more than 8
+            TypeError: An argument does not hold numbers, or indices that are no integers.
+            ValueError: A wrong shape, a pose that is not finite, an index outside the map, or more than 8
                 features for a joint association.
         """
         return cast(np.ndarray, self._evaluate(poses, features, correspondence, out=out)[0])
@@ -144,25 +144,26 @@ class LandmarkModel(FeatureModel):
     ) -> np.ndarray:
         """Draw features from p(f | x, m) at each pose, on the host in float64; see ``BeamModel.sample``.
 
-        Without ``correspondence`` these are the sensor's reports at a pose: each landmark within range_max and the
-        field of view is detected with probability p_detect. With it, a feature of each landmark that it names, detected
-        for certain. With probability z_false a feature is a false positive, uniform within the sensor's limits. Given
-        their correspondence, features have the density of ``log_likelihood``.
+        Without ``correspondence``, each landmark within range_max and the field of view is detected with probability
+        p_detect. With it, each landmark in it gives a feature for certain. With probability z_false a feature is a
+        false positive, uniform within the sensor's limits. Given their correspondence, features have the density of
+        ``log_likelihood``.
 
         Args:
             poses: (N, 3) or (S, N, 3) robot poses in the world [m, m, rad].
             seed: Seed of the random numbers, 0 to 2^64 - 1.
-            step: Step of a run, 0 to 2^31 - 1: other steps have other numbers.
+            step: Step of a run, 0 to 2^31 - 1; each step has different random numbers.
             correspondence: None, or (F,) indices of landmarks, -1 for a false positive.
 
         Returns:
             (N, M, 2) or (N, F, 2) ranges [m] and bearings [rad], (N, M, 3) with signatures where ``sigma_signature`` is
-            a number; (S, N, ...) for S scans. A NumPy array of float64. NaN for parts without a deviation, and for all
-            of a feature that is not detected or lies beyond the sensor's limits; ``log_likelihood`` leaves these out.
+            a number; (S, N, ...) for S scans. A NumPy array of float64. Parts without a deviation are NaN, and so are
+            all parts of a feature that is not detected or lies beyond the sensor's limits; ``log_likelihood`` leaves
+            these features out.
 
         Raises:
-            TypeError: an argument does not hold numbers of its kind.
-            ValueError: a wrong shape, a pose that is not finite, a seed or step beyond its limits, or an index outside
+            TypeError: An argument does not hold numbers of its kind.
+            ValueError: A wrong shape, a pose that is not finite, a seed or step beyond its limits, or an index outside
                 the map.
 
         Example:

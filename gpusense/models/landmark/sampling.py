@@ -55,7 +55,7 @@ def draw_features(
             if not every:
                 seen = (distance <= p.range_max) & (np.abs(bearing) <= p.field_of_view / 2) & (detected < p.p_detect)
                 drawn[~seen] = np.nan
-        # A part that is measured but not observed leaves no feature.
+        # A feature with an unobservable measured part is not reported.
         measured = [sigma is not None for sigma in (p.sigma_range, p.sigma_bearing, p.sigma_signature)]
         drawn[np.isnan(drawn[:, measured]).any(axis=1)] = np.nan
         features[:, f] = drawn[:, :columns]

@@ -23,8 +23,8 @@ class LandmarkTables:
     Attributes:
         landmark: (M,) real4 positions in the buckets' frame, by place, and their rounding errors (low parts).
         normal: (M,) real4 normals of lines, x and y, each with its rounding error; one number for landmarks.
-        signature: (M,) real4 signatures, their rounding errors (low parts), and -log of their mass on the span; of
-            lines half their length, and 1 where they are seen from both sides.
+        signature: (M,) real4 signatures, their rounding errors (low parts), and -log of their mass on the span; for
+            lines half their length, and 1 if they are seen from both sides.
         start: (rows * columns + 1,) place of the first landmark of each bucket.
         terms: The sensor's numbers.
         arcs: Arcs of the slopes i / 8.

@@ -25,14 +25,15 @@ from gpusense.models.poses import Part, Poses
 from gpusense.reference.relative import wrapped_difference
 from gpusense.world.sensor_parameters import HeadingParameters, PositionParameters, check_covariance
 
-# Up to this deviation a wrapped normal is a sum of normals, beyond it a Fourier series: each has few terms.
+# Up to this deviation a wrapped normal is a sum of normals, beyond it a Fourier series; either has few terms there.
 _WIDEST_SUM = 1.5
 
 
 class PositionModel(PointModel):
     """log p(z | x) of a position fix, as of a satellite receiver.
 
-    ``z_hit N(z; antenna, covariance) + z_rand / area`` for a fix within the region, without the second part outside.
+    ``z_hit N(z; antenna, covariance) + z_rand / area`` for a fix within the region; outside it the second part is
+    missing.
 
     Args:
         parameters: Covariance, weights, region and the antenna's mount.
@@ -41,8 +42,8 @@ class PositionModel(PointModel):
         temperature: In (0, 1]: multiplies log p, for errors that are not independent from fix to fix.
 
     Raises:
-        TypeError: an argument is of the wrong kind.
-        ValueError: an argument breaks its rule, or the device is absent; the message names both.
+        TypeError: An argument is of the wrong kind.
+        ValueError: An argument breaks its rule, or the device is absent; the message names both.
 
     Example:
         >>> import gpusense as gs
@@ -80,7 +81,7 @@ class PositionModel(PointModel):
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
-            fix: (2,) measured x and y of the antenna [m]. One that is not finite is missing and has log p = 0.
+            fix: (2,) measured x and y of the antenna [m]. A value that is not finite is missing and has log p = 0.
             covariance: None, or the (2, 2) covariance matrix of this fix in the world [m^2].
             out: The array for the result, in the memory of the poses.
 
@@ -88,8 +89,8 @@ class PositionModel(PointModel):
             (N,) log-likelihoods in the model's precision, densities in 1/m^2.
 
         Raises:
-            TypeError: an argument does not hold real numbers.
-            ValueError: a wrong shape, a pose that is not finite, or no covariance.
+            TypeError: An argument does not hold real numbers.
+            ValueError: A wrong shape, a pose that is not finite, or no covariance.
         """
         on_host = arrays.copied_to_host(fix, self._backend, "fix")
         x, y = (float(value) for value in checks.array("fix", on_host, (2,), finite=False))
@@ -128,15 +129,15 @@ class PositionModel(PointModel):
         Args:
             poses: (N, 3) or (S, N, 3) robot poses in the world [m, m, rad].
             seed: Seed of the random numbers, 0 to 2^64 - 1.
-            step: Step of a run, 0 to 2^31 - 1: other steps have other numbers.
+            step: Step of a run, 0 to 2^31 - 1; each step has different random numbers.
             covariance: None, or the (2, 2) covariance matrix of the fixes in the world [m^2].
 
         Returns:
             (N, 2) or (S, N, 2) x and y of the antenna [m], a NumPy array of float64.
 
         Raises:
-            TypeError: an argument does not hold numbers of its kind.
-            ValueError: a wrong shape, a pose that is not finite, a seed or step beyond its limits, or no covariance.
+            TypeError: An argument does not hold numbers of its kind.
+            ValueError: A wrong shape, a pose that is not finite, a seed or step beyond its limits, or no covariance.
 
         Example:
             >>> import gpusense as gs
@@ -205,8 +206,8 @@ class HeadingModel(PointModel):
         temperature: In (0, 1]: multiplies log p, for errors that are not independent from reading to reading.
 
     Raises:
-        TypeError: an argument is of the wrong kind.
-        ValueError: an argument breaks its rule, or the device is absent; the message names both.
+        TypeError: An argument is of the wrong kind.
+        ValueError: An argument breaks its rule, or the device is absent; the message names both.
 
     Example:
         >>> import gpusense as gs, math
@@ -236,15 +237,15 @@ class HeadingModel(PointModel):
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
-            heading: The reading [rad], any number of turns. One that is not finite is missing and has log p = 0.
+            heading: The reading [rad], any number of turns. A value that is not finite is missing and has log p = 0.
             out: The array for the result, in the memory of the poses.
 
         Returns:
             (N,) log-likelihoods in the model's precision, densities in 1/rad.
 
         Raises:
-            TypeError: an argument does not hold real numbers.
-            ValueError: a wrong shape, or a pose that is not finite.
+            TypeError: An argument does not hold real numbers.
+            ValueError: A wrong shape, or a pose that is not finite.
         """
         on_host = arrays.copied_to_host(heading, self._backend, "heading")
         reading = float(checks.array("heading", on_host, (), finite=False))
@@ -272,14 +273,14 @@ class HeadingModel(PointModel):
         Args:
             poses: (N, 3) or (S, N, 3) robot poses in the world [m, m, rad].
             seed: Seed of the random numbers, 0 to 2^64 - 1.
-            step: Step of a run, 0 to 2^31 - 1: other steps have other numbers.
+            step: Step of a run, 0 to 2^31 - 1; each step has different random numbers.
 
         Returns:
             (N,) or (S, N) headings in [-pi, pi] [rad], a NumPy array of float64.
 
         Raises:
-            TypeError: an argument does not hold numbers of its kind.
-            ValueError: a wrong shape, a pose that is not finite, or a seed or step beyond its limits.
+            TypeError: An argument does not hold numbers of its kind.
+            ValueError: A wrong shape, a pose that is not finite, or a seed or step beyond its limits.
 
         Example:
             >>> import gpusense as gs
@@ -302,7 +303,7 @@ class HeadingModel(PointModel):
     def _describe(self) -> tuple[str, list[Omission]]:
         p = self.parameters
         omissions = [] if p.z_rand else [rand_omission("z_rand = 0")]
-        # Distance from half a turn beyond which all other turns are below exp(-40) of the nearest one.
+        # Distance from half a turn beyond which the other turns are below exp(-40) of the nearest turn.
         near = NEGLIGIBLE * p.sigma**2 / (2 * math.pi)
         if self._kind == NEARBY and near < math.pi:
             why = f"residuals of less than pi - {near:.2g} rad need the nearest turn only"

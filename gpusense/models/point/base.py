@@ -32,7 +32,7 @@ MISSING = Omission("reading", "it is not finite, so it is missing", "everything 
 
 
 def rand_omission(why: str, each: str = "") -> Omission:
-    """Return the saving of a mixture without its uniform component."""
+    """Return the omission of the uniform component of a mixture."""
     return Omission("rand component", why, f"1 exp and 1 log per particle{each}")
 
 
@@ -49,7 +49,7 @@ def relative_omissions(mount: tuple[float, float], precision: str) -> list[Omiss
 
 
 class PointModel(Pickled):
-    """Base of the measurement models of one reading, or a few, for each of many poses."""
+    """Base of the measurement models with one reading or a few."""
 
     _specialize = True
 
@@ -100,7 +100,7 @@ class PointModel(Pickled):
         return cast(Precision, self._real.name)
 
     def explain(self) -> str:
-        """Report the parts that the last call's readings and poses leave out, with reasons and savings."""
+        """Report the parts left out by the readings and poses of the last call, with reasons and savings."""
         name, omissions = self._describe()
         title = f"{name}, {self.precision}, {self.device.selection} ({self.device.name})"
         code = self._last_code or frozenset()
@@ -119,7 +119,7 @@ class PointModel(Pickled):
         """Refuse a deviation whose square is beyond the model's precision.
 
         Raises:
-            ValueError: it is outside.
+            ValueError: It is outside.
         """
         limit = 100 if self._real == np.float64 else 12
         if not 10.0**-limit <= value <= 10.0**limit:
@@ -142,14 +142,14 @@ class PointModel(Pickled):
         Args:
             poses: (N, 3) poses.
             out: The array for the result, or None.
-            program: Makes the program that writes log p of some poses into a buffer.
+            program: Function that makes the program that writes log p of some poses into a buffer.
             left_out: The omissions by these readings.
             items: Cost of each pose, in readings of a scan.
             itemsize: Bytes that are kept for each pose and item.
-            after: Called with each part once its program is started.
+            after: Function called with each part after its program has started.
 
         Raises:
-            TypeError, ValueError: poses that are not (N, 3) finite numbers, or an unfit array for the result.
+            TypeError, ValueError: Poses that are not (N, 3) finite numbers, or an unfit array for the result.
         """
         backend, space, real = self._backend, self._workspace, self._real
         checked = Poses(poses, backend)

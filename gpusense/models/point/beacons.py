@@ -31,7 +31,7 @@ class BeaconModel(PointModel):
 
     Each range adds ``log(z_hit f(z - d - bias) / m + z_rand / range_max)``. d is the antenna's distance to the beacon,
     f the density of the parameters' kind and m its mass on [0, range_max], so that each range's density integrates to
-    1; where d + bias lies outside this interval, m is taken at its nearest end.
+    1; where d + bias lies outside this interval, m is taken at the nearest end.
 
     Args:
         xy: (M, 2) positions of the beacons in the world [m].
@@ -41,8 +41,8 @@ class BeaconModel(PointModel):
         temperature: In (0, 1]: multiplies the sum over ranges. 1 is the plain product of densities.
 
     Raises:
-        TypeError: an argument is of the wrong kind.
-        ValueError: an argument breaks its rule, or the device is absent; the message names both.
+        TypeError: An argument is of the wrong kind.
+        ValueError: An argument breaks its rule, or the device is absent; the message names both.
 
     Example:
         >>> import gpusense as gs
@@ -100,8 +100,8 @@ class BeaconModel(PointModel):
             (N,) log-likelihoods in the model's precision, densities in 1/m for each range; 0 without ranges.
 
         Raises:
-            TypeError: an argument does not hold real numbers, or indices that are no integers.
-            ValueError: a wrong shape, a pose that is not finite, an index that is no beacon's.
+            TypeError: An argument does not hold real numbers, or indices that are no integers.
+            ValueError: A wrong shape, a pose that is not finite, an index that is no beacon's.
         """
         beacon, left_out = self._prepare(ranges, ids)
         count = len(beacon)
@@ -134,7 +134,7 @@ class BeaconModel(PointModel):
         Args:
             poses: (N, 3) or (S, N, 3) robot poses in the world [m, m, rad].
             seed: Seed of the random numbers, 0 to 2^64 - 1.
-            step: Step of a run, 0 to 2^31 - 1: other steps have other numbers.
+            step: Step of a run, 0 to 2^31 - 1; each step has different random numbers.
             ids: None for all M beacons, or (F,) indices of the beacons; one may have several ranges.
 
         Returns:
@@ -142,8 +142,8 @@ class BeaconModel(PointModel):
             beyond range_max, or below 0, and the range is not observed.
 
         Raises:
-            TypeError: an argument does not hold numbers of its kind.
-            ValueError: a wrong shape, a pose that is not finite, a seed or step beyond its limits, or an index that is
+            TypeError: An argument does not hold numbers of its kind.
+            ValueError: A wrong shape, a pose that is not finite, a seed or step beyond its limits, or an index that is
                 no beacon's.
 
         Example:
@@ -181,7 +181,7 @@ class BeaconModel(PointModel):
         """Return the (F,) indices of beacons.
 
         Raises:
-            TypeError, ValueError: indices that are no integers, or no beacon's.
+            TypeError, ValueError: Indices that are no integers, or no beacon's.
         """
         known = len(self.xy)
         if ids is None:

@@ -42,25 +42,25 @@ class BumperModel(PointModel):
     ``P(pressed) = p_contact P(touching) + p_false (1 - P(touching))`` with ``P(touching) = Phi(-gap / sigma)``. The gap
     is the distance from the outline to the nearest occupied cell's centre, less half a cell. A point has the distance
     of its cell, as in the likelihood field. A circle is one look-up at its centre; a polygon, and a circle in segments,
-    are looked up at points half a cell apart at most. An obstacle wholly inside a polygon does not touch it. Points are
-    clamped to a margin around the map: the outline's reach, and 4 deviations (64 cells at most).
+    are looked up at points half a cell apart at most. An obstacle entirely inside a polygon does not touch it. Points
+    are clamped to a margin around the map: the outline's reach, and 4 deviations (64 cells at most).
 
     Args:
         grid: The map.
         outline: The radius of a round robot [m], or (P, 2) corners of a polygon in its frame [m], in order.
         parameters: Probabilities, and the deviation of outline and map.
-        segments: None where the outline is one bumper. Of a circle: (B, 2) bearings from and to which bumpers reach
-            counter-clockwise [rad]. Of a polygon: (P,) integers, the bumper 0 to B - 1 that the edge from each corner
-            to the next is part of, or -1 for none.
+        segments: None where the outline is one bumper. For a circle: (B, 2) bearings of the two ends of each bumper,
+            counter-clockwise [rad]. For a polygon: (P,) integers, the bumper 0 to B - 1 of the edge from each corner to
+            the next, or -1 for none.
         backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
         unknown: Whether unknown cells are ``"free"`` (the default) or ``"occupied"``.
-        outside: Whether what lies outside the grid is ``"free"`` (the default) or ``"occupied"``.
+        outside: Whether space outside the grid is ``"free"`` (the default) or ``"occupied"``.
         temperature: In (0, 1]: multiplies the sum over segments. 1 is the plain product of probabilities.
 
     Raises:
-        TypeError: an argument is of the wrong kind.
-        ValueError: an argument breaks its rule, or the device is absent; the message names both.
+        TypeError: An argument is of the wrong kind.
+        ValueError: An argument breaks its rule, or the device is absent; the message names both.
 
     Example:
         >>> import gpusense as gs
@@ -121,7 +121,7 @@ class BumperModel(PointModel):
 
         Args:
             poses: (N, 3) robot poses (x, y, theta) in the world [m, m, rad], an array of any library as for scans.
-            pressed: True or False, or 1 or 0; (B,) of them with segments. NaN or None is missing, and adds 0.
+            pressed: True or False, or 1 or 0; with segments (B,) of these values. NaN or None is missing, and adds 0.
             out: The array for the result, in the memory of the poses.
 
         Returns:
@@ -129,7 +129,7 @@ class BumperModel(PointModel):
 
         Raises:
             TypeError: ``pressed`` is none of these, or poses do not hold real numbers.
-            ValueError: a wrong shape, or a pose that is not finite.
+            ValueError: A wrong shape, or a pose that is not finite.
         """
         states = self._states(pressed)
         valid, left_out = states >= 0, []
@@ -162,10 +162,10 @@ class BumperModel(PointModel):
         return cast(np.ndarray, self._score(poses, out, program, left_out, items=int(kept.sum())))
 
     def _arguments(self) -> dict[str, Any]:
-        own = dict(
+        options = dict(
             grid=self.grid, outline=self._outline, segments=self._segments, unknown=self.unknown, outside=self.outside
         )
-        return super()._arguments() | own
+        return super()._arguments() | options
 
     def sample(self, poses: AnyArray, seed: int = 0, *, step: int = 0) -> np.ndarray:
         """Draw the states of the bumper from P(pressed | x, m) at each pose, on the host; see ``BeamModel.sample``.
@@ -173,14 +173,14 @@ class BumperModel(PointModel):
         Args:
             poses: (N, 3) or (S, N, 3) robot poses in the world [m, m, rad].
             seed: Seed of the random numbers, 0 to 2^64 - 1.
-            step: Step of a run, 0 to 2^31 - 1: other steps have other numbers.
+            step: Step of a run, 0 to 2^31 - 1; each step has different random numbers.
 
         Returns:
             (N,) or (S, N) whether the bumper is pressed, a NumPy array of bool; (N, B) or (S, N, B) with segments.
 
         Raises:
-            TypeError: an argument does not hold numbers of its kind.
-            ValueError: a wrong shape, a pose that is not finite, or a seed or step beyond its limits.
+            TypeError: An argument does not hold numbers of its kind.
+            ValueError: A wrong shape, a pose that is not finite, or a seed or step beyond its limits.
 
         Example:
             >>> import gpusense as gs
@@ -190,7 +190,7 @@ class BumperModel(PointModel):
             [False, True]
         """
         draws = draws_at(poses, self._backend, seed, step)
-        # Probabilities of one backend and precision, so that all backends draw the same.
+        # Probabilities from a single backend and precision, so that all backends draw the same readings.
         model = self if self.device.backend == "numpy" and self._real == np.float64 else self._on_host()
         pressed = np.empty((len(draws.poses), self.segments), bool)
         for segment in range(self.segments):
@@ -270,8 +270,8 @@ def sample_outline(outline: object, segments: object, spacing: float) -> tuple[f
     """Return the contact radius around an outline's points, the (Q, 2) points, and (B + 1,) starts of segments.
 
     Raises:
-        TypeError: not numbers, or segments of a polygon that are no integers.
-        ValueError: a radius that is not positive, fewer than 3 corners, segments of a wrong shape, or too many points.
+        TypeError: Not numbers, or segments of a polygon that are no integers.
+        ValueError: A radius that is not positive, fewer than 3 corners, segments of a wrong shape, or too many points.
     """
     if isinstance(outline, (int, float, np.integer, np.floating)) and not isinstance(outline, bool):
         radius = checks.real("outline", float(outline), above=0)
@@ -310,7 +310,7 @@ def _count(length: float, spacing: float) -> int:
     """Return the number of pieces of a stretch of the outline.
 
     Raises:
-        ValueError: more than 65 536.
+        ValueError: More than 65 536.
     """
     count = max(math.ceil(length / spacing), 1) if length / spacing <= _MOST_POINTS else _MOST_POINTS + 1
     if count > _MOST_POINTS:

@@ -1,9 +1,8 @@
 """Readings that point and landmark models draw.
 
-They are drawn on the host in float64, in one place for all backends, whose readings therefore have the same bits.
-Random numbers are those of Philox (reference/philox.py) with the counter (pose, step, stream, call). A distribution is
-drawn by inverting its distribution function, so that readings move smoothly with poses; a von Mises is drawn by
-rejection.
+They are drawn on the host in float64 for all backends, whose readings therefore have the same bits. Random numbers come
+from Philox (reference/philox.py) with the counter (pose, step, stream, call). A distribution is drawn by inverting its
+distribution function, so that readings move smoothly with poses; a von Mises is drawn by rejection.
 """
 
 from __future__ import annotations
@@ -65,7 +64,7 @@ def draws_at(poses: Any, backend: Backend, seed: object, step: object) -> Draws:
     """Return the random numbers of (N, 3) or (S, N, 3) poses.
 
     Raises:
-        TypeError, ValueError: poses, seed or step are not of the kind described, or beyond their limits.
+        TypeError, ValueError: Poses, seed or step have the wrong type, or are beyond their limits.
     """
     key = checks.integer("seed", seed, low=0, high=MOST_SEED)
     first = checks.integer("step", step, low=0, high=MOST_STEP)
@@ -95,8 +94,8 @@ def within(
 ) -> Floats:
     """Return draws of a symmetric distribution on an interval.
 
-    A mean outside the interval has the normaliser of its nearest end, as in the models' densities; the rest of its mass
-    is not observed: NaN.
+    For a mean outside the interval, the normaliser is taken at the nearest end, as in the models' densities; the rest
+    of the mass is not observed and gives NaN.
 
     Args:
         u: (N,) numbers in (0, 1).
@@ -130,7 +129,7 @@ def normal_within(u: Floats, mean: Floats, sigma: float | Floats, low: float, hi
 def wrapped_normal_within(u: Floats, mean: Floats, sigma: float, half: float) -> Floats:
     """Return angles in [-half, half] whose wrapped differences from ``mean`` in [-pi, pi] are normal.
 
-    A mean outside has the normaliser of the nearest end; the rest of its mass is not observed: NaN.
+    For a mean outside, the normaliser is taken at the nearest end; the rest of the mass is not observed and gives NaN.
     """
     from scipy.special import ndtri
 
@@ -183,7 +182,7 @@ def von_mises(draws: Draws, stream: int, kappa: float) -> Floats:
     """Return angles in [-pi, pi] drawn from a von Mises around 0.
 
     The density exp(-2 kappa sin^2(r / 2)) is below exp(-2 kappa r^2 / pi^2), a normal on [-pi, pi], from which angles
-    are drawn until one is accepted; 2 / pi of them are, or more.
+    are drawn until one is accepted; at least a share of 2 / pi is accepted.
     """
     angles = np.full(len(draws.poses), np.nan)
     sigma = np.pi / 2 / np.sqrt(kappa) if kappa > 0 else np.inf

@@ -42,8 +42,8 @@ class BeamModel(ScanModel):
     Args:
         grid: The map.
         scanner: The scanner's geometry.
-        parameters: Weights and shapes of the mixture; or a :class:`DiscreteBeamModel`, a table over
-            the scanner's range_max; each beam is one look-up, max readings too.
+        parameters: Weights and shapes of the mixture; or a :class:`DiscreteBeamModel`, a table over the scanner's
+            range_max, with one look-up per beam, max readings included.
         incidence: Parameters by angle of incidence, in place of ``parameters``; see ``RayCaster.incidence`` for the
             angle. A beam without a hit has ``no_surface``, or the parameters of the first bin. If ``z_max`` differs
             between bins, max readings depend on the pose, and are impossible where it is 0. Needs an exact caster.
@@ -54,17 +54,17 @@ class BeamModel(ScanModel):
         sensor_table: None to evaluate the mixture, or the width [m] of bins of readings and expected ranges in which
             log p is tabulated, at least range_max / 8192, as racing particle filters do.
         unknown: Whether unknown cells are ``"free"`` (the default) or ``"occupied"``.
-        outside: Whether what lies outside the grid is ``"free"`` (the default) or ``"occupied"``.
+        outside: Whether space outside the grid is ``"free"`` (the default) or ``"occupied"``.
         temperature: In (0, 1]: multiplies the sum over beams, which is overconfident because beams are not
             independent. 1 is the book's plain product.
         beams: None, the number of informative beams to use, evenly chosen, or the indices of the beams to use.
-        compat: None; or ``"amcl"`` or ``"beluga"`` for the weights of these programs, with their defaults of
-            parameters, caster, unknown and outside; or their options, see ``gpusense.compat``.
-        specialize: False leaves nothing out: same numbers, slower.
+        compat: None; or ``"amcl"`` or ``"beluga"`` for the weights of these programs, with their defaults for
+            parameters, caster, unknown and outside; or an object with their options, see ``gpusense.compat``.
+        specialize: False leaves nothing out, for the same numbers at lower speed.
 
     Raises:
-        TypeError: an argument is of the wrong kind.
-        ValueError: an argument breaks its rule, or the device is absent; the message names both.
+        TypeError: An argument is of the wrong kind.
+        ValueError: An argument breaks its rule, or the device is absent; the message names both.
 
     Example:
         >>> import gpusense as gs
@@ -122,7 +122,7 @@ class BeamModel(ScanModel):
             temperature=temperature, beams=beams, compat=compat, cubes=weights.is_peer,
             specialize=specialize, z_max=max(p.z_max for p in mixtures) if table is None else 1.0,
             max_depends=max_depends, constant_term=weights.constant_term,
-            # Where max readings depend on the pose, the kernel finds impossible ranges.
+            # If max readings depend on the pose, the kernel detects impossible ranges.
             possible=max_depends or any(p.z_hit or p.z_short or p.z_rand for p in mixtures),
         )  # fmt: skip
         setting = self._setting
@@ -147,9 +147,9 @@ class BeamModel(ScanModel):
 
     def _arguments(self) -> dict[str, Any]:
         angles = self.incidence_parameters
-        own = dict(parameters=None if angles is not None else self._parameters, incidence=angles,
-                   caster=self._caster.method, sensor_table=self.sensor_table)  # fmt: skip
-        return super()._arguments() | own
+        options = dict(parameters=None if angles is not None else self._parameters, incidence=angles,
+                       caster=self._caster.method, sensor_table=self.sensor_table)  # fmt: skip
+        return super()._arguments() | options
 
     def _options(self) -> tuple[str, ...]:
         return (f"caster={self._caster.method}",)
@@ -159,7 +159,7 @@ class BeamModel(ScanModel):
         """Weights and shapes of the mixture, or the table of a sensor.
 
         Raises:
-            AttributeError: they depend on the angle of incidence; see ``incidence_parameters``.
+            AttributeError: They depend on the angle of incidence; see ``incidence_parameters``.
         """
         if self.incidence_parameters is not None:
             raise AttributeError("parameters: depend on the angle of incidence here, see incidence_parameters")
@@ -180,7 +180,7 @@ class BeamModel(ScanModel):
             region: (row, col) of the cell that ``cells[0, 0]`` replaces.
 
         Raises:
-            TypeError, ValueError: cells or a region that are not integers, or do not fit the grid, or a look-up table
+            TypeError, ValueError: Cells or a region that are not integers, or do not fit the grid, or a look-up table
                 from a file; nothing has changed.
         """
         with self._lock:
@@ -197,7 +197,7 @@ class BeamModel(ScanModel):
             (N, K) metres in the model's precision; exactly range_max without a nearer obstacle or return.
 
         Raises:
-            TypeError, ValueError: poses that are not (N, 3) finite numbers.
+            TypeError, ValueError: Poses that are not (N, 3) finite numbers.
         """
         with self._lock:
             return self._cast(poses, out, incidence=False)
@@ -214,7 +214,7 @@ class BeamModel(ScanModel):
             return. NaN for a beam without a return.
 
         Raises:
-            TypeError, ValueError: poses that are not (N, 3) finite numbers, or a caster that is not exact.
+            TypeError, ValueError: Poses that are not (N, 3) finite numbers, or a caster that is not exact.
         """
         require_exact("caster", self._caster.method)
         with self._lock:
@@ -223,8 +223,8 @@ class BeamModel(ScanModel):
     def sample(self, poses: AnyArray, seed: int = 0, *, step: int = 0, out: Any = None) -> Any:
         """Draw readings from p(z | x, m) of every beam of the scanner at each pose.
 
-        A reading depends on seed, step, index of the pose and index of the beam alone, by the counter-based generator
-        Philox; all backends draw the same bits. It is a component of the mixture drawn by its weight, and a range by
+        A reading depends only on the seed, the step, and the indices of pose and beam, by the counter-based generator
+        Philox; all backends draw the same bits. A component of the mixture is drawn by its weight, and a range by
         inverting the component's distribution function, so readings move smoothly with the poses (*Probabilistic
         Robotics* section 6.3.1, the simulation of equation 6.12). With z* = 0, p_short has no mass, and the other
         components share its weight.
@@ -236,7 +236,7 @@ class BeamModel(ScanModel):
             poses: (N, 3) robot poses in the world [m, m, rad], or (S, N, 3) of S scans; arrays of other libraries as
                 in ``log_likelihood``.
             seed: Seed of the random numbers, 0 to 2^64 - 1.
-            step: Step of a run, or of the first of S scans, 0 to 2^31 - 1; each step has other random numbers.
+            step: Step of a run, or of the first of S scans, 0 to 2^31 - 1; each step has different random numbers.
             out: The array for the readings, as in ``log_likelihood``.
 
         Returns:
@@ -244,9 +244,9 @@ class BeamModel(ScanModel):
             return, NaN where no reading is possible, which happens only where z* = 0 and all weight is z_short.
 
         Raises:
-            TypeError: an argument does not hold numbers of its kind.
-            ValueError: a wrong shape, a pose that is not finite, a seed or step beyond its limits, or a model with
-                ``compat``, whose weights are no density.
+            TypeError: An argument does not hold numbers of its kind.
+            ValueError: A wrong shape, a pose that is not finite, a seed or step beyond its limits, or a model with
+                ``compat``, whose weights are not a density.
 
         Example:
             >>> import gpusense as gs, numpy as np
@@ -284,10 +284,10 @@ class BeamModel(ScanModel):
 
 
 def _method_of(caster: object, weights: Likelihood) -> Caster:
-    """Return the caster that a user chose, or the default; ranges beyond range_max are for a peer's weights alone.
+    """Return the user's caster, or the default; ranges beyond range_max are only for a peer's weights.
 
     Raises:
-        TypeError, ValueError: no caster, or one whose ranges do not fit the model.
+        TypeError, ValueError: The value is not a caster, or its ranges do not fit the model.
     """
     method = casters.choose("caster", weights.caster if caster is None else caster, lines=weights.name)
     if method.beyond and not weights.is_peer:
@@ -299,7 +299,7 @@ def _check_peer(peer: Peer, sensor_table: object) -> None:
     """Refuse options that a beam model with ``compat`` does not have.
 
     Raises:
-        ValueError: such an option is set.
+        ValueError: Such an option is set.
     """
     check_absent("with compat", sensor_table=sensor_table)
     if peer.prob:
@@ -310,8 +310,8 @@ def _check_incidence(incidence: object, **others: object) -> None:
     """Refuse parameters by angle of incidence of a wrong type, or with conflicting options.
 
     Raises:
-        TypeError: not IncidenceParameters.
-        ValueError: a conflicting option is set.
+        TypeError: Not IncidenceParameters.
+        ValueError: A conflicting option is set.
     """
     if not isinstance(incidence, IncidenceParameters):
         raise TypeError(f"incidence: must be IncidenceParameters, got {checks.show(incidence)}")

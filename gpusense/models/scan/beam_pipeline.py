@@ -47,7 +47,7 @@ class BeamPipeline(ScanPipeline):
         self.rays_each = cones.rays
         # The rays of each beam, several for a cone.
         self.cone_vectors = ray_vectors(self.scanner.ray_bearings, self.scanner.mount)
-        # Without possible ranges there are no components, but the kernel's code needs one.
+        # If no range is possible, no component is left, but the kernel's code needs one.
         self._fixed_flags = (mixture.flags or frozenset({"RAND", "SINGLE"})) | flags_if(
             FLOAT64=self.real == np.float64, ALL_READINGS=max_evaluated or not self.specialize
         )
@@ -86,7 +86,7 @@ class BeamPipeline(ScanPipeline):
         if several:
             begins = np.append(0, np.cumsum(scans.ray_counts)).astype(np.int32)
             start, counts = space.upload_all("scans", [begins, scans.counts.astype(np.int32)])
-        # Kernels without shared rays read no first reading, but NumPy's does, of a single scan.
+        # Without shared rays kernels do not read ``first``; NumPy's kernel does for a single scan.
         first = space.upload("first", scans.first) if shared and (several or scans.shared) else self._one_each
         return Readings(
             scans.scans, scans.most_rays, scans.most_readings, flags_if(SHARED_RAYS=shared, SCANS=several),

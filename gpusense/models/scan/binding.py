@@ -1,4 +1,4 @@
-"""``bind`` of a model: the choice among bound calls, and those of arrays in host memory.
+"""``bind`` of a model: the choice among bound calls, and bound calls of arrays in host memory.
 
 A call that waits is the ordinary one, except for NumPy arrays of few particles on a GPU. They are copied to the device,
 as :mod:`.packed_call` describes.
@@ -20,7 +20,7 @@ from gpusense.models.scan.packed_call import LARGEST, PackedCall, fits, host_tas
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.tiles import LEAST_ORDERED
 
-# Most cells of a map for which a short call makes the whole table.
+# Largest map for which a short call makes the whole table [cells].
 _MOST_CELLS = 1 << 22
 
 
@@ -56,7 +56,7 @@ def bind(
         try:
             return _StagedCall(host, lock)
         except MemoryError:
-            # The ordinary call needs but a part of the map's table.
+            # The ordinary call needs only a part of the map's table.
             host.reason = "the table of the whole map does not fit the device"
     return host
 
@@ -136,7 +136,7 @@ class _StagedCall(BoundCall):
         except MemoryError:
             # This call would need the whole table of a changed map; the ordinary call needs only a part.
             pass
-        # Its message names the pose that is not finite.
+        # The ordinary call's message names the pose that is not finite.
         return self._host()
 
     def explain(self) -> str:

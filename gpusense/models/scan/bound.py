@@ -1,7 +1,7 @@
-"""Bound calls: arrays that stay in place, one start per call, no repeated checks.
+"""Bound calls: arrays that stay in place, a single start per call, and no repeated checks.
 
-The host takes longer over a call of few particles than its kernels do: checks, the preparation of the scan, a start for
-each launch. Where poses and readings are on the device, all of it is done once. The kernel file ``scan`` classes and
+In a call of few particles the host takes longer than the kernels: for checks, the preparation of the scan, and a start
+of each launch. If poses and readings are on the device, all of this is done once. The kernel file ``scan`` classes and
 places readings there, and the program is recorded (``Backend.record``), with CUDA as a graph.
 """
 
@@ -59,18 +59,18 @@ class BoundCall(ABC):
                 calls that do not wait.
 
         Returns:
-            ``out``; where ``waits`` is False, the device may yet be about to write it.
+            ``out``; if ``waits`` is False, the device may not have written it yet.
 
         Raises:
-            TypeError: not a stream, or a stream for a call that waits.
-            TypeError, ValueError: for a call that waits, the errors of ``log_likelihood``.
+            TypeError: Not a stream, or a stream for a call that waits.
+            TypeError, ValueError: For a call that waits, the errors of ``log_likelihood``.
         """
 
     @abstractmethod
     def explain(self) -> str:
         """Return in one line how a call is started: ``"one CUDA graph of 3 launches"``, or the reason for none.
 
-        A graph is captured at the second call, so ask after two calls.
+        A graph is captured at the second call, so the line is final after two calls.
         """
 
     @abstractmethod
@@ -78,7 +78,7 @@ class BoundCall(ABC):
         """Wait until all calls have ended.
 
         Raises:
-            ValueError: a pose was not finite in some call since the last check; a call that waits reports it at once.
+            ValueError: A pose was not finite in some call since the last check; a call that waits reports it at once.
         """
 
 
@@ -115,7 +115,7 @@ class DeviceCall(BoundCall):
         adopted = arrays.adopt_readings(ranges, backend, pipeline.scanner.count, in_place=True)
         result = Result(poses, out, (count,), real, backend, on_device=True)
         self._log_p, self.out = result.flat, result.user_array()
-        # The owners of the memory that is read and written.
+        # Owners of the memory that calls read and write.
         self._owners = (poses, ranges, adopted, self.out)
         # Private buffers: other calls of the model may come between.
         self._space = Workspace(backend)
@@ -127,7 +127,7 @@ class DeviceCall(BoundCall):
         rays = self._readings.readings * pipeline.rays_each
         chunk = chunk_of(backend, rays, pipeline.kept_bytes())
         self._chunk = -(-chunk // whole) * whole
-        # The program for the map as it is, by the version of its table.
+        # The program for the current map, by the version of the map's table.
         self._programs = ProgramCache[RecordedProgram](1)
         self._recorded()
 
@@ -186,7 +186,7 @@ class DeviceCall(BoundCall):
             program.recording.wait()
 
     def _current(self) -> RecordedProgram:
-        """Return the program for the map as it is."""
+        """Return the program for the current map."""
         self._pipeline.backend.check_process()
         program = self._programs.get(self._pipeline.map.version)
         if program is None:

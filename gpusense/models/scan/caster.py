@@ -38,11 +38,11 @@ class RayCaster(Pickled):
         backend: The device, see ``gpusense.devices()``; or a queue of pyopencl.
         precision: ``"float32"`` or ``"float64"``.
         unknown: Whether unknown cells are ``"free"`` or ``"occupied"``.
-        outside: Whether what lies outside the grid is ``"free"`` or ``"occupied"``.
+        outside: Whether space outside the grid is ``"free"`` or ``"occupied"``.
 
     Raises:
-        TypeError: an argument is of the wrong kind.
-        ValueError: an argument breaks its rule, or the device is absent.
+        TypeError: An argument is of the wrong kind.
+        ValueError: An argument breaks its rule, or the device is absent.
 
     Example:
         >>> import gpusense as gs
@@ -101,7 +101,7 @@ class RayCaster(Pickled):
 
     @property
     def grid(self) -> OccupancyGrid:
-        """The map as it is now."""
+        """The current map."""
         return self._caster.grid
 
     @property
@@ -134,11 +134,11 @@ class RayCaster(Pickled):
         return self._caster.table_bytes
 
     def prepare(self, poses: AnyArray) -> None:
-        """Make the map's table for a cloud of (N, 3) poses now; ``cast`` does it otherwise.
+        """Make the map's table for a cloud of (N, 3) poses now, instead of in the first ``cast``.
 
         Raises:
-            TypeError, ValueError: poses that are not (N, 3) finite numbers.
-            MemoryError: the device cannot hold the table.
+            TypeError, ValueError: Poses that are not (N, 3) finite numbers.
+            MemoryError: The device cannot hold the table.
         """
         self._caster.prepare(Poses(poses, self._caster.backend))
 
@@ -146,14 +146,14 @@ class RayCaster(Pickled):
         """Replace cells of the map; later ranges equal those of a caster made with the changed grid.
 
         The exact caster updates its table where rectangles can hold a changed obstacle, up to 254 cells away. Other
-        casters make their tables anew with the next cast.
+        casters rebuild their tables at the next cast.
 
         Args:
             cells: (h, w) integers as ``OccupancyGrid.cells``: occupancy in per cent, or -1 for unknown.
             region: (row, col) of the cell that ``cells[0, 0]`` replaces.
 
         Raises:
-            TypeError, ValueError: cells or a region that are not integers, or do not fit the grid, or a look-up table
+            TypeError, ValueError: Cells or a region that are not integers, or do not fit the grid, or a look-up table
                 from a file; nothing has changed.
         """
         self._caster.update(cells, region)
@@ -162,8 +162,8 @@ class RayCaster(Pickled):
         """Write the look-up table, whole or not at all, for ``casters.Lookup(bins, file=path)``.
 
         Raises:
-            ValueError: the method is not ``"lookup"``.
-            OSError: the file cannot be written.
+            ValueError: The method is not ``"lookup"``.
+            OSError: The file cannot be written.
         """
         if not isinstance(self.caster, casters.Lookup):
             raise ValueError(f"method: must be 'lookup' for a table to be saved, got {self.caster.name!r}")
@@ -183,7 +183,7 @@ class RayCaster(Pickled):
             obstacle.
 
         Raises:
-            TypeError, ValueError: arguments that are not finite numbers of these shapes.
+            TypeError, ValueError: Arguments that are not finite numbers of these shapes.
         """
         return self._caster.cast(poses, self._vectors(bearings), out)
 
@@ -202,14 +202,14 @@ class RayCaster(Pickled):
             (N, K) radians in [0, pi / 2], 0 head-on; NaN without an obstacle nearer than ``range_max``.
 
         Raises:
-            TypeError, ValueError: arguments that are not finite numbers of these shapes, or a method that is not exact.
+            TypeError, ValueError: Arguments that are not finite numbers of these shapes, or a method that is not exact.
         """
         vectors = self._vectors(bearings)
         require_exact("method", self.caster)
         return self._caster.cast(poses, vectors, out, Cones(incidence=True))
 
     def _vectors(self, bearings: AnyArray) -> Any:
-        """Return (K, 2) cosines and sines of bearings; the first ones are looked at for degrees."""
+        """Return (K, 2) cosines and sines of bearings; the first calls check for degrees."""
         checked = checks.array("bearings", bearings, ("K",))
         if not self._seen:
             self._seen = True

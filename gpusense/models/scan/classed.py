@@ -22,8 +22,8 @@ class LeftOut(NamedTuple):
     Attributes:
         hit: (K,) whether each reading is a range.
         far: Whether it is a max reading.
-        used: Whether it is a range that is used.
-        used_max: Whether it is a max reading that is used.
+        used: Whether it is a used range.
+        used_max: Whether it is a used max reading.
         constant: Whether it is part of the constant term.
         informs: Whether max readings have information: z_max > 0.
     """
@@ -71,8 +71,8 @@ class ClassedScans:
         constants: (S,) constant terms: log-likelihoods of the readings that do not depend on the pose.
         left_out: The other readings of the last scan.
         scans: S.
-        most_readings: Readings of the scan that has most.
-        most_rays: Rays of the scan that has most.
+        most_readings: Largest number of readings of a scan.
+        most_rays: Largest number of rays of a scan.
     """
 
     __slots__ = (
@@ -92,7 +92,7 @@ class ClassedScans:
 
     @property
     def shared(self) -> bool:
-        """Tell whether several readings share a ray."""
+        """Whether several readings share a ray."""
         return len(self.rays) < len(self.readings)
 
     def part(self, begin: int, end: int) -> ClassedScans:
@@ -138,7 +138,7 @@ def hits_and_max(ranges: np.ndarray, limits: tuple[float, float]) -> tuple[np.nd
     nearest, farthest = _limits(*limits, ranges.dtype)
     hit, far = ranges >= nearest, ranges >= farthest
     if nearest == 0 < limits[0]:
-        # A reading of 0 is missing, even where the limit is rounded to 0.
+        # A reading of 0 is missing, even if the limit is rounded to 0.
         hit, far = ranges > 0, far & (ranges > 0)
     hit &= ranges < farthest
     return hit, far

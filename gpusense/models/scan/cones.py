@@ -1,4 +1,4 @@
-"""Cones of a sensor: one ray or several, with returns from surfaces at any angle of incidence or only up to a limit."""
+"""Cones of a sensor: one or several rays, with returns at any angle of incidence or only up to a limit."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gpusense.tables.casters import Caster
 from gpusense.world.parameters import BeamParameters, IncidenceParameters
 from gpusense.world.scanner import Scanner
 
-# Between the largest cosine, 1, and 2, the kernels' value for a ray without a return.
+# Between 1, the largest cosine, and 2, which kernels use for a ray without a return.
 _BEYOND = 1.5
 
 
@@ -53,7 +53,7 @@ def cones_of(scanner: Scanner, method: Caster, *, incidence: bool) -> Cones:
     """Return the cones of a scanner; ``incidence`` says whether its model depends on angles of incidence.
 
     Raises:
-        ValueError: angles of incidence matter, and the caster is not exact.
+        ValueError: Angles of incidence matter, and the caster is not exact.
     """
     critical = scanner.critical_incidence
     least = 0.0 if critical is None or critical >= math.pi / 2 else max(math.cos(critical), 0.0)
@@ -77,7 +77,7 @@ def require_exact(argument: str, method: Caster) -> None:
     """Refuse casters that do not find the cell in which a ray ends.
 
     Raises:
-        ValueError: the caster is not exact.
+        ValueError: The caster is not exact.
     """
     if not method.exact:
         raise ValueError(f"{argument}: must be an exact one where angles of incidence matter, got {method.name!r}")

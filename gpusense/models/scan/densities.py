@@ -4,7 +4,7 @@ Kernels see expected ranges in [0, range_max], as casters return them. Learning,
 need values outside this interval, where the textbook's normaliser underflows to 0. These functions stay finite.
 They take scalars or arrays, float64 or float32; float32 throughout gives float32, computed in float32.
 
-The ``naive_`` functions are the textbook's formulas as printed. They serve comparisons only.
+The ``naive_`` functions are the textbook's formulas as printed, for comparisons only.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _ROOT_HALF = math.sqrt(0.5)
 _ROOT_2PI = math.sqrt(2 * math.pi)
 _ROOT_HALF_PI = math.sqrt(math.pi / 2)
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
-# Panels of the mass of another shape around z* outside [0, Z]; each is twice as long as the one before.
+# Panels for the mass of other shapes around z* outside [0, Z]; each is twice as long as the previous panel.
 _PANELS = 60
 
 
@@ -126,9 +126,10 @@ def log_mixture(
 ) -> Any:
     """Return log p(z | z*) of the mixture (book equation 6.12); ``**BeamParameters(...).to_dict()`` fits.
 
-    The components are added as logarithms, the largest taken out, so none is lost by underflow and a mixture that is 0
-    is -inf, not NaN. Continuous part and atom have mass 1 together, but for p_short's share where z* <= 0. An obstacle
-    expected beyond range_max leaves room for unexpected ones up to range_max: p_short sees ``min(z*, range_max)``.
+    The components are added as logarithms relative to the largest, so none is lost by underflow, and a mixture of 0
+    gives -inf, not NaN. Continuous part and atom together have mass 1, except for p_short's share where z* <= 0. An
+    obstacle expected beyond range_max leaves room for unexpected ones up to range_max: p_short sees ``min(z*,
+    range_max)``.
 
     Args:
         z: Readings [m].
@@ -220,7 +221,7 @@ def _moments(expected: Floats, bias: Floats, sigma: Floats, growth: Floats, rang
 
 
 def _log_other_hit(z: Floats, expected: Floats, sigma: Floats, range_max: Floats, shape: HitShape) -> Floats:
-    """Return the log density of a hit that is no normal; see log_hit."""
+    """Return the log density of a hit that is not normal; see log_hit."""
     real = z.dtype.type
     with np.errstate(all="ignore"):
         u = np.abs(z - expected) / sigma
@@ -240,7 +241,7 @@ def _log_other_hit(z: Floats, expected: Floats, sigma: Floats, range_max: Floats
 def _mass_beyond(begin: Floats, width: Floats, shape: HitShape) -> Floats:
     """Return the integral of exp(E(begin) - E(u)) from ``begin`` >= 0 over a width > 0."""
     real = begin.dtype.type
-    # The first panel is as long as the density takes to fall, or to bend at its top.
+    # The first panel has the length over which the density falls, or bends at its top.
     first = np.minimum(1 / (1 + shape.slope(begin)), width)
     total, start = np.zeros_like(begin), np.zeros_like(begin)
     base = shape.exponent(begin)

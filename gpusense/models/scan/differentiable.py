@@ -1,6 +1,6 @@
 """Log-likelihoods as operations that PyTorch and JAX differentiate, by the model's own gradient.
 
-Neither library is imported before one of its arrays is passed.
+A library is imported only after one of its arrays has been passed.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def log_likelihood_of(poses: Any, ranges: object, calls: Differentiable) -> Any:
 
     Raises:
         TypeError: JAX also traces the ranges.
-        ValueError: poses of another shape.
+        ValueError: Poses of another shape.
     """
     checks.check_values("ranges", ranges)
     if type(poses).__module__.partition(".")[0] == "torch":
@@ -59,7 +59,7 @@ def _torch_log_likelihood(torch: Any, poses: Any, calls: Differentiable) -> Any:
 
     def backward(ctx: Any, pull: Any) -> Any:
         (gradient,) = ctx.saved_tensors
-        # PyTorch wants a gradient in the precision of its input.
+        # PyTorch expects a gradient in the precision of its input.
         return (pull[..., None] * gradient).to(poses.dtype)
 
     if not torch.is_grad_enabled():

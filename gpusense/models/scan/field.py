@@ -46,11 +46,11 @@ class LikelihoodFieldModel(ScanModel):
         beams: None, the number of informative beams to use, evenly chosen, or the indices of the beams to use.
         compat: None; or ``"amcl"`` or ``"beluga"`` for the weights of these programs, with their default
             parameters; or their options, see ``gpusense.compat``.
-        specialize: False leaves nothing out: same numbers, slower.
+        specialize: False leaves nothing out, for the same numbers at lower speed.
 
     Raises:
-        TypeError: an argument is of the wrong kind.
-        ValueError: an argument breaks its rule, or the device is absent; the message names both.
+        TypeError: An argument is of the wrong kind.
+        ValueError: An argument breaks its rule, or the device is absent; the message names both.
 
     Example:
         >>> import gpusense as gs
@@ -119,9 +119,9 @@ class LikelihoodFieldModel(ScanModel):
             of the interpolated distance and r is the share of the hit density. With a leading axis (S,) for S scans.
 
         Raises:
-            TypeError: an argument does not hold real numbers, or is on a device that the backend cannot read.
-            ValueError: a wrong shape, a pose that is not finite, or a field that is not interpolated.
-            MemoryError: the device cannot hold the map's table, or even a few particles.
+            TypeError: An argument does not hold real numbers, or is on a device that the backend cannot read.
+            ValueError: A wrong shape, a pose that is not finite, or a field that is not interpolated.
+            MemoryError: The device cannot hold the map's table, or even a few particles.
         """
         if self.parameters.interpolation != "bilinear":
             raise ValueError(
@@ -154,19 +154,19 @@ class LikelihoodFieldModel(ScanModel):
             region: (row, col) of the cell that ``cells[0, 0]`` replaces.
 
         Raises:
-            TypeError, ValueError: cells or a region that are not integers, or do not fit the grid; nothing has changed.
+            TypeError, ValueError: Cells or a region that are not integers, or do not fit the grid; nothing has changed.
         """
         with self._lock:
             self._field_pipeline.map.update(cells, region)
 
     def sample(self, poses: AnyArray, seed: int = 0, **options: Any) -> NoReturn:
-        """Refuse to draw readings, since a likelihood field is no density of them.
+        """Refuse to draw readings, since a likelihood field is not a density of readings.
 
         Its sum over a beam's readings depends on the pose: readings drawn from the normalised field would have another
-        density than ``log_likelihood``. A :class:`BeamModel` of the same map draws.
+        density than ``log_likelihood``. A :class:`BeamModel` of the same map can draw readings.
 
         Raises:
-            TypeError: always.
+            TypeError: Always.
 
         Example:
             >>> import gpusense as gs
@@ -194,7 +194,7 @@ class LikelihoodFieldModel(ScanModel):
             ]
         )
         if not bilinear:
-            # They are in the table, whatever their weights.
+            # The table includes them, whatever their weights.
             omissions = [dataclasses.replace(o, flags=frozenset(), ends=frozenset()) for o in omissions]
         kept_precision, could_go = precision_notes(self.precision)
         kept += kept_precision

@@ -16,7 +16,7 @@ from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.readings import Readings, placing_launches
 from gpusense.models.scan.request import Request
 
-# Flags of the mixture that the kernel does not know.
+# Flags of the mixture that have no meaning for the kernel.
 _OTHERS = {"LOG_TABLE", "CUBES"}
 
 
@@ -57,13 +57,13 @@ class _Gradient:
         mount_x, mount_y = (value / resolution for value in pipeline.scanner.mount[:2])
         flags = (pipeline.components | readings.flags) - _OTHERS
         flags, per_scan = with_lanes_flag(backend.info.lanes, "field_gradient", flags), piece.count // readings.scans
-        # The particles of a vector belong to one scan.
+        # The particles of a work-item's lanes belong to one scan.
         size = readings.scans * -(-per_scan // LANES) * LANES if "IN_LANES" in flags else piece.count
-        given = readings.arguments
+        arguments = readings.arguments
         gradient = launch(
             "field_gradient", flags, (size,), table=table, pose_cell=placed.cell, pose=placed.pose,
-            pose_low=placed.low, point=given["point"], point_low=given["point_low"], terms=pipeline.terms,
-            start=given["start"], constant_terms=readings.sums["constant_terms"], gradient=numbers,
+            pose_low=placed.low, point=arguments["point"], point_low=arguments["point_low"], terms=pipeline.terms,
+            start=arguments["start"], constant_terms=readings.sums["constant_terms"], gradient=numbers,
             window=placed.frame.window, particles=piece.count, readings=readings.readings,
             guard=pipeline.guard * readings.reach, mount_x=mount_x, mount_y=mount_y, resolution=resolution,
             score=Score(readings.constant_term, pipeline.setting.temperature), batch=ScanBatch(per_scan, 0),
@@ -75,13 +75,13 @@ class _Gradient:
 def in_world(numbers: np.ndarray, yaw: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return log p (M,), gradient (M, 3) and information (M, 3, 3) in the world from numbers in the grid's frame.
 
-    Without a turn between them they are views of the numbers.
+    If the frames are not rotated, the results are views of the numbers.
     """
     gradient, information = numbers[:, 1:4], numbers[:, 4:]
     if yaw:
         c, s = np.cos(yaw), np.sin(yaw)
         turned = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-        # One product for all poses: the information as a vector turns by a Kronecker product.
+        # One product for all poses: a Kronecker product rotates the information as a vector.
         real = numbers.dtype
         gradient = (gradient @ turned.T).astype(real)
         information = (information @ np.kron(turned, turned).T).astype(real)

@@ -41,7 +41,7 @@ class FieldPipeline(ScanPipeline):
         table: Maker of the map's table.
         components: Flags of the mixture.
         log_table: Whether cells hold log densities or cubes of densities, not distances.
-        quick: Whether GPUs find cells in working precision, and again with more digits near edges of cells.
+        quick: Whether GPUs find cells in working precision, and use more digits only near edges of cells.
         terms: The numbers of the mixture on the device.
         guard: Distance from a cell's edge below which an end point needs more digits, by its length + 2 cells.
     """
@@ -194,7 +194,7 @@ class FieldPipeline(ScanPipeline):
             parts=parts.buffer, **readings.arguments,
         )  # fmt: skip
         if scoring.tiles is None:
-            # The particles of a vector belong to one scan.
+            # The particles of a work-item's lanes belong to one scan.
             grouped = readings.scans * -(-scoring.batch.per_scan // _GROUP) * _GROUP
             size = grouped if "IN_LANES" in scoring.flags else count
             common |= self.numbers(scoring)

@@ -1,4 +1,4 @@
-"""Several models of one device in one call: other maps, sensors or kinds of model, and one wait for all."""
+"""Several models of one device in one call, with a single wait: models of different maps, sensors or kinds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gpusense.models.scan.request import make_request
 def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out: Any = None) -> list[Any]:
     """Return log p(z | x, m) of several beam models and likelihood fields, as ``log_likelihood`` of each.
 
-    All models queue their launches, and the call waits for the device once. Models may differ in everything but the
+    All models enqueue their launches, and the call waits for the device once. Models may differ in everything but the
     device: maps (of floors or robots), scanners, parameters, precision. A model may occur several times.
 
     Args:
@@ -30,9 +30,9 @@ def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out
         A list of the results of ``log_likelihood`` of each model, with the same bits: (N,) or (S, N).
 
     Raises:
-        TypeError: models of another type, or an argument of one of them that breaks its rule.
-        ValueError: models of several devices, a list of another length, or an argument that breaks its rule.
-        MemoryError: the device cannot hold a map's table, or even a few particles.
+        TypeError: Models of another type, or an argument of one of them that breaks its rule.
+        ValueError: Models of several devices, a list of another length, or an argument that breaks its rule.
+        MemoryError: The device cannot hold a map's table, or even a few particles.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -55,14 +55,14 @@ def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out
         # Poses that several models share are checked once.
         shared = known.setdefault(id(model_poses), {})
         requests.append(make_request(model._setting, model_poses, model_ranges, model_out, known=shared))
-    # One order of locks, so that two such calls cannot deadlock.
+    # A fixed order of locks, so that two such calls cannot deadlock.
     different = sorted({id(model): model for model in chosen}.items())
     with contextlib.ExitStack() as stack:
         for _, model in different:
             stack.enter_context(model._lock)
         for _, model in different:
             stack.push(lambda kind, *error, space=model._workspace: space.abandon() if kind else None)
-        # Left first: the batch is started before an error abandons its memory.
+        # Left first, so that the batch is started before an error abandons its memory.
         stack.enter_context(chosen[0]._workspace)
         for model, request in zip(chosen, requests, strict=True):
             model._run(request)
@@ -76,7 +76,7 @@ def _checked(models: object) -> list[ScanModel]:
     """Return models of one device as a list.
 
     Raises:
-        TypeError, ValueError: not models of scans, or models of several devices.
+        TypeError, ValueError: Not models of scans, or models of several devices.
     """
     if not isinstance(models, (list, tuple)):
         raise TypeError(f"models: must be a list or tuple of models, got {checks.show(models)}")
@@ -94,7 +94,7 @@ def _one_each(name: str, value: Any, count: int) -> list[Any]:
     """Return an argument of each model: an entry of a list or tuple, or the same value for all.
 
     Raises:
-        ValueError: a list of another length.
+        ValueError: A list of another length.
     """
     if not isinstance(value, (list, tuple)):
         return [value] * count

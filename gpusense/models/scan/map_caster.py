@@ -44,7 +44,7 @@ class MapCaster:
         range_max: Longest range [m].
         method: The method for ranges.
         unknown: Whether unknown cells are ``"free"`` or ``"occupied"``.
-        outside: Whether what lies outside the grid is ``"free"`` or ``"occupied"``.
+        outside: Whether space outside the grid is ``"free"`` or ``"occupied"``.
         crop: False prepares the whole map at once.
         obstacles_of: Function that returns the mask of a grid's cells that stop a beam, from the grid and ``unknown``.
     """
@@ -66,7 +66,7 @@ class MapCaster:
         self.backend, self.real, self.mount, self.range_max = backend, real, mount, range_max
         self.limit = range_max / grid.resolution
         self.method, self.outside, self._table_bytes = method, outside, 0
-        # Window of the normals of the map's walls, the normals, and their bytes.
+        # Window of the normals of the map's walls, the normals, and their size [bytes].
         self._normals: tuple[Window, Buffer, int] | None = None
         self._no_normals = backend.upload(np.zeros(2, real))
         self.map = ReachableMap(
@@ -85,7 +85,7 @@ class MapCaster:
 
     @property
     def grid(self) -> OccupancyGrid:
-        """The map as it is."""
+        """The current map."""
         return self.map.grid
 
     @property
@@ -97,7 +97,7 @@ class MapCaster:
         """Return the normals of the walls in a window, where flags need them; made once for a window.
 
         Raises:
-            TableMemoryError: the device cannot hold them.
+            TableMemoryError: The device cannot hold them.
         """
         if "INCIDENCE" not in flags:
             return self._no_normals
@@ -134,7 +134,8 @@ class MapCaster:
         if isinstance(self.method, casters.Lookup) and self.method.file is not None:
             raise ValueError(f"file: must be None where the map changes, got {checks.show(self.method.file)}")
         with self._lock:
-            # First: an interrupt may come before the map has changed, but not between the map and its normals.
+            # Drop the normals first: an interrupt may come before the map has changed, but not between the map and its
+            # normals.
             self._normals = None
             return self.map.update(cells, region)
 
@@ -188,7 +189,7 @@ class MapCaster:
         with self._lock, self._workspace as space:
             ray = space.upload("ray", vectors.astype(self.real))
             chunk = chunk_of(self.backend, rays * cones.rays, 2 * self.real.itemsize)
-            # Numbers of drawings go by the index of a particle among all, so scans need not be whole.
+            # Random numbers depend on the index of a particle among all, so scans may be split.
             run_pieces(
                 space, Piece(0, poses.count, poses.count), chunk,
                 lambda piece: self._draw(poses, piece, ray, rays, flat, cones, drawing),
@@ -198,7 +199,7 @@ class MapCaster:
     def _draw(
         self, poses: Poses, piece: Piece, ray: Buffer, rays: int, flat: Any, cones: Cones, drawing: Drawing
     ) -> None:
-        """Start to draw the readings of a piece."""
+        """Start drawing the readings of a piece."""
         space, count, info = self._workspace, piece.count, self.backend.info
         table, window = poses.window(self.map, piece.part)
         placed = place(poses, piece.part, Frame(window, self.grid, self.mount), self.backend, space, self.real)
@@ -215,7 +216,7 @@ class MapCaster:
             drawing.on_host(piece.begin, count, rays, flat[piece.begin * rays : piece.end * rays], incidence)
 
     def _cast(self, poses: Poses, piece: Piece, ray: Buffer, rays: int, flat: Any, cones: Cones) -> None:
-        """Start to cast the rays of a piece."""
+        """Start casting the rays of a piece."""
         space, count = self._workspace, piece.count
         table, window = poses.window(self.map, piece.part)
         placed = place(poses, piece.part, Frame(window, self.grid, self.mount), self.backend, space, self.real)

@@ -1,4 +1,4 @@
-"""The beam model's mixture for kernels: flags of its components, its numbers, or a table in its place."""
+"""The beam model's mixture for kernels: flags of its components and its numbers, or a table instead."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gpusense.world.parameters import BeamParameters
 from gpusense.world.range_causes import NoReturn, RandomDensity, ShortDensity
 from gpusense.world.sensor_table import SensorTable
 
-# Most bins of a sensor's table along each axis: 268 MB in float32.
+# Largest number of bins of a sensor's table along each axis: 268 MB in float32.
 _MOST_BINS = 8192
 
 
@@ -74,8 +74,8 @@ def mixture_on_device(
         max_depends: Whether the probability of a max reading depends on the pose.
 
     Raises:
-        ValueError: a number is beyond what the precision can hold.
-        TypeError, ValueError: a width that is no number, too small or more than range_max.
+        ValueError: A number is beyond what the precision can hold.
+        TypeError, ValueError: A width that is not a number, too small or more than range_max.
     """
     if compat is not None:
         return Mixture(*peer_mixture(mixtures[0], range_max, real, amcl=compat == "amcl"), cosines)
@@ -97,7 +97,7 @@ def mixture_of(
     """Return flags of the components, and the numbers of the kernel file ``mixture`` for each bin of incidence.
 
     Raises:
-        ValueError: a number is beyond what the precision can hold.
+        ValueError: A number is beyond what the precision can hold.
     """
     hit, short, rand = (max(getattr(p, name) for p in kinds) > 0 for name in ("z_hit", "z_short", "z_rand"))
     # If no range is possible at any angle, a component must evaluate to -inf.
@@ -124,7 +124,7 @@ def learning_terms(p: BeamParameters, range_max: float, real: np.dtype) -> np.nd
     """Return the numbers of the kernel file ``learning``, with the table of masses behind them.
 
     Raises:
-        ValueError: a number is beyond what the precision can hold.
+        ValueError: A number is beyond what the precision can hold.
     """
     shape = shape_of(p)
     terms = _terms(p, range_max, real, False, (1 / p.sigma_hit, 1 / shape.width, 0.0))
@@ -135,7 +135,7 @@ def _common_flags(kinds: Sequence[BeamParameters]) -> frozenset[str]:
     """Return the flags of the shape of hits, which all bins of angles of incidence share.
 
     Raises:
-        ValueError: bins differ in it.
+        ValueError: Bins differ in it.
     """
     shapes = {p.hit: shape_of(p).flags for p in kinds}
     if len(shapes) > 1:
@@ -149,7 +149,7 @@ def peer_mixture(
     """Return flags and numbers of the kernel file ``compat``.
 
     Raises:
-        ValueError: a number is beyond what the precision can hold.
+        ValueError: A number is beyond what the precision can hold.
     """
     if p.range_bias or p.sigma_growth:
         raise ValueError(f"parameters: range_bias and sigma_growth must be 0 with compat, got {p}")
@@ -164,7 +164,7 @@ def tabulated(p: BeamParameters, width: float, range_max: float, real: np.dtype)
     """Return log p in bins of readings and expected ranges, both with a last bin for range_max.
 
     Raises:
-        TypeError, ValueError: a width that is no number, too small or more than range_max.
+        TypeError, ValueError: A width that is not a number, too small or more than range_max.
     """
     from gpusense.models.scan.densities import log_mixture  # loads SciPy
 
@@ -218,7 +218,7 @@ def _last_range(p: BeamParameters, range_max: float, real: np.dtype, linear: boo
     below half of the last bit of 1.
 
     Returns:
-        None where there is no such range below range_max for some reading.
+        None if some reading has no such range below range_max.
     """
     rand, digits = _rand(p, range_max), np.finfo(real).nmant
     if not rand or (p.z_short and not (linear and p.lambda_short)):
@@ -234,7 +234,7 @@ def _last_range(p: BeamParameters, range_max: float, real: np.dtype, linear: boo
             return None
         slope = 1 / (1 - u * p.sigma_growth)
         offset = (u * p.sigma_hit + max(-p.range_bias, 0.0)) * slope
-    # More than the rounding errors of ranges.
+    # A margin that exceeds the rounding errors of ranges.
     slope, offset = slope * 1.0001, offset * 1.0001 + 1e-6 * range_max
     return (offset, slope, least) if max(offset, least) < range_max else None
 

@@ -88,7 +88,7 @@ class ScanModel(Pickled):
 
     @functools.cached_property
     def _short(self) -> ShortCalls | None:
-        """Calls of few particles that repeat a size; None where there are none."""
+        """Calls of few particles that repeat a size; None if the model has none."""
         if not self.backend.replays:
             return None
         from gpusense.models.scan.packed_call import ShortCalls
@@ -151,7 +151,7 @@ class ScanModel(Pickled):
 
     @property
     def grid(self) -> OccupancyGrid:
-        """The map as it is now."""
+        """The current map."""
         return self._pipeline.grid
 
     @property
@@ -166,7 +166,7 @@ class ScanModel(Pickled):
 
     @property
     def used_beams(self) -> int:
-        """Most beams of a scan that the model evaluates."""
+        """Largest number of beams of a scan that the model evaluates."""
         return self._setting.rules.choice.most
 
     @property
@@ -220,12 +220,12 @@ class ScanModel(Pickled):
             ``compat`` the logarithm of a particle's weight, and the cubes or logarithms that it sums.
 
         Raises:
-            TypeError: an argument does not hold real numbers, or is on a device that the backend cannot read.
-            ValueError: a wrong shape, or a pose that is not finite; the message names it.
-            MemoryError: the device cannot hold the map's table, or even a few particles.
+            TypeError: An argument does not hold real numbers, or is on a device that the backend cannot read.
+            ValueError: A wrong shape, or a pose that is not finite; the message names it.
+            MemoryError: The device cannot hold the map's table, or even a few particles.
 
         Warns:
-            PlausibilityWarning: in the first calls of a scanner, negative readings, or ones in millimetres.
+            PlausibilityWarning: In the first calls of a scanner, negative readings, or readings in millimetres.
         """
         if out is None and not per_beam and type(poses) is not np.ndarray and is_recorded(poses):
             calls = self._differentiable(ranges)
@@ -233,9 +233,9 @@ class ScanModel(Pickled):
                 return cast(np.ndarray, log_likelihood_of(poses, ranges, calls))
         if self._short is not None:
             with self._lock:
-                found = self._short.score(poses, ranges, out, per_beam=per_beam)
-            if found is not None:
-                return found
+                result = self._short.score(poses, ranges, out, per_beam=per_beam)
+            if result is not None:
+                return result
         request = make_request(self._setting, poses, ranges, out, per_beam=per_beam)
         with self._lock, self._workspace:
             run(self._pipeline, request, self._workspace, self._last_call)
@@ -246,16 +246,16 @@ class ScanModel(Pickled):
     def start_scoring(
         self, poses: Any, ranges: AnyArray, *, out: Any, before: Callable[[], None] | None = None
     ) -> None:
-        """Start to score poses on the device; ``finish_scoring`` waits, or whatever waits for the device.
+        """Start scoring poses on the device; ``finish_scoring``, or any other wait for the device, ends it.
 
         Args:
             poses: (N, 3) poses on the device.
             ranges: (K,) readings [m].
             out: (N,) array on the device for the log-likelihoods.
-            before: Called before poses are read, to start the launches that write them.
+            before: Function called before poses are read, to start the launches that write them.
 
         Raises:
-            TypeError, ValueError, MemoryError: see ``log_likelihood``.
+            TypeError, ValueError, MemoryError: See ``log_likelihood``.
         """
         request = make_request(self._setting, poses, ranges, out, before=before)
         with self._lock, self._workspace:
@@ -265,7 +265,7 @@ class ScanModel(Pickled):
         """Wait for calls that ``start_scoring`` has begun.
 
         Raises:
-            ValueError: a pose was not finite.
+            ValueError: A pose was not finite.
         """
         with self._lock:
             finish(self._workspace, on_device=True)
@@ -278,10 +278,10 @@ class ScanModel(Pickled):
         """Bind arrays that stay in place to a call of ``log_likelihood``, for filters that repeat it.
 
         Each call reads the present contents of the arrays, and writes ``out``. Where poses and ranges are on the
-        model's GPU, a call is one start of a CUDA graph, or three launches of OpenCL whose arguments stay set: it
-        checks nothing, allocates nothing, copies nothing and does not wait; ``check`` waits, and reports poses that
-        were not finite. NumPy arrays of few particles go to a GPU and back with one copy each way; elsewhere the bound
-        call is the ordinary one, so that the same program runs on every backend.
+        model's GPU, a call starts a CUDA graph, or three launches of OpenCL whose arguments stay set: it checks
+        nothing, allocates nothing, copies nothing and does not wait. ``check`` waits, and reports poses that were not
+        finite. NumPy arrays of few particles go to a GPU and back with one copy each way; elsewhere the bound call is
+        the ordinary one, so that the same program runs on every backend.
 
         Results have the bits of ``log_likelihood`` with the same poses on the device. Three cases agree only to
         rounding: scans in which bearings repeat, scans of a temperature below 1 in which no range depends on the pose,
@@ -293,11 +293,11 @@ class ScanModel(Pickled):
             out: (N,) array for the log-likelihoods, as ``log_likelihood`` takes it.
 
         Raises:
-            TypeError: not an array, an immutable one, or one on a device that the backend cannot read.
-            ValueError: a wrong shape.
-            MemoryError: the device cannot hold the map's table, or the buffers of a call.
+            TypeError: Not an array, an immutable one, or one on a device that the backend cannot read.
+            ValueError: A wrong shape.
+            MemoryError: The device cannot hold the map's table, or the buffers of a call.
         """
-        # Few programs bind calls.
+        # Imported on use, since few programs bind calls.
         from gpusense.models.scan.binding import bind
 
         return bind(self._pipeline, self._lock, self.log_likelihood, poses, ranges, out)
@@ -308,10 +308,10 @@ class ScanModel(Pickled):
         Readings and map are those of the last call.
 
         Args:
-            measure: Whether to time the scene with and without each part that flags of the kernel bring back. Each line
-                of a part that is left out then ends with what that saves in a call with the last scan and 2000
-                particles all over the map, ``measured +0.012 ms``, or with ``not timed``. A difference below a few
-                percent of the call is noise.
+            measure: Whether to time the scene with and without each part that flags of the kernel bring back. The line
+                of an omitted part then ends with its saving in a call with the last scan and 2000 particles spread over
+                the map, ``measured +0.012 ms``, or with ``not timed``. A difference below a few percent of the call is
+                noise.
 
         Returns:
             A title, the flags of the code, a line ``- part  reason; saves ...`` for each part that is left out, and
@@ -332,7 +332,7 @@ class ScanModel(Pickled):
             The title, the flags of the code, and the parts that are left out, kept, and could go.
 
         Raises:
-            RuntimeError: as :meth:`explain`.
+            RuntimeError: As :meth:`explain`.
         """
         title, omissions, kept, could_go = self._notes()
         plan = self._plan(title, omissions, kept, could_go)
@@ -362,11 +362,11 @@ class ScanModel(Pickled):
         """Return the report's title, and the parts that are left out, kept, and removable."""
 
     def prepare(self, poses: AnyArray) -> None:
-        """Make the map's table for a cloud of (N, 3) poses now; ``log_likelihood`` does it otherwise.
+        """Make the map's table for a cloud of (N, 3) poses now, instead of in the first ``log_likelihood``.
 
         Raises:
-            TypeError, ValueError: poses that are not (N, 3) finite numbers.
-            MemoryError: the device cannot hold the table.
+            TypeError, ValueError: Poses that are not (N, 3) finite numbers.
+            MemoryError: The device cannot hold the table.
         """
         checked = Poses(poses, self._setting.backend)
         if checked.count:

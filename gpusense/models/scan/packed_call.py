@@ -1,8 +1,8 @@
 """Calls of few particles in NumPy arrays on a GPU: inputs go to the device as one array, results come back as one.
 
-A copy of few numbers takes as long as a launch, and the host takes longer to class a scan than the device. So the
-recording of :class:`.bound.DeviceCall` follows the copy, and the device classes the readings. With CUDA copies and
-launches are one graph. Bound calls of such arrays are of this kind, and so are ordinary calls that repeat a size.
+A copy of few numbers takes as long as a launch, and the device classes a scan faster than the host. Therefore the
+recording of :class:`.bound.DeviceCall` follows the copy, and the device classes the readings. With CUDA, copies and
+launches are one graph. Bound calls of such arrays work like this, and so do ordinary calls that repeat a size.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.tiles import LEAST_ORDERED
 from gpusense.world.windows import Corners
 
-# Most bytes that are copied with the launches; longer arrays take the ordinary call.
+# Largest size that is copied with the launches [bytes]; longer arrays take the ordinary call.
 LARGEST = 256 << 10
 _DOUBLE, _INT = np.dtype(np.float64), np.dtype(np.int32)
 _FLOATS = (np.dtype(np.float32), _DOUBLE)
 # Alignment of arrays that are copied as one [bytes], enough for every device.
 _ALIGNED = 1024
-# Sizes of short calls that are kept; other calls of a size before; cells of a map up to which it may have two tables.
+# Number of sizes of short calls that are kept; ordinary calls of a size before the first short one; largest map that
+# may have two tables [cells].
 _MOST_SIZES, _BEFORE, _MOST_CELLS = 8, 2, 1 << 22
 
 
@@ -122,7 +123,7 @@ class PackedCall:
             False where a pose is not finite; nothing is written then.
 
         Raises:
-            MemoryError: the device cannot hold the map's table.
+            MemoryError: The device cannot hold the map's table.
         """
         backend, inputs, outputs = self._backend, self._inputs, self._outputs
         (own_poses, own_ranges), (log_p, status) = self.arrays, outputs.views
@@ -149,34 +150,34 @@ class PackedCall:
 class ShortCalls:
     """Ordinary calls of a model that repeat a size of few particles.
 
-    Results have the bits of any other ordinary call, so calls for which that is not certain are left to those.
+    Results have the bits of ordinary calls; a call for which this is not certain is left to the ordinary path.
 
     Args:
         pipeline: The stages of the model.
 
     Attributes:
-        last: The last call; None where it was none of these.
+        last: The last call; None if it was not a short one.
     """
 
     def __init__(self, pipeline: ScanPipeline) -> None:
         self._pipeline = pipeline
         self.last: PackedCall | None = None
         self._calls = ProgramCache[PackedCall](_MOST_SIZES)
-        # Calls of a size so far.
+        # Number of calls by size so far.
         self._seen = ProgramCache[int](_MOST_SIZES)
-        # A private lock: whoever scores holds that of the model.
+        # A private lock, since the scoring thread holds the model's lock.
         self._lock = threading.Lock()
 
     @staticmethod
     def of(pipeline: ScanPipeline) -> ShortCalls | None:
-        """Return those of a model; None where its device or its options have none."""
+        """Return the short calls of a model; None if its device or its options exclude them."""
         if not pipeline.backend.replays or host_task(pipeline) or pipeline.grid.cells.size > _MOST_CELLS:
             return None
         certain = pipeline.specialize and pipeline.rules.separate and pipeline.setting.possible
         return ShortCalls(pipeline) if certain else None
 
     def score(self, poses: Any, ranges: Any, out: Any, *, per_beam: bool) -> np.ndarray | None:
-        """Score poses by the readings of a scan; None where that is left to another call.
+        """Score poses by the readings of a scan; None if the ordinary call must do it.
 
         Args:
             poses: Poses as ``log_likelihood`` takes them.
@@ -202,7 +203,7 @@ class ShortCalls:
             call = call or self._calls.keep(key, PackedCall(pipeline, self._lock, count, ranges.dtype, corners))
             call.score(poses, ranges, result, corners)
         except MemoryError:
-            # The buffers of both kinds of calls may not fit where those of one do.
+            # The buffers of both kinds of calls may not fit the device at once.
             self._calls.clear()
             return None
         self.last = call
@@ -211,7 +212,7 @@ class ShortCalls:
         return result
 
     def _takes(self, count: int, out: Any) -> bool:
-        """Return whether the size is that of a short call, and results can be written."""
+        """Return whether the call has the size of a short call, and results can be written."""
         if not is_short(count, self._pipeline.scanner.count) or not fits(count, self._pipeline.scanner.count):
             return False
         if out is None:
@@ -220,14 +221,14 @@ class ShortCalls:
         return usable and out.flags.c_contiguous and out.flags.writeable
 
     def _repeats(self, count: int, limits: np.dtype) -> bool:
-        """Return whether a size comes again and again, and count it."""
+        """Count a call of a size, and return whether the size has occurred often."""
         seen = self._seen.get((count, limits)) or 0
         if seen < _BEFORE:
             self._seen.keep((count, limits), seen + 1)
         return seen >= _BEFORE
 
     def _has_range(self, ranges: np.ndarray) -> bool:
-        """Return whether a reading depends on the pose; a scan without one rounds its constant term otherwise."""
+        """Return whether a reading depends on the pose; without one the constant term is rounded differently."""
         return bool(hits_and_max(ranges, self._pipeline.rules.limits)[0].any())
 
     def _corners(self, poses: np.ndarray) -> Corners | None:

@@ -2,7 +2,7 @@
 
 Every scan model and every kind of call passes through these five stages. A request holds checked arguments. Readings
 and poses are brought to the device. The program follows from them and starts nothing. The file ``scoring`` runs it, in
-pieces that fit the memory of the device: the only loop.
+the only loop, over pieces that fit the memory of the device.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from gpusense.models.scan.tiles import Order, Parts, order_of
 from gpusense.tables.reachable import ReachableMap
 from gpusense.world.grid import OccupancyGrid
 
-# Rays times particles of one scan up to which several scans share their launches, by kind of device. Above, a scan's
-# launches fill the device for longer than it takes to start them.
+# Rays times particles of one scan up to which several scans share their launches, by kind of device. Above, the
+# launches of a single scan take longer on the device than their starts.
 TOGETHER = {"gpu": 1 << 22, "cpu": 1 << 20}
 
 
@@ -53,7 +53,7 @@ class ScanLaunch(NamedTuple):
         table: The map's table for the window of the poses.
         log_p: The buffer for the log-likelihoods.
         flags: Flags of the scoring kernel.
-        tiles: The tiles of GPUs, which sum in a second launch; None where one launch does it all.
+        tiles: The tiles of GPUs, which sum in a second launch; None if a single launch does everything.
         per_beam: Whether the log-likelihoods of single readings are kept.
     """
 
@@ -97,16 +97,16 @@ class ScanPipeline(ABC):
         self.scanner, self.specialize = setting.rules.scanner, setting.rules.specialize
         self._mount, self._readings = self.scanner.mount, setting.weights.readings
         self.nothing = self.backend.upload(np.zeros(1, np.int32))
-        # Flags by everything on which they depend.
+        # Flags, keyed by everything on which they depend.
         self._flags: dict[Hashable, frozenset[str]] = {}
-        # Flags to add and to take away while what is left out is measured.
+        # Flags to add and to remove while omissions are measured.
         self.trial: tuple[frozenset[str], frozenset[str]] | None = None
 
     # ---- stages that depend on the model
 
     @property
     def grid(self) -> OccupancyGrid:
-        """The map as it is."""
+        """The current map."""
         return self.map.grid
 
     @abstractmethod
@@ -185,7 +185,7 @@ class ScanPipeline(ABC):
         return class_scans(self._readings(ranges, self.scanner, self.end_points), self.rules)
 
     def value(self, scans: ClassedScans) -> float | None:
-        """Return the log-likelihood of scans where it is the same at every pose, None elsewhere."""
+        """Return the log-likelihood of scans if it is the same at every pose, else None."""
         if not len(scans.readings):
             setting = self.setting
             constant = setting.weights.without_readings(scans.constants[0], setting.constant_term, cubes=setting.cubes)

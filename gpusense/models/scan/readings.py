@@ -20,7 +20,7 @@ from gpusense.world.range_causes import NoReturn
 from gpusense.world.scanner import Scanner
 
 _INT = np.dtype(np.int32)
-# The kernel places readings by whole groups of work-items, so that the work-items of poses begin with a new group.
+# The kernel places readings in whole groups of work-items, so that the work-items of poses begin a new group.
 _GROUP = 64
 
 
@@ -29,8 +29,8 @@ class Readings(NamedTuple):
 
     Attributes:
         scans: S.
-        rays: Rays of the scan that has most.
-        readings: Readings of the scan that has most.
+        rays: Largest number of rays of a scan.
+        readings: Largest number of readings of a scan.
         flags: Flags of kernels that score them.
         arguments: Their arguments of scoring kernels, by name.
         sums: Their arguments of ``sum_parts``, by name: counts of readings or blocks, and constant terms of scans.
@@ -126,7 +126,7 @@ class Sensing:
 
     @property
     def constants_there(self) -> bool:
-        """Tell whether readings without a place may add a constant term."""
+        """Whether readings without a place may add a constant term."""
         return self.max_readings == MAX_FIXED or not self.possible
 
     def limits(self, dtype: np.dtype) -> tuple[float, float]:
@@ -134,7 +134,7 @@ class Sensing:
         with np.errstate(over="ignore"):
             nearest, farthest = dtype.type(self.scanner.range_min), dtype.type(self.scanner.range_max)
         if self.scanner.range_min > 0:
-            # A reading of 0 is missing, even where the limit is rounded to 0.
+            # A reading of 0 is missing, even if the limit is rounded to 0.
             nearest = max(nearest, np.finfo(dtype).smallest_subnormal)
         return float(nearest), float(farthest)
 

@@ -76,7 +76,7 @@ def make_request(
         before: See Request.
 
     Raises:
-        TypeError, ValueError: an argument breaks its rule.
+        TypeError, ValueError: An argument breaks its rule.
     """
     backend, real, scanner = setting.backend, setting.real, setting.rules.scanner
     beams = scanner.count

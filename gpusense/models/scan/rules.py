@@ -24,7 +24,7 @@ class BeamChoice:
 
     Attributes:
         columns: Beams that may be used.
-        most: Most readings that are used; of more, an even choice.
+        most: Largest number of readings that are used, evenly chosen from more.
         every: Whether all beams are used.
     """
 
@@ -92,7 +92,7 @@ class Rules:
 
     @functools.cached_property
     def separate(self) -> bool:
-        """Tell whether each reading has its ray: all bearings differ, or nothing is left out."""
+        """Whether each reading has a separate ray, because all bearings differ or nothing is left out."""
         return not self.specialize or len(np.unique(self.vectors, axis=0)) == len(self.vectors)
 
     @functools.cached_property
@@ -102,17 +102,17 @@ class Rules:
 
     @functools.cached_property
     def first_scans(self) -> FirstScans:
-        """The look at the first scans of the scanner."""
+        """The check of the scanner's first scans for implausible readings."""
         return self.scanner._first_scans
 
     @functools.cached_property
     def max_is_constant(self) -> bool:
-        """Tell whether max readings are added as a constant term instead of being evaluated."""
+        """Whether max readings are added as a constant term instead of being evaluated."""
         return self.specialize and not self.max_depends
 
     @functools.cached_property
     def log_max(self) -> float:
-        """Log of the probability of a max reading that counts; 0 where none does."""
+        """Log of the probability of a max reading; 0 if max readings do not count."""
         return float(NoReturn(self.z_max).log_mass) if self.z_max > 0 else 0.0
 
 
@@ -131,7 +131,7 @@ class ModelContext:
         real: Precision.
         rules: How readings are classed; they hold the scanner.
         weights: The book's likelihood, or the program whose weights are reproduced.
-        cubes: Whether the model sums cubes of densities, in place of logarithms.
+        cubes: Whether the model sums cubes of densities instead of logarithms.
         temperature: Multiplies the sum over readings.
         constant_term: The first term of that sum.
         possible: Whether some range is possible at some pose.
@@ -151,8 +151,8 @@ def check_beams(beams: Beams, count: int) -> Beams:
     """Validate ``beams=`` for a scanner of ``count`` beams.
 
     Raises:
-        ValueError: a number below 0, or an index outside the scan.
-        TypeError: not an integer or a list of them.
+        ValueError: A number below 0, or an index outside the scan.
+        TypeError: Not an integer or a list of them.
     """
     if beams is None:
         return None

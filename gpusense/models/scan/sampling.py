@@ -34,7 +34,7 @@ class Drawing:
         mixture: Numbers of the mixture for each bin of angles of incidence, then the tables of the hit shape.
         edges: Cosines between these bins, in the model's precision.
         chances: Cumulative probabilities of a table of a sensor; one number without a table.
-        cells: Bins of a range in the table; 0 without one.
+        cells: Number of range bins of the table; 0 without one.
         range_max: Longest range [m].
         real: Precision of ranges and readings.
         seed: The seed.
@@ -77,7 +77,7 @@ class Drawing:
         settings[c.DRAW_STEP], settings[c.DRAW_FIRST], settings[c.DRAW_PER_SCAN] = self.step, first, self.per_scan
         limit = self.real.type(self.range_max)
         settings[c.DRAW_RANGE_MAX], settings[c.DRAW_TOP] = self.range_max, np.nextafter(limit, self.real.type(0))
-        # Rounding must not take a reading to the next bin.
+        # Rounding must not move a reading to the next bin.
         settings[c.DRAW_MARGIN] = 4 * max(self.cells, 1) * float(np.finfo(self.real).eps)
         return settings
 
@@ -117,7 +117,7 @@ def drawing_of(
     """Return the numbers by which a model draws.
 
     Raises:
-        TypeError, ValueError: a seed or a step that is not an integer, or beyond its limits.
+        TypeError, ValueError: A seed or a step that is not an integer, or beyond its limits.
     """
     key = checks.integer("seed", seed, low=0, high=MOST_SEED)
     first = checks.integer("step", step, low=0, high=MOST_STEP)
@@ -156,7 +156,7 @@ def poses_to_draw_at(poses: Any, backend: Backend) -> tuple[Poses, tuple[int, ..
     """Return checked (N, 3) or (S, N, 3) poses, and their shape without the last axis.
 
     Raises:
-        TypeError, ValueError: not numbers, another shape, or a pose that is not finite.
+        TypeError, ValueError: Not numbers, another shape, or a pose that is not finite.
     """
     if arrays.on_device(poses):
         shape = tuple(poses.shape)

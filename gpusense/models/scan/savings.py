@@ -17,7 +17,8 @@ from gpusense.models.scan.request import Request
 from gpusense.models.scan.scoring import LastCall, run
 from gpusense.world.grid import OccupancyGrid
 
-# Particles, rounds in which the scene with and without a part take turns, and the least time of a turn [s].
+# Number of particles, number of rounds in which the scene with and without a part alternate, and least time of a turn
+# [s].
 PARTICLES, ROUNDS, TURN = 2000, 7, 0.01
 MakeRequest = Callable[[np.ndarray, np.ndarray], Request]
 
@@ -38,7 +39,7 @@ def measured_savings(
         Median differences [s] of a call with a part and one without it, by the names of the parts.
 
     Raises:
-        RuntimeError: before any call with a reading that depends on the pose.
+        RuntimeError: Before any call with a reading that depends on the pose.
     """
     scan = last.scan
     if scan is None or not len(scan.readings) or not last.flags:
@@ -70,7 +71,7 @@ def ranges_of(scan: ClassedScans, beams: int) -> np.ndarray:
 
 
 def _difference(pipeline: ScanPipeline, request: Request, with_part: tuple[frozenset[str], frozenset[str]]) -> float:
-    """Return how much longer a call takes with other flags of the scoring kernel [s], in turns."""
+    """Return by how much longer a call takes with other flags of the scoring kernel [s], measured in turns."""
     spaces = [(Workspace(pipeline.backend), None), (Workspace(pipeline.backend), with_part)]
 
     def turn(which: int, calls: int) -> float:

@@ -26,7 +26,7 @@ class LastCall:
     Attributes:
         flags: Flags of its launches.
         scans: The readings of its last scans; None before there is a call.
-        together: Scans that shared launches.
+        together: Number of scans that shared launches.
         kernels: The kernels of its last piece, from the poses to log-likelihoods.
     """
 
@@ -81,7 +81,7 @@ class _Scorer:
         value = self._pipeline.value(scans)
         if value is None and (self._uploaded is None or self._uploaded[0] != piece.scans):
             self._uploaded = piece.scans, self._pipeline.upload(scans, self._space)
-        # Once, also where a piece is tried again.
+        # Only once, even if a piece is retried.
         before, self._before = self._before, None
         if before is not None:
             before()
@@ -102,7 +102,7 @@ class _Scorer:
                 lambda: pipeline.program(scoring), version=pipeline.map.version,
             )  # fmt: skip
         self._last.kernels = pipeline.kernel_names[scoring.tiles is not None]
-        # Poses are placed in vectors, whatever scores them.
+        # Poses are placed in lanes, whatever kernel scores them.
         self._last.flags = (flags - _IN_LANES) | (scoring.flags & _IN_LANES)
         if readings.scans > 1:
             self._last.together = max(self._last.together, readings.scans)
@@ -113,7 +113,7 @@ class _Scorer:
             rows[:, scans.left_out.constant_max] = NoReturn(pipeline.rules.z_max).number
 
     def _fill(self, piece: Piece, scans: ClassedScans, value: float) -> None:
-        """Set log-likelihoods that do not depend on the poses; device poses are inspected all the same."""
+        """Set log-likelihoods that do not depend on the poses; device poses are still inspected."""
         pipeline, request, space = self._pipeline, self._request, self._space
         if request.poses.on_device:
             frame = Frame(whole(pipeline.grid), pipeline.grid, pipeline.scanner.mount)

@@ -19,7 +19,7 @@ _INT = np.dtype(np.int32)
 _UNBOUNDED = np.full(7, -(1 << 31), _INT)
 # Least particle-beams, and least particles, for which sorting saves more time than it takes.
 LEAST_ORDERED = (1 << 22, 1 << 12)
-# Work-items that fill any device.
+# Number of work-items that fill any device.
 ENOUGH = 1 << 21
 # The same for the likelihood field, whose short work-items have a relatively costly start.
 ENOUGH_SHORT = 1 << 19

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 import pytest
+from support.fit_scenes import learning_scenes
 from support.learning_data import RANGE_MAX, TYPICAL, draw, starts
 
 import gpusense as gs
-from gpusense.evaluation.fit_scenes import learning_scenes
 from gpusense.evaluation.tolerances import TOLERANCES
 from gpusense.models.scan.densities import log_mixture
 

@@ -17,7 +17,7 @@ from gpusense.evaluation.range_data import RangeData
 from gpusense.evaluation.tolerances import per_beam
 from gpusense.models.scan.densities import log_hit, log_mixture
 from gpusense.plots import fits
-from gpusense.world.hit_shapes import NORMAL, SHAPES, StudentHit
+from gpusense.world.hit_shapes import NORMAL, SHAPES, HitShape, StudentHit
 from gpusense.world.hit_tables import looked_up, mass_table, quantile_table
 
 RANGE = 8.0
@@ -302,6 +302,20 @@ def test_a_made_up_shape_is_learned(monkeypatch):
 
 
 # ---- rules
+
+
+@pytest.mark.parametrize(
+    "attributes",
+    [
+        dict(fitted=("hit_dof", "hit_skew"), limits=((0.0, 1.0),) * 2, starts=((0.3, 0.0, 1.0),)),
+        dict(fitted=("hit_dof",)),
+        dict(limits=((0.0, 1.0),)),
+        dict(starts=((0.3, 1.0),)),
+    ],
+)
+def test_a_shape_has_at_most_one_fitted_parameter_with_limits_and_starts(attributes):
+    with pytest.raises(TypeError, match="Odd: must have at most one fitted parameter"):
+        type("Odd", (HitShape,), attributes)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,9 @@ from support.learning_data import point
 
 import gpusense as gs
 from gpusense.backends import get_backend
+from gpusense.backends.workspace import Workspace
 from gpusense.evaluation.benchmark.accuracy import score_ranges
+from gpusense.evaluation.range_data import RangeData
 from gpusense.learning.beam import blocks, growth, starts
 from gpusense.learning.beam.device_sums import DeviceSums
 from gpusense.learning.beam.options import make_bounds
@@ -24,6 +26,8 @@ from gpusense.learning.beam.problem import NO_PRIOR, Problem
 from gpusense.learning.point import beacons
 from gpusense.models.scan.densities import log_mixture
 from gpusense.models.scan.mixture import mixture_of, peer_mixture, tabulated
+from gpusense.models.scan.readings import device_readings
+from gpusense.plots import fits
 from gpusense.world.field_density import FieldDensity
 from gpusense.world.range_causes import NoReturn, RandomDensity, ShortDensity
 
@@ -174,15 +178,16 @@ def test_a_made_up_random_density_is_followed(monkeypatch):
     at = point(*weights, sigma=0.3, rate=0.4)
     steep = BASE.replace(z_hit=0.7 - 1e-7, z_rand=1e-7, lambda_short=10.0)
     log_term = numbers(steep)["terms of logarithms"][1]
-    before = learned(at), drawn(gs.BeamParameters(0.0, 0.0, 0.0, 1.0))["worlds"], peers(), radio()
+    before = learned(at), drawn(gs.BeamParameters(0.0, 0.0, 0.0, 1.0))["worlds"], peers(), radio(), log_floor()
     monkeypatch.setattr(RandomDensity, "__init__", lambda self, longest: setattr(self, "range_max", 2 * longest))
     compare(users(weights), wanted, plain)
-    after = learned(at), drawn(gs.BeamParameters(0.0, 0.0, 0.0, 1.0))["worlds"], peers(), radio()
+    after = learned(at), drawn(gs.BeamParameters(0.0, 0.0, 0.0, 1.0))["worlds"], peers(), radio(), log_floor()
     assert after[0]["terms"][5] == pytest.approx(before[0]["terms"][5] - math.log(2))
     np.testing.assert_allclose(after[0]["components"][2], before[0]["components"][2] - math.log(2))
     np.testing.assert_allclose(after[1], np.minimum(2 * before[1], RANGE))
     np.testing.assert_allclose(after[2], 0.5 * before[2], rtol=1e-6)
     np.testing.assert_allclose(after[3], before[3] - math.log(2))
+    assert after[4] == pytest.approx(before[4] - math.log(2))
     assert numbers(steep)["terms of logarithms"][1] == pytest.approx(log_term - math.log(2))
     np.testing.assert_allclose(far_ranges(), 2 * ranges)
     # The joint fit's density is that of the host's mixture.
@@ -209,10 +214,27 @@ def radio():
     return np.append(model, fit.log_p(np.array([math.log(0.1), 0.2]))[0])
 
 
+def log_floor():
+    """Return the log of the lower end of the density's axis in the picture of a fit, half of a random density."""
+    data = RangeData(np.full(20, 3.0), np.full(20, 3.0), None, np.zeros(20, int), RANGE)
+    rare = gs.BeamParameters(0.99, 0.0, 0.0, 0.01, 0.3)
+    return math.log(fits.density_figure(data, rare, [3.0]).axes[0].get_ylim()[0])
+
+
 def far_ranges():
     """Return random readings to a beacon."""
     p = gs.BeaconParameters(z_hit=0.0, z_rand=1.0, range_max=RANGE)
     return gs.BeaconModel([(0.0, 0.0)], p, **HOST).sample(POSES, seed=4)
+
+
+def placed_and_drawn():
+    """Return log z_max as kernels that place readings take it, and as the picture of a fit shows it."""
+    device, kind = get_backend("numpy"), np.dtype(np.float64)
+    sensing = gs.BeamModel(ROOM, SCANNER, BASE, **HOST)._pipeline.sensing()
+    placing, _ = device_readings(sensing, device.upload(WITH_MAX), kind, kind, Workspace(device))
+    data = RangeData(Z, EXPECTED, None, np.zeros(20, int), RANGE)
+    title = fits.surface_figure(data, BASE).axes[0].get_title()
+    return placing.arguments["rules"].log_max, float(title.rpartition("log z_max = ")[2])
 
 
 def test_a_made_up_probability_of_no_return_is_followed(monkeypatch):
@@ -240,12 +262,13 @@ def test_a_made_up_probability_of_no_return_is_followed(monkeypatch):
         )[1][:, ::5]
         return found
 
-    plain = users()
+    plain, before = users(), placed_and_drawn()
 
     def halve(self, weight):
         self.weight = 0.5 * weight
 
     monkeypatch.setattr(NoReturn, "__init__", halve)
+    assert placed_and_drawn() == pytest.approx([number - math.log(2) for number in before], abs=0.011)
     once = dict.fromkeys(
         ("field's term", "tabulated", "placed", "kernel's term", "peer", "each of them", "nothing but no return"), 1
     )

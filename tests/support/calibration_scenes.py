@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from support.calibration import Draw, Score
 
 from gpusense.backends import Selection
 from gpusense.evaluation.buildings import building
-from gpusense.evaluation.calibration import Draw, Score
 from gpusense.evaluation.worlds import cloud_uniform
 from gpusense.learning.discrete.causes import DiscreteCauses
 from gpusense.learning.discrete.table import DiscreteBeamModel

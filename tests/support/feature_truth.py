@@ -7,8 +7,7 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-
-from gpusense.evaluation.feature_scenes import Floats, Floor, corner_between
+from support.feature_scenes import Floats, Floor, corner_between
 
 # A run of beams on a wall is seen well from this number and length on [m].
 WELL_POINTS, WELL_LENGTH = 10, 0.5

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+from support.feature_truth import Truth
 
-from gpusense.evaluation.feature_truth import Truth
 from gpusense.features.result import Features
 
 # A feature is found within this distance [m] and angle [rad], and its size within this [m or rad].

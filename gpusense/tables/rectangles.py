@@ -24,7 +24,7 @@ _STACK = 1024
 # Rows of a group.
 ROWS = 8
 # Cells of the largest map whose planes have single rows, and of the largest one with four sectors, on GPUs.
-_CACHED = 1 << 23
+_CACHED = 1 << 24
 _FOUR_SECTORS = 1 << 25
 
 

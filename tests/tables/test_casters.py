@@ -220,7 +220,7 @@ def test_the_page_of_casters_mentions_every_method_and_knob():
     ("kind", "side", "buffer", "form"),
     [
         ("gpu", 2000, 1 << 34, Planes(4)),
-        ("gpu", 4000, 1 << 34, Planes(4, 8)),
+        ("gpu", 5000, 1 << 34, Planes(4, 8)),
         ("gpu", 6000, 1 << 34, Planes(2, 8)),
         ("gpu", 20_000, 1 << 36, Planes(1, 8)),
         ("gpu", 2000, 1 << 26, Planes(2)),

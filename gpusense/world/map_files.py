@@ -127,10 +127,10 @@ def write_map(
     The image has the YAML file's name with the suffix of its format. Modes:
 
     - ``"trinary"``: map_saver's greys, 254 for free, 0 for occupied, 205 for unknown cells (``free_thresh`` 0.196). The
-    image can be viewed and edited. :func:`read_map` returns the same free, occupied and unknown cells, of 0, 100
+      image can be viewed and edited. :func:`read_map` returns the same free, occupied and unknown cells, of 0, 100
       and -1.
     - ``"scale"``: from white, 0 per cent, to black; unknown cells are transparent, which requires a PNG. Cells are read
-    back unchanged.
+      back unchanged.
     - ``"raw"``: per cent as greys, which look almost black, and 255 for unknown. Cells are read back unchanged.
     - None: trinary for a grid of 0, 100 and unknown, else raw, so that cells are read back unchanged.
 

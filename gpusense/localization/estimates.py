@@ -65,7 +65,7 @@ class Estimate:
 
     @property
     def lost(self) -> bool:
-        """Whether p_lost is above 0.5: the pose is unusable, because scans contradict it or the spread is wide."""
+        """Tell whether p_lost is above 0.5: the pose is unusable, because scans contradict it or the spread is wide."""
         return self.p_lost > LOST
 
 

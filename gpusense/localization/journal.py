@@ -42,7 +42,7 @@ _OTHER, _OBJECT, _CONTAINER = range(3)
 
 
 class _Kinds(dict[type, int]):
-    """Whether values of a class hold state in their attributes, in their items, or by identity."""
+    """Map classes to the place of their state: attributes, items, or identity alone."""
 
     def __missing__(self, kind: type) -> int:
         own = kind.__module__.startswith(_PACKAGE) and not issubclass(kind, (tuple, type))

@@ -45,7 +45,7 @@ class PoseVerdict:
 
     @property
     def lost(self) -> bool:
-        """Whether p_lost is above 0.5."""
+        """Tell whether p_lost is above 0.5."""
         return self.p_lost > LOST
 
 

@@ -80,7 +80,7 @@ class MapMatch:
 
     @property
     def found(self) -> bool:
-        """Whether a single pose explains the local map."""
+        """Tell whether a single pose explains the local map."""
         return self.status == "found"
 
 

@@ -170,7 +170,7 @@ class DaskExecutor(Executor):
 
     @property
     def alive(self) -> bool:
-        """Whether the scheduler is running."""
+        """Tell whether the scheduler is running."""
         return bool(self._client.status == "running" and not self._client.scheduler_comm.comm.closed())
 
     @property

@@ -25,7 +25,7 @@ from gpusense.tables import casters
 from gpusense.tables.caster_base import CasterInput
 from gpusense.tables.casters import Bresenham, Caster, Cddt, Dda, Exact, Lookup, March
 from gpusense.tables.directional import directional_table
-from gpusense.tables.rectangles import Planes, planes_of
+from gpusense.tables.rectangles import Planes, empty_rectangles, planes_of
 from gpusense.world import windows
 
 DOCS = ROOT / "docs" / "speed.md"
@@ -234,3 +234,10 @@ def test_planes_fit_indices_buffers_and_caches(kind, side, buffer, form):
     planes = planes_of(SimpleNamespace(info=info), side, side)
     assert planes == form
     assert (planes.entries(side, side) < 1 << 31 and 2 * planes.entries(side, side) <= buffer) or planes.sectors == 1
+
+
+def test_planes_that_no_kernel_makes_or_reads_are_refused():
+    with pytest.raises(ValueError, match="group: must be 1 or 8, got 4"):
+        Planes(2, 4)
+    with pytest.raises(ValueError, match="planes: must have single rows on a processor, got groups of 8"):
+        empty_rectangles(get_backend("numpy"), np.zeros((3, 4), bool), Planes(2, 8))

@@ -68,7 +68,7 @@ class IncidenceFit:
 
     @property
     def converged(self) -> bool:
-        """Whether every fit converged."""
+        """Tell whether every fit converged."""
         return self.pooled.converged and all(fit.converged for fit in self._all_fits)
 
     @property

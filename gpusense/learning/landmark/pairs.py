@@ -68,7 +68,7 @@ class Limits:
 
     @property
     def full_circle(self) -> bool:
-        """Whether the field of view is a full circle."""
+        """Tell whether the field of view is a full circle."""
         return self.half_field >= math.pi
 
 

@@ -92,7 +92,7 @@ class ClassedScans:
 
     @property
     def shared(self) -> bool:
-        """Whether several readings share a ray."""
+        """Tell whether several readings share a ray."""
         return len(self.rays) < len(self.readings)
 
     def part(self, begin: int, end: int) -> ClassedScans:

@@ -92,7 +92,7 @@ class Rules:
 
     @functools.cached_property
     def separate(self) -> bool:
-        """Whether each reading has a separate ray, because all bearings differ or nothing is left out."""
+        """Tell whether each reading has a separate ray, because all bearings differ or nothing is left out."""
         return not self.specialize or len(np.unique(self.vectors, axis=0)) == len(self.vectors)
 
     @functools.cached_property
@@ -107,7 +107,7 @@ class Rules:
 
     @functools.cached_property
     def max_is_constant(self) -> bool:
-        """Whether max readings are added as a constant term instead of being evaluated."""
+        """Tell whether max readings are added as a constant term instead of being evaluated."""
         return self.specialize and not self.max_depends
 
     @functools.cached_property

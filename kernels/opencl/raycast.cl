@@ -37,39 +37,39 @@ int sector_of(const real speed_x, const real speed_y) {
 #define GROUP 1
 #endif
 
-// The way of a ray through a plane of rectangles: index of the origin's column, the origin's row, and steps in x and y,
+// The track of a ray through a plane: index of the origin's column, the origin's row, and steps in x and y,
 // so that boundaries COUNT + k need no conversion; skip is what a group has beyond its first column.
-typedef struct Way {
+typedef struct Track {
     uint col, row, step_x, step_y, skip;
-} Way;
+} Track;
 
-// Return the way of a ray that begins in a cell through the plane of its direction.
-Way way_of(const Ray r, const int2 cell, const Window window) {
+// Return the track of a ray that begins in a cell through the plane of its direction.
+Track track_of(const Ray r, const int2 cell, const Window window) {
     const uint plane = ((r.right ? 0 : 1) + (r.up ? 0 : 2)) * SECTORS + sector_of(r.speed_x, r.speed_y);
     const uint stride = GROUP * (window.cols + 2), groups = (window.rows + 2 + GROUP - 1) / GROUP;
-    Way way;
-    way.step_x = GROUP * r.step_x;
-    way.col = plane * groups * stride + GROUP * (cell.x + 1) - way.step_x * FIRST;
-    way.skip = stride - GROUP;
+    Track track;
+    track.step_x = GROUP * r.step_x;
+    track.col = plane * groups * stride + GROUP * (cell.x + 1) - track.step_x * FIRST;
+    track.skip = stride - GROUP;
 #if ROW_GROUPS
-    way.step_y = r.step_y;
-    way.row = cell.y + 1 - way.step_y * FIRST;
+    track.step_y = r.step_y;
+    track.row = cell.y + 1 - track.step_y * FIRST;
 #else
-    way.step_y = stride * r.step_y;
-    way.row = 0;
-    way.col += stride * (cell.y + 1) - way.step_y * FIRST;
+    track.step_y = stride * r.step_y;
+    track.row = 0;
+    track.col += stride * (cell.y + 1) - track.step_y * FIRST;
 #endif
-    return way;
+    return track;
 }
 
-// Return the rectangle at the cell of a way behind k_x and k_y boundaries.
-uint rectangle_at(global const entry *map_table, const Way way, const real k_x, const real k_y) {
-    const uint col = way.col + way.step_x * (uint)as_bits(k_x);
+// Return the rectangle at the cell of a track behind k_x and k_y boundaries.
+uint rectangle_at(global const entry *map_table, const Track track, const real k_x, const real k_y) {
+    const uint col = track.col + track.step_x * (uint)as_bits(k_x);
 #if ROW_GROUPS
-    const uint row = way.row + way.step_y * (uint)as_bits(k_y);
-    return map_table[(int)(col + row + row / GROUP * way.skip)];
+    const uint row = track.row + track.step_y * (uint)as_bits(k_y);
+    return map_table[(int)(col + row + row / GROUP * track.skip)];
 #else
-    return map_table[(int)(col + way.step_y * (uint)as_bits(k_y))];
+    return map_table[(int)(col + track.step_y * (uint)as_bits(k_y))];
 #endif
 }
 
@@ -86,9 +86,9 @@ real cast_ray(global const entry *map_table, const Window window, const int2 cel
 #if ORIGINS_OUTSIDE
     if (start.t >= limit) return limit;
 #endif
-    const Way way = way_of(r, cell, window);
+    const Track track = track_of(r, cell, window);
     real k_x = COUNT + (real)start.k_x, k_y = COUNT + (real)start.k_y, t = start.t;
-    uint sides = rectangle_at(map_table, way, k_x, k_y);
+    uint sides = rectangle_at(map_table, track, k_x, k_y);
     // A step beyond limit still ends in the table. GPUs are fastest with a single exit of the loop.
     while (sides > OCCUPIED && t < limit) {
         const real end_x = as_real(as_bits(k_x) + (sides & 255)), end_y = as_real(as_bits(k_y) + (sides >> 8));
@@ -99,7 +99,7 @@ real cast_ray(global const entry *map_table, const Window window, const int2 cel
                                    !by_x);
         k_x = by_x ? end_x : aside;
         k_y = by_x ? aside : end_y;
-        sides = rectangle_at(map_table, way, k_x, k_y);
+        sides = rectangle_at(map_table, track, k_x, k_y);
     }
 #if OUTSIDE_OCCUPIED
     return t < limit ? t : limit;

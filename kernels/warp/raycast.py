@@ -54,42 +54,42 @@ def functions(flags):
     GROUP = 8 if ROW_GROUPS else 1
     ROWS = wp.uint32(GROUP)
 
-    # The way of a ray through a plane of rectangles: index of the origin's column, the origin's row, and steps in x and
+    # The track of a ray through a plane: index of the origin's column, the origin's row, and steps in x and
     # y, so that boundaries COUNT + k need no conversion; skip is what a group has beyond its first column.
     @wp.struct
-    class Way:
+    class Track:
         col: wp.uint32
         row: wp.uint32
         step_x: wp.uint32
         step_y: wp.uint32
         skip: wp.uint32
 
-    # Return the way of a ray that begins in a cell through the plane of its direction.
+    # Return the track of a ray that begins in a cell through the plane of its direction.
     @wp.func
-    def way_of(r: Ray, cell: wp.vec2i, window: types.Window):
+    def track_of(r: Ray, cell: wp.vec2i, window: types.Window):
         plane = (wp.where(r.right, 0, 1) + wp.where(r.up, 0, 2)) * SECTORS + sector_of(r.speed_x, r.speed_y)
         stride = GROUP * (window.cols + 2)
         groups = (window.rows + 2 + GROUP - 1) // GROUP
-        way = Way()
-        way.step_x = wp.uint32(GROUP * r.step_x)
-        way.col = wp.uint32(plane * groups * stride + GROUP * (cell.x + 1)) - way.step_x * FIRST
-        way.skip = wp.uint32(stride - GROUP)
+        track = Track()
+        track.step_x = wp.uint32(GROUP * r.step_x)
+        track.col = wp.uint32(plane * groups * stride + GROUP * (cell.x + 1)) - track.step_x * FIRST
+        track.skip = wp.uint32(stride - GROUP)
         if ROW_GROUPS:
-            way.step_y = wp.uint32(r.step_y)
-            way.row = wp.uint32(cell.y + 1) - way.step_y * FIRST
+            track.step_y = wp.uint32(r.step_y)
+            track.row = wp.uint32(cell.y + 1) - track.step_y * FIRST
         else:
-            way.step_y = wp.uint32(stride * r.step_y)
-            way.col += wp.uint32(stride * (cell.y + 1)) - way.step_y * FIRST
-        return way
+            track.step_y = wp.uint32(stride * r.step_y)
+            track.col += wp.uint32(stride * (cell.y + 1)) - track.step_y * FIRST
+        return track
 
-    # Return the rectangle at the cell of a way behind k_x and k_y boundaries.
+    # Return the rectangle at the cell of a track behind k_x and k_y boundaries.
     @wp.func
-    def rectangle_at(map_table: wp.array(dtype=ENTRY), way: Way, k_x: real, k_y: real):
-        col = way.col + way.step_x * as_bits(k_x)
-        index = col + way.step_y * as_bits(k_y)
+    def rectangle_at(map_table: wp.array(dtype=ENTRY), track: Track, k_x: real, k_y: real):
+        col = track.col + track.step_x * as_bits(k_x)
+        index = col + track.step_y * as_bits(k_y)
         if ROW_GROUPS:
-            row = way.row + way.step_y * as_bits(k_y)
-            index = col + row + row // ROWS * way.skip
+            row = track.row + track.step_y * as_bits(k_y)
+            index = col + row + row // ROWS * track.skip
         return wp.uint32(entry_at(map_table, wp.int32(index)))
 
     # Return the distance in cells to the first occupied cell, limit where none is nearer.
@@ -111,11 +111,11 @@ def functions(flags):
         if ORIGINS_OUTSIDE:
             if start.t >= limit:
                 return limit
-        way = way_of(r, cell, window)
+        track = track_of(r, cell, window)
         k_x = COUNT + real(start.k_x)
         k_y = COUNT + real(start.k_y)
         t = real(start.t)
-        sides = rectangle_at(map_table, way, k_x, k_y)
+        sides = rectangle_at(map_table, track, k_x, k_y)
         # A step beyond limit still ends in the table. GPUs are fastest with a single exit of the loop.
         while sides > OCCUPIED and t < limit:
             end_x = farther(k_x, sides & wp.uint32(255))
@@ -129,7 +129,7 @@ def functions(flags):
             aside = crossed(t, speed, a, wp.where(by_x, r.inv_y, r.inv_x), not by_x)
             k_x = wp.where(by_x, end_x, aside)
             k_y = wp.where(by_x, aside, end_y)
-            sides = rectangle_at(map_table, way, k_x, k_y)
+            sides = rectangle_at(map_table, track, k_x, k_y)
         if OUTSIDE_OCCUPIED:
             return wp.min(t, limit)
         else:

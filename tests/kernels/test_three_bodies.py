@@ -74,7 +74,7 @@ ON_PURPOSE = [
     Purpose("landmarks", "negative_where at_places", REFERENCE_ONLY, ARRAYS),
     Purpose("placement", "floor_cells", (OPENCL,), FLOOR),
     Purpose("ranges", "caster_of", (WARP, NUMPY), "OpenCL requires the file caster, which sources.py resolves"),
-    Purpose("raycast", "way_of rectangle_at", KERNELS_ONLY, COUNTS),
+    Purpose("raycast", "track_of rectangle_at", KERNELS_ONLY, COUNTS),
     Purpose("ray", "as_bits farther", (WARP,), "OpenCL has casts of bits, as_bits and as_real; NumPy needs none"),
     Purpose("ray", "whole", KERNELS_ONLY, COUNTS),
     Purpose("ray", "start_casts", REFERENCE_ONLY, ARRAYS),

@@ -19,7 +19,7 @@ REASONS = {
     "no match": "the scan matches neither its predecessor nor key scans: its motion is from odometry or a guess",
     "unobserved": "the scans do not observe a direction of the motion, as along a corridor, and there is no odometry",
     "contested": "the scans agree about as well for a second motion, and there is no odometry to decide between both",
-    "unconfirmed": "an unsure match determines the motion, or without odometry a single one: hardly any confirms it",
+    "unconfirmed": "an unsure match, or without odometry a single one, determines the motion: nothing confirms it",
     "jump": "the time jumps, and the robot may be anywhere after it",
 }
 """The meaning of each doubt."""

@@ -4,9 +4,6 @@ The cost is the sum over links of c^2 log(1 + s / c^2), Cauchy's kernel of the s
 residual r in deviations (I is its information). Reweighted Gauss-Newton steps, damped as by Levenberg, minimise it; the
 normal equations are sparse and are factored by SuperLU. Poses are relative to a fixed pose. Information may be 0 in
 some directions of some or even all links: an undetermined direction keeps its initial value.
-
-A few poses whose links leave directions open lie in curved valleys of the cost, where steps of Gauss-Newton fail for
-all poses. Where asked for, these poses are then moved to a minimum alone, with all further poses held.
 """
 
 from __future__ import annotations
@@ -21,7 +18,6 @@ from gpusense.chaining.links import Links
 from gpusense.localization.pose_algebra import wrap_angle
 
 Floats = NDArray[np.float64]
-Flags = NDArray[np.bool]
 
 # Scale of Cauchy's kernel [deviations of a link].
 KERNEL = 3.0
@@ -30,9 +26,6 @@ _ITERATIONS, _SMALL = 50, 1e-6
 _DAMPING, _LEAST, _MOST = 1e-6, 1e-9, 1e6
 # Columns that are factored at once: fewer than SuperLU's default, since few columns of a pose graph are alike.
 _PANEL = 4
-# Poses are loose if the cost of one of their links rises by this share of the largest rise, and so are those this many
-# links away. Iterations end when moving them alone, and the steps of all further poses, gain less than this share.
-_RISE, _HOPS, _ENOUGH = 0.1, 2, 1e-4
 # Information that damping multiplies, of 1 m and 1 rad.
 _UNIT = 1.0
 
@@ -54,10 +47,7 @@ class Solution:
     iterations: int
 
 
-def solve(
-    poses: Floats, links: Links, *, fixed: int = 0, kernel: float = KERNEL, least: float = 1e-7, settle: bool = False,
-    held: Flags | None = None,
-) -> Solution:  # fmt: skip
+def solve(poses: Floats, links: Links, *, fixed: int = 0, kernel: float = KERNEL, least: float = 1e-7) -> Solution:
     """Return the poses near initial ones that agree best with links.
 
     Args:
@@ -66,8 +56,6 @@ def solve(
         fixed: Index of the pose that is kept.
         kernel: Scale of Cauchy's kernel [deviations]; infinity for plain least squares.
         least: Relative gain of the cost below which the iterations end.
-        settle: Whether loose poses are moved alone where steps fail.
-        held: (N,) further poses that are kept; None: none.
     """
     at, damping = np.array(poses, np.float64), _DAMPING
     squared = links.squared_distances(at)
@@ -77,21 +65,11 @@ def solve(
     while count < _ITERATIONS:
         count += 1
         matrix, gradient = normal_equations(at, links, _weights(squared, kernel), fixed)
-        step = _step(matrix, gradient, damping, None if held is None else np.repeat(~np.delete(held, fixed), 3))
+        step = factored(matrix, damping).solve(-gradient)
         trial = moved(at, step, fixed)
         squared_there = links.squared_distances(trial)
         cost_there = _cost(squared_there, kernel)
         if not cost_there <= cost * (1 + 1e-12):
-            if settle:
-                loose = _loose(len(at), links, _costs(squared_there, kernel) - _costs(squared, kernel), fixed)
-                promised = -(gradient * step).reshape(-1, 3)[~np.delete(loose, fixed)].sum()
-                at, before = _settled(at, links, loose, kernel), cost
-                squared = links.squared_distances(at)
-                cost = _cost(squared, kernel)
-                if max(promised, before - cost) <= _ENOUGH * cost:
-                    break
-                if before - cost > _ENOUGH * cost:
-                    continue
             damping = min(10 * max(damping, 1e-4), _MOST)
             if damping >= _MOST:
                 break
@@ -101,40 +79,6 @@ def solve(
         if np.abs(step).max() < _SMALL or gain <= least * cost:
             break
     return Solution(at, replace(links, weight=_weights(squared, kernel)), cost, count)
-
-
-def _loose(count: int, links: Links, rise: Floats, fixed: int) -> Flags:
-    """Return which poses (N,) are loose, by the rises (L,) of their links' costs."""
-    near, some = np.zeros(count, bool), rise > _RISE * rise.max()
-    for _ in range(_HOPS + 1):
-        near[links.first[some]] = near[links.second[some]] = True
-        some = near[links.first] | near[links.second]
-    near[fixed] = False
-    return near
-
-
-def _settled(poses: Floats, links: Links, loose: Flags, kernel: float) -> Floats:
-    """Return poses (N, 3), of which the loose ones are at a minimum of the cost with all further ones held."""
-    some = links[loose[links.first] | loose[links.second]]
-    nodes = np.unique(np.concatenate([some.first, some.second]))
-    numbers = np.zeros(len(poses), np.int64)
-    numbers[nodes] = np.arange(len(nodes))
-    held = ~loose[nodes]
-    result = poses.copy()
-    result[nodes] = solve(
-        poses[nodes], some.renumbered(numbers), fixed=int(np.argmax(held)), kernel=kernel, held=held
-    ).poses
-    return result
-
-
-def _step(matrix: Any, gradient: Floats, damping: float, free: Flags | None) -> Floats:
-    """Return the damped step, 0 for unknowns that are not free."""
-    if free is None:
-        whole: Floats = factored(matrix, damping).solve(-gradient)
-        return whole
-    step, rows = np.zeros(len(gradient)), np.flatnonzero(free)
-    step[rows] = factored(matrix[rows][:, rows].tocsc(), damping).solve(-gradient[rows])
-    return step
 
 
 def normal_equations(poses: Floats, links: Links, weight: Floats, fixed: int) -> tuple[Any, Floats]:
@@ -203,12 +147,6 @@ def _weights(squared: Floats, kernel: float) -> Floats:
     return weights
 
 
-def _costs(squared: Floats, kernel: float) -> Floats:
-    """Return Cauchy's kernels (L,) of squared distances."""
-    costs: Floats = kernel**2 * np.log1p(squared / kernel**2) if np.isfinite(kernel) else squared
-    return costs
-
-
 def _cost(squared: Floats, kernel: float) -> float:
     """Return the sum of Cauchy's kernels."""
-    return float(np.sum(_costs(squared, kernel)))
+    return float(np.sum(kernel**2 * np.log1p(squared / kernel**2) if np.isfinite(kernel) else squared))

@@ -113,39 +113,12 @@ def test_a_graph_without_links_stays(poses: np.ndarray) -> None:
     assert pose_covariances(found).shape == (*poses.shape, 3)
 
 
-@pytest.mark.parametrize("settle", [False, True])
-def test_the_cost_never_rises(settle: bool) -> None:
+def test_the_cost_never_rises() -> None:
     for seed in range(5):
         start, links = scene(seed, outlier=True)
         squared = links.squared_distances(start)
         before = float(np.sum(KERNEL**2 * np.log1p(squared / KERNEL**2)))
-        assert solve(start, links, settle=settle).cost <= before
-
-
-@pytest.mark.parametrize("seed", [0, 9])
-def test_poses_where_steps_fail_are_moved_alone(seed: int) -> None:
-    # The links of three poses of a long way observe one direction each, and the poses begin far off.
-    rng, count = np.random.default_rng(seed), 60
-    truth = np.stack([0.4 * np.arange(count), np.zeros(count), np.zeros(count)], axis=1)
-    first = np.concatenate([np.arange(count - 1), np.arange(count - 4)])
-    second = np.concatenate([np.arange(1, count), np.arange(4, count)])
-    information = np.tile(np.diag([1e4, 1e4, 4e4]), (len(first), 1, 1))
-    loose = np.isin(first, [29, 30, 31]) | np.isin(second, [29, 30, 31])
-    axis = rng.normal(size=(np.count_nonzero(loose), 3))
-    axis /= np.linalg.norm(axis, axis=1)[:, None]
-    information[loose] = 1e4 * axis[:, :, None] * axis[:, None, :] + 1e-3 * np.eye(3)
-    pose = pose_difference(truth[first], truth[second]) + rng.normal(0, 0.01, (len(first), 3))
-    links = Links.of(MATCH, first, second, pose, information, 0.9)
-    start = truth + rng.normal(0, 0.02, truth.shape)
-    start[0] = truth[0]
-    start[29:32] += np.array((1.0, 2.0, 2.0))
-    plain, found = solve(start, links), solve(start, links, settle=True)
-    assert found.iterations < 0.5 * plain.iterations
-    assert found.cost < plain.cost * (1 + 1e-3)
-    held = np.arange(count) % 3 == 0
-    some = solve(truth, links, held=held)
-    np.testing.assert_array_equal(some.poses[held], truth[held])
-    assert np.abs(some.poses - truth)[~held].max() > 1e-3
+        assert solve(start, links).cost <= before
 
 
 @pytest.mark.parametrize("count", [2, 3, 40])

@@ -61,9 +61,9 @@ START = (0.5, 0.5, 0.26)
 MOST = {"cpu": 4_000_000, "gpu": 1_100_000_000}
 # Runs of a drive in place of one, by the largest particles x beams: the median error of one run with few particles has
 # a standard deviation of a seventh of it, and no run may depend on the time that others took.
-REPEATS = {100_000: 6, 1_000_000: 2}
-# Most readings of the methods that take some hundred passes over them.
-MOST_SEARCHED = 100_000
+REPEATS = {100_000: 4, 1_000_000: 2}
+# Methods that take some hundred passes over the readings, and the most readings that they get; runs of other methods.
+SEARCHES, MOST_SEARCHED, FITS = ("hill_climb", "genetic"), 100_000, 4
 PARTICLES = 10_000
 
 
@@ -160,7 +160,7 @@ def learning(device: Backend) -> Iterator[Setting]:
     for count, method in itertools.product(
         (100, 1000, 10_000, 100_000, 1_000_000), ("em", "em-book", "gradient", "hill_climb", "genetic")
     ):
-        if method in ("hill_climb", "genetic") and count > MOST_SEARCHED:
+        if method in SEARCHES and count > MOST_SEARCHED:
             continue
 
         def run(seed: int, count: int = count, method: Any = method) -> tuple[np.ndarray, Steps]:
@@ -172,7 +172,8 @@ def learning(device: Backend) -> Iterator[Setting]:
 
         code = f'gs.fit_beam_parameters(ranges, expected, range_max, method="{method}")'
         precision = "float64" if device.info.float64 else "float32"
-        yield Setting("learning", method, f"{count} readings", code, precision, run)
+        repeats = 1 if method in SEARCHES or count > MOST_SEARCHED else FITS
+        yield Setting("learning", method, f"{count} readings", code, precision, run, repeats=repeats)
 
 
 def landmarks(device: Backend) -> Iterator[Setting]:

@@ -110,17 +110,21 @@ def answer(rows: Sequence[Row], wish: Wish, device: str) -> str:
     return f"**{row.text}**: {figures}" if kept else f"none; nearest: {row.text}, {figures}"
 
 
+PLACES = (("laptop", "a laptop's processor", False), ("gpu", "a GPU", True))
+
+
 def lead(rows: Sequence[Row], devices: Sequence[str]) -> list[str]:
-    """Return the first wish's methods on the first processor and the first GPU that have any, with their code."""
-    lines = []
-    for place, gpu in (("a laptop's processor", False), ("a GPU", True)):
+    """Return the first wish's methods on the first processor and the first GPU that have any, and their code."""
+    lines, codes = [], []
+    for name, place, gpu in PLACES:
         for device in devices:
             row, kept = chosen(rows, FIRST[0], device)
             if row is not None and kept and ("NVIDIA" in device) == gpu:
                 figures = _figures(row, SHOWN[row.need][0])
-                lines.append(f"- **{FIRST[0].words} on {place}** ({device}): {figures}, `{row.code}`")
+                lines.append(f"- **{FIRST[0].words} on {place}** ({device}): {row.text}: {figures}")
+                codes.append(f"{name} = {row.code}")
                 break
-    return lines
+    return [*lines, "", "```python", *codes, "```"] if lines else []
 
 
 def _figures(row: Row, measure: str) -> str:

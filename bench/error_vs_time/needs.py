@@ -82,15 +82,17 @@ def scan_model(kind: str, run: Any, beams: int, device: Backend, precision: str)
     words = f"beams={beams}" + (', precision="float64"' if precision == "float64" else "")
     if kind == "field":
         parameters = gs.LikelihoodFieldParameters(**DEFAULTS.field)
-        return gs.LikelihoodFieldModel(run.grid, run.scanner, parameters, **made), f"gs.LikelihoodFieldModel({words})"
+        return gs.LikelihoodFieldModel(
+            run.grid, run.scanner, parameters, **made
+        ), f"gs.LikelihoodFieldModel(grid, scanner, {words})"
     chosen: Any = gs.BeamParameters(**BEAM)
     if kind == "discrete":
         chosen = gs.DiscreteBeamModel(chosen, range_max=run.scanner.range_max, bins=600)
     elif kind != "beam":
         made["caster"] = kind.removeprefix("beam, ")
         words += f', caster="{made["caster"]}"'
-    name = "DiscreteBeamModel" if kind == "discrete" else "BeamParameters"
-    return gs.BeamModel(run.grid, run.scanner, chosen, **made), f"gs.BeamModel(gs.{name}, {words})"
+    given = "gs.DiscreteBeamModel(gs.BeamParameters(), range_max=scanner.range_max), " if kind == "discrete" else ""
+    return gs.BeamModel(run.grid, run.scanner, chosen, **made), f"gs.BeamModel(grid, scanner, {given}{words})"
 
 
 def drive(run: Any, model: Any, seed: int, particles: int, options: dict[str, Any]) -> tuple[np.ndarray, Steps]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import statistics
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
@@ -22,6 +23,7 @@ FOLDERS = ("kernels", "gpusense/models", "gpusense/tables", "gpusense/backends")
 LIMIT = 100
 TASK_MEASURES = {"median": "median error", "p95": "95 % error", "max": "largest error"}
 UNITS = {"%": "relative"}
+DISCRETE = "gs.DiscreteBeamModel(gs.BeamParameters(), range_max=scanner.range_max)"
 # Relative standard deviation of a run's median error, by need: that of reports of few runs.
 SPREAD = {"localisation": 0.15, "learning": 0.3}
 
@@ -147,12 +149,20 @@ def task_rows(report: Mapping[str, Any]) -> list[Row]:
         seconds = one["seconds"]["median"] if one["kind"] == "gpu" else one["processor_s"]
         rows.append(
             Row(
-                one["need"], titles[one["backend"]], ALL, one["method"], one["setting"], one["precision"], one["code"],
-                seconds, quartiles, errors, dict.fromkeys(errors, unit), outside=one.get("outside", ""), origin=origin,
-                doubt=doubt(one),
+                one["need"], titles[one["backend"]], ALL, one["method"], one["setting"], one["precision"],
+                code_of(one["code"]), seconds, quartiles, errors, dict.fromkeys(errors, unit),
+                outside=one.get("outside", ""), origin=origin, doubt=doubt(one),
             )
         )  # fmt: skip
     return rows
+
+
+def code_of(text: str) -> str:
+    """Return the code of a row; reports of 2026-11-26 and before name neither map nor laser."""
+    text = text.replace("gs.BeamModel(gs.BeamParameters, ", "gs.BeamModel(").replace(
+        "(gs.DiscreteBeamModel, ", f"({DISCRETE}, "
+    )
+    return re.sub(r"(gs\.(?:LikelihoodField|Beam)Model)\((?=beams|gs\.Discrete)", r"\1(grid, scanner, ", text)
 
 
 def doubt(row: Mapping[str, Any]) -> float:

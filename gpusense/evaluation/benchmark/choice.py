@@ -1,9 +1,9 @@
 """Choose the method for an affordable error or time: the fastest within the error, or the most exact within the time.
 
 A method is judged over all scenes and clouds of a report together, by its largest error and the geometric mean of its
-times. A run of another day must choose the same, so no measured difference that noise can make decides: a limit is kept
-only with ``ROOM`` to spare, methods within ``ALIKE`` of the fastest count as equally fast and those within ``CLOSE`` of
-the least error as equally exact, and of equal ones :attr:`Entry.preference` decides, in which nothing is measured.
+times. A run of another day should choose the same, so no difference that noise makes decides: methods within ``ALIKE``
+of the fastest count as equally fast and those within ``CLOSE`` of the least error as equally exact, and of equal ones
+:attr:`Entry.preference` decides, in which nothing is measured. An error must keep its limit for other seeds as well.
 """
 
 from __future__ import annotations
@@ -16,8 +16,6 @@ from typing import Any
 
 from gpusense.evaluation.benchmark.profiles import error_of, label, pareto_front, setting, time_of
 
-ROOM = 1.1
-"""Factor by which a method's time and error must stay below their limits."""
 ALIKE = 1.25
 """Factor of the times below which two methods are equally fast."""
 CLOSE = 1.25
@@ -52,6 +50,8 @@ MEASURES = {"ranges": {"%": WRONG, "cells": CELLS}, "beam": {"nats": KL, "m": SH
 DEFAULTS = {"ranges": ("%", 0.01), "beam": ("nats", 0.01), "field": ("nats", 0.01)}
 """By problem, the unit and the largest error if no limit is passed."""
 _NUMBER = re.compile(r"[0-9.]+")
+# Methods that gpusense takes where none is named.
+_DEFAULT = ("exact", "field", "beam", "auto", "em", "nearest")
 # Knobs whose smaller values are finer; of the others larger ones are.
 _SMALLER = ("tolerance", "every", "bin width")
 _QUANTITY = re.compile(r"\s*([0-9.]+(?:[eE][-+]?[0-9]+)?)\s*([a-z%]+)\s*")
@@ -85,11 +85,12 @@ class Entry:
     doubt: float = 1.0
 
     @property
-    def preference(self) -> tuple[bool, bool, int, str, float]:
-        """Place among equal methods, first ones first: exact, float32, few assumptions, name, the finest setting."""
+    def preference(self) -> tuple[bool, bool, int, bool, str, float]:
+        """Place among equal methods: exact, float32, few assumptions, a default, name, and the coarsest setting."""
         numbers = math.prod(float(number) for number in _NUMBER.findall(self.setting))
-        finest = numbers if self.setting.startswith(_SMALLER) else -numbers
-        return not self.exact, self.precision != "float32", self.method.count(","), self.method, finest
+        coarse = -numbers if self.setting.startswith(_SMALLER) else numbers
+        other = self.method not in _DEFAULT
+        return not self.exact, self.precision != "float32", self.method.count(","), other, self.method, coarse
 
     @property
     def text(self) -> str:
@@ -200,8 +201,8 @@ def front(listed: Sequence[Entry]) -> list[Entry]:
 def choose(listed: Sequence[Entry], error: float | None, seconds: float | None) -> Entry | None:
     """Choose the entry for a largest error and a longest time.
 
-    With a largest error, the fastest method within both limits is chosen. With a longest time alone, the most exact
-    method within it is chosen. Of equal ones the preferred one is chosen.
+    With a largest error, the fastest method within both limits is chosen. With a longest time alone, the fastest of the
+    most exact methods within it is chosen. Of equal ones the preferred one is chosen.
 
     Args:
         listed: Entries of one device and one measure.
@@ -214,19 +215,18 @@ def choose(listed: Sequence[Entry], error: float | None, seconds: float | None) 
     able = [
         entry
         for entry in listed
-        if (error is None or entry.error * max(ROOM, entry.doubt) <= error)
-        and (seconds is None or entry.seconds * ROOM <= seconds)
+        if (error is None or entry.error * entry.doubt <= error) and (seconds is None or entry.seconds <= seconds)
     ]
     if not able:
         return None
     if error is None:
         most = CLOSE * max(min(entry.error for entry in able), ROUNDING)
-        return min((entry for entry in able if entry.error <= most), key=_preference)
+        able = [entry for entry in able if entry.error <= most]
     longest = ALIKE * min(entry.seconds for entry in able)
     return min((entry for entry in able if entry.seconds <= longest), key=_preference)
 
 
-def _preference(entry: Entry) -> tuple[bool, bool, int, str, float]:
+def _preference(entry: Entry) -> tuple[bool, bool, int, bool, str, float]:
     return entry.preference
 
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gpusense._util.angles import wrapped
 from gpusense.backends import Backend
 from gpusense.matching.evidence import pair_evidence
 from gpusense.matching.icp import STRAIGHT_WIDTH, WIDTH, IcpPairs, space_of
@@ -201,11 +202,6 @@ def distinct(poses: np.ndarray, score: np.ndarray, known: np.ndarray, capture: f
     numbers = np.concatenate(which[:-1])
     order = np.argsort(numbers, kind="stable")
     return numbers[order], np.concatenate(chosen[:-1])[order]
-
-
-def wrapped(angle: np.ndarray) -> np.ndarray:
-    """Return angles in [-pi, pi)."""
-    return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
 def to_sensor(pose: np.ndarray, mount: tuple[float, float]) -> np.ndarray:

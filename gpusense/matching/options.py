@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpusense._util import checks
+from gpusense._util.angles import wrapped
 from gpusense.interface.structs import MatchRules
 from gpusense.matching.points import GAP
 
@@ -44,7 +45,7 @@ class MatchOptions:
 
     def is_outside(self, offset: np.ndarray) -> np.ndarray:
         """Return whether (S, 3) offsets from guesses leave the window, enlarged by the move that a start may make."""
-        turn = np.abs((offset[:, 2] + math.pi) % (2 * math.pi) - math.pi)
+        turn = np.abs(wrapped(offset[:, 2]))
         reach, half = self.window
         outside: np.ndarray = (np.hypot(offset[:, 0], offset[:, 1]) > reach + _MARGIN) | (turn > half + _MARGIN)
         return outside

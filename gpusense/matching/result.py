@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.angles import wrapped
 from gpusense._util.html import card, pose_rows
 from gpusense.matching.observability import covariance_of
 
@@ -128,7 +128,7 @@ class ScanMatch:
         """
         c, s = np.cos(frame[:, 2]), np.sin(frame[:, 2])
         x, y, theta = self.pose.T
-        turn = (theta + frame[:, 2] + math.pi) % (2 * math.pi) - math.pi
+        turn = wrapped(theta + frame[:, 2])
         pose = np.stack([frame[:, 0] + c * x - s * y, frame[:, 1] + s * x + c * y, turn], axis=1)
         zero, one = np.zeros(len(c)), np.ones(len(c))
         turned = np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=1).reshape(-1, 3, 3)

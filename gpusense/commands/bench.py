@@ -78,7 +78,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--compare", nargs="+", type=Path, metavar=("OLD", "NEW"), help="compare with an old report, or two reports")
     add("--slower", type=positive_number, default=1.3, metavar="F",
         help="with --compare, factor of the times above which a point is slower (default: %(default)s)")  # fmt: skip
-    add("--quick", action="store_true", help="small maps, few values of the knobs, float32: half a minute plus compiling")
+    add("--quick", action="store_true",
+        help="small maps, few values of the knobs, float32: half a minute plus compiling")  # fmt: skip
     add("--scene", action="append", metavar="NAME", help="a scene; may be repeated (default: all)")
     add("--map", action="append", default=[], type=Path, metavar="YAML",
         help="a map_server map as a further scene; may be repeated")  # fmt: skip

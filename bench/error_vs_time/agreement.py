@@ -5,8 +5,9 @@
     python bench/error_vs_time/agreement.py --history ONE.json   # of both
 
 Two reports of a device are compared on the points or settings that both have, so a map or a setting that one of them
-lacks makes no difference. A report that another one extends does not count. Commits differ: some differences are those
-of the code.
+lacks makes no difference. A report that another one extends does not count. Tasks of a processor that were timed as
+whole runs, before 2026-11-26, are not compared with those that were timed step by step. Commits differ: some
+differences are those of the code.
 """
 
 from __future__ import annotations
@@ -49,6 +50,13 @@ class Report:
     kind: str
     document: Mapping[str, Any]
     measured: dict[tuple[Any, ...], Mapping[str, Any]] = field(default_factory=dict)
+
+    @property
+    def whole_runs(self) -> bool:
+        """Whether a processor's tasks are timed as whole runs."""
+        return (
+            any(row["kind"] == "cpu" and "by_run" not in row for row in self.measured.values()) and self.kind == "tasks"
+        )
 
     def within(self, common: set[tuple[Any, ...]]) -> dict[str, Any]:
         """Return the document with some of its points or rows."""
@@ -128,7 +136,7 @@ def compare(old: Report, new: Report) -> list[Answer]:
 def pairs(reports: Sequence[Report]) -> Iterator[tuple[Report, Report, list[Answer]]]:
     """Yield all pairs of reports that can be compared, with their answers."""
     for new, old in itertools.combinations(reports, 2):
-        answers = compare(old, new) if old.kind == new.kind else []
+        answers = compare(old, new) if (old.kind, old.whole_runs) == (new.kind, new.whole_runs) else []
         if answers:
             yield old, new, answers
 

@@ -5,7 +5,7 @@
 
 Each row of the table is a call of one commit on one device: its time, its error, and whether the run was quiet. Calls
 take turns with a probe, a sum of sines in NumPy, whose time is measured likewise; times are the processor's own on a
-processor and elapsed ones on a GPU. Short calls are timed several in a row, 20 ms at least. A call is quiet where the
+processor and elapsed ones on a GPU. Short calls are timed several in a row, 100 ms at least. A call is quiet where the
 quartiles of its times lie within 5 % of the median. The last commit is compared with the median of up to --window quiet
 rows before it, after the probe's change is taken out of processors' times: slower by more than 10 % (--limit), or an
 error twice as large, is a regression, and the exit code 1.
@@ -40,7 +40,7 @@ FILE = ROOT / "bench" / "history.csv"
 COLUMNS = ("date", "commit", "device", "row", "ms", "q1_ms", "q3_ms", "probe_ms", "error", "unit", "quiet")
 QUIET, LIMIT, WORSE = 0.05, 0.10, 2.0
 # Least duration of a timing [s], and most calls of one.
-SPAN, MOST = 0.02, 1000
+SPAN, MOST = 0.1, 1000
 # Errors below these are rounding, by their unit.
 FLOORS = {"m": 1e-4, "nats": 1e-3}
 Row = Mapping[str, str]

@@ -341,6 +341,7 @@ def test_no_information_is_exactly_0(kind, on, name):
         same_bits(parts, np.zeros((12, len(z)), on["precision"]))
 
 
+@pytest.mark.sampled(1, without="warp")
 def test_laws_can_be_broken(on):
     """By poses that are moved by the least that counts, and by a beam too many in the sum."""
     before, p = scene("beam", 0), PARAMETERS["beam"]["ordinary"]

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gpusense._util.angles import wrapped
 from gpusense.features.beams import Beams
-from gpusense.features.hallways import pairs_of, wrapped
+from gpusense.features.hallways import pairs_of
 from gpusense.features.lines import scores_of
 from gpusense.features.result import Found
 from gpusense.features.segments import Segments

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from gpusense._util.angles import wrapped
 from gpusense.features.lines import in_robot_frame, scores_of
 from gpusense.features.result import Found
 from gpusense.features.segments import Segments
@@ -26,12 +27,6 @@ def pairs_of(scan: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     one = np.repeat(number, count)
     two = np.arange(len(one)) - np.repeat(np.cumsum(count) - count, count) + one + 1
     return one, two
-
-
-def wrapped(angle: np.ndarray) -> np.ndarray:
-    """Return angles in -pi to pi."""
-    result: np.ndarray = np.mod(angle + math.pi, 2 * math.pi) - math.pi
-    return result
 
 
 def find_hallways(segments: Segments, straight: np.ndarray, mount: tuple[float, float, float]) -> Found:

@@ -14,11 +14,11 @@ WRONG, MEDIAN, TAIL, LARGEST = (
     "rays wrong by more than a cell", "median error of a ray", "95 % error of a ray", "largest error of a ray",
 )  # fmt: skip
 KL, FINE = "KL divergence at a comparable temperature", "KL divergence from the true posterior"
-SHIFT, GLOBAL = "shift of the mean position", "the same, all over the map"
+SHIFT, GLOBAL, LOG_P = "shift of the mean position", "the same, all over the map", "RMS error of log p"
 # By need: the measures of its figure and of its table, the first one that of choices.
 SHOWN = {
-    "rays": (WRONG, MEDIAN, TAIL, LARGEST), "beam model": (KL, GLOBAL, FINE, SHIFT),
-    "likelihood field": (KL, GLOBAL, FINE, SHIFT),
+    "rays": (WRONG, MEDIAN, TAIL, LARGEST), "beam model": (KL, GLOBAL, FINE, SHIFT, LOG_P),
+    "likelihood field": (KL, GLOBAL, FINE, SHIFT, LOG_P),
     "localisation": ("median error", "95 % error"), "matching": ("median error", "95 % error"),
     "in a map": ("median error", "95 % error"), "learning": ("median error", "largest error"),
     "landmarks": ("median error",),

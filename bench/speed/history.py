@@ -5,7 +5,7 @@
 
 Each row of the table is a call of one commit on one device: its time, its error, and whether the run was quiet. Calls
 take turns with a probe, a sum of sines in NumPy. Times are processor time on a processor and elapsed time on a GPU;
-short calls are timed several in a row, for at least 20 ms. A call is quiet where the quartiles of its times lie within
+short calls are timed several in a row, for at least 100 ms. A call is quiet where the quartiles of its times lie within
 5 % of the median. The last commit is compared with the median of up to --window quiet rows before it, after processors'
 times are corrected by the probe's: slower by more than 10 % (--limit), or an error twice as large, is a regression, and
 the exit code 1. An older tree is measured with PYTHONPATH=TREE and --commit.
@@ -39,7 +39,7 @@ FILE = ROOT / "bench" / "history.csv"
 COLUMNS = ("date", "commit", "device", "row", "ms", "q1_ms", "q3_ms", "probe_ms", "error", "unit", "quiet")
 QUIET, LIMIT, WORSE = 0.05, 0.10, 2.0
 # Least duration of a timing [s], and most calls of one.
-SPAN, MOST = 0.02, 1000
+SPAN, MOST = 0.1, 1000
 # Errors below these are rounding, by their unit.
 FLOORS = {"m": 1e-4, "nats": 1e-3}
 Row = Mapping[str, str]

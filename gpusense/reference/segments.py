@@ -17,7 +17,7 @@ from gpusense.interface.constants import LINE_NUMBERS
 PASSES, STEPS = 2, 5
 # A segment with a larger cost per point is split at its best point, even if a single split does not pay.
 POOR = 3.0
-# Rows are parallel up to this.
+# Rows count as parallel up to this sine.
 PARALLEL = 1e-6
 # Splits whose costs differ by less than this share, which exceeds float32 rounding, are tied: the first counts.
 TIED = 3e-7
@@ -209,7 +209,7 @@ def fit_segments(
     points: int,
     parts: int,
 ) -> None:
-    """Fit lines to parts of scans: first point and number of points, which may go on at the scan's first point."""
+    """Fit lines to parts of scans: first point and number of points, which may wrap around to the first point."""
     for k in range(parts):
         begin, end = start[scan[k]], start[scan[k] + 1]
         index = begin + (part[k, 0] - begin + np.arange(part[k, 1])) % (end - begin)

@@ -47,7 +47,7 @@ def possible_of(totals: np.ndarray, largest: float) -> float:
 
 
 def column_of(high: float, rung: int) -> int:
-    """Return the column of sums with the weights of a rung; that of the weights before where none is possible."""
+    """Return the column of sums with the weights of a rung, or of the previous weights where none is possible."""
     return 2 * RUNGS if high == -np.inf else rung
 
 

@@ -1,7 +1,7 @@
 """Weights of particles from the log-likelihoods of sensors, at the highest temperature that leaves enough particles.
 
-w_k = v exp(b_k (l - max l)), where v is the weight before, l the sum over sensors of temperature times log p, and b_k =
-d b / 2^k a ladder of depth d. The first rung whose effective sample size (sum w)^2 / sum w^2 is at least SHARE of the
+w_k = v exp(b_k (l - max l)), where v is the previous weight, l the sum over sensors of temperature times log p, and b_k
+= d b / 2^k a ladder of depth d. The first rung whose effective sample size (sum w)^2 / sum w^2 is at least SHARE of the
 previous one is taken; the rest of b is left to the next stage of the correction (annealing: Neal, *Annealed importance
 sampling*, 2001). Weights are rounded to integers below 2^53 / N, so that their sums are exact in any order.
 """
@@ -59,7 +59,7 @@ def weigh_particles(
     groups: int,
     stage: int,
 ) -> None:
-    """Sum the integer weights of each block on each rung, their squares, and the weights before."""
+    """Sum the integer weights of each block on each rung, their squares, and the previous weights."""
     scale, old = settings[SCALE], before[:particles]
     highest[0] = largest_of(largest, 0, groups)
     likelihood = tempered(score[:particles], highest[0], left_of(state, stage) * settings[DEPTH])

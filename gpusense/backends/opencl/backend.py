@@ -159,10 +159,6 @@ class OpenCLBackend(ProcessBound, Backend):
                 cl.enqueue_copy(self._queue, out, buffer, is_blocking=wait)
         return out
 
-    def empty_result(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-        """See Backend.empty_result."""
-        return np.empty(shape, dtype) if self._results is None else self._results.empty(shape, dtype)
-
     def part(self, buffer: Buffer, first: int, count: int, dtype: np.dtype) -> Buffer:
         """See Backend.part."""
         size = np.dtype(dtype).itemsize

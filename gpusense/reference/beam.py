@@ -25,14 +25,9 @@ def ray_limit(flags: frozenset[str], z: np.ndarray, terms: np.ndarray, scale: st
 
 
 def reading_term(
-    flags: frozenset[str],
-    z: np.ndarray,
-    expected: np.ndarray,
-    terms: np.ndarray,
-    sensor: np.ndarray,
-    tables: structs.MixtureTables,
-    range_max: float,
-) -> np.ndarray:
+    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray, sensor: np.ndarray,
+    tables: structs.MixtureTables, range_max: float,
+) -> np.ndarray:  # fmt: skip
     """Return the terms of the scan's sum: log densities of readings, or cubes of densities."""
     if "CUBES" in flags:
         term = compat_density(flags, z, expected, terms) ** 3
@@ -52,32 +47,12 @@ def scan_log(flags: frozenset[str], total: np.ndarray) -> np.ndarray:
 
 
 def score_beams(
-    flags: frozenset[str],
-    map_table: np.ndarray,
-    normals: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    ray: np.ndarray,
-    first: np.ndarray,
-    reading: np.ndarray,
-    terms: np.ndarray,
-    edges: np.ndarray,
-    sensor: np.ndarray,
-    start: np.ndarray,
-    constant_terms: np.ndarray,
-    log_p: np.ndarray,
-    parts: np.ndarray,
-    window: structs.Window,
-    particles: int,
-    rays: int,
-    readings: int,
-    tables: structs.MixtureTables,
-    cone: structs.Cone,
-    caster: structs.Caster,
-    scale: structs.RangeScale,
-    score: structs.Score,
-    batch: structs.ScanBatch,
-) -> None:
+    flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
+    ray: np.ndarray, first: np.ndarray, reading: np.ndarray, terms: np.ndarray, edges: np.ndarray, sensor: np.ndarray,
+    start: np.ndarray, constant_terms: np.ndarray, log_p: np.ndarray, parts: np.ndarray, window: structs.Window,
+    particles: int, rays: int, readings: int, tables: structs.MixtureTables, cone: structs.Cone, caster: structs.Caster,
+    scale: structs.RangeScale, score: structs.Score, batch: structs.ScanBatch,
+) -> None:  # fmt: skip
     """Score scans; ray r has the readings first[r] to first[r + 1] - 1, and ``score`` has the constant term.
 
     With SCANS, the rays of a scan begin at start[scan]; where rays are shared, first counts the readings of all scans.
@@ -114,31 +89,12 @@ def score_beams(
 
 
 def beam_tiles(
-    flags: frozenset[str],
-    map_table: np.ndarray,
-    normals: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    order: np.ndarray,
-    ray: np.ndarray,
-    first: np.ndarray,
-    reading: np.ndarray,
-    terms: np.ndarray,
-    edges: np.ndarray,
-    sensor: np.ndarray,
-    start: np.ndarray,
-    parts: np.ndarray,
-    window: structs.Window,
-    particles: int,
-    rays: int,
-    readings: int,
-    tables: structs.MixtureTables,
-    cone: structs.Cone,
-    caster: structs.Caster,
-    scale: structs.RangeScale,
-    spread: int,
-    batch: structs.ScanBatch,
-) -> None:
+    flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
+    order: np.ndarray, ray: np.ndarray, first: np.ndarray, reading: np.ndarray, terms: np.ndarray, edges: np.ndarray,
+    sensor: np.ndarray, start: np.ndarray, parts: np.ndarray, window: structs.Window, particles: int, rays: int,
+    readings: int, tables: structs.MixtureTables, cone: structs.Cone, caster: structs.Caster, scale: structs.RangeScale,
+    spread: int, batch: structs.ScanBatch,
+) -> None:  # fmt: skip
     """Write the term of reading k to parts[place + k * particles]; GPUs do so in tiles of particles and rays.
 
     With STRANDED the number there is the sum of strand k.
@@ -173,18 +129,10 @@ def beam_tiles(
 
 
 def expected_ranges(
-    flags: frozenset[str],
-    map_table: np.ndarray,
-    normals: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    ray: np.ndarray,
-    rays: int,
-    window: structs.Window,
-    cone: structs.Cone,
-    caster: structs.Caster,
+    flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
+    ray: np.ndarray, rays: int, window: structs.Window, cone: structs.Cone, caster: structs.Caster,
     scale: structs.RangeScale,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return the (N * R,) expected ranges of rays or cones [m], and the cosines of incidence of cones; none of rays."""
     if "CONES" in flags:
         t, cosine, _ = echoes(

@@ -25,13 +25,8 @@ LOG_2 = 0.69314718055994531
 
 
 def add_landmark(
-    j: int,
-    log_each: np.ndarray,
-    numbers: np.ndarray,
-    best: np.ndarray,
-    choice: np.ndarray,
-    value: np.ndarray,
-) -> None:
+    j: int, log_each: np.ndarray, numbers: np.ndarray, best: np.ndarray, choice: np.ndarray, value: np.ndarray,
+) -> None:  # fmt: skip
     """Let landmark j be seen by one more feature of each set, at most one of each group.
 
     Args:
@@ -65,29 +60,11 @@ def set_total(s: int, sums: np.ndarray, numbers: np.ndarray) -> np.ndarray:
 
 
 def joint_features(
-    flags: frozenset[str],
-    landmark: np.ndarray,
-    normal: np.ndarray,
-    signature: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    pose_low: np.ndarray,
-    feature: np.ndarray,
-    terms: np.ndarray,
-    arcs: np.ndarray,
-    best: np.ndarray,
-    choice: np.ndarray,
-    value: np.ndarray,
-    log_p: np.ndarray,
-    parts: np.ndarray,
-    which: np.ndarray,
-    landmarks: int,
-    particles: int,
-    features: int,
-    sets: int,
-    buckets: structs.Buckets,
-    score: structs.Score,
-) -> None:
+    flags: frozenset[str], landmark: np.ndarray, normal: np.ndarray, signature: np.ndarray, pose_cell: np.ndarray,
+    pose: np.ndarray, pose_low: np.ndarray, feature: np.ndarray, terms: np.ndarray, arcs: np.ndarray, best: np.ndarray,
+    choice: np.ndarray, value: np.ndarray, log_p: np.ndarray, parts: np.ndarray, which: np.ndarray, landmarks: int,
+    particles: int, features: int, sets: int, buckets: structs.Buckets, score: structs.Score,
+) -> None:  # fmt: skip
     """Find the best joint association of each particle.
 
     ``choice[s]`` has the landmark of each feature of set s, and ``value[s]`` its log p; ``sets`` is 2^features.

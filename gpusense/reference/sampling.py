@@ -170,14 +170,9 @@ def short_of(u: np.ndarray, expected: np.ndarray, decay: np.ndarray) -> np.ndarr
 
 
 def reading_of(
-    flags: frozenset[str],
-    u: np.ndarray,
-    v: np.ndarray,
-    expected: np.ndarray,
-    mixture: np.ndarray,
-    bins: np.ndarray,
+    flags: frozenset[str], u: np.ndarray, v: np.ndarray, expected: np.ndarray, mixture: np.ndarray, bins: np.ndarray,
     range_max: float,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Return readings drawn from the mixture; infinity without return, NaN where no reading is possible.
 
     Args:
@@ -226,18 +221,10 @@ def cell_reading_of(
 
 
 def draw_readings(
-    flags: frozenset[str],
-    incidence: np.ndarray,
-    mixture: np.ndarray,
-    edges: np.ndarray,
-    chances: np.ndarray,
-    settings: np.ndarray,
-    ranges: np.ndarray,
-    particles: int,
-    rays: int,
-    tables: structs.MixtureTables,
+    flags: frozenset[str], incidence: np.ndarray, mixture: np.ndarray, edges: np.ndarray, chances: np.ndarray,
+    settings: np.ndarray, ranges: np.ndarray, particles: int, rays: int, tables: structs.MixtureTables,
     scale: structs.RangeScale,
-) -> None:
+) -> None:  # fmt: skip
     """Replace expected ranges by readings; ``incidence`` holds cosines, and ``edges`` the cosines between bins."""
     count, limit, top = particles * rays, settings[DRAW_RANGE_MAX], settings[DRAW_TOP]
     for begin in range(0, count, BLOCK):

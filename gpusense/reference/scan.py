@@ -30,14 +30,9 @@ def reading_of(flags: frozenset[str], ranges: np.ndarray, beam: np.ndarray, beam
 
 
 def fill_end_point(
-    value: np.ndarray,
-    vectors: np.ndarray,
-    point: np.ndarray,
-    point_low: np.ndarray,
-    guard: np.ndarray,
-    resolution: float,
-    rules: structs.ReadingRules,
-) -> None:
+    value: np.ndarray, vectors: np.ndarray, point: np.ndarray, point_low: np.ndarray, guard: np.ndarray,
+    resolution: float, rules: structs.ReadingRules,
+) -> None:  # fmt: skip
     """Fill places with end points: readings times the vectors of their beams, in cells, and rounding errors.
 
     ``guard`` is guard_scale (longest + 2 cells) of a block of places.
@@ -68,18 +63,10 @@ def fill_rays(
 
 
 def place_reading(
-    flags: frozenset[str],
-    ranges: np.ndarray,
-    beam: np.ndarray,
-    vector: np.ndarray,
-    point: np.ndarray,
-    point_low: np.ndarray,
-    reading: np.ndarray,
-    guard: np.ndarray,
-    constant_term: np.ndarray,
-    resolution: float,
+    flags: frozenset[str], ranges: np.ndarray, beam: np.ndarray, vector: np.ndarray, point: np.ndarray,
+    point_low: np.ndarray, reading: np.ndarray, guard: np.ndarray, constant_term: np.ndarray, resolution: float,
     rules: structs.ReadingRules,
-) -> None:
+) -> None:  # fmt: skip
     """Put readings of some beams in their places.
 
     A max reading is inf. ``constant_term`` is that of max readings without a place, -inf with a range where none is
@@ -104,26 +91,11 @@ def place_reading(
 
 
 def place_inputs(
-    flags: frozenset[str],
-    poses: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    pose_low: np.ndarray,
-    pose_status: np.ndarray,
-    ranges: np.ndarray,
-    beam: np.ndarray,
-    vector: np.ndarray,
-    point: np.ndarray,
-    point_low: np.ndarray,
-    reading: np.ndarray,
-    guard: np.ndarray,
-    constant_term: np.ndarray,
-    frame: structs.Frame,
-    window: structs.Window,
-    particles: int,
-    head: int,
-    rules: structs.ReadingRules,
-) -> None:
+    flags: frozenset[str], poses: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
+    pose_status: np.ndarray, ranges: np.ndarray, beam: np.ndarray, vector: np.ndarray, point: np.ndarray,
+    point_low: np.ndarray, reading: np.ndarray, guard: np.ndarray, constant_term: np.ndarray, frame: structs.Frame,
+    window: structs.Window, particles: int, head: int, rules: structs.ReadingRules,
+) -> None:  # fmt: skip
     """Put poses and readings in their places; the first ``head`` work-items of a device are for readings."""
     place_reading(flags, ranges, beam, vector, point, point_low, reading, guard, constant_term, frame.resolution, rules)
     place_poses(flags, poses, pose_cell, pose, pose_low, pose_status, frame, window, particles)  # fmt: skip

@@ -33,14 +33,9 @@ def pool_scores(flags: frozenset[str], table: np.ndarray, pooled: np.ndarray, sc
 
 
 def fold_scores(
-    flags: frozenset[str],
-    table: np.ndarray,
-    out: np.ndarray,
-    scores: ScoreTable,
-    folded: ScoreTable,
-    period: int,
+    flags: frozenset[str], table: np.ndarray, out: np.ndarray, scores: ScoreTable, folded: ScoreTable, period: int,
     beyond: int,
-) -> None:
+) -> None:  # fmt: skip
     """Write every period-th row and column of each padded table as an image, for each of period^2 first cells."""
     lines, stride = padded_lines(scores), padded_stride(scores)
     images = table[: scores.tables * lines * stride].reshape(scores.tables, lines, stride)
@@ -55,17 +50,9 @@ def fold_scores(
 
 
 def shift_scores(
-    flags: frozenset[str],
-    table: np.ndarray,
-    point: np.ndarray,
-    image: np.ndarray,
-    first: np.ndarray,
-    score: np.ndarray,
-    scores: ScoreTable,
-    items: int,
-    height: int,
-    width: int,
-) -> None:
+    flags: frozenset[str], table: np.ndarray, point: np.ndarray, image: np.ndarray, first: np.ndarray,
+    score: np.ndarray, scores: ScoreTable, items: int, height: int, width: int,
+) -> None:  # fmt: skip
     """Sum the cells of each item's points at all shifts by less than height rows and width columns."""
     size = padded_lines(scores) * padded_stride(scores)
     total = score[: items * height * width].reshape(items, height, width)
@@ -78,16 +65,9 @@ def shift_scores(
 
 
 def candidate_scores(
-    flags: frozenset[str],
-    table: np.ndarray,
-    point: np.ndarray,
-    image: np.ndarray,
-    first: np.ndarray,
-    candidate: np.ndarray,
-    score: np.ndarray,
-    scores: ScoreTable,
-    candidates: int,
-) -> None:
+    flags: frozenset[str], table: np.ndarray, point: np.ndarray, image: np.ndarray, first: np.ndarray,
+    candidate: np.ndarray, score: np.ndarray, scores: ScoreTable, candidates: int,
+) -> None:  # fmt: skip
     """Sum the cells of candidates' points; a candidate is an item, and the row and column of its shift."""
     size = padded_lines(scores) * padded_stride(scores)
     chosen = candidate[: 3 * candidates].reshape(candidates, 3)

@@ -174,17 +174,9 @@ def _solve(rows: np.ndarray) -> np.ndarray:
 
 
 def split_scans(
-    flags: frozenset[str],
-    point: np.ndarray,
-    start: np.ndarray,
-    noise: np.ndarray,
-    cost: np.ndarray,
-    stop: np.ndarray,
-    scans: int,
-    points: int,
-    penalty: float,
-    gap: float,
-) -> None:
+    flags: frozenset[str], point: np.ndarray, start: np.ndarray, noise: np.ndarray, cost: np.ndarray, stop: np.ndarray,
+    scans: int, points: int, penalty: float, gap: float,
+) -> None:  # fmt: skip
     """Split scans into segments: ``stop`` is the end of the segment that begins at a point, -1 at all other points."""
     for scan in range(scans):
         first, last, sigma = int(start[scan]), int(start[scan + 1]), float(noise[scan])
@@ -198,17 +190,9 @@ def split_scans(
 
 
 def fit_segments(
-    flags: frozenset[str],
-    point: np.ndarray,
-    start: np.ndarray,
-    noise: np.ndarray,
-    part: np.ndarray,
-    scan: np.ndarray,
-    line: np.ndarray,
-    scans: int,
-    points: int,
-    parts: int,
-) -> None:
+    flags: frozenset[str], point: np.ndarray, start: np.ndarray, noise: np.ndarray, part: np.ndarray, scan: np.ndarray,
+    line: np.ndarray, scans: int, points: int, parts: int,
+) -> None:  # fmt: skip
     """Fit lines to parts of scans: first point and number of points, which may wrap around to the first point."""
     for k in range(parts):
         begin, end = start[scan[k]], start[scan[k] + 1]

@@ -90,16 +90,9 @@ def follow_evidence(total: float, before: float, largest: float, settings: np.nd
 
 
 def set_stage(
-    totals: np.ndarray,
-    settings: np.ndarray,
-    state: np.ndarray,
-    high: float,
-    left: float,
-    rung: int,
-    particles: int,
-    stage: int,
-    stages: int,
-) -> None:
+    totals: np.ndarray, settings: np.ndarray, state: np.ndarray, high: float, left: float, rung: int, particles: int,
+    stage: int, stages: int,
+) -> None:  # fmt: skip
     """Write the state of a stage that uses a rung; at stage 0, follow the evidence of the whole temperature."""
     if stage == 0 and settings[DEPTH] == 1.0:
         follow_evidence(totals[0], totals[2 * RUNGS], high, settings, state)

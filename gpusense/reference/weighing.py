@@ -22,15 +22,9 @@ from gpusense.reference.tempering import largest_of, left_of, possible_of, rung_
 
 
 def add_scores(
-    flags: frozenset[str],
-    log_p: np.ndarray,
-    settings: np.ndarray,
-    score: np.ndarray,
-    largest: np.ndarray,
-    particles: int,
-    block: int,
-    sensor: int,
-) -> None:
+    flags: frozenset[str], log_p: np.ndarray, settings: np.ndarray, score: np.ndarray, largest: np.ndarray,
+    particles: int, block: int, sensor: int,
+) -> None:  # fmt: skip
     """Add a sensor's log-likelihoods times its temperature to the scores, which sensor 0 begins; find block maxima."""
     scaled = settings[TEMPERATURE + sensor] * log_p[:particles].astype(np.float64)
     score[:particles] = scaled if sensor == 0 else score[:particles] + scaled
@@ -45,20 +39,10 @@ def join_scores(flags: frozenset[str], scores: np.ndarray, largest: np.ndarray, 
 
 
 def weigh_particles(
-    flags: frozenset[str],
-    score: np.ndarray,
-    before: np.ndarray,
-    largest: np.ndarray,
-    settings: np.ndarray,
-    state: np.ndarray,
-    sums: np.ndarray,
-    highest: np.ndarray,
-    particles: int,
-    block: int,
-    blocks: int,
-    groups: int,
+    flags: frozenset[str], score: np.ndarray, before: np.ndarray, largest: np.ndarray, settings: np.ndarray,
+    state: np.ndarray, sums: np.ndarray, highest: np.ndarray, particles: int, block: int, blocks: int, groups: int,
     stage: int,
-) -> None:
+) -> None:  # fmt: skip
     """Sum the integer weights of each block on each rung, their squares, and the previous weights."""
     scale, old = settings[SCALE], before[:particles]
     highest[0] = largest_of(largest, 0, groups)
@@ -83,24 +67,10 @@ def join_rows(flags: frozenset[str], sums: np.ndarray, joined: np.ndarray, rows:
 
 
 def set_weights(
-    flags: frozenset[str],
-    score: np.ndarray,
-    before: np.ndarray,
-    highest: np.ndarray,
-    sums: np.ndarray,
-    joined: np.ndarray,
-    totals: np.ndarray,
-    settings: np.ndarray,
-    state: np.ndarray,
-    weight: np.ndarray,
-    ends: np.ndarray,
-    particles: int,
-    block: int,
-    blocks: int,
-    fan: int,
-    stage: int,
-    stages: int,
-) -> None:
+    flags: frozenset[str], score: np.ndarray, before: np.ndarray, highest: np.ndarray, sums: np.ndarray,
+    joined: np.ndarray, totals: np.ndarray, settings: np.ndarray, state: np.ndarray, weight: np.ndarray,
+    ends: np.ndarray, particles: int, block: int, blocks: int, fan: int, stage: int, stages: int,
+) -> None:  # fmt: skip
     """Choose the rung, set the weights and their exact cumulative sums, and write the stage's state."""
     scale, left, high = settings[SCALE], left_of(state, stage), possible_of(totals, highest[0])
     rung = rung_of(totals, settings, settings[SHARE] * particles) if left > 0.0 else 0

@@ -26,6 +26,8 @@ _NAV2_FILES = (
     "pf/eig3.c",
 )
 _C = ("gcc", "-O2", "-DNDEBUG", "-DHAVE_DRAND48", "-fPIC", "-c")
+# nav2_amcl pushes obstacles into the queue of its distances with a priority that it never sets (map_cspace.cpp): zero.
+_SET = "-ftrivial-auto-var-init=zero"
 _FLAGS = ("-std=c++17", "-O2", "-DNDEBUG", "-fPIC", "-shared")
 
 
@@ -194,7 +196,7 @@ def build(name: str, source: Path, include: Sequence[Path], folder: Path) -> Com
             _run(*_C, *renamed, f"-I{root / 'include'}", str(root / "src" / file), "-o", objects[-1])
         models = [str(path) for path in sorted((root / "src" / "sensors" / "laser").glob("*.cpp"))]
         models.append(str(root / "src" / "motion_model" / "differential_motion_model.cpp"))
-        _run("g++", *_FLAGS, f"-I{root}", f"-I{root / 'include'}", f"-I{CODE / 'stubs'}", "-o", str(library),
+        _run("g++", *_FLAGS, _SET, f"-I{root}", f"-I{root / 'include'}", f"-I{CODE / 'stubs'}", "-o", str(library),
              str(CODE / "nav2.cpp"), *models, *objects)  # fmt: skip
     else:
         headers = [f"-I{path}" for path in (source / "beluga" / "include", *include)]

@@ -5,9 +5,10 @@
 
 Each row of the table is a call of one commit on one device: its time, its error, and whether the run was quiet. Calls
 take turns with a probe, a sum of sines in NumPy, whose time is measured likewise; times are the processor's own on a
-processor and elapsed ones on a GPU. A call is quiet where the quartiles of its times lie within 5 % of the median. The
-last commit is compared with the median of up to --window quiet rows before it, after the probe's change is taken out of
-processors' times: slower by more than 10 % (--limit), or an error twice as large, is a regression, and the exit code 1.
+processor and elapsed ones on a GPU. Short calls are timed several in a row, 100 ms at least. A call is quiet where the
+quartiles of its times lie within 5 % of the median. The last commit is compared with the median of up to --window quiet
+rows before it, after the probe's change is taken out of processors' times: slower by more than 10 % (--limit), or an
+error twice as large, is a regression, and the exit code 1.
 An older tree is measured with PYTHONPATH=TREE and --commit.
 """
 
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import math
 import statistics
 import sys
 import time
@@ -37,6 +39,8 @@ from common import ROOT, make_parser, note, parse
 FILE = ROOT / "bench" / "history.csv"
 COLUMNS = ("date", "commit", "device", "row", "ms", "q1_ms", "q3_ms", "probe_ms", "error", "unit", "quiet")
 QUIET, LIMIT, WORSE = 0.05, 0.10, 2.0
+# Least duration of a timing [s], and most calls of one.
+SPAN, MOST = 0.1, 1000
 # Errors below these are rounding, by their unit.
 FLOORS = {"m": 1e-4, "nats": 1e-3}
 Row = Mapping[str, str]
@@ -83,12 +87,17 @@ def measure(backend: str, particles: int, beams: int, turns: int, stated: str) -
     calls = calls_of(device, particles, beams)
     works = {"probe": probe} | {name: call for name, (call, *_) in calls.items()}
     times: dict[str, list[float]] = {name: [] for name in works}
+    counts = dict.fromkeys(works, 1)
     for turn in range(-2, turns):
         for name, work in works.items():
             begin = clock()
-            work()
-            if turn >= 0:
-                times[name].append(1e3 * (clock() - begin))
+            for _ in range(counts[name]):
+                work()
+            seconds = clock() - begin
+            if turn == -1:
+                counts[name] = math.ceil(SPAN / max(seconds, SPAN / MOST))
+            elif turn >= 0:
+                times[name].append(1e3 * seconds / counts[name])
     where = device.info.name if device.info.kind == "gpu" else processor_name()
     rows = []
     for name, (_, unit, error) in calls.items():

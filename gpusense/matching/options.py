@@ -143,6 +143,8 @@ def check_guess(guess: object, matches: int | None, farthest: float = _FARTHEST)
         raise ValueError(f"guess: shape must be (3,) for a single match, got {checks.shape_text(values.shape)}")
     if np.abs(values[..., :2]).max(initial=0.0) > farthest:
         raise ValueError(f"guess: x and y must be within {farthest:g} m, got {checks.show(values)}")
-    result = np.array(np.broadcast_to(values, (1 if matches is None else matches, 3)))
-    result[:, 2] = np.angle(np.exp(1j * result[:, 2]))
+    result = np.empty((1 if matches is None else matches, 3))
+    result[:] = values
+    turned = np.exp(1j * result[:, 2])
+    result[:, 2] = np.arctan2(turned.imag, turned.real)
     return result

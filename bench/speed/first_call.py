@@ -1,12 +1,12 @@
-"""Measure first calls: the wait of a new process, with an empty cache on disk and with a full one.
+"""Measure first calls in a new process, with an empty and with a full cache on disk.
 
     python bench/speed/first_call.py --backend opencl --backend warp:cpu
     python bench/speed/first_call.py --backend opencl --tree .:now --tree ../old:before --output NAME
 
-Each time is of a new process: the import of the package, opening the device, the first call of the likelihood field,
-the first one of the beam model after it. "Cold" begins with an empty cache folder, so that the device is proved too;
-"warm" is the next process with the same folder. Modules have their bytecode, as those of an installed package. Trees
-(checkouts, with a name each) take turns, so that their ratio holds on a busy machine.
+A new process imports the package, opens the device, and calls the likelihood field and then the beam model for the
+first time. "Cold" begins with an empty cache folder, so that the device is also proved; "warm" is the next process with
+the same folder. Modules have their bytecode, as those of an installed package. Trees (checkouts, with a name each) take
+turns, so that their ratio is valid on a busy machine.
 """
 
 from __future__ import annotations

@@ -62,13 +62,8 @@ def log_waves(residual: Pair, terms: np.ndarray) -> np.ndarray:
 
 
 def score_position(
-    flags: frozenset[str],
-    place: np.ndarray,
-    terms: np.ndarray,
-    log_p: np.ndarray,
-    particles: int,
-    temperature: float,
-) -> None:
+    flags: frozenset[str], place: np.ndarray, terms: np.ndarray, log_p: np.ndarray, particles: int, temperature: float,
+) -> None:  # fmt: skip
     """Score positions; ``terms`` are a, b, c and peak, each with its low part, and the log of the uniform part.
 
     The exponent is ``(a x)^2 + (b x + c y)^2``, where (x, y) is the offset from the reading to the sensor.
@@ -85,14 +80,9 @@ def score_position(
 
 
 def score_heading(
-    flags: frozenset[str],
-    residual: np.ndarray,
-    terms: np.ndarray,
-    log_p: np.ndarray,
-    particles: int,
-    kind: int,
+    flags: frozenset[str], residual: np.ndarray, terms: np.ndarray, log_p: np.ndarray, particles: int, kind: int,
     temperature: float,
-) -> None:
+) -> None:  # fmt: skip
     """Score headings; residuals are headings minus the reading, in [-pi, pi]."""
     r = residual[:particles, 0], residual[:particles, 1]
     scale = np.asarray(terms[SCALE]), np.asarray(terms[SCALE_LOW])

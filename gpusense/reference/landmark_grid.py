@@ -74,18 +74,9 @@ def log_match(
 
 
 def search(
-    flags: frozenset[str],
-    landmark: np.ndarray,
-    normal: np.ndarray,
-    signature: np.ndarray,
-    start: np.ndarray,
-    place: Quad,
-    turned: Quad,
-    feature: np.ndarray,
-    terms: np.ndarray,
-    arcs: np.ndarray,
-    buckets: structs.Buckets,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    flags: frozenset[str], landmark: np.ndarray, normal: np.ndarray, signature: np.ndarray, start: np.ndarray,
+    place: Quad, turned: Quad, feature: np.ndarray, terms: np.ndarray, arcs: np.ndarray, buckets: structs.Buckets,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Return per particle the log density, the log density of the likeliest landmark, and its index.
 
     The log density is that of the likeliest landmark, or with MARGINAL of all landmarks.

@@ -48,8 +48,8 @@ kernel void score_field(ARGUMENTS) {
 }
 
 // Write the sums of blocks of readings to parts[n + block * particles], for GPUs. One work-item takes a particle
-// and every 2^spread-th block. Each block has a guard of its own; with SCANS each scan has as many guards as the
-// longest one.
+// and every 2^spread-th block. Each block has a separate guard; with SCANS each scan has as many guards as the longest
+// one.
 kernel void field_blocks(ARGUMENTS) {
     const int item = get_global_id(0), n = ((item / GROUP) >> spread) * GROUP + item % GROUP;
     if (n >= particles) return;

@@ -124,8 +124,8 @@ def make(name, flags):
             log_p[n] = score.temperature * (total.x + total.y)
 
     # Write the sums of blocks of readings to parts[n + block * particles], for GPUs. One work-item takes a
-    # particle and every 2^spread-th block. Each block has a guard of its own; with SCANS each scan has as many guards
-    # as the longest one.
+    # particle and every 2^spread-th block. Each block has a separate guard; with SCANS each scan has as many guards as
+    # the longest one.
     @kernel(flags)
     def field_blocks(
         table, pose_cell, pose, pose_low, point, point_low, terms, guard, start, parts, window, particles, readings,

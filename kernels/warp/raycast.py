@@ -50,7 +50,7 @@ def functions(flags):
             sector += wp.where(speed_y > wp.where(steep, STEEPEST, FLATTEST) * speed_x, 1, 0)
         return sector
 
-    # Rows of a group of the planes; without ROW_GROUPS each row stands alone.
+    # Rows of a group of the planes; without ROW_GROUPS a group is a single row.
     GROUP = 8 if ROW_GROUPS else 1
     ROWS = wp.uint32(GROUP)
 

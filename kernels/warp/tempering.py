@@ -19,7 +19,7 @@ SHARE, THRESHOLD, SCALE = (wp.constant(place) for place in (19, 20, 21))
 PER_BEAM_SCALE, SLOW_RATE, FAST_RATE, MOST_INJECTED = (wp.constant(place) for place in (22, 23, 24, 25))
 RUNGS, WEIGHT_SUMS = wp.constant(8), wp.constant(17)
 DEPTH = wp.constant(60)
-# Places in the state: of a stage, and of what lasts.
+# Places in the state: numbers of a stage, then numbers that outlast it.
 LEFT, TOTAL, SAMPLE_SIZE, RESAMPLED, DEGENERATE, RUNG = (wp.constant(place) for place in range(6))
 STAGE = wp.constant(8)
 # 2^-(RUNGS - 1).
@@ -75,7 +75,7 @@ def possible_of(totals: wp.array(dtype=wp.float64), largest: wp.float64):
     return high
 
 
-# Return the column of sums with the weights of a rung; that of the weights before where none is possible.
+# Return the column of sums with the weights of a rung; the column of the previous weights where none is possible.
 @wp.func
 def column_of(high: wp.float64, rung: wp.int32):
     column = rung

@@ -136,8 +136,8 @@ def make(name, flags):
     # 2 without a return. One work-item takes a particle and cone; a launch has fewer than 2^31.
     @kernel(flags, entry=ENTRY)
     def cast_echoes(
-        map_table, normals, pose_cell, pose, ray, ranges, incidence, window, particles, rays, cone, caster, scale,
-    ):  # fmt: skip
+        map_table, normals, pose_cell, pose, ray, ranges, incidence, window, particles, rays, cone, caster, scale
+    ):
         n, k = wp.tid()
         if k >= rays or n >= particles:
             return

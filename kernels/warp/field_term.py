@@ -122,8 +122,8 @@ def functions(flags):
     # missing or max reading has no cell: the sensor's cell is read and not used. The term of a max reading is far.
     @wp.func
     def quick_value(
-        table: wp.array(dtype=real), start_cell: wp.vec2i, lowered: vec4, to: vec2, far: real, window: types.Window,
-    ):  # fmt: skip
+        table: wp.array(dtype=real), start_cell: wp.vec2i, lowered: vec4, to: vec2, far: real, window: types.Window
+    ):
         if ALL_READINGS:
             is_range = wp.isfinite(to.x)
             near, off = rounded_cell(lowered, wp.where(is_range, to, vec2(ZERO, ZERO)))

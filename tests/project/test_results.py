@@ -22,7 +22,8 @@ COMMAND = re.compile(r"(?:python )?bench/[\w/]+\.py")
 SCRIPT = re.compile(r"(?:python |\"script\": \")(bench/[\w/]+\.py)")
 # Scripts of older reports, by today's; bench/RESULTS.md says so.
 FORMER = {
-    "absolute": "point_models", "landmarks": "point_models", "several_scans": "small_calls", "speed": "limits",
+    "absolute": "point_models", "landmarks": "point_models", "localization": "localization_logs",
+    "several_scans": "small_calls", "speed": "limits",
 }  # fmt: skip
 
 

@@ -13,7 +13,7 @@ BENCH = ROOT / "bench"
 
 
 def run_script(name: str, *arguments: str, output: Path) -> dict:
-    """Run a script and return its report; its Markdown must be there, too."""
+    """Run a script, check its Markdown, and return its report."""
     command = [sys.executable, str(BENCH / name), *arguments, "--output", str(output)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr[-3000:]

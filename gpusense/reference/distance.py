@@ -97,3 +97,21 @@ def distance_search(
         column = columns[begin : begin + BLOCK]
         lowest = _lowest(np.where(column == FAR_CELLS, FAR, squares_sum(column, np.zeros_like(column))))
         out[:, begin : begin + BLOCK] = np.where(lowest > most, UNREACHABLE, lowest).T
+
+
+def fill_field(
+    flags: frozenset[str], squared: np.ndarray, density: np.ndarray, table: np.ndarray, rows: int, cols: int, cap: int,
+    beyond: float, from_col: int, from_row: int, width: int, height: int, begin: int, stride: int,
+) -> None:  # fmt: skip
+    """Fill cells of a field's table from squared distances; density has a value for each one up to the cap.
+
+    There are height x width cells, which begin at index begin of the table and at cell (from_row, from_col) of the
+    grid; cells outside the grid get beyond.
+    """
+    size = table.itemsize
+    out = np.lib.stride_tricks.as_strided(table[begin:], (height, width), (stride * size, size))
+    top, bottom = (min(max(row, 0), rows) for row in (from_row, from_row + height))
+    left, right = (min(max(col, 0), cols) for col in (from_col, from_col + width))
+    known = squared[: rows * cols].reshape(rows, cols)[top:bottom, left:right]
+    out[...] = beyond
+    out[top - from_row : bottom - from_row, left - from_col : right - from_col] = density[np.minimum(known, cap)]

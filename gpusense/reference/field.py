@@ -17,24 +17,6 @@ from gpusense.reference.scans import particles_of_scans
 BLOCK = 1 << 18
 
 
-def fill_field(
-    flags: frozenset[str], squared: np.ndarray, density: np.ndarray, table: np.ndarray, rows: int, cols: int, cap: int,
-    beyond: float, from_col: int, from_row: int, width: int, height: int, begin: int, stride: int,
-) -> None:  # fmt: skip
-    """Fill cells of the table from squared distances; density has a value for each squared distance up to the cap.
-
-    There are height x width cells, which begin at index begin of the table and at cell (from_row, from_col) of the
-    grid; cells outside the grid get beyond.
-    """
-    size = table.itemsize
-    out = np.lib.stride_tricks.as_strided(table[begin:], (height, width), (stride * size, size))
-    top, bottom = (min(max(row, 0), rows) for row in (from_row, from_row + height))
-    left, right = (min(max(col, 0), cols) for col in (from_col, from_col + width))
-    known = squared[: rows * cols].reshape(rows, cols)[top:bottom, left:right]
-    out[...] = beyond
-    out[top - from_row : bottom - from_row, left - from_col : right - from_col] = density[np.minimum(known, cap)]
-
-
 def score_field(
     flags: frozenset[str], table: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
     point: np.ndarray, point_low: np.ndarray, terms: np.ndarray, start: np.ndarray, constant_terms: np.ndarray,

@@ -89,7 +89,7 @@ def same_as_one_by_one(make: Callable[[object], object], as_gpu: Pretend, poses:
     np.testing.assert_allclose(found, plain, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.sampled(0.25, without="warp")
+@pytest.mark.sampled(0.25, without="warp:cpu")
 @pytest.mark.parametrize("kind", ["all over", "inside"])
 def test_models(kind, ordered, as_gpu, backend):
     grid, scanner, z = world()

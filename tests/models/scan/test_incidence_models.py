@@ -29,7 +29,7 @@ def model_of(backend, **options) -> gs.BeamModel:
 
 
 def brute_force(model: gs.BeamModel, poses: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Return (N, K) log densities, each with the parameters of its own angle."""
+    """Return (N, K) log densities, each with the parameters of its angle."""
     parameters = model.incidence_parameters
     expected, angle = model.expected_ranges(poses).astype(float), model.incidence(poses).astype(float)
     which = np.searchsorted(parameters.edges[1:-1], np.nan_to_num(angle), side="right")

@@ -1,7 +1,8 @@
 """Laws that a range model keeps whatever its numbers are: no oracle, only two scenes whose results must fit.
 
-Most hold to the bit, because the second scene is the first one exactly in the grid's frame: poses lie at odd multiples
-of 1/256 cell, resolutions are powers of two, and free cells around the walls are wider than any distance counts.
+Most laws are exact to the bit, because the second scene equals the first one in the grid's frame: poses lie at odd
+multiples of 1/256 cell, resolutions are powers of two, and free cells around the walls are wider than any distance
+counts.
 """
 
 from __future__ import annotations
@@ -264,8 +265,8 @@ def test_cells_cut_in_four_change_no_range(on, seed, name):
 @LAWS
 @given(SEEDS)
 def test_cells_cut_in_four_change_distances_by_a_diagonal(interpolation, longer, shorter, on, seed):
-    """In cells, d - sqrt(1/2) <= d' <= d: the quarter of a wall that lies to it as the end point's own quarter does is
-    d away, and either of them moves by sqrt(1/8) at most. Interpolated, d' and d are sqrt(2) apart at most: they differ
+    """In cells, d - sqrt(1/2) <= d' <= d: the quarter of a wall in the same position as the end point's quarter is d
+    away, and each of them moves by sqrt(1/8) at most. Interpolated, d' and d are sqrt(2) apart at most: they differ
     from the distance of the end point itself by sqrt(1/8) and sqrt(1/2), and walls move by sqrt(1/8).
     """
     coarse, bounds = scene("field", seed), []

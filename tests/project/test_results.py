@@ -40,7 +40,7 @@ def test_each_report_is_published(published: str) -> None:
 
 
 def parts_of(file: Path) -> list[str]:
-    """Return the reports of a file: the elements of a list, or what stands under headings of the first level."""
+    """Return the reports of a file: the elements of a list, or the sections of the first level."""
     text = file.read_text(encoding="utf-8")
     if file.suffix == ".json":
         whole = json.loads(text)

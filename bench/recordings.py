@@ -6,9 +6,11 @@ A run is a list of events in order of time: a scan of one scanner, the odometry,
 from __future__ import annotations
 
 import math
+import multiprocessing
 import os
 import time
 import warnings
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -260,3 +262,26 @@ def coverage_cell(row):
 def error_cell(row):
     """Format the median error and the 95 % quantile [cm]."""
     return f"{row['median_cm']:.1f}, {row['p95_cm']:.1f}"
+
+
+# PoCL reads the first of these up to version 5, the second one since then.
+_ONE_THREAD = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
+
+
+def results(function, jobs, processes=1):
+    """Yield ``function(*job)`` of each job, in their order; of several processes each has one thread.
+
+    Args:
+        function: A function of a module, for one process and for several.
+        jobs: Its arguments, plain data.
+        processes: Number of processes; 1 runs the jobs here, with all threads.
+    """
+    if processes == 1:
+        yield from (function(*job) for job in jobs)
+        return
+    for name in _ONE_THREAD:
+        os.environ.setdefault(name, "1")
+    # Devices do not survive a fork.
+    with ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn")) as pool:
+        waiting = [pool.submit(function, *job) for job in jobs]
+        yield from (one.result() for one in waiting)

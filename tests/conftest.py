@@ -49,7 +49,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             function = item.nodeid.split("[")[0]
             params = item.callspec.params
             where = function, params.get("backend", params.get("device", ""))
-            if where[1].split(":")[0] == sampled.kwargs.get("without"):
+            if where[1] == sampled.kwargs.get("without"):
                 item.add_marker("slow")
                 continue
             # Multiples of the golden ratio spread over every parameter, however its values follow one another.

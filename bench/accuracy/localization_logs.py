@@ -23,7 +23,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 import recordings
 from common import make_parser, note, parse, publish, table
-from parallel import results
 
 import gpusense as gs
 from gpusense.evaluation.tracking import CONVERGED, CONVERGED_TURN
@@ -135,7 +134,7 @@ def main() -> None:
         for setting in settings
         for seed in range(args.seeds)
     ]
-    tracks = results(track, jobs, args.processes)
+    tracks = recordings.results(track, jobs, args.processes)
     for name, kind, count in settings:
         noise = "fitted" if args.fit_motion else "default"
         row = dict(log=name, model=kind, particles=count, beams=args.beams, noise=noise, recovery=args.recovery)

@@ -19,7 +19,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 import recordings
 from common import make_parser, note, parse, publish, table
-from parallel import results
 
 import gpusense as gs
 from gpusense.evaluation.tracking import CONVERGED, CONVERGED_SCANS, CONVERGED_TURN
@@ -73,7 +72,7 @@ def main() -> None:
         for particles, recovery in settings
         for seed in range(args.runs)
     ]
-    done = results(run, jobs, args.processes)
+    done = recordings.results(run, jobs, args.processes)
     for particles, recovery in settings:
         runs = list(itertools.islice(done, args.runs))
         scans = [one for one, _ in runs if one is not None]

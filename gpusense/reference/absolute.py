@@ -62,8 +62,8 @@ def log_waves(residual: Pair, terms: np.ndarray) -> np.ndarray:
 
 
 def score_position(
-    flags: frozenset[str], place: np.ndarray, terms: np.ndarray, log_p: np.ndarray, particles: int, temperature: float,
-) -> None:  # fmt: skip
+    flags: frozenset[str], place: np.ndarray, terms: np.ndarray, log_p: np.ndarray, particles: int, temperature: float
+) -> None:
     """Score positions; ``terms`` are a, b, c and peak, each with its low part, and the log of the uniform part.
 
     The exponent is ``(a x)^2 + (b x + c y)^2``, where (x, y) is the offset from the reading to the sensor.

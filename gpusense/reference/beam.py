@@ -156,10 +156,7 @@ def readings_of_scan(
 
 
 def sum_terms(
-    flags: frozenset[str],
-    term: np.ndarray,
-    score: structs.Score,
-    plainly: Callable[[np.ndarray], np.ndarray],
+    flags: frozenset[str], term: np.ndarray, score: structs.Score, plainly: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
     """Sum (M, K) terms and a constant one in the order of the beams; -inf where one of them is -inf.
 

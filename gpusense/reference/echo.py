@@ -21,11 +21,7 @@ def is_wall(normal: np.ndarray) -> np.ndarray:
 
 
 def normal_at(
-    flags: frozenset[str],
-    normals: np.ndarray,
-    window: structs.Window,
-    col: np.ndarray,
-    row: np.ndarray,
+    flags: frozenset[str], normals: np.ndarray, window: structs.Window, col: np.ndarray, row: np.ndarray
 ) -> np.ndarray:
     """Return (M, 2) normals of cells."""
     beyond = off_grid(np.stack([col + 1, row + 1]), window.rows + 2, window.cols + 2)
@@ -35,8 +31,8 @@ def normal_at(
 
 
 def hit_normal(
-    flags: frozenset[str], normals: np.ndarray, window: structs.Window, cell: np.ndarray, r: Ray, t: np.ndarray,
-) -> np.ndarray:  # fmt: skip
+    flags: frozenset[str], normals: np.ndarray, window: structs.Window, cell: np.ndarray, r: Ray, t: np.ndarray
+) -> np.ndarray:
     """Return the normals of the cells in which M rays end at distances t.
 
     The distance determines the cell of the exact walk: it has crossed all boundaries in x up to t, and those in y

@@ -22,8 +22,8 @@ def between(flags: frozenset[str], weight_a: Pair, a: Pair, weight_b: Pair, b: P
 
 
 def bilinear(
-    flags: frozenset[str], table: np.ndarray, col: np.ndarray, row: np.ndarray, end: EndPoint, window: structs.Window,
-) -> Pair:  # fmt: skip
+    flags: frozenset[str], table: np.ndarray, col: np.ndarray, row: np.ndarray, end: EndPoint, window: structs.Window
+) -> Pair:
     """Interpolate the distance between the four cell centres around an end point, in two parts."""
     zero = np.zeros_like(end.rest_x[0])
     a = table[field_cell(col, row, window)], zero

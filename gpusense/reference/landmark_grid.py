@@ -25,11 +25,7 @@ def bucket_at(position: np.ndarray, size: float, count: int) -> np.ndarray:
 
 
 def candidates(
-    start: np.ndarray,
-    place: Quad,
-    turned: Quad,
-    feature: np.ndarray,
-    buckets: structs.Buckets,
+    start: np.ndarray, place: Quad, turned: Quad, feature: np.ndarray, buckets: structs.Buckets
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return runs of landmarks in the buckets that discs touch: (P, rows of buckets) first and last + 1."""
     reach, radius = feature[REACH], feature[RADIUS]

@@ -39,18 +39,10 @@ def make(name, flags):
     # p. The particle's sets begin at index sums of best, and their features at index begin of choice and value.
     @wp.func
     def add_landmark(
-        j: wp.int32,
-        log_each: LogEach,
-        feature: wp.array(dtype=real),
-        best: wp.array(dtype=real),
-        choice: wp.array(dtype=wp.int32),
-        value: wp.array(dtype=real),
-        sums: wp.int32,
-        begin: wp.int32,
-        features: wp.int32,
-        sets: wp.int32,
-        groups: wp.int32,
-    ):
+        j: wp.int32, log_each: LogEach, feature: wp.array(dtype=real), best: wp.array(dtype=real),
+        choice: wp.array(dtype=wp.int32), value: wp.array(dtype=real), sums: wp.int32, begin: wp.int32,
+        features: wp.int32, sets: wp.int32, groups: wp.int32,
+    ):  # fmt: skip
         # From the full set down, since smaller sets must not yet contain this landmark for the group.
         step = int(0)
         while step < groups * (sets - 1):

@@ -193,13 +193,9 @@ def functions(flags):
     # Return a reading drawn from the mixture; infinity without return, NaN where no reading is possible.
     @wp.func
     def reading_of(
-        u: wp.float64,
-        v: wp.float64,
-        expected: wp.float64,
-        mixture: wp.array(dtype=wp.float64),
-        bins: wp.int32,
+        u: wp.float64, v: wp.float64, expected: wp.float64, mixture: wp.array(dtype=wp.float64), bins: wp.int32,
         range_max: wp.float64,
-    ):
+    ):  # fmt: skip
         p = DRAW_TERMS * bins
         first = mixture[p]
         second = first + wp.where(expected > ZERO, mixture[p + 1], ZERO)
@@ -224,14 +220,9 @@ def functions(flags):
     # Return a reading drawn from a table: uniform in a drawn bin, at a margin from the bin's ends.
     @wp.func
     def cell_reading_of(
-        u: wp.float64,
-        v: wp.float64,
-        column: wp.int32,
-        chances: wp.array(dtype=wp.float64),
-        cells: wp.int32,
-        range_max: wp.float64,
-        margin: wp.float64,
-    ):
+        u: wp.float64, v: wp.float64, column: wp.int32, chances: wp.array(dtype=wp.float64), cells: wp.int32,
+        range_max: wp.float64, margin: wp.float64,
+    ):  # fmt: skip
         row = column * (cells + 1)
         mark = u * chances[row + cells]
         low = int(0)

@@ -64,16 +64,9 @@ def make(name, flags):
     # reading.
     @wp.func
     def fill_end_point(
-        place: wp.int32,
-        value: wp.float64,
-        vector: wp.vec2d,
-        longest: wp.float64,
-        point: wp.array(dtype=vec2),
-        point_low: wp.array(dtype=vec2),
-        guard: wp.array(dtype=real),
-        resolution: wp.float64,
-        guard_scale: wp.float64,
-    ):
+        place: wp.int32, value: wp.float64, vector: wp.vec2d, longest: wp.float64, point: wp.array(dtype=vec2),
+        point_low: wp.array(dtype=vec2), guard: wp.array(dtype=real), resolution: wp.float64, guard_scale: wp.float64,
+    ):  # fmt: skip
         cells = value / resolution
         length = wp.where(wp.isfinite(cells), cells, ZERO)
         x = vector.x * length
@@ -89,16 +82,9 @@ def make(name, flags):
     # Fill a place with a reading, at most top, and with the vectors of its beam, the first of which is read already.
     @wp.func
     def fill_rays(
-        place: wp.int32,
-        value: wp.float64,
-        vector: wp.vec2d,
-        vectors: wp.array(dtype=wp.float64),
-        source: wp.int32,
-        point: wp.array(dtype=vec2),
-        reading: wp.array(dtype=real),
-        each: wp.int32,
-        top: wp.float64,
-    ):
+        place: wp.int32, value: wp.float64, vector: wp.vec2d, vectors: wp.array(dtype=wp.float64), source: wp.int32,
+        point: wp.array(dtype=vec2), reading: wp.array(dtype=real), each: wp.int32, top: wp.float64,
+    ):  # fmt: skip
         point[place * each] = vec2(real(vector.x), real(vector.y))
         for j in range(1, each):
             point[place * each + j] = vec2(real(vectors[source + 2 * j]), real(vectors[source + 2 * j + 1]))
@@ -112,18 +98,11 @@ def make(name, flags):
     # readings without a place, -inf if there is a range where none is possible.
     @wp.func
     def place_reading(
-        item: wp.int32,
-        ranges: wp.array(dtype=measured),
-        beam: wp.array(dtype=wp.int32),
-        vector: wp.array(dtype=wp.float64),
-        point: wp.array(dtype=vec2),
-        point_low: wp.array(dtype=vec2),
-        reading: wp.array(dtype=real),
-        guard: wp.array(dtype=real),
-        constant_term: wp.array(dtype=real),
-        resolution: wp.float64,
-        rules: types.ReadingRules,
-    ):
+        item: wp.int32, ranges: wp.array(dtype=measured), beam: wp.array(dtype=wp.int32),
+        vector: wp.array(dtype=wp.float64), point: wp.array(dtype=vec2), point_low: wp.array(dtype=vec2),
+        reading: wp.array(dtype=real), guard: wp.array(dtype=real), constant_term: wp.array(dtype=real),
+        resolution: wp.float64, rules: types.ReadingRules,
+    ):  # fmt: skip
         # Values that are needed last are read first, so that nothing waits for them.
         source = 2 * item * rules.each
         item_reading = reading_of(item, ranges, beam, rules.beams)

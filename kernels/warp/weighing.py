@@ -71,8 +71,8 @@ def make(name, flags):
     # block. The first one writes the largest score.
     @kernel(flags)
     def weigh_particles(
-        score, before, largest, settings, state, sums, highest, particles, block, blocks, groups, stage,
-    ):  # fmt: skip
+        score, before, largest, settings, state, sums, highest, particles, block, blocks, groups, stage
+    ):
         b = wp.tid()
         begin = b * block
         if begin >= particles:

@@ -1,4 +1,4 @@
-"""Runs whose caches are damaged, locked, full, unsafe or shared; and what lies beside a cache."""
+"""Runs with damaged, locked, full, unsafe or shared caches; files beside a cache."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_damaged_files_of_every_kind_are_made_anew(needs, tmp_path, expected, fa
 @pytest.mark.slow
 @pytest.mark.parametrize(("family", "how"), [("opencl", BLOCKED[0]), ("opencl", BLOCKED[2]), ("warp:cpu", BLOCKED[1])])
 def test_a_cache_that_cannot_be_written_is_named_and_stops_nothing(needs, tmp_path, expected, family, how):
-    """gpusense's own folder, and where PoCL and Warp would put theirs."""
+    """The folder of gpusense, and the default folders of PoCL and Warp."""
     needs(family.split(":")[0])
     place = str(blocked(tmp_path, how))
     (tmp_path / "tmp").mkdir()

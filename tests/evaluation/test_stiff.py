@@ -73,7 +73,7 @@ def test_density_grid_against_60_digits(backend, precision):
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-def test_density_grid_reaches_what_it_says(precision):
+def test_density_grid_covers_its_ranges(precision):
     grid, real = density_grid("numpy", precision), np.dtype(precision).type
     top = real(stiff.RANGE_MAX)
     assert {0.0, top}.issubset(grid.expected.tolist())

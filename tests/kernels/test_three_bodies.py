@@ -31,7 +31,7 @@ OTHER_FILES = {
 
 @dataclass(frozen=True)
 class Purpose:
-    """Functions of a concept that some languages have on purpose, and why the others do not."""
+    """Functions of a concept that only some languages have, with the reason."""
 
     concept: str
     functions: str

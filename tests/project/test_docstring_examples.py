@@ -1,4 +1,4 @@
-"""Examples in docstrings run, each in a namespace of its own, and print the results that they show."""
+"""Examples in docstrings run in separate namespaces, and print the results that they show."""
 
 from __future__ import annotations
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
+import mpmath as mp
 from support.paths import ROOT
 
 BENCH = ROOT / "bench"
@@ -26,3 +29,15 @@ def run_script(name: str, *arguments: str, output: Path) -> dict:
     assert report["command"].startswith(f"python bench/{name} ")
     assert str(output.parent) not in json.dumps(report)
     return report
+
+
+def derived(name: str) -> ModuleType:
+    """Import a script of bench/derive, and restore mpmath's precision."""
+    spec = importlib.util.spec_from_file_location(name, BENCH / "derive" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    digits = mp.mp.dps
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        mp.mp.dps = digits
+    return module

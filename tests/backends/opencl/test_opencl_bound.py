@@ -75,7 +75,7 @@ def test_bound_calls_on_another_queue(as_gpu, queue, there):
 
 
 def test_a_bound_call_binds_no_argument_again(as_gpu, queue, there, monkeypatch):
-    """A call is three launches, started by kernels of its own."""
+    """A call is three launches with kernel objects of its own."""
     from gpusense.backends.opencl import replay as _opencl_replay
 
     model = FIELD(GRID, NEAR, backend=queue)

@@ -195,12 +195,10 @@ def _first_cells(
     """Return distances to the first wall and to the first unknown cell of rays in cells [cells]; inf for none."""
     rays, (rows, columns) = len(x), grid.shape
     ray = np.repeat(np.arange(rays), steps)
-    number = np.arange(len(ray)) - np.repeat(np.cumsum(steps) - steps, steps)
+    number = np.arange(len(ray))
+    number -= np.repeat(np.cumsum(steps) - steps, steps)
     distance = _STEP * number
-    # Processors convert to 32 bits several times as fast as to 64, and off the map any number of cells will do.
-    x, y = (np.minimum(np.maximum(start, -_AFAR), _AFAR) for start in (x, y))
-    column = np.floor(np.repeat(x, steps) + distance * np.repeat(along, steps)).astype(np.int32)
-    row = np.floor(np.repeat(y, steps) + distance * np.repeat(up, steps)).astype(np.int32)
+    column, row = (_cells_along(start, slope, steps, distance) for start, slope in ((x, along), (y, up)))
     # As unsigned numbers, negative indices exceed every limit.
     within = (column.view(np.uint32) < columns) & (row.view(np.uint32) < rows)
     cells, place = grid.cells.reshape(-1), row.astype(np.int64) * columns + column
@@ -215,6 +213,19 @@ def _first_cells(
     one, two = place[corner + 1] - moved, place[corner] + moved
     wall[corner + 1] |= (cells[one] >= grid.occupied_threshold) & (cells[two] >= grid.occupied_threshold)
     return _firsts(wall, ray, number, rays), _firsts(value < 0, ray, number, rays)
+
+
+def _cells_along(
+    start: Floats, slope: Floats, steps: NDArray[np.int64], distance: NDArray[np.floating]
+) -> NDArray[np.int32]:
+    """Return the rows or columns of all steps of rays, each of which begins at a coordinate and has a slope [cells].
+
+    Processors convert to 32 bits several times as fast as to 64, and off the map any number of cells will do.
+    """
+    place = np.repeat(slope, steps)
+    place *= distance
+    place += np.repeat(np.minimum(np.maximum(start, -_AFAR), _AFAR), steps)
+    return np.floor(place, out=place).astype(np.int32)
 
 
 def _firsts(marked: NDArray[np.bool_], ray: NDArray[np.int64], number: NDArray[np.int64], rays: int) -> Floats:

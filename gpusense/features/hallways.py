@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -83,13 +84,21 @@ def _extents(segments: Segments, lines: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def _one_each(scan: np.ndarray, angle: np.ndarray, length: np.ndarray) -> np.ndarray:
     """Choose the pair with the longest walls of each scan and axis."""
-    order = np.lexsort((-length, scan))
+
+    def on_another_axis(k: int, j: int) -> bool:
+        return abs(math.remainder(angle[k] - angle[j], math.pi)) > _ONE_AXIS
+
+    return np.sort(first_apart(np.lexsort((-length, scan)), scan, on_another_axis))
+
+
+def first_apart(order: np.ndarray, scan: np.ndarray, are_apart: Callable[[int, int], bool]) -> np.ndarray:
+    """Choose in an order, scan after scan, each index that is apart from those chosen before in its scan."""
     kept: list[int] = []
     taken: list[int] = []
     for k in order.tolist():
         if taken and scan[taken[0]] != scan[k]:
             taken = []
-        if all(abs(math.remainder(angle[k] - angle[j], math.pi)) > _ONE_AXIS for j in taken):
+        if all(are_apart(k, j) for j in taken):
             taken.append(k)
             kept.append(k)
-    return np.sort(np.array(kept, np.int64))
+    return np.array(kept, np.int64)

@@ -130,7 +130,7 @@ def test_a_scene_without_any_method_does_not_count() -> None:
     assert {entry.method for entry in chosen} == {"exact", "march"}
 
 
-def test_devices_of_one_title_are_told_apart() -> None:
+def test_devices_with_equal_titles_are_distinguished() -> None:
     points = [made_point(backend=name, device="pthread-X") for name in ("opencl:0:0", "opencl:1:0")]
     rows = model_rows(report_of(points=[*points, made_point(backend="outside", outside=True)]))
     assert {row.device for row in rows if not row.outside} == {

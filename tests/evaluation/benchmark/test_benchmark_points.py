@@ -196,7 +196,7 @@ def test_baselines_say_why_they_cannot_run(baselines):
             assert any(word in one.missing for word in ("cannot be imported", "pip install numba", "not compiled"))
 
 
-def test_numba_computes_what_it_says(baselines):
+def test_numba_computes_the_stated_scores(baselines):
     pytest.importorskip("numba")
     scene = quick_scene(beams=30)
     truth = accuracy.Truth(scene, scene.clouds["tracking"], get_backend("numpy"))

@@ -1,4 +1,4 @@
-"""Share options, scenes, timings and reports among the scripts of ``bench/``.
+"""Options, scenes, timings and reports that the scripts of ``bench/`` share.
 
 A script runs from a checkout, with an installed gpusense: ``python bench/speed/limits.py ...``. Its line
 ``sys.path.insert(0, str(Path(__file__).resolve().parents[1]))`` makes this file and the folders beside it importable.
@@ -38,31 +38,35 @@ LOGS = ("intel", "freiburg-079", "csail", "aces")
 # A rate counts if no error is larger [eps (1 + |log p|) for each reading].
 MOST_EPS = 16.0
 
-# Names the script that runs another one, such as speed/as_avx2.py, for the command of its report.
+# Environment variable with the script that runs another one, such as speed/as_avx2.py; it joins the report's command.
 THROUGH = "GPUSENSE_BENCH_THROUGH"
 
 # ---- options
 
 
-def make_parser(doc: str | None, *, backend: str = "present", data: bool = False) -> argparse.ArgumentParser:
+def make_parser(
+    doc: str | None, *, backend: str = "present", data: bool = False, seed: bool = True
+) -> argparse.ArgumentParser:
     """Make a parser with the options that the scripts share.
 
     Args:
         doc: The script's docstring, which is its help.
         backend: The default of ``--backend``: "present" for every device of the machine, "kernels" for every one but
-            NumPy, "auto" for the library's choice of one, "" for no such option.
+            NumPy, the selection string of a single device, "" for no such option.
         data: Whether the script reads recorded data.
+        seed: Whether the script has ``--seed``.
     """
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
-    if backend == "auto":
-        parser.add_argument("--backend", default="auto", help="selection string (default: %(default)s)")
-    elif backend:
+    if backend in ("present", "kernels"):
         which = "every device present" + (" but NumPy" if backend == "kernels" else "")
         parser.add_argument("--backend", action="append", help=f"selection string, repeatable; default: {which}")
         parser.set_defaults(numpy=backend == "present")
+    elif backend:
+        parser.add_argument("--backend", default=backend, help="selection string (default: %(default)s)")
     if data:
         parser.add_argument("--data", type=Path, default=os.environ.get("GPUSENSE_DATA"), help="default: GPUSENSE_DATA")
-    parser.add_argument("--seed", type=int, default=0)
+    if seed:
+        parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--commit", default="", help="for a copy of the tree that is no git repository")
     parser.add_argument("--output", type=Path, help="path without ending for the .json and .md files")
     return parser
@@ -86,7 +90,7 @@ def add_scene(parser: argparse.ArgumentParser, size: float, range_max: float = 3
 
 
 def parse(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> argparse.Namespace:
-    """Parse a script's arguments and fill in the devices; refuse to run without the recorded data that it reads."""
+    """Parse a script's arguments and fill in the devices; exit with an error where the recorded data is missing."""
     arguments = parser.parse_args(argv)
     if getattr(arguments, "data", True) is None:
         parser.error("--data or GPUSENSE_DATA must name the folder of recorded data")
@@ -96,7 +100,7 @@ def parse(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) ->
 
 
 def present(*, numpy: bool = True) -> list[str]:
-    """List the selection strings of the machine's devices, simulators left out."""
+    """List the selection strings of the machine's devices, without simulators."""
     found = [device for device in gs.devices() if device.available and device.kind != "simulator"]
     return [device.selection for device in found if numpy or device.backend != "numpy"]
 
@@ -108,7 +112,7 @@ class Scene:
     """A map with a pose in it, from the options of :func:`add_scene` and ``--seed``.
 
     Attributes:
-        grid: The map: the built-in building, or that of ``--map``.
+        grid: The map: the built-in building, or the one that ``--map`` names.
         pose: A free pose in it.
         rng: The generator of clouds and readings.
         label: The map in words.
@@ -138,12 +142,12 @@ class Scene:
         return np.minimum(ranges, self.range_max - 0.1)
 
     def noisy_scan(self, scanner: gs.Scanner, backend: Any = "numpy") -> np.ndarray:
-        """Draw a scan at the pose from the beam model's default parameters, beams without a return included."""
+        """Draw a scan at the pose from the beam model with default parameters; some beams have no return."""
         return simulate_scan(self.grid, scanner, self.pose, gs.BeamParameters(), self.rng, backend)
 
 
 def odd_scans(data: Path, name: str, limit: int | None = None) -> tuple[gs.OccupancyGrid, list[Any]]:
-    """Read the map of 5 cm that was made of a log's even scans, and its odd scans with their logged poses."""
+    """Read the 5 cm map of a log's even scans, and its odd scans with their logged poses."""
     folder = data / "carmen_logs"
     grid = gs.read_map(folder / "derived_maps" / f"{name}_even_05cm.yaml")
     log = folder / f"{name}-corrected.log.gz"
@@ -155,7 +159,7 @@ def odd_scans(data: Path, name: str, limit: int | None = None) -> tuple[gs.Occup
 
 @dataclass(frozen=True)
 class Started:
-    """A launch of an earlier call, to be started again."""
+    """A recorded launch that can be started again."""
 
     launch: Launch
     launcher: Launcher
@@ -166,7 +170,7 @@ class Started:
 
 
 class Recorder(Proxy):
-    """A backend that passes everything on to another one and keeps launches, so that they can be timed again."""
+    """A proxy of a backend that records launches, so that they can be timed alone."""
 
     def __init__(self, backend: Backend) -> None:
         super().__init__(backend)
@@ -180,7 +184,7 @@ class Recorder(Proxy):
 
     @property
     def in_batch(self) -> bool:
-        """See Backend.in_batch; while launches are recorded each copy and launch is started by itself."""
+        """See Backend.in_batch; while launches are recorded, each copy and launch is started alone."""
         return not self._listening and super().in_batch
 
     def record(self, program: Program) -> Recording:
@@ -227,11 +231,11 @@ def one_by_one(launches: list[Callable[[], None]]) -> Callable[[], None]:
 
 
 def as_a_call(device: Any, launches: list[Callable[[], None]]) -> Callable[[], None]:
-    """Make a function that starts launches as a call starts them: on CUDA devices as one graph."""
+    """Make a function that starts launches as a call does: on CUDA devices as one graph."""
     if device.info.kind != "gpu":
         return one_by_one(launches)
     replay = device.record(tuple(one.launch for one in launches))
-    # The first time each is started on its own, the second time the graph is made.
+    # The first replay starts each launch alone, the second one captures the graph.
     replay()
     replay()
     device.synchronize()
@@ -239,7 +243,7 @@ def as_a_call(device: Any, launches: list[Callable[[], None]]) -> Callable[[], N
 
 
 def waited(device: Any, start: Callable[[], Any], times: int = 1) -> Callable[..., None]:
-    """Make a function that starts something a number of times and waits for the device once."""
+    """Make a function that starts something repeatedly and waits for the device once."""
 
     def run(*_: Any) -> None:
         for _ in range(times):
@@ -253,11 +257,11 @@ def waited(device: Any, start: Callable[[], Any], times: int = 1) -> Callable[..
 
 
 def on_device(device: Any, array: np.ndarray) -> Any:
-    """Copy an array to the memory of a GPU, as an array of the library that drives it."""
+    """Copy an array to a GPU, as an array of the library that drives it."""
     if device.info.backend == "opencl":
         import pyopencl.array
 
-        # The queue is that of the backend, not of what watches it.
+        # The queue belongs to the backend behind the recorder.
         queue = device.watched.queue if isinstance(device, Recorder) else device.queue
         return pyopencl.array.to_device(queue, array)
     import warp as wp
@@ -267,12 +271,12 @@ def on_device(device: Any, array: np.ndarray) -> Any:
 
 
 def on_host(array: Any) -> np.ndarray:
-    """Copy an array of any of the libraries to NumPy."""
+    """Copy an array of any library to NumPy."""
     return np.array(array if isinstance(array, np.ndarray) else array.get() if hasattr(array, "get") else array.numpy())
 
 
 def differing_bits(one: Any, other: Any) -> int:
-    """Count the float32 values with other bits."""
+    """Count the float32 values whose bits differ."""
     return int(np.count_nonzero(on_host(one).view(np.uint32) != on_host(other).view(np.uint32)))
 
 
@@ -280,13 +284,13 @@ def differing_bits(one: Any, other: Any) -> int:
 
 
 def best(run: Callable[[], Any], repeats: int, longest: float, least: int = 1) -> tuple[float, float]:
-    """Return the shortest and the median seconds of some calls.
+    """Return the shortest and the median time of calls [s].
 
     Args:
         run: The call.
         repeats: The number of calls.
-        longest: Seconds of all calls together; there are fewer of them where they would take longer.
-        least: The number of calls that are made however long they take.
+        longest: The most time of all calls together [s]; fewer calls are made where they would take longer.
+        least: The number of calls that are made in any case.
     """
     times: list[float] = []
     while len(times) < repeats and (len(times) < least or sum(times) + times[-1] < longest):
@@ -302,7 +306,7 @@ class Way:
 
     Attributes:
         run: Takes the number of a call.
-        around: Makes the context of a turn.
+        around: Makes the context in which a turn runs.
         each: The number of calls that ``run`` makes.
     """
 
@@ -312,13 +316,13 @@ class Way:
 
 
 def in_turns(ways: Sequence[Way], calls: int, turn: int = 1, seconds: float = 0.0) -> list[list[float]]:
-    """Time ways in turns, so that their ratios hold on a busy machine.
+    """Time ways in turns, so that ratios are valid on a busy machine.
 
     Args:
         ways: They take turns in this order.
-        calls: The least number of calls of each.
-        turn: Calls before the next way has its turn. A turn of several calls begins with one that does not count.
-        seconds: The least time of all together.
+        calls: The least number of calls of each way.
+        turn: Calls of a turn. A turn of several calls begins with a call that is not counted.
+        seconds: The least time of all calls together [s].
 
     Returns:
         Seconds of each call, for each way.
@@ -356,13 +360,13 @@ def table(columns: Sequence[str], rows: Iterable[Iterable[Any]]) -> str:
 
 
 def command_line(script: str) -> str:
-    """Return the command as typed, absolute paths by their last part."""
+    """Return the command as typed, with absolute paths cut to their last part."""
     words = [Path(word).name if Path(word).is_absolute() else word for word in sys.argv[1:]]
     return shlex.join(["python", *os.environ.get(THROUGH, "").split(), script, *words])
 
 
 def machine(commit: str) -> dict[str, str]:
-    """Describe the machine and the versions, with a commit that git names where it is empty."""
+    """Describe the machine and the versions; an empty commit is replaced by git's."""
     commit = (
         commit
         or subprocess.run(
@@ -377,7 +381,7 @@ def machine(commit: str) -> dict[str, str]:
 
 
 def publish(script: str, arguments: argparse.Namespace, text: str, report: dict[str, Any], remark: str = "") -> None:
-    """Print a script's tables with machine and command below them, and write them with the report to ``--output``.
+    """Print a script's tables, then machine and command, and write them and the report to ``--output``.
 
     Args:
         script: The script's ``__file__``.
@@ -388,7 +392,7 @@ def publish(script: str, arguments: argparse.Namespace, text: str, report: dict[
     """
     command = command_line(Path(script).resolve().relative_to(ROOT).as_posix())
     if getattr(arguments, "data", None) is not None:
-        # The folder of the data says nothing to others.
+        # The path of the data means nothing on other machines.
         command = command.replace(str(arguments.data), "DATA")
     host = machine(arguments.commit)
     described = ", ".join(f"{name} {value}" for name, value in host.items())

@@ -1,13 +1,16 @@
-"""Recorded runs with maps and reference poses, for studies of localisation.
+"""Recorded runs with maps and reference poses for studies of localisation.
 
-A run is a list of events in the order of time: a scan of one of the scanners, the odometry, and the reference pose.
+A run is a list of events in order of time: a scan of one scanner, the odometry, and the reference pose.
 """
 
 from __future__ import annotations
 
+import math
+import multiprocessing
 import os
 import time
 import warnings
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,7 +67,7 @@ def load(name):
 
 
 def _carmen(name):
-    """Odd scans in the map of the even ones; raw odometry that is chained from the log's ODOM lines."""
+    """Return the odd scans of a CARMEN log in the map of the even ones, with raw odometry from the ODOM lines."""
     folder = data() / "carmen_logs"
     grid = gs.read_map(folder / "derived_maps" / f"{CARMEN[name]}_even_05cm.yaml")
     steps = read_steps(folder / f"{CARMEN[name]}-corrected.log.gz", every=2, offset=1)
@@ -73,9 +76,9 @@ def _carmen(name):
 
 
 def _intel_raw():
-    """Every scan of the raw log in the map of the even corrected scans.
+    """Return every scan of the raw log in the map of the even corrected scans.
 
-    Odd corrected scans that the raw log has, too, give the reference; the run begins with the first of them.
+    References are the odd corrected scans that are also in the raw log; the run begins with the first of them.
     """
     folder = data() / "carmen_logs"
     grid = gs.read_map(folder / "derived_maps" / "intel_even_05cm.yaml")
@@ -92,7 +95,8 @@ def _intel_raw():
 
 
 def _jarvis(name):
-    """The complex run; reflectors give the reference. The maps, of 3 cm, are built of the same run at these poses."""
+    """Return the complex run, with references from reflectors; its 3 cm maps are built from the same run at these
+    poses."""
     folder = data() / "jarvis_lab"
     run = np.load(folder / "jarvis_complex_path_fast.npz")
     mounts = {"s3000": ((0.895, 0.0, 0.0), 50.0), "nav350": ((0.194, 0.0, 0.0), 250.0)}
@@ -100,7 +104,7 @@ def _jarvis(name):
     places, rows = [], []
     for index, which in enumerate(chosen):
         ranges, (mount, far) = run[f"{which}_ranges"].astype(float), mounts[which]
-        # 0 is no return; so are readings at the end of the scale.
+        # 0 and readings at the end of the scale mean no return.
         ranges[(ranges <= 0) | ~np.isfinite(ranges)] = np.inf
         far = min(far, float(ranges[np.isfinite(ranges)].max()) + 1)
         scanner = gs.Scanner.uniform(
@@ -117,10 +121,10 @@ def _jarvis(name):
 
 
 def _olin():
-    """Every scan of the bag; the reference was refined scan by scan in the same map, so it is not independent."""
+    """Return every scan of the bag; its reference was refined in the same map, so it is not independent."""
     folder = data() / "olin_mac_bag"
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # free_thresh frees unknown cells: they do not matter to a field.
+        warnings.simplefilter("ignore")  # free_thresh frees unknown cells, which do not matter to a field.
         grid = gs.read_map(folder / "mac_1st_floor_9_23.yaml")
     reference = np.loadtxt(folder / "derived_reference.csv", delimiter=",", skiprows=1)
     scans = list(gs.read_log(folder / "macfirst_floor_take_2", range_max=12.0))
@@ -132,13 +136,21 @@ def _olin():
     return Recording("olin", [(grid, scans[0].scanner)], events)
 
 
+def wean(log):
+    """Return a log of wean_hall, which has no reference poses."""
+    folder = data() / "wean_hall"
+    steps = read_steps(folder / f"{log}.log.gz")
+    events = [Event(0, s.scan.ranges, np.array(s.odometry), np.full(3, np.nan)) for s in steps]
+    return Recording(log, [(gs.read_map(folder / "wean_10cm.yaml"), steps[0].scan.scanner)], events)
+
+
 def field(backend, **options):
-    """Return a maker of the likelihood field that the command uses."""
+    """Return a maker of the command's likelihood field."""
     parameters = gs.LikelihoodFieldParameters(**DEFAULTS.field)
     return lambda grid, scanner: gs.LikelihoodFieldModel(grid, scanner, parameters, backend=backend, **options)
 
 
-# Of a beam model: a scanner with a deviation of a few centimetres among people.
+# Parameters of a beam model: a scanner with a deviation of a few centimetres among people.
 BEAM = dict(z_hit=0.7, z_short=0.1, z_max=0.05, z_rand=0.15, sigma_hit=0.07, lambda_short=0.5)
 
 
@@ -160,7 +172,7 @@ def makers(kind, backend, beams):
 
 @dataclass
 class Followed:
-    """A filter's track: estimates less references, covariances, ranks of the references, verdicts, times [ms]."""
+    """A filter's track: errors of the estimates, covariances, ranks of the references, verdicts, times [ms]."""
 
     differences: np.ndarray
     covariances: np.ndarray
@@ -170,33 +182,57 @@ class Followed:
     ms: np.ndarray
 
     def with_reference(self):
-        """Return the scans of which a reference pose is known."""
+        """Return the scans that have a reference pose."""
         known = np.isfinite(self.differences).all(axis=1)
         return Followed(**{name: values[known] for name, values in vars(self).items()})
 
 
-def follow(recording, models, *, limit=None, **options):
-    """Track a recording from a normal start around the first reference pose; ranks need all particles."""
-    pf = gs.ParticleFilter(models, **options)
-    events = recording.events[:limit]
-    pf.initialize(mean=events[0].truth, covariance=np.diag(np.square(START)))
-    rows = []
+def simulated_events(run):
+    """Return the events of a run of ``gs.worlds.simulate_run``."""
+    return [Event(0, *one) for one in zip(run.scans, run.odometry, run.poses, strict=True)]
+
+
+def play(pf, models, events):
+    """Move and correct a filter by each event in turn, and yield the event."""
     for before, event in zip([None, *events], events, strict=False):
-        begin = time.perf_counter()
         if before is not None:
             pf.predict(before.odometry, event.odometry)
         pf.correct({models[event.scanner]: event.ranges})
+        yield event
+
+
+def start_at(pf, pose):
+    """Start a filter from a normal density around a pose, or anywhere on the map for None."""
+    if pose is None:
+        pf.initialize_uniform()
+    else:
+        pf.initialize(mean=pose, covariance=np.diag(np.square(START)))
+
+
+def errors(pose, truth):
+    """Return the distance [m] and the turn [rad] between two poses."""
+    return math.hypot(pose[0] - truth[0], pose[1] - truth[1]), abs(math.remainder(pose[2] - truth[2], math.tau))
+
+
+def follow(recording, models, *, limit=None, **options):
+    """Track a recording from a normal density around the first reference pose; ranks need all particles."""
+    pf = gs.ParticleFilter(models, **options)
+    events = recording.events[:limit]
+    start_at(pf, events[0].truth)
+    rows, begin = [], time.perf_counter()
+    for event in play(pf, models, events):
         found = pf.estimate()
         ms = (time.perf_counter() - begin) * 1000
         d = found.pose - event.truth
         d[2] = gs.wrap_angle(d[2])
         rank = rank_of(pf.host_particles(), pf.host_weights(), event.truth)
         rows.append((d, found.covariance, rank, found.lost, found.temperature, ms))
+        begin = time.perf_counter()
     return Followed(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
 def figures(tracks):
-    """Return the figures of several tracks of one setting; the first 5 % of a track count for errors only."""
+    """Return the figures of several tracks of one setting; the first 5 % of a track count only for errors."""
     known = [t.with_reference() for t in tracks]
     late = [slice(len(t.ms) // 20, None) for t in known]
     reports = [
@@ -216,3 +252,36 @@ def figures(tracks):
     for key in reports[0]:
         result[key] = np.mean([r[key] for r in reports], axis=0).round(4).tolist()
     return result
+
+
+def coverage_cell(row):
+    """Format the coverage of the regions of 50, 80 and 95 %."""
+    return ", ".join(f"{row[f'coverage_{k}']:.2f}" for k in (50, 80, 95))
+
+
+def error_cell(row):
+    """Format the median error and the 95 % quantile [cm]."""
+    return f"{row['median_cm']:.1f}, {row['p95_cm']:.1f}"
+
+
+# PoCL reads the first of these up to version 5, the second one since then.
+_ONE_THREAD = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
+
+
+def results(function, jobs, processes=1):
+    """Yield ``function(*job)`` of each job, in their order; of several processes each has one thread.
+
+    Args:
+        function: A function of a module, for one process and for several.
+        jobs: Its arguments, plain data.
+        processes: Number of processes; 1 runs the jobs here, with all threads.
+    """
+    if processes == 1:
+        yield from (function(*job) for job in jobs)
+        return
+    for name in _ONE_THREAD:
+        os.environ.setdefault(name, "1")
+    # Devices do not survive a fork.
+    with ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn")) as pool:
+        waiting = [pool.submit(function, *job) for job in jobs]
+        yield from (one.result() for one in waiting)

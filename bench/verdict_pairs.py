@@ -1,7 +1,7 @@
-"""Pairs of scans whose poses are known, for the calibration and the tests of what matches say about themselves.
+"""Pairs of scans with known poses, for fitting and testing the probabilities that matches report.
 
-Recordings are split by name before anything is fitted: names in alphabetical order, every other one, both lasers of a
-run together. Half A and simulations are for fits, half B is for tests alone.
+Recordings are split by name before anything is fitted: alternate names in alphabetical order, both lasers of a run
+together. Half A and simulations are for fits, half B only for tests.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _FARTHEST = {
 }  # fmt: skip
 # Errors of guesses [m, m, rad].
 GUESS = np.array([0.5, 0.5, 0.17])
-# Unrelated places are farther apart [m]: recorded ones, and simulated ones, which are in rooms of their own.
+# Least distance of unrelated places [m]: recorded ones, and simulated ones, which are in different rooms.
 UNRELATED, UNRELATED_SIMULATED = 20.0, 3.0
 
 
@@ -61,7 +61,7 @@ class Pairs:
         return gs.match_scan(self.first, self.second, self.scanner, self.guess, backend=backend)
 
     def right(self, match: ScanMatch) -> np.ndarray:
-        """Return which poses are off by at most 0.2 m and 5 degrees along their observed directions."""
+        """Return which poses have errors of at most 0.2 m and 5 degrees along their observed directions."""
         off = match.pose - self.truth
         off[:, 2] = np.angle(np.exp(1j * off[:, 2]))
         off[:, 2] *= match.lever
@@ -132,7 +132,7 @@ def scanners() -> list[gs.Scanner]:
 
 
 def with_people(ranges: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
-    """Return a scan of which people hide a share of the beams, in runs of neighbours."""
+    """Return a scan in which people hide a share of the beams, in runs of neighbours."""
     ranges, left = ranges.copy(), int(share * len(ranges))
     while left > 0:
         width = int(rng.integers(2, max(3, len(ranges) // 30)))

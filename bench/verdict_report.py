@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import ast
 import itertools
-import json
+import math
 
 import numpy as np
-
-from gpusense.evaluation.machine import machine, machine_line
+from common import table
 
 FIELDS = ("group", "name", "case", "other", "people", "moved", "glass", "seed")
 ERROR, HEADING, P_LOST, WORD, RATIO, DEVIATION = range(6)
@@ -30,7 +29,7 @@ def read(files):
 
 
 def labelled(job, rows):
-    """Return which scans have a right pose, which are off by the definition of p_lost, and which are off for long."""
+    """Return which scans have a right pose, which have a wrong one by the definition of p_lost, and which for long."""
     known = np.isfinite(rows[:, ERROR])
     wrong = np.full(len(rows), job["case"] == "wrong")
     near = known & ~wrong & (rows[:, ERROR] < 1) & (rows[:, HEADING] < 0.5)
@@ -61,7 +60,7 @@ def figures(found):
 
 
 def _final(rows, near, off, late):
-    """Return whether the last verdict is right; None where the last pose is neither right nor off for long."""
+    """Return whether the last verdict is right; None where the last pose is neither right nor wrong for long."""
     if near[-1]:
         return rows[-1, P_LOST] <= 0.5
     return rows[-1, P_LOST] > 0.5 if late[-1] else None
@@ -72,7 +71,7 @@ def _share(values):
 
 
 def auroc(p, near, late):
-    """Return the area under the ROC curve of p for scans off for long against right ones."""
+    """Return the area under the ROC curve of p: scans that are wrong for long against right ones."""
     from scipy.stats import rankdata
 
     values = np.concatenate([p[late], p[near]])
@@ -91,7 +90,7 @@ def roc(found):
 
 
 def reliability(found):
-    """Return (low, high, scans, mean of p_lost, share that is off) of bins of p_lost."""
+    """Return (low, high, scans, mean of p_lost, share of wrong poses) for bins of p_lost."""
     parts = [(rows, *labelled(job, rows)) for job, rows in found]
     p = np.concatenate([part[0][:, P_LOST] for part in parts])
     near, off = (np.concatenate([part[k] for part in parts]) for k in (1, 2))
@@ -102,24 +101,44 @@ def reliability(found):
     return result
 
 
+def at_share(bins, share=0.1):
+    """Return the share of each bin that is off where `share` of all scans are, by weights of scans that are off.
+
+    A study has more wrong poses than a robot's day. Its other scans keep their weight.
+    """
+    off = sum(count * happened for _, _, count, _, happened in bins if count)
+    right = sum(count for _, _, count, _, _ in bins) - off
+    weight = share / (1 - share) * right / off if off else math.nan
+    return [
+        None if not count else weight * happened / (weight * happened + 1 - happened)
+        for _, _, count, _, happened in bins
+    ]
+
+
 def _text(value, form=".2f", scale=100.0):
     return "-" if value is None else f"{scale * value:{form}}"
 
 
-def _line(name, r):
-    return (
-        f"| {name} | {r['runs']} | {_text(r['false'])} | {_text(r['false_word'])} | {_text(r['not_tracking'])} | "
-        f"{_text(r['missed'])} | "
-        f"{_text(r['missed_tracking'])} | {r['finals'] - r['finals_wrong']} of {r['finals']} | "
-        f"{_text(r['auroc'], '.4f', 1.0)} |"
-    )
+COLUMNS = (
+    "runs of", "runs", "false alarms [%]", "said 'lost' [%]", "right, not tracking [%]", "missed [%]",
+    "missed, tracking [%]", "last verdict right", "AUROC",
+)  # fmt: skip
+SHARES = ("false", "false_word", "not_tracking", "missed", "missed_tracking")
 
 
-_HEAD = (
-    "| runs of | runs | false alarms [%] | said 'lost' [%] | right, not tracking [%] | missed [%] "
-    "| missed, tracking [%] | last verdict right | AUROC |",
-    "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-)
+def _cells(name, r):
+    finals = f"{r['finals'] - r['finals_wrong']} of {r['finals']}"
+    return name, r["runs"], *(_text(r[share]) for share in SHARES), finals, _text(r["auroc"], ".4f", 1.0)
+
+
+def reliability_table(groups):
+    """Format the table of groups of bins."""
+    rows = []
+    for k, (low, high) in enumerate(itertools.pairwise(BINS)):
+        values = [(bins[k][2], (*bins[k][3:], at_share(bins)[k])) for bins in groups.values()]
+        cells = (f"{count}: {', '.join(_text(value, '.3f', 1.0) for value in each)}" for count, each in values)
+        rows.append((f"{low} to {high}", *cells))
+    return table(("p_lost", *groups), rows)
 
 
 def commands(files):
@@ -129,41 +148,34 @@ def commands(files):
             yield str(data["command"])
 
 
-def write(files, out):
-    """Print the page of shards, and write it with its figures."""
+def page(files):
+    """Return the tables of shards, and their figures."""
     found = read(files)
     groups = {name: [one for one in found if one[0]["group"] == name] for name in ("tuning", "held out", "simulated")}
     groups = {name: chosen for name, chosen in groups.items() if chosen}
-    lines, result = [*_HEAD], {}
+    rows, result = [], {}
     for name, chosen in groups.items():
         result[name] = figures(chosen)
-        lines.append(_line(f"**{name}**", result[name]))
+        rows.append(_cells(f"**{name}**", result[name]))
         for field in ("case", "people", "moved", "glass", "name"):
             for value in sorted({job[field] for job, _ in chosen}, key=str):
                 part = [one for one in chosen if one[0][field] == value]
                 if len(part) < len(chosen):
                     label = value if isinstance(value, str) else f"{field} {100 * value:.0f} %"
                     result[f"{name}, {field} {value}"] = figures(part)
-                    lines.append(_line(f"{name}: {label}", result[f"{name}, {field} {value}"]))
-    lines += ["", "ROC: share of right scans, and of scans off for long, with p_lost above a threshold [%]", ""]
-    lines += ["| threshold | " + " | ".join(groups) + " |", "| --- |" + " --- |" * len(groups)]
+                    rows.append(_cells(f"{name}: {label}", result[f"{name}, {field} {value}"]))
     curves = {name: roc(chosen) for name, chosen in groups.items()}
-    for k, threshold in enumerate(THRESHOLDS):
-        cells = " | ".join(f"{_text(curve[k][1])}, {_text(curve[k][2])}" for curve in curves.values())
-        lines.append(f"| {threshold} | {cells} |")
-    lines += ["", "Reliability: scans of a range of p_lost, its mean and the share that is off by 1 m or 0.5 rad", ""]
-    lines += ["| p_lost | " + " | ".join(groups) + " |", "| --- |" + " --- |" * len(groups)]
     bins = {name: reliability(chosen) for name, chosen in groups.items()}
-    for k in range(len(BINS) - 1):
-        cells = [
-            f"{row[k][2]}: {_text(row[k][3], '.3f', 1.0)}, {_text(row[k][4], '.3f', 1.0)}" for row in bins.values()
-        ]
-        lines.append(f"| {BINS[k]} to {BINS[k + 1]} | {' | '.join(cells)} |")
-    print("\n".join(lines))
-    if out is not None:
-        made = list(commands(files))
-        document = dict(machine=machine(), commands=made, figures=result, roc=curves, reliability=bins)
-        out.write_text(json.dumps(document, indent=1))
-        table = "\n".join(lines)
-        text = "\n".join(f"`python {command}`\\" for command in made)
-        out.with_suffix(".md").write_text(f"{machine_line()}\n\n{text}\n`--join`\n\n{table}\n")
+    text = "\n\n".join([
+        table(COLUMNS, rows),
+        "ROC: share of right scans, and of scans off for long, with p_lost above a threshold [%]",
+        table(("threshold", *groups), [
+            (threshold, *(f"{_text(curve[k][1])}, {_text(curve[k][2])}" for curve in curves.values()))
+            for k, threshold in enumerate(THRESHOLDS)
+        ]),
+        "Reliability: scans of a range of p_lost, its mean, the share that is off by 1 m or 0.5 rad, and that share "
+        "where a tenth of all scans is off",
+        reliability_table(bins),
+        "Shards: " + "; ".join(f"`{command}`" for command in commands(files)) + ".",
+    ])  # fmt: skip
+    return text, dict(commands=list(commands(files)), figures=result, roc=curves, reliability=bins)

@@ -13,7 +13,6 @@ import recordings
 
 import gpusense as gs
 from gpusense.evaluation.steps import read_steps
-from gpusense.evaluation.tracking import START as START
 from gpusense.localization.pose_algebra import compose_poses
 
 # Names of the logs in the data folder; intel-rawodom is a part of intel, and the lasers of jarvis are one log.
@@ -171,5 +170,4 @@ def simulated(seed, *, scans=60, hidden=0.0, moved=0.0, glass=0.0, beams=180, ar
         grid, scanner, scans=scans, hidden=hidden, glass=glass, kidnaps=int(case == "kidnapped"), step=step, seed=seed,
         backend="opencl", **changes,
     )  # fmt: skip
-    events = [recordings.Event(0, *one) for one in zip(run.scans, run.odometry, run.poses, strict=True)]
-    return grid, scanner, events
+    return grid, scanner, recordings.simulated_events(run)

@@ -49,6 +49,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             function = item.nodeid.split("[")[0]
             params = item.callspec.params
             where = function, params.get("backend", params.get("device", ""))
+            if where[1] == sampled.kwargs.get("without"):
+                item.add_marker("slow")
+                continue
             # Multiples of the golden ratio spread over every parameter, however its values follow one another.
             if number[function] * GOLDEN % 1 < sampled.args[0]:
                 kept.add(where)
@@ -56,7 +59,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 left[where].append(item)
             number[function] += 1
     for where, beyond in left.items():
-        # A sample leaves out no backend.
+        # A sample leaves out no backend that its marker does not name.
         for item in beyond if where in kept else beyond[1:]:
             item.add_marker("slow")
     for item in items:

@@ -1,11 +1,11 @@
-"""Test by thousands of runs whether the readings that models draw have the density by which the models score them.
+"""Test by thousands of runs whether readings drawn by models have the density by which the models score them.
 
     python bench/accuracy/calibration.py --runs 5000
 
 Simulation-based calibration: readings are drawn at poses of a prior, and the rank of the true pose in its posterior, by
 x, y, theta and by the log-likelihood, must be uniform. The table has the least p-value of eight tests of each model
-(chi-square over ten bins, Kolmogorov and Smirnov's), and the largest difference of a bin from its share in standard
-deviations. Of p-values that are right, one of 17 x 8 is below 0.0001 in 1.4 % of all reports.
+(chi-square over ten bins, Kolmogorov-Smirnov), and the largest difference of a bin from its share in standard
+deviations. With true p-values, one of 17 x 8 is below 0.0001 in 1.4 % of all reports.
 """
 
 from __future__ import annotations

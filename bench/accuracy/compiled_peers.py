@@ -1,4 +1,4 @@
-"""nav2_amcl and Beluga as compiled from copies of their sources, which the user gives: models and filters."""
+"""Models and filters of nav2_amcl and Beluga, compiled from the user's copies of their sources."""
 
 from __future__ import annotations
 
@@ -26,6 +26,8 @@ _NAV2_FILES = (
     "pf/eig3.c",
 )
 _C = ("gcc", "-O2", "-DNDEBUG", "-DHAVE_DRAND48", "-fPIC", "-c")
+# nav2_amcl pushes obstacles into the queue of its distances with a priority that it never sets (map_cspace.cpp): zero.
+_SET = "-ftrivial-auto-var-init=zero"
 _FLAGS = ("-std=c++17", "-O2", "-DNDEBUG", "-fPIC", "-shared")
 
 
@@ -86,7 +88,7 @@ class Compiled:
 
 
 class Weigher:
-    """A model of a peer that is made once; its calls give weights alone.
+    """A model of a peer that is made once; its calls return only weights.
 
     Args:
         compiled: The peer.
@@ -133,11 +135,11 @@ class Weigher:
 class Follower:
     """A particle filter of a peer: motion model, weights, resampling, and the pose that it reports.
 
-    The number of particles is fixed, every scan is taken, and no random poses are injected. nav2_amcl reports the mean
+    The number of particles is fixed, every scan is used, and no random poses are injected. nav2_amcl reports the mean
     of its heaviest cluster, Beluga the mean of all particles.
 
     Args:
-        weigher: The model, which the filter uses until it is gone.
+        weigher: The model, which must outlive the filter.
         particles: Their number.
         mean: Pose of the start.
         deviations: Standard deviations of x, y and heading around it [m, m, rad].
@@ -160,7 +162,7 @@ class Follower:
         self._filter = ctypes.c_void_p(begin(weigher._made, particles, *map(_pointer, given), seed))
 
     def step(self, odometry: Sequence[float], ranges: np.ndarray) -> np.ndarray:
-        """Take the pose of the odometry and (K,) readings [m]; return the pose on the map."""
+        """Process the pose of the odometry and (K,) readings [m]; return the pose on the map."""
         moved, read, found = np.array(odometry, np.float64), np.ascontiguousarray(ranges, np.float64), np.empty(3)
         scanner, bearings = self._weigher._scanner, self._weigher._bearings
         self._weigher._library.step(
@@ -194,7 +196,7 @@ def build(name: str, source: Path, include: Sequence[Path], folder: Path) -> Com
             _run(*_C, *renamed, f"-I{root / 'include'}", str(root / "src" / file), "-o", objects[-1])
         models = [str(path) for path in sorted((root / "src" / "sensors" / "laser").glob("*.cpp"))]
         models.append(str(root / "src" / "motion_model" / "differential_motion_model.cpp"))
-        _run("g++", *_FLAGS, f"-I{root}", f"-I{root / 'include'}", f"-I{CODE / 'stubs'}", "-o", str(library),
+        _run("g++", *_FLAGS, _SET, f"-I{root}", f"-I{root / 'include'}", f"-I{CODE / 'stubs'}", "-o", str(library),
              str(CODE / "nav2.cpp"), *models, *objects)  # fmt: skip
     else:
         headers = [f"-I{path}" for path in (source / "beluga" / "include", *include)]
@@ -204,7 +206,7 @@ def build(name: str, source: Path, include: Sequence[Path], folder: Path) -> Com
 
 
 def version(source: Path, package: str) -> str:
-    """Return the version that a package of a copy states."""
+    """Return the version that a package states."""
     found = re.search(r"<version>(.*?)</version>", (source / package / "package.xml").read_text(encoding="utf-8"))
     return f"{package} {found[1] if found else 'unknown'}"
 

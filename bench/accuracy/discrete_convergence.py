@@ -1,10 +1,11 @@
-"""Draw rows of the discrete model, and measure how fast it tends to continuous densities as bins shrink.
+"""Draw rows of the discrete model, and measure its convergence to continuous densities as bins shrink.
 
     python bench/accuracy/discrete_convergence.py           # docs/img/discrete_*.png, and the table of bench/RESULTS.md
     python bench/accuracy/discrete_convergence.py --figures DIRECTORY --most 512
 
 *Convergence*: the largest difference of densities (probability over width) from the continuous model, over readings and
-expected ranges but next to p_short's jump at z*, for the causes of a mixture (limit: the mixture) and for separate
+    expected ranges except next to p_short's jump at z*, for the causes of a mixture (limit: the mixture) and for
+    separate
 causes (limit: the first of three waits), and of the probability of no return. *Rows*: for a laser and a sonar, the
 densities at one distance with dependent causes and with those of a mixture of the same size, whose causes are
 independent.
@@ -85,7 +86,7 @@ def draw_convergence(path: Path, bins: list[int]) -> list[tuple[float, ...]]:
 
 
 def independent(c: gs.DiscreteCauses, expected: float) -> gs.BeamParameters:
-    """Make a mixture whose components have the shares that the causes would have if none hid another."""
+    """Make a mixture whose components have the causes' shares without occlusion by each other."""
     short, rand = 1 - np.exp(-c.lambda_short * expected), 1 - np.exp(-c.lambda_rand * RANGE)
     none = 1 - c.p_detect
     total = c.p_detect + short + rand + none

@@ -1,11 +1,11 @@
-"""Prove PoCL on processors that this machine is not: QEMU's user mode emulates their instruction sets.
+"""Prove PoCL on other processors, whose instruction sets QEMU's user mode emulates.
 
     python bench/accuracy/emulated_processors.py --output bench/results/emulated_processors
 
 Needs ``qemu-x86_64`` (Debian: qemu-user) and PoCL's wheel. For each processor the proof of
 ``gpusense.evaluation.proof`` runs in an emulated interpreter: LLVM and PoCL see the emulated CPUID, and an instruction
-that the processor lacks ends the process. QEMU shows the host's /proc/cpuinfo, so the processor's flags are given in a
-file. It emulates AVX2, but neither AVX-512 nor AMD's FMA4 and XOP; NumPy's wheels need SSE 4.2.
+that the processor lacks ends the process. QEMU shows the host's /proc/cpuinfo, so a file gives the processor's flags.
+It emulates AVX2, but neither AVX-512 nor AMD's FMA4 and XOP; NumPy's wheels need SSE 4.2.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from common import ROOT, make_parser, parse, publish, table
 
 _NEHALEM = "sse sse2 pni ssse3 cx16 sse4_1 sse4_2 popcnt"
 _HASWELL = f"{_NEHALEM} avx f16c avx2 fma abm bmi1 bmi2 movbe"
-# QEMU's model, and the flags that Linux lists on such a machine as QEMU emulates it.
+# QEMU's model, and the flags that Linux lists on the emulated machine.
 PROCESSORS = {
     "Nehalem": _NEHALEM,
     "SandyBridge": f"{_NEHALEM} avx",

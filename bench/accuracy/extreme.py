@@ -1,9 +1,9 @@
-"""Try extreme sizes and levels: 100 000 beams, 10 000 000 particles, maps of 400 million cells, log p of -1e9.
+"""Test extreme sizes and levels: 100 000 beams, 10 000 000 particles, maps of 400 million cells, log p of -1e9.
 
     python bench/accuracy/extreme.py --backend opencl --backend warp:cpu --output bench/results/extreme-cpu
     python bench/accuracy/extreme.py --full --part sizes               # sizes meant for a GPU; nothing is left out
 
-Parts: *sizes* are long scans and large clouds; *products* weights that nav2 and Beluga would make of the same beams;
+Parts: *sizes* are long scans and large clouds; *products* the weights of nav2 and Beluga for the same beams;
 *maps* large grids with a local and a global cloud; *levels* log-likelihoods around -1e9. Prints tables and writes JSON.
 Exit code 1 where log p is not finite, weights do not sum to 1 within 1e-6, a bound breaks or ranges have other bits.
 """

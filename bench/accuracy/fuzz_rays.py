@@ -2,10 +2,10 @@
 
     python bench/accuracy/fuzz_rays.py --backend opencl --backend warp:cpu --rays 2000000 --output NAME
 
-Every case is a map, poses and bearings drawn to be awkward: sparse to dense maps of one cell to hundreds on a side,
-diagonal walls, resolutions from 1 mm to 100 m, origins at 5e6 m with yaw, poses on edges and corners, in walls and off
-the map, headings of multiples of 45 degrees to the last bit and of 1e6 rad, both policies for what lies outside. Each
-device is compared with float32 NumPy bit by bit. Exit code 1 where a bit differs.
+Every case has an awkward map, poses and bearings: sparse to dense maps of one cell to hundreds on a side, diagonal
+walls, resolutions from 1 mm to 100 m, origins at 5e6 m with yaw, poses on edges and corners, in walls and off the map,
+headings at exact multiples of 45 degrees and of 1e6 rad, both policies for the outside. Each device is compared with
+float32 NumPy bit by bit. Exit code 1 where a bit differs.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def draw_poses(rng: np.random.Generator, grid: gs.OccupancyGrid, count: int) -> 
 
 
 def main() -> int:
-    """Fuzz until enough rays are cast."""
+    """Fuzz the wanted number of rays."""
     parser = make_parser(__doc__, backend="kernels")
     parser.add_argument("--rays", type=int, default=2_000_000)
     arguments = parse(parser)

@@ -1,16 +1,16 @@
-"""Measure what scan matches say about themselves against what happens.
+"""Compare the verdicts and covariances of scan matches with their actual errors.
 
     python bench/accuracy/match_verdicts.py --backend opencl --output bench/results/match_verdicts_cpu
 
 ``GPUSENSE_DATA`` names the folder of recorded data. ``corridors``: endless corridors, noise of 1 to 5 cm, 360 and 1081
-beams over 360 and 270 degrees, three headings, guesses 0.3 m off along the corridor: matches that say they converged,
-and the largest error over the deviation of a coordinate that is finite. ``pairs``: neighbouring and unrelated places of
-both halves of the recordings and of simulations (see ``bench/verdict_pairs.py``; half B took no part in any fit):
-probabilities that are said and shares that happen, with right and wrong ones weighing the same, the area under the ROC
-curve, unrelated pairs that converged, and right neighbours that are kept. ``nees``: squared errors over predicted ones
-(NEES / 3, whose median is 0.79 and mean 1 for right covariances) of simulations, of loops of three scans, and against
-the reference poses. Each scan of a loop is used twice, with other beams each time, so that its three matches are
-independent: no reference is needed. ``few``: scans of 8 to 72 beams, to scans and to maps.
+beams over 360 and 270 degrees, three headings, guesses 0.3 m off along the corridor: matches reported as converged, and
+the largest error over the deviation of a coordinate with a finite one. ``pairs``: neighbouring and unrelated places of
+both halves of the recordings and of simulations (``bench/verdict_pairs.py``; half B is held out of all fits): stated
+probabilities and observed shares with equal weight for right and wrong matches, the area under the ROC curve, unrelated
+pairs that converged, and accepted right neighbours. ``nees``: squared errors over predicted ones (NEES / 3, with a
+median of 0.79 and a mean of 1 for right covariances) of simulations, of loops of three scans, and against the reference
+poses. The two matches of a loop's scan use different beams, so that its three matches are independent and need no
+reference. ``few``: scans of 8 to 72 beams, to scans and to maps.
 """
 
 from __future__ import annotations

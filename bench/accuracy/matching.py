@@ -1,15 +1,15 @@
-"""Measure scan matching: simulated pairs, recorded pairs with the guesses that peers were given, and scans in maps.
+"""Measure scan matching: simulated pairs, recorded pairs with the same guesses as for peers, and scans in maps.
 
     python bench/accuracy/matching.py --recorded DATA --backend opencl --output bench/results/matching_cpu
 
 Rows "pairs": the sets of ``matching_pairs`` (300 pairs each; truth from reflectors or corrected poses) from the
 odometry's guess, without a guess, and from the reference +-0.5 m and +-10 degrees. Rows "single": the same from the
-odometry's guess, each match in a call of its own. Rows "simulated": exact and noisy
-scans of neighbouring poses in six maps, from guesses with such errors. Rows "map": odd scans of logs in the maps of
-their even ones, from such guesses. A match is wrong beyond 0.2 m or 5 degrees. Times are those of one call with all
-matches, the best of ``--repeats``, after a call that compiles; processor times are summed over cores. NEES is the
-squared error by the predicted covariance over 3: 1 in the mean if the covariance is right; of pairs also over the third
-of the matches with the least turn of the robot, and that with the largest.
+odometry's guess, with a call for each match. Rows "simulated": exact and noisy scans of neighbouring poses in six maps,
+from guesses with such errors. Rows "map": odd scans of logs in the maps of their even ones, from such guesses. A match
+is wrong beyond 0.2 m or 5 degrees. Times are those of one call with all matches, the best of ``--repeats``, after a
+first call that compiles; processor times are summed over cores. NEES is the squared error by the predicted covariance
+over 3, with a mean of 1 for right covariances; for pairs it is also given for the third of the matches with the
+smallest turns of the robot, and for the third with the largest ones.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def row(kind: str, name: str, guess: str, backend: str, truth: np.ndarray, call:
     off = match.pose - truth
     off[:, 2] = np.remainder(off[:, 2] + np.pi, 2 * np.pi) - np.pi
     squared = np.einsum("si,sij,sj->s", off[sure], np.linalg.inv(match.covariance[sure]), off[sure]) / 3
-    # Wrong matches whose covariance denies it.
+    # Wrong matches with a covariance that excludes the truth.
     deviation = np.sqrt(np.einsum("sii->si", match.covariance)[:, :2].max(axis=1))
     lies = wrong & match.usable & (distance > 10 * deviation)
     names, counts = np.unique(match.status, return_counts=True)

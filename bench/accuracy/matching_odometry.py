@@ -2,14 +2,13 @@
 
     python bench/accuracy/matching_odometry.py --recorded DATA --backend opencl --output bench/results/matching_odometry
 
-Rows "scan to scan": each scan of a log is matched to the one before, from the wheels' raw odometry. Rows "scan to
-map": odd scans in the map of the even ones; the guess is the last pose with the wheels' motion since, and where a
-match fails, it stays the pose. Errors are those of relative poses between successive scans; corrected poses have
-errors of their own of about a centimetre. "wrong" poses are off by more than 0.2 m or 5 degrees. "confident" matches
-are wrong by more than ten of their deviations. A corrected pose is "contradicted" where the matches to both
-neighbours are wrong, and the match between these, past the scan, is right. "wheels" are the errors of the odometry
-itself. "off" is the median distance from the corrected pose in the map, "lost" the number of scans more than 0.5 m
-off it.
+Rows "scan to scan": each scan of a log is matched to the previous one, from the wheels' raw odometry. Rows "scan to
+map": odd scans in the map of the even ones; the guess is the last pose moved by the wheels' odometry, which is kept
+where a match fails. Errors are those of relative poses between successive scans; corrected poses themselves have errors
+of about a centimetre. "wrong" poses are off by more than 0.2 m or 5 degrees. "confident" matches are wrong by more than
+ten of their deviations. A corrected pose is "contradicted" where the matches to both neighbours are wrong and the match
+between the neighbours is right. "wheels" are the errors of the odometry itself. "off" is the median distance from the
+corrected pose in the map, "lost" the number of scans with more than 0.5 m.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ def row(
 
 
 def confident(match: gs.ScanMatch, truth: np.ndarray) -> int:
-    """Return the number of wrong matches whose covariance denies it: more than ten deviations off."""
+    """Return the number of matches with errors of more than ten deviations."""
     distance, turn = differences(match.pose, truth)
     variances = np.einsum("sii->si", match.covariance)
     denied = distance > 10 * np.sqrt(variances[:, :2].max(axis=1))
@@ -88,7 +87,7 @@ def recorded(data: Path, log: str) -> tuple[list[gs.Scan], np.ndarray]:
 
 
 def scan_to_scan(data: Path, log: str, backend: str, limit: int) -> dict[str, Any]:
-    """Match each scan to the one before."""
+    """Match each scan to the previous one."""
     scans, motions = recorded(data, log)
     scans, guess = scans[:limit], motions[: limit - 1]
     poses = np.array([s.pose for s in scans])

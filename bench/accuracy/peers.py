@@ -3,11 +3,11 @@
     python bench/accuracy/peers.py --nav2 NAVIGATION2 --beluga BELUGA --include SOPHUS --include EIGEN --data DATA
     python bench/accuracy/peers.py --nav2 NAVIGATION2 --beluga BELUGA --include SOPHUS --write WEIGHTS.json
 
-Poses are on the map's free cells, anywhere on it and off it; some cells are in mode scale. Readings are NaN, infinite,
-too short, at range_max and beyond for a part of the beams. Weights of likelihood fields are compared with exact
+Poses are on the map's free cells, anywhere on it and off it; some cells are in mode scale. Readings of a part of the
+beams are NaN, infinite, too short, at range_max or beyond. Weights of likelihood fields are compared with exact
 distances in the peers' code; *inexact* is the share of cells that differ with the peers' distances. nav2_amcl rounds
-where others truncate, so it is compared on a grid whose origin is half a cell lower. ``--write`` stores weights in
-small scenes, as in ``tests/models/scan/peer_weights.json``. Needs g++ with C++17, Sophus, Eigen, range-v3 and TBB.
+where other programs truncate, so it is compared on a grid whose origin is half a cell lower. ``--write`` stores weights
+in small scenes, as in ``tests/models/scan/peer_weights.json``. Needs g++ with C++17, Sophus, Eigen, range-v3 and TBB.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ MAPS = {
     "stata": "ros_maps/stata_basement.yaml",
     "willow": "ros_maps/willow-full.yaml",
 }
-# Fields in which a walk to unknown cells and a far reach matter, too.
+# Fields in which rays to unknown cells and a long reach also matter.
 DEFAULT = gs.compat.FieldWeights()
 WIDE = gs.compat.FieldWeights(0.4, 0.0, 0.3, 0.7, 1.13)
 BOUND = 1e-12
@@ -102,11 +102,11 @@ def poses_in(grid: gs.OccupancyGrid, rng: np.random.Generator, count: int) -> np
 
 
 def readings_from(expected: np.ndarray, scanner: gs.Scanner, rng: np.random.Generator) -> np.ndarray:
-    """Return noisy readings of a scan, of which a part is NaN, infinite, too short, at range_max or beyond."""
+    """Return noisy readings of a scan; some are NaN, infinite, too short, at range_max or beyond."""
     top = scanner.range_max
     ranges = expected + rng.normal(0, 0.1, len(expected))
     odd = (math.nan, math.inf, -math.inf, 0.5 * scanner.range_min, scanner.range_min, top, top + 0.13, 2 * top)
-    # Beam 0 points ahead, so that Beluga's conversion to points leaves a reading of range_max what it is.
+    # Beam 0 points ahead, so that Beluga's conversion to points keeps a reading of range_max exactly.
     where = rng.permutation(np.arange(1, len(ranges)))[: len(odd)]
     ranges[where] = odd
     ranges[where[odd.index(top)]], ranges[0] = ranges[0], top
@@ -114,7 +114,7 @@ def readings_from(expected: np.ndarray, scanner: gs.Scanner, rng: np.random.Gene
 
 
 def grid_for(name: str, grid: gs.OccupancyGrid) -> gs.OccupancyGrid:
-    """Return the grid as gpusense needs it to look up the cells that a peer does."""
+    """Return the grid on which gpusense looks up the same cells as a peer."""
     if name == "beluga":
         return grid
     x, y, yaw = grid.origin
@@ -130,7 +130,7 @@ def scene_of(grid: gs.OccupancyGrid, seed: int, beams: int, range_max: float, po
     """Return a scanner, poses and readings on a grid."""
     rng = np.random.default_rng(seed)
     bearings = np.append(0.0, rng.uniform(-math.pi, math.pi, beams - 1))
-    # No distance between cells: rounding would decide whether a reading is shorter than z*.
+    # No reading equals a distance between cells, where rounding would decide whether it is shorter than z*.
     scanner = gs.Scanner(bearings, range_max, 0.117)
     cloud = poses_in(grid, rng, poses)
     expected = gs.RayCaster(grid, range_max, backend="numpy").cast(cloud[:1], bearings)[0]
@@ -144,7 +144,7 @@ def compare(compiled: Compiled, case: Case, grid: gs.OccupancyGrid, scene: dict[
     arguments = (grid, scene["scanner"], case.numbers, case.model, case.options, scene["poses"], scene["ranges"])
     weights, field = compiled.score(*arguments, exact)
     ours = model.log_likelihood(scene["poses"], scene["ranges"])
-    # Where a product underflows, no weight remains to be compared with.
+    # Underflowed products cannot be compared.
     known = weights > 1e-290
     differences = np.abs(np.expm1(ours[known] - np.log(weights[known])))
     row = {"peer": compiled.name, "model": f"{case.model} {case.peer}", "poses": int(known.sum()),

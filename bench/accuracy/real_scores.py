@@ -1,12 +1,12 @@
-"""Compare backends on real maps and logs, and measure how well both models rank the logged poses.
+"""Compare backends on real maps and logs, and measure both models' ranks of the logged poses.
 
     python bench/accuracy/real_scores.py --data DATA --output bench/results/real           # everything; tens of minutes
     python bench/accuracy/real_scores.py --data DATA --scans 20 --log intel --map intel_even_05cm
 
 Writes Markdown and JSON with devices, sizes, differences, scores and the command. Differences are those of
 ``gpusense selftest`` on a scene in each map, NumPy and every other device pairwise and with the float64 truth. Scores
-are those of ``gpusense score`` with the parameters below: the odd scans of a log in a map made of its even ones, on
-every device but NumPy, and the first of them on NumPy too.
+are those of ``gpusense score`` with the parameters below: the odd scans of a log in a map of its even ones, on every
+device but NumPy, and the first scans also on NumPy.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ MAPS = {
 BEAM_PARAMETERS = gs.BeamParameters(z_hit=0.75, z_short=0.1, z_max=0.05, z_rand=0.1, sigma_hit=0.1)
 FIELD_PARAMETERS = gs.LikelihoodFieldParameters(sigma_hit=0.1, max_distance=1.0)
 LOGS = ("intel", "csail", "freiburg-079", "aces", "belgioioso")
-# Selftest quantities that make a row's columns, and the unit that each is given in.
+# Quantities of the self-test for the columns, and their units.
 COLUMNS = {
     "float32 ranges": "float32 ranges, other bits",
     "float64 ranges": "float64 ranges, relative",

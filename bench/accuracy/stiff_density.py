@@ -1,4 +1,4 @@
-"""Measure errors of the beam densities against 60 digits, ours beside the textbook's formulas.
+"""Measure errors of the beam densities against 60 digits, beside those of the textbook's formulas.
 
     python bench/accuracy/stiff_density.py --page docs/numerics.md   # docs/img/stiff_*, and the tables of the page
     python bench/accuracy/stiff_density.py --figures DIRECTORY --backend numpy --backend opencl
@@ -78,7 +78,7 @@ Places = Callable[[float], tuple[np.ndarray, np.ndarray]]
 
 
 def sweep(precision: str, shares: np.ndarray, weights: tuple[float, ...], places: Places) -> Sweep:
-    """Find the worst errors of ours and of the textbook's formula: for sigma / Z, or lambda z* with z* = Z / 4."""
+    """Find the worst errors of gpusense's and the textbook's formula: for sigma / Z, or lambda z* with z* = Z / 4."""
     real, ours, textbook = np.dtype(precision), [], []
     hit = weights[0] > 0
     for share in shares:
@@ -167,7 +167,7 @@ def family_rows(backend: str, precision: str, rows: list[stiff.Row]) -> list[dic
 
 
 def _share(row: stiff.Row) -> float:
-    """Return an error as a share of its bound; of a bound of 0, 0 or 2."""
+    """Return an error as a share of its bound; for a bound of 0 return 0 or 2."""
     return row.worst / row.bound if row.bound else 2.0 * (row.worst > 0)
 
 
@@ -220,7 +220,7 @@ def grid_rows(backends: list[str], families: list[dict[str, Any]]) -> list[dict[
 
 
 def bilinear_rows() -> list[list[Any]]:
-    """Measure the error of the interpolated field in float32 that rounding a position makes beside a cliff."""
+    """Measure the float32 error of the interpolated field beside a cliff, which rounding a position causes."""
     from gpusense.evaluation.replay import Recorder, replay
     from gpusense.evaluation.tolerances import beam_tolerance
 

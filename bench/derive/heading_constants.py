@@ -1,8 +1,8 @@
 """Derive the constants of ``heading`` in the three kernel languages with mpmath, and print them and their errors.
 
-Sines and cosines are polynomials in z = r^2 for |r| <= pi/4, of least largest relative error (Remez's exchange):
-sin r = r + r z S(z), cos r = 1 - z/2 + z^2 C(z). pi/2 is cut into parts that have products with counts without
-rounding, and 2/pi into words of 32 bits.
+Sines and cosines are minimax polynomials (Remez's exchange, relative error) in z = r^2 for |r| <= pi/4: sin r = r + r z
+S(z), cos r = 1 - z/2 + z^2 C(z). pi/2 is split into parts whose products with counts are exact, and 2/pi into words of
+32 bits.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from derive.remez import polynomial, remez
 
 # 2/pi is needed to 1184 bits.
 mp.mp.dps = 400
-# Largest r^2, with room for a count that is rounded to its wrong side.
+# Largest r^2, with a margin for counts that are rounded to the wrong side.
 END = (mp.pi / 4) ** 2 * (1 + mp.mpf(2) ** -30)
 COEFFICIENTS = 6
-# Bits of each part of pi/2 but the last, and of the words of 2/pi.
+# Bits of each part of pi/2 except the last, and of the words of 2/pi.
 PART_BITS, WORD_BITS = 33, 32
 # Two words of zeros come first. A number below 2^1024 needs the bits up to 2^-969 and 192 more.
 ZERO_WORDS, WORDS = 2, 39
@@ -37,7 +37,7 @@ def polynomials() -> tuple[list[float], list[float]]:
 
 
 def errors(sine: list[float], cosine: list[float]) -> tuple[float, float]:
-    """Return base-2 logarithms of the largest relative errors of sine and cosine by these polynomials."""
+    """Return base-2 logarithms of the largest relative errors of the sine and the cosine."""
     worst = [mp.mpf(0), mp.mpf(0)]
     for i in range(1, 2001):
         z = END * i / 2000
@@ -49,7 +49,7 @@ def errors(sine: list[float], cosine: list[float]) -> tuple[float, float]:
 
 
 def quarter_parts() -> list[float]:
-    """Cut pi/2 into three parts of 33 bits and a fourth that is rounded."""
+    """Split pi/2 into three parts of 33 bits and a rounded fourth."""
     rest, parts = mp.pi / 2, []
     for i in range(3):
         scale = mp.mpf(2) ** (PART_BITS * (i + 1) - 1)
@@ -65,7 +65,7 @@ def quarter_pair() -> list[float]:
 
 
 def words() -> list[int]:
-    """Return the first bits of 2/pi in words of 32, after the zeros."""
+    """Return the first bits of 2/pi in words of 32 bits, after the zeros."""
     bits = int(mp.floor(2 / mp.pi * mp.mpf(2) ** (WORD_BITS * (WORDS - ZERO_WORDS))))
     shifts = range(WORD_BITS * (WORDS - ZERO_WORDS - 1), -1, -WORD_BITS)
     return [0] * ZERO_WORDS + [bits >> shift & (1 << WORD_BITS) - 1 for shift in shifts]

@@ -1,10 +1,9 @@
 """Derive the constants of ``kernels/opencl/lanes/math.cl`` with mpmath, and print them and their errors.
 
-Polynomials of least largest relative error of the function (Remez's exchange): e^r = 1 + r + r^2 E(r) for
-|r| <= log(2)/2, judged by e^r - 1; log(1 + f) = f - f^2/2 + f^3 L(f) for 1 + f from sqrt(1/2) to sqrt(2);
-erf(x) = 1 - exp(-x W(x)) for x up to 4, judged by erf; log erfc(x) = -x V(x) for x up to 4, judged by
-1 - log(erfc(x) / 2); arctan t = t + t^3 A(t^2) for t up to tan(pi/8). log 2 is cut into a part that has products with
-counts without rounding and the rest.
+Minimax polynomials (Remez's exchange) for the relative error of the function: e^r = 1 + r + r^2 E(r) for |r| <=
+log(2)/2, judged by e^r - 1; log(1 + f) = f - f^2/2 + f^3 L(f) for 1 + f from sqrt(1/2) to sqrt(2); erf(x) = 1 - exp(-x
+W(x)) for x up to 4, judged by erf; log erfc(x) = -x V(x) for x up to 4, judged by 1 - log(erfc(x) / 2); arctan t = t +
+t^3 A(t^2) for t up to tan(pi/8). log 2 is split into a part whose products with counts are exact, and the rest.
 """
 
 from __future__ import annotations
@@ -20,11 +19,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from derive.remez import Function, remez, weighted_errors
 
 mp.mp.dps = 50
-# log(2)/2 with room for a count that is rounded to its wrong side.
+# log(2)/2 with a margin for counts that are rounded to the wrong side.
 HALF = mp.log(2) / 2 * (1 + mp.mpf(2) ** -10)
 LOW, HIGH = mp.sqrt(0.5) - 1, mp.sqrt(2) - 1
 ERF_ONE = mp.mpf(4)
-# tan(pi/8) with room for rounding.
+# tan(pi/8) with a margin for rounding.
 ARC_END = (mp.sqrt(2) - 1) * (1 + mp.mpf(2) ** -10)
 # Bits of the first part of log 2; counts have at most 8.
 PART_BITS = 16
@@ -34,7 +33,7 @@ POINTS = 1001
 def rounded_polynomial(
     f: Function, weight: Function, low: mp.mpf, high: mp.mpf, count: int
 ) -> tuple[list[float], float]:
-    """Find the polynomial with the least largest weighted error, and round its coefficients to float32.
+    """Find the polynomial with the smallest maximal weighted error, and round its coefficients to float32.
 
     Returns:
         The coefficients, lowest power first, and the base-2 logarithm of the largest weighted error of the rounded
@@ -78,7 +77,7 @@ def arc() -> tuple[list[float], float]:
 
 
 def log_parts() -> list[float]:
-    """Return log 2 in a part of 16 bits and the rest, and its reciprocal."""
+    """Return log 2 as a part of 16 bits and the rest, and its reciprocal."""
     scale = mp.mpf(2) ** PART_BITS
     first = mp.floor(mp.log(2) * scale) / scale
     return [float(first), *(float(np.float32(float(v))) for v in (mp.log(2) - first, 1 / mp.log(2)))]

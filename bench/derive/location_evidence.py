@@ -2,9 +2,9 @@
 
     GPUSENSE_DATA=DATA python bench/derive/location_evidence.py --backend opencl
 
-Scans of half A of the logs and of generated buildings, some with people, on their own map and on the others of their
-half. Right and wrong poses weigh the same. With ``--half B`` the table of what is said against what happens for the
-logs that took no part.
+Scans of half A of the logs and of generated buildings, some with people, are located on their own map and on the other
+maps of their half. Right and wrong poses have equal weight. ``--half B`` prints stated against observed probabilities
+for the held-out logs.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PEOPLE = (0.0, 0.0, 0.1, 0.3)
 
 
 def located(model, ranges, truth):
-    """Return evidence, p_right, whether the pose is right, and the status of a scan."""
+    """Return the evidence, p_right, whether the pose is right, and the status of a scan."""
     found = gs.locate_scan(model, ranges, resolution=0.1)
     turn = abs(np.angle(np.exp(1j * (found.pose[2] - truth[2]))))
     right = np.hypot(*(found.pose - truth)[:2]) <= RIGHT and turn <= RIGHT_TURN
@@ -64,7 +64,7 @@ def cases(half: str, backend: str, count: int, seed: int):
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Fit, and print the numbers and what is said against what happens."""
+    """Fit, and print the weights, and stated against observed probabilities."""
     parser = make_parser(__doc__, backend="auto")
     parser.add_argument("--count", type=int, default=60, help="scans of each map (default: %(default)s)")
     parser.add_argument("--half", choices=("A", "B"), default="A", help="default: %(default)s, which fits")

@@ -2,8 +2,8 @@
 
     GPUSENSE_DATA=DATA python bench/derive/match_evidence.py --backend opencl
 
-Matches of half A of the recordings and of simulations, see ``bench/verdict_pairs.py``; right and wrong ones weigh the
-same in both. Logistic regression by Newton's steps with a small quadratic penalty. Half B takes no part.
+Matches of half A of the recordings and of simulations (``bench/verdict_pairs.py``), with equal weight for right and
+wrong ones in both. Logistic regression by Newton's method with a small quadratic penalty. Half B is held out.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common import make_parser, parse
 from verdict_pairs import HALF_A, recorded_pairs, simulated_pairs
 
-# Statuses of matches in which the scans agree; only these have a probability.
+# Statuses of matches whose scans agree; only these have a probability.
 AGREE = ("converged", "unobservable", "ambiguous", "doubtful")
 _PENALTY = 1e-3
 assert set(AGREE) < set(STATUSES)
@@ -45,7 +45,7 @@ def logistic(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> tuple[float, n
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Fit, and print the numbers."""
+    """Fit, and print the constant and the weights."""
     parser = make_parser(__doc__, backend="auto")
     parser.add_argument("--count", type=int, default=200, help="matches of a kind and recording (default: %(default)s)")
     arguments = parse(parser, argv)

@@ -1,4 +1,4 @@
-"""Find polynomials of least largest error by Remez's exchange, with mpmath."""
+"""Find minimax polynomials by Remez's exchange, with mpmath."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Function = Callable[[mp.mpf], mp.mpf]
 
 
 def polynomial(powers: list, z: mp.mpf) -> mp.mpf:
-    """Evaluate a polynomial by Horner's rule; coefficients are those of the lowest power first."""
+    """Evaluate a polynomial by Horner's rule; coefficients begin with the lowest power."""
     value = mp.mpf(0)
     for power in reversed(powers):
         value = value * z + power
@@ -18,7 +18,7 @@ def polynomial(powers: list, z: mp.mpf) -> mp.mpf:
 
 
 def remez(f: Function, weight: Function, grid: list[mp.mpf], count: int) -> list[mp.mpf]:
-    """Find the polynomial with the least largest weighted error at the points of a grid.
+    """Find the polynomial with the smallest maximal weighted error at the points of a grid.
 
     Args:
         f: The function to approximate.
@@ -37,7 +37,7 @@ def remez(f: Function, weight: Function, grid: list[mp.mpf], count: int) -> list
         rows = [[grid[i] ** k for k in range(count)] + [(-1) ** j / weights[i]] for j, i in enumerate(chosen)]
         powers = list(mp.lu_solve(mp.matrix(rows), mp.matrix([targets[i] for i in chosen])))[:count]
         error = weighted_errors(powers, targets, weights, grid)
-        # The largest error between two changes of its sign.
+        # The largest error between two sign changes.
         runs: list[int] = []
         for i, e in enumerate(error):
             if not runs or e * error[runs[-1]] < 0:

@@ -16,7 +16,8 @@ scans on their map, from such guesses.
 six relative ones. *Landmarks*: errors are the KL divergence of the posterior of 10 000 particles from that of known
 correspondences in float64, at a comparable temperature.
 
-Settings run in rounds, so that a busy machine slows all alike. A setting that takes longer than --longest a step runs
+Settings run in rounds, so that a busy machine slows all alike; drives of few particles and beams run in more of them,
+since their errors differ by seed. A setting that takes longer than --longest a step runs
 once; one that the time of its need leaves no room for is listed as left out.
 """
 
@@ -49,7 +50,7 @@ from matching_tasks import between_scans, in_a_map, rivals
 from recordings import BEAM
 from speed.learning import TYPICAL, values
 from speed.point_models import landmark_scene
-from task_settings import NEEDS, Setting
+from task_settings import NEEDS, Setting, Steps
 
 SCHEMA = 1
 # Scans of the drive, and those at its beginning that do not count.
@@ -58,8 +59,11 @@ SCANNER = gs.Scanner.uniform(angle_min=-2.356, angle_increment=4.712 / 1079, cou
 START = (0.5, 0.5, 0.26)
 # Most particles x beams of a setting, by the kind of device.
 MOST = {"cpu": 4_000_000, "gpu": 1_100_000_000}
-# Most readings of the methods that take some hundred passes over them.
-MOST_SEARCHED = 100_000
+# Runs of a drive in place of one, by the largest particles x beams: the median error of one run with few particles has
+# a standard deviation of a seventh of it, and no run may depend on the time that others took.
+REPEATS = {100_000: 4, 1_000_000: 2}
+# Methods that take some hundred passes over the readings, and the most readings that they get; runs of other methods.
+SEARCHES, MOST_SEARCHED, FITS = ("hill_climb", "genetic"), 100_000, 4
 PARTICLES = 10_000
 
 
@@ -78,31 +82,32 @@ def scan_model(kind: str, run: Any, beams: int, device: Backend, precision: str)
     words = f"beams={beams}" + (', precision="float64"' if precision == "float64" else "")
     if kind == "field":
         parameters = gs.LikelihoodFieldParameters(**DEFAULTS.field)
-        return gs.LikelihoodFieldModel(run.grid, run.scanner, parameters, **made), f"gs.LikelihoodFieldModel({words})"
+        return gs.LikelihoodFieldModel(
+            run.grid, run.scanner, parameters, **made
+        ), f"gs.LikelihoodFieldModel(grid, scanner, {words})"
     chosen: Any = gs.BeamParameters(**BEAM)
     if kind == "discrete":
         chosen = gs.DiscreteBeamModel(chosen, range_max=run.scanner.range_max, bins=600)
     elif kind != "beam":
         made["caster"] = kind.removeprefix("beam, ")
         words += f', caster="{made["caster"]}"'
-    name = "DiscreteBeamModel" if kind == "discrete" else "BeamParameters"
-    return gs.BeamModel(run.grid, run.scanner, chosen, **made), f"gs.BeamModel(gs.{name}, {words})"
+    given = "gs.DiscreteBeamModel(gs.BeamParameters(), range_max=scanner.range_max), " if kind == "discrete" else ""
+    return gs.BeamModel(run.grid, run.scanner, chosen, **made), f"gs.BeamModel(grid, scanner, {given}{words})"
 
 
-def drive(run: Any, model: Any, seed: int, particles: int, options: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Follow the robot; return the errors of the position [m] and the seconds of each step."""
+def drive(run: Any, model: Any, seed: int, particles: int, options: dict[str, Any]) -> tuple[np.ndarray, Steps]:
+    """Follow the robot; return the errors of the position [m] and the steps."""
     pf = gs.ParticleFilter(model, particles=particles, seed=seed, **options)
     pf.initialize(mean=run.poses[0], covariance=np.diag(np.square(START)))
-    errors, seconds = [], []
+    errors, steps = [], Steps(settling=SETTLING)
     for k, ranges in enumerate(run.scans):
-        begin = time.perf_counter()
-        if k:
-            pf.predict(run.odometry[k - 1], run.odometry[k])
-        pf.correct(ranges)
-        found = pf.estimate()
-        seconds.append(time.perf_counter() - begin)
+        with steps:
+            if k:
+                pf.predict(run.odometry[k - 1], run.odometry[k])
+            pf.correct(ranges)
+            found = pf.estimate()
         errors.append(np.hypot(*(found.pose[:2] - run.poses[k, :2])))
-    return np.array(errors[SETTLING:]), np.array(seconds[SETTLING:])
+    return np.array(errors[SETTLING:]), steps
 
 
 def simulated(device: Backend) -> Any:
@@ -145,6 +150,7 @@ def localisation(device: Backend) -> Iterator[Setting]:
         yield Setting(
             "localisation", kind, f"{n} x {k}{words}", f"gs.ParticleFilter({code}, particles={n}{called})", precision,
             lambda seed, n=n, model=model, options=options: drive(run, model, seed, n, options),
+            repeats=next((times for most, times in REPEATS.items() if n * k <= most), 1),
         )  # fmt: skip
 
 
@@ -156,20 +162,20 @@ def learning(device: Backend) -> Iterator[Setting]:
     for count, method in itertools.product(
         (100, 1000, 10_000, 100_000, 1_000_000), ("em", "em-book", "gradient", "hill_climb", "genetic")
     ):
-        if method in ("hill_climb", "genetic") and count > MOST_SEARCHED:
+        if method in SEARCHES and count > MOST_SEARCHED:
             continue
 
-        def run(seed: int, count: int = count, method: Any = method) -> tuple[np.ndarray, np.ndarray]:
-            z, expected = TYPICAL.draw(count, np.random.default_rng(seed))
-            begin = time.perf_counter()
-            fit = gs.fit_beam_parameters(z, expected, TYPICAL.range_max, method=method, backend=device)
-            seconds = time.perf_counter() - begin
+        def run(seed: int, count: int = count, method: Any = method) -> tuple[np.ndarray, Steps]:
+            (z, expected), steps = TYPICAL.draw(count, np.random.default_rng(seed)), Steps()
+            with steps:
+                fit = gs.fit_beam_parameters(z, expected, TYPICAL.range_max, method=method, backend=device)
             relative = values(fit.parameters) / values(TYPICAL.parameters) - 1
-            return np.array([np.sqrt(np.mean(np.square(relative)))]), np.array([seconds])
+            return np.array([np.sqrt(np.mean(np.square(relative)))]), steps
 
         code = f'gs.fit_beam_parameters(ranges, expected, range_max, method="{method}")'
         precision = "float64" if device.info.float64 else "float32"
-        yield Setting("learning", method, f"{count} readings", code, precision, run)
+        repeats = 1 if method in SEARCHES or count > MOST_SEARCHED else FITS
+        yield Setting("learning", method, f"{count} readings", code, precision, run, repeats=repeats)
 
 
 def landmarks(device: Backend) -> Iterator[Setting]:
@@ -191,17 +197,14 @@ def landmarks(device: Backend) -> Iterator[Setting]:
         chosen = slice(None, None, 2) if used == 2 else slice(None)
         model = gs.LandmarkModel(scene.landmarks, backend=device, precision=precision, **options)
 
-        def run(
-            seed: int, model: Any = model, chosen: slice = chosen, given: bool = given
-        ) -> tuple[np.ndarray, np.ndarray]:
-            seconds = []
+        def run(seed: int, model: Any = model, chosen: slice = chosen, given: bool = given) -> tuple[np.ndarray, Steps]:
+            steps = Steps()
             for _ in range(5):
-                begin = time.perf_counter()
-                log_p = model.log_likelihood(poses, features[chosen], known[chosen] if given else None)
-                seconds.append(time.perf_counter() - begin)
+                with steps:
+                    log_p = model.log_likelihood(poses, features[chosen], known[chosen] if given else None)
             scores = np.asarray(log_p, np.float64)
             kl = posterior_errors(factor_for(scores, size) * scores, factor * right, poses)["kl"]
-            return np.array([kl]), np.array(seconds)
+            return np.array([kl]), steps
 
         words = "".join(f", {name}={value!r}" for name, value in options.items()).replace("'", '"')
         count = len(features[chosen])
@@ -225,9 +228,9 @@ def measure(need: str, device: Backend, arguments: argparse.Namespace, *, peers:
     """Run all settings of a need in rounds, with ``peers`` those of other programs; return their rows."""
     settings = [*(RIVALS[need](device) if peers and need in RIVALS else ()), *SETTINGS[need](device)]
     begin = time.perf_counter()
-    for number in range(arguments.rounds):
+    for number in range(arguments.rounds * max((one.repeats for one in settings), default=0)):
         for one in settings:
-            if one.reason:
+            if one.reason or number >= arguments.rounds * one.repeats:
                 continue
             spent = time.perf_counter() - begin
             if spent > arguments.seconds:
@@ -267,7 +270,9 @@ def add_options(parser: argparse.ArgumentParser, seconds: float = 120.0) -> None
     parser.add_argument("--need", action="append", choices=NEEDS, help="repeatable; default: all")
     parser.add_argument("--seconds", type=float, default=seconds, help="longest time of a need on a device")
     parser.add_argument("--longest", type=float, default=0.5, help="longest step that is repeated [s]")
-    parser.add_argument("--rounds", type=int, default=3, help="runs of each setting, each with a seed of its own")
+    parser.add_argument(
+        "--rounds", type=int, default=3, help="runs of each setting, each with its own seed; more of small drives"
+    )
     parser.add_argument("--no-peers", action="store_true", help="without other implementations")
 
 

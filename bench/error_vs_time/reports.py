@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
+import re
+import statistics
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,6 +23,9 @@ FOLDERS = ("kernels", "gpusense/models", "gpusense/tables", "gpusense/backends")
 LIMIT = 100
 TASK_MEASURES = {"median": "median error", "p95": "95 % error", "max": "largest error"}
 UNITS = {"%": "relative"}
+DISCRETE = "gs.DiscreteBeamModel(gs.BeamParameters(), range_max=scanner.range_max)"
+# Relative standard deviation of a run's median error, by need: that of reports of few runs.
+SPREAD = {"localisation": 0.15, "learning": 0.3}
 
 
 @dataclass(frozen=True)
@@ -143,11 +149,30 @@ def task_rows(report: Mapping[str, Any]) -> list[Row]:
         seconds = one["seconds"]["median"] if one["kind"] == "gpu" else one["processor_s"]
         rows.append(
             Row(
-                one["need"], titles[one["backend"]], ALL, one["method"], one["setting"], one["precision"], one["code"],
-                seconds, quartiles, errors, dict.fromkeys(errors, unit), outside=one.get("outside", ""), origin=origin,
+                one["need"], titles[one["backend"]], ALL, one["method"], one["setting"], one["precision"],
+                code_of(one["code"]), seconds, quartiles, errors, dict.fromkeys(errors, unit),
+                outside=one.get("outside", ""), origin=origin, doubt=doubt(one),
             )
         )  # fmt: skip
     return rows
+
+
+def code_of(text: str) -> str:
+    """Return the code of a row; reports of 2026-11-26 and before name neither map nor laser."""
+    text = text.replace("gs.BeamModel(gs.BeamParameters, ", "gs.BeamModel(").replace(
+        "(gs.DiscreteBeamModel, ", f"({DISCRETE}, "
+    )
+    return re.sub(r"(gs\.(?:LikelihoodField|Beam)Model)\((?=beams|gs\.Discrete)", r"\1(grid, scanner, ", text)
+
+
+def doubt(row: Mapping[str, Any]) -> float:
+    """Return the factor of a row's error below which that of other seeds lies, two standard deviations away."""
+    errors = row.get("by_run", {}).get("error", ())
+    spread = SPREAD.get(row["need"], 0.0)
+    if len(errors) > 2 and spread:
+        middle = statistics.fmean(errors)
+        spread = statistics.stdev(errors) / middle if middle else 0.0
+    return float(1 + 2 * spread / math.sqrt(row["runs"]))
 
 
 ROWS: dict[str, Callable[[Mapping[str, Any]], list[Row]]] = {"models": model_rows, "tasks": task_rows}

@@ -10,7 +10,6 @@ rows: those of a field whose densities are multiplied, and of a beam model.
 from __future__ import annotations
 
 import itertools
-import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -19,7 +18,7 @@ from accuracy.compiled_peers import Compiled, Follower, Weigher
 from common import note
 from recordings import BEAM
 from speed.filters import PEERS, load
-from task_settings import Setting
+from task_settings import Setting, Steps
 
 import gpusense as gs
 from gpusense.localization.defaults import DEFAULTS
@@ -75,7 +74,7 @@ def rivals(run: Any, start: Sequence[float], settling: int) -> Iterator[Setting]
 
 
 class Drive:
-    """Follows the robot with a program's filter; returns errors of the position [m] and seconds of each step."""
+    """Follows the robot with a program's filter; returns errors of the position [m] and the steps."""
 
     def __init__(
         self,
@@ -94,14 +93,13 @@ class Drive:
         self._run, self._chosen, self._alpha = run, chosen, alpha
         self._particles, self._start, self._settling = particles, start, settling
 
-    def __call__(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, seed: int) -> tuple[np.ndarray, Steps]:
         """Follow it once."""
         run = self._run
         follower = Follower(self._weigher, self._particles, run.poses[0], self._start, self._alpha, seed)
-        errors, seconds = [], []
+        errors, steps = [], Steps(settling=self._settling)
         for odometry, ranges, pose in zip(run.odometry, run.scans, run.poses, strict=True):
-            begin = time.perf_counter()
-            found = follower.step(odometry, ranges[self._chosen])
-            seconds.append(time.perf_counter() - begin)
+            with steps:
+                found = follower.step(odometry, ranges[self._chosen])
             errors.append(np.hypot(*(found[:2] - pose[:2])))
-        return np.array(errors[self._settling :]), np.array(seconds[self._settling :])
+        return np.array(errors[self._settling :]), steps

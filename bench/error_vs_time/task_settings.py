@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +13,37 @@ from gpusense.backends import Backend
 
 NEEDS = ("localisation", "matching", "in a map", "learning", "landmarks")
 UNITS = {"localisation": "m", "matching": "m", "in a map": "m", "learning": "%", "landmarks": "nats"}
+
+
+class Steps:
+    """Time the steps of a run, each in a ``with`` block.
+
+    Args:
+        together: Number of results of a step, by which its seconds are divided.
+        settling: Number of steps at the beginning that do not count.
+    """
+
+    def __init__(self, together: int = 1, settling: int = 0) -> None:
+        self._together, self._settling = together, settling
+        self._elapsed: list[float] = []
+        self._processor: list[float] = []
+
+    def __enter__(self) -> None:
+        self._begin = time.perf_counter(), time.process_time()
+
+    def __exit__(self, *_: object) -> None:
+        self._processor.append((time.process_time() - self._begin[1]) / self._together)
+        self._elapsed.append((time.perf_counter() - self._begin[0]) / self._together)
+
+    @property
+    def seconds(self) -> np.ndarray:
+        """Elapsed seconds of each step."""
+        return np.array(self._elapsed[self._settling :])
+
+    @property
+    def processor(self) -> np.ndarray:
+        """Seconds of the processor of each step, those of all threads."""
+        return np.array(self._processor[self._settling :])
 
 
 @dataclass
@@ -25,10 +56,10 @@ class Setting:
         options: Its setting in words.
         code: How it is called.
         precision: The precision.
-        run: Makes a run of a seed; returns errors, and seconds of each step.
-        together: Number of results of a step, by which its seconds are already divided.
+        run: Makes a run of a seed; returns errors, and its steps.
         outside: Version and threads of another program; empty for gpusense.
-        errors, seconds, processor: Of all runs so far; ``processor`` has the processor's seconds of a step.
+        repeats: Runs of it in place of one, where errors differ much between seeds.
+        errors, seconds, processor: Of each run so far; both times are those of steps.
         runs: Number of runs.
         reason: Why it was left out; empty where it was not.
     """
@@ -38,12 +69,12 @@ class Setting:
     options: str
     code: str
     precision: str
-    run: Callable[[int], tuple[np.ndarray, np.ndarray]]
-    together: int = 1
+    run: Callable[[int], tuple[np.ndarray, Steps]]
     outside: str = ""
+    repeats: int = 1
     errors: list[np.ndarray] = field(default_factory=list)
     seconds: list[np.ndarray] = field(default_factory=list)
-    processor: list[float] = field(default_factory=list)
+    processor: list[np.ndarray] = field(default_factory=list)
     runs: int = 0
     reason: str = ""
 
@@ -51,11 +82,10 @@ class Setting:
         """Make a run; the first one also runs before it counts, to compile."""
         if not self.runs:
             self.run(seed)
-        before = time.process_time()
-        errors, seconds = self.run(seed)
-        self.processor.append((time.process_time() - before) / len(seconds) / self.together)
+        errors, steps = self.run(seed)
         self.errors.append(errors)
-        self.seconds.append(seconds)
+        self.seconds.append(steps.seconds)
+        self.processor.append(steps.processor)
         self.runs += 1
 
     def row(self, device: Backend) -> dict[str, Any]:
@@ -71,11 +101,17 @@ class Setting:
         if self.runs:
             errors, seconds = np.concatenate(self.errors), np.concatenate(self.seconds)
             found["seconds"] = quantiles(seconds) | {"min": float(seconds.min())}
-            found["processor_s"] = float(np.median(self.processor))
+            found["processor_s"] = float(np.median(np.concatenate(self.processor)))
             found["error"] = quantiles(errors) | {"p95": float(np.quantile(errors, 0.95)), "max": float(errors.max())}
+            found["by_run"] = {"error": medians(self.errors), "processor_s": medians(self.processor)}
         return found
 
 
 def quantiles(numbers: np.ndarray) -> dict[str, float]:
     """Return the quartiles."""
     return dict(zip(("q1", "median", "q3"), map(float, np.quantile(numbers, (0.25, 0.5, 0.75))), strict=True))
+
+
+def medians(runs: Sequence[np.ndarray]) -> list[float]:
+    """Return the median of each run."""
+    return [float(np.median(one)) for one in runs]

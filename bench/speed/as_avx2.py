@@ -1,12 +1,12 @@
-"""Run a script with PoCL as it is on a processor without AVX-512, at this processor's speed.
+"""Run a script with PoCL as on a processor without AVX-512, at the speed of this processor.
 
     python bench/speed/as_avx2.py bench/speed/whole_calls.py --backend opencl --calls 200
     python bench/speed/as_avx2.py bench/speed/options.py --backend opencl
 
-PoCL's compiler asks the processor by the instruction ``xgetbv`` for the registers that the system keeps. In a copy of
-PoCL's wheel these three bytes, ``0f 01 d0``, are ``push 7; pop rax``: registers of AVX, but not of AVX-512. Kernels are
-then compiled for ``haswell``, as ``gpusense backends`` shows. Code that PoCL does not compile, such as numba's, keeps
-AVX-512. emulated_processors.py has other processors, whose speed says nothing.
+PoCL's compiler asks by the instruction ``xgetbv`` which registers the system saves. A copy of PoCL's wheel has ``push
+7; pop rax`` in place of its three bytes, ``0f 01 d0``: registers of AVX but not of AVX-512. Kernels are then compiled
+for ``haswell``, as ``gpusense backends`` shows. Code that PoCL does not compile, such as numba's, keeps AVX-512.
+emulated_processors.py has other processors, without a meaningful speed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import tempfile
 from pathlib import Path
 
 PACKAGES = ("pyopencl", "pocl_binary_distribution")
-# The register's number, 0, is set by ``xor ecx, ecx``; elsewhere the same bytes are no instruction.
+# The register's number, 0, is set by ``xor ecx, ecx``; elsewhere the same bytes are not an instruction.
 SET, READ, CLAIM = b"\x31\xc9", b"\x0f\x01\xd0", b"\x6a\x07\x58"
 
 

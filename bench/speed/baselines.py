@@ -1,18 +1,18 @@
 """Offer outside rows of ``gpusense bench``: other implementations, measured in the same run on the same scenes.
 
-numba (``pip install numba``): code of our own from public descriptions, parallel over particles on all processors:
+numba (``pip install numba``): this project's code after public descriptions, parallel over particles on all processors:
 
-- ``numba field``: the likelihood field as Beluga scores it: a grid of z_hit N(d; 0, sigma_hit) + z_rand / range_max
-  made beforehand, one look-up per beam. ``log grid`` stores logarithms, so that a beam costs an addition; ``log of
-  products`` stores densities as Beluga's ``LikelihoodFieldProbModel`` does and takes one logarithm for some beams
-  together; ``sum of cubes`` is the weight 1 + sum p^3 of AMCL and of Beluga's ``LikelihoodFieldModel``, which is no
-  likelihood.
-- ``numba march``: f1tenth_gym's ray marching: steps of the distance between cell centres through the Euclidean distance
-  field, headings rounded to a table of sines.
+- ``numba field``: the likelihood field as Beluga scores it: a precomputed grid of z_hit N(d; 0, sigma_hit) + z_rand /
+    range_max, with one look-up per beam. ``log grid`` stores logarithms, so that a beam costs an addition; ``log of
+    products`` stores densities as Beluga's ``LikelihoodFieldProbModel`` does and takes one logarithm for several beams;
+    ``sum of cubes`` is the weight 1 + sum p^3 of AMCL and of Beluga's ``LikelihoodFieldModel``, which is not a
+    likelihood.
+- ``numba march``: ray marching of f1tenth_gym: steps through the Euclidean distances between cell centres, with
+    headings rounded to a table of sines.
 
 range_libc appears where the variable RANGE_LIBC names a copy of its sources, which are compiled then; f1tenth_gym where
 it can be imported, or where F1TENTH_GYM names its file of the scan simulator, which is executed. Both run one thread.
-Their maps are the whole map in cells, with its yaw taken out. ``filters.py`` adds the models of nav2_amcl and Beluga.
+They get the whole map in cells, without its yaw. ``filters.py`` adds the models of nav2_amcl and Beluga.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ else:
 
 
 class Runner:
-    """A candidate made ready for a scene, as ``gpusense bench`` measures it."""
+    """A candidate prepared for a scene, as ``gpusense bench`` measures it."""
 
     def __init__(self, run: Callable[[np.ndarray], np.ndarray], table_bytes: int) -> None:
         self.run, self.table_bytes = run, table_bytes
@@ -149,7 +149,7 @@ if numba is not None:
 
 
 def numba_field(kind: str) -> Callable[[Scene, None, str], Runner]:
-    """Make a runner of one of the three ways to score with a precomputed grid."""
+    """Make a runner of one of the three scores with a precomputed grid."""
 
     def make(scene: Scene, backend: None, precision: str) -> Runner:
         p, chosen = scene.field, hits(scene)
@@ -172,7 +172,7 @@ def numba_field(kind: str) -> Callable[[Scene, None, str], Runner]:
 
 
 def distances_of(scene: Scene) -> np.ndarray:
-    """Return the distances of cell centres to the nearest obstacle's [m]; far away where there is none."""
+    """Return the distance from each cell centre to the nearest obstacle's [m]; a large one without obstacles."""
     obstacles = scene.grid.occupied
     if not obstacles.any():
         return np.full(obstacles.shape, scene.scanner.range_max)
@@ -213,7 +213,7 @@ def range_libc_caster(library: Any, kind: str, bins: int) -> Callable[[Scene, No
 
 
 def f1tenth_scan(module: Any, bins: int) -> Callable[[Scene, None, str], Runner]:
-    """Make a runner of f1tenth_gym's scan simulator, one scan a call as it offers it."""
+    """Make a runner of f1tenth_gym's scan simulator, which casts one scan a call."""
 
     def make(scene: Scene, backend: None, precision: str) -> Runner:
         bearings, limit = scene.scanner.bearings, scene.scanner.range_max
@@ -227,7 +227,7 @@ def f1tenth_scan(module: Any, bins: int) -> Callable[[Scene, None, str], Runner]
         simulator.orig_x, simulator.orig_y, yaw = scene.grid.origin
         simulator.orig_c, simulator.orig_s = math.cos(yaw), math.sin(yaw)
         middle = 0.5 * float(bearings[0] + bearings[-1])
-        # Newer versions take the generator of the noise, and None for none.
+        # Newer versions take the noise's generator; None means no noise.
         noise = (None,) if "rng" in inspect.signature(simulator.scan).parameters else ()
 
         def run(poses: np.ndarray) -> np.ndarray:

@@ -2,13 +2,13 @@
 
     python bench/speed/chaining_growth.py --backend opencl --output bench/results/chaining_growth
 
-Rows of less than a pass have the first scans of a recorded log. Those of more drive it again and again: forth, back in
-the reverse order of its scans, forth, ... Each scan then has noise of its own, of 1 cm on ranges, and of 2 % on the
-odometer's motions. The last row of fr079 has 5000 scans.
+Rows of less than a pass have the first scans of a recorded log. Rows of more passes repeat it: forward, in reverse
+order of its scans, forward, ... Each scan then has independent noise: 1 cm on ranges, and 2 % on odometry. The last row
+of fr079 has 5000 scans.
 
-"searched" are pairs of key scans that were matched to find places again. "links" are all of the pose graph. "launches"
-are those of kernels. Each row has a process of its own; "memory" is the growth of its largest resident set during the
-chain, "processor" the time of all threads, "main" that of the thread that calls, both without compilation.
+"searched" counts the pairs of key scans that were matched to close loops, "links" those of the pose graph, "launches"
+those of kernels. Each row has its own process; "memory" is the growth of its peak resident set during the chain,
+"processor" the time of all threads, "main" the time of the calling thread, both without compilation.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Counter(Proxy):
 
 
 def driven(data: Path, name: str, passes: float) -> tuple[np.ndarray, gs.Scanner, np.ndarray]:
-    """Return ranges, scanner and odometry of a recorded log that is driven forth and back, or of its first part."""
+    """Return ranges, scanner and odometry of a recorded log driven forward and back, or of its first part."""
     log, rng = load(data, name), np.random.default_rng(0)
     count = len(log.ranges)
     if passes <= 1:

@@ -1,9 +1,9 @@
-"""Count the machine instructions of the code that Warp makes of a kernel for a CUDA device; no GPU is needed.
+"""Count the machine instructions of a Warp kernel compiled for a CUDA device; no GPU is needed.
 
     python bench/speed/cuda_code.py field_blocks --flags LOG_TABLE,TWO_PART_POINTS,ROUNDED_CELLS,INSIDE --terms 16
 
-Prints all instructions by kind, and those of the longest stretch without branches: the body of an unrolled loop, which
-computes --terms readings. Needs NVIDIA's ``nvdisasm`` (from PyPI: nvidia-cuda-nvdisasm; part of CUDA's tools).
+Prints all instructions by kind, and the longest stretch without branches: the body of an unrolled loop, which computes
+--terms readings. Needs NVIDIA's ``nvdisasm`` (from PyPI: nvidia-cuda-nvdisasm; part of CUDA's tools).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def stretches(text: str) -> list[list[str]]:
 
 
 def described(names: list[str], terms: int) -> str:
-    """Describe instructions: their number, also by term, and their kinds."""
+    """Describe instructions: their number, the number per term, and their kinds."""
     kinds = ", ".join(f"{name} {count}" for name, count in Counter(names).most_common())
     return f"{len(names)} instructions, {len(names) / terms:.4g} a term: {kinds}"
 

@@ -1,11 +1,11 @@
-"""Measure how fast the interpolated likelihood field gives log p, its gradient and its information.
+"""Measure the speed of the interpolated likelihood field's log p, gradient and information.
 
     python bench/speed/field_gradient.py --backend opencl --output NAME
 
-Rows: poses all over a building, and poses around the scan's, as those of a match; one scan, and twenty scans in a call.
-*Call* is the best whole call with NumPy arrays, *kernels* are its launches alone, started again and waited for once.
-Look-ups are poses times hits, in millions a second; *per processor second* divides by the time of all cores. The
-gradient of some poses must be that of the NumPy reference in float64.
+Rows: poses all over a building, and around the scan's pose as in a match; one scan, and twenty scans in a call.
+*Call* is the best whole call with NumPy arrays, *kernels* are its launches alone with a single wait. Look-ups are poses
+times hits, in millions a second; *per processor second* divides by the time of all cores. Gradients of some poses are
+checked against the NumPy reference in float64.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common import Recorder, add_repeats, best, make_parser, one_by_one, parse, publish, table, waited
 
 SCANS, CHECKED = 20, 50
-# Largest difference of a gradient from the reference, in shares of the largest one.
+# Largest difference of a gradient from the reference, relative to the largest gradient.
 MOST_OFF = 1e-3
 
 
@@ -34,7 +34,7 @@ def measure(selection: str, poses: np.ndarray, ranges: np.ndarray, grid: Any, sc
     """Return seconds of a call, of its launches, and of all cores in a call.
 
     Raises:
-        RuntimeError: the gradient is wrong, so no time counts.
+        RuntimeError: the gradient is wrong.
     """
     device, parameters = Recorder(get_backend(selection)), gs.LikelihoodFieldParameters(interpolation="bilinear")
     model = gs.LikelihoodFieldModel(grid, scanner, parameters, backend=device)  # type: ignore[arg-type]

@@ -1,9 +1,9 @@
 """Measure a step of the particle filter: predict, score, normalise, resample, estimate.
 
-Where a step is one recorded program, starts of it in a row show the time on the device, with and without the estimate.
+Where a step is one recorded program, replays in a row show its time on the device, with and without the estimate.
 
-The scene is a generated building, the cloud that of a tracked robot. One stage is the plain filter; the default is up
-to four stages, of which a step on a processor takes those that the cloud needs. Steps of three filters run in turns:
+The scene is a generated building with the cloud of a tracked robot. One stage is the plain filter; the default is up to
+four stages, of which a step on a processor takes those that the cloud needs. Steps of three filters run in turns:
 without recovery and verdict, with the verdict of ``estimate``, and with recovery as well, which is the default.
 """
 
@@ -55,7 +55,7 @@ def measure(backend: str, particles: int, beams: int, stages: int, steps: int) -
                 pf.mean_and_covariance()
             kept.append((time.perf_counter() - begin) * 1000)
     late, verdict, default = (kept[5:] for kept in times)
-    # The mean, since only some steps judge; the machine's interruptions are cut off.
+    # A mean without outliers of the machine, since only some steps compute the verdict.
     means = [float(np.minimum(kept, 4 * np.median(kept)).mean()) for kept in (late, verdict, default)]
     pf = filters[0]
     in_a_row = with_estimate = None
@@ -71,11 +71,11 @@ def measure(backend: str, particles: int, beams: int, stages: int, steps: int) -
 
 
 def _in_a_row(pf: gs.ParticleFilter, steps: int, recordings: list[Any]) -> float:
-    """Return the milliseconds of the device for recordings that are started one after the other."""
+    """Return the device's milliseconds for recordings that are replayed one after the other."""
     cloud, times = pf._cloud, []
     poses = cloud.host_poses(cloud.places.shown, cloud.count)
     for _ in range(5):
-        # The recorded step moves the same particles each time: they must not drift apart.
+        # Each replay moves the same particles, which must not drift apart.
         for buffer in cloud.poses:
             cloud.backend.upload(poses, buffer)
         cloud.wait()

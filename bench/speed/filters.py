@@ -1,9 +1,10 @@
-"""Sensor models of nav2_amcl and Beluga as compiled from copies of their sources; rows for baselines.py.
+"""Sensor models of nav2_amcl and Beluga, compiled from copies of their sources; rows for baselines.py.
 
 NAV2 names a copy of navigation2, BELUGA one of Beluga, BELUGA_INCLUDE folders of headers that the compiler does not
-find by itself: Sophus, Eigen, range-v3, TBB. LIBRARY_PATH and LD_LIBRARY_PATH are the compiler's and the loader's, for
-TBB. Both run one thread. A weight's logarithm is the log-likelihood; nav2_amcl's beam model and likelihood field, and
-Beluga's, add cubes of densities, which is no likelihood. nav2_amcl rounds to cells where others truncate.
+find by itself: Sophus, Eigen, range-v3, TBB. LIBRARY_PATH and LD_LIBRARY_PATH lead the compiler and the loader to TBB.
+Both run one thread. A weight's logarithm is the log-likelihood; nav2_amcl's beam model and likelihood field, and
+Beluga's, add cubes of densities, which is not a likelihood. nav2_amcl rounds positions to cells; the other programs
+truncate.
 """
 
 from __future__ import annotations
@@ -22,15 +23,15 @@ from gpusense.evaluation.benchmark.candidates import Candidate
 from gpusense.evaluation.benchmark.scenes import Scene
 from gpusense.world.grid import OccupancyGrid
 
-# By peer: its variable, its package, and that of its headers.
+# By peer: its variable, its package, and the package of its headers.
 PEERS = {"amcl": ("NAV2", "nav2_amcl", ""), "beluga": ("BELUGA", "beluga", "BELUGA_INCLUDE")}
-# By problem: the peers' models, and what to call them.
+# By problem: the peers' models, and their names in rows.
 MODELS = {"beam": {"beam": "sum of cubes"}, "field": {"field": "sum of cubes", "field, prob": "product"}}
 _kept: list[tempfile.TemporaryDirectory[str]] = []
 
 
 class Runner:
-    """A model made ready for a scene, as ``gpusense bench`` measures it."""
+    """A model prepared for a scene, as ``gpusense bench`` measures it."""
 
     def __init__(self, compiled: compiled_peers.Compiled, scene: Scene, problem: str, model: str) -> None:
         grid, beam, field = scene.grid, scene.beam, scene.field
@@ -54,7 +55,7 @@ class Runner:
 
 
 def load(name: str) -> tuple[compiled_peers.Compiled | None, str, str]:
-    """Compile a peer; return it, its version, and why there is none."""
+    """Compile a peer; return it, its version, and the reason where it fails."""
     variable, package, headers = PEERS[name]
     source = Path(os.environ.get(variable, ""))
     if not os.environ.get(variable):

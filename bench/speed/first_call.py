@@ -1,12 +1,12 @@
-"""Measure first calls: the wait of a new process, with an empty cache on disk and with a full one.
+"""Measure first calls in a new process, with an empty and with a full cache on disk.
 
     python bench/speed/first_call.py --backend opencl --backend warp:cpu
     python bench/speed/first_call.py --backend opencl --tree .:now --tree ../old:before --output NAME
 
-Each time is of a new process: the import of the package, opening the device, the first call of the likelihood field,
-the first one of the beam model after it. "Cold" begins with an empty cache folder, so that the device is proved too;
-"warm" is the next process with the same folder. Trees (checkouts, with a name each) take turns, so that their ratio
-holds on a busy machine.
+A new process imports the package, opens the device, and calls the likelihood field and then the beam model for the
+first time. "Cold" begins with an empty cache folder, so that the device is also proved; "warm" is the next process with
+the same folder. Modules have their bytecode, as those of an installed package. Trees (checkouts, with a name each) take
+turns, so that their ratio is valid on a busy machine.
 """
 
 from __future__ import annotations
@@ -50,11 +50,12 @@ STEPS = ("import and scene", "open", "field", "beam model")
 COLUMNS = ("backend", "tree", "cache", *STEPS, "open and field", "all")
 
 
-def milliseconds(tree: Path, backend: str, folder: str) -> list[float]:
-    """Run one process and return the milliseconds of its steps."""
+def milliseconds(tree: Path, backend: str, folder: str, bytecode: str) -> list[float]:
+    """Run one process and return the milliseconds of its steps; its modules' bytecode is in a folder."""
     places = dict.fromkeys(("GPUSENSE_CACHE_DIR", "XDG_CACHE_HOME", "POCL_CACHE_DIR", "WARP_CACHE_PATH"), folder)
     search = os.pathsep.join(filter(None, (str(tree.resolve()), os.environ.get("PYTHONPATH"))))
-    environment = os.environ | places | {"PYTHONPATH": search}
+    environment = os.environ | places | {"PYTHONPATH": search, "PYTHONPYCACHEPREFIX": bytecode}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
     # Modules of the working directory are not imported.
     command = [sys.executable, "-P", "-c", _PROCESS, backend]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
@@ -64,11 +65,17 @@ def milliseconds(tree: Path, backend: str, folder: str) -> list[float]:
 def measured(trees: list[tuple[Path, str]], backend: str, repeats: int) -> list[dict[str, Any]]:
     """Return a row for each tree and state of the cache: medians over the repeats."""
     times: dict[tuple[str, str], list[list[float]]] = {}
-    for _ in range(repeats):
-        for tree, name in trees:
-            with tempfile.TemporaryDirectory() as folder:
-                for state in ("cold", "warm"):
-                    times.setdefault((name, state), []).append(milliseconds(tree, backend, folder))
+    with tempfile.TemporaryDirectory() as bytecode:
+        for _, name in trees:
+            Path(bytecode, name).mkdir()
+        # The first run of each tree writes its bytecode.
+        for repeat in range(repeats + 1):
+            for tree, name in trees:
+                with tempfile.TemporaryDirectory() as folder:
+                    for state in ("cold", "warm"):
+                        run = milliseconds(tree, backend, folder, str(Path(bytecode, name)))
+                        if repeat:
+                            times.setdefault((name, state), []).append(run)
     rows = []
     for (name, state), runs in times.items():
         steps = {step: median(run[i] for run in runs) for i, step in enumerate(STEPS)}

@@ -1,20 +1,21 @@
-"""Keep rates and errors over commits, and see regressions.
+"""Record rates and errors over commits, and detect regressions.
 
     python bench/speed/history.py --backend opencl                 # measure, compare, append to bench/history.csv
     python bench/speed/history.py --compare                        # only compare the last commit with those before
 
 Each row of the table is a call of one commit on one device: its time, its error, and whether the run was quiet. Calls
-take turns with a probe, a sum of sines in NumPy, whose time is measured likewise; times are the processor's own on a
-processor and elapsed ones on a GPU. A call is quiet where the quartiles of its times lie within 5 % of the median. The
-last commit is compared with the median of up to --window quiet rows before it, after the probe's change is taken out of
-processors' times: slower by more than 10 % (--limit), or an error twice as large, is a regression, and the exit code 1.
-An older tree is measured with PYTHONPATH=TREE and --commit.
+take turns with a probe, a sum of sines in NumPy. Times are processor time on a processor and elapsed time on a GPU;
+short calls are timed several in a row, for at least 100 ms. A call is quiet where the quartiles of its times lie within
+5 % of the median. The last commit is compared with the median of up to --window quiet rows before it, after processors'
+times are corrected by the probe's: slower by more than 10 % (--limit), or an error twice as large, is a regression, and
+the exit code 1. An older tree is measured with PYTHONPATH=TREE and --commit.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import math
 import statistics
 import sys
 import time
@@ -37,6 +38,8 @@ from common import ROOT, make_parser, note, parse
 FILE = ROOT / "bench" / "history.csv"
 COLUMNS = ("date", "commit", "device", "row", "ms", "q1_ms", "q3_ms", "probe_ms", "error", "unit", "quiet")
 QUIET, LIMIT, WORSE = 0.05, 0.10, 2.0
+# Least duration of a timing [s], and most calls of one.
+SPAN, MOST = 0.1, 1000
 # Errors below these are rounding, by their unit.
 FLOORS = {"m": 1e-4, "nats": 1e-3}
 Row = Mapping[str, str]
@@ -57,7 +60,7 @@ def calls_of(device: Backend, particles: int, beams: int) -> dict[str, Call]:
 
         def error() -> float:
             right = call(make(backend="numpy", precision="float64"), few)
-            # An end of a ray that grazes a corner is no error of rounding: the 95 % quantile leaves it out.
+            # Rays that graze a corner have errors beyond rounding: the 95 % quantile leaves them out.
             return float(np.quantile(np.abs(np.asarray(call(ours, few), np.float64) - right), 0.95))
 
         found[name] = (lambda: call(ours, poses), unit, error)
@@ -83,12 +86,17 @@ def measure(backend: str, particles: int, beams: int, turns: int, stated: str) -
     calls = calls_of(device, particles, beams)
     works = {"probe": probe} | {name: call for name, (call, *_) in calls.items()}
     times: dict[str, list[float]] = {name: [] for name in works}
+    counts = dict.fromkeys(works, 1)
     for turn in range(-2, turns):
         for name, work in works.items():
             begin = clock()
-            work()
-            if turn >= 0:
-                times[name].append(1e3 * (clock() - begin))
+            for _ in range(counts[name]):
+                work()
+            seconds = clock() - begin
+            if turn == -1:
+                counts[name] = math.ceil(SPAN / max(seconds, SPAN / MOST))
+            elif turn >= 0:
+                times[name].append(1e3 * seconds / counts[name])
     where = device.info.name if device.info.kind == "gpu" else processor_name()
     rows = []
     for name, (_, unit, error) in calls.items():
@@ -134,8 +142,8 @@ def regressions(rows: Sequence[Row], *, limit: float = LIMIT, window: int = 5) -
 
     Args:
         rows: Rows of the table in their order.
-        limit: Growth of the time above which a call is slower; a row that is not quiet is not compared in time.
-        window: Most rows that it is compared with.
+        limit: Growth of the time above which a call is slower; times of rows that are not quiet are not compared.
+        window: The most rows that a row is compared with.
 
     Returns:
         A line for each regression.

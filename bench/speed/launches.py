@@ -1,13 +1,13 @@
-"""Measure each launch of a call by the device's own clock, all of them together, and numbers of work-items.
+"""Measure each launch of a call by the device's clock, all launches together, and other numbers of work-items.
 
     python bench/speed/launches.py --backend opencl --backend warp:cuda:0 --particles 100000 --output NAME
     python bench/speed/launches.py --backend warp:cuda:0 --particles 100000 --power 19 --power 21
 
-Rows are of the built-in building of 2000 x 2000 cells, with a cloud over the whole map and one around a pose. The time
-of a launch is the least of several by its events, which add some microseconds to short ones. "Together" is a set of
-launches started as the call starts them and waited for; "in a row" ten of them are waited for. "Main" is the launch
-that casts or looks up, four of them in a row. GPUs split their launches into a number of work-items
-(``gpusense.models.scan.tiles``); --power tries powers of two beside the number as it is. Powers are taken in turns.
+The scene is the built-in building of 2000 x 2000 cells, with a cloud over the whole map and one around a pose. The time
+of a launch is the shortest of several by its events, which add some microseconds to short launches. "Together" is the
+set of launches of a call with a wait, "in a row" ten sets with one wait. "Main" is the launch that casts or looks up,
+four of them in a row. GPUs split launches into a number of work-items (``gpusense.models.scan.tiles``); --power
+compares powers of two with the default, in turns.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ COLUMNS = (
 
 @contextlib.contextmanager
 def work_items(power: int | None) -> Iterator[None]:
-    """Split launches into a power of two of work-items; None for the numbers as they are."""
+    """Split launches into a power of two of work-items; None for the default number."""
     before = tiles.ENOUGH, field_pipeline.ENOUGH_SHORT
     if power is not None:
         tiles.ENOUGH = field_pipeline.ENOUGH_SHORT = 1 << power

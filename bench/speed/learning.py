@@ -1,4 +1,4 @@
-"""Measure how fast the beam model's parameters are learned, and how well: rates, fifty scenes, ten starts.
+"""Measure speed and quality of learning the beam model's parameters: rates, fifty scenes, ten starts.
 
     python bench/speed/learning.py --backend numpy --backend opencl --backend warp:cpu --output NAME
     python bench/speed/learning.py --backend opencl --pairs 100000 --count 1000 --starts 2     # a quick look
@@ -11,9 +11,9 @@ device has some; beside them the NumPy reference on the same pairs (a part of th
 sums each backend's must match: *error* is the largest difference of the fitted parameters, relative, in float64.
 
 *Scenes*, on the last backend: fifty with known parameters, from mild to stiff. Parameters whose standard error is
-below 30 % of them are identified. Of these: how many lie within 3 standard errors of the truth; the largest fall of the
-log-likelihood in an iteration of exact EM and of the book's; and from --starts starts, by how many nats "gradient" and
-"hill_climb" end from EM's optimum in scenes that are identified as a whole.
+below 30 % of them are identified. For these the tables show: how many lie within 3 standard errors of the truth; the
+largest decrease of the log-likelihood in an iteration of exact EM and of the book's; and, in scenes with all parameters
+identified, how many nats "gradient" and "hill_climb" end from EM's optimum from --starts starts.
 
 Exit code 1 where exact EM falls by more than 1e-9 of the log-likelihood, fewer than 95 % are within 3 standard errors,
 or an end differs by more than 1e-4 nats.
@@ -51,11 +51,11 @@ IDENTIFIED, FALLS, SHARE, NATS = 0.3, 1e-9, 0.95, 1e-4
 
 
 class Timed(Proxy):
-    """A backend that passes everything on to another one, and notes how long kernels and copies back take.
+    """A proxy of a backend that measures kernels and copies back to the host.
 
     Attributes:
         info: That of the other one; without lanes where ``lanes`` is False.
-        seconds: Of kernels and of downloads, since it was last emptied.
+        seconds: Seconds of kernels and of downloads since the last reset.
     """
 
     def __init__(self, backend: Backend, lanes: bool = True) -> None:
@@ -90,7 +90,7 @@ class Timed(Proxy):
 
 
 def pass_parts(backend: Backend, real: np.dtype, pairs: Pairs, point: Point, repeats: int) -> dict[str, float]:
-    """Return the seconds of the quickest of some passes over the pairs, without second derivatives, and of its parts.
+    """Return the seconds of the fastest pass over the pairs, without second derivatives, and of its parts.
 
     ``scalar_s`` is that of passes without lanes, in turns with the others, where the device asks for lanes.
     """
@@ -158,7 +158,7 @@ def rates(
         reference = gs.fit_beam_parameters(
             z[: arguments.numpy_pairs], expected[: arguments.numpy_pairs], TYPICAL.range_max, backend="numpy"
         )
-        # The reference on fewer pairs is no truth for more of them: compare the same pairs.
+        # The reference may have fewer pairs: compare the same pairs.
         part = gs.fit_beam_parameters(
             z[: arguments.numpy_pairs],
             expected[: arguments.numpy_pairs],
@@ -190,7 +190,7 @@ def scene_row(number: int, scene: Scene, arguments: argparse.Namespace) -> dict[
     z, expected = scene.draw(arguments.count, np.random.default_rng(arguments.seed + number))
     pairs = make_pairs(z, expected, scene.range_max)
     bounds = make_bounds(pairs)
-    # One device buffer serves every fit of a scene only within the library: users call the function.
+    # Users call the function, which uploads the readings for every fit.
     run = dict(backend=arguments.backend[-1], precision="float64")
     fit = gs.fit_beam_parameters(z, expected, scene.range_max, **run)
     book = gs.fit_beam_parameters(z, expected, scene.range_max, method="em-book", **run)
@@ -220,7 +220,7 @@ def scene_row(number: int, scene: Scene, arguments: argparse.Namespace) -> dict[
 
 
 def passes_text(scenes: list[dict[str, Any]]) -> str:
-    """Format the quantiles of 5 and 95 % of the passes that a fit of each method takes."""
+    """Format the 5 % and 95 % quantiles of the passes of a fit by each method."""
     found = {}
     for method in ("em", "gradient", "hill_climb"):
         counts = [count for scene in scenes for count in scene["passes"].get(method, [])]
@@ -277,7 +277,7 @@ def main() -> int:
     add_repeats(parser, 10, 20.0)
     arguments = parse(parser)
     truth: dict[int, np.ndarray] = {}
-    # The reference first: others are held against it.
+    # The reference comes first, since the other backends are compared with it.
     selections = sorted(arguments.backend, key=lambda name: name != "numpy")
     rows = []
     for selection in selections:

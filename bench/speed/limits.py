@@ -1,4 +1,4 @@
-"""Measure the rates that gpusense is to reach: whole calls, launches alone, small calls, preparation, large maps.
+"""Measure gpusense's rates: whole calls, launches alone, small calls, preparation, large maps.
 
     python bench/speed/limits.py                                                  # every device present
     python bench/speed/limits.py --backend opencl --backend warp:cuda:0 --particles 100000 --rows all --output NAME
@@ -10,11 +10,11 @@ beams; *preparation* that of the map; *large* a million particles, and a map of 
 built-in building of 2000 x 2000 cells, or --map. A scan is cast exactly, with a range for each beam, or noisy: work
 counts the ranges in it.
 
-Launches are all kernels of a call with its arrays on the device: placing the poses, ordering them, casting, scoring and
-summing, started as the call starts them (on CUDA as one graph). "Alone" each set is waited for, "in a row" ten are, or
-as many as fit into --seconds. The first call includes compilation (or its cache on disk) and the preparation of the
-map. Errors and bits are those of the first particles, against NumPy in float64 and in float32; ranges must have the
-same bits. Times are the least and the median of several runs; machines are noisy, so compare within a run.
+Launches are all kernels of a call with its arrays on the device (placing and ordering poses, casting, scoring,
+summing), started as the call does (on CUDA as one graph). "Alone" has a wait after each set, "in a row" after ten sets,
+or as many as fit into --seconds. The first call includes compilation (or its cache on disk) and the preparation of the
+map. Errors and bits of the first particles are against NumPy in float64 and in float32; ranges must have the same bits.
+Times are the shortest and the median of several runs; machines are noisy, so compare within a run.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ from common import (
 
 ROWS = ("clouds", "bilinear", "small", "preparation", "large")
 CHECKED = 100
-# Most sets of launches that are waited for together.
+# The most sets of launches before a wait.
 IN_A_ROW = 10
 # Scores poses, or casts rays from them, and writes the result to an array if there is one.
 Call = Callable[[Any, Any], Any]
@@ -71,11 +71,11 @@ class Job:
 
     Attributes:
         what: Its label.
-        work: Rays or particle-beams of the call; 0 where a rate says nothing.
+        work: Rays or particle-beams of the call; 0 where a rate is meaningless.
         make: Makes the call of a backend and a precision.
         poses: Its particles.
         out: Where it writes.
-        checked: Whether results are held to NumPy's.
+        checked: Whether results are compared with NumPy's.
         cast: Whether they are ranges.
     """
 
@@ -90,7 +90,7 @@ class Job:
 
 @functools.cache
 def numpy_call(make: Callable[[Any, str], Call], precision: str) -> Call:
-    """Make the call of NumPy that results are held to, once for all devices and clouds."""
+    """Make NumPy's call for comparison, once for all devices and clouds."""
     return make("numpy", precision)
 
 
@@ -177,7 +177,7 @@ def large_jobs(scene: Scene, arguments: argparse.Namespace) -> Iterator[Job]:
 
 
 def jobs(scene: Scene, device: Any, arguments: argparse.Namespace) -> Iterator[Job]:
-    """Yield all rows that are asked for."""
+    """Yield all chosen rows."""
     if {"clouds", "bilinear"} & set(arguments.rows):
         yield from cloud_jobs(scene, arguments)
     if "small" in arguments.rows:
@@ -195,7 +195,7 @@ def measure(device: Recorder, job: Job, arguments: argparse.Namespace) -> dict[s
     """Measure one row.
 
     Raises:
-        RuntimeError: ranges have other bits than NumPy's, so no time counts.
+        RuntimeError: ranges have other bits than NumPy's.
     """
     start = time.perf_counter()
     call = job.make(device, "float32")
@@ -256,7 +256,7 @@ def main() -> int:
     rows = []
     for selection in arguments.backend:
         device = Recorder(get_backend(selection))
-        # A scene's own numbers, so that every device has the same poses.
+        # A new scene for each device, so that all have the same poses.
         scene = Scene(arguments)
         for job in jobs(scene, device, arguments):
             rows.append(measure(device, job, arguments))

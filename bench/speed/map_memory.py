@@ -2,10 +2,10 @@
 
     python bench/speed/map_memory.py --side 8000 --side 20000 --tree ../main:before --tree .:after
 
-Each figure comes from a process of its own, in which a small map has been built or read before. Memory is the peak
-of the resident set less what was resident before the call, per cell of the map. Built maps hold ``--scans`` scans of
-360 beams up to 20 m at random poses, with cells of 5 cm; images are random greys of map_saver, in a PNG of 1 bit all
-black. With ``--tree`` several checkouts are measured in turn.
+Each figure comes from a separate process that has built or read a small map before. Memory is the growth of the
+resident set to its peak during the call, per cell of the map. Built maps hold ``--scans`` scans of 360 beams up to 20 m
+at random poses, with cells of 5 cm; images have random greys of map_saver, and PNGs of 1 bit are black. ``--tree``
+measures several checkouts in turn.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from common import ROOT, make_parser, note, parse, publish, table
 COLUMNS = ("what", "side, cells", "tree", "seconds", "processor, s", "peak, bytes a cell", "result, SHA-256")
 IMAGES = ("PGM", "PNG, 8 bits", "PNG, 1 bit")
 
-# Runs in a process of its own: what, side, scans, seed and a folder, as JSON.
+# The program of each process; its argument is a JSON list: what, side, scans, seed, folder.
 _CHILD = r"""
 import hashlib, json, pathlib, sys, time, zlib, struct
 import numpy as np
@@ -94,7 +94,7 @@ print(json.dumps([seconds, spent, peak / grid.cells.size, hashlib.sha256(grid.ce
 
 
 def figures(tree: Path, task: list[Any]) -> list[Any]:
-    """Return seconds, seconds of the processors, bytes a cell and the checksum of one run."""
+    """Return the seconds, processor seconds, bytes a cell and checksum of one run."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (str(tree), os.environ.get("PYTHONPATH"))))}
     # Modules of the working directory are not imported.
     command = [sys.executable, "-P", "-W", "ignore", "-c", _CHILD, json.dumps(task)]

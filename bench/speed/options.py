@@ -1,12 +1,12 @@
-"""Measure what each option of the scan models costs beside the default parameters, on every device.
+"""Measure the cost of each option of the scan models relative to the default parameters, on every device.
 
     python bench/speed/options.py --backend opencl --output bench/results/options_cpu
     python bench/speed/options.py --backend opencl --backend warp:cuda:0 --particles 100000 --beams 360
 
-A row is one option: parameters that leave a part of the density out or add one, another precision, caster, table, or
-the weights of another program. Its ratio is its time over that of the default with the same particles and scan: whole
-calls with NumPy arrays in and out, medians of several rounds in which every option has its turn. The largest ratio that
-is meant to be stands beside it. The quartiles of the rounds say how far the ratio can be trusted.
+A row is one option: parameters that remove or add a part of the density, another precision, caster or table, or the
+weights of another program. Its ratio is its time over the default's with the same particles and scan: whole calls with
+NumPy arrays in and out, medians of several rounds of all options. The intended upper bound stands beside it. The
+quartiles of the rounds show how reliable the ratio is.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common import Scene, add_scene, make_parser, note, parse, publish, table
 
 BEAM, FIELD = gs.BeamParameters(), gs.LikelihoodFieldParameters()
-# A fit of the recorded lidar before a wall: narrow, with an offset and a growing deviation.
+# A fit to the recorded lidar before a wall: narrow, with an offset and a deviation that grows with range.
 FITTED = gs.BeamParameters(
     z_hit=0.9, z_short=0.04, z_max=0.02, z_rand=0.04, sigma_hit=0.005, lambda_short=0.5, range_bias=0.01,
     sigma_growth=0.002,
@@ -45,7 +45,7 @@ class Option:
     Attributes:
         model: "beam model" or "field".
         name: What it changes.
-        most: The largest ratio to the default's time that is meant to be.
+        most: The intended upper bound of the ratio to the default's time.
         make: Makes the model of a backend.
     """
 
@@ -106,7 +106,7 @@ def field_options(scene: Scene, scanner: gs.Scanner) -> Iterator[Option]:
 
 
 def rounds_of(calls: dict[str, Callable[[], Any]], rounds: int, clock: Callable[[], float]) -> dict[str, np.ndarray]:
-    """Time every call in every round [s], in an order that changes; each runs for at least 20 ms a round."""
+    """Time every call in every round [s], in varying order; each runs for at least 20 ms a round."""
     rng, each = np.random.default_rng(0), {}
     for name, call in calls.items():
         call()
@@ -140,7 +140,7 @@ def measure(arguments: argparse.Namespace, scene: Scene, backend: str) -> Iterat
             model = make(backend=backend)
             calls[option.name] = functools.partial(model.log_likelihood, poses, scan)
             most[option.name] = option.most
-        # Other work on the machine does not count where the processor is the device.
+        # Processor time, which leaves other work on the machine out, where the processor is the device.
         clock = time.perf_counter if get_backend(backend).info.kind == "gpu" else time.process_time
         times = rounds_of(calls, arguments.rounds, clock)
         for name, seconds in times.items():

@@ -4,11 +4,11 @@
     python bench/speed/point_models.py --backend opencl --what landmarks --landmarks 100 --cloud tracking
     python bench/speed/point_models.py --backend opencl --what absolute --particles 100000 --output NAME
 
-*Landmarks*: there is one in every 16 m2, 100 in a square of 40 m; features are those nearest to a pose within 20 m,
-with noise. Known: it is given which landmark each feature is; nearest: the likeliest of all. The others are as nearest,
-but for what their names say; those with a field of view have features in it, joint at most 5. Clouds are around the
-pose (tracking) or all over the map (global). *Absolute*: poses are all over the built-in building, moved to UTM
-coordinates; a reading is a fix, a heading, a range, or a segment of a bumper.
+*Landmarks*: one in every 16 m2, 100 in a square of 40 m; features are the nearest landmarks within 20 m of a pose, with
+    noise. Known: the landmark of each feature is given; nearest: it is the likeliest one. The other kinds differ from
+    nearest as their names say; with a field of view all features lie in it, and joint has at most 5. Clouds are around
+    the pose (tracking) or all over the map (global). *Absolute*: poses are all over the built-in building, moved to UTM
+    coordinates; a reading is a fix, a heading, a range, or a segment of a bumper.
 
 Rates are of whole calls with NumPy in and out, and of their launches alone. Errors are of log p against the float64
 reference on the first particles, in eps (1 + |log p|) of float32 and a reading; a larger one than 16 ends the run.
@@ -51,7 +51,7 @@ CHECKED = 200
 CLOUDS = ("tracking", "global")
 # Square metres of the map for each landmark.
 EACH = 16.0
-# Kinds of calls of the landmark model, and what each changes in parameters and model.
+# Kinds of calls of the landmark model, with their changes of parameters and model.
 LANDMARKS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "known": ({}, {}),
     "nearest": ({}, {}),
@@ -65,7 +65,7 @@ LANDMARKS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "associate": ({}, {}),
 }
 ABSOLUTE = ("position fix", "heading", "beacons", "bumper")
-# The building's origin [m, m, rad]: a place of UTM's.
+# The building's origin in UTM coordinates [m, m, rad].
 PLACE = (5e5, 5e6, 0.3)
 SQUARE = [(0.2, 0.2), (-0.2, 0.2), (-0.2, -0.2), (0.2, -0.2)]
 COLUMNS = (
@@ -98,7 +98,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Landmarks:
-    """A map, the features seen within 20 m with the landmark of each, the nearest first, and clouds of particles."""
+    """A map, the features seen within 20 m with the landmark of each, nearest first, and clouds of particles."""
 
     landmarks: gs.LandmarkMap
     features: np.ndarray
@@ -151,7 +151,7 @@ def landmark_job(scene: Landmarks, what: str, cloud: str, most: int) -> Job:
 
 
 def absolute_models(grid: gs.OccupancyGrid, xy: np.ndarray) -> dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]:
-    """Return a function that makes each model, and its arguments beside the poses."""
+    """Return a function that makes each model, and its arguments besides the poses."""
     x, y = float(xy[0, 0]), float(xy[0, 1])
     region = (x - 500, y - 500, x + 500, y + 500)
     fix, mounted = gs.PositionParameters(sigma=2.0), dict(z_hit=0.9, z_rand=0.1, region=region, mount=(0.2, 0.1))
@@ -197,7 +197,7 @@ def absolute_jobs(arguments: argparse.Namespace) -> Iterator[Job]:
 
 
 def jobs(arguments: argparse.Namespace) -> Iterator[Job]:
-    """Yield all rows that are asked for."""
+    """Yield all chosen rows."""
     kinds = [kind for kind in LANDMARKS if kind in arguments.what]
     for count in arguments.landmarks if kinds else ():
         scene = landmark_scene(count, arguments.particles, arguments.seed)
@@ -211,7 +211,7 @@ def measure(backend: str, job: Job, arguments: argparse.Namespace) -> dict[str, 
     """Measure times and error of a row.
 
     Raises:
-        RuntimeError: the error is above 16 eps (1 + |log p|), so no time counts.
+        RuntimeError: the error is above 16 eps (1 + |log p|).
     """
     device = Recorder(get_backend(backend))
     start = time.perf_counter()

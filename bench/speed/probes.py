@@ -1,12 +1,12 @@
-"""Measure what a device can do at most by kernels that do nothing else; scaling.py makes its floors of it.
+"""Measure the peak rates of a device by minimal kernels; scaling.py computes its floors from them.
 
-A probe is run a few times and its best time counts, so that a floor is rather too low than too high:
+The best time of a few runs counts, so that a floor is too low rather than too high:
 
 - nothing: launches without work, one after the other, and one with the wait for it;
-- issue: additions of float32 numbers that wait for nothing but themselves, operations/s of the whole device;
-- gather: look-ups of float32 numbers, scattered (all at random places) in tables of several sizes, and together (32
-  neighbours read 32 words in a row) in a table that the nearest cache holds: nothing makes look-ups cheaper;
-- copy: bytes read plus bytes written per second, of small arrays that caches hold and of large ones;
+- issue: float32 additions in independent chains, operations/s of the whole device;
+- gather: look-ups of float32 numbers, scattered (at random places) in tables of several sizes, and together (32
+    neighbours read 32 consecutive words) in a table that fits the nearest cache: the cheapest look-ups;
+- copy: bytes read plus bytes written per second, of small arrays in caches and of large ones;
 - upload and download: bytes/s between NumPy arrays and the device, through gpusense's backend.
 
 OpenCL probes compute WIDTH numbers in a work-item where processors want vectors. Warp's processor device and NumPy use
@@ -69,7 +69,7 @@ kernel void copy(global const words *from, global words *to) { to[get_global_id(
 
 
 # Figures of devices from other sources, by a part of their names: additions/s, bytes/s of large copies, and the source.
-# The better of both counts, so that no floor is too high because a probe was disturbed.
+# The better figure counts, so that a disturbed probe makes no floor too high.
 SHEETS = {
     "H200": (132 * 128 * 1.98e9, 4.27e12, "132 SMs x 128 lanes x 1.98 GHz (data sheet), 4.27 TB/s of copies measured"),
 }
@@ -93,19 +93,19 @@ class Figures:
 
 
 def rate(rates: dict[int, float], size: float) -> float:
-    """Return the best rate measured at this size or a larger one, or near the largest; never too low."""
+    """Return the best rate at this size or larger, or near the largest; it is never too low."""
     below = [measured for measured in rates if measured <= size]
     return max(rates[measured] for measured in rates if measured >= max(below, default=0))
 
 
 def shortest(run: Callable[[], Any], seconds: float = 0.12, least: int = 3) -> float:
-    """Return the seconds of the shortest of some calls, after one that does not count."""
+    """Return the seconds of the shortest call, after one that is not counted."""
     run()
     return best(run, 50, seconds, least)[0]
 
 
 def shortest_in_a_row(one: Callable[[], Any], wait: Callable[[], Any]) -> float:
-    """Return the seconds of a launch among many, so that the wait for the last of them takes no time beside."""
+    """Return the seconds of a launch among many, so that the wait for the last one is negligible."""
 
     def run(count: int) -> None:
         for _ in range(count):
@@ -122,7 +122,7 @@ def threads() -> int:
 
 
 def probe(selection: str, quick: bool = False) -> Figures:
-    """Measure the figures of a device; quick ones, of small arrays, for tests."""
+    """Measure the figures of a device; ``quick`` uses small arrays, for tests."""
     backend = get_backend(selection)
     info = backend.info
     tables = [1 << 16, 1 << 20] if quick else [1 << 16, 1 << 20, 1 << 24, 1 << 28, 1 << 31]
@@ -153,7 +153,7 @@ def probe(selection: str, quick: bool = False) -> Figures:
 
 
 def _launches(one: Callable[[], None], wait: Callable[[], None]) -> tuple[float, float]:
-    """Return the seconds of a launch in a row of many, and of one with the wait for it."""
+    """Return the seconds of a launch in a row of many, and of one with a wait."""
 
     def many() -> None:
         for _ in range(200):
@@ -199,7 +199,7 @@ class _OpenCL:
 
     def _buffer(self, size: int) -> Any:
         buffer = self._cl.Buffer(self._context, self._cl.mem_flags.READ_WRITE, size)
-        # One driver's own clearing hangs beyond 2 GiB; the contents of the rest do not matter.
+        # One driver's fill hangs beyond 2 GiB; the contents of the rest do not matter.
         self._cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.uint8), 0, min(size, 1 << 30))
         return buffer
 

@@ -1,4 +1,4 @@
-"""range_libc as compiled from a copy of its sources, which the variable RANGE_LIBC names; for baselines.py."""
+"""range_libc, compiled from a copy of its sources that the variable RANGE_LIBC names; for baselines.py."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gpusense.evaluation.benchmark.runner import LeftOutError
 SOURCE = "RANGE_LIBC"
 CODE = Path(__file__).resolve().parents[1] / "accuracy" / "peer_code" / "range_libc.cpp"
 KINDS = ("BL", "RM", "CDDT", "PCDDT", "GLT")
-# Its own options for a release.
+# range_libc's release options.
 _FLAGS = ("-w", "-std=c++11", "-march=native", "-ffast-math", "-fno-math-errno", "-O3", "-fPIC", "-shared")
 # Rays of the look-up table, of one thread: at some millions a second.
 _MOST_RAYS = 100_000_000
@@ -24,7 +24,7 @@ _kept: list[tempfile.TemporaryDirectory[str]] = []
 
 
 def load() -> tuple[ctypes.CDLL | None, str]:
-    """Compile range_libc; return the library, or why there is none."""
+    """Compile range_libc; return the library, or the reason where it fails."""
     source = os.environ.get(SOURCE, "")
     if not source:
         return None, f"not compiled: {SOURCE} must name a copy of its sources"
@@ -47,7 +47,7 @@ class Caster:
     """A caster of range_libc on a map in cells.
 
     Attributes:
-        table_bytes: Its tables, as far as they are known; 0 otherwise.
+        table_bytes: Size of its tables where it is known, otherwise 0.
     """
 
     def __init__(self, library: ctypes.CDLL, kind: str, occupied: np.ndarray, range_max: float, bins: int) -> None:
@@ -57,7 +57,7 @@ class Caster:
         self._library, self._kind = library, KINDS.index(kind)
         cells = np.ascontiguousarray(occupied, np.uint8)
         self.table_bytes = 2 * rows * cols * bins if kind == "GLT" else 0
-        # It prints while it builds tables, which is no part of a report.
+        # It prints while it builds tables.
         sys.stdout.flush()
         with open(os.devnull, "w") as silent:
             shown = os.dup(1)

@@ -1,8 +1,8 @@
-"""Compare casters with range_libc's, in rays for each second of the processor's time, in turns on the same poses.
+"""Compare casters with range_libc's in turns on the same poses: rays per second of processor time.
 
     RANGE_LIBC=SOURCES python bench/speed/rays_per_core.py --backend opencl
 
-range_libc runs one thread, so times of the process, not of a clock, are compared: what a core does in a second. A busy
+range_libc runs one thread, so the process's processor times are compared, not elapsed ones: the rate of a core. A busy
 machine changes them little. The map is the built-in building; poses lie around one place (tracking) or all over the map
 (global). Tables have the same angle bins on both sides, marching the same steps (``rule="centre"``). Medians of
 differences of ranges are between the two.
@@ -27,7 +27,7 @@ from common import add_repeats, make_parser, note, parse, publish, table, table_
 from speed import range_libc
 
 BEARINGS, RANGE_MAX = np.linspace(-2.35, 2.35, 360), 15.0
-# range_libc's name of a method, its angle bins, and ours.
+# range_libc's method, its angle bins, and the caster.
 PAIRS = (
     ("GLT", 108, gs.casters.Lookup(108)),
     ("CDDT", 108, gs.casters.Cddt(108)),
@@ -37,7 +37,7 @@ COLUMNS = ("backend", "caster", "cloud", "M rays/s a core", "range_libc", "ratio
 
 
 def least(ways: list[Callable[[], Any]], repeats: int, seconds: float) -> list[float]:
-    """Return the least time of the processor that each way takes, in turns [s]."""
+    """Return the least processor time of each way, measured in turns [s]."""
     found, begin = [float("inf")] * len(ways), time.perf_counter()
     for _ in range(repeats):
         for k, way in enumerate(ways):

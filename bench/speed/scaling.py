@@ -5,16 +5,15 @@
 
 Three curves of rays, beam model and likelihood field (nearest), float32, 30 m of range at 5 cm: N particles with 60
 beams, K beams with 10 000 particles, and the side of the map with 360 beams and 100 000 particles (4096 on processors).
-Maps are the built-in building; above 2000 cells it stands side by side with itself, since a building is not drawn
-larger. The cloud is uniform over the free cells but for the first particles, which are near one pose: float64 NumPy
-finds these on a part of the map, and their largest difference from it is a point's error (of ranges as well: rays that
-graze an obstacle differ).
+Maps are the built-in building; above 2000 cells it is repeated side by side, since a building is not drawn larger. The
+cloud is uniform over the free cells, except for the first particles, which are near one pose: float64 NumPy computes
+these on a part of the map, and the largest difference is a point's error (also of ranges: rays that graze an obstacle
+differ).
 
-A *call* has NumPy arrays in and out. *Launches* are the kernels of that call again, one after the other, with
-everything on the device. Points that take too long (--seconds, --total) or too much memory are left out and listed with
-the reason.
+A *call* has NumPy arrays in and out. *Launches* are the same kernels one after the other, with everything on the
+device. Points that take too long (--seconds, --total) or too much memory are left out and listed with the reason.
 
-The floor. probes.py measures what the device does at most: launches, round trip, additions/s (issue), look-ups/s,
+The floor. probes.py measures the peak rates of the device: launches, round trip, additions/s (issue), look-ups/s,
 bytes/s of copies, up and down. With E particle-beams, N particles and L launches
 
     launches >= max(L * launch, round trip, operations / issue, look-ups / nearest, bytes / copy)
@@ -25,9 +24,9 @@ bytes/s of copies, up and down. With E particle-beams, N particles and L launche
     bytes       24 N in, 4 N out (rays 4 E); these alone go up and down
 
 and *nearest* is the rate of look-ups in a table that the nearest cache holds. The upper edge of the band that is drawn
-on top of the floor has the rate of look-ups at random places of a table as large as the model's instead: a cloud whose
-neighbours share nothing. A cloud's end points share cache lines, so the upper edge can be beaten; the floor cannot, as
-far as the probes are good: where a time is below it the report says so.
+above the floor uses the rate of look-ups at random places of a table as large as the model's: a cloud whose neighbours
+share no cache lines. A real cloud's end points do, so times may be below the upper edge; a time below the floor is
+reported, since it means a bad probe.
 
 Operations are counted in kernels/opencl, as the fewest instructions: a multiplication is not merged with an addition
 (ranges have the same bits everywhere), sizes and signs are free, a rounded division is 8, exp 8, log 15.
@@ -41,7 +40,7 @@ Operations are counted in kernels/opencl, as the fewest instructions: a multipli
     mixture.cl, hit and uniform part alone: 1 difference, 2 and exp 8, 5 of hit_mass, 2 and a division 8, log 15, 1 42
     placement.cl, a particle: cosine and sine 40, cell and fraction 20                                              60
 
-Steps and reads per ray are counted: gpusense.reference casts some rays of the cloud in the table that the device makes.
+Steps and reads per ray are counted: gpusense.reference casts some rays of the cloud in the device's table.
 """
 
 from __future__ import annotations
@@ -72,7 +71,7 @@ OPERATIONS = {"field": 17, "ray": 46, "step": 41, "mixture": 42, "particle": 60}
 
 @dataclass(frozen=True)
 class Floor:
-    """Least seconds of a call and of its launches, their cause, and the upper edge of the band."""
+    """Least seconds of a call and of its launches, the limiting rate, and the upper edge of the band."""
 
     call: float
     launches: float
@@ -81,7 +80,7 @@ class Floor:
 
 
 def floor_of(kind: str, n: int, k: int, launches: int, table: int, reads: tuple[float, float], f: Figures) -> Floor:
-    """Compute the floor as the top of the file says."""
+    """Compute the floor by the formulas at the top of the file."""
     work, (per_ray, steps) = n * k, reads
     operations = OPERATIONS["particle"] * n
     look_ups = work if kind == "field" else per_ray * work
@@ -103,7 +102,7 @@ def floor_of(kind: str, n: int, k: int, launches: int, table: int, reads: tuple[
 
 @dataclass
 class Device:
-    """Measures one device, and lists what it left out."""
+    """Measures one device, and lists the points that were left out."""
 
     selection: str
     arguments: argparse.Namespace
@@ -137,7 +136,7 @@ class Device:
         a = self.arguments
         many = a.map_particles or (100_000 if self.info.kind == "gpu" else 4096)
         for place, (axis, values) in enumerate((("particles", a.particles), ("beams", a.beams), ("side", a.sides))):
-            # A third of the time for each curve, and what the ones before left.
+            # A third of the time for each curve, and the time that earlier curves left.
             self.until = a.total * (place + 1) / 3
             for value in values:
                 n = value if axis == "particles" else a.beam_particles if axis == "beams" else many
@@ -157,7 +156,7 @@ class Device:
                     note(f"{self.info.selection}: left out: {self.left_out[-1]}")
 
     def refused(self, axis: str, kind: str, n: int, k: int, side: int) -> str:
-        """Say why a point is not to be tried; empty where it is."""
+        """Return the reason for leaving a point out; empty otherwise."""
         spent = time.perf_counter() - self.start
         if spent > self.until:
             return (
@@ -172,7 +171,7 @@ class Device:
             return f"needs some {host / 1e9:.2g} GB of the host and {device / 1e9:.2g} GB of the device"
         work, seconds = self.last.get((axis, kind), (1.0, 0.0))
         size = side**2 if axis == "side" else n * k
-        # A first call, one that is looked at, and launches alone.
+        # A first call, a measured one, and launches alone.
         if (foreseen := 3 * seconds * size / work) > self.arguments.longest:
             return f"would take some {foreseen:.2g} s, more than the {self.arguments.longest:g} s of a point"
         return ""
@@ -237,7 +236,7 @@ class Device:
         """Return a model of the device, kept while map and beams stay the same."""
         key = (side, 0 if kind == "rays" else scanner.count)
         if self.models.get(kind, (None, None))[0] != key:
-            # The memory of the old one is free before there is a new one.
+            # Free the old model's memory before making a new one.
             self.models.pop(kind, None)
             grid = self.scene(side).grid
             if kind == "rays":
@@ -268,7 +267,7 @@ class Device:
 
 
 def host_memory() -> float:
-    """Return the bytes that the host can spare, as far as the system says."""
+    """Return the host's free memory [bytes], where the system reports it."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
         return 1024.0 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
@@ -277,7 +276,7 @@ def host_memory() -> float:
 
 
 def numbers(text: str) -> list[int]:
-    """Parse whole numbers with commas between them; 1e4 is one."""
+    """Parse integers separated by commas; 1e4 is an integer."""
     return [int(float(word)) for word in text.split(",") if word]
 
 

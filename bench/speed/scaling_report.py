@@ -17,7 +17,7 @@ COLUMNS = (
 
 
 def cells(r: dict[str, Any]) -> list[str]:
-    """Format the cells of a row; a time below the floor is marked."""
+    """Format the cells of a row, with a mark at times below the floor."""
     work = r["particles"] * r["beams"] / 1e6
     share = r["floor_launch_s"] / r["launch_s"]
     return [

@@ -1,4 +1,4 @@
-"""Make maps of any size for scaling.py and clouds in them; count how often a ray reads the map's table there."""
+"""Make maps of any size and clouds in them for scaling.py; count a ray's reads of the map's table."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CHECKED, COUNTED, WINDOW = 8, 512, 1400
 
 @dataclass(frozen=True)
 class Scene:
-    """A map, a pose in it, and what casting costs there."""
+    """A map, a pose in it, and the cost of casting there."""
 
     grid: gs.OccupancyGrid
     pose: np.ndarray
@@ -29,7 +29,7 @@ class Scene:
     seconds: float
 
     def cloud(self, count: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw poses over the free cells, the first of them around the pose."""
+        """Draw poses over the free cells; the first ones are around the pose."""
         rows, cols = self.grid.shape
         cells = np.empty((0, 2))
         while len(cells) < count:
@@ -43,7 +43,7 @@ class Scene:
 
 
 def make_scene(side: int) -> Scene:
-    """Make the built-in building of that number of cells, many of them side by side where it is larger than one."""
+    """Make the built-in building, repeated side by side above its largest size."""
     start = time.perf_counter()
     rng = np.random.default_rng(0)
     resolution = RESOLUTION if side * RESOLUTION >= 10 else 10 / side
@@ -53,7 +53,7 @@ def make_scene(side: int) -> Scene:
     grid = one
     if times > 1:
         grid = gs.OccupancyGrid(np.tile(one.cells, (times, times))[:side, :side], resolution)
-    # All that the first particles can see, so that float64 NumPy need not prepare the whole map.
+    # The part in sight of the first particles, so that float64 NumPy need not prepare the whole map.
     reach = int((RANGE_MAX + 5) / resolution)
     col, row = (max(int(place / resolution) - reach, 0) for place in pose[:2])
     right, top = (int(place / resolution) + reach for place in pose[:2])
@@ -63,7 +63,7 @@ def make_scene(side: int) -> Scene:
 
 
 class Counted:
-    """A table that counts how often it is read."""
+    """A table that counts its reads."""
 
     def __init__(self, table: np.ndarray) -> None:
         self.table, self.reads = table, 0
@@ -74,7 +74,7 @@ class Counted:
 
 
 def count_reads(scene: Scene, backend: Any) -> tuple[float, float]:
-    """Count mean reads and mean steps of a ray, in the middle of the map at most: where rays end early, too few."""
+    """Count mean reads and steps of a ray in the middle of the map; too few where rays end early."""
     rows, cols = (min(side, WINDOW) for side in scene.grid.shape)
     row, col = ((whole - part) // 2 for whole, part in zip(scene.grid.shape, (rows, cols), strict=True))
     size = scene.grid.resolution
@@ -92,5 +92,5 @@ def count_reads(scene: Scene, backend: Any) -> tuple[float, float]:
     found = raycast.cast_ray(
         form.flags, table, Window(0, 0, rows, cols), placed.cell, placed.pose, rays, limit, Caster(0, 0.0, 0.0)
     )  # type: ignore[arg-type]
-    # The read that finds an obstacle is no step.
+    # The read that finds an obstacle is not a step.
     return table.reads / len(poses), (table.reads - np.count_nonzero(found < limit)) / len(poses)

@@ -4,17 +4,17 @@
     python bench/speed/small_calls.py --backend warp:cuda:0 --rows calls bound --output bench/results/small_calls_name
     python bench/speed/small_calls.py --backend warp:cpu --rows scans models --particles 500 --particles 8000
 
-Ways to the same result are taken in turns in one run, so that their ratio holds on a busy machine, and must have the
-same bits. Times are of whole calls: NumPy arrays in and out, and on GPUs also arrays of Warp or pyopencl. Rows:
+Ways to the same result take turns in one run, so that their ratio is valid on a busy machine; their bits must be equal.
+Times are of whole calls: NumPy arrays in and out, and on GPUs also arrays of Warp or pyopencl. Rows:
 
-- *calls* of ``log_likelihood``, beside the plain way: copies by commands, each launch started on its own. "Kernels" are
-  the launches of an ordinary call, started one after the other with everything on the device.
+- *calls* of ``log_likelihood``, beside the plain way: copies by commands, and each launch started alone. "Kernels" are
+    the launches of an ordinary call one after the other, with everything on the device.
 - *bound* calls (``bind``) beside ``log_likelihood`` with the same arrays, with a wait after each call and after many:
-  with NumPy arrays (on GPUs launches that are kept go along with the copies, with CUDA as one graph; on processors it
-  is the ordinary call), and on the device.
-- *scans*: one call of several scans that share launches however large they are, one call whose scans are queued one
-  after the other, and a call for each. The library takes the first way up to a number of particle-beams of a scan
-  (``gpusense.models.scan.pipeline.TOGETHER``), and beyond it the second.
+  with NumPy arrays (on GPUs recorded launches with the copies, on CUDA as one graph; on processors the ordinary call),
+  and on the device.
+- *scans*: one call of several scans in shared launches, one call whose scans are queued one after the other, and a call
+    for each scan. The library shares launches up to a number of particle-beams of a scan
+    (``gpusense.models.scan.pipeline.TOGETHER``), and queues scans beyond it.
 - *models*: several models in one call, and a call for each.
 """
 
@@ -59,7 +59,7 @@ from common import (
 )
 
 ROWS = ("calls", "bound", "scans", "models")
-# Calls of one way before the other has its turn.
+# Calls of a turn.
 TURN = 20
 # Calls whose results are compared.
 CHECKED = 5
@@ -77,7 +77,7 @@ SEVERAL_COLUMNS = (
 
 @contextlib.contextmanager
 def plainly(device: Any) -> Iterator[None]:
-    """Make a backend go the plain way: no calls of kept launches, no memory that host and device share."""
+    """Make a backend work the plain way: without recorded launches and memory that host and device share."""
     before, shared = device.info, getattr(device, "_shared", None)
     device.info = dataclasses.replace(before, graphs=False)
     if shared is not None:
@@ -136,7 +136,7 @@ class Bench:
         clouds = [self.scene.cloud("tracking", count, SPREAD).astype(np.float64) for count in counts]
         model = make(backend=self.device)
         with plainly(self.device):
-            # Its buffers are made now, and large enough.
+            # This call allocates large enough buffers.
             plain = make(backend=self.device)
             plain._short = None
             plain.log_likelihood(max(clouds, key=len), scans[0])
@@ -184,7 +184,7 @@ class Bench:
         self, what: str, model: Any, poses: np.ndarray, scan: np.ndarray, kernels: float,
         there: Callable[[np.ndarray], Any],
     ) -> None:  # fmt: skip
-        """Add rows of a bound call against an ordinary one with the same arrays, whose readings are the host's."""
+        """Add rows of a bound call against an ordinary one with the same arrays and readings on the host."""
         result = np.zeros(len(poses), np.float32)
         placed, out, other = there(poses), there(result), there(result)
         call = model.bind(placed, there(scan), out=out)
@@ -205,11 +205,11 @@ class Bench:
             self.add(f"{what}, {words}", both, kernels, max(self.arguments.calls // count, 3))
 
     def add(self, what: str, ways: tuple[Way, ...], kernels: float, calls: int) -> None:
-        """Add a row of a call in two ways, the plain or ordinary one last."""
+        """Add a row of a call in two ways; the plain or ordinary one is last."""
         short, other = ways
         with other.around():
             expected = [on_host(other.run(number)) for number in range(CHECKED)]
-        # Three rounds: the first calls are not what the others are, since what is kept of a call is kept then.
+        # Three rounds, since programs are recorded in the first calls.
         bits = sum(differing_bits(short.run(i), one) for _ in range(3) for i, one in enumerate(expected))
         times, plain_times = in_turns(ways, calls, TURN)
         row = {
@@ -262,7 +262,7 @@ class Bench:
         self.add_several(what, ways, shared=False)
 
     def add_several(self, what: str, ways: dict[str, Way], *, shared: bool) -> None:
-        """Add a row of ways, calls one by one the last of them."""
+        """Add a row of several ways; single calls are the last one."""
         results = []
         for way in ways.values():
             with way.around():
@@ -280,7 +280,7 @@ class Bench:
 
 
 def rows_of(found: Any) -> list[np.ndarray]:
-    """Return each scan's or model's result as an array of the host."""
+    """Return each scan's or model's result as an array on the host."""
     return [on_host(one) for one in found] if isinstance(found, list) else [*on_host(found)]
 
 

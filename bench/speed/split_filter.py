@@ -1,10 +1,10 @@
-"""Measure where a filter that is split over several devices pays, and hold its particles to those of one device.
+"""Measure where splitting a filter over several devices pays, and compare its particles with those of one device.
 
     python bench/speed/split_filter.py --device opencl --output bench/results/split_filter_cpu
     python bench/speed/split_filter.py --device warp:cuda:0 --device warp:cuda:1 --size 1000000 1080 --model beam
 
-The first device has the single filter, all of them the split one. The scene is a generated building, with the cloud of
-a tracked robot. A step is predict, correct, mean and covariance, and both filters make the same steps in turns.
+The first device has the single filter, all devices have the split one. The scene is a generated building with the cloud
+of a tracked robot. A step is predict, correct, mean and covariance; both filters make the same steps in turns.
 """
 
 from __future__ import annotations

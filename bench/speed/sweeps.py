@@ -1,14 +1,13 @@
-"""Measure the efficiency of a sweep: the same jobs on 1, 2, ... workers, each with a device of its own.
+"""Measure the efficiency of a sweep: the same jobs on 1, 2, ... workers, each with its own device.
 
     python bench/speed/sweeps.py --device numpy --workers 1 2 --output bench/results/sweeps_cpu
     python bench/speed/sweeps.py --device warp:cuda:0 --device warp:cuda:1 --workers 1 2 --engine dask
 
-Jobs track a robot along a simulated run in a generated building, with another seed each. Every worker runs jobs before
-the clock starts, so that no kernel is compiled while it runs, and sweeps of all numbers of workers run in turns.
-Efficiency is the least time on one worker over the least on n, times 1 / n. "Busy" is the share of the workers' time
-that jobs take; the rest is for the engine and the table. On processors that others use, efficiency says little: then
-compare the processor time of a job, too. The tables of all sweeps must be equal, but for times and places; else the
-exit code is 1.
+Jobs track a robot along a simulated run in a generated building, each with another seed. Every worker runs jobs before
+the measurement, so that no kernel is compiled during it; sweeps of all numbers of workers take turns. Efficiency is the
+least time on one worker over the least on n, times 1 / n. "Busy" is the share of the workers' time in jobs; the engine
+and the table take the rest. On busy processors efficiency says little: also compare the processor time of a job. The
+tables of all sweeps must be equal except for times and places; otherwise the exit code is 1.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ def executor_of(engine: str, devices: list[str]) -> Executor:
 def swept(
     jobs: list[Any], executor: Executor, folder: Path, name: str
 ) -> tuple[float, float, float, dict[str, list[Any]]]:
-    """Return the seconds of a sweep, those of its jobs by clock and processor, and its table without these."""
+    """Return the seconds of a sweep, elapsed and processor seconds of its jobs, and its table without times."""
     begin = time.perf_counter()
     ended = gs.sweep.run(jobs, table=folder / f"{name}.csv", executor=executor, root=folder)
     seconds = time.perf_counter() - begin

@@ -1,11 +1,11 @@
-"""Measure whole calls of the likelihood field beside numba's: NumPy arrays in and out, all calls, not the best.
+"""Measure whole calls of the likelihood field beside numba's: NumPy arrays in and out, quantiles over all calls.
 
     python bench/speed/whole_calls.py --size 100 --output bench/results/whole_calls_name
     python bench/speed/whole_calls.py --load 2            # beside two processes that keep a processor busy each
 
-Ways take turns of ``TURN`` calls in one run. "Launches alone" have their arrays on the device and are waited for once.
-numba's way is a table of log densities in parallel over particles (``score_logs`` of baselines.py), with the same
-float64 poses in and sums out; it finds cells without the low parts of poses. Quantiles are of all calls of a way.
+Ways take turns of ``TURN`` calls in one run. "Launches alone" have their arrays on the device and a single wait.
+numba's way is a table of log densities, parallel over particles (``score_logs`` of baselines.py), with the same float64
+poses in and sums out; it finds cells without the low parts of poses.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def ways_of(
     model = gs.LikelihoodFieldModel(scene.grid, scanner, backend=device)
     recorder = Recorder(device)
     recorded = gs.LikelihoodFieldModel(scene.grid, scanner, backend=recorder)
-    # The first call makes the map's table as well.
+    # The first call also makes the map's table.
     recorded.log_likelihood(poses, ranges)
     launches = recorder.launches_of(lambda: recorded.log_likelihood(poses, ranges))
     bound = model.bind(poses, ranges)

@@ -2,13 +2,13 @@
 
     python bench/studies/beacon_offsets.py --data DATA --output bench/results/beacon_offsets
 
-Ranges of recorded features count as ranges to beacons. ``fit_beacon_parameters`` learns deviation, weights and no
-offset, a common one, or one for each beacon, on every other window of 10 s. In the windows between, the position of all
-poses is moved together until the ranges fit best (least squares); its normalised squared error e' C^-1 e (NEES), with C
-of the fitted deviation, is 2 in the mean for independent errors of that deviation, and larger where ranges of a window
-share an error. Ranges beyond 4 deviations of the model without offsets count as outliers and are left out of positions,
-the same ones for all models. "simulated" is a radio among 6 beacons with offsets of 0.1 to 0.5 m and independent noise
-of 0.15 m, for which everything is known.
+Ranges of recorded features are taken as ranges to beacons. On alternate windows of 10 s, ``fit_beacon_parameters``
+learns deviation and weights with no offset, with a common one, or with one for each beacon. In the other windows all
+poses are shifted together until the ranges fit best (least squares). The normalised squared error of this shift, e'
+C^-1 e (NEES) with C of the fitted deviation, has a mean of 2 for independent errors, and is larger where ranges of a
+window share an error. Ranges beyond 4 deviations of the model without offsets are outliers for all models, and are left
+out of positions. "simulated" is a radio among 6 beacons with known offsets of 0.1 to 0.5 m and independent noise of
+0.15 m.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def simulated(seed: int) -> Ranges:
 
 
 def recorded(data: Path, name: str) -> Ranges:
-    """Read the ranges of a run, its exchanged landmarks put back."""
+    """Read the ranges of a run, with its exchanged landmarks repaired."""
     run = run_of(data, name)
     run = lr.repaired(run, lr.suspicions(run, lr.fit_run(run)))
     known = np.flatnonzero(run.ids >= 0)
@@ -112,12 +112,12 @@ def measure(data: Ranges, name: str) -> dict[str, Any]:
 
 
 def mean_of(values: list[float]) -> float | None:
-    """Return the mean; None of nothing."""
+    """Return the mean; None for no values."""
     return float(np.mean(values)) if values else None
 
 
 def held_out(data: Ranges, parameters: gs.BeaconParameters, test: np.ndarray) -> float:
-    """Return the mean log p of the ranges that no fit has seen."""
+    """Return the mean log p of the held-out ranges."""
     model = gs.BeaconModel(data.xy, parameters, backend="numpy", precision="float64")
     each = [model.log_likelihood(data.poses[k][None], [data.ranges[k]], [data.ids[k]])[0]
             for k in np.flatnonzero(test) if 0 <= data.ranges[k] <= parameters.range_max]  # fmt: skip

@@ -1,31 +1,28 @@
-"""Confidence of a particle filter against the number of beams: plain product, tempering, thinning, cubes.
+"""Confidence of a particle filter by number of beams: plain product, tempering, thinning, cubes.
 
 For each log, number of beams (bad readings are dropped first, the others thinned evenly) and kind of weights: coverage
 of the 50, 80 and 95 % regions, width of the 95 % interval of the position, median NEES (2.37 is right) and the rank
 histogram of the true poses, which is flat where the weights are right.
 
-    python bench/studies/coverage.py --logs intel csail fr079 --beams 10 30 90 180 --out coverage_cpu.json
+    python bench/studies/coverage.py --logs intel csail fr079 --beams 10 30 90 180 --output coverage_cpu
     python bench/studies/coverage.py --logs intel olin --models beam --beams 60 --weights "plain product" auto
 """
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import json
-import shlex
 import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import recordings
+from common import make_parser, note, parse, publish, table
 
 import gpusense as gs
-from gpusense.evaluation.machine import machine, machine_line
 from gpusense.localization.defaults import DEFAULTS
 
-# Words, temperature, weights of a peer.
+# Description: temperature, weights of a peer.
 WEIGHTS = {
     "plain product": (1.0, None), "temperature 0.1": (0.1, None), "auto": ("auto", None),
     "sum of cubes (nav2)": (1.0, gs.compat.Amcl()),
@@ -43,27 +40,23 @@ def maker(kind, backend, beams, peer):
     )
 
 
-def table(results):
-    """Return the results as a table of Markdown."""
-    lines = [
-        "| log | model | beams | weights | temperature | median, 95 % error [cm] | coverage 50, 80, 95 % "
-        "| width of 95 % [cm] | median NEES | share of ranks in the outer fifth (0.2 is right) |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for r in results:
-        outer = r["rank_histogram"][0] + r["rank_histogram"][-1]
-        coverage = ", ".join(f"{r[f'coverage_{k}']:.2f}" for k in (50, 80, 95))
-        errors, width = f"{r['median_cm']:.1f}, {r['p95_cm']:.1f}", f"{100 * r['width_95']:.0f}"
-        lines.append(
-            f"| {r['log']} | {r['model']} | {r['beams']} | {r['weights']} | {r['temperature']:.3f} | {errors} "
-            f"| {coverage} | {width} | {r['nees_median']:.2f} | {outer:.2f} |"
-        )
-    return "\n".join(lines)
+COLUMNS = (
+    "log", "model", "beams", "weights", "temperature", "median, 95 % error [cm]", "coverage 50, 80, 95 %",
+    "width of 95 % [cm]", "median NEES", "share of ranks in the outer fifth (0.2 is right)",
+)  # fmt: skip
+
+
+def cells(r):
+    """Format the cells of a row."""
+    outer = r["rank_histogram"][0] + r["rank_histogram"][-1]
+    return (
+        r["log"], r["model"], r["beams"], r["weights"], f"{r['temperature']:.3f}", recordings.error_cell(r),
+        recordings.coverage_cell(r), f"{100 * r['width_95']:.0f}", f"{r['nees_median']:.2f}", f"{outer:.2f}",
+    )  # fmt: skip
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--backend", default="opencl")
+    parser = make_parser(__doc__, backend="opencl", seed=False)
     parser.add_argument("--logs", nargs="+", default=["intel", "csail", "fr079"], choices=recordings.NAMES)
     parser.add_argument("--models", nargs="+", default=["field"], choices=("field", "beam", "discrete"))
     parser.add_argument(
@@ -73,8 +66,7 @@ def main() -> None:
     parser.add_argument("--particles", type=int, default=2000)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--limit", type=int, default=600, help="scans of each log")
-    parser.add_argument("--out", type=Path, help="a .json file; the table goes to the .md file beside it")
-    args = parser.parse_args()
+    args = parse(parser)
     results = []
     for name in args.logs:
         recording = recordings.load(name)
@@ -83,13 +75,9 @@ def main() -> None:
             models = recording.models(maker(kind, args.backend, beams, peer))
             options = dict(limit=args.limit, particles=args.particles, temperature=temperature)
             runs = [recordings.follow(recording, models, seed=seed, **options) for seed in range(args.seeds)]
-            row = dict(log=name, model=kind, beams=beams, weights=words) | recordings.figures(runs)
-            print(table([row]).splitlines()[-1], flush=True)
-            results.append(row)
-    if args.out is not None:
-        command = shlex.join(["bench/studies/coverage.py", *sys.argv[1:]])
-        args.out.write_text(json.dumps(dict(machine=machine(), command=command, results=results), indent=1))
-        args.out.with_suffix(".md").write_text(f"{machine_line()}\n\n`python {command}`\n\n{table(results)}\n")
+            results.append(dict(log=name, model=kind, beams=beams, weights=words) | recordings.figures(runs))
+            note(str(cells(results[-1])))
+    publish(__file__, args, table(COLUMNS, map(cells, results)), dict(results=results))
 
 
 if __name__ == "__main__":

@@ -1,14 +1,14 @@
-"""Localise with fitted parameters: rank of the true pose and error of the mean, beside others' defaults.
+"""Localise with fitted parameters and with other programs' defaults: rank of the true pose and error of the mean.
 
     python bench/studies/fit_localisation.py --data DATA --output bench/results/fit_localisation      # some minutes
 
-For each log, maps are of the even scans, and odd scans come in blocks of --block neighbours: parameters of the beam
-model are fitted to every other block, and scans of the blocks between are scored, evenly chosen, with these
-parameters, with the defaults of nav2_amcl and Beluga in the book's mixture, and with gpusense's own. Particles are
-those of ``gpusense score``: the logged pose, half of the rest around it, half uniform over the free cells.
+Maps are made of the even scans of a log, and odd scans are grouped in blocks of --block neighbours. Parameters of the
+beam model are fitted to alternate blocks. Evenly chosen scans of the other blocks are scored with these parameters,
+with the defaults of nav2_amcl and Beluga in the book's mixture, and with gpusense's defaults. Particles are drawn as by
+``gpusense score``: the logged pose, and of the rest one half around it and one half uniform over the free cells.
 
-SLAM made the logged poses of the whole log. A product of 180 beams has about one effective particle; so the
-error of the mean is also given at the temperature 0.1.
+Logged poses come from SLAM of the whole log. A product of 180 beams has about one effective particle, so the error of
+the mean is also given at temperature 0.1.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common import LOGS, make_parser, note, odd_scans, parse, publish, table
 
 TEMPERATURES = (1.0, 0.1)
-# In the published results these are "gpusense score's", whose defaults they were.
+# Published results call these "gpusense score's", whose defaults they were.
 HAND_TUNED = gs.BeamParameters(z_hit=0.75, z_short=0.1, z_max=0.05, z_rand=0.1, sigma_hit=0.1)
 
 
 def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Fit every other block of the odd scans, score some of the others."""
+    """Fit alternate blocks of the odd scans, and score scans of the other blocks."""
     grid, scans = odd_scans(data, name)
     block = np.arange(len(scans)) // arguments.block
     known = [scan for scan, odd in zip(scans, block % 2, strict=True) if not odd]

@@ -1,4 +1,4 @@
-"""Fit the beam model's parameters of real sensors, and compare them with others' defaults on held-out readings.
+"""Fit the beam model's parameters of real sensors, and compare them with other programs' defaults on held-out readings.
 
     python bench/studies/fit_real.py --data DATA --output bench/results/fit_real             # everything; some minutes
     python bench/studies/fit_real.py --data DATA --set lidar_wall --set sonar1 --discrete 0.1
@@ -10,19 +10,19 @@ Each set is fitted on one half and scored on the other:
 - sonar1-transfer, sonar2-transfer: fitted on the recording "calibration", scored on "training1", in which the second
   sonar has another offset and more noise.
 - lidar_wall: an LDS-02 before a wall at a taped distance, seven set-ups; every other scan is held out.
-- intel, freiburg-079, csail, aces (carmen_logs): SICK lasers in maps of 5 cm that were made of the even scans; expected
-  ranges are those of the odd ones at their SLAM-corrected poses. Every other block of odd scans is held out.
-- pioneer8, pioneer8-cone (sonar_pioneer8): eight sonars in a map of 5 cm that was made of the even frames' readings;
-  expected ranges of the odd frames along the axis, or in a cone of 15 degrees. Every other odd frame is held out.
-- nav350, s3000 (jarvis_lab): two lasers with poses from reflectors, in maps of 3 cm that were made of the same run, so
-  that both halves look better than a new run would. Every other block of scans is held out.
+- intel, freiburg-079, csail, aces (carmen_logs): SICK lasers in 5 cm maps of the even scans; expected ranges are
+    computed for the odd ones at their SLAM-corrected poses. Alternate blocks of odd scans are held out.
+- pioneer8, pioneer8-cone (sonar_pioneer8): eight sonars in a 5 cm map of the even frames' readings; expected ranges of
+    the odd frames along the axis, or in a cone of 15 degrees. Every other odd frame is held out.
+- nav350, s3000 (jarvis_lab): two lasers with poses from reflectors, in 3 cm maps of the same run, so that both halves
+    look better than a new run would. Alternate blocks of scans are held out.
 
 The log-likelihood of a reading is a density [log 1/m], so it depends on the sensor; its difference between parameters
-does not. Standard errors of the held-out figures are those of blocks of neighbouring scans (--block) or of 100 readings
-of a sonar. Others' defaults are those of nav2_amcl and Beluga with their weights divided by their sums, in the book's
+does not. Standard errors of the held-out figures are computed from blocks of neighbouring scans (--block) or of 100
+readings of a sonar. The defaults of nav2_amcl and Beluga, with weights divided by their sums, are used in the book's
 normalised mixture. Where the fitted parameters make a held-out reading impossible, half a reading of each cause is
-added to them ("softened"). --discrete adds the discrete model with dependent causes, learned in steps of that width
-on the same half, and its gain over the fitted mixture in the same steps. --incidence adds, for the logs of SICK lasers,
+added to the fit ("softened"). --discrete adds the discrete model with dependent causes, learned in bins of that width
+on the same half, and its gain over the fitted mixture in the same bins. --incidence adds, for the logs of SICK lasers,
 parameters for a number of bins of angles of incidence, and their gain over the same parameters for all angles.
 --student adds fits with Student's t in place of the normal, and their gain over the fits with a normal.
 """
@@ -58,7 +58,7 @@ LASERS = {"nav350": (25.0, 0.0), "s3000": (51.2, None)}
 
 
 def read_columns(path: Path) -> dict[str, np.ndarray]:
-    """Read the columns of a compressed CSV file, as numbers where they are."""
+    """Read the columns of a compressed CSV file; numeric ones become numbers."""
     with gzip.open(path, "rt", newline="") as stream:
         rows = list(csv.DictReader(stream))
     columns = {}
@@ -90,7 +90,7 @@ def sonar(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeDa
 
 
 def wall(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeData, RangeData]:
-    """Read all set-ups before the wall, a scan a block."""
+    """Read all set-ups before the wall; each scan is a block."""
     columns = read_columns(data / "lidar_wall" / "frontal_beams.csv.gz")
     expected = columns["true_distance_m"] / np.cos(columns["angle_rad"])
     _, bag = np.unique(columns["bag"], return_inverse=True)
@@ -117,7 +117,7 @@ def laser(data: Path, name: str, arguments: argparse.Namespace) -> tuple[RangeDa
     poses = values["gt_pose"][valid][: len(ranges)]
     if nothing is not None:
         ranges[ranges == nothing] = np.inf
-    # float32 readings of range_max are a little off it.
+    # float32 readings of range_max differ slightly from it.
     ranges[ranges >= np.float32(top)] = np.inf
     scanner = gs.Scanner.uniform(
         angle_min=float(values["angle_min"]), angle_increment=float(values["angle_inc"]), count=ranges.shape[1],
@@ -154,7 +154,7 @@ BIASED = {*SONARS, "lidar_wall"}
 
 
 def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Fit one half, score the other."""
+    """Fit one half and score the other one."""
     half, rest = SETS[name](data, name, arguments)
     begin = time.perf_counter()
     fit = gs.fit_beam_parameters(
@@ -184,7 +184,7 @@ def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, A
 
 
 def student(half: RangeData, rest: RangeData, normal: gs.BeamFit, backend: str) -> dict[str, Any]:
-    """Fit hits of Student's t to one half, and compare with normal ones on the other."""
+    """Fit hits with Student's t to one half, and compare them with normal ones on the other half."""
     begin = time.perf_counter()
     fit = gs.fit_beam_parameters(
         half.ranges, half.expected, half.range_max, range_min=half.range_min, backend=backend,
@@ -196,7 +196,7 @@ def student(half: RangeData, rest: RangeData, normal: gs.BeamFit, backend: str) 
     log_p = [held_out.log_densities(held_out.softened(each.parameters, readings), rest) for each in (fit, normal)]
     _, block = np.unique(rest.block, return_inverse=True)
     mean, error = held_out.block_mean(log_p[0] - log_p[1], block)
-    # One parameter more.
+    # Student's t has one more parameter.
     bic = 2 * (fit.log_likelihood - normal.log_likelihood) - np.log(readings)
     return {
         "fit": fit.to_dict(),
@@ -210,7 +210,7 @@ def student(half: RangeData, rest: RangeData, normal: gs.BeamFit, backend: str) 
 def by_incidence(
     half: RangeData, rest: RangeData, parameters: gs.BeamParameters, bins: int, backend: str
 ) -> dict[str, Any]:
-    """Learn parameters by angle of incidence on one half, and compare with those for all angles on the other."""
+    """Learn parameters by angle of incidence on one half, and compare them with common ones on the other half."""
     assert half.incidence is not None
     fit = gs.fit_incidence_parameters(
         half.ranges, half.expected, half.incidence, half.range_max, range_min=half.range_min, bins=bins, backend=backend
@@ -234,7 +234,8 @@ def without_missing(data: RangeData) -> RangeData:
 
 
 def discrete(half: RangeData, rest: RangeData, parameters: gs.BeamParameters, width: float) -> dict[str, Any]:
-    """Learn the discrete model on one half, and compare with the fitted mixture in the same steps on the other."""
+    """Learn the discrete model on one half, and compare it with the fitted mixture in the same bins on the other
+    half."""
     bins = min(max(round(half.range_max / width), 1), 4096)
 
     def moved(data: RangeData) -> RangeData:
@@ -260,7 +261,7 @@ def discrete(half: RangeData, rest: RangeData, parameters: gs.BeamParameters, wi
 
 
 def finite(value: float) -> float | None:
-    """Return a number that JSON has, or None."""
+    """Return a finite number, or None."""
     return value if np.isfinite(value) else None
 
 
@@ -272,7 +273,7 @@ def pair(value: float | None, error: float | None, digits: int = 3) -> str:
 
 
 def to_markdown(reports: list[dict[str, Any]]) -> str:
-    """Format fitted parameters, held-out comparison, and what options add."""
+    """Format fitted parameters, the held-out comparison, and the rows of options."""
     names = list(gs.BeamParameters().to_dict())
     fitted, compared, discrete_lines, incidence_lines, student_lines = [], [], [], [], []
     for report in reports:

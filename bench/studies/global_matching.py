@@ -85,7 +85,7 @@ def located(model: gs.LikelihoodFieldModel, scans: list[tuple[np.ndarray, Any]])
 
 
 def window(backend: str, arguments: Any) -> list[dict[str, Any]]:
-    """Search 41 x 41 x 61 poses around an offset guess, first all of them, then by bounds."""
+    """Search 41 x 41 x 61 poses around an offset guess by brute force, then by branch and bound."""
     grid, scans = odd_scans(arguments.data, "intel")
     distances = gs.distance_transform(grid.occupied, resolution=grid.resolution, backend=backend)
     scan = scans[50][1]
@@ -107,7 +107,7 @@ def window(backend: str, arguments: Any) -> list[dict[str, Any]]:
 
 
 def large(backend: str, arguments: Any) -> list[dict[str, Any]]:
-    """Localise scans of csail in its map, with unknown cells around it to 2000 x 2000 cells."""
+    """Localise scans of csail in its map, padded by unknown cells to 2000 x 2000 cells."""
     grid, scans = odd_scans(arguments.data, "csail")
     cells = np.full((2000, 2000), -1, np.int8)
     cells[: grid.shape[0], : grid.shape[1]] = grid.cells

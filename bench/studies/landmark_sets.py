@@ -14,9 +14,9 @@ from gpusense.evaluation.landmark_runs import first_scans
 from gpusense.logs.mrclam import read_mrclam
 from gpusense.logs.records import LandmarkRun
 
-# The LEGO robot: metres per tick, distance of its wheels, and from where a cylinder is hit to its axis.
+# The LEGO robot: metres per tick, distance of its wheels, and radius of a cylinder [m].
 _TICK, _TRACK, _AXIS = 0.000349, 0.150, 0.09
-# Noise that is added to the simulated robot's odometry: of each turn [rad], and of each way, as a share of it.
+# Noise that is added to the simulated robot's odometry: of each turn [rad], and of each distance, as a share of it.
 _TURN, _WAY = 0.05, 0.1
 
 
@@ -28,9 +28,9 @@ def run_of(data: Path, name: str) -> LandmarkRun:
 
 
 def _beacons(data: Path) -> LandmarkRun:
-    """Read a camera's fiducials; every row is a moment, some without a beacon, and poses are those of SLAM.
+    """Read a camera's fiducials; rows are moments, some without a beacon, and poses come from SLAM.
 
-    From 275 s on SLAM is lost and leaps by metres: the run ends where it first moves half a metre more than odometry.
+    SLAM is lost from 275 s on and jumps by metres: the run ends where it first moves half a metre more than odometry.
     """
     folder = data / "beacons_enmt482"
     with (folder / "beacon_map.csv").open() as stream:
@@ -59,7 +59,7 @@ def _beacons(data: Path) -> LandmarkRun:
 
 
 def cylinders(ranges: np.ndarray) -> np.ndarray:
-    """Find (F, 2) ranges and bearings of cylinders in a scan: readings between a jump nearer and one farther."""
+    """Find (F, 2) ranges and bearings of cylinders in a scan: readings between a jump inwards and one outwards."""
     bearings = (np.arange(ranges.size) - 330) * 0.006135923 - 0.0698
     found, inside, active = [], [], False
     for k in range(1, ranges.size - 1):
@@ -77,7 +77,7 @@ def cylinders(ranges: np.ndarray) -> np.ndarray:
 
 
 def _lego(data: Path) -> LandmarkRun:
-    """Read a lidar's cylinders. Positions are an overhead camera's; headings are those that explain most cylinders."""
+    """Read a lidar's cylinders. Positions come from an overhead camera; headings explain the most cylinders."""
     folder = data / "brenner_lego"
     xy = np.loadtxt(folder / "robot_arena_landmarks.txt", usecols=(2, 3)) / 1000
     position = np.loadtxt(folder / "robot4_reference.txt", usecols=(2, 3)) / 1000
@@ -116,9 +116,9 @@ def _lego(data: Path) -> LandmarkRun:
 
 
 def _freiburg(data: Path) -> LandmarkRun:
-    """Read a simulated run without a true path, whose logged poses are those of its nearly exact odometry.
+    """Read a simulated run without a true path; its nearly exact odometry gives the logged poses.
 
-    A filter would have nothing to do with that: it gets the odometry with noise of a poor robot added.
+    Filters get this odometry with the noise of a poor robot added.
     """
     folder = data / "freiburg_course"
     world = np.loadtxt(folder / "world.dat")
@@ -146,7 +146,7 @@ def _freiburg(data: Path) -> LandmarkRun:
 
 
 def _path(moves: np.ndarray) -> np.ndarray:
-    """Return (S, 3) poses after (S, 3) first turns, ways and second turns, from the origin."""
+    """Return (S, 3) poses after (S, 3) first turns, distances and second turns, from the origin."""
     heading = np.cumsum(moves[:, 0] + moves[:, 2])
     along = heading - moves[:, 2]
     return np.column_stack([

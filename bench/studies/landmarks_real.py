@@ -2,15 +2,15 @@
 
     python bench/studies/landmarks_real.py --data DATA --output bench/results/landmarks_real      # some minutes
 
-For each run: parameters fitted at the logged poses with known and with unknown landmarks; landmarks whose readings
-stand where another one is; how often the likeliest landmark of a feature is the recorded one, at logged poses and at
-poses moved at random; and the error of a particle filter (odometry, ``LandmarkModel``)
-that knows the landmarks, or does not, with the parameters of the fit of its kind. It starts 0.5 m and 0.3 rad (one
-deviation) around the first logged pose. Two landmarks of the UTIAS data are exchanged in the published positions: they
-are left so, and for comparison put back as reported ("repaired"). Fits and filters use the same run.
+For each run: parameters fitted at the logged poses with known and with unknown landmarks; landmarks whose readings lie
+at another landmark; how often the likeliest landmark of a feature is the recorded one, at logged poses and at randomly
+moved ones; and the error of a particle filter (odometry, ``LandmarkModel``) with known and with unknown landmarks and
+the parameters of the corresponding fit. It starts 0.5 m and 0.3 rad (one deviation) around the first logged pose. Two
+landmarks of the UTIAS data are exchanged in the published positions: results are for these positions, and for
+comparison for the corrected ones ("repaired"). Fits and filters use the same run.
 
-freiburg is simulated and has no true path, but nearly exact odometry: that is taken for the path, and the filter gets
-it with noise added. The LEGO robot's headings are made of the features themselves.
+freiburg is simulated without a true path but with nearly exact odometry, which is taken as the path; the filter gets it
+with added noise. The LEGO robot's headings are computed from the features themselves.
 """
 
 from __future__ import annotations

@@ -1,16 +1,14 @@
-"""Count reference poses that their own scans contradict, and what they do to the coverage of the filter's regions.
+"""Count reference poses that their own scans contradict, and their effect on the coverage of the filter's regions.
 
-Errors and coverage are those against reference poses, which are not free of errors. A reference is contradicted where
-the scan is likelier at the filter's estimate by NATS at least, with all beams and in every run. The reverse, estimates
-that are contradicted by as much, is the control.
+Errors and coverage are measured against reference poses, which have errors themselves. A reference is contradicted
+where the scan with all beams is likelier at the filter's estimate by at least NATS in every run. The control is the
+reverse: estimates that are contradicted by as much.
 
-    python bench/studies/references.py --seeds 3 --out references_cpu.json
+    python bench/studies/references.py --seeds 3 --output references_cpu
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 from pathlib import Path
 
@@ -18,16 +16,16 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 import recordings
+from common import make_parser, note, parse, publish, table
 
 from gpusense.evaluation.coverage import coverage_report
-from gpusense.evaluation.machine import machine, machine_line
 
 NATS = 100.0
 LOGS = (*recordings.CARMEN, "intel-raw", "olin", "jarvis-s3000", "jarvis-nav350")
 
 
 def gains(recording, model, track):
-    """Return how much likelier each scan is at the estimate than at the reference [nats]; NaN without a reference."""
+    """Return the gain in log p of each scan at the estimate over the reference [nats]; NaN without a reference."""
     found = np.full(len(recording.events), np.nan)
     for k, event in enumerate(recording.events):
         if np.isfinite(event.truth).all():
@@ -59,38 +57,30 @@ def study(name, backend, particles, seeds):
     )  # fmt: skip
 
 
-def _line(r):
-    both = " | ".join(", ".join(f"{value:.2f}" for value in r["coverage"][which]) for which in ("all", "others"))
+COLUMNS = (
+    "log", "references", "contradicted", "farthest", "estimates contradicted", "coverage 50, 80, 95 %, all",
+    "without them",
+)  # fmt: skip
+
+
+def cells(r):
+    """Format the cells of a row."""
+    both = (", ".join(f"{value:.2f}" for value in r["coverage"][which]) for which in ("all", "others"))
     farthest = f"{r['farthest_cm']:.0f} cm, {r['farthest_deg']:.1f} deg"
-    counts = f"{r['references']} | {r['contradicted']} | {farthest} | {r['estimates_contradicted']}"
-    return f"| {r['log']} | {counts} | {both} |"
-
-
-_HEAD = (
-    "| log | references | contradicted | farthest | estimates contradicted | "
-    "coverage 50, 80, 95 %, all | without them |",
-    "| --- | --- | --- | --- | --- | --- | --- |",
-)
+    return r["log"], r["references"], r["contradicted"], farthest, r["estimates_contradicted"], *both
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--backend", default="opencl")
+    parser = make_parser(__doc__, backend="opencl", seed=False)
     parser.add_argument("--logs", nargs="+", default=list(LOGS), choices=LOGS)
     parser.add_argument("--particles", type=int, default=2000)
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--out", type=Path, help="a .json file; the table goes to the .md file beside it")
-    args = parser.parse_args()
-    print("\n".join(_HEAD))
+    args = parse(parser)
     rows = []
     for name in args.logs:
         rows.append(study(name, args.backend, args.particles, args.seeds))
-        print(_line(rows[-1]), flush=True)
-    if args.out is not None:
-        command = " ".join(["bench/studies/references.py", *sys.argv[1:]])
-        args.out.write_text(json.dumps(dict(machine=machine(), command=command, results=rows), indent=1))
-        table = "\n".join([*_HEAD, *map(_line, rows)])
-        args.out.with_suffix(".md").write_text(f"{machine_line()}\n\n`python {command}`\n\n{table}\n")
+        note(str(cells(rows[-1])))
+    publish(__file__, args, table(COLUMNS, map(cells, rows)), dict(results=rows))
 
 
 if __name__ == "__main__":

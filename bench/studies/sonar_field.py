@@ -5,11 +5,11 @@
 
 Simulated: a ring of 16 sensors in the built-in building, cones of 30 degrees, walls that are mirrors beyond 0.4 rad.
 Recorded, where GPUSENSE_DATA names the data: the run ``sonar_pioneer8``, 8 sensors, in a map made of its even frames.
-Every model's numbers are tuned on frames of their own, for the largest information; the others are scored. The scored
-pose is known, the particles are spread around a guess, or over the whole map:
+Every model is tuned on separate frames for the largest information, and scored on the other ones. The scored pose is
+known; particles are spread around a guess or over the whole map:
 
 - rank: the share of particles that score better than the true pose, 0 at best;
-- information: the logarithm of the true pose's weight among N particles, times N, so that 0 is what no reading gives;
+- information: the logarithm of the true pose's weight among N particles, times N, which is 0 without any reading;
 - error: distance from the true position to the weighted mean of the particles around the guess.
 """
 
@@ -53,7 +53,7 @@ class Place:
 
 
 def moved(poses: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Move poses by steps in their own frames."""
+    """Move poses by steps in their frames."""
     c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
     x, y = steps[..., 0], steps[..., 1]
     turned = poses[..., 2] + steps[..., 2]
@@ -61,7 +61,7 @@ def moved(poses: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 
 def steps_from(pose: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the steps that lead from one pose to others."""
+    """Return the steps from a pose to other ones."""
     off = others - pose
     c, s = math.cos(pose[2]), math.sin(pose[2])
     return np.stack([c * off[:, 0] + s * off[:, 1], c * off[:, 1] - s * off[:, 0], off[:, 2]], axis=-1)
@@ -93,7 +93,7 @@ def simulated(frames: int, rng: np.random.Generator) -> Place:
 
 
 def recorded(folder: Path, frames: int) -> Place:
-    """Read the run of a Pioneer with 8 sonars; odd frames are tuned on and scored in turn."""
+    """Read the run of a Pioneer with 8 sonars; odd frames are for tuning and scoring in turn."""
     raw, pose = (np.loadtxt(folder / name) for name in ("measurement.txt", "poses.txt"))
     poses = np.column_stack([pose[:, 1:3] / 1000, np.radians(pose[:, 3] / 10)])
     z = np.where(raw[:, 1:] >= 5110, np.inf, raw[:, 1:] / 1000)
@@ -104,7 +104,7 @@ def recorded(folder: Path, frames: int) -> Place:
 
 
 def sonar_map(ring: gs.Scanner, poses: np.ndarray, z: np.ndarray, *, width: float) -> gs.OccupancyGrid:
-    """Map by log odds from cones: free before a reading, occupied at it, less so towards the cone's edges."""
+    """Map by log odds from cones: free before a reading, occupied at it, with less weight towards the cone's edges."""
     side, reach = 0.05, ring.range_max
     low, high = poses[:, :2].min(axis=0) - reach, poses[:, :2].max(axis=0) + reach
     shape = np.ceil((high - low) / side).astype(int)[::-1]
@@ -130,7 +130,7 @@ def sonar_map(ring: gs.Scanner, poses: np.ndarray, z: np.ndarray, *, width: floa
 
 
 def rings(place: Place, name: str) -> list[tuple[dict[str, float], gs.Scanner]]:
-    """List the sensors that a way may be tuned to."""
+    """List the sensors that a method may be tuned to."""
     if name in (FIELD, LASER):
         return [({}, ring_of(place))]
     found = []
@@ -147,7 +147,7 @@ def ring_of(place: Place, **options: Any) -> gs.Scanner:
 
 
 def mixtures(name: str, quick: bool) -> list[tuple[dict[str, float], Any]]:
-    """List the parameters that a way may be tuned to, a middling one first."""
+    """List the parameters that a method may be tuned to; a middling one is first."""
     if name == FIELD:
         pairs = [(0.1, 0.5)] if quick else itertools.product((0.1, 0.05, 0.2, 0.4), (0.5, 0.1, 0.3, 0.7, 0.9))
         return [
@@ -170,7 +170,7 @@ def mixtures(name: str, quick: bool) -> list[tuple[dict[str, float], Any]]:
 def tuned(
     place: Place, name: str, clouds: np.ndarray, z: np.ndarray, quick: bool, backend: Any
 ) -> tuple[dict[str, float], Any]:
-    """Find the numbers and the model with the largest mean information about the first poses of clouds.
+    """Find the parameters and the model with the largest mean information about the first poses of clouds.
 
     Cones are chosen with a middling mixture, and then the mixture.
     """
@@ -198,7 +198,7 @@ def information(log_p: np.ndarray) -> float:
     if not np.isfinite(p).any():
         return 0.0
     top = p.max()
-    # A pose that is held to be impossible counts as one of a weight of exp(-50).
+    # An impossible pose has a weight of exp(-50).
     return max(float(p[0] - top - np.log(np.exp(p - top).sum())), -50.0) + math.log(len(p))
 
 
@@ -233,15 +233,15 @@ def scores(
 
 
 def better(log_p: np.ndarray) -> float:
-    """Return the share of particles that score better than the first; equal ones count half."""
+    """Return the share of particles that score better than the first one; equal scores count half."""
     return float((log_p[1:] > log_p[0]).mean() + 0.5 * (log_p[1:] == log_p[0]).mean())
 
 
 def at_the_truth(model: Any, poses: np.ndarray, z: np.ndarray) -> dict[str, float | None]:
-    """Compare the readings with those that a beam model expects at the true poses.
+    """Compare readings with a beam model's expectation at the true poses.
 
-    The median of the differences of those that have both a reading and an expected return, and the share of readings
-    without an echo where one is expected.
+    Return the median difference of readings with an expected return, and the share of readings without an echo where
+    one is expected.
     """
     if not isinstance(model, gs.BeamModel):
         return {"bias": None, "unexpected_silence": None}
@@ -254,9 +254,9 @@ def at_the_truth(model: Any, poses: np.ndarray, z: np.ndarray) -> dict[str, floa
 
 
 def measure(place: Place, arguments: argparse.Namespace, backend: Any) -> list[dict[str, Any]]:
-    """Tune each way and score it; a row a way and length of windows."""
+    """Tune and score each method; return a row for each method and length of windows."""
     rng = np.random.default_rng(7)
-    # Some 50 frames decide, evenly chosen, each against 300 particles at most.
+    # Some 50 evenly chosen frames decide, each with at most 300 particles.
     step = max(len(place.tuning[0]) // 50, 1)
     poses, z = (each[::step] for each in place.tuning)
     clouds = []
@@ -333,7 +333,7 @@ def draw_scene(place: Place, path: Path, backend: Any) -> None:
     model = gs.BeamModel(place.grid, ring, backend=backend)
     rays = gs.BeamModel(place.grid, gs.Scanner(ring.ray_bearings.ravel(), ring.range_max), backend=backend)
     expected = model.expected_ranges(poses)
-    # The frame in which most sensors hear something that is not on their axis, and some nothing.
+    # The frame in which most sensors hear something off their axis, and some hear nothing.
     along = gs.BeamModel(place.grid, ring_of(place), backend=backend).expected_ranges(poses)
     aside = ((expected < ring.range_max) & (along - expected > 0.15)).sum(axis=1)
     silent = ((expected == ring.range_max) & (along < ring.range_max)).sum(axis=1)

@@ -1,16 +1,16 @@
-"""The verdict of a filter, said against happened: people, moved walls, glass, wrong maps and jumps.
+"""The verdict of a filter against the truth: people, moved walls, glass, wrong maps and jumps.
 
 The logs of the data folder are split by name before any run: alternate ones are "tuning" and "held out"
 (``verdict_runs.TUNING``, ``HELD_OUT``). Constants of the verdict were chosen on simulated runs
-(``bench/studies/verdict_fit.py``) and looked at on the tuning half; the table has both halves side by side.
+(``bench/studies/verdict_fit.py``) and inspected on the tuning half; the table has both halves side by side.
 
-A false alarm is a scan with p_lost above 0.5 whose pose is within 1 m and 0.5 rad of the reference, for a wide cloud or
-contradicting scans; the next column counts those with the verdict "lost" alone. A miss is a scan
-with p_lost of at most 0.5 whose pose has been more than 2 m off, or on a wrong map, for more than 20 scans. A shard
-writes its runs to a file; ``--join`` makes the page of all shards.
+A false alarm is a scan with p_lost above 0.5 whose pose is within 1 m and 0.5 rad of the reference, because of a wide
+cloud or contradicting scans; the next column counts only those with the verdict "lost". A miss is a scan with p_lost of
+at most 0.5 whose pose has been wrong by more than 2 m, or on a wrong map, for more than 20 scans. A shard writes its
+runs to a file; ``--join`` makes the page of all shards.
 
     python bench/studies/verdict.py --shard 1/16 --seeds 4 --maps 10 --simulated 2000 --raw shard_1.npz
-    python bench/studies/verdict.py --join shard_*.npz --out verdict_cpu.json
+    python bench/studies/verdict.py --join shard_*.npz --output verdict_cpu
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 import recordings
 import verdict_runs as runs
-from verdict_report import write
+from common import command_line, make_parser, parse, publish
+from verdict_report import page
 
 import gpusense as gs
 from gpusense._util.progress import progress
@@ -40,7 +41,7 @@ SCANS, EVERYWHERE = 70, 5000
 
 
 def follow(places, events, start, *, backend, particles, kind, beams, seed):
-    """Return a row for each scan: errors, p_lost, word, ratio, whether wide, pose.
+    """Return a row for each scan: errors, p_lost, verdict, ratio, deviation of the position, pose.
 
     Args:
         places: A map and a scanner for each laser.
@@ -55,19 +56,12 @@ def follow(places, events, start, *, backend, particles, kind, beams, seed):
     make = recordings.makers(kind, backend, beams)
     models = [make(grid, scanner) for grid, scanner in places]
     pf = gs.ParticleFilter(models, particles=particles, seed=seed)
-    if start is None:
-        pf.initialize_uniform()
-    else:
-        pf.initialize(mean=start, covariance=np.diag(np.square(runs.START)))
+    recordings.start_at(pf, start)
     rows = []
-    for before, event in zip([None, *events], events, strict=False):
-        if before is not None:
-            pf.predict(before.odometry, event.odometry)
-        pf.correct({models[event.scanner]: event.ranges})
+    for event in recordings.play(pf, models, events):
         e = pf.estimate()
-        d = e.pose - event.truth
         belief, word = pf._parts.verdict.state.belief, WORDS.index(e.verdict)
-        rows.append((math.hypot(d[0], d[1]), abs(math.remainder(d[2], math.tau)), e.p_lost, word, belief.ratio,
+        rows.append((*recordings.errors(e.pose, event.truth), e.p_lost, word, belief.ratio,
                      math.sqrt(e.covariance[0, 0] + e.covariance[1, 1]), *e.pose))  # fmt: skip
     return np.array(rows)
 
@@ -88,7 +82,7 @@ def jobs(args):
         case = CASES[int(rng.choice(3, p=(0.5, 0.25, 0.25)))]
         people, moved = rng.choice(SHARES, 2)
         found.append(("simulated", "building", case, None, float(people), float(moved), float(k % 4 == 3) * 0.1, k))
-    # In any order but the same one, so that shards take equally long.
+    # In a fixed random order, so that shards take equally long.
     order = np.random.default_rng(1).permutation(len(found))
     return [found[k] for k in order if found[k][0] in args.groups]
 
@@ -98,22 +92,10 @@ def prepared(job, args):
     group, name, case, other, people, moved, glass, seed = job
     rng = np.random.default_rng((7, seed, CASES.index(case), round(100 * people), round(100 * moved)))
     if group == "simulated":
-        beams, around, step = (
-            int(rng.choice([16, 36, 180, 360])),
-            bool(rng.integers(2)),
-            float(rng.choice([0.1, 0.2, 0.3])),
-        )
         grid, scanner, events = runs.simulated(
-            1000 + seed,
-            scans=60,
-            hidden=people,
-            moved=moved,
-            glass=glass,
-            beams=beams,
-            around=around,
-            step=step,
-            case=case,
-        )
+            1000 + seed, scans=60, hidden=people, moved=moved, glass=glass, beams=int(rng.choice([16, 36, 180, 360])),
+            around=bool(rng.integers(2)), step=float(rng.choice([0.1, 0.2, 0.3])), case=case,
+        )  # fmt: skip
         return [(grid, scanner)], events, _start(case, grid, events, rng)
     parts = runs.parts_of(name)
     recording = runs.load(parts[seed % len(parts)])
@@ -129,7 +111,7 @@ def prepared(job, args):
 
 
 def _start(case, grid, events, rng):
-    """Return where a run begins: at the reference; on a wrong map anywhere, or around a free pose."""
+    """Return the pose at which a run begins: the reference; on a wrong map a free pose, or None for anywhere."""
     if case != "wrong":
         return events[0].truth
     return None if rng.integers(2) else gs.worlds.free_pose(grid, rng, 0.2)
@@ -154,9 +136,8 @@ def run_shard(args):
                                beams=args.beams, seed=job[-1]))  # fmt: skip
             kept.append(repr(job))
     lengths = np.array([len(one) for one in rows])
-    options = [word for k, word in enumerate(sys.argv) if k and "--raw" not in sys.argv[k - 1 : k + 1]]
     np.savez_compressed(args.raw, jobs=np.array(kept), lengths=lengths, rows=np.concatenate(rows).astype(np.float32),
-                        command=" ".join(["bench/studies/verdict.py", *options]))  # fmt: skip
+                        command=command_line("bench/studies/verdict.py"))  # fmt: skip
     print(f"{len(kept)} runs, {lengths.sum()} scans in {time.time() - begin:.0f} s: {args.raw}")
 
 
@@ -168,8 +149,7 @@ def _shard(text):
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--backend", default="opencl")
+    parser = make_parser(__doc__, backend="opencl", seed=False)
     parser.add_argument("--model", default="field", choices=("field", "beam", "discrete"))
     parser.add_argument("--particles", type=int, default=500)
     parser.add_argument("--beams", type=int, default=60)
@@ -182,12 +162,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, help="begin no more runs of the shard after this time")
     parser.add_argument("--raw", type=Path, default=Path("verdict_shard.npz"), help="file of the shard's runs")
     parser.add_argument("--join", type=Path, nargs="+", help="files of shards to report on")
-    parser.add_argument("--out", type=Path, help="a .json file; the page goes to the .md file beside it")
-    args = parser.parse_args()
+    args = parse(parser)
     if args.join is None:
         run_shard(args)
         return
-    write(args.join, args.out)
+    text, report = page(args.join)
+    publish(__file__, args, text, report)
 
 
 if __name__ == "__main__":

@@ -1,16 +1,15 @@
 """The verdict on short logs in small worlds: how often "tracking" is wrong, by the number of scans.
 
-Every second log is of another building than the map. Two of three filters begin anywhere, the others at the first pose,
-or, in the map of another building, around a free pose. Buildings have sides of 10 to 24 m, scanners 60 to 360 beams and
-ranges up to 8, 12 or 20 m; the robot goes 2 to 20 cm a scan. A pose is wrong off by 1 m or 0.5 rad, or on another map.
+Every second log comes from another building than the map. Two of three filters begin anywhere, the other ones at the
+first pose, or around a free pose where the building is another one. Buildings have sides of 10 to 24 m, scanners 60 to
+360 beams and ranges up to 8, 12 or 20 m; the robot goes 2 to 20 cm a scan. A pose is wrong with an error above 1 m or
+0.5 rad, or on the map of another building.
 
-    python bench/studies/verdict_short.py --seconds 300 --out verdict_short.json
+    python bench/studies/verdict_short.py --seconds 300 --output verdict_short
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import sys
 import time
@@ -20,11 +19,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
 import recordings
-import verdict_runs as runs
+from common import make_parser, parse, publish, table
 
 import gpusense as gs
 from gpusense._util.progress import progress
-from gpusense.evaluation.machine import machine, machine_line
 
 SCANS = (10, 20, 30, 40, 60)
 KINDS = ("anywhere", "at a pose")
@@ -33,7 +31,7 @@ FAR, FAR_TURN = 1.0, 0.5
 
 
 def follow(seed, backend):
-    """Return the kind of the start, and p_lost, whether tracked and whether wrong, after each number of ``SCANS``."""
+    """Return the kind of the start, and p_lost, whether "tracking" and whether wrong after each number of ``SCANS``."""
     rng = np.random.default_rng((31, seed))
     other, start = seed % 2 == 1, KINDS[int(seed // 2 % 3 == 2)]
 
@@ -50,52 +48,41 @@ def follow(seed, backend):
         grid, scanner, scans=max(SCANS), hidden=float(rng.choice([0, 0, 0.1])),
         step=float(rng.choice([0.02, 0.05, 0.1, 0.2])), seed=seed, backend="numpy", **world,
     )  # fmt: skip
-    pf = gs.ParticleFilter(
-        recordings.field(backend, beams=60)(grid, scanner), particles=2000 if start == "anywhere" else 500, seed=seed
-    )
-    if start == "anywhere":
-        pf.initialize_uniform()
-    else:
-        mean = gs.worlds.free_pose(grid, rng, 0.2) if other else run.poses[0]
-        pf.initialize(mean=mean, covariance=np.diag(np.square(runs.START)))
+    models = [recordings.field(backend, beams=60)(grid, scanner)]
+    pf = gs.ParticleFilter(models, particles=2000 if start == "anywhere" else 500, seed=seed)
+    at = gs.worlds.free_pose(grid, rng, 0.2) if other and start != "anywhere" else run.poses[0]
+    recordings.start_at(pf, None if start == "anywhere" else at)
     rows = []
-    for k in range(max(SCANS)):
-        if k:
-            pf.predict(run.odometry[k - 1], run.odometry[k])
-        pf.correct(run.scans[k])
+    for k, event in enumerate(recordings.play(pf, models, recordings.simulated_events(run))):
         e = pf.estimate()
-        d = e.pose - run.poses[k]
-        wrong = other or math.hypot(d[0], d[1]) > FAR or abs(math.remainder(d[2], math.tau)) > FAR_TURN
+        distance, turn = recordings.errors(e.pose, event.truth)
+        wrong = other or distance > FAR or turn > FAR_TURN
         if k + 1 in SCANS:
             rows.append((e.p_lost, e.verdict == "tracking", wrong))
     return start, np.array(rows, np.float64)
 
 
-def table(found):
-    """Return the lines of the table."""
-    lines = ["| start | scans | runs | tracked | of them wrong | said [%] | right | of them tracked |",
-             "| --- | --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
+COLUMNS = ("start", "scans", "runs", "tracked", "of them wrong", "said [%]", "right", "of them tracked")
+
+
+def cells(found):
+    """Yield the cells of each row of the table."""
     for kind in KINDS:
         rows = np.array([each for start, each in found if start == kind])
-        for k, scans in enumerate(SCANS):
-            if not len(rows):
-                continue
+        for k, scans in enumerate(SCANS if len(rows) else ()):
             p, tracked, wrong = rows[:, k].T
             tracked, wrong = tracked > 0, wrong > 0
             said = 100 * p[tracked].mean() if tracked.any() else math.nan
-            lines.append(f"| {kind} | {scans} | {len(rows)} | {tracked.sum()} | {(tracked & wrong).sum()} | {said:.1f} "
-                         f"| {(~wrong).sum()} | {(tracked & ~wrong).sum()} |")  # fmt: skip
-    return lines
+            yield (kind, scans, len(rows), tracked.sum(), (tracked & wrong).sum(), f"{said:.1f}", (~wrong).sum(),
+                   (tracked & ~wrong).sum())  # fmt: skip
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--backend", default="opencl")
+    parser = make_parser(__doc__, backend="opencl", seed=False)
     parser.add_argument("--runs", type=int, default=120)
     parser.add_argument("--first", type=int, default=5000, help="first seed; constants were chosen below 2000")
     parser.add_argument("--seconds", type=float, default=math.inf, help="begin no more runs after this time")
-    parser.add_argument("--out", type=Path, help="a .json file; the table goes to the .md file beside it")
-    args = parser.parse_args()
+    args = parse(parser)
     found, begin = [], time.time()
     with progress(args.runs) as step:
         for seed in range(args.first, args.first + args.runs):
@@ -103,14 +90,8 @@ def main() -> None:
                 break
             step(f"run {seed}")
             found.append(follow(seed, args.backend))
-    lines = table(found)
-    print("\n".join(lines))
-    if args.out is not None:
-        command = " ".join(["bench/studies/verdict_short.py", *sys.argv[1:]])
-        results = [dict(start=start, rows=rows.tolist()) for start, rows in found]
-        args.out.write_text(json.dumps(dict(machine=machine(), command=command, results=results), indent=1))
-        text = "\n".join(lines)
-        args.out.with_suffix(".md").write_text(f"{machine_line()}\n\n`python {command}`\n\n{text}\n")
+    results = [dict(start=start, rows=rows.tolist()) for start, rows in found]
+    publish(__file__, args, table(COLUMNS, cells(found)), dict(results=results))
 
 
 if __name__ == "__main__":

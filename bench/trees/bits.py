@@ -47,12 +47,12 @@ from trees.models import make_models
 from trees.tasks import run_filter, run_match
 
 ROOT, SCRIPT = Path(__file__).resolve().parents[2], Path(__file__).resolve().parents[1] / "compare_trees.py"
-# Cases that share a model, and numbers of a result that are shown.
+# Cases of a model, and values of a result that are shown.
 ROUND, SHOWN = 10, 3
 
 
 def digest(label: str, value: Any) -> list[Any]:
-    """Return what is kept of a result: label, how many numbers, their kind and shape, a digest, and the first few."""
+    """Return the record of a result: label, number of values, dtype and shape, a digest, and the first few values."""
     if isinstance(value, str):
         return [label, 0, "text", value]
     array = on_host(value)
@@ -62,7 +62,7 @@ def digest(label: str, value: Any) -> list[Any]:
 
 
 def outcome_of(action: Callable[[Case], Outcome], case: Case) -> list[list[Any]]:
-    """Return what is kept of a case: results, and the error that ended it."""
+    """Return the record of a case: its results, and the error that ended it."""
     return kept_of(results_of(action, case))
 
 
@@ -72,7 +72,7 @@ def results_of(action: Callable[[Case], Outcome], case: Case) -> Iterator[tuple[
 
 
 def kept_of(results: Iterable[tuple[str, Any]]) -> list[list[Any]]:
-    """Return what is kept of results, and of the error that ended them."""
+    """Return the record of results, and of the error that ended them."""
     kept = []
     try:
         for label, value in results:
@@ -91,7 +91,7 @@ class Record:
         self._begin = self._said = time.perf_counter()
 
     def add(self, name: str, kept: list[list[Any]]) -> None:
-        """Keep a case, and say now and then how many there are."""
+        """Keep a case, and print progress from time to time."""
         self.cases[name] = kept
         self.numbers += sum(each[1] for each in kept)
         self.errors += sum(each[0].startswith("error") for each in kept)
@@ -105,7 +105,7 @@ class Record:
 
 
 def record_rays(record: Record, arguments: argparse.Namespace, devices: tuple[Device, Device]) -> None:
-    """Cast rays until enough are cast."""
+    """Cast the wanted number of rays."""
     each = POSES_OF_RAYS * BEARINGS_OF_RAYS
     part, parts = arguments.part
     for number in range(part, -(-arguments.rays // each), parts):
@@ -182,7 +182,7 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def differences(old: list[list[Any]], new: list[list[Any]], messages: bool) -> Iterator[tuple[Any, Any]]:
-    """Find the results of a case that differ."""
+    """Yield the results of a case that differ."""
     for one, other in itertools.zip_longest(old, new):
         both = one is not None and other is not None and one[:3] == other[:3]
         texts = both and one[2] == "text" and not messages
@@ -224,7 +224,7 @@ def compare_command(arguments: argparse.Namespace) -> int:
 
 
 def bits_command(arguments: argparse.Namespace) -> int:
-    """Record both trees, each by a process of its own, and compare."""
+    """Record both trees, each in its own process, and compare the records."""
     with tempfile.TemporaryDirectory() as folder:
         records = []
         for name, tree in (("old", arguments.old), ("new", arguments.new)):
@@ -243,7 +243,7 @@ def bits_command(arguments: argparse.Namespace) -> int:
 
 
 def part_of(text: str) -> tuple[int, int]:
-    """Read which part of how many."""
+    """Read "i/n"."""
     part, parts = (int(number) for number in text.split("/"))
     if not 0 <= part < parts:
         raise argparse.ArgumentTypeError(f"must be i/n with 0 <= i < n, got {text}")
@@ -251,7 +251,7 @@ def part_of(text: str) -> tuple[int, int]:
 
 
 def add_cases(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say which cases are run."""
+    """Add the options that choose the cases."""
     parser.add_argument("--backend", default="opencl", help="selection string")
     parser.add_argument("--rays", type=int, default=2_000_000)
     parser.add_argument("--models", type=int, default=15_000, help="cases of models")

@@ -1,13 +1,13 @@
 """Time calls of one version of gpusense on request: the child of speed.py.
 
-It uses NumPy and the public interface alone, so that it runs with any version of the package that is on the path.
-Arguments are the file of arrays that the parent wrote, and a backend. The first line of standard output describes
-package and device and lists the rows. Then each line of standard input is a request, and each has a line of answer:
+It uses only NumPy and the public interface, so it runs with any version of the package on the path. Arguments are the
+file of arrays that the parent wrote, and a backend. The first line of standard output describes package and device and
+lists the rows. Each line of standard input is then a request, which is answered by one line:
 
-- ``{"row": LABEL, "calls": 0}`` makes the calls of a row ready and runs two: seconds of the second, and a digest of
-  the bits of its result;
-- ``{"row": LABEL, "calls": N}`` runs that many of the row made ready last, after one that does not count: seconds of
-  the shortest.
+- ``{"row": LABEL, "calls": 0}`` prepares a row and runs two calls: seconds of the second one, and a digest of the bits
+    of its result;
+- ``{"row": LABEL, "calls": N}`` runs that many calls of the prepared row, after one that is not counted: seconds of the
+    shortest.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 import gpusense as gs
 
 MODELS = {"field": gs.LikelihoodFieldModel, "beam model": gs.BeamModel}
-# Calls of a bound call that are waited for together.
+# Number of bound calls before a wait.
 IN_A_ROW = 20
 
 
@@ -103,7 +103,7 @@ class Warp(Host):
 # Particles of filters.
 FILTERS = (500, 4000)
 
-# Makes the calls of a row ready: a function that runs some and waits, the result, and how many it runs.
+# Prepares a row: a function that runs calls and waits, the result, and the number of calls.
 Ready = tuple[Callable[[], Any], Callable[[], np.ndarray], int]
 
 
@@ -112,7 +112,7 @@ class Rows:
 
     Attributes:
         info: The device, as a model describes it.
-        makers: Functions that make the rows ready, by label.
+        makers: Functions that prepare the rows, by label.
     """
 
     def __init__(self, arrays: dict[str, np.ndarray], selection: str) -> None:
@@ -200,7 +200,7 @@ class Rows:
         return run, lambda: np.asarray(found[0]), 1
 
     def _follow(self, place: Host, name: str, count: int) -> Ready:
-        """Make a filter of the default options ready, whose robot stands still: predict, correct, estimate."""
+        """Prepare a filter with default options whose robot stands still: predict, correct, estimate."""
         model, ranges = self._model(place, name, few=True)
         poses, found = self._arrays["tracking"], []
         pf = gs.ParticleFilter(model, particles=count, seed=1)
@@ -226,7 +226,7 @@ class Rows:
 
 
 def main() -> None:
-    """Answer requests until there are no more."""
+    """Answer requests until the input ends."""
     with np.load(sys.argv[1], allow_pickle=False) as file:
         arrays = {name: file[name] for name in file}
     # Libraries that print do so on standard error.
@@ -241,7 +241,7 @@ def main() -> None:
     for line in sys.stdin:
         request = json.loads(line)
         if not request["calls"]:
-            # The row before gives its memory back first.
+            # Free the memory of the previous row first.
             ready = None
             ready = rows.makers[request["row"]]()
         assert ready is not None

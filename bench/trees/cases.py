@@ -1,4 +1,4 @@
-"""Draw the worlds, poses and readings of cases, to be awkward."""
+"""Draw awkward worlds, poses and readings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ORDINARY = 40_000
 
 @dataclasses.dataclass
 class World:
-    """A map, a scanner, and what it would measure at one pose."""
+    """A map, a scanner, and its scan at one pose."""
 
     grid: gs.OccupancyGrid
     scanner: gs.Scanner
@@ -54,7 +54,7 @@ class Case:
 
 
 def draw_grid(rng: np.random.Generator, most: float = 2.7, resolutions: tuple[float, ...] = ()) -> gs.OccupancyGrid:
-    """Draw a map to trip over, of up to 10 ** most cells on a side."""
+    """Draw an awkward map of up to 10 ** most cells on a side."""
     rows, cols = (int(n) for n in np.ceil(10 ** rng.uniform(0, most, 2)))
     density = rng.choice([0.0, 0.002, 0.02, 0.2, 0.7, 1.0], p=[0.05, 0.3, 0.3, 0.2, 0.1, 0.05])
     cells = np.where(rng.random((rows, cols)) < density, 100, 0)
@@ -102,7 +102,7 @@ def draw_cloud(case: Case, count: int) -> np.ndarray:
 
 
 def draw_scanner(rng: np.random.Generator, grid: gs.OccupancyGrid, wanted: dict[str, Any]) -> gs.Scanner:
-    """Draw a scanner of up to 400 beams; what is wanted of it is as it is wanted."""
+    """Draw a scanner of up to 400 beams; attributes in ``wanted`` are not drawn."""
     options = dict(wanted)
     few = int(10 ** rng.uniform(0, 2.6))
     count = int(rng.choice([few, 0, 1, 17, 64, 65, 129, 181, 400], p=[0.65, 0.01, 0.04, *[0.05] * 6]))
@@ -122,7 +122,7 @@ def draw_scanner(rng: np.random.Generator, grid: gs.OccupancyGrid, wanted: dict[
 
 
 def walk(grid: gs.OccupancyGrid, scanner: gs.Scanner, pose: np.ndarray) -> np.ndarray:
-    """Find roughly what a scanner would measure, by steps of a quarter of a cell; in no way by the package's code."""
+    """Estimate a scan by steps of a quarter of a cell, without the package's code."""
     x, y, turn = scanner.mount
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     dx, dy = pose[0] + cos * x - sin * y - grid.origin[0], pose[1] + sin * x + cos * y - grid.origin[1]
@@ -138,7 +138,7 @@ def walk(grid: gs.OccupancyGrid, scanner: gs.Scanner, pose: np.ndarray) -> np.nd
 
 
 def draw_world(rng: np.random.Generator, config: dict[str, Any]) -> World:
-    """Draw a map and a scanner, and where the scanner is."""
+    """Draw a map, a scanner and its pose."""
     grid = draw_grid(rng, config.get("most", 2.0), config.get("resolutions", (0.05, 0.05, 0.1, 0.1, 1.0, 1e-3)))
     scanner = draw_scanner(rng, grid, config.get("scanner", {}))
     rows, cols = grid.shape
@@ -148,7 +148,7 @@ def draw_world(rng: np.random.Generator, config: dict[str, Any]) -> World:
 
 
 def draw_readings(rng: np.random.Generator, world: World, scans: int | None = None) -> np.ndarray:
-    """Draw a scan, or several: what is there, anything at all, and readings that need care."""
+    """Draw one or several scans: true ranges, random ones, and special readings."""
     top, shape = world.scanner.range_max, (*(() if scans is None else (scans,)), world.scanner.count)
     z = world.truth + rng.standard_normal(shape) * world.grid.resolution * rng.choice([1e-3, 0.5, 2.0])
     z = np.where(rng.random(shape) < 0.1, rng.uniform(0, top, shape), z)
@@ -162,7 +162,7 @@ def draw_readings(rng: np.random.Generator, world: World, scans: int | None = No
 
 
 def draw_count(case: Case) -> int:
-    """Draw how many particles: none to a few thousand, at times more than several scans of one launch may have."""
+    """Draw the number of particles: none to a few thousand, at times more than one launch of several scans may have."""
     rng, rays = case.rng, max(case.world.scanner.count * case.world.scanner.cone_rays, 1)
     if rng.random() < 0.01:
         return 0
@@ -172,5 +172,5 @@ def draw_count(case: Case) -> int:
 
 
 def seeds(seed: int, name: str, *numbers: int) -> np.random.Generator:
-    """Return the randomness of a case or a round."""
+    """Return the seeds of a case or a round."""
     return np.random.default_rng([seed, zlib.crc32(name.encode()), *numbers])

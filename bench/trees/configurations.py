@@ -40,7 +40,7 @@ MIXTURES = {
 
 
 def knobs(name: str, **values: Any) -> Any:
-    """Return a caster with knobs of its own, or its name where they cannot be had."""
+    """Return a caster with other knobs than the default ones, or its name in versions without knobs."""
     return name.lower() if casters is None else getattr(casters, name)(**values)
 
 
@@ -55,7 +55,7 @@ def learned() -> Any:
 
 
 def beam(name: str = "book", scanner: dict[str, Any] | None = None, **options: Any) -> dict[str, Any]:
-    """Return a configuration of a beam model; what does not concern the model stands beside its options."""
+    """Return a configuration of a beam model; settings of world and scanner stand beside its options."""
     own = {key: options.pop(key) for key in ("most", "slow", "resolutions", "bins") if key in options}
     if not {"incidence", "compat", "parameters"} & set(options):
         options["parameters"] = gs.BeamParameters(*MIXTURES[name])
@@ -70,7 +70,7 @@ def beam_mixtures() -> Kinds:
 
 
 def beam_casters() -> Kinds:
-    """Return beam models with each caster, and with both policies."""
+    """Return beam models with each caster, and with both policies for unknown and outside cells."""
     both = {"unknown": "occupied", "outside": "occupied"}
     tables = {"most": 1.6, "slow": True}
     return {
@@ -93,7 +93,7 @@ def beam_casters() -> Kinds:
 
 
 def beam_options() -> Kinds:
-    """Return beam models with tables, other peers' weights, some of the beams, and nothing left out."""
+    """Return beam models with tables, peers' weights, some of the beams, and without specialisation."""
     mounted = {"mount": (0.7, -0.4, 0.9)}
     discrete = {"scanner": {"range_max": 10.0}, "resolutions": (0.05, 0.1, 0.5)}
     separate = gs.DiscreteBeamModel(gs.BeamParameters(), 10.0, 40)
@@ -249,7 +249,8 @@ def points() -> Kinds:
 
 
 def configurations() -> Kinds:
-    """Return every configuration of models, by name; every fourth with huge headings, every third on a queue too."""
+    """Return every configuration of models by name; every fourth has huge headings, every third also runs on a
+    queue."""
     found = beam_mixtures() | beam_casters() | beam_options() | beam_echoes() | fields() | severals() | landmarks()
     found |= points() | {"tables": {"kind": "tables"}}
     for i, config in enumerate(found.values()):

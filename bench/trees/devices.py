@@ -13,7 +13,7 @@ from trees.cases import Device
 
 
 def pyopencl_device(info: Any) -> Device | None:
-    """Return a user's queue on a device, whose arrays are pyopencl's; None where there is no such library."""
+    """Return a device with a user's queue and pyopencl's arrays; None without pyopencl."""
     try:
         import pyopencl as cl
         import pyopencl.array
@@ -35,7 +35,7 @@ def pyopencl_device(info: Any) -> Device | None:
 
 
 def warp_device(selection: str, info: Any) -> Device | None:
-    """Return a device whose arrays are Warp's; None where there is no such library."""
+    """Return a device with Warp's arrays; None without Warp."""
     try:
         import warp as wp
     except ImportError:
@@ -51,7 +51,7 @@ def warp_device(selection: str, info: Any) -> Device | None:
 
 
 def devices_of(selection: str, as_gpu: bool) -> tuple[Device, Device, Any]:
-    """Return where most cases run, where those with arrays on the device do, and the package's description of it."""
+    """Return the device of most cases, the one for cases with arrays on the device, and its description."""
     info = gs.RayCaster(gs.OccupancyGrid([[0]]), 1.0, backend=selection).device
     there = None
     if info.backend == "opencl":

@@ -1,4 +1,4 @@
-"""Compare the rates of two trees (checkouts) in one run: time of the new one over that of the old one, row by row.
+"""Compare the rates of two trees (checkouts) in one run: the ratio of new to old time, row by row.
 
     python bench/compare_trees.py speed --old ../before                     # against this checkout
     python bench/compare_trees.py speed --old ../before --new . --backend warp:cuda:0 --blocks 5 --output NAME
@@ -7,16 +7,16 @@
 Rows are those of limits.py and small_calls.py that the public interface has: rays, beam model and field with a cloud
 over the whole map and one around a pose, calls of 2000 and 4000 particles x 60 beams, ordinary and bound, several scans
 in one call, steps of filters with 500 and 4000 particles (predict, correct, estimate), and the preparation of the map;
-with NumPy arrays, and on GPUs with poses and results on the device, where a call is its launches and their start.
+with NumPy arrays, and on GPUs also with poses and results on the device, where a call is only its launches.
 
-Each tree has a process of its own (calls.py), and both have the same arrays. The processes take turns in the order
-old, new, new, old, so that a machine that becomes slower favours neither. A turn takes --seconds, and its time is that
-of its shortest call. Each pair of neighbouring turns has a ratio. A block is a new pair of processes, since two
-processes of one tree differ too.
+Each tree runs in its own process (calls.py) on the same arrays. The processes take turns in the order old, new, new,
+old, so that a machine that slows down favours neither. A turn takes --seconds; its time is the one of its shortest
+call. Each pair of neighbouring turns gives a ratio. A block is a new pair of processes, since two processes of one tree
+also differ.
 
-The table has the medians of the turns' times, the median and the quartiles of all ratios, the medians of the blocks,
-and the ratio of the shortest turns. A row is slower where all of these but the upper quartile are above --limit. Exit
-code 1 where a row is slower, or where --bits is set and a result has other bits.
+The table shows the median times of the turns, the median and the quartiles of all ratios, the medians of the blocks,
+and the ratio of the shortest turns. A row is slower where all of these but the upper quartile are above --limit. The
+exit code is 1 where a row is slower, or where --bits is set and bits of a result differ.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ COLUMNS = ("backend", "what", "old, ms", "new, ms", "new / old", "quartiles", "b
 
 
 def write_arrays(path: Path, arguments: argparse.Namespace) -> str:
-    """Write map, clouds and scans that both trees are to work on, and return the map in words."""
+    """Write the map, clouds and scans for both trees, and return the map in words."""
     scene = Scene(arguments)
     wide, few = scene.scanner(arguments.beams), scene.scanner(FEW)
     count = max(arguments.particles, 1000)
@@ -85,7 +85,7 @@ class Tree:
         return answer
 
     def ask(self, row: str, calls: int) -> dict[str, Any]:
-        """Run calls of a row; 0 to make it ready."""
+        """Run calls of a row; 0 prepares it."""
         assert self._process.stdin is not None
         print(json.dumps({"row": row, "calls": calls}), file=self._process.stdin, flush=True)
         return self._answer()
@@ -99,7 +99,7 @@ def pairs_of(trees: tuple[Tree, Tree], row: str, arguments: argparse.Namespace) 
     """Time a row in turns.
 
     Returns:
-        Seconds of the old and of the new tree for each pair of turns, and whether results have the same bits.
+        Seconds of the old and the new tree for each pair of turns, and whether results have the same bits.
     """
     first = [tree.ask(row, 0) for tree in trees]
     longest = max(answer["seconds"] * answer["each"] for answer in first)
@@ -117,7 +117,7 @@ def measure(backend: str, arrays: Path, arguments: argparse.Namespace) -> list[d
     found: dict[str, dict[str, Any]] = {}
     for block in range(arguments.blocks):
         places = (arguments.old, arguments.new)
-        # The process that starts first is another one in each block.
+        # Blocks start with either process in turn.
         made = {number: Tree(places[number], arrays, backend) for number in ((0, 1) if block % 2 == 0 else (1, 0))}
         trees = made[0], made[1]
         about = trees[0].about

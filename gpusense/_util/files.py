@@ -5,7 +5,6 @@ from __future__ import annotations
 import atexit
 import contextlib
 import os
-import secrets
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -50,6 +49,8 @@ def write_several(writers: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
     Args:
         writers: Functions that write the contents to a binary stream, by file.
     """
+    import secrets
+
     tag = secrets.token_hex(4)
     fresh = {target: target.with_name(f".{target.name}.{tag}.new") for target in writers}
     backup = {target: target.with_name(f".{target.name}.{tag}.old") for target in writers}
@@ -85,6 +86,8 @@ def write_several(writers: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
 
 def _write_fresh(path: Path, write: Callable[[BinaryIO], object], target: Path | None) -> None:
     """Write a new file in the folder of ``path``, and rename it to the target, or delete it."""
+    import secrets
+
     fresh = path.parent / f".gpusense-{secrets.token_hex(6)}.new"
     # An interrupt may come before the first clean-up.
     try:

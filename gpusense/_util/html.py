@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import struct
 import zlib
 from collections.abc import Iterable, Sequence
@@ -77,5 +76,7 @@ def grey_png(pixels: NDArray[np.uint8]) -> bytes:
 
 
 def _text(value: object) -> str:
+    import html
+
     text = f"{value:.5g}" if isinstance(value, float) else str(value)
     return html.escape(text if len(text) <= LONGEST else f"{text[:LONGEST]} ...")

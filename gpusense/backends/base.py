@@ -17,6 +17,7 @@ import numpy as np
 
 from gpusense.backends.info import BackendInfo
 from gpusense.backends.recording import Recording, pluralize
+from gpusense.backends.recycled import ResultMemory
 from gpusense.interface.launches import Program
 
 Buffer = Any
@@ -62,6 +63,8 @@ class Backend(ABC):
 
     info: BackendInfo
     alignment: int = 1
+    # Memory of freed results on the host; None where a new array costs less.
+    _results: ResultMemory | None = None
 
     # ---- buffers and copies
 
@@ -89,7 +92,7 @@ class Backend(ABC):
 
     def empty_result(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
         """Return a new host array for a result; large arrays reuse the memory of earlier results that were freed."""
-        return np.empty(shape, dtype)
+        return np.empty(shape, dtype) if self._results is None else self._results.empty(shape, dtype)
 
     @abstractmethod
     def part(self, buffer: Buffer, first: int, count: int, dtype: np.dtype) -> Buffer:

@@ -12,7 +12,6 @@ import importlib
 import json
 import os
 import re
-import secrets
 import signal
 import subprocess
 import sys
@@ -115,6 +114,8 @@ def run_text(arguments: list[str], job: dict[str, Any], variables: dict[str, str
             with the ``token`` that is added to the job.
         variables: Further variables of its environment.
     """
+    import secrets
+
     # The child must not start children.
     environment = os.environ | {"GPUSENSE_PROOF": "off"} | (variables or {})
     command = [sys.executable, *arguments]

@@ -11,6 +11,7 @@ import copy
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.angles import wrapped
 from gpusense.chaining.following import matched_again, matched_by_motion, motions_around, weakened
 from gpusense.chaining.links import MATCH, Links, chained
 from gpusense.chaining.matcher import GROUP, NEAR, SURE, Matcher
@@ -307,7 +308,7 @@ def moved_scans(odometry: Floats | None, readings: Floats, step: tuple[float, fl
         return np.arange(len(readings))
     chosen, last = [0], odometry[0].tolist()
     for k, pose in enumerate(odometry.tolist()):
-        turn = abs((pose[2] - last[2] + np.pi) % (2 * np.pi) - np.pi)
+        turn = abs(wrapped(pose[2] - last[2]))
         moved = np.hypot(pose[0] - last[0], pose[1] - last[1]) >= step[0] or turn >= step[1]
         if k and (moved or _are_unlike(readings[chosen[-1]], readings[k])):
             chosen.append(k)

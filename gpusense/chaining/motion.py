@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from gpusense.localization.motion import OdometryMotion
 from gpusense.localization.motion_fit import fit_odometry_motion
 from gpusense.localization.pose_algebra import pose_difference, wrap_angle
+from gpusense.world.deskew import part_of_arc
 
 Floats = NDArray[np.float64]
 
@@ -95,13 +96,8 @@ def relative(poses: Floats, first: NDArray[np.int64], second: NDArray[np.int64])
 
 
 def partial_motion(motion: Floats, share: Floats) -> Floats:
-    """Return the motions (L, 3) after a share (L,) of full motions, which are arcs (see ``gpusense.world.deskew``)."""
-    half = motion[:, 2] / 2
-    length = share * np.sinc(share * half / math.pi) / np.sinc(half / math.pi)
-    turn = (share - 1) * half
-    c, s = length * np.cos(turn), length * np.sin(turn)
-    x, y = motion[:, 0], motion[:, 1]
-    return np.stack([c * x - s * y, s * x + c * y, 2 * share * half], axis=1)
+    """Return the motions (L, 3) after a share (L,) of full motions, which are arcs."""
+    return np.stack(part_of_arc(motion, share), axis=1)
 
 
 def filled_motion(motion: Floats, expected: Floats, unseen: Floats) -> Floats:

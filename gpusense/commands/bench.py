@@ -27,7 +27,7 @@ LESS_EXACT = 1
 PROBLEMS = ("ranges", "beam", "field")
 PRECISIONS = ("float32", "float64")
 DEFAULTS: dict[str, Any] = {"particles": None, "checked": 512, "beams": 360, "repeats": 20, "seed": 0}
-QUICK: dict[str, Any] = {"particles": 128, "checked": 128, "beams": 60, "repeats": 20, "seed": 0}
+QUICK: dict[str, Any] = {"particles": 128, "checked": 128, "beams": 60, "repeats": 10, "seed": 0}
 # Measuring time after which a quick run begins no further point, and its longest time to build a table [s].
 _QUICK_DEADLINE, _QUICK_BUILD = 40.0, 3.0
 # Tables that take longer [s] are built once in a quick run; their times then include compiling.
@@ -53,7 +53,8 @@ or the most exact with a call of at most --max-time. Nats are the KL divergence 
 its mean, both at a comparable temperature; percents are rays wrong by more than a cell, cells the range error that 95 %
 of the rays keep. The times are of calls of --particles times --beams.
 
---quick builds a table that takes more than 0.1 s once, and its time to build then includes compiling.
+--quick builds a table that takes more than 0.1 s once, and its time to build then includes compiling; a look-up table
+or CDDT serves both clouds of a scene.
 
 --compare OLD repeats the measurements of the old report, with its particles, beams and seed unless options change
 them, and lists points that became slower or less exact; --compare OLD NEW compares two reports without measuring.
@@ -77,7 +78,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--compare", nargs="+", type=Path, metavar=("OLD", "NEW"), help="compare with an old report, or two reports")
     add("--slower", type=positive_number, default=1.3, metavar="F",
         help="with --compare, factor of the times above which a point is slower (default: %(default)s)")  # fmt: skip
-    add("--quick", action="store_true", help="small maps, few values of the knobs, float32: a minute plus compiling")
+    add("--quick", action="store_true",
+        help="small maps, few values of the knobs, float32: half a minute plus compiling")  # fmt: skip
     add("--scene", action="append", metavar="NAME", help="a scene; may be repeated (default: all)")
     add("--map", action="append", default=[], type=Path, metavar="YAML",
         help="a map_server map as a further scene; may be repeated")  # fmt: skip
@@ -92,7 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="particles of a timed call; NumPy gets an eighth (default: GPU 4096, processor 1024)")  # fmt: skip
     add("--checked", type=whole_number(low=2), metavar="M", help="particles whose errors are computed (default: 512)")
     add("--beams", type=whole_number(low=1, high=100_000), metavar="K", help="beams of the scanner (default: 360)")
-    add("--repeats", type=whole_number(low=1), metavar="R", help="timed calls per point (default: 20)")
+    add("--repeats", type=whole_number(low=1), metavar="R", help="timed calls per point (default: 20; with --quick 10)")
     add("--seconds", type=positive_number, default=5.0, metavar="S",
         help="longest time of a point's timed calls, at least three of them [s] (default: %(default)s)")  # fmt: skip
     add("--build-limit", type=positive_number, metavar="S",

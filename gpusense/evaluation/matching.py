@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.angles import wrapped
 from gpusense.backends import Selection
 from gpusense.localization.pose_algebra import compose_poses
 from gpusense.logs import Scan
@@ -56,13 +57,13 @@ class LogMatches:
 def differences(poses: Floats, others: Floats) -> tuple[Floats, Floats]:
     """Return distances [m] and angles [rad] between (S, 3) poses."""
     off = poses - others
-    return np.hypot(off[:, 0], off[:, 1]), np.abs(np.remainder(off[:, 2] + math.pi, 2 * math.pi) - math.pi)
+    return np.hypot(off[:, 0], off[:, 1]), np.abs(wrapped(off[:, 2]))
 
 
 def relative_poses(first: Floats, second: Floats) -> Floats:
     """Return (S, 3) second poses in the frames of first ones."""
     c, s, off = np.cos(first[:, 2]), np.sin(first[:, 2]), second - first
-    turn = np.remainder(off[:, 2] + math.pi, 2 * math.pi) - math.pi
+    turn = wrapped(off[:, 2])
     return np.stack([c * off[:, 0] + s * off[:, 1], -s * off[:, 0] + c * off[:, 1], turn], axis=1)
 
 

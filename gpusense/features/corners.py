@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from gpusense._util.angles import wrapped
 from gpusense.features.lines import scores_of
 from gpusense.features.result import Found
 from gpusense.features.segments import Segments
@@ -20,7 +21,7 @@ def find_corners(segments: Segments, straight: np.ndarray, mount: tuple[float, f
     """Return the corners of scans: inner ones open by less than pi, outer ones by more."""
     one, two, between = _neighbours(segments, straight)
     alpha, beta = segments.angle[one], segments.angle[two]
-    turn = np.mod(beta - alpha + math.pi, 2 * math.pi) - math.pi
+    turn = wrapped(beta - alpha)
     clear = np.abs(np.sin(turn)) > math.sin(_LEAST_TURN)
     one, two, between, turn, alpha, beta = (v[clear] for v in (one, two, between, turn, alpha, beta))
     normals = np.stack([np.cos(alpha), np.sin(alpha), np.cos(beta), np.sin(beta)], axis=1).reshape(-1, 2, 2)

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gpusense._util.angles import wrapped
 from gpusense.features.beams import Beams
-from gpusense.features.hallways import pairs_of, wrapped
+from gpusense.features.hallways import first_apart, pairs_of
 from gpusense.features.lines import scores_of
 from gpusense.features.result import Found
 from gpusense.features.segments import Segments
@@ -117,16 +118,11 @@ def _one_each(segments: Segments, gaps: _Gaps, sure: np.ndarray) -> np.ndarray:
     order = np.lexsort((ends[:, 1] - ends[:, 0], ~sure, segments.scan[wall]))
     middle = segments.place(wall, ends[:, :2].mean(axis=1))
     width = ends[:, 1] - ends[:, 0]
-    scan = segments.scan[wall]
-    kept: list[int] = []
-    taken: list[int] = []
-    for k in order.tolist():
-        if taken and scan[taken[0]] != scan[k]:
-            taken = []
-        if all(np.hypot(*(middle[j] - middle[k])) > 0.5 * (width[j] + width[k]) for j in taken):
-            taken.append(k)
-            kept.append(k)
-    return np.array(kept, np.int64)
+
+    def do_not_overlap(k: int, j: int) -> bool:
+        return bool(np.hypot(*(middle[j] - middle[k])) > 0.5 * (width[j] + width[k]))
+
+    return first_apart(order, segments.scan[wall], do_not_overlap)
 
 
 def _ordered(segments: Segments, one: np.ndarray, two: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

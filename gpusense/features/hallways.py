@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
+from gpusense._util.angles import wrapped
 from gpusense.features.lines import in_robot_frame, scores_of
 from gpusense.features.result import Found
 from gpusense.features.segments import Segments
@@ -26,12 +28,6 @@ def pairs_of(scan: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     one = np.repeat(number, count)
     two = np.arange(len(one)) - np.repeat(np.cumsum(count) - count, count) + one + 1
     return one, two
-
-
-def wrapped(angle: np.ndarray) -> np.ndarray:
-    """Return angles in -pi to pi."""
-    result: np.ndarray = np.mod(angle + math.pi, 2 * math.pi) - math.pi
-    return result
 
 
 def find_hallways(segments: Segments, straight: np.ndarray, mount: tuple[float, float, float]) -> Found:
@@ -88,13 +84,21 @@ def _extents(segments: Segments, lines: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def _one_each(scan: np.ndarray, angle: np.ndarray, length: np.ndarray) -> np.ndarray:
     """Choose the pair with the longest walls of each scan and axis."""
-    order = np.lexsort((-length, scan))
+
+    def on_another_axis(k: int, j: int) -> bool:
+        return abs(math.remainder(angle[k] - angle[j], math.pi)) > _ONE_AXIS
+
+    return np.sort(first_apart(np.lexsort((-length, scan)), scan, on_another_axis))
+
+
+def first_apart(order: np.ndarray, scan: np.ndarray, are_apart: Callable[[int, int], bool]) -> np.ndarray:
+    """Choose in an order, scan after scan, each index that is apart from those chosen before in its scan."""
     kept: list[int] = []
     taken: list[int] = []
     for k in order.tolist():
         if taken and scan[taken[0]] != scan[k]:
             taken = []
-        if all(abs(math.remainder(angle[k] - angle[j], math.pi)) > _ONE_AXIS for j in taken):
+        if all(are_apart(k, j) for j in taken):
             taken.append(k)
             kept.append(k)
-    return np.sort(np.array(kept, np.int64))
+    return np.array(kept, np.int64)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gpusense._util.angles import wrapped
 from gpusense.features.feature_map import FeatureMap
 from gpusense.features.result import KIND_TYPE, Features, Floats, across_lines
 
@@ -57,7 +58,7 @@ def lines_of(features: Features, poses: Floats, spread: Floats, least: int) -> F
     rows = [i for i in range(len(pieces.theta)) if len(np.unique(features.scan[label == i])) >= least]
     sine, cosine = np.sin(pieces.theta[rows]), np.cos(pieces.theta[rows])
     normal = np.column_stack([-sine, cosine])
-    theta = np.mod(pieces.theta[rows] + math.pi, 2 * math.pi) - math.pi
+    theta = wrapped(pieces.theta[rows])
     return FeatureMap(
         np.full(len(rows), "line", KIND_TYPE), np.column_stack([pieces.middle[rows], theta]),
         pieces.covariance[rows, 0, 0, None, None] * normal[:, :, None] * normal[:, None, :], 2 * pieces.half[rows],
@@ -93,7 +94,7 @@ class _Lines:
     def nearest(self, pieces: _Pieces, i: int) -> int:
         """Return the line to which a piece may belong, or -1."""
         n = self.count
-        turn = np.mod(pieces.theta[i] - self._theta[:n] + math.pi, 2 * math.pi) - math.pi
+        turn = wrapped(pieces.theta[i] - self._theta[:n])
         near = np.flatnonzero(np.abs(turn) < _ALIKE)
         along, across = _place(self._origin[near], self._theta[near], pieces.middle[i])
         inside = (along - pieces.half[i] < self._ends[near, 1] + _GAP) & (
@@ -119,7 +120,7 @@ class _Lines:
             self._origin[j], self._theta[j] = pieces.middle[i], pieces.theta[i]
             self._ends[j] = np.inf, -np.inf
         along, across = (float(v[0]) for v in _place(self._origin[[j]], self._theta[[j]], pieces.middle[i]))
-        turn = float(np.mod(pieces.theta[i] - self._theta[j] + math.pi, 2 * math.pi) - math.pi)
+        turn = float(wrapped(pieces.theta[i] - self._theta[j]))
         row, information = _rows(np.array([along]))[0], np.linalg.inv(pieces.covariance[i])
         self._information[j] += row.T @ information @ row
         self._sum[j] += row.T @ information @ (across, turn)
@@ -162,7 +163,7 @@ def _fused(own: _Pieces, label: np.ndarray, count: int) -> _Pieces:
         first = rows[own.covariance[rows, 1, 1].argmin()]
         origin, start = own.middle[first], own.theta[first]
         along, across = _place(np.tile(origin, (len(rows), 1)), np.full(len(rows), start), own.middle[rows])
-        turn = np.mod(own.theta[rows] - start + math.pi, 2 * math.pi) - math.pi
+        turn = wrapped(own.theta[rows] - start)
         ends = (along - own.half[rows]).min(), (along + own.half[rows]).max()
         centre = 0.5 * (ends[0] + ends[1])
         row, information = _rows(along - centre), np.linalg.inv(own.covariance[rows])

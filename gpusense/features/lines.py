@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gpusense._util.angles import wrapped
 from gpusense.features.device import ScanDevice
 from gpusense.features.result import Found
 from gpusense.features.segments import PENALTY, Segments
@@ -54,7 +55,7 @@ def _is_round(device: ScanDevice, segments: Segments) -> np.ndarray:
     part = np.stack([segments.first[one], segments.count[one] + segments.count[two]], axis=1)
     circle = device.circles(part, segments.scan[one], np.zeros((len(one), 4)))
     apart = segments.cost[one] + segments.cost[two]
-    turn = np.abs(np.mod(segments.angle[two] - segments.angle[one] + math.pi, 2 * math.pi) - math.pi)
+    turn = np.abs(wrapped(segments.angle[two] - segments.angle[one]))
     arc = (circle[:, 3] >= 0) & (turn > _LEAST_TURN) & (turn < _LARGEST_TURN)
     found = np.zeros(len(number), bool)
     sure = arc & (circle[:, 3] <= apart + _ROUND)

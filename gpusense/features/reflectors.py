@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from gpusense._util.angles import wrapped
 from gpusense.features.result import Found, nothing
 from gpusense.world.scanner import Reading, Scanner, classes
 
@@ -62,7 +63,7 @@ def _reflector(
         return None
     weight = light[inner] - usual
     weight = weight / weight.sum()
-    turn = np.mod(bearing[inner] - bearing[0] + math.pi, 2 * math.pi) - math.pi
+    turn = wrapped(bearing[inner] - bearing[0])
     distance = float(np.median(r[inner]))
     width = distance * (float(turn.max() - turn.min()) + step)
     if width > _WIDEST:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util import checks
+from gpusense._util.angles import wrapped
 
 Floats = NDArray[np.float64]
 
@@ -129,8 +130,7 @@ class Features:
         across = across_lines(chosen)
         variance, both = across[:, 1, 1], across[:, 0, 1] + middle * across[:, 1, 1]
         far = across[:, 0, 0] + 2 * middle * across[:, 0, 1] + middle**2 * variance
-        wrapped = np.mod(angle + math.pi, 2 * math.pi) - math.pi
-        return np.column_stack([wrapped, c * x + s * y, middle - half, middle + half, variance, both, far])
+        return np.column_stack([wrapped(angle), c * x + s * y, middle - half, middle + half, variance, both, far])
 
     @property
     def signatures(self) -> Floats:
@@ -231,7 +231,7 @@ def features_of(found: dict[str, Found]) -> Features:
         return np.concatenate([np.zeros((0, *shape)), *values])[order]
 
     pose = joined([part.pose for part in parts], (3,))
-    pose[:, 2] = np.mod(pose[:, 2] + math.pi, 2 * math.pi) - math.pi
+    pose[:, 2] = wrapped(pose[:, 2])
     return Features(
         kind[order], scan[order], pose, joined([one for one, _ in pairs], (3, 3)),
         joined([two for _, two in pairs], (3, 3)), joined([part.size for part in parts], ()),

@@ -83,7 +83,7 @@ def find_segments(device: ScanDevice, points: ScanPoints, noise: np.ndarray) -> 
     count = stop[first] - first
     line = device.lines(np.stack([first, count], axis=1), scan)
     closed = _is_closed(points)
-    first, count, scan, line = _joined_around(device, points, closed, first, count, scan, line)
+    first, count, scan, line = _joined_around(device, closed, first, count, scan, line)
     return _described(points, closed, noise, first, count, scan, line)
 
 
@@ -100,9 +100,8 @@ def _is_closed(points: ScanPoints) -> np.ndarray:
 
 
 def _joined_around(
-    device: ScanDevice, points: ScanPoints, closed: np.ndarray, first: np.ndarray, count: np.ndarray,
-    scan: np.ndarray, line: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    device: ScanDevice, closed: np.ndarray, first: np.ndarray, count: np.ndarray, scan: np.ndarray, line: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Join the last segment of a scan with its first one where a single line explains both."""
     begin = np.searchsorted(scan, np.arange(len(closed)))
     end = np.searchsorted(scan, np.arange(len(closed)), side="right") - 1

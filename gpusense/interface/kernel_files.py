@@ -6,6 +6,7 @@ The kernels are written in the top-level folder ``kernels/`` of a checkout and s
 modules do not depend on how the package was installed.
 """
 
+import functools
 import importlib
 import importlib.util
 import sys
@@ -17,6 +18,7 @@ _PACKAGE = "gpusense.kernels"
 _LOCK = threading.Lock()
 
 
+@functools.cache
 def kernel_root() -> Path:
     """Return the folder that holds ``opencl/`` and ``warp/``.
 
@@ -32,8 +34,9 @@ def kernel_root() -> Path:
     raise FileNotFoundError(f"the kernel sources must be in {places}; neither is there: install gpusense again")
 
 
+@functools.cache
 def opencl_source(name: str) -> str:
-    """Return the text of ``opencl/<name>.cl``.
+    """Return the text of ``opencl/<name>.cl``, which is read once.
 
     Args:
         name: The file's name with its subfolder and without its suffix: ``"beam"``, ``"lanes/beam"``.
@@ -55,6 +58,7 @@ def opencl_names() -> list[str]:
     return sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.cl"))
 
 
+@functools.cache
 def has_opencl_source(name: str) -> bool:
     """Return whether there is a file ``opencl/<name>.cl``."""
     return (kernel_root() / "opencl" / f"{name}.cl").is_file()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,15 @@ class Note:
 
     what: str
     why: str
+
+
+class SceneNotes(NamedTuple):
+    """A title, and the parts that a scene leaves out, keeps, and could leave out."""
+
+    title: str
+    omissions: list[Omission]
+    kept: list[Note]
+    could_go: list[Note]
 
 
 @dataclass(frozen=True)

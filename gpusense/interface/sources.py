@@ -29,6 +29,7 @@ typedef {real}4 real4;
 """
 _HEAD = re.compile(r"^kernel void (\w+)\(ARGUMENTS\)", re.MULTILINE)
 _WORD = re.compile(r"\w+")
+_COMMENT, _DOUBLE = re.compile(r"//.*"), re.compile(r"\bdouble[24]?\b")
 _REQUIRES = re.compile(r"^// requires: (.*)$", re.MULTILINE)
 
 
@@ -111,15 +112,27 @@ def _with_requirements(name: str, flags: frozenset[str]) -> list[str]:
 
 
 def _requirements(name: str) -> list[str]:
-    match = _REQUIRES.search(opencl_source(name))
+    return _named_files(opencl_source(name))
+
+
+@functools.lru_cache(maxsize=512)
+def _named_files(text: str) -> list[str]:
+    """Return the files that a source requires."""
+    match = _REQUIRES.search(text)
     return match.group(1).split() if match else []
 
 
 def uses_double(file: str, flags: frozenset[str] = frozenset()) -> bool:
     """Return whether a kernel file computes in float64 also where the model's precision is float32."""
     kept = (_kept(needed, flags - {"FLOAT64"}) for needed in required_files(file, flags))
-    texts = (re.sub(r"//.*", "", text) for text in kept)
-    return any(re.search(r"\bdouble[24]?\b", text + _declarations(text)) for text in texts)
+    return any(_names_double(text) for text in kept)
+
+
+@functools.lru_cache(maxsize=512)
+def _names_double(text: str) -> bool:
+    """Return whether a source, or a struct that it names, has a float64 number."""
+    code = _COMMENT.sub("", text)
+    return _DOUBLE.search(code + _declarations(code)) is not None
 
 
 def _declarations(text: str) -> str:

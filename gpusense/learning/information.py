@@ -1,4 +1,4 @@
-"""Standard errors from the observed information, for independent or correlated readings."""
+"""Standard errors and Newton steps from the observed information, for independent or correlated readings."""
 
 from __future__ import annotations
 
@@ -11,6 +11,44 @@ Floats = NDArray[np.float64]
 
 # Scaled information below this share of the largest counts as none.
 _FLAT = 1e-10
+
+
+def scaled_axes(curve: Floats, least: float = 1e-300) -> tuple[Floats, Floats, Floats]:
+    """Return the eigenvalues and axes of a curvature in scaled coordinates, in which its diagonal is 1.
+
+    Args:
+        curve: (m, m) curvature.
+        least: Smaller elements of the diagonal count as this.
+
+    Returns:
+        (m,) scales of the coordinates, (m,) ascending eigenvalues, and (m, m) axes as columns.
+    """
+    scale = 1 / np.sqrt(np.maximum(np.abs(np.diag(curve)), least))
+    size, axes = np.linalg.eigh(curve * np.outer(scale, scale))
+    return scale, size, axes
+
+
+def newton_direction(
+    gradient: Floats, second: Floats, places: NDArray[np.integer], least: float = 1e-300
+) -> tuple[Floats, float]:
+    """Return the Newton step, uphill even if the function is not concave, and its predicted gain [nats].
+
+    The gain is half the slope along the step.
+
+    Args:
+        gradient: (m,) derivatives of the log-likelihood.
+        second: (m, m) second derivatives.
+        places: Indices of the free coordinates; the step is 0 along the remaining ones.
+        least: As in :func:`scaled_axes`.
+    """
+    step = np.zeros(len(gradient))
+    if not len(places):
+        return step, 0.0
+    scale, size, axes = scaled_axes(-second[np.ix_(places, places)], least)
+    slope = axes.T @ (scale * gradient[places])
+    along = slope / np.maximum(np.abs(size), 1e-9)
+    step[places] = scale * (axes @ along)
+    return step, 0.5 * float(slope @ along)
 
 
 def errors_of(curve: Floats, rows: Floats, scatter: Floats | None = None) -> Floats:
@@ -29,8 +67,7 @@ def errors_of(curve: Floats, rows: Floats, scatter: Floats | None = None) -> Flo
     """
     if not len(curve):
         return np.full(len(rows), math.nan)
-    scale = 1 / np.sqrt(np.maximum(np.abs(np.diag(curve)), 1e-300))
-    size, axes = np.linalg.eigh(curve * np.outer(scale, scale))
+    scale, size, axes = scaled_axes(curve)
     known = size > _FLAT * max(float(size[-1]), 0.0)
     errors = np.empty(len(rows))
     for k, row_of in enumerate(rows):

@@ -25,9 +25,9 @@ class DeviceCloud(Cloud, FilterCloud):
 
     def correct(self, step: Step) -> None:
         """See FilterCloud.correct."""
-        score = self._scoring.of(self, step.given)
+        score = self._scoring.of(self, step.readings)
         stages = self.places.stages(self.kept, step.stages, step.drawn, step.kind)
-        self.run_stages(step.settings, stages, step.drawn, len(step.given), score)
+        self.run_stages(step.settings, stages, step.drawn, len(step.readings), score)
 
     @property
     def scoring_seconds(self) -> float:

@@ -174,12 +174,12 @@ def _mount(
     """Return the angle by which scans must be turned to fit at a pose (None for no angle), and whether mirrored."""
     best: tuple[float, float | None, bool] = (0.0, None, False)
     for mirrored in (False, True):
-        given = _mirrored(sensors, readings) if mirrored else readings
+        seen = _mirrored(sensors, readings) if mirrored else readings
         for k in range(_TURNS):
             angle = math.remainder(k * math.tau / _TURNS, math.tau)
             if not mirrored and abs(angle) < _LEAST_TURN:
                 continue
-            scans = sightings(sensors, given, pose + np.array([0.0, 0.0, angle]), _STILL)
+            scans = sightings(sensors, seen, pose + np.array([0.0, 0.0, angle]), _STILL)
             agree = sum(one.count(AGREES) for one in scans)
             if agree > best[0] and _fits(scans):
                 best = agree, angle, mirrored

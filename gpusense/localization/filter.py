@@ -394,8 +394,8 @@ class ParticleFilter(Whole):
         Raises:
             TypeError, ValueError: ``state`` is no state, or belongs to a filter with other options or models.
         """
-        given = check_state(state, *self._kind())
-        self._parts.restore(given.contents, given.memory)
+        checked = check_state(state, *self._kind())
+        self._parts.restore(checked.contents, checked.memory)
 
     def _kind(self) -> tuple[dict[str, Any], tuple[str, ...]]:
         """Return the constructor's options, and the names of the models' classes."""

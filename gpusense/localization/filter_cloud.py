@@ -47,14 +47,14 @@ class Step(NamedTuple):
         kind: Kind of the motion that begins it.
         stages: Most stages.
         drawn: Particles of the next step.
-        given: Indices of sensors with their readings.
+        readings: Indices of sensors with their readings.
     """
 
     settings: np.ndarray
     kind: int
     stages: int
     drawn: int
-    given: list[SensorReadings]
+    readings: list[SensorReadings]
 
 
 class Contents(NamedTuple):

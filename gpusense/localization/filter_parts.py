@@ -14,7 +14,7 @@ from gpusense.localization.filter_cloud import Contents, FilterCloud
 from gpusense.localization.motion import SampledMotion
 from gpusense.localization.options import Options
 from gpusense.localization.recovery import Recovery
-from gpusense.localization.scoring import given_of
+from gpusense.localization.scoring import readings_of
 from gpusense.localization.sensors import Sensor, grid_of
 from gpusense.localization.state import memory_of, remember
 from gpusense.localization.tracker import Tracker, is_together
@@ -113,21 +113,21 @@ class FilterParts:
 
     def correct(self, readings: Any) -> None:
         """Weigh the particles by readings; see ``ParticleFilter.correct``."""
-        given = given_of(readings, self.sensors)
-        if not given:
+        used = readings_of(readings, self.sensors)
+        if not used:
             return
         tracker, verdict, share = self.tracker, self.verdict, self.options.beam_skip
-        everything = dict(given)
+        everything = dict(used)
         if verdict.watches(everything):
             verdict.predicted(*tracker.moved_particles(), everything)
         if share is not None:
-            given = skipping.skipped(self.sensors, given, tracker.moved_particles(), verdict.anywhere, share)
-        tracker.weigh(given, corrected_before=bool(self.last))
+            used = skipping.skipped(self.sensors, used, tracker.moved_particles(), verdict.anywhere, share)
+        tracker.weigh(used, corrected_before=bool(self.last))
         # The caller may write the next readings to the same arrays.
         self.last = {index: tuple(map(_copied, reading)) for index, reading in everything.items()}
         verdict.corrected()
-        tracker.learn(given, self.recovery.is_doubted)
-        self.recovery.corrected(given, self.last)
+        tracker.learn(used, self.recovery.is_doubted)
+        self.recovery.corrected(used, self.last)
 
     def reset(self) -> None:
         """Replace half of the particles by poses at which the last readings are likely."""

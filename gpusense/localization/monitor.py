@@ -12,7 +12,7 @@ from gpusense._util import checks
 from gpusense._util.typing import AnyArray
 from gpusense.localization import starts
 from gpusense.localization.diagnosis import Diagnosis, diagnose
-from gpusense.localization.scoring import given_of
+from gpusense.localization.scoring import readings_of
 from gpusense.localization.sensors import sensors_of
 from gpusense.localization.spread import is_apart, is_wide, share_off
 from gpusense.localization.verdict import Verdict, VerdictState
@@ -100,17 +100,17 @@ class PoseMonitor:
         """
         place = checks.array("pose", pose, (3,))
         spread = np.zeros((3, 3)) if covariance is None else _checked(covariance)
-        given = dict(given_of(ranges, self._sensors))
-        for index, reading in given.items():
+        readings = dict(readings_of(ranges, self._sensors))
+        for index, reading in readings.items():
             if self._sensors[index].calibrates:
                 count = self._sensors[index].model.scanner.count
-                given[index] = (checks.array("ranges", reading[0], (count,), finite=False), *reading[1:])
+                readings[index] = (checks.array("ranges", reading[0], (count,), finite=False), *reading[1:])
         self._verdict.corrected()
-        if self._verdict.watches(given):
+        if self._verdict.watches(readings):
             drawn = starts.normal(place, _finite(spread), _DRAWN, (self._seed & 0xFFFFFFFF, self._seed >> 32, 0))
-            self._verdict.predicted(drawn, np.full(_DRAWN, 1 / _DRAWN), given)
-        explained = self._verdict.judge(place, spread, given)
-        self._pose, self._last = place, given
+            self._verdict.predicted(drawn, np.full(_DRAWN, 1 / _DRAWN), readings)
+        explained = self._verdict.judge(place, spread, readings)
+        self._pose, self._last = place, readings
         wrong = self._verdict.wrong
         p_lost = wrong + (1 - wrong) * share_off(spread)
         return PoseVerdict(p_lost, word_of(p_lost, wrong, wide=is_wide(spread), apart=is_apart(spread)), explained)

@@ -19,31 +19,31 @@ _COVARIANCES = tuple(f"{_START}.covariance_{each}" for each in ("x", "xy", "xyaw
 NAMES = (*_POSE, *_COVARIANCES)
 
 
-def pose(name: str, found: Mapping[str, Any]) -> Row:
+def pose(name: str, parameters: Mapping[str, Any]) -> Row:
     """Return the first pose (x, y, yaw) [m, m, rad].
 
     Args:
         name: Name of the file.
-        found: Parameters by dotted names.
+        parameters: Parameters by dotted names.
 
     Raises:
         TypeError, ValueError: A part is no finite number.
     """
-    if _START in found:
-        raise TypeError(f"{name}: {_START}: must be a mapping, got {checks.show(found[_START])}")
-    x, y, yaw = (checks.real(f"{name}: {key}", found.get(key, 0.0)) for key in _POSE)
+    if _START in parameters:
+        raise TypeError(f"{name}: {_START}: must be a mapping, got {checks.show(parameters[_START])}")
+    x, y, yaw = (checks.real(f"{name}: {key}", parameters.get(key, 0.0)) for key in _POSE)
     return x, y, yaw
 
 
-def covariance(name: str, found: Mapping[str, Any]) -> Matrix | None:
+def covariance(name: str, parameters: Mapping[str, Any]) -> Matrix | None:
     """Return the covariance of the first pose; None where the file has no part of it.
 
     Raises:
         TypeError, ValueError: A part is no finite number, or the matrix is not positive semidefinite.
     """
-    if not any(key in found for key in _COVARIANCES):
+    if not any(key in parameters for key in _COVARIANCES):
         return None
-    xx, xy, xt, yy, yt, tt = (checks.real(f"{name}: {key}", found.get(key, 0.0)) for key in _COVARIANCES)
+    xx, xy, xt, yy, yt, tt = (checks.real(f"{name}: {key}", parameters.get(key, 0.0)) for key in _COVARIANCES)
     matrix = (xx, xy, xt), (xy, yy, yt), (xt, yt, tt)
     least = float(np.linalg.eigvalsh(np.array(matrix)).min())
     if least < -1e-9 * max(xx, yy, tt, 0.0):

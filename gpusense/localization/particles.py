@@ -220,6 +220,6 @@ class Particles:
         """Return the launches that draw into the second buffer of the bank."""
         copies: Program = ()
         if self._copies is not None:
-            given = {name: self.numbers(stage)[name] for name in ("state", "particles", "block", "blocks")}
-            copies = self.sums.copies(dict(given, ends=self.ends), self._copies, drawn, stage.number)
+            numbers = {name: self.numbers(stage)[name] for name in ("state", "particles", "block", "blocks")}
+            copies = self.sums.copies(dict(numbers, ends=self.ends), self._copies, drawn, stage.number)
         return copies + self.drawing((self.poses[stage.source], self.ends, self.count), stage, drawn)

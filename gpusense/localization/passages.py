@@ -38,6 +38,8 @@ _BESIDE, _APART, _MOST_BESIDE, _MOST_APART = 0.08, 0.025, 0.3, 0.1
 _PART, _LEAST, _LEAST_CELLS = 0.02, 0.2, 2.0
 # Agreeing readings within this of a wall are close [m].
 _CLOSE = 0.1
+# Rays that begin farther off than this are moved here, where no map reaches [cells].
+_AFAR = 1e9
 # Step of the walk [cells].
 _STEP = 0.5
 
@@ -130,19 +132,22 @@ def passages(
     blind = unknown < np.minimum(first, np.where(returned, before, reading))
     within = returned & (reading <= limit)
     beam_agrees = (first[0] >= before) & (first[0] <= after) & ~blind[0]
-    between = wall.all(axis=0) & (first.min(axis=0) <= after) & (first.max(axis=0) >= before) & ~blind.any(axis=0)
-    agrees = within & (beam_agrees | between)
-    through = returned & (first < before).all(axis=0) & ~blind.any(axis=0)
-    vanished = ~returned & wall.all(axis=0) & ~blind.any(axis=0)
-    short = within & ~wall.any(axis=0) & ~blind.any(axis=0)
-    kind = np.select([agrees, through, vanished, short], [AGREES, THROUGH, VANISHED, SHORT], NOTHING)
+    nearest, farthest, seen = first.min(axis=0), first.max(axis=0), ~blind.any(axis=0)
+    walled = farthest < np.inf
+    agrees = within & (beam_agrees | (walled & (nearest <= after) & (farthest >= before) & seen))
+    # Of several classes of a beam, the last one counts.
+    kind = np.full(len(bearing), NOTHING, np.int8)
+    kind[within & (nearest == np.inf) & seen] = SHORT
+    kind[~returned & walled & seen] = VANISHED
+    kind[returned & (farthest < before) & seen] = THROUGH
+    kind[agrees] = AGREES
     direction = heading + bearing
     with np.errstate(invalid="ignore"):
         distance = np.where(wall[0], first[0], np.nan)
         close = agrees & (np.abs(reading - distance) < max(_CLOSE, grid.resolution))
         met = origin[:2] + distance[:, None] * np.column_stack([np.cos(direction), np.sin(direction)])
     inside, off = _place_of(grid, pose)
-    return Passages(kind.astype(np.int8), bearing, met, close, inside, off)
+    return Passages(kind, bearing, met, close, inside, off)
 
 
 def _origin_of(pose: Floats, mount: tuple[float, float, float]) -> tuple[Floats, float]:
@@ -190,13 +195,13 @@ def _first_cells(
     """Return distances to the first wall and to the first unknown cell of rays in cells [cells]; inf for none."""
     rays, (rows, columns) = len(x), grid.shape
     ray = np.repeat(np.arange(rays), steps)
-    number = np.arange(len(ray)) - np.repeat(np.cumsum(steps) - steps, steps)
+    number = np.arange(len(ray))
+    number -= np.repeat(np.cumsum(steps) - steps, steps)
     distance = _STEP * number
-    column = np.floor(np.repeat(x, steps) + distance * np.repeat(along, steps)).astype(np.int64)
-    row = np.floor(np.repeat(y, steps) + distance * np.repeat(up, steps)).astype(np.int64)
+    column, row = (_cells_along(start, slope, steps, distance) for start, slope in ((x, along), (y, up)))
     # As unsigned numbers, negative indices exceed every limit.
-    within = (column.view(np.uint64) < columns) & (row.view(np.uint64) < rows)
-    cells, place = grid.cells.reshape(-1), row * columns + column
+    within = (column.view(np.uint32) < columns) & (row.view(np.uint32) < rows)
+    cells, place = grid.cells.reshape(-1), row.astype(np.int64) * columns + column
     # Cells off the map are unknown, -1.
     value = np.full(len(ray), -1, np.int8)
     np.copyto(value, cells.take(place, mode="clip"), where=within)
@@ -204,9 +209,23 @@ def _first_cells(
     # If two successive cells share only a corner, both cells beside the corner may be walls.
     corner = np.flatnonzero((column[1:] != column[:-1]) & (row[1:] != row[:-1]))
     corner = corner[(number[corner + 1] > 0) & within[corner + 1] & within[corner]]
-    one, two = row[corner + 1] * columns + column[corner], row[corner] * columns + column[corner + 1]
+    moved = column[corner + 1] - column[corner]
+    one, two = place[corner + 1] - moved, place[corner] + moved
     wall[corner + 1] |= (cells[one] >= grid.occupied_threshold) & (cells[two] >= grid.occupied_threshold)
     return _firsts(wall, ray, number, rays), _firsts(value < 0, ray, number, rays)
+
+
+def _cells_along(
+    start: Floats, slope: Floats, steps: NDArray[np.int64], distance: NDArray[np.floating]
+) -> NDArray[np.int32]:
+    """Return the rows or columns of all steps of rays, each of which begins at a coordinate and has a slope [cells].
+
+    Processors convert to 32 bits several times as fast as to 64, and off the map any number of cells will do.
+    """
+    place = np.repeat(slope, steps)
+    place *= distance
+    place += np.repeat(np.minimum(np.maximum(start, -_AFAR), _AFAR), steps)
+    return np.floor(place, out=place).astype(np.int32)
 
 
 def _firsts(marked: NDArray[np.bool_], ray: NDArray[np.int64], number: NDArray[np.int64], rays: int) -> Floats:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense._util import checks
+from gpusense._util.angles import wrapped
 from gpusense._util.typing import AnyArray
 
 
@@ -23,7 +24,7 @@ def wrap_angle(angle: AnyArray) -> np.ndarray:
         -0.5
     """
     values = np.asarray(checks.as_array("angle", angle), np.float64)
-    return (values + np.pi) % (2 * np.pi) - np.pi
+    return wrapped(values)
 
 
 def compose_poses(first: AnyArray, second: AnyArray) -> np.ndarray:

@@ -76,17 +76,17 @@ class Recovery:
         apart = self.active is not None or not self._tracker.together
         return apart or verdict.wrong > _DOUBT or verdict.explains_little
 
-    def corrected(self, given: list[SensorReadings], readings: Mapping[int, tuple[Any, ...]]) -> None:
+    def corrected(self, readings: list[SensorReadings], last: Mapping[int, tuple[Any, ...]]) -> None:
         """Compare the particles with their rival, or search for a rival if scans contradict the pose.
 
         Args:
-            given: Indices of sensors, with the readings that corrected the particles.
-            readings: Copies of the same readings with all beams.
+            readings: Indices of sensors, with the readings that corrected the particles.
+            last: Copies of the same readings with all beams.
         """
         if not self._searches:
             return
         if self.active is not None:
-            self._compare(self.active, given)
+            self._compare(self.active, readings)
             return
         tracker = self._tracker
         if tracker.wide or (self.everywhere and not tracker.together):
@@ -94,17 +94,17 @@ class Recovery:
         if not (self.everywhere or self.is_doubted() or self._verdict.due):
             return
         pose, covariance = tracker.mean_and_covariance()
-        self._verdict.judge(pose, covariance, readings, evidence_of(tracker.cloud.summary()))
+        self._verdict.judge(pose, covariance, last, evidence_of(tracker.cloud.summary()))
         if self.everywhere or self.is_doubted():
             prior = 0.0 if self.everywhere else PRIOR
             self.everywhere = max(self.everywhere - 1, 0)
-            self._made().start(pose, covariance, list(readings.items()), step=tracker.step, prior=prior)
+            self._made().start(pose, covariance, list(last.items()), step=tracker.step, prior=prior)
 
-    def _compare(self, rival: Rival, given: list[SensorReadings]) -> None:
+    def _compare(self, rival: Rival, readings: list[SensorReadings]) -> None:
         """Correct the rival, and let it replace the particles if it has won."""
         tracker = self._tracker
-        rival.correct(given, evidence_of(tracker.cloud.summary()))
-        won = rival.judge(*tracker.mean_and_covariance(), given)
+        rival.correct(readings, evidence_of(tracker.cloud.summary()))
+        won = rival.judge(*tracker.mean_and_covariance(), readings)
         if won is not None:
             poses, weights = won
             # The next scans have to confirm them.

@@ -23,7 +23,7 @@ _MOST_VIEWS = 32
 _DOUBLE = np.dtype(np.float64)
 
 
-def given_of(readings: Any, sensors: Sequence[Sensor]) -> list[SensorReadings]:
+def readings_of(readings: Any, sensors: Sequence[Sensor]) -> list[SensorReadings]:
     """Return the readings that are not missing, in the order of the sensors.
 
     Args:
@@ -71,35 +71,35 @@ class FilterScoring:
         # Views of buffers by the number of particles, as models take them.
         self._views: dict[tuple[str, int, int], Any] = {}
 
-    def records(self, given: Sequence[SensorReadings]) -> bool:
+    def records(self, readings: Sequence[SensorReadings]) -> bool:
         """Tell whether a stage with such readings is one recorded program: on a GPU that can score them all."""
         gpu = self._backend.info.kind == "gpu"
-        return gpu and all(self._sensors[index].records(reading) for index, reading in given)
+        return gpu and all(self._sensors[index].records(reading) for index, reading in readings)
 
-    def of(self, cloud: Cloud, given: Sequence[SensorReadings]) -> Callable[[Stage], None]:
+    def of(self, cloud: Cloud, readings: Sequence[SensorReadings]) -> Callable[[Stage], None]:
         """Return the function that runs a stage with readings, by the indices of their sensors."""
-        if not self.records(given):
-            return functools.partial(self._called, cloud, given)
-        for index, reading in given:
+        if not self.records(readings):
+            return functools.partial(self._called, cloud, readings)
+        for index, reading in readings:
             self._sensors[index].upload(reading)
-        return functools.partial(self._recorded, cloud, given)
+        return functools.partial(self._recorded, cloud, readings)
 
-    def _called(self, cloud: Cloud, given: Sequence[SensorReadings], stage: Stage) -> None:
+    def _called(self, cloud: Cloud, readings: Sequence[SensorReadings], stage: Stage) -> None:
         """Start the log-likelihoods of a stage call by call, and weigh."""
         poses = self._poses(cloud, stage.source)
         before = None if stage.kind is None else functools.partial(cloud.begin, stage)
-        for place, (index, reading) in enumerate(given):
+        for place, (index, reading) in enumerate(readings):
             self._sensors[index].score(poses, reading, self._log_p(cloud, place), before=before, timed=self.timed)
             before = None
         cloud.weigh(stage)
 
-    def _recorded(self, cloud: Cloud, given: Sequence[SensorReadings], stage: Stage) -> None:
+    def _recorded(self, cloud: Cloud, readings: Sequence[SensorReadings], stage: Stage) -> None:
         """Run a stage as one recorded program."""
-        key = (tuple((index, self._sensors[index].version) for index, _ in given), cloud.count)
-        cloud.replay(stage, key, lambda source: self._program(cloud, key, source, given))
+        key = (tuple((index, self._sensors[index].version) for index, _ in readings), cloud.count)
+        cloud.replay(stage, key, lambda source: self._program(cloud, key, source, readings))
 
     def _program(
-        self, cloud: Cloud, key: Hashable, source: int, given: Sequence[SensorReadings]
+        self, cloud: Cloud, key: Hashable, source: int, readings: Sequence[SensorReadings]
     ) -> tuple[Program, object]:
         """Return the launches that score the poses of a buffer, and the owners of their memory."""
         kept = self._programs.get((key, source))
@@ -108,7 +108,7 @@ class FilterScoring:
         program: Program = ()
         owners: list[object] = []
         poses = self._poses(cloud, source)
-        for place, (index, _) in enumerate(given):
+        for place, (index, _) in enumerate(readings):
             out = self._log_p(cloud, place)
             launches, owner = self._sensors[index].program(poses, out)
             program += launches

@@ -31,7 +31,7 @@ def together(poses: np.ndarray, weights: np.ndarray) -> bool:
 
 def skipped(
     sensors: Sequence[Sensor],
-    given: list[SensorReadings],
+    readings: list[SensorReadings],
     particles: tuple[np.ndarray, np.ndarray],
     anywhere: Callable[[], np.ndarray],
     share: float,
@@ -40,19 +40,19 @@ def skipped(
 
     Args:
         sensors: The filter's sensors.
-        given: Indices of sensors with their readings.
+        readings: Indices of sensors with their readings.
         particles: (N, 3) poses and (N,) weights.
         anywhere: Returns (M, 3) poses anywhere in the free space.
         share: Least weight of the particles that explain a used beam, as a share.
     """
     poses, weights = particles
     if not together(poses, weights):
-        return given
+        return readings
     asked = slice(None, None, max(len(poses) // _ASKED, 1))
     few, elsewhere = (poses[asked], weights[asked]), anywhere()
     return [
         (i, without_skipped(sensors[i], reading, *few, elsewhere, share) if sensors[i].calibrates else reading)
-        for i, reading in given
+        for i, reading in readings
     ]
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from gpusense._util import checks
+from gpusense._util.angles import wrapped
 from gpusense.localization.sensors import Sensor
 from gpusense.reference.philox import normal_pair, random_words, uniform_of
 from gpusense.world.grid import OccupancyGrid
@@ -37,7 +38,7 @@ def _words(count: int, key: Key, stream: int) -> tuple[np.ndarray, ...]:
 
 
 def _wrapped(poses: np.ndarray) -> np.ndarray:
-    poses[:, 2] = np.remainder(poses[:, 2] + np.pi, 2 * np.pi) - np.pi
+    poses[:, 2] = wrapped(poses[:, 2])
     return poses
 
 

@@ -143,19 +143,19 @@ class Tracker:
         self.cloud.move(self.settings(motion, []), motion.kind)
         self.shown, self.pending = self.cloud.count, following
 
-    def weigh(self, given: list[SensorReadings], *, corrected_before: bool = False) -> None:
+    def weigh(self, readings: list[SensorReadings], *, corrected_before: bool = False) -> None:
         """Run the motion, and correct the particles by readings of sensors.
 
         Args:
-            given: Indices of sensors with their readings.
+            readings: Indices of sensors with their readings.
             corrected_before: Whether the particles were corrected before, so that some may be copies.
         """
         chosen, motion = self.options, STILL if self.pending is None else self.pending
         self.distinct = self._distinct_share() if self.pending is None and corrected_before else 1.0
         drawn = self.cloud.count if chosen.least == chosen.most else self._wanted()
-        settings = self.settings(motion, [index for index, _ in given])
+        settings = self.settings(motion, [index for index, _ in readings])
         self.shown, self.pending = self.cloud.count, None
-        self.cloud.correct(Step(settings, motion.kind, chosen.stages, drawn, given))
+        self.cloud.correct(Step(settings, motion.kind, chosen.stages, drawn, readings))
         self.wide = max(self.wide - 1, 0)
 
     def _distinct_share(self) -> float:
@@ -164,15 +164,15 @@ class Tracker:
         before = self.distinct if last.stages == 1 else 1.0
         return before * min(last.effective_sample_size / self.shown, 1.0) if last.resampled else before
 
-    def learn(self, given: list[SensorReadings], is_doubted: Callable[[], bool]) -> None:
+    def learn(self, readings: list[SensorReadings], is_doubted: Callable[[], bool]) -> None:
         """Determine whether the particles lie together, and learn from scans at a pose that nothing contradicts.
 
         Args:
-            given: Indices of sensors with the readings of the last correction.
+            readings: Indices of sensors with the readings of the last correction.
             is_doubted: Tells whether something contradicts the pose.
         """
         self.corrections += 1
-        due = _due_of(self.sensors, given) if self.options.temperature == "auto" else []
+        due = _due_of(self.sensors, readings) if self.options.temperature == "auto" else []
         if not (due or not self.together or self.corrections % _LOOK == 0):
             return
         pose, covariance = self.mean_and_covariance()
@@ -181,14 +181,14 @@ class Tracker:
             for sensor, reading in due:
                 sensor.correlate(pose, covariance, reading)
 
-    def settings(self, motion: SampledMotion, given: list[int]) -> np.ndarray:
+    def settings(self, motion: SampledMotion, indices: list[int]) -> np.ndarray:
         """Return the settings of a new step with readings of sensors, by their indices."""
         temperature, sensors = self.options.temperature, []
         wide = DEFAULTS.wide_share if self.wide and temperature == "auto" else 1.0
-        for sensor in (self.sensors[index] for index in given):
+        for sensor in (self.sensors[index] for index in indices):
             sensors.append((sensor.temperature(temperature) * (wide if sensor.calibrates else 1.0), sensor.beams))
         step, count = self.key()[2], self.cloud.count
-        one_peak = self.together and not any(self.sensors[index].ambiguous for index in given)
+        one_peak = self.together and not any(self.sensors[index].ambiguous for index in indices)
         return settings_of_step(self.options, motion, step, count, self.pool, sensors, one_peak)
 
     def _wanted(self) -> int:
@@ -196,10 +196,10 @@ class Tracker:
         return kld_count(self.next_particles(), self.options.least, self.options.most)
 
 
-def _due_of(sensors: Sequence[Sensor], given: Sequence[SensorReadings]) -> list[tuple[Sensor, tuple[Any, ...]]]:
+def _due_of(sensors: Sequence[Sensor], readings: Sequence[SensorReadings]) -> list[tuple[Sensor, tuple[Any, ...]]]:
     """Count the scans of a correction; return the scans to learn from, with their sensors."""
     due = []
-    for index, reading in given:
+    for index, reading in readings:
         sensor = sensors[index]
         if sensor.calibrates:
             sensor.count()

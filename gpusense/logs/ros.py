@@ -36,6 +36,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.angles import wrapped
 from gpusense._util.notices import warn_user
 from gpusense.logs.bags import ODOMETRY, SCAN, TRANSFORMS, errors_at, messages, topics_of
 from gpusense.logs.records import Floats, Odometry, Pose, Scan
@@ -206,7 +207,7 @@ def _mount(path: Path, bag: _Bag, given: Pose | None) -> tuple[Pose, bool]:
     if given is None:
         return place, upside_down
     apart = math.hypot(given[0] - place[0], given[1] - place[1])
-    turn = abs((given[2] - place[2] + math.pi) % (2 * math.pi) - math.pi)
+    turn = abs(wrapped(given[2] - place[2]))
     if apart > _APART[0] or turn > _APART[1]:
         shown = ", ".join(f"{value:.4g}" for value in place)
         warn_user(f"{path}: mount {given} contradicts the transforms of the log, by which it is ({shown})")

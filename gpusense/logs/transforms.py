@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from gpusense._util.angles import wrapped
 from gpusense.logs.records import Floats, Pose, Scan
 
 # Largest change of a transform that still counts as fixed [m, 1].
@@ -114,7 +115,7 @@ def _pairs(scans: Sequence[Scan]) -> list[tuple[Scan, Scan]]:
     pairs, first = [], 0
     for k in range(1, len(scans)):
         x, y, theta = np.subtract(scans[k].odometry, scans[first].odometry)
-        turn = abs((theta + math.pi) % (2 * math.pi) - math.pi)
+        turn = abs(wrapped(theta))
         if turn > _TURN or math.hypot(x, y) > _SHIFT[1]:
             first = k
         elif math.hypot(x, y) >= _SHIFT[0]:

@@ -14,7 +14,8 @@ from gpusense.backends import Selection, get_backend
 from gpusense.mapping.counts import BandCounts, bands
 from gpusense.mapping.rays import SCANS, RayEnds, Survey, batches, check_lengths, extent
 from gpusense.world.deskew import check_motion
-from gpusense.world.grid import OccupancyGrid, check_origin, check_resolution, grid_of_checked
+from gpusense.world.grid import OccupancyGrid, grid_of_checked
+from gpusense.world.grid_frame import GridFrame, check_origin, check_resolution
 from gpusense.world.scanner import Scanner
 from gpusense.world.sensor_scans import check_scans
 from gpusense.world.windows import LONGEST_SIDE, Window
@@ -148,7 +149,7 @@ class MapBuilder:
         """Choose the map's frame and shape, and find the rows that the rays of each scan meet."""
         placed = _frame(origin, shape)
         # Without a frame, boxes are in metres until all are known.
-        frame = OccupancyGrid([[0]], 1.0 if placed is None else resolution, (0, 0, 0) if placed is None else placed[0])
+        frame = GridFrame(1.0, (0.0, 0.0, 0.0)) if placed is None else GridFrame(resolution, placed[0])
         boxes = np.empty((len(self._survey.poses), 4))
         self._kept: dict[bytes, RayEnds] = {}
         for part in batches(np.arange(len(boxes)), self._each):
@@ -160,8 +161,8 @@ class MapBuilder:
         if placed is None:
             placed = extent(boxes, resolution)
             boxes = (boxes - np.tile(placed[0][:2], 2)) / resolution
-        (self._origin, self._shape), self._rows = placed, boxes[:, [1, 3]]
-        self._frame = OccupancyGrid([[0]], resolution, self._origin)
+        (origin, self._shape), self._rows = placed, boxes[:, [1, 3]]
+        self._frame = GridFrame(resolution, check_origin(origin))
 
     def steps(self) -> Iterator[float]:
         """Count rays, some scans at a time, and yield the share of the work that is done."""
@@ -214,7 +215,7 @@ class MapBuilder:
             cells = cells.copy()
             if self._counts is not None:
                 self._write(self._counts, cells)
-        return grid_of_checked(cells, self._frame.resolution, self._frame.origin, occupied_threshold=self._threshold)
+        return grid_of_checked(cells, *self._frame, occupied_threshold=self._threshold)
 
 
 def _readings(name: str, value: Any, scanner: Scanner) -> np.ndarray:

@@ -12,7 +12,7 @@ from gpusense.backends import Backend
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.launches import launch
 from gpusense.mapping.rays import CellRays, RayEnds
-from gpusense.world.grid import OccupancyGrid
+from gpusense.world.grid_frame import GridFrame
 from gpusense.world.windows import Window
 
 _INT = np.dtype(np.int32)
@@ -37,7 +37,7 @@ class BandCounts:
 
     Args:
         backend: The device.
-        frame: A map with the origin and resolution of the whole.
+        frame: Frame of the whole map.
         shape: Rows and columns of the whole map.
         band: The band.
 
@@ -45,7 +45,7 @@ class BandCounts:
         rays: Rays that were counted and end in the band, or beside it outside the map.
     """
 
-    def __init__(self, backend: Backend, frame: OccupancyGrid, shape: tuple[int, int], band: Window) -> None:
+    def __init__(self, backend: Backend, frame: GridFrame, shape: tuple[int, int], band: Window) -> None:
         self._backend, self._frame, self._shape, self._band = backend, frame, shape, band
         self._space = Workspace(backend)
         self._hits = backend.empty(band.cells, _INT, zero=True)

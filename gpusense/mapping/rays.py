@@ -9,7 +9,7 @@ import numpy as np
 from gpusense.interface.constants import RAY_BITS
 from gpusense.world.deskew import beam_poses
 from gpusense.world.frames import ray_vectors
-from gpusense.world.grid import FARTHEST_ORIGIN, OccupancyGrid
+from gpusense.world.grid_frame import FARTHEST_ORIGIN, GridFrame
 from gpusense.world.scanner import Reading, Scanner, classify
 from gpusense.world.sensor_scans import SensorScans
 from gpusense.world.windows import LONGEST_SIDE, Window
@@ -105,12 +105,12 @@ class RayEnds:
             setattr(result, name, np.concatenate([getattr(part, name) for part in parts])[order])
         return result
 
-    def boxes(self, count: int, frame: OccupancyGrid) -> np.ndarray:
+    def boxes(self, count: int, frame: GridFrame) -> np.ndarray:
         """Return the (S, 4) least column and row and largest column and row of the rays of each scan [cells].
 
         Scans without a ray have infinite ones in reverse order.
         """
-        both = np.stack([frame.world_to_cells(xy) for xy in (self.start, self.end)])
+        both = np.stack([frame.to_cells(xy) for xy in (self.start, self.end)])
         boxes = np.tile([np.inf, np.inf, -np.inf, -np.inf], (count, 1))
         # Rays lie in the order of their scans.
         first = np.flatnonzero(np.diff(self.scan, prepend=-1))
@@ -142,9 +142,9 @@ class CellRays:
         ending: Number of rays whose end, or the map's cell nearest to it, lies in the rows of the window.
     """
 
-    def __init__(self, ends: RayEnds, frame: OccupancyGrid, window: Window, shape: tuple[int, int]) -> None:
+    def __init__(self, ends: RayEnds, frame: GridFrame, window: Window, shape: tuple[int, int]) -> None:
         with np.errstate(over="ignore", invalid="ignore"):
-            start, end = frame.world_to_cells(ends.start), frame.world_to_cells(ends.end)
+            start, end = frame.to_cells(ends.start), frame.to_cells(ends.end)
             low, high = np.minimum(start, end), np.maximum(start, end)
             first, last = (window.col, window.row), (window.col + window.cols, window.row + window.rows)
             # Enlarge the window by a fraction of a cell for the rounding of coordinates.

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gpusense._util.angles import wrapped
 from gpusense.backends import Backend
 from gpusense.matching.evidence import pair_evidence
 from gpusense.matching.icp import STRAIGHT_WIDTH, WIDTH, IcpPairs, space_of
@@ -32,6 +33,8 @@ _PROMISING = 0.15
 _TURNED = 0.11
 # A match is ambiguous if two poses differ by more than this distance [m] or turn [rad], and score alike within this.
 _OTHER, _OTHER_TURN, _CLOSE = 0.25, 0.1, 0.012
+
+_IDENTITY = np.eye(3)
 
 
 class Best(NamedTuple):
@@ -67,19 +70,18 @@ def match_pairs(
     sensor = to_sensor(guess, mount)
     with lock, space:
         device = IcpPairs(backend, real, points, pairs, options.noise, space)
-        everything = np.arange(len(pairs))
-        before, most = (int(points.counts[pairs[:, i]].max(initial=0)) for i in (0, 1))
-        result = device.run(everything, sensor[:, None], options.rules(most, points.gap))[:, 0]
+        counts = points.counts[pairs]
+        before, most = counts.max(axis=0, initial=0).tolist()
+        result = device.run(np.arange(len(pairs)), sensor[:, None], options.rules(most, points.gap))[:, 0]
         best = Best(result, np.full((len(pairs), 3), np.nan))
         if method == "auto":
-            enough = points.counts[pairs].min(axis=1) > 2
-            poor = enough & (result[:, 3] < DOUBTFUL)
-            moved = np.abs(result[:, :3] - sensor)
-            far = (moved[:, :2].max(axis=1) > _FAR * options.capture) | (moved[:, 2] > _FAR_TURN)
-            for some, window in ((poor, options), (enough & far & ~poor & (result[:, 3] < _SURE), nearby(options))):
+            enough, score = counts.min(axis=1) > 2, result[:, 3]
+            poor = enough & (score < DOUBTFUL)
+            far = _is_moved(result, sensor, _FAR * options.capture, _FAR_TURN) & enough & ~poor & (score < _SURE)
+            for some, wide in ((poor, True), (far, False)):
                 if some.any():
-                    which = np.flatnonzero(some)
-                    _search(device, which, sensor[which], window.starts(), best, options, (before, most), points.gap)
+                    which, starts = np.flatnonzero(some), (options if wide else nearby(options)).starts()
+                    _search(device, which, sensor[which], starts, best, options, (before, most), points.gap)
             _repeat(device, sensor, best, options, most, points.gap)
         noisy = _straighten(device, best.result, points, pairs, options)
         sums = tested(device, best.result, points, pairs, options, noisy)
@@ -142,10 +144,16 @@ def _prior(result: np.ndarray, guess: np.ndarray, options: MatchOptions) -> np.n
     return lost
 
 
+def _is_moved(result: np.ndarray, guess: np.ndarray, distance: float, turn: float) -> np.ndarray:
+    """Return which results differ from their guesses by more than a distance along an axis [m], or a turn [rad]."""
+    moved = np.abs(result[:, :3] - guess)
+    far: np.ndarray = (np.maximum(moved[:, 0], moved[:, 1]) > distance) | (moved[:, 2] > turn)
+    return far
+
+
 def _repeat(device: IcpPairs, guess: np.ndarray, best: Best, options: MatchOptions, most: int, gap: float) -> None:
     """Match pairs again from their results where the guess was poor: ICP may have stopped short of it."""
-    moved = np.abs(best.result[:, :3] - guess)
-    rows = np.flatnonzero((moved[:, :2].max(axis=1) > _NEAR * options.capture) | (moved[:, 2] > _NEAR_TURN))
+    rows = np.flatnonzero(_is_moved(best.result, guess, _NEAR * options.capture, _NEAR_TURN))
     if len(rows):
         again = device.run(rows, best.result[rows, None, :3], options.rules(most, gap))[:, 0]
         better = (
@@ -203,11 +211,6 @@ def distinct(poses: np.ndarray, score: np.ndarray, known: np.ndarray, capture: f
     return numbers[order], np.concatenate(chosen[:-1])[order]
 
 
-def wrapped(angle: np.ndarray) -> np.ndarray:
-    """Return angles in [-pi, pi)."""
-    return (angle + math.pi) % (2 * math.pi) - math.pi
-
-
 def to_sensor(pose: np.ndarray, mount: tuple[float, float]) -> np.ndarray:
     """Convert relative poses of robot frames to poses of frames at the sensors with the robots' axes."""
     x, y = mount
@@ -229,12 +232,13 @@ def _finished(
     pose = np.empty((len(result), 3))
     pose[:, 0], pose[:, 1], pose[:, 2] = result[:, 0] - c * x + s * y + x, result[:, 1] - s * x - c * y + y, theta
     # Derivative of the sensor's pose with respect to the robot's.
-    moved = np.zeros((len(pose), 3, 3))
-    moved[:, range(3), range(3)] = 1
+    moved = np.empty((len(pose), 3, 3))
+    moved[:] = _IDENTITY
     moved[:, 0, 2], moved[:, 1, 2] = -s * x - c * y, c * x - s * y
     found, factor = sums.found, sums.factor
     final = moved.transpose(0, 2, 1) @ found.information @ moved / factor[:, None, None]
-    step = np.linalg.solve(moved, result[:, 32:35, None])[..., 0]
+    step = np.array(result[:, 32:35])
+    step[:, :2] -= moved[:, :2, 2] * step[:, 2:]
     length = np.sqrt(np.maximum(np.einsum("si,sij,sj->s", step, final, step), 0))
     status = statuses(result, found.lost, length)
     evidence = pair_evidence(result, found.lost, best.other, options.noise)

@@ -45,10 +45,10 @@ def pair_evidence(result: np.ndarray, lost: np.ndarray, other: np.ndarray, noise
     pairs, weights = np.maximum(result[:, 18], 1), result[:, 19]
     rough = np.sqrt(result[:, 20] / np.maximum(weights, 1e-30)) / max(noise, 1e-6)
     common = np.maximum(seen + through, 1)
-    evidence = np.empty((len(result), len(NAMES)))
+    evidence = np.zeros((len(result), len(NAMES)))
     values = (
         1 - result[:, 3], through / common, seen / np.maximum(common + unseen, 1), pairs, np.minimum(rough, 20.0),
-        1 - weights / pairs, lost, np.isfinite(other).all(axis=1), 0 * lost,
+        1 - weights / pairs, lost, np.isfinite(other).all(axis=1),
     )  # fmt: skip
     for column, value in enumerate(values):
         evidence[:, column] = value
@@ -57,9 +57,11 @@ def pair_evidence(result: np.ndarray, lost: np.ndarray, other: np.ndarray, noise
 
 def features_of(evidence: np.ndarray) -> np.ndarray:
     """Return the numbers (S, 10) that the weights multiply."""
-    logs = np.log(np.maximum(evidence[:, :6], _LEAST))
-    lost = evidence[:, 6]
-    return np.column_stack([logs, lost > 0, lost > 1, evidence[:, 7], np.log(evidence[:, 8] + _NEAR)])
+    features, lost = np.empty((len(evidence), len(_WEIGHTS))), evidence[:, 6]
+    features[:, :6] = np.log(np.maximum(evidence[:, :6], _LEAST))
+    features[:, 6], features[:, 7], features[:, 8] = lost > 0, lost > 1, evidence[:, 7]
+    features[:, 9] = np.log(evidence[:, 8] + _NEAR)
+    return features
 
 
 def probability_right(evidence: np.ndarray) -> np.ndarray:

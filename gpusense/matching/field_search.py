@@ -19,6 +19,7 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
+from gpusense._util.angles import wrapped
 from gpusense._util.typing import Space
 from gpusense.backends import get_backend
 from gpusense.matching.pose_grid import Found, PoseGrid
@@ -232,5 +233,5 @@ def _tile_numbers(points: np.ndarray, headings: np.ndarray, start: np.ndarray, t
 def to_world(grid: OccupancyGrid, cells: np.ndarray) -> np.ndarray:
     """Convert (M, 3) poses in the grid's frame [cells, cells, rad] to the world, headings from -pi to pi."""
     xy = grid._to_world(cells[:, :2] * grid.resolution)
-    theta = np.remainder(cells[:, 2] + grid.origin[2] + math.pi, 2 * math.pi) - math.pi
+    theta = wrapped(cells[:, 2] + grid.origin[2])
     return np.column_stack([xy, theta])

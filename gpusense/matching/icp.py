@@ -44,8 +44,11 @@ def points_of_line(gap: float, noise: float, lever: np.ndarray) -> np.ndarray:
 
 def space_of(backend: Backend) -> tuple[threading.RLock, Workspace]:
     """Return the buffers of matches on a device, and the lock of their owner."""
-    with _LOCK:
-        return _SPACES.setdefault(backend, (threading.RLock(), Workspace(backend)))
+    kept = _SPACES.get(backend)
+    if kept is None:
+        with _LOCK:
+            kept = _SPACES.setdefault(backend, (threading.RLock(), Workspace(backend)))
+    return kept
 
 
 class IcpPairs:

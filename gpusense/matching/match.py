@@ -158,7 +158,7 @@ def _matches(
     noise = np.full(len(second), options.noise)
     if not given:
         own = scan_noise(np.concatenate([first, second]), scanner)
-        noise = match_noise(np.broadcast_to(own[: len(first)], len(second)), own[len(first) :])
+        noise = match_noise(own[: len(first)], own[len(first) :])
     return _by_noise(noise, options, to_scan), single
 
 
@@ -188,7 +188,9 @@ def _to_scans(
         both = (first, before), (second, motion)
         moved = np.concatenate([np.zeros((len(scans), 3)) if m is None else m for scans, m in both])
     points = scan_points(np.concatenate([first, second]), scanner, real, moved)
-    pairs = np.stack([np.arange(len(second)) % max(len(first), 1), len(first) + np.arange(len(second))], axis=1)
+    pairs = np.empty((len(second), 2), np.intp)
+    pairs[:, 1] = np.arange(len(first), len(first) + len(second))
+    pairs[:, 0] = pairs[:, 1] - len(first) if len(first) == len(second) else 0
     match = match_pairs(device, real, points, pairs, poses, method, options, scanner.mount[:2])
     return judged(match, poses, options)
 

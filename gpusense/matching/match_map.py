@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
+from gpusense._util.angles import wrapped
 from gpusense._util.html import card
 from gpusense.backends import Selection, get_backend
 from gpusense.matching.align import Alignment
@@ -244,7 +245,7 @@ def _distinct(poses: np.ndarray, cell: float) -> list[int]:
     while left.any() and len(chosen) < _MODES:
         chosen.append(int(left.argmax()))
         off = poses - poses[chosen[-1]]
-        turn = np.abs(np.remainder(off[:, 2] + math.pi, 2 * math.pi) - math.pi)
+        turn = np.abs(wrapped(off[:, 2]))
         left &= (np.hypot(off[:, 0], off[:, 1]) * cell > _MODE_RADIUS) | (turn > _MODE_ANGLE)
     return chosen
 
@@ -278,5 +279,4 @@ def _to_world(local: _Local, grid: OccupancyGrid, poses: np.ndarray) -> Floats:
     cos, sin = np.cos(theta), np.sin(theta)
     x, y = local.middle
     shift = np.stack([cos * x - sin * y, sin * x + cos * y], axis=1)
-    wrapped = np.remainder(theta + math.pi, 2 * math.pi) - math.pi
-    return np.column_stack([grid._to_world(poses[:, :2] * grid.resolution) - shift, wrapped])
+    return np.column_stack([grid._to_world(poses[:, :2] * grid.resolution) - shift, wrapped(theta)])

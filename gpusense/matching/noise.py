@@ -33,51 +33,69 @@ def scan_noise(ranges: np.ndarray, scanner: Scanner) -> np.ndarray:
     """Return the standard deviations (S,) of the ranges of (S, K) readings [m], NaN where too few beams measure it."""
     if scanner.count < 3 or not len(ranges):
         return np.full(len(ranges), np.nan)
-    place, left, right = _neighbors(scanner)
+    places, left, right = _neighbors(scanner)
     readings = ranges.astype(np.float64)
     hit = hits(readings, scanner.range_min, scanner.range_max)
-    z = [readings[:, place + k] for k in (-1, 0, 1)]
-    use = hit[:, place - 1] & hit[:, place] & hit[:, place + 1]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        expected = 1 / (left / z[0] + right / z[2])
+    before, here, after = (readings[:, part] for part in places)
+    use = hit[:, places[0]] & hit[:, places[1]]
+    use &= hit[:, places[2]]
+    with np.errstate(all="ignore"):
+        expected = 1 / (left / before + right / after)
         # Standard deviation of the difference, with the errors of both neighbours times their derivatives.
-        share = np.sqrt(1 + ((expected / z[0]) ** 2 * left) ** 2 + ((expected / z[2]) ** 2 * right) ** 2)
-        use &= (expected > 0) & (np.abs(z[0] - z[1]) < _STEP * z[1]) & (np.abs(z[2] - z[1]) < _STEP * z[1])
-        off = np.where(use, np.abs(z[1] - expected) / share, np.inf)
-    number = use.sum(axis=1)
-    middle = np.sort(off, axis=1)[np.arange(len(off)), np.maximum(number - 1, 0) // 2]
-    rounding = _range_steps(np.where(use, z[1], np.inf)) / np.sqrt(12)
-    return np.where(number >= _LEAST, np.maximum(middle / _MEDIAN, rounding), np.nan)
+        share = np.sqrt(
+            1 + np.square(np.square(expected / before) * left) + np.square(np.square(expected / after) * right)
+        )
+        limit = _STEP * here
+        use &= expected > 0
+        use &= np.abs(before - here) < limit
+        use &= np.abs(after - here) < limit
+        off = np.where(use, np.abs(here - expected) / share, np.inf)
+        number = np.add.reduce(use, axis=1, dtype=np.intp)
+        off.sort(axis=1)
+        middle = off[np.arange(len(off)), np.maximum(number - 1, 0) // 2]
+        rounding = _range_steps(np.where(use, here, np.inf)) / np.sqrt(12)
+        return np.where(number >= _LEAST, np.maximum(middle / _MEDIAN, rounding), np.nan)
 
 
 @functools.lru_cache(maxsize=16)
-def _neighbors(scanner: Scanner) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the places (P,) at which noise is measured, and the weights of their neighbours on a straight wall."""
-    bearing, place = scanner.bearings, np.arange(1, scanner.count - 1)
-    place = place[:: -(-len(place) // _PLACES)]
-    before, after = bearing[place] - bearing[place - 1], bearing[place + 1] - bearing[place]
-    whole = np.sin(before + after)
+def _neighbors(scanner: Scanner) -> tuple[tuple[slice, ...], np.ndarray, np.ndarray]:
+    """Return slices of the beams before, at and after (P,) places, and the neighbours' weights on a straight wall."""
+    bearing, last = scanner.bearings, scanner.count - 1
+    step = -(-(last - 1) // _PLACES)
+    places = slice(0, last - 1, step), slice(1, last, step), slice(2, last + 1, step)
+    before, here, after = (bearing[part] for part in places)
+    whole = np.sin((here - before) + (after - here))
     with np.errstate(divide="ignore", invalid="ignore"):
-        return place, np.sin(after) / whole, np.sin(before) / whole
+        return places, np.sin(after - here) / whole, np.sin(here - before) / whole
 
 
 def _range_steps(ranges: np.ndarray) -> np.ndarray:
-    """Return the step (S,) in which ranges (S, K) come [m], 0 without one; infinite ranges do not count."""
-    with np.errstate(invalid="ignore"):
-        gap = np.diff(np.sort(ranges, axis=1), axis=1)
-    gap = np.where(np.isfinite(gap) & (gap > 0.5 * _LEAST_STEP), gap, np.inf)
-    step = gap.min(axis=1, initial=np.inf)
-    with np.errstate(invalid="ignore"):
-        multiple = gap / step[:, None]
-        odd = np.isfinite(gap) & (np.abs(multiple - np.rint(multiple)) > _ODD)
-    known = np.isfinite(gap).sum(axis=1) >= _LEAST
-    return np.where(known & (step > _LEAST_STEP) & ~odd.any(axis=1), step, 0.0)
+    """Return the step (S,) in which ranges (S, K) come [m], 0 without one; infinite ranges do not count.
+
+    Call it where invalid operations are ignored.
+    """
+    ranges.sort(axis=1)
+    gap = ranges[:, 1:] - ranges[:, :-1]
+    # Differences of infinite ranges are NaN.
+    gap = np.where(gap > 0.5 * _LEAST_STEP, gap, np.inf)
+    step = np.minimum.reduce(gap, axis=1, initial=np.inf)
+    multiple = gap / step[:, None]
+    # Infinite gaps are infinite multiples, or NaN, and neither is odd.
+    odd = np.logical_or.reduce(np.abs(multiple - np.rint(multiple)) > _ODD, axis=1)
+    known = np.add.reduce(gap < np.inf, axis=1, dtype=np.intp) >= _LEAST
+    return np.where(known & (step > _LEAST_STEP) & ~odd, step, 0.0)
 
 
 def match_noise(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the noise of matches (S,): the larger noise of both scans, rounded up to a step; NaN is unknown."""
+    """Return the noise of matches (S,): the larger noise of both scans, rounded up to a step.
+
+    Args:
+        first: (S,) or (1,) noise of the reference scans [m]; NaN is unknown.
+        second: (S,) noise of the second scans.
+    """
     both = np.fmax(first, second)
-    both = np.clip(np.where(np.isnan(both), ASSUMED_NOISE, both), LEAST_NOISE, LARGEST_NOISE)
+    both = np.where(np.isnan(both), ASSUMED_NOISE, both)
+    both = np.minimum(np.maximum(both, LEAST_NOISE), LARGEST_NOISE)
     noise: np.ndarray = LEAST_NOISE * ROOT ** np.ceil(np.log(both / LEAST_NOISE) / np.log(ROOT) - 0.1)
     return noise
 

@@ -26,6 +26,7 @@ _LEAST_LINES, _LEAST_RATIO = 4.0, 2.0
 LEAST_PAIRS = 1.5
 # Spurious information attributed to lines without errors [pairs].
 _SPURIOUS = 1e-3
+_SPURIOUS_PART = _SPURIOUS * np.eye(3)
 # Share of the largest eigenvalue below which a direction of an information is lost.
 _NOTHING = 1e-9
 
@@ -63,20 +64,20 @@ def observed_information(
     """
     scale = balance_of(lever)
     both = scale[:, :, None] * scale[:, None, :]
-    total, made_up = information * both, spurious * both + _SPURIOUS * np.eye(3)
+    total, made_up = information * both, spurious * both + _SPURIOUS_PART
     critical = critical_ratio(lines)
     values, vectors = _generalised(total, made_up)
     lost = _is_lost(values, vectors, critical, least)
-    count = lost.sum(axis=1)
-    some = np.flatnonzero(count)
-    result = np.array(total)
-    if len(some):
-        basis = _lost_basis(total[some], made_up[some], critical[some], least[some], vectors[some], lost[some])
-        result[some] = without(total[some], basis, made_up[some])
-        values, vectors = np.array(values), np.array(vectors)
-        values[some], vectors[some] = _generalised(result[some], made_up[some])
+    some = np.flatnonzero(lost[:, 0])
+    count = np.zeros(len(lever), np.intp)
     # Noise contributes 1 to each eigenvalue.
-    left = np.where(np.arange(3) < count[:, None], 0.0, np.maximum(values - 1, 1e-3 * values))
+    left = np.maximum(values - 1, 1e-3 * values)
+    if len(some):
+        count = lost.sum(axis=1)
+        basis = _lost_basis(total[some], made_up[some], critical[some], least[some], vectors[some], lost[some])
+        result = without(total[some], basis, made_up[some])
+        values[some], vectors[some] = _generalised(result, made_up[some])
+        left = np.where(np.arange(3) < count[:, None], 0.0, np.maximum(values - 1, 1e-3 * values))
     sides = made_up @ vectors
     result = np.einsum("sik,sk,sjk->sij", sides, left, sides)
     if len(some):
@@ -110,13 +111,14 @@ def without(information: np.ndarray, lost: np.ndarray, made_up: np.ndarray) -> n
 def _generalised(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return ascending eigenvalues (S, 3) of a v = lambda b v, and eigenvectors in columns with v' b v = 1."""
     inverse = np.linalg.inv(np.linalg.cholesky(b))
-    values, vectors = np.linalg.eigh(inverse @ a @ inverse.transpose(0, 2, 1))
-    return values, inverse.transpose(0, 2, 1) @ vectors
+    turned = inverse.transpose(0, 2, 1)
+    values, vectors = np.linalg.eigh(inverse @ a @ turned)
+    return values, turned @ vectors
 
 
 def _is_lost(values: np.ndarray, vectors: np.ndarray, critical: np.ndarray, least: np.ndarray) -> np.ndarray:
     """Return which directions noise explains or hardly a pair observes, and all directions with smaller ratios."""
-    pairs = values / np.maximum(np.square(vectors).sum(axis=1), 1e-300)
+    pairs = values / np.maximum(np.add.reduce(np.square(vectors), axis=1), 1e-300)
     lost = (values < critical[:, None]) | (pairs < least[:, None])
     result: np.ndarray = np.logical_or.accumulate(lost[:, ::-1], axis=1)[:, ::-1]
     return result
@@ -184,13 +186,13 @@ def covariance_of(
     """
     scale = balance_of(lever)
     values, vectors = axes_of(information, lever) if known_axes is None else known_axes
-    gone = values == 0
     axes = vectors * scale[:, :, None]
+    if values.all():
+        return np.einsum("sik,sk,sjk->sij", axes, 1 / values, axes)
+    gone = values == 0
     inverse = np.where(gone, 0, 1 / np.where(gone, 1, values))
     covariance = np.einsum("sik,sk,sjk->sij", axes, inverse, axes)
     lost = np.where(gone[:, None, :], axes, 0.0)
-    if not gone.any():
-        return covariance
     # Largest move along each lost direction within reach, and the change of each coordinate by it.
     limit = np.array([max(reach[0], 1e-3), max(reach[0], 1e-3), max(reach[1], 1e-3)])
     with np.errstate(divide="ignore"):

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpusense._util import checks
+from gpusense._util.angles import wrapped
 from gpusense.interface.structs import MatchRules
 from gpusense.matching.points import GAP
 
@@ -44,7 +45,7 @@ class MatchOptions:
 
     def is_outside(self, offset: np.ndarray) -> np.ndarray:
         """Return whether (S, 3) offsets from guesses leave the window, enlarged by the move that a start may make."""
-        turn = np.abs((offset[:, 2] + math.pi) % (2 * math.pi) - math.pi)
+        turn = np.abs(wrapped(offset[:, 2]))
         reach, half = self.window
         outside: np.ndarray = (np.hypot(offset[:, 0], offset[:, 1]) > reach + _MARGIN) | (turn > half + _MARGIN)
         return outside
@@ -142,6 +143,8 @@ def check_guess(guess: object, matches: int | None, farthest: float = _FARTHEST)
         raise ValueError(f"guess: shape must be (3,) for a single match, got {checks.shape_text(values.shape)}")
     if np.abs(values[..., :2]).max(initial=0.0) > farthest:
         raise ValueError(f"guess: x and y must be within {farthest:g} m, got {checks.show(values)}")
-    result = np.array(np.broadcast_to(values, (1 if matches is None else matches, 3)))
-    result[:, 2] = np.angle(np.exp(1j * result[:, 2]))
+    result = np.empty((1 if matches is None else matches, 3))
+    result[:] = values
+    turned = np.exp(1j * result[:, 2])
+    result[:, 2] = np.arctan2(turned.imag, turned.real)
     return result

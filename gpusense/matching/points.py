@@ -39,7 +39,7 @@ class ScanPoints:
     @functools.cached_property
     def counts(self) -> np.ndarray:
         """(S,) points of each scan."""
-        return np.diff(self.start)
+        return self.start[1:] - self.start[:-1]
 
     def joined(self, others: ScanPoints) -> ScanPoints:
         """Return these scans followed by the second ones, with ``gap`` of the first."""
@@ -83,7 +83,7 @@ def scan_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype, motion: np
     order, bearing, cosine, sine, gap = _beams_by_angle(scanner, real)
     z = ranges[:, order]
     # Columns taken in an order lie in memory one after another; sums of squares go along rows.
-    hit = np.ascontiguousarray(hits(z, scanner.range_min, scanner.range_max)) & (z > _NEAREST)
+    hit = np.ascontiguousarray(hits(z, scanner.range_min, scanner.range_max) & (z > _NEAREST))
     z = np.where(hit, z, 0).astype(np.float64, copy=False)
     everything = np.empty((*z.shape, 4), real)
     np.multiply(z, cosine, out=everything[..., 0], casting="same_kind")
@@ -126,5 +126,5 @@ def _moved_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype, motion: 
 def _points(point: np.ndarray, hit: np.ndarray, gap: float, squares: np.ndarray) -> ScanPoints:
     """Return points with the starts of their scans."""
     start = np.zeros(len(hit) + 1, np.int32)
-    np.cumsum(np.count_nonzero(hit, axis=1), out=start[1:])
+    np.add.accumulate(np.add.reduce(hit, axis=1, dtype=np.int32), out=start[1:])
     return ScanPoints(np.ascontiguousarray(point), start, gap, squares)

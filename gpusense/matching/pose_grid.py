@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gpusense._util.angles import wrapped
+
 
 @dataclass(frozen=True, eq=False)
 class PoseGrid:
@@ -110,7 +112,7 @@ def distinct_poses(poses: np.ndarray, count: int, radius: float, angle: float, f
     while len(chosen) < count and left.any():
         chosen.append(following)
         off = poses - poses[following]
-        turn = np.abs(np.remainder(off[:, 2] + np.pi, 2 * np.pi) - np.pi)
+        turn = np.abs(wrapped(off[:, 2]))
         left &= (np.hypot(off[:, 0], off[:, 1]) > radius) | (turn > angle)
         following = int(np.argmax(left))
     return chosen

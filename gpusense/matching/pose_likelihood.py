@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks, pictures
+from gpusense._util.angles import wrapped
 from gpusense.models.scan.model import ScanModel
 from gpusense.world.grid import OccupancyGrid
 
@@ -102,7 +103,7 @@ class PoseLikelihood:
         poses: list[Floats] = []
         log_p: list[float] = []
         reach = int(near / self.resolution)
-        distant = np.abs(np.remainder(np.subtract.outer(self.headings, self.headings) + math.pi, 2 * math.pi) - math.pi)
+        distant = np.abs(wrapped(np.subtract.outer(self.headings, self.headings)))
         rows, cols = np.mgrid[-reach : reach + 1, -reach : reach + 1]
         disc = rows**2 + cols**2 <= (near / self.resolution) ** 2
         while len(log_p) < count:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense._util.angles import wrapped
 from gpusense._util.html import card, pose_rows
 from gpusense.matching.observability import covariance_of
 
@@ -107,17 +107,18 @@ class ScanMatch:
         """Return one of S matches."""
         if self.pose.ndim == 1:
             raise TypeError("a single match has no items")
-        values = {field.name: getattr(self, field.name)[index] for field in fields(self)}
-        return ScanMatch(**values | {"status": str(values["status"])})
+        values = {name: getattr(self, name)[index] for name in _FIELDS}
+        values["status"] = str(values["status"])
+        return ScanMatch(**values)
 
     @classmethod
     def joined(cls, matches: list[ScanMatch]) -> ScanMatch:
         """Return the matches of several calls as one, in their order; at least one."""
-        return cls(**{f.name: np.concatenate([getattr(match, f.name) for match in matches]) for f in fields(cls)})
+        return cls(*[np.concatenate([getattr(match, name) for match in matches]) for name in _FIELDS])
 
     def ordered(self, order: NDArray[np.intp]) -> ScanMatch:
         """Return S matches in another order."""
-        return ScanMatch(**{field.name: np.asarray(getattr(self, field.name))[order] for field in fields(self)})
+        return ScanMatch(*[np.asarray(getattr(self, name))[order] for name in _FIELDS])
 
     def moved(self, frame: Floats, reach: tuple[float, float]) -> ScanMatch:
         """Return S matches in the frame in which the reference's robot frames are at (S, 3) poses.
@@ -128,7 +129,7 @@ class ScanMatch:
         """
         c, s = np.cos(frame[:, 2]), np.sin(frame[:, 2])
         x, y, theta = self.pose.T
-        turn = (theta + frame[:, 2] + math.pi) % (2 * math.pi) - math.pi
+        turn = wrapped(theta + frame[:, 2])
         pose = np.stack([frame[:, 0] + c * x - s * y, frame[:, 1] + s * x + c * y, turn], axis=1)
         zero, one = np.zeros(len(c)), np.ones(len(c))
         turned = np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=1).reshape(-1, 3, 3)
@@ -139,11 +140,10 @@ class ScanMatch:
 
     def replaced(self, rows: NDArray[np.intp], others: ScanMatch, chosen: NDArray[np.bool]) -> ScanMatch:
         """Return S matches in which the chosen ones of some rows are replaced by other matches."""
-        values = {}
-        for field in fields(self):
-            values[field.name] = np.array(getattr(self, field.name))
-            values[field.name][rows[chosen]] = getattr(others, field.name)[chosen]
-        return ScanMatch(**values)
+        values = [np.array(getattr(self, name)) for name in _FIELDS]
+        for name, value in zip(_FIELDS, values, strict=True):
+            value[rows[chosen]] = getattr(others, name)[chosen]
+        return ScanMatch(*values)
 
     def explain(self) -> str:
         """Return the status and its meaning, for one match or counted over many."""
@@ -166,3 +166,7 @@ class ScanMatch:
                 f"ScanMatch({self.status}, x={x:.4g}, y={y:.4g}, theta={theta:.4g}, p_right={float(self.p_right):.3g})"
             )
         return f"ScanMatch({len(self)} matches, {np.count_nonzero(self.converged)} converged)"
+
+
+# Names of the fields in their order.
+_FIELDS = tuple(field.name for field in fields(ScanMatch))

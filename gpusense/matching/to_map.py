@@ -12,8 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from gpusense._util.angles import wrapped
 from gpusense.backends import Backend
-from gpusense.matching.chain import DOUBTFUL, match_pairs, wrapped
+from gpusense.matching.chain import DOUBTFUL, match_pairs
 from gpusense.matching.evidence import pair_evidence
 from gpusense.matching.observability import axes_of, balance_of, observed_information, orthonormal
 from gpusense.matching.options import MatchOptions

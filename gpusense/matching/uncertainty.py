@@ -24,17 +24,20 @@ from gpusense.world.scanner import Scanner
 
 # Least pairs of points of a match, least share of points in common sight, and least score.
 _FEW, _OVERLAP, _POOR = 5, 0.1, 0.46
+_STATUSES = np.array(["converged", "unobservable", "no convergence", "poor", "no overlap", "few points"], "<U16")
 # Number of pairs as which the prior noise counts.
 _PRIOR_PAIRS = 2.0
 # Least variance of a point [m^2]: float32 resolves about a micrometre at ten metres.
 _LEAST_VARIANCE = 1e-9
+# Places of the numbers of an upper triangle in a matrix.
+_BOTH_TRIANGLES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 # A match has converged if its last step along observed directions is shorter than this [deviations of the pose].
 _SHORT = 0.5
 
 
 def symmetric(upper: np.ndarray) -> np.ndarray:
     """Return (S, 3, 3) matrices from the six numbers of their upper triangles."""
-    return upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    return upper[:, _BOTH_TRIANGLES]
 
 
 def noise_of(ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -77,12 +80,12 @@ def inflation_of(squares: np.ndarray) -> np.ndarray:
         squares: (S, 8) sums of squares of the sums of blocks of 1, 2, 4 to 128 points.
     """
     ratio = squares / np.where(squares[:, :1] > 0, squares[:, :1], 1)
-    step = np.diff(ratio, axis=1)
+    step = ratio[:, 1:] - ratio[:, :-1]
     rises = np.logical_and.accumulate(step > 0, axis=1)
-    steps = np.where(rises, step, 0)
-    count = rises.sum(axis=1)
-    last = np.where(count > 0, steps[np.arange(len(steps)), count - 1], 0)
-    inflation: np.ndarray = 1 + steps.sum(axis=1) + last
+    steps = np.where(rises, step, 0.0)
+    # Without a rise, all steps are 0.
+    last = steps[np.arange(len(steps)), np.add.reduce(rises, axis=1, dtype=np.intp) - 1]
+    inflation: np.ndarray = 1 + np.add.reduce(steps, axis=1) + last
     return inflation
 
 
@@ -100,8 +103,9 @@ def variance_of(
         scale: Scale of the weights [m].
         inflation: (S,) factor of the covariance because errors of neighbours are correlated.
     """
-    sigma, factor = noise_of(squared / scale**2)
-    whole = inflation * factor * scale**2
+    square = scale**2
+    sigma, factor = noise_of(squared / square)
+    whole = inflation * factor * square
     whole = (whole * pairs + _PRIOR_PAIRS * noise**2) / (np.maximum(pairs - 3, 0.5) + _PRIOR_PAIRS)
     return (sigma * scale) ** 2, np.maximum(whole, _LEAST_VARIANCE)
 
@@ -118,8 +122,9 @@ def observed_pairs(
         lever: (S,) length by which headings are multiplied [m].
         lines: (S,) lines without a common point.
     """
-    least = np.full(len(lever), LEAST_PAIRS)
-    return observed_information(information, doubt * variance[:, None, None], lever, lines, least)
+    return observed_information(
+        information, doubt * variance[:, None, None], lever, lines, np.full(len(lever), LEAST_PAIRS)
+    )
 
 
 def statuses(result: np.ndarray, lost: np.ndarray, step: np.ndarray) -> np.ndarray:
@@ -131,12 +136,15 @@ def statuses(result: np.ndarray, lost: np.ndarray, step: np.ndarray) -> np.ndarr
         step: (S,) length of the last step in deviations of the pose, along observed directions.
     """
     pairs, seen, through, unseen = result[:, 18], result[:, 21], result[:, 22], result[:, 23]
-    status = np.full(len(result), "converged", dtype="<U16")
-    status[lost > 0] = "unobservable"
-    status[(result[:, 5] == 0) & ~(step < _SHORT)] = "no convergence"
-    status[result[:, 3] < _POOR] = "poor"
-    status[seen < _OVERLAP * np.maximum(seen + through + unseen, 1)] = "no overlap"
-    status[pairs < _FEW] = "few points"
+    code = (lost > 0).astype(np.intp)
+    # Of several reasons, the last one counts.
+    reasons = (
+        (result[:, 5] == 0) & ~(step < _SHORT), result[:, 3] < _POOR,
+        seen < _OVERLAP * np.maximum(seen + through + unseen, 1), pairs < _FEW,
+    )  # fmt: skip
+    for number, failed in enumerate(reasons, 2):
+        code[failed] = number
+    status: np.ndarray = _STATUSES[code]
     return status
 
 

@@ -38,21 +38,19 @@ def tested(
 
     ``noisy`` are numbers of pairs whose lines noise turns.
     """
-    lever = points.rms_range(pairs[:, 1])
-    squared = result[:, 20] / np.maximum(result[:, 19], 1e-30)
+    lever, weights = points.rms_range(pairs[:, 1]), np.maximum(result[:, 19], 1e-30)
     variance, factor = variance_of(
-        squared, result[:, 19], options.least_scale, options.noise, inflation_of(result[:, 24:32])
+        result[:, 20] / weights, result[:, 19], options.least_scale, options.noise, inflation_of(result[:, 24:32])
     )
     noise = np.maximum(variance, options.noise**2)
-    lines = result[:, 19] / points_of_line(points.gap, options.noise, lever)
 
-    def observed(sums: np.ndarray, rows: np.ndarray, independent: np.ndarray) -> Observed:
+    def observed(sums: np.ndarray, rows: np.ndarray | slice, independent: np.ndarray) -> Observed:
         information, doubt = symmetric(sums[:, 6:12]), symmetric(sums[:, 12:18])
         return observed_pairs(information, doubt, noise[rows], lever[rows], independent)
 
     # Short lines decide only where the result is beyond doubt.
-    found = observed(result, np.arange(len(result)), np.zeros(len(result)))
-    turned = (result[:, 12] + result[:, 15]) * noise > _TURNED_LINES * np.maximum(result[:, 19], 1e-30)
+    found = observed(result, slice(None), np.zeros(len(result)))
+    turned = (result[:, 12] + result[:, 15]) * noise > _TURNED_LINES * weights
     turned[noisy] = True
     rows = np.flatnonzero((found.lost > 0) | turned)
     if len(rows) and LONG_WIDTH * options.noise > WIDTH:
@@ -62,6 +60,7 @@ def tested(
         longer = device.run(rows, result[rows, None, :3], rules._replace(stride=stride, thin=1))[:, 0]
         # A subset represents all points.
         longer[:, 6:18] *= stride
+        lines = result[:, 19] / points_of_line(points.gap, options.noise, lever)
         for values, others in zip(found, observed(longer, rows, lines[rows]), strict=True):
             values[rows] = others
     return PairSums(found, variance, factor)
@@ -89,20 +88,21 @@ def concluded(
     """
     usable = is_usable(status)
     two = usable & np.isfinite(other).all(axis=1)
-    offset = np.where(two[:, None], other, 0.0)
-    # The covariance plus a quarter of the offset's square, by Woodbury's identity.
-    side = np.einsum("sij,sj->si", information, offset)
-    information = information - side[:, :, None] * (side / (4 + (side * offset).sum(axis=1))[:, None])[:, None, :]
-    status = np.where(two, "ambiguous", status)
+    if two.any():
+        offset = np.where(two[:, None], other, 0.0)
+        # The covariance plus a quarter of the offset's square, by Woodbury's identity.
+        side = np.einsum("sij,sj->si", information, offset)
+        information = information - side[:, :, None] * (side / (4 + (side * offset).sum(axis=1))[:, None])[:, None, :]
+        status = np.where(two, "ambiguous", status)
     values, vectors = axes_of(information, lever)
-    shares = values * (factor / np.maximum(pairs, 1))[:, None]
-    # The axes of the information that is kept, where all of it is.
-    axes = (values, vectors) if usable.all() else None
-    information = np.where(usable[:, None, None], information, 0.0)
+    kept = (values, vectors) if usable.all() else None
+    if kept is None:
+        # These are not the axes of the information that is kept.
+        information = np.where(usable[:, None, None], information, 0.0)
     return ScanMatch(
-        pose, covariance_of(information, lever, options.window, axes), information, np.zeros(len(pose)), score,
-        iterations.astype(np.int64), shares, vectors.transpose(0, 2, 1), lever, np.full(len(pose), options.noise),
-        evidence, status,
+        pose, covariance_of(information, lever, options.window, kept), information, np.zeros(len(pose)), score,
+        iterations.astype(np.int64), values * (factor / np.maximum(pairs, 1))[:, None], vectors.transpose(0, 2, 1),
+        lever, np.full(len(pose), options.noise), evidence, status,
     )  # fmt: skip
 
 
@@ -117,15 +117,16 @@ def judged(match: ScanMatch, guess: np.ndarray, options: MatchOptions) -> ScanMa
     offset = match.pose - guess
     evidence = match.evidence.copy()
     evidence[:, -1] = np.hypot(offset[:, 0], offset[:, 1]) / max(options.window[0], _LEAST_WINDOW)
-    status, outside = np.asarray(match.status), options.is_outside(offset)
-    usable = match.usable
+    status, outside, usable = np.asarray(match.status), options.is_outside(offset), match.usable
     p_right = np.where(usable & ~outside, probability_right(evidence), 0.0)
-    least = np.where(status == "converged", DOUBTED, DOUBTED_PARTLY)
-    status = np.where(usable & (p_right < least), "doubtful", status)
+    # Poses outside the window have probability 0.
+    doubtful = p_right < np.where(status == "converged", DOUBTED, DOUBTED_PARTLY)
+    good = usable & ~doubtful
+    if good.all():
+        return replace(match, evidence=evidence, p_right=p_right)
+    status = np.where(usable & doubtful, "doubtful", status)
     status = np.where(usable & outside, "outside window", status)
-    if is_usable(status).all():
-        return replace(match, evidence=evidence, p_right=p_right, status=status)
-    failed = ~is_usable(status)[:, None, None]
+    failed = ~good[:, None, None]
     return replace(
         match, evidence=evidence, p_right=p_right, status=status, information=np.where(failed, 0.0, match.information),
         covariance=np.where(failed, np.where(np.eye(3) > 0, np.inf, 0.0), match.covariance),

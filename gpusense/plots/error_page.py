@@ -15,7 +15,8 @@ _PAGES = Path(__file__).parent / "pages"
 def error_page(rows: Sequence[Row], shown: Mapping[str, Sequence[str]] | None = None, text: str = "") -> str:
     """Return the page: a figure of time over error, a budget, and performance profiles.
 
-    A reader chooses need, device, map and error. The most exact method within the budget is marked. The other view is
+    A reader chooses need, device, map and error. The most exact method within the budget is marked, chosen as
+    :func:`~gpusense.evaluation.benchmark.choice.choose` does. The other view is
     the performance profile of Dolan and More (2002): the share of scenes that a method solves to a largest error within
     a factor of the best time.
 
@@ -25,7 +26,8 @@ def error_page(rows: Sequence[Row], shown: Mapping[str, Sequence[str]] | None = 
         text: Line about the machine below the title.
     """
     origins = list(dict.fromkeys(row.origin for row in rows))
-    lines = ",\n".join(_json(_plain(row, origins, shown)) for row in rows)
+    order = sorted({_preference(row) for row in rows})
+    lines = ",\n".join(_json(_plain(row, origins, shown) | {"place": order.index(_preference(row))}) for row in rows)
     data = f'{{"origins":{_json(origins)},"text":{_json(text)},"rows":[\n{lines}]}}'
     page = (_PAGES / "error.html").read_text(encoding="utf-8")
     script = (_PAGES / "error.js").read_text(encoding="utf-8")
@@ -47,6 +49,11 @@ def _plain(row: Row, origins: Sequence[str], shown: Mapping[str, Sequence[str]] 
         ],
         "origin": origins.index(row.origin),
     }  # fmt: skip
+
+
+def _preference(row: Row) -> tuple[Any, ...]:
+    """Return the place of a row among equal ones."""
+    return row.entry(next(iter(row.errors))).preference
 
 
 def _json(value: Any) -> str:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gpusense._util.angles import wrapped
 from gpusense._util.typing import Loss
 from gpusense.positions.closed_forms import two_circles, wrap
 from gpusense.positions.fix import PositionFix
@@ -125,4 +125,4 @@ def _rigid(problem: Problem, sets: NDArray[np.intp]) -> tuple[NDArray[np.complex
     share = share / share.sum(axis=1, keepdims=True)
     middle, centre = (share * seen).sum(axis=1), (share * world).sum(axis=1)
     heading = np.angle((share * np.conj(seen - middle[:, None]) * (world - centre[:, None])).sum(axis=1))
-    return centre - middle * np.exp(1j * heading), np.remainder(heading + math.pi, 2 * math.pi) - math.pi
+    return centre - middle * np.exp(1j * heading), wrapped(heading)

@@ -256,25 +256,16 @@ def make_problem(
     """
     positions = checks.array("xy", xy, ("M", 2))
     count = len(positions)
-    distances = None if ranges is None else checks.array("ranges", ranges, (count,))
+    distances = None if ranges is None else _not_negative("ranges", ranges, count)
     angles = None if bearings is None else checks.array("bearings", bearings, (count,))
     look_at_bearings("bearings", angles)
-    if distances is not None and distances.size and distances.min() < 0:
-        index = int(np.argmin(distances))
-        raise ValueError(f"ranges: must be >= 0, got {distances[index]} at index {index}")
     theta = None if heading is None else checks.real("heading", heading)
     sigma_r, sigma_b = deviations(names[0], sigma_range, count), deviations(names[1], sigma_bearing, count)
-    factors = np.ones(count) if weights is None else checks.array("weights", weights, (count,))
-    if factors.size and factors.min() < 0:
-        raise ValueError(f"weights: must be >= 0, got {factors.min()} at index {int(np.argmin(factors))}")
+    factors = np.ones(count) if weights is None else _not_negative("weights", weights, count)
     loss = checks.choice("loss", loss, tuple(LOSSES))
     loss_scale = checks.real("loss_scale", loss_scale, above=0)
     used = factors > 0
-    if np.count_nonzero(used) < least:
-        noun = f"beacon{'s' * (least > 1)}"
-        if count >= least:
-            raise ValueError(f"weights: must be > 0 for at least {least} {noun}{reason}, got {np.count_nonzero(used)}")
-        raise ValueError(f"xy: must hold at least {least} {noun}{reason}, got {count}")
+    _check_number(used, least, reason)
     positions, factors = positions[used], factors[used]
     # The middle of the box is rounded as finely as the beacons; differences of near numbers are exact.
     origin = positions.min(axis=0) / 2 + positions.max(axis=0) / 2
@@ -291,6 +282,33 @@ def make_problem(
         loss_scale,
         used,
     )
+
+
+def _not_negative(name: str, values: ArrayLike, count: int) -> Floats:
+    """Return (M,) numbers that are at least 0.
+
+    Raises:
+        TypeError, ValueError: They are not.
+    """
+    checked = checks.array(name, values, (count,))
+    if checked.size and checked.min() < 0:
+        raise ValueError(f"{name}: must be >= 0, got {checked.min()} at index {int(np.argmin(checked))}")
+    return checked
+
+
+def _check_number(used: NDArray[np.bool], least: int, reason: str) -> None:
+    """Refuse fewer than ``least`` beacons of positive weight.
+
+    Raises:
+        ValueError: There are fewer, for the ``reason``.
+    """
+    number = int(np.count_nonzero(used))
+    if number >= least:
+        return
+    rule = f"at least {least} beacon{'s' * (least > 1)}{reason}"
+    if len(used) >= least:
+        raise ValueError(f"weights: must be > 0 for {rule}, got {number}")
+    raise ValueError(f"xy: must hold {rule}, got {len(used)}")
 
 
 def subsets(count: int, size: int) -> NDArray[np.intp]:

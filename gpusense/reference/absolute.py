@@ -62,12 +62,7 @@ def log_waves(residual: Pair, terms: np.ndarray) -> np.ndarray:
 
 
 def score_position(
-    flags: frozenset[str],
-    place: np.ndarray,
-    terms: np.ndarray,
-    log_p: np.ndarray,
-    particles: int,
-    temperature: float,
+    flags: frozenset[str], place: np.ndarray, terms: np.ndarray, log_p: np.ndarray, particles: int, temperature: float
 ) -> None:
     """Score positions; ``terms`` are a, b, c and peak, each with its low part, and the log of the uniform part.
 
@@ -85,14 +80,9 @@ def score_position(
 
 
 def score_heading(
-    flags: frozenset[str],
-    residual: np.ndarray,
-    terms: np.ndarray,
-    log_p: np.ndarray,
-    particles: int,
-    kind: int,
+    flags: frozenset[str], residual: np.ndarray, terms: np.ndarray, log_p: np.ndarray, particles: int, kind: int,
     temperature: float,
-) -> None:
+) -> None:  # fmt: skip
     """Score headings; residuals are headings minus the reading, in [-pi, pi]."""
     r = residual[:particles, 0], residual[:particles, 1]
     scale = np.asarray(terms[SCALE]), np.asarray(terms[SCALE_LOW])

@@ -79,18 +79,9 @@ def log_range(
 
 
 def score_beacons(
-    flags: frozenset[str],
-    place: np.ndarray,
-    beacon: np.ndarray,
-    terms: np.ndarray,
-    series: np.ndarray,
-    log_p: np.ndarray,
-    particles: int,
-    beacons: int,
-    count: int,
-    kind: int,
-    temperature: float,
-) -> None:
+    flags: frozenset[str], place: np.ndarray, beacon: np.ndarray, terms: np.ndarray, series: np.ndarray,
+    log_p: np.ndarray, particles: int, beacons: int, count: int, kind: int, temperature: float,
+) -> None:  # fmt: skip
     """Sum log p of ranges over beacons; the first ``count`` numbers of the series belong to a t."""
     sensor = place[:particles, 0], place[:particles, 1], place[:particles, 2], place[:particles, 3]
     zero = np.zeros(particles, place.dtype)

@@ -25,14 +25,9 @@ def ray_limit(flags: frozenset[str], z: np.ndarray, terms: np.ndarray, scale: st
 
 
 def reading_term(
-    flags: frozenset[str],
-    z: np.ndarray,
-    expected: np.ndarray,
-    terms: np.ndarray,
-    sensor: np.ndarray,
-    tables: structs.MixtureTables,
-    range_max: float,
-) -> np.ndarray:
+    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray, sensor: np.ndarray,
+    tables: structs.MixtureTables, range_max: float,
+) -> np.ndarray:  # fmt: skip
     """Return the terms of the scan's sum: log densities of readings, or cubes of densities."""
     if "CUBES" in flags:
         term = compat_density(flags, z, expected, terms) ** 3
@@ -52,32 +47,12 @@ def scan_log(flags: frozenset[str], total: np.ndarray) -> np.ndarray:
 
 
 def score_beams(
-    flags: frozenset[str],
-    map_table: np.ndarray,
-    normals: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    ray: np.ndarray,
-    first: np.ndarray,
-    reading: np.ndarray,
-    terms: np.ndarray,
-    edges: np.ndarray,
-    sensor: np.ndarray,
-    start: np.ndarray,
-    constant_terms: np.ndarray,
-    log_p: np.ndarray,
-    parts: np.ndarray,
-    window: structs.Window,
-    particles: int,
-    rays: int,
-    readings: int,
-    tables: structs.MixtureTables,
-    cone: structs.Cone,
-    caster: structs.Caster,
-    scale: structs.RangeScale,
-    score: structs.Score,
-    batch: structs.ScanBatch,
-) -> None:
+    flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
+    ray: np.ndarray, first: np.ndarray, reading: np.ndarray, terms: np.ndarray, edges: np.ndarray, sensor: np.ndarray,
+    start: np.ndarray, constant_terms: np.ndarray, log_p: np.ndarray, parts: np.ndarray, window: structs.Window,
+    particles: int, rays: int, readings: int, tables: structs.MixtureTables, cone: structs.Cone, caster: structs.Caster,
+    scale: structs.RangeScale, score: structs.Score, batch: structs.ScanBatch,
+) -> None:  # fmt: skip
     """Score scans; ray r has the readings first[r] to first[r + 1] - 1, and ``score`` has the constant term.
 
     With SCANS, the rays of a scan begin at start[scan]; where rays are shared, first counts the readings of all scans.
@@ -92,27 +67,16 @@ def score_beams(
                 structs.Score(constant_terms[scan], score.temperature), batch,
             )  # fmt: skip
         return
-    real = pose.dtype
     block = max((1 << 20) // max(readings * cone.rays, 1), 1)
     ray_of = np.repeat(np.arange(rays), np.diff(first[: rays + 1]))
     for begin in range(0, particles, block):
         end = min(begin + block, particles)
-        bin_terms = terms
-        if "CONES" in flags:
-            t, cosine, _ = echoes(
-                flags, map_table, normals, window, pose_cell[begin:end], pose[begin:end], ray, rays, cone, scale.limit,
-                caster,
-            )  # fmt: skip
-            ranges = expected_range(flags, t, scale)
-            if "INCIDENCE" in flags:
-                cosine = cosine.reshape(end - begin, rays)[:, ray_of]
-                bin_terms = incidence_terms(terms, edges, tables.incidence_bins, cosine)
-        else:
-            ranges = np.empty((end - begin) * rays, real)
-            cast_ranges(
-                flags, map_table, pose_cell[begin:end], pose[begin:end], ray, ranges, window, end - begin, rays, caster,
-                scale,
-            )  # fmt: skip
+        part, bin_terms = slice(begin, end), terms
+        ranges, cosine = expected_ranges(
+            flags, map_table, normals, pose_cell[part], pose[part], ray, rays, window, cone, caster, scale
+        )
+        if "INCIDENCE" in flags:
+            bin_terms = incidence_terms(terms, edges, tables.incidence_bins, cosine.reshape(-1, rays)[:, ray_of])
         expected = ranges.reshape(end - begin, rays)[:, ray_of]
         z = np.broadcast_to(reading[:readings], expected.shape)
         # Devices cast rays up to their limits only; here ranges are cut there.
@@ -121,35 +85,16 @@ def score_beams(
         term = reading_term(flags, z, expected, bin_terms, sensor, tables, scale.range_max)
         if "PER_BEAM" in flags:
             parts[begin * readings : end * readings] = term.ravel()
-        log_p[begin:end] = sum_terms(flags, term, score, strand_sums)
+        log_p[part] = sum_terms(flags, term, score, strand_sums)
 
 
 def beam_tiles(
-    flags: frozenset[str],
-    map_table: np.ndarray,
-    normals: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    order: np.ndarray,
-    ray: np.ndarray,
-    first: np.ndarray,
-    reading: np.ndarray,
-    terms: np.ndarray,
-    edges: np.ndarray,
-    sensor: np.ndarray,
-    start: np.ndarray,
-    parts: np.ndarray,
-    window: structs.Window,
-    particles: int,
-    rays: int,
-    readings: int,
-    tables: structs.MixtureTables,
-    cone: structs.Cone,
-    caster: structs.Caster,
-    scale: structs.RangeScale,
-    spread: int,
-    batch: structs.ScanBatch,
-) -> None:
+    flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
+    order: np.ndarray, ray: np.ndarray, first: np.ndarray, reading: np.ndarray, terms: np.ndarray, edges: np.ndarray,
+    sensor: np.ndarray, start: np.ndarray, parts: np.ndarray, window: structs.Window, particles: int, rays: int,
+    readings: int, tables: structs.MixtureTables, cone: structs.Cone, caster: structs.Caster, scale: structs.RangeScale,
+    spread: int, batch: structs.ScanBatch,
+) -> None:  # fmt: skip
     """Write the term of reading k to parts[place + k * particles]; GPUs do so in tiles of particles and rays.
 
     With STRANDED the number there is the sum of strand k.
@@ -183,6 +128,22 @@ def beam_tiles(
     parts[places[:, None] + np.arange(term.shape[1]) * particles] = term
 
 
+def expected_ranges(
+    flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
+    ray: np.ndarray, rays: int, window: structs.Window, cone: structs.Cone, caster: structs.Caster,
+    scale: structs.RangeScale,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return the (N * R,) expected ranges of rays or cones [m], and the cosines of incidence of cones; none of rays."""
+    if "CONES" in flags:
+        t, cosine, _ = echoes(
+            flags, map_table, normals, window, pose_cell, pose, ray, rays, cone, scale.limit, caster
+        )  # fmt: skip
+        return expected_range(flags, t, scale), cosine
+    ranges = np.empty(len(pose) * rays, pose.dtype)
+    cast_ranges(flags, map_table, pose_cell, pose, ray, ranges, window, len(pose), rays, caster, scale)
+    return ranges, np.empty(0, pose.dtype)
+
+
 def readings_of_scan(
     flags: frozenset[str], scan: int, start: np.ndarray, first: np.ndarray, reading: np.ndarray
 ) -> tuple[int, int, np.ndarray, np.ndarray]:
@@ -195,10 +156,7 @@ def readings_of_scan(
 
 
 def sum_terms(
-    flags: frozenset[str],
-    term: np.ndarray,
-    score: structs.Score,
-    plainly: Callable[[np.ndarray], np.ndarray],
+    flags: frozenset[str], term: np.ndarray, score: structs.Score, plainly: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
     """Sum (M, K) terms and a constant one in the order of the beams; -inf where one of them is -inf.
 

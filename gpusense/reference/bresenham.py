@@ -17,15 +17,9 @@ from gpusense.reference.rectangles import padded
 
 
 def cast_ray(
-    flags: frozenset[str],
-    map_table: np.ndarray,
-    window: structs.Window,
-    cell: np.ndarray,
-    pose: np.ndarray,
-    ray: np.ndarray,
-    limit: float,
-    caster: structs.Caster,
-) -> np.ndarray:
+    flags: frozenset[str], map_table: np.ndarray, window: structs.Window, cell: np.ndarray, pose: np.ndarray,
+    ray: np.ndarray, limit: float, caster: structs.Caster,
+) -> np.ndarray:  # fmt: skip
     """Return the distance in cells from the origin's cell to the first occupied cell of the line, limit without one.
 
     Args:

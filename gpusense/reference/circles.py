@@ -131,18 +131,9 @@ def fit_circle(mine: np.ndarray, edge: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def fit_circles(
-    flags: frozenset[str],
-    point: np.ndarray,
-    start: np.ndarray,
-    noise: np.ndarray,
-    part: np.ndarray,
-    scan: np.ndarray,
-    edge: np.ndarray,
-    circle: np.ndarray,
-    scans: int,
-    points: int,
-    parts: int,
-) -> None:
+    flags: frozenset[str], point: np.ndarray, start: np.ndarray, noise: np.ndarray, part: np.ndarray, scan: np.ndarray,
+    edge: np.ndarray, circle: np.ndarray, scans: int, points: int, parts: int,
+) -> None:  # fmt: skip
     """Fit circles to parts of scans, of a first point and a number of points.
 
     Edges are the bearings of the right and the left edge and their deviations, which are 0 where edges are not seen.

@@ -63,23 +63,10 @@ def log_bump(squared: np.ndarray, pressed: int, terms: np.ndarray) -> np.ndarray
 
 
 def score_contact(
-    flags: frozenset[str],
-    table: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    pose_low: np.ndarray,
-    point: np.ndarray,
-    point_low: np.ndarray,
-    start: np.ndarray,
-    pressed: np.ndarray,
-    terms: np.ndarray,
-    log_p: np.ndarray,
-    window: structs.Window,
-    particles: int,
-    segments: int,
-    guard: float,
-    temperature: float,
-) -> None:
+    flags: frozenset[str], table: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
+    point: np.ndarray, point_low: np.ndarray, start: np.ndarray, pressed: np.ndarray, terms: np.ndarray,
+    log_p: np.ndarray, window: structs.Window, particles: int, segments: int, guard: float, temperature: float,
+) -> None:  # fmt: skip
     """Sum log p over segments; segment s has the points start[s] to start[s + 1] - 1."""
     total = np.zeros(particles, terms.dtype)
     sensor_pose, low = pose[:particles, None], pose_low[: particles if "TWO_PART_POINTS" in flags else 1, None]

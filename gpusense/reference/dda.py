@@ -13,15 +13,9 @@ from gpusense.reference.rectangles import padded
 
 
 def cast_ray(
-    flags: frozenset[str],
-    map_table: np.ndarray,
-    window: structs.Window,
-    cell: np.ndarray,
-    pose: np.ndarray,
-    ray: np.ndarray,
-    limit: float,
-    caster: structs.Caster,
-) -> np.ndarray:
+    flags: frozenset[str], map_table: np.ndarray, window: structs.Window, cell: np.ndarray, pose: np.ndarray,
+    ray: np.ndarray, limit: float, caster: structs.Caster,
+) -> np.ndarray:  # fmt: skip
     """Return the distance in cells to the first occupied cell, limit where none is nearer.
 
     Args:

@@ -27,14 +27,9 @@ def _lines(array: np.ndarray, lines: int, length: int, line_stride: int, step: i
 
 
 def distance_lines(
-    flags: frozenset[str],
-    occupied: np.ndarray,
-    along: np.ndarray,
-    lines: int,
-    length: int,
-    line_stride: int,
+    flags: frozenset[str], occupied: np.ndarray, along: np.ndarray, lines: int, length: int, line_stride: int,
     step: int,
-) -> None:
+) -> None:  # fmt: skip
     """Count the cells to the nearest occupied cell of the same line, NO_OBSTACLE without one (first pass)."""
     cells = _lines(occupied, lines, length, line_stride, step)
     index = np.arange(length, dtype=np.int32)
@@ -46,15 +41,9 @@ def distance_lines(
 
 
 def distance_envelope(
-    flags: frozenset[str],
-    along: np.ndarray,
-    starts: np.ndarray,
-    squared: np.ndarray,
-    lines: int,
-    length: int,
-    line_stride: int,
-    step: int,
-) -> None:
+    flags: frozenset[str], along: np.ndarray, starts: np.ndarray, squared: np.ndarray, lines: int, length: int,
+    line_stride: int, step: int,
+) -> None:  # fmt: skip
     """Find the lowest parabola of a line at each of its cells (second pass)."""
     across = _lines(along, lines, length, line_stride, step)
     out = _lines(squared, lines, length, line_stride, step)
@@ -98,15 +87,9 @@ def squares_sum(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def distance_search(
-    flags: frozenset[str],
-    nearest: np.ndarray,
-    blocks: np.ndarray,
-    squared: np.ndarray,
-    rows: int,
-    cols: int,
-    count: int,
-    most: int,
-) -> None:
+    flags: frozenset[str], nearest: np.ndarray, blocks: np.ndarray, squared: np.ndarray, rows: int, cols: int,
+    count: int, most: int,
+) -> None:  # fmt: skip
     """Find the least sum of squares along each column, UNREACHABLE where it is over most (second pass)."""
     columns = nearest[: rows * cols].reshape(rows, cols).astype(np.uint32).T
     out = squared[: rows * cols].reshape(rows, cols)
@@ -114,3 +97,21 @@ def distance_search(
         column = columns[begin : begin + BLOCK]
         lowest = _lowest(np.where(column == FAR_CELLS, FAR, squares_sum(column, np.zeros_like(column))))
         out[:, begin : begin + BLOCK] = np.where(lowest > most, UNREACHABLE, lowest).T
+
+
+def fill_field(
+    flags: frozenset[str], squared: np.ndarray, density: np.ndarray, table: np.ndarray, rows: int, cols: int, cap: int,
+    beyond: float, from_col: int, from_row: int, width: int, height: int, begin: int, stride: int,
+) -> None:  # fmt: skip
+    """Fill cells of a field's table from squared distances; density has a value for each one up to the cap.
+
+    There are height x width cells, which begin at index begin of the table and at cell (from_row, from_col) of the
+    grid; cells outside the grid get beyond.
+    """
+    size = table.itemsize
+    out = np.lib.stride_tricks.as_strided(table[begin:], (height, width), (stride * size, size))
+    top, bottom = (min(max(row, 0), rows) for row in (from_row, from_row + height))
+    left, right = (min(max(col, 0), cols) for col in (from_col, from_col + width))
+    known = squared[: rows * cols].reshape(rows, cols)[top:bottom, left:right]
+    out[...] = beyond
+    out[top - from_row : bottom - from_row, left - from_col : right - from_col] = density[np.minimum(known, cap)]

@@ -67,15 +67,9 @@ def is_copied(own: np.ndarray, particles: int, drawn: int) -> bool:
 
 
 def copy_particle(
-    source: np.ndarray,
-    weight: np.ndarray,
-    settings: np.ndarray,
-    own: np.ndarray,
-    target: np.ndarray,
-    after: np.ndarray,
-    particles: int,
-    n: np.ndarray,
-) -> None:
+    source: np.ndarray, weight: np.ndarray, settings: np.ndarray, own: np.ndarray, target: np.ndarray,
+    after: np.ndarray, particles: int, n: np.ndarray,
+) -> None:  # fmt: skip
     """Copy particles with their weights, relative to the mean weight."""
     total, old = own[TOTAL], weight[n % particles]
     target.reshape(-1, 3)[n] = source.reshape(-1, 3)[n % particles]
@@ -101,18 +95,9 @@ def start_of(settings: np.ndarray, stage: int, index: np.ndarray) -> np.ndarray:
 
 
 def draw_particle(
-    source: np.ndarray,
-    ends: np.ndarray,
-    settings: np.ndarray,
-    state: np.ndarray,
-    pool: np.ndarray,
-    target: np.ndarray,
-    after: np.ndarray,
-    particles: int,
-    stage: int,
-    n: np.ndarray,
-    chosen: np.ndarray,
-) -> None:
+    source: np.ndarray, ends: np.ndarray, settings: np.ndarray, state: np.ndarray, pool: np.ndarray, target: np.ndarray,
+    after: np.ndarray, particles: int, stage: int, n: np.ndarray, chosen: np.ndarray,
+) -> None:  # fmt: skip
     """Draw particles from those with indices ``chosen``: move them by jitter where a stage follows, or inject poses."""
     poses, index = source[: 3 * particles].reshape(-1, 3), n + int(settings[FIRST])
     pose, total = poses[chosen], state[stage * STAGE + TOTAL]

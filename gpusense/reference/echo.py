@@ -21,11 +21,7 @@ def is_wall(normal: np.ndarray) -> np.ndarray:
 
 
 def normal_at(
-    flags: frozenset[str],
-    normals: np.ndarray,
-    window: structs.Window,
-    col: np.ndarray,
-    row: np.ndarray,
+    flags: frozenset[str], normals: np.ndarray, window: structs.Window, col: np.ndarray, row: np.ndarray
 ) -> np.ndarray:
     """Return (M, 2) normals of cells."""
     beyond = off_grid(np.stack([col + 1, row + 1]), window.rows + 2, window.cols + 2)
@@ -35,12 +31,7 @@ def normal_at(
 
 
 def hit_normal(
-    flags: frozenset[str],
-    normals: np.ndarray,
-    window: structs.Window,
-    cell: np.ndarray,
-    r: Ray,
-    t: np.ndarray,
+    flags: frozenset[str], normals: np.ndarray, window: structs.Window, cell: np.ndarray, r: Ray, t: np.ndarray
 ) -> np.ndarray:
     """Return the normals of the cells in which M rays end at distances t.
 
@@ -66,17 +57,9 @@ def incidence_terms(terms: np.ndarray, edges: np.ndarray, incidence_bins: int, c
 
 
 def nearest_echo(
-    flags: frozenset[str],
-    map_table: np.ndarray,
-    normals: np.ndarray,
-    window: structs.Window,
-    cell: np.ndarray,
-    pose: np.ndarray,
-    ray: np.ndarray,
-    critical: float,
-    limit: float,
-    caster: structs.Caster,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, window: structs.Window, cell: np.ndarray,
+    pose: np.ndarray, ray: np.ndarray, critical: float, limit: float, caster: structs.Caster,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Return the nearest returns of M cones.
 
     A ray whose angle of incidence has a cosine below critical has no return: the surface reflects it like a mirror.
@@ -116,21 +99,10 @@ def nearest_echo(
 
 
 def cast_echoes(
-    flags: frozenset[str],
-    map_table: np.ndarray,
-    normals: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    ray: np.ndarray,
-    ranges: np.ndarray,
-    incidence: np.ndarray,
-    window: structs.Window,
-    particles: int,
-    rays: int,
-    cone: structs.Cone,
-    caster: structs.Caster,
-    scale: structs.RangeScale,
-) -> None:
+    flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
+    ray: np.ndarray, ranges: np.ndarray, incidence: np.ndarray, window: structs.Window, particles: int, rays: int,
+    cone: structs.Cone, caster: structs.Caster, scale: structs.RangeScale,
+) -> None:  # fmt: skip
     """Cast the cones of all particles to expected ranges and angles of incidence, NaN without a return.
 
     With COSINES, cosines replace the angles; 2 without a return.
@@ -149,18 +121,9 @@ def cast_echoes(
 
 
 def echoes(
-    flags: frozenset[str],
-    map_table: np.ndarray,
-    normals: np.ndarray,
-    window: structs.Window,
-    cell: np.ndarray,
-    pose: np.ndarray,
-    ray: np.ndarray,
-    rays: int,
-    cone: structs.Cone,
-    limit: float,
-    caster: structs.Caster,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, window: structs.Window, cell: np.ndarray,
+    pose: np.ndarray, ray: np.ndarray, rays: int, cone: structs.Cone, limit: float, caster: structs.Caster,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Return ``nearest_echo`` of all cones at all poses, (N * rays,) each."""
     lanes = (np.repeat(cell, rays, axis=0), np.repeat(pose, rays, axis=0))
     cones = np.tile(ray[: rays * cone.rays].reshape(rays, cone.rays, 2), (len(pose), 1, 1))

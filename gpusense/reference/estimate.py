@@ -19,16 +19,9 @@ from gpusense.reference.motion import wrap_once
 
 
 def sum_poses(
-    flags: frozenset[str],
-    poses: np.ndarray,
-    weight: np.ndarray,
-    estimate: np.ndarray,
-    sums: np.ndarray,
-    particles: int,
-    block: int,
-    lanes: int,
-    second_pass: int,
-) -> None:
+    flags: frozenset[str], poses: np.ndarray, weight: np.ndarray, estimate: np.ndarray, sums: np.ndarray,
+    particles: int, block: int, lanes: int, second_pass: int,
+) -> None:  # fmt: skip
     """Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings.
 
     A row of sums takes ``lanes`` lanes of a block.

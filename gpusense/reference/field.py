@@ -17,56 +17,12 @@ from gpusense.reference.scans import particles_of_scans
 BLOCK = 1 << 18
 
 
-def fill_field(
-    flags: frozenset[str],
-    squared: np.ndarray,
-    density: np.ndarray,
-    table: np.ndarray,
-    rows: int,
-    cols: int,
-    cap: int,
-    beyond: float,
-    from_col: int,
-    from_row: int,
-    width: int,
-    height: int,
-    begin: int,
-    stride: int,
-) -> None:
-    """Fill cells of the table from squared distances; density has a value for each squared distance up to the cap.
-
-    There are height x width cells, which begin at index begin of the table and at cell (from_row, from_col) of the
-    grid; cells outside the grid get beyond.
-    """
-    size = table.itemsize
-    out = np.lib.stride_tricks.as_strided(table[begin:], (height, width), (stride * size, size))
-    top, bottom = (min(max(row, 0), rows) for row in (from_row, from_row + height))
-    left, right = (min(max(col, 0), cols) for col in (from_col, from_col + width))
-    known = squared[: rows * cols].reshape(rows, cols)[top:bottom, left:right]
-    out[...] = beyond
-    out[top - from_row : bottom - from_row, left - from_col : right - from_col] = density[np.minimum(known, cap)]
-
-
 def score_field(
-    flags: frozenset[str],
-    table: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    pose_low: np.ndarray,
-    point: np.ndarray,
-    point_low: np.ndarray,
-    terms: np.ndarray,
-    start: np.ndarray,
-    constant_terms: np.ndarray,
-    log_p: np.ndarray,
-    parts: np.ndarray,
-    window: structs.Window,
-    particles: int,
-    readings: int,
-    guard: float,
-    score: structs.Score,
-    batch: structs.ScanBatch,
-) -> None:
+    flags: frozenset[str], table: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
+    point: np.ndarray, point_low: np.ndarray, terms: np.ndarray, start: np.ndarray, constant_terms: np.ndarray,
+    log_p: np.ndarray, parts: np.ndarray, window: structs.Window, particles: int, readings: int, guard: float,
+    score: structs.Score, batch: structs.ScanBatch,
+) -> None:  # fmt: skip
     """Score scans; the table holds log densities, or capped distances in metres where it is interpolated."""
     if "SCANS" in flags:
         for scan, part in particles_of_scans(particles, batch):
@@ -92,23 +48,10 @@ def score_field(
 
 
 def field_blocks(
-    flags: frozenset[str],
-    table: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    pose_low: np.ndarray,
-    point: np.ndarray,
-    point_low: np.ndarray,
-    terms: np.ndarray,
-    guard: np.ndarray,
-    start: np.ndarray,
-    parts: np.ndarray,
-    window: structs.Window,
-    particles: int,
-    readings: int,
-    spread: int,
-    batch: structs.ScanBatch,
-) -> None:
+    flags: frozenset[str], table: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
+    point: np.ndarray, point_low: np.ndarray, terms: np.ndarray, guard: np.ndarray, start: np.ndarray,
+    parts: np.ndarray, window: structs.Window, particles: int, readings: int, spread: int, batch: structs.ScanBatch,
+) -> None:  # fmt: skip
     """Write the sums of blocks of readings to parts[n + block * particles]; on GPUs a work-item takes single blocks."""
     if "SCANS" in flags:
         for scan, part in particles_of_scans(particles, batch):

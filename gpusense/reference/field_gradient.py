@@ -45,27 +45,11 @@ def distance_slope(
 
 
 def field_gradient(
-    flags: frozenset[str],
-    table: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    pose_low: np.ndarray,
-    point: np.ndarray,
-    point_low: np.ndarray,
-    terms: np.ndarray,
-    start: np.ndarray,
-    constant_terms: np.ndarray,
-    gradient: np.ndarray,
-    window: structs.Window,
-    particles: int,
-    readings: int,
-    guard: float,
-    mount_x: float,
-    mount_y: float,
-    resolution: float,
-    score: structs.Score,
-    batch: structs.ScanBatch,
-) -> None:
+    flags: frozenset[str], table: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
+    point: np.ndarray, point_low: np.ndarray, terms: np.ndarray, start: np.ndarray, constant_terms: np.ndarray,
+    gradient: np.ndarray, window: structs.Window, particles: int, readings: int, guard: float, mount_x: float,
+    mount_y: float, resolution: float, score: structs.Score, batch: structs.ScanBatch,
+) -> None:  # fmt: skip
     """Write log p, its gradient (3) and the information (9) of poses in the grid's frame, each times the temperature.
 
     ``mount_x`` and ``mount_y`` are the sensor's place on the robot in cells.

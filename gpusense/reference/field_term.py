@@ -22,12 +22,7 @@ def between(flags: frozenset[str], weight_a: Pair, a: Pair, weight_b: Pair, b: P
 
 
 def bilinear(
-    flags: frozenset[str],
-    table: np.ndarray,
-    col: np.ndarray,
-    row: np.ndarray,
-    end: EndPoint,
-    window: structs.Window,
+    flags: frozenset[str], table: np.ndarray, col: np.ndarray, row: np.ndarray, end: EndPoint, window: structs.Window
 ) -> Pair:
     """Interpolate the distance between the four cell centres around an end point, in two parts."""
     zero = np.zeros_like(end.rest_x[0])
@@ -70,16 +65,9 @@ def log_field(flags: frozenset[str], distance: Pair, terms: np.ndarray) -> np.nd
 
 
 def reading_value(
-    flags: frozenset[str],
-    table: np.ndarray,
-    origin: np.ndarray,
-    pose: np.ndarray,
-    pose_low: np.ndarray,
-    point: np.ndarray,
-    point_low: np.ndarray,
-    terms: np.ndarray,
-    window: structs.Window,
-) -> np.ndarray:
+    flags: frozenset[str], table: np.ndarray, origin: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
+    point: np.ndarray, point_low: np.ndarray, terms: np.ndarray, window: structs.Window,
+) -> np.ndarray:  # fmt: skip
     """Return the terms of readings: (M, 1, ...) poses and their cells with (1, K, 2) points give (M, K) terms."""
     end = end_point(flags, pose, pose_low, point, point_low)
     col, row = end.col + origin[..., 0], end.row + origin[..., 1]

@@ -78,19 +78,9 @@ def agreement(
 
 
 def match_scans(
-    flags: frozenset[str],
-    point: np.ndarray,
-    start: np.ndarray,
-    line: np.ndarray,
-    pair: np.ndarray,
-    guess: np.ndarray,
-    result: np.ndarray,
-    scans: int,
-    points: int,
-    pairs: int,
-    starts: int,
-    rules: structs.MatchRules,
-) -> None:
+    flags: frozenset[str], point: np.ndarray, start: np.ndarray, line: np.ndarray, pair: np.ndarray, guess: np.ndarray,
+    result: np.ndarray, scans: int, points: int, pairs: int, starts: int, rules: structs.MatchRules,
+) -> None:  # fmt: skip
     """Match pairs of scans (reference, second scan) from guesses (x, y, theta).
 
     A guess is the pose of the second scan in the reference's frame. Every ``stride``-th point and every ``skip``-th of

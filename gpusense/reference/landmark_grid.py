@@ -25,11 +25,7 @@ def bucket_at(position: np.ndarray, size: float, count: int) -> np.ndarray:
 
 
 def candidates(
-    start: np.ndarray,
-    place: Quad,
-    turned: Quad,
-    feature: np.ndarray,
-    buckets: structs.Buckets,
+    start: np.ndarray, place: Quad, turned: Quad, feature: np.ndarray, buckets: structs.Buckets
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return runs of landmarks in the buckets that discs touch: (P, rows of buckets) first and last + 1."""
     reach, radius = feature[REACH], feature[RADIUS]
@@ -74,18 +70,9 @@ def log_match(
 
 
 def search(
-    flags: frozenset[str],
-    landmark: np.ndarray,
-    normal: np.ndarray,
-    signature: np.ndarray,
-    start: np.ndarray,
-    place: Quad,
-    turned: Quad,
-    feature: np.ndarray,
-    terms: np.ndarray,
-    arcs: np.ndarray,
-    buckets: structs.Buckets,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    flags: frozenset[str], landmark: np.ndarray, normal: np.ndarray, signature: np.ndarray, start: np.ndarray,
+    place: Quad, turned: Quad, feature: np.ndarray, terms: np.ndarray, arcs: np.ndarray, buckets: structs.Buckets,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Return per particle the log density, the log density of the likeliest landmark, and its index.
 
     The log density is that of the likeliest landmark, or with MARGINAL of all landmarks.

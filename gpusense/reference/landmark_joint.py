@@ -24,30 +24,47 @@ from gpusense.reference.offsets import offset
 LOG_2 = 0.69314718055994531
 
 
-def joint_features(
-    flags: frozenset[str],
-    landmark: np.ndarray,
-    normal: np.ndarray,
-    signature: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    pose_low: np.ndarray,
-    feature: np.ndarray,
-    terms: np.ndarray,
-    arcs: np.ndarray,
-    best: np.ndarray,
-    choice: np.ndarray,
-    value: np.ndarray,
-    log_p: np.ndarray,
-    parts: np.ndarray,
-    which: np.ndarray,
-    landmarks: int,
-    particles: int,
-    features: int,
-    sets: int,
-    buckets: structs.Buckets,
-    score: structs.Score,
+def add_landmark(
+    j: int, log_each: np.ndarray, numbers: np.ndarray, best: np.ndarray, choice: np.ndarray, value: np.ndarray
 ) -> None:
+    """Let landmark j be seen by one more feature of each set, at most one of each group.
+
+    Args:
+        j: The landmark.
+        log_each: (F, N) log p of the features.
+        numbers: (F, FEATURE) numbers of the features.
+        best: (N, 2^F) largest sums of the sets.
+        choice: (N, 2^F, F) landmarks of the features of the sets.
+        value: (N, 2^F, F) their log p.
+    """
+    sets, groups = best.shape[1], int(numbers[:, GROUP].max(initial=0)) + 1
+    # From the full set down, since smaller sets must not yet contain this landmark for the group.
+    for group, s in itertools.product(range(groups), range(sets - 1, 0, -1)):
+        for k in range(len(numbers)):
+            if s >> k & 1 and numbers[k, GROUP] == group:
+                less = s ^ 1 << k
+                joined = best[:, less] + log_each[k]
+                better = joined > best[:, s]
+                best[better, s] = joined[better]
+                choice[better, s], value[better, s] = choice[better, less], value[better, less]
+                choice[better, s, k], value[better, s, k] = j, log_each[k, better]
+
+
+def set_total(s: int, sums: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """Return log p of all features if those of set s have landmarks and the remaining ones are false positives."""
+    total = sums.copy()
+    for k in range(len(numbers)):
+        if not s >> k & 1:
+            total = total + numbers[k, FALSE_POSITIVE]
+    return total
+
+
+def joint_features(
+    flags: frozenset[str], landmark: np.ndarray, normal: np.ndarray, signature: np.ndarray, pose_cell: np.ndarray,
+    pose: np.ndarray, pose_low: np.ndarray, feature: np.ndarray, terms: np.ndarray, arcs: np.ndarray, best: np.ndarray,
+    choice: np.ndarray, value: np.ndarray, log_p: np.ndarray, parts: np.ndarray, which: np.ndarray, landmarks: int,
+    particles: int, features: int, sets: int, buckets: structs.Buckets, score: structs.Score,
+) -> None:  # fmt: skip
     """Find the best joint association of each particle.
 
     ``choice[s]`` has the landmark of each feature of set s, and ``value[s]`` its log p; ``sets`` is 2^features.
@@ -61,7 +78,6 @@ def joint_features(
     each = value[: particles * sets * features].reshape(particles, sets, features)
     sums[:], partners[:], each[:] = -np.inf, -1, -np.inf
     sums[:, 0] = 0
-    groups = int(numbers[:features, GROUP].max(initial=0)) + 1
     for j in range(landmarks):
         off = offset(landmark[j : j + 1], place)
         same = np.full(particles, j)
@@ -72,22 +88,10 @@ def joint_features(
                 detected = either(detected, numbers[k, FALSE_POSITIVE])
                 may = may_match(flags, off, turned[k], numbers[k], normal, signature, same)
                 log_each[k] = np.where(may, detected, -np.inf)
-        # From the full set down, since smaller sets must not yet contain this landmark for the group.
-        for group, s in itertools.product(range(groups), range(sets - 1, 0, -1)):
-            for k in range(features):
-                if s >> k & 1 and numbers[k, GROUP] == group:
-                    less = s ^ 1 << k
-                    joined = sums[:, less] + log_each[k]
-                    better = joined > sums[:, s]
-                    sums[better, s] = joined[better]
-                    partners[better, s], each[better, s] = partners[better, less], each[better, less]
-                    partners[better, s, k], each[better, s, k] = j, log_each[k, better]
+        add_landmark(j, log_each, numbers[:features], sums, partners, each)
     most, chosen = np.full(particles, -np.inf, real), np.zeros(particles, np.int64)
     for s in range(sets):
-        total = sums[:, s].copy()
-        for k in range(features):
-            if not s >> k & 1:
-                total = total + numbers[k, FALSE_POSITIVE]
+        total = set_total(s, sums[:, s], numbers[:features])
         better = total > most
         most[better], chosen[better] = total[better], s
     log_p[:particles] = np.where(np.isneginf(most), most, score.temperature * (score.constant_term + most))

@@ -18,28 +18,11 @@ BLOCK = 1 << 14
 
 
 def score_features(
-    flags: frozenset[str],
-    landmark: np.ndarray,
-    normal: np.ndarray,
-    signature: np.ndarray,
-    start: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    pose_low: np.ndarray,
-    feature: np.ndarray,
-    partner: np.ndarray,
-    terms: np.ndarray,
-    arcs: np.ndarray,
-    log_p: np.ndarray,
-    parts: np.ndarray,
-    which: np.ndarray,
-    buckets: structs.Buckets,
-    landmarks: int,
-    particles: int,
-    features: int,
-    share: float,
-    score: structs.Score,
-) -> None:
+    flags: frozenset[str], landmark: np.ndarray, normal: np.ndarray, signature: np.ndarray, start: np.ndarray,
+    pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray, feature: np.ndarray, partner: np.ndarray,
+    terms: np.ndarray, arcs: np.ndarray, log_p: np.ndarray, parts: np.ndarray, which: np.ndarray,
+    buckets: structs.Buckets, landmarks: int, particles: int, features: int, share: float, score: structs.Score,
+) -> None:  # fmt: skip
     """Sum log p over features: with the KNOWN partner, all landmarks (MARGINAL) or the likeliest one.
 
     With PER_BEAM, ``parts`` has the term of each feature, and ``which`` the index of its likeliest landmark, -1 where a

@@ -17,19 +17,10 @@ def in_view(off: Quad, cosine: np.ndarray, sine: np.ndarray, range_max: float, l
 
 
 def count_unseen(
-    flags: frozenset[str],
-    landmark: np.ndarray,
-    start: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    pose_low: np.ndarray,
-    which: np.ndarray,
-    log_p: np.ndarray,
-    buckets: structs.Buckets,
-    particles: int,
-    features: int,
+    flags: frozenset[str], landmark: np.ndarray, start: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
+    pose_low: np.ndarray, which: np.ndarray, log_p: np.ndarray, buckets: structs.Buckets, particles: int, features: int,
     view: structs.SensorView,
-) -> None:
+) -> None:  # fmt: skip
     """Add ``log_missed`` to log_p for every landmark in view that belongs to no feature."""
     block = max(BLOCK_PAIRS // max(int(start[buckets.rows * buckets.cols]), 1), 1)
     for begin in range(0, particles, block):

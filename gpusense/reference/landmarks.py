@@ -157,14 +157,9 @@ def add_square(total: Pair, residual: Pair, scale: float, scale_low: np.floating
 
 
 def log_detection(
-    flags: frozenset[str],
-    off: Quad,
-    turned: Quad,
-    feature: np.ndarray,
-    signature: np.ndarray,
-    terms: np.ndarray,
+    flags: frozenset[str], off: Quad, turned: Quad, feature: np.ndarray, signature: np.ndarray, terms: np.ndarray,
     arcs: np.ndarray,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Return ``log(z_detect p(f | j))`` of one feature at each offset; signature is (s_j, low part, -log m_s, 0)."""
     real = terms.dtype
     zero = np.zeros(len(off[0]), real)

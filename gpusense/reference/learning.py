@@ -101,17 +101,9 @@ def add_pair(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: 
 
 
 def e_step(
-    flags: frozenset[str],
-    reading: np.ndarray,
-    expected: np.ndarray,
-    terms: np.ndarray,
-    sums: np.ndarray,
-    blocks: int,
-    readings: int,
-    across: int,
-    along: int,
-    width: int,
-) -> None:
+    flags: frozenset[str], reading: np.ndarray, expected: np.ndarray, terms: np.ndarray, sums: np.ndarray, blocks: int,
+    readings: int, across: int, along: int, width: int,
+) -> None:  # fmt: skip
     """Sum over blocks of pairs; pair k of a block is pair block * across + k * along."""
     count = 39 if "INFORMATION" in flags else 13
     total = (np.zeros((count, blocks), terms.dtype), np.zeros((count, blocks), terms.dtype))
@@ -126,16 +118,9 @@ def e_step(
 
 
 def pair_causes(
-    flags: frozenset[str],
-    reading: np.ndarray,
-    expected: np.ndarray,
-    terms: np.ndarray,
-    causes: np.ndarray,
-    blocks: int,
-    readings: int,
-    across: int,
-    along: int,
-) -> None:
+    flags: frozenset[str], reading: np.ndarray, expected: np.ndarray, terms: np.ndarray, causes: np.ndarray,
+    blocks: int, readings: int, across: int, along: int,
+) -> None:  # fmt: skip
     """Write log p and the responsibilities of each pair, NaN for padding."""
     starts = np.arange(blocks) * across
     for k in range(readings):

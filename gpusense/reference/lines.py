@@ -8,21 +8,9 @@ WHOLE_TURN = 6.283185307179586
 
 
 def fit_lines(
-    flags: frozenset[str],
-    point: np.ndarray,
-    start: np.ndarray,
-    which: np.ndarray,
-    line: np.ndarray,
-    scans: int,
-    points: int,
-    chosen: int,
-    reach: int,
-    most: int,
-    ratio: float,
-    slack: float,
-    width: float,
-    gap: float,
-) -> None:
+    flags: frozenset[str], point: np.ndarray, start: np.ndarray, which: np.ndarray, line: np.ndarray, scans: int,
+    points: int, chosen: int, reach: int, most: int, ratio: float, slack: float, width: float, gap: float,
+) -> None:  # fmt: skip
     """Fit a line to each point of the chosen scans and ``reach`` neighbours on either side.
 
     Up to ``most`` neighbours within a distance of ``width`` take part. Each lies within ``slack`` plus ``ratio`` times

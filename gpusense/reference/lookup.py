@@ -13,15 +13,9 @@ from gpusense.reference.ray import angle_bin, make_ray, start_casts
 
 
 def cast_ray(
-    flags: frozenset[str],
-    map_table: np.ndarray,
-    window: structs.Window,
-    cell: np.ndarray,
-    pose: np.ndarray,
-    ray: np.ndarray,
-    limit: float,
-    caster: structs.Caster,
-) -> np.ndarray:
+    flags: frozenset[str], map_table: np.ndarray, window: structs.Window, cell: np.ndarray, pose: np.ndarray,
+    ray: np.ndarray, limit: float, caster: structs.Caster,
+) -> np.ndarray:  # fmt: skip
     """Return the distance in cells from the table, limit where no obstacle is nearer.
 
     Args:

@@ -17,15 +17,9 @@ LEAST_STEP = 2.0**-22
 
 
 def cast_ray(
-    flags: frozenset[str],
-    map_table: np.ndarray,
-    window: structs.Window,
-    cell: np.ndarray,
-    pose: np.ndarray,
-    ray: np.ndarray,
-    limit: float,
-    caster: structs.Caster,
-) -> np.ndarray:
+    flags: frozenset[str], map_table: np.ndarray, window: structs.Window, cell: np.ndarray, pose: np.ndarray,
+    ray: np.ndarray, limit: float, caster: structs.Caster,
+) -> np.ndarray:  # fmt: skip
     """Return the distance in cells to a point in an occupied cell, limit where none is nearer.
 
     Args:

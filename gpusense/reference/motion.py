@@ -43,12 +43,7 @@ def wrap_any(theta: np.ndarray) -> np.ndarray:
 
 
 def move_particles(
-    flags: frozenset[str],
-    source: np.ndarray,
-    settings: np.ndarray,
-    target: np.ndarray,
-    particles: int,
-    kind: int,
+    flags: frozenset[str], source: np.ndarray, settings: np.ndarray, target: np.ndarray, particles: int, kind: int
 ) -> None:
     """Move particles from ``source`` to ``target``, which may be the same array."""
     n = np.arange(particles) + int(settings[FIRST])

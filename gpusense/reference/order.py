@@ -44,14 +44,9 @@ def part_of(value: np.ndarray, least: int, most: int, real: np.dtype) -> np.ndar
 
 
 def order_count(
-    flags: frozenset[str],
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    bounds: np.ndarray,
-    bins: np.ndarray,
-    bin_of: np.ndarray,
-    particles: int,
-) -> None:
+    flags: frozenset[str], pose_cell: np.ndarray, pose: np.ndarray, bounds: np.ndarray, bins: np.ndarray,
+    bin_of: np.ndarray, particles: int,
+) -> None:  # fmt: skip
     """Find the bin of each particle, and count it there."""
     turn = relative_turn(pose[:particles], pose[0])
     values = (pose_cell[:particles, 1], pose_cell[:particles, 0], turn)

@@ -21,15 +21,9 @@ def within_reach(position: np.ndarray) -> np.ndarray:
 
 
 def place_pose(
-    flags: frozenset[str],
-    poses: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    pose_low: np.ndarray,
-    pose_status: np.ndarray,
-    frame: structs.Frame,
-    window: structs.Window,
-) -> None:
+    flags: frozenset[str], poses: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
+    pose_status: np.ndarray, frame: structs.Frame, window: structs.Window,
+) -> None:  # fmt: skip
     """Place sensors: (M, 3) poses times the scanner's mount, without its yaw, which belongs to the bearings.
 
     ``pose_low`` gets the rounding errors (low parts) of ``pose``. ``pose_status``, which the caller clears, becomes 1
@@ -72,16 +66,9 @@ def place_pose(
 
 
 def place_poses(
-    flags: frozenset[str],
-    poses: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    pose_low: np.ndarray,
-    pose_status: np.ndarray,
-    frame: structs.Frame,
-    window: structs.Window,
-    particles: int,
-) -> None:
+    flags: frozenset[str], poses: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
+    pose_status: np.ndarray, frame: structs.Frame, window: structs.Window, particles: int,
+) -> None:  # fmt: skip
     """Place all poses, a block of them at a time."""
     all_poses = poses.reshape(-1)[: 3 * particles].reshape(-1, 3)
     for begin in range(0, particles, BLOCK):

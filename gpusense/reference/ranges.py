@@ -20,18 +20,10 @@ def caster_of(flags: frozenset[str]) -> ModuleType:
 
 
 def cast_ranges(
-    flags: frozenset[str],
-    map_table: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    ray: np.ndarray,
-    ranges: np.ndarray,
-    window: structs.Window,
-    particles: int,
-    rays: int,
-    caster: structs.Caster,
+    flags: frozenset[str], map_table: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, ray: np.ndarray,
+    ranges: np.ndarray, window: structs.Window, particles: int, rays: int, caster: structs.Caster,
     scale: structs.RangeScale,
-) -> None:
+) -> None:  # fmt: skip
     """Cast all rays of all particles."""
     cast_ray = caster_of(flags).cast_ray
     block = max(BLOCK // max(rays, 1), 1)
@@ -45,19 +37,9 @@ def cast_ranges(
 
 
 def cast_tiles(
-    flags: frozenset[str],
-    map_table: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    order: np.ndarray,
-    ray: np.ndarray,
-    ranges: np.ndarray,
-    window: structs.Window,
-    particles: int,
-    rays: int,
-    caster: structs.Caster,
-    scale: structs.RangeScale,
-    spread: int,
-) -> None:
+    flags: frozenset[str], map_table: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, order: np.ndarray,
+    ray: np.ndarray, ranges: np.ndarray, window: structs.Window, particles: int, rays: int, caster: structs.Caster,
+    scale: structs.RangeScale, spread: int,
+) -> None:  # fmt: skip
     """Cast all rays of all particles; GPUs do so in tiles of particles and rays."""
     cast_ranges(flags, map_table, pose_cell, pose, ray, ranges, window, particles, rays, caster, scale)  # fmt: skip

@@ -66,11 +66,7 @@ def crossed(t: np.ndarray, speed: np.ndarray, a: np.ndarray, inv: np.ndarray, un
 
 
 def start_walk(
-    flags: frozenset[str],
-    r: Ray,
-    cell: np.ndarray,
-    window: structs.Window,
-    limit: float,
+    flags: frozenset[str], r: Ray, cell: np.ndarray, window: structs.Window, limit: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return boundaries crossed (2, M) and distance (M,) at the ray's origin, or at the first cell inside the grid.
 
@@ -98,11 +94,7 @@ def start_walk(
 
 
 def start_casts(
-    flags: frozenset[str],
-    r: Ray,
-    cell: np.ndarray,
-    window: structs.Window,
-    limit: float,
+    flags: frozenset[str], r: Ray, cell: np.ndarray, window: structs.Window, limit: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the start of all walks, and the ranges that are known before any cell is read.
 

@@ -31,15 +31,9 @@ def sector_of(sectors: int, speed_x: np.ndarray, speed_y: np.ndarray) -> np.ndar
 
 
 def cast_ray(
-    flags: frozenset[str],
-    map_table: np.ndarray,
-    window: structs.Window,
-    cell: np.ndarray,
-    pose: np.ndarray,
-    ray: np.ndarray,
-    limit: float,
-    caster: structs.Caster,
-) -> np.ndarray:
+    flags: frozenset[str], map_table: np.ndarray, window: structs.Window, cell: np.ndarray, pose: np.ndarray,
+    ray: np.ndarray, limit: float, caster: structs.Caster,
+) -> np.ndarray:  # fmt: skip
     """Return the distance in cells to the first occupied cell, limit where none is nearer.
 
     Args:

@@ -116,20 +116,9 @@ def _quadrants(
 
 
 def rectangles_rows(
-    flags: frozenset[str],
-    runs: np.ndarray,
-    stack: np.ndarray,
-    rectangles: np.ndarray,
-    rows: int,
-    cols: int,
-    sectors: int,
-    first: int,
-    band: int,
-    top: int,
-    left: int,
-    bottom: int,
-    right: int,
-) -> None:
+    flags: frozenset[str], runs: np.ndarray, stack: np.ndarray, rectangles: np.ndarray, rows: int, cols: int,
+    sectors: int, first: int, band: int, top: int, left: int, bottom: int, right: int,
+) -> None:  # fmt: skip
     """Find the widest rectangles of sufficient height along rows, from free cells in columns."""
     free = runs[: 2 * band * cols].reshape(2, band, cols)
     planes = rectangles[: 4 * sectors * (rows + 2) * (cols + 2)].reshape(4, sectors, rows + 2, cols + 2)
@@ -154,21 +143,9 @@ def free_rows(
 
 
 def rectangles_scan(
-    flags: frozenset[str],
-    runs: np.ndarray,
-    rectangles: np.ndarray,
-    rows: int,
-    cols: int,
-    sectors: int,
-    first: int,
-    band: int,
-    top: int,
-    left: int,
-    bottom: int,
-    right: int,
-    lines: int,
-    group: int,
-) -> None:
+    flags: frozenset[str], runs: np.ndarray, rectangles: np.ndarray, rows: int, cols: int, sectors: int, first: int,
+    band: int, top: int, left: int, bottom: int, right: int, lines: int, group: int,
+) -> None:  # fmt: skip
     """Find the highest rectangles of sufficient width along columns, from free cells in rows."""
     free = runs[: 2 * band * cols].reshape(2, band, cols)
     planes = rectangles[: 4 * sectors * lines * (cols + 2)].reshape(4, sectors, lines * (cols + 2))

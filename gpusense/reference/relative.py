@@ -35,16 +35,9 @@ def rounded_place(at: Pair, real: np.dtype) -> Pair:
 
 
 def place_relative(
-    flags: frozenset[str],
-    poses: np.ndarray,
-    place: np.ndarray,
-    pose_status: np.ndarray,
-    origin_x: float,
-    origin_y: float,
-    mount_x: float,
-    mount_y: float,
-    particles: int,
-) -> None:
+    flags: frozenset[str], poses: np.ndarray, place: np.ndarray, pose_status: np.ndarray, origin_x: float,
+    origin_y: float, mount_x: float, mount_y: float, particles: int,
+) -> None:  # fmt: skip
     """Place sensors relative to an origin: x, its low part, y, its low part.
 
     ``pose_status``, which the caller clears, becomes 1 at index 0 if a pose is not finite; its place is the origin.
@@ -65,14 +58,9 @@ def place_relative(
 
 
 def wrap_headings(
-    flags: frozenset[str],
-    poses: np.ndarray,
-    residual: np.ndarray,
-    pose_status: np.ndarray,
-    target: float,
-    target_low: float,
-    particles: int,
-) -> None:
+    flags: frozenset[str], poses: np.ndarray, residual: np.ndarray, pose_status: np.ndarray, target: float,
+    target_low: float, particles: int,
+) -> None:  # fmt: skip
     """Subtract the target from headings and wrap to [-pi, pi], a sum of two numbers; pose_status as for places."""
     all_poses = poses.reshape(-1)[: 3 * particles].reshape(-1, 3).astype(np.float64)
     finite: np.ndarray = np.asarray(np.isfinite(all_poses).all(axis=1))

@@ -3,9 +3,9 @@
 Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), section 6.3.1: a component is drawn by its weight, and a
 reading by inverting the component's distribution function. For p_hit it is the normal on both sides of its mean, each
 with its mass on [0, range_max]. Masses are sums of positive terms: x phi(x) (1 + x^2 / 3 + x^4 / 15 + ...), and beyond
-SERIES_END one half less the continued fraction of Laplace. Quantiles are those of Wichura, *Algorithm AS 241* (1988).
-For p_short it is 1 - u (1 - exp(-lambda z*)), written as a sum of positive terms, or as a series where lambda z* is
-small. Everything is computed in float64 by +, -, *, / and sqrt, so that every device draws the same bits.
+SERIES_END one half less the continued fraction of Laplace. Quantiles: Wichura, *Algorithm AS 241* (1988). For p_short
+it is 1 - u (1 - exp(-lambda z*)), written as a sum of positive terms, or as a series where lambda z* is small.
+Everything is computed in float64 by +, -, *, / and sqrt, so that every device draws the same bits.
 
 Other shapes of hits than the normal (MASS_TABLE) have a table of masses and one of quantiles: cells of equal width in
 log(1 + b), b = u / sqrt 2, and in -log(1 - 2 mass), with the coefficients of a polynomial in the position within the
@@ -170,14 +170,9 @@ def short_of(u: np.ndarray, expected: np.ndarray, decay: np.ndarray) -> np.ndarr
 
 
 def reading_of(
-    flags: frozenset[str],
-    u: np.ndarray,
-    v: np.ndarray,
-    expected: np.ndarray,
-    mixture: np.ndarray,
-    bins: np.ndarray,
+    flags: frozenset[str], u: np.ndarray, v: np.ndarray, expected: np.ndarray, mixture: np.ndarray, bins: np.ndarray,
     range_max: float,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Return readings drawn from the mixture; infinity without return, NaN where no reading is possible.
 
     Args:
@@ -226,18 +221,10 @@ def cell_reading_of(
 
 
 def draw_readings(
-    flags: frozenset[str],
-    incidence: np.ndarray,
-    mixture: np.ndarray,
-    edges: np.ndarray,
-    chances: np.ndarray,
-    settings: np.ndarray,
-    ranges: np.ndarray,
-    particles: int,
-    rays: int,
-    tables: structs.MixtureTables,
+    flags: frozenset[str], incidence: np.ndarray, mixture: np.ndarray, edges: np.ndarray, chances: np.ndarray,
+    settings: np.ndarray, ranges: np.ndarray, particles: int, rays: int, tables: structs.MixtureTables,
     scale: structs.RangeScale,
-) -> None:
+) -> None:  # fmt: skip
     """Replace expected ranges by readings; ``incidence`` holds cosines, and ``edges`` the cosines between bins."""
     count, limit, top = particles * rays, settings[DRAW_RANGE_MAX], settings[DRAW_TOP]
     for begin in range(0, count, BLOCK):

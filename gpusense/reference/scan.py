@@ -29,25 +29,48 @@ def reading_of(flags: frozenset[str], ranges: np.ndarray, beam: np.ndarray, beam
     return ranges[beam[:beams] if "SOME_BEAMS" in flags else slice(beams)].astype(np.float64)
 
 
-def place_reading(
-    flags: frozenset[str],
-    ranges: np.ndarray,
-    beam: np.ndarray,
-    vector: np.ndarray,
-    point: np.ndarray,
-    point_low: np.ndarray,
-    reading: np.ndarray,
-    guard: np.ndarray,
-    constant_term: np.ndarray,
-    resolution: float,
-    rules: structs.ReadingRules,
+def fill_end_point(
+    value: np.ndarray, vectors: np.ndarray, point: np.ndarray, point_low: np.ndarray, guard: np.ndarray,
+    resolution: float, rules: structs.ReadingRules,
+) -> None:  # fmt: skip
+    """Fill places with end points: readings times the vectors of their beams, in cells, and rounding errors.
+
+    ``guard`` is guard_scale (longest + 2 cells) of a block of places.
+    """
+    count, cells = len(value), value / resolution
+    length = np.where(np.isfinite(cells), cells, 0.0)
+    exact = vectors[:, 0] * length[:, None]
+    point[:count] = exact
+    point_low[:count] = exact - point[:count]
+    point[:count][~np.isfinite(cells)] = cells[~np.isfinite(cells), None]
+    point[count : rules.places] = np.nan
+    point_low[count : rules.places] = 0
+    for block, first in enumerate(range(0, rules.places, BLOCK_TERMS)):
+        longest = np.max(length[first : first + BLOCK_TERMS], initial=0.0)
+        guard[block] = rules.guard_scale * (longest + 2)
+
+
+def fill_rays(
+    value: np.ndarray, vectors: np.ndarray, point: np.ndarray, reading: np.ndarray, rules: structs.ReadingRules
 ) -> None:
+    """Fill places with readings, at most ``top``, and with the ``each`` vectors of their beams."""
+    count = len(value)
+    point[: count * rules.each] = vectors.reshape(-1, 2)
+    point[count * rules.each : rules.places * rules.each] = (1, 0)
+    rounded = value.astype(reading.dtype)
+    reading[:count] = np.where(np.isinf(rounded), rounded, np.minimum(rounded, rules.top))
+    reading[count : rules.places] = np.nan
+
+
+def place_reading(
+    flags: frozenset[str], ranges: np.ndarray, beam: np.ndarray, vector: np.ndarray, point: np.ndarray,
+    point_low: np.ndarray, reading: np.ndarray, guard: np.ndarray, constant_term: np.ndarray, resolution: float,
+    rules: structs.ReadingRules,
+) -> None:  # fmt: skip
     """Put readings of some beams in their places.
 
-    A place gets its reading, at most ``top``, and as points the ``each`` vectors of its beam; with END_POINTS a point
-    is the reading times its vector, in cells, and its rounding error. A max reading is inf. ``guard`` is guard_scale
-    (longest + 2 cells) of a block of places. ``constant_term`` is that of max readings without a place,
-    -inf with a range where none is ``possible``.
+    A max reading is inf. ``constant_term`` is that of max readings without a place, -inf with a range where none is
+    ``possible``.
     """
     z = reading_of(flags, ranges, beam, rules.beams)
     hit, far = (z >= rules.nearest) & (z < rules.farthest), z >= rules.farthest
@@ -57,52 +80,22 @@ def place_reading(
     value = np.where(used & hit & bool(rules.possible), z, np.nan)
     value[used & far & (rules.max_readings == MAX_PLACED)] = np.inf
     column = np.arange(rules.beams) if "ALL_READINGS" in flags else np.flatnonzero(~np.isnan(value))
-    count = len(column)
     vectors = vector[: 2 * rules.each * rules.beams].reshape(rules.beams, rules.each, 2)[column]
     if "END_POINTS" in flags:
-        cells = value[column] / resolution
-        length = np.where(np.isfinite(cells), cells, 0.0)
-        exact = vectors[:, 0] * length[:, None]
-        point[:count] = exact
-        point_low[:count] = exact - point[:count]
-        point[:count][~np.isfinite(cells)] = cells[~np.isfinite(cells), None]
-        point[count : rules.places] = np.nan
-        point_low[count : rules.places] = 0
-        for block, first in enumerate(range(0, rules.places, BLOCK_TERMS)):
-            longest = np.max(length[first : first + BLOCK_TERMS], initial=0.0)
-            guard[block] = rules.guard_scale * (longest + 2)
+        fill_end_point(value[column], vectors, point, point_low, guard, resolution, rules)
     else:
-        point[: count * rules.each] = vectors.reshape(-1, 2)
-        point[count * rules.each : rules.places * rules.each] = (1, 0)
-        rounded = value[column].astype(reading.dtype)
-        reading[:count] = np.where(np.isinf(rounded), rounded, np.minimum(rounded, rules.top))
-        reading[count : rules.places] = np.nan
+        fill_rays(value[column], vectors, point, reading, rules)
     constant_term[0] = np.count_nonzero(used & far) * rules.log_max if rules.max_readings == MAX_FIXED else 0.0
     if not rules.possible and (used & hit).any():
         constant_term[0] = -np.inf
 
 
 def place_inputs(
-    flags: frozenset[str],
-    poses: np.ndarray,
-    pose_cell: np.ndarray,
-    pose: np.ndarray,
-    pose_low: np.ndarray,
-    pose_status: np.ndarray,
-    ranges: np.ndarray,
-    beam: np.ndarray,
-    vector: np.ndarray,
-    point: np.ndarray,
-    point_low: np.ndarray,
-    reading: np.ndarray,
-    guard: np.ndarray,
-    constant_term: np.ndarray,
-    frame: structs.Frame,
-    window: structs.Window,
-    particles: int,
-    head: int,
-    rules: structs.ReadingRules,
-) -> None:
+    flags: frozenset[str], poses: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray, pose_low: np.ndarray,
+    pose_status: np.ndarray, ranges: np.ndarray, beam: np.ndarray, vector: np.ndarray, point: np.ndarray,
+    point_low: np.ndarray, reading: np.ndarray, guard: np.ndarray, constant_term: np.ndarray, frame: structs.Frame,
+    window: structs.Window, particles: int, head: int, rules: structs.ReadingRules,
+) -> None:  # fmt: skip
     """Put poses and readings in their places; the first ``head`` work-items of a device are for readings."""
     place_reading(flags, ranges, beam, vector, point, point_low, reading, guard, constant_term, frame.resolution, rules)
     place_poses(flags, poses, pose_cell, pose, pose_low, pose_status, frame, window, particles)  # fmt: skip

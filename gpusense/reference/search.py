@@ -3,12 +3,12 @@
 For one heading the end points fall into integer cells, and the cells of all positions on the grid are the same ones,
 shifted. The score of a position is the sum of the table over the shifted cells (Olson, Real-time correlative scan
 matching, ICRA 2009). A pooled table holds the largest value of a square of positions, so that its sums are upper bounds
-of all scores in the square (Hess et al., Real-time loop closure in 2D lidar SLAM, ICRA 2016). All sums are those of
-integers: a bound is never below a score that it bounds.
+of all scores in the square (Hess et al., Real-time loop closure in 2D lidar SLAM, ICRA 2016). All sums are sums of
+integers, so a bound is never below a score that it bounds.
 
 Tables are consecutive, each with a margin of cells around the map. An item is a scan at a heading; its points are
 first[item] to first[item + 1] - 1, each of which names the table (image) that it reads. A folded table holds every
-period-th cell of a table as an image of its own: shifts by whole periods read neighbours.
+period-th cell of a table as a separate image: shifts by whole periods read neighbours.
 """
 
 from __future__ import annotations
@@ -33,14 +33,9 @@ def pool_scores(flags: frozenset[str], table: np.ndarray, pooled: np.ndarray, sc
 
 
 def fold_scores(
-    flags: frozenset[str],
-    table: np.ndarray,
-    out: np.ndarray,
-    scores: ScoreTable,
-    folded: ScoreTable,
-    period: int,
+    flags: frozenset[str], table: np.ndarray, out: np.ndarray, scores: ScoreTable, folded: ScoreTable, period: int,
     beyond: int,
-) -> None:
+) -> None:  # fmt: skip
     """Write every period-th row and column of each padded table as an image, for each of period^2 first cells."""
     lines, stride = padded_lines(scores), padded_stride(scores)
     images = table[: scores.tables * lines * stride].reshape(scores.tables, lines, stride)
@@ -55,17 +50,9 @@ def fold_scores(
 
 
 def shift_scores(
-    flags: frozenset[str],
-    table: np.ndarray,
-    point: np.ndarray,
-    image: np.ndarray,
-    first: np.ndarray,
-    score: np.ndarray,
-    scores: ScoreTable,
-    items: int,
-    height: int,
-    width: int,
-) -> None:
+    flags: frozenset[str], table: np.ndarray, point: np.ndarray, image: np.ndarray, first: np.ndarray,
+    score: np.ndarray, scores: ScoreTable, items: int, height: int, width: int,
+) -> None:  # fmt: skip
     """Sum the cells of each item's points at all shifts by less than height rows and width columns."""
     size = padded_lines(scores) * padded_stride(scores)
     total = score[: items * height * width].reshape(items, height, width)
@@ -78,16 +65,9 @@ def shift_scores(
 
 
 def candidate_scores(
-    flags: frozenset[str],
-    table: np.ndarray,
-    point: np.ndarray,
-    image: np.ndarray,
-    first: np.ndarray,
-    candidate: np.ndarray,
-    score: np.ndarray,
-    scores: ScoreTable,
-    candidates: int,
-) -> None:
+    flags: frozenset[str], table: np.ndarray, point: np.ndarray, image: np.ndarray, first: np.ndarray,
+    candidate: np.ndarray, score: np.ndarray, scores: ScoreTable, candidates: int,
+) -> None:  # fmt: skip
     """Sum the cells of candidates' points; a candidate is an item, and the row and column of its shift."""
     size = padded_lines(scores) * padded_stride(scores)
     chosen = candidate[: 3 * candidates].reshape(candidates, 3)

@@ -17,7 +17,7 @@ from gpusense.interface.constants import LINE_NUMBERS
 PASSES, STEPS = 2, 5
 # A segment with a larger cost per point is split at its best point, even if a single split does not pay.
 POOR = 3.0
-# Rows are parallel up to this.
+# Rows count as parallel up to this sine.
 PARALLEL = 1e-6
 # Splits whose costs differ by less than this share, which exceeds float32 rounding, are tied: the first counts.
 TIED = 3e-7
@@ -174,17 +174,9 @@ def _solve(rows: np.ndarray) -> np.ndarray:
 
 
 def split_scans(
-    flags: frozenset[str],
-    point: np.ndarray,
-    start: np.ndarray,
-    noise: np.ndarray,
-    cost: np.ndarray,
-    stop: np.ndarray,
-    scans: int,
-    points: int,
-    penalty: float,
-    gap: float,
-) -> None:
+    flags: frozenset[str], point: np.ndarray, start: np.ndarray, noise: np.ndarray, cost: np.ndarray, stop: np.ndarray,
+    scans: int, points: int, penalty: float, gap: float,
+) -> None:  # fmt: skip
     """Split scans into segments: ``stop`` is the end of the segment that begins at a point, -1 at all other points."""
     for scan in range(scans):
         first, last, sigma = int(start[scan]), int(start[scan + 1]), float(noise[scan])
@@ -198,18 +190,10 @@ def split_scans(
 
 
 def fit_segments(
-    flags: frozenset[str],
-    point: np.ndarray,
-    start: np.ndarray,
-    noise: np.ndarray,
-    part: np.ndarray,
-    scan: np.ndarray,
-    line: np.ndarray,
-    scans: int,
-    points: int,
-    parts: int,
-) -> None:
-    """Fit lines to parts of scans: first point and number of points, which may go on at the scan's first point."""
+    flags: frozenset[str], point: np.ndarray, start: np.ndarray, noise: np.ndarray, part: np.ndarray, scan: np.ndarray,
+    line: np.ndarray, scans: int, points: int, parts: int,
+) -> None:  # fmt: skip
+    """Fit lines to parts of scans: first point and number of points, which may wrap around to the first point."""
     for k in range(parts):
         begin, end = start[scan[k]], start[scan[k] + 1]
         index = begin + (part[k, 0] - begin + np.arange(part[k, 1])) % (end - begin)

@@ -19,11 +19,7 @@ def range_bin(distance: np.ndarray, per_metre: float, cells: int, range_max: flo
 
 
 def tabulated_density(
-    z: np.ndarray,
-    expected: np.ndarray,
-    sensor: np.ndarray,
-    tables: structs.MixtureTables,
-    range_max: float,
+    z: np.ndarray, expected: np.ndarray, sensor: np.ndarray, tables: structs.MixtureTables, range_max: float
 ) -> np.ndarray:
     """Return log p of readings by the table."""
     column = range_bin(expected, tables.per_metre, tables.cells, range_max)

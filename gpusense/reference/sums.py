@@ -9,18 +9,9 @@ from gpusense.reference.error_free import add_term, strand_sums, strands_in
 
 
 def sum_parts(
-    flags: frozenset[str],
-    parts: np.ndarray,
-    order: np.ndarray,
-    counts: np.ndarray,
-    constant_terms: np.ndarray,
-    log_p: np.ndarray,
-    particles: int,
-    count: int,
-    block: int,
-    score: structs.Score,
-    batch: structs.ScanBatch,
-) -> None:
+    flags: frozenset[str], parts: np.ndarray, order: np.ndarray, counts: np.ndarray, constant_terms: np.ndarray,
+    log_p: np.ndarray, particles: int, count: int, block: int, score: structs.Score, batch: structs.ScanBatch,
+) -> None:  # fmt: skip
     """Sum ``count`` numbers of each particle, number k at parts[place + k * particles].
 
     The numbers are sums of blocks or strands, and block is 1, or single terms, whose strands are added plainly first.

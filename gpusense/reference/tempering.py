@@ -47,7 +47,7 @@ def possible_of(totals: np.ndarray, largest: float) -> float:
 
 
 def column_of(high: float, rung: int) -> int:
-    """Return the column of sums with the weights of a rung; that of the weights before where none is possible."""
+    """Return the column of sums with the weights of a rung, or of the previous weights where none is possible."""
     return 2 * RUNGS if high == -np.inf else rung
 
 
@@ -90,16 +90,9 @@ def follow_evidence(total: float, before: float, largest: float, settings: np.nd
 
 
 def set_stage(
-    totals: np.ndarray,
-    settings: np.ndarray,
-    state: np.ndarray,
-    high: float,
-    left: float,
-    rung: int,
-    particles: int,
-    stage: int,
-    stages: int,
-) -> None:
+    totals: np.ndarray, settings: np.ndarray, state: np.ndarray, high: float, left: float, rung: int, particles: int,
+    stage: int, stages: int,
+) -> None:  # fmt: skip
     """Write the state of a stage that uses a rung; at stage 0, follow the evidence of the whole temperature."""
     if stage == 0 and settings[DEPTH] == 1.0:
         follow_evidence(totals[0], totals[2 * RUNGS], high, settings, state)

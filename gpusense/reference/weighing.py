@@ -1,7 +1,7 @@
 """Weights of particles from the log-likelihoods of sensors, at the highest temperature that leaves enough particles.
 
-w_k = v exp(b_k (l - max l)), where v is the weight before, l the sum over sensors of temperature times log p, and b_k =
-d b / 2^k a ladder of depth d. The first rung whose effective sample size (sum w)^2 / sum w^2 is at least SHARE of the
+w_k = v exp(b_k (l - max l)), where v is the previous weight, l the sum over sensors of temperature times log p, and b_k
+= d b / 2^k a ladder of depth d. The first rung whose effective sample size (sum w)^2 / sum w^2 is at least SHARE of the
 previous one is taken; the rest of b is left to the next stage of the correction (annealing: Neal, *Annealed importance
 sampling*, 2001). Weights are rounded to integers below 2^53 / N, so that their sums are exact in any order.
 """
@@ -22,15 +22,9 @@ from gpusense.reference.tempering import largest_of, left_of, possible_of, rung_
 
 
 def add_scores(
-    flags: frozenset[str],
-    log_p: np.ndarray,
-    settings: np.ndarray,
-    score: np.ndarray,
-    largest: np.ndarray,
-    particles: int,
-    block: int,
-    sensor: int,
-) -> None:
+    flags: frozenset[str], log_p: np.ndarray, settings: np.ndarray, score: np.ndarray, largest: np.ndarray,
+    particles: int, block: int, sensor: int,
+) -> None:  # fmt: skip
     """Add a sensor's log-likelihoods times its temperature to the scores, which sensor 0 begins; find block maxima."""
     scaled = settings[TEMPERATURE + sensor] * log_p[:particles].astype(np.float64)
     score[:particles] = scaled if sensor == 0 else score[:particles] + scaled
@@ -45,21 +39,11 @@ def join_scores(flags: frozenset[str], scores: np.ndarray, largest: np.ndarray, 
 
 
 def weigh_particles(
-    flags: frozenset[str],
-    score: np.ndarray,
-    before: np.ndarray,
-    largest: np.ndarray,
-    settings: np.ndarray,
-    state: np.ndarray,
-    sums: np.ndarray,
-    highest: np.ndarray,
-    particles: int,
-    block: int,
-    blocks: int,
-    groups: int,
+    flags: frozenset[str], score: np.ndarray, before: np.ndarray, largest: np.ndarray, settings: np.ndarray,
+    state: np.ndarray, sums: np.ndarray, highest: np.ndarray, particles: int, block: int, blocks: int, groups: int,
     stage: int,
-) -> None:
-    """Sum the integer weights of each block on each rung, their squares, and the weights before."""
+) -> None:  # fmt: skip
+    """Sum the integer weights of each block on each rung, their squares, and the previous weights."""
     scale, old = settings[SCALE], before[:particles]
     highest[0] = largest_of(largest, 0, groups)
     likelihood = tempered(score[:particles], highest[0], left_of(state, stage) * settings[DEPTH])
@@ -83,24 +67,10 @@ def join_rows(flags: frozenset[str], sums: np.ndarray, joined: np.ndarray, rows:
 
 
 def set_weights(
-    flags: frozenset[str],
-    score: np.ndarray,
-    before: np.ndarray,
-    highest: np.ndarray,
-    sums: np.ndarray,
-    joined: np.ndarray,
-    totals: np.ndarray,
-    settings: np.ndarray,
-    state: np.ndarray,
-    weight: np.ndarray,
-    ends: np.ndarray,
-    particles: int,
-    block: int,
-    blocks: int,
-    fan: int,
-    stage: int,
-    stages: int,
-) -> None:
+    flags: frozenset[str], score: np.ndarray, before: np.ndarray, highest: np.ndarray, sums: np.ndarray,
+    joined: np.ndarray, totals: np.ndarray, settings: np.ndarray, state: np.ndarray, weight: np.ndarray,
+    ends: np.ndarray, particles: int, block: int, blocks: int, fan: int, stage: int, stages: int,
+) -> None:  # fmt: skip
     """Choose the rung, set the weights and their exact cumulative sums, and write the stage's state."""
     scale, left, high = settings[SCALE], left_of(state, stage), possible_of(totals, highest[0])
     rung = rung_of(totals, settings, settings[SHARE] * particles) if left > 0.0 else 0

@@ -38,12 +38,27 @@ def check_motion(name: str, motion: object, scans: int) -> Floats | None:
     return np.array(np.broadcast_to(values, (scans, 3)), np.float64)
 
 
+def part_of_arc(motion: Floats, share: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return x, y and heading after a share of a motion with constant velocities, which is an arc.
+
+    For an arc that turns by theta, the chord to a fraction f of it has sin(f theta / 2) / sin(theta / 2) of the length
+    of the whole chord, and is turned by (f - 1) theta / 2 from the whole chord.
+
+    Args:
+        motion: (..., 3) motions [m, m, rad].
+        share: Shares that broadcast with the motions.
+    """
+    half = motion[..., 2] / 2
+    # sinc has no division by zero where the robot does not turn.
+    length = share * np.sinc(share * half / math.pi) / np.sinc(half / math.pi)
+    turn = (share - 1) * half
+    c, s = length * np.cos(turn), length * np.sin(turn)
+    x, y = motion[..., 0], motion[..., 1]
+    return c * x - s * y, s * x + c * y, 2 * share * half
+
+
 def beam_poses(motion: Floats, beams: int) -> tuple[Floats, Floats]:
     """Return the robot's pose at each beam in its frame at the first beam, for constant velocities.
-
-    A robot with constant velocities moves on an arc. For an arc that turns by theta, the chord to a fraction f of it
-    has sin(f theta / 2) / sin(theta / 2) of the length of the whole chord, and is turned by (f - 1) theta / 2 from
-    that.
 
     Args:
         motion: (S, 3) pose at the last beam in the frame at the first beam [m, m, rad].
@@ -52,14 +67,8 @@ def beam_poses(motion: Floats, beams: int) -> tuple[Floats, Floats]:
     Returns:
         (S, K, 2) positions [m] and (S, K) headings [rad].
     """
-    share = np.arange(beams) / max(beams - 1, 1)
-    half = motion[:, 2, None] / 2
-    # sinc has no division by zero where the robot does not turn.
-    length = share * np.sinc(share * half / math.pi) / np.sinc(half / math.pi)
-    turn = (share - 1) * half
-    c, s = length * np.cos(turn), length * np.sin(turn)
-    x, y = motion[:, 0, None], motion[:, 1, None]
-    return np.stack([c * x - s * y, s * x + c * y], axis=-1), 2 * share * half
+    x, y, heading = part_of_arc(motion[:, None], np.arange(beams) / max(beams - 1, 1))
+    return np.stack([x, y], axis=-1), heading
 
 
 def sensor_points(ranges: Floats, scanner: Scanner, motion: Floats) -> Floats:

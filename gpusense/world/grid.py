@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -12,14 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
 from gpusense._util.html import card
+from gpusense.world.grid_frame import GridFrame, check_origin, check_resolution
 from gpusense.world.messages import field, planar_pose, real_field
 from gpusense.world.plausible import look_at_grid
 from gpusense.world.thumbnail import thumbnail
-
-SMALLEST_RESOLUTION, LARGEST_RESOLUTION = 1e-4, 1e3
-"""Bounds of the side of a cell [m]."""
-FARTHEST_ORIGIN = 1e9
-"""Largest coordinate of a map's origin [m]."""
 
 
 class OccupancyGrid:
@@ -53,7 +48,7 @@ class OccupancyGrid:
         (0.0, 0.0, 1.5, 1.0)
     """
 
-    __slots__ = ("_cells", "_occupied", "_occupied_threshold", "_origin", "_resolution")
+    __slots__ = ("_cells", "_frame", "_occupied", "_occupied_threshold")
 
     def __init__(
         self,
@@ -70,9 +65,8 @@ class OccupancyGrid:
     ) -> OccupancyGrid:
         """Store checked cells, after checking all other arguments."""
         self._cells = cells
-        self._resolution = check_resolution(resolution)
-        self._origin = check_origin(origin)
-        look_at_grid(self._resolution, self._origin)
+        self._frame = GridFrame(check_resolution(resolution), check_origin(origin))
+        look_at_grid(*self._frame)
         self._occupied_threshold = checks.integer("occupied_threshold", occupied_threshold, low=1, high=100)
         self._occupied: NDArray[np.bool] | None = None
         return self
@@ -119,12 +113,12 @@ class OccupancyGrid:
     @property
     def resolution(self) -> float:
         """Side of a cell [m]."""
-        return self._resolution
+        return self._frame.resolution
 
     @property
     def origin(self) -> tuple[float, float, float]:
         """Pose (x, y, yaw) of the outer corner of ``cells[0, 0]`` in the world [m, m, rad]."""
-        return self._origin
+        return self._frame.origin
 
     @property
     def occupied_threshold(self) -> int:
@@ -140,12 +134,12 @@ class OccupancyGrid:
     @property
     def width(self) -> float:
         """Extent along the columns, the x axis of the grid's frame [m]."""
-        return self.shape[1] * self._resolution
+        return self.shape[1] * self._frame.resolution
 
     @property
     def height(self) -> float:
         """Extent along the rows, the y axis of the grid's frame [m]."""
-        return self.shape[0] * self._resolution
+        return self.shape[0] * self._frame.resolution
 
     @property
     def occupied(self) -> NDArray[np.bool]:
@@ -204,7 +198,7 @@ class OccupancyGrid:
             raise ValueError(f"region: must put {size}, got ({row}, {col})")
         changed = self._cells.copy()
         changed[row : row + rows, col : col + cols] = patch
-        return grid_of_checked(changed, self._resolution, self._origin, occupied_threshold=self._occupied_threshold)
+        return grid_of_checked(changed, *self._frame, occupied_threshold=self._occupied_threshold)
 
     def bounds(self) -> tuple[float, float, float, float]:
         """Return the axis-aligned box around the grid in the world: (x_min, y_min, x_max, y_max) [m]."""
@@ -229,7 +223,7 @@ class OccupancyGrid:
         """
         row = checks.array("rows", rows, ("M",), dtype=np.int64)
         col = checks.array("cols", cols, row.shape, dtype=np.int64)
-        return self._to_world((np.stack([col, row], axis=1) + 0.5) * self._resolution)
+        return self._to_world((np.stack([col, row], axis=1) + 0.5) * self._frame.resolution)
 
     def world_to_cells(self, xy: ArrayLike) -> NDArray[np.float64]:
         """Convert world points to the grid's frame, in cell units.
@@ -247,25 +241,14 @@ class OccupancyGrid:
             TypeError: ``xy`` does not hold real numbers.
             ValueError: The shape is not (M, 2), or a value is not finite.
         """
-        points = checks.array("xy", xy, ("M", 2))
-        x, y, yaw = self._origin
-        u, v = points[:, 0] - x, points[:, 1] - y
-        if yaw != 0.0:
-            c, s = math.cos(yaw), math.sin(yaw)
-            u, v = c * u + s * v, c * v - s * u
-        return np.stack([u, v], axis=1) / self._resolution
+        return self._frame.to_cells(checks.array("xy", xy, ("M", 2)))
 
     def _to_world(self, local: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert (M, 2) points in the grid's frame to the world [m]."""
-        x, y, yaw = self._origin
-        u, v = local[:, 0], local[:, 1]
-        if yaw != 0.0:
-            c, s = math.cos(yaw), math.sin(yaw)
-            u, v = c * u - s * v, s * u + c * v
-        return np.stack([u + x, v + y], axis=1)
+        return self._frame.to_world(local)
 
     def _key(self) -> tuple[Any, ...]:
-        return self.shape, self._resolution, self._origin, self._occupied_threshold
+        return self.shape, self._frame, self._occupied_threshold
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, OccupancyGrid):
@@ -279,8 +262,8 @@ class OccupancyGrid:
         rows, cols = self.shape
         share = np.count_nonzero(self.occupied) / self._cells.size
         return (
-            f"OccupancyGrid({rows} x {cols} cells, {100 * share:.3g}% occupied, resolution={self._resolution}, "
-            f"origin={self._origin}, occupied_threshold={self._occupied_threshold})"
+            f"OccupancyGrid({rows} x {cols} cells, {100 * share:.3g}% occupied, resolution={self._frame.resolution}, "
+            f"origin={self._frame.origin}, occupied_threshold={self._occupied_threshold})"
         )
 
     def _repr_html_(self) -> str:
@@ -288,9 +271,9 @@ class OccupancyGrid:
         shares = ((name, np.count_nonzero(mask) / max(self._cells.size, 1)) for name, mask in
                   (("occupied", self.occupied), ("unknown", self.unknown)))  # fmt: skip
         table = [
-            ("cells", f"{rows} x {cols} of {self._resolution:g} m"),
+            ("cells", f"{rows} x {cols} of {self._frame.resolution:g} m"),
             ("size [m]", f"{self.width:g} x {self.height:g}"),
-            ("origin", self._origin),
+            ("origin", self._frame.origin),
             *((name, f"{share:.1%}") for name, share in shares),
         ]
         return card("OccupancyGrid", table, picture=thumbnail(self.unknown, self.occupied))
@@ -298,30 +281,7 @@ class OccupancyGrid:
     def __reduce__(self) -> tuple[Callable[..., OccupancyGrid], tuple[Any, ...]]:
         # Copies and pickles call the constructor, so that their cells are also read-only.
         make = functools.partial(OccupancyGrid, occupied_threshold=self._occupied_threshold)
-        return make, (self._cells, self._resolution, self._origin)
-
-
-def check_resolution(value: object) -> float:
-    """Return the side of a cell after checking its bounds [m].
-
-    Raises:
-        TypeError: The value is not a real number.
-        ValueError: The value is out of bounds.
-    """
-    return checks.real("resolution", value, low=SMALLEST_RESOLUTION, high=LARGEST_RESOLUTION)
-
-
-def check_origin(value: object) -> tuple[float, float, float]:
-    """Return the pose of a map after checking it [m, m, rad].
-
-    Raises:
-        TypeError: The value does not hold real numbers.
-        ValueError: The shape is wrong, a value is not finite, or a coordinate is out of bounds.
-    """
-    x, y, yaw = checks.array("origin", value, (3,)).tolist()
-    for index, coordinate in enumerate((x, y)):
-        checks.real(f"origin[{index}]", coordinate, low=-FARTHEST_ORIGIN, high=FARTHEST_ORIGIN)
-    return x, y, yaw
+        return make, (self._cells, *self._frame)
 
 
 def grid_of_checked(

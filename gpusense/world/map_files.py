@@ -16,13 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense._util import checks
 from gpusense._util.documents import read_mapping
 from gpusense._util.files import write_several
-from gpusense.world.grid import (
-    FARTHEST_ORIGIN,
-    LARGEST_RESOLUTION,
-    SMALLEST_RESOLUTION,
-    OccupancyGrid,
-    grid_of_checked,
-)
+from gpusense.world.grid import OccupancyGrid, grid_of_checked
+from gpusense.world.grid_frame import FARTHEST_ORIGIN, LARGEST_RESOLUTION, SMALLEST_RESOLUTION
 from gpusense.world.images import mapped, open_raster
 from gpusense.world.map_greys import MODES, UNKNOWN_GREY, MapMode, paint, write_image
 from gpusense.world.map_hints import check_no_image

@@ -288,8 +288,11 @@ def classify(ranges: ArrayLike, scanner: Scanner) -> NDArray[np.uint8]:
 
 def hits(z: NDArray[np.floating], range_min: float, range_max: float) -> NDArray[np.bool]:
     """Return which readings of any shape are of the class ``HIT``; see :func:`classify`."""
-    with np.errstate(over="ignore"):  # range_max may exceed float16
-        nearest, farthest = z.dtype.type(range_min), z.dtype.type(range_max)
+    nearest: float | np.floating = range_min
+    farthest: float | np.floating = range_max
+    if z.dtype != np.float64:
+        with np.errstate(over="ignore"):  # range_max may exceed float16
+            nearest, farthest = z.dtype.type(range_min), z.dtype.type(range_max)
     near_enough: NDArray[np.bool] = (z < farthest) & (z >= nearest)
     return near_enough & (z > 0) if range_min > 0 else near_enough
 

@@ -13,7 +13,8 @@ import numpy as np
 
 from gpusense._util.lines import numbered_lines
 from gpusense._util.memory import check_room
-from gpusense.world.grid import LARGEST_RESOLUTION, SMALLEST_RESOLUTION, OccupancyGrid, grid_of_checked
+from gpusense.world.grid import OccupancyGrid, grid_of_checked
+from gpusense.world.grid_frame import LARGEST_RESOLUTION, SMALLEST_RESOLUTION
 
 _RESOLUTION, _MOST_CELLS, _LONGEST_FIELD = 0.1, 1 << 28, 64
 _SPECIFICATION, _SIZE = b"robot_specifications->", b"global_map[0]:"

@@ -26,7 +26,7 @@ typedef struct {
     real cost, x, y, r, xx, xy, xr, yy, yr, rr;
 } Sums;
 
-// Return a point of a part, which may go on at the scan's first point.
+// Return a point of a part, which may wrap around to the scan's first point.
 real4 point_of(const Part *mine, const int k) {
     return mine->point[mine->begin + (mine->first - mine->begin + k) % mine->size];
 }

@@ -135,3 +135,15 @@ kernel void distance_search(ARGUMENTS) {
     }
     squared[(long)row * cols + col] = best > (uint)most ? UNREACHABLE : (int)best;
 }
+
+// ---- table of a likelihood field
+
+// Fill width x height cells of a field's table from squared distances: density has a value for each squared distance
+// up to the cap. The cells begin at index begin of the table and at cell (from_col, from_row) of the grid; cells
+// outside the grid get beyond.
+kernel void fill_field(ARGUMENTS) {
+    const int i = get_global_id(0), j = get_global_id(1), col = from_col + i, row = from_row + j;
+    if (i >= width || j >= height) return;
+    const int inside = col >= 0 && col < cols && row >= 0 && row < rows;
+    table[begin + (long)j * stride + i] = inside ? density[min(squared[(long)row * cols + col], cap)] : beyond;
+}

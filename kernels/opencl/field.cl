@@ -5,16 +5,6 @@
 // Particles per work-group of field_blocks.
 #define GROUP 64
 
-// Fill width x height cells of the table from squared distances: density has a value for each squared distance up to
-// the cap. The cells begin at index begin of the table and at cell (from_col, from_row) of the grid; cells outside the
-// grid get beyond.
-kernel void fill_field(ARGUMENTS) {
-    const int i = get_global_id(0), j = get_global_id(1), col = from_col + i, row = from_row + j;
-    if (i >= width || j >= height) return;
-    const int inside = col >= 0 && col < cols && row >= 0 && row < rows;
-    table[begin + (long)j * stride + i] = inside ? density[min(squared[(long)row * cols + col], cap)] : beyond;
-}
-
 // Score scans: one work-item takes a particle. ROUNDED_CELLS changes this kernel in Warp alone, on processors, whose
 // compiler makes vector code of loops.
 kernel void score_field(ARGUMENTS) {
@@ -58,8 +48,8 @@ kernel void score_field(ARGUMENTS) {
 }
 
 // Write the sums of blocks of readings to parts[n + block * particles], for GPUs. One work-item takes a particle
-// and every 2^spread-th block. Each block has a guard of its own; with SCANS each scan has as many guards as the
-// longest one.
+// and every 2^spread-th block. Each block has a separate guard; with SCANS each scan has as many guards as the longest
+// one.
 kernel void field_blocks(ARGUMENTS) {
     const int item = get_global_id(0), n = ((item / GROUP) >> spread) * GROUP + item % GROUP;
     if (n >= particles) return;

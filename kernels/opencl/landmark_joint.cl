@@ -11,6 +11,34 @@
 // A landmark's part of a density exceeds the false positive's if the density is more than twice the latter.
 #define LOG_2 ((real)0.69314718055994531)
 
+// Let landmark j be seen by one more feature of each set, at most one of each group; log_each has the features' log p.
+void add_landmark(const int j, const real *log_each, global const real *feature, global real *best, global int *choice,
+                  global real *value, const int features, const int sets, const int groups) {
+    // From the full set down, since smaller sets must not yet contain this landmark for the group.
+    for (int step = 0; step < groups * (sets - 1); ++step) {
+        const int group = step / (sets - 1), s = sets - 1 - step % (sets - 1);
+        for (int k = 0; k < features; ++k) {
+            if (!(s >> k & 1) || feature[FEATURE * k + GROUP] != group) continue;
+            const int less = s ^ 1 << k;
+            const real joined = best[less] + log_each[k];
+            if (!(joined > best[s])) continue;
+            best[s] = joined;
+            for (int i = 0; i < features; ++i) {
+                choice[s * features + i] = i == k ? j : choice[less * features + i];
+                value[s * features + i] = i == k ? log_each[k] : value[less * features + i];
+            }
+        }
+    }
+}
+
+// Return log p of all features if those of set s have landmarks and the remaining ones are false positives.
+real set_total(const int s, const real sum, global const real *feature, const int features) {
+    real total = sum;
+    for (int k = 0; k < features; ++k)
+        if (!(s >> k & 1)) total += feature[FEATURE * k + FALSE_POSITIVE];
+    return total;
+}
+
 // Find the best joint association: one work-item takes a particle. choice[s] has the landmark of each feature of set s,
 // and value[s] its log p; sets is 2^features.
 kernel void joint_features(ARGUMENTS) {
@@ -34,28 +62,12 @@ kernel void joint_features(ARGUMENTS) {
                 log_each[k] = either(log_match(off, turned, numbers, normal, signature, j, terms, arcs),
                                      numbers[FALSE_POSITIVE]);
         }
-        // From the full set down, since smaller sets must not yet contain this landmark for the group.
-        for (int step = 0; step < groups * (sets - 1); ++step) {
-            const int group = step / (sets - 1), s = sets - 1 - step % (sets - 1);
-            for (int k = 0; k < features; ++k) {
-                if (!(s >> k & 1) || feature[FEATURE * k + GROUP] != group) continue;
-                const int less = s ^ 1 << k;
-                const real joined = sums[less] + log_each[k];
-                if (!(joined > sums[s])) continue;
-                sums[s] = joined;
-                for (int i = 0; i < features; ++i) {
-                    who[s * features + i] = i == k ? j : who[less * features + i];
-                    each[s * features + i] = i == k ? log_each[k] : each[less * features + i];
-                }
-            }
-        }
+        add_landmark(j, log_each, feature, sums, who, each, features, sets, groups);
     }
     real most = -INFINITY;
     int chosen = 0;
     for (int s = 0; s < sets; ++s) {
-        real total = sums[s];
-        for (int k = 0; k < features; ++k)
-            if (!(s >> k & 1)) total += feature[FEATURE * k + FALSE_POSITIVE];
+        const real total = set_total(s, sums[s], feature, features);
         if (total > most) most = total, chosen = s;
     }
     log_p[n] = isinf(most) ? most : score.temperature * (score.constant_term + most);

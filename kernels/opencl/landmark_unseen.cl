@@ -1,7 +1,7 @@
 // Negative information: landmarks that the sensor should see from a pose, but that match no feature.
 // requires: error_free landmarks landmark_grid
 
-// Return whether a landmark is within range, and its angle to the sensor's axis has a cosine of at least least.
+// Return whether a landmark is within range, and the cosine of its angle to the sensor's axis is at least ``least``.
 int in_view(const real4 off, const real cosine, const real sine, const real range_max, const real least) {
     const real d = sqrt(off.x * off.x + off.z * off.z);
     return d <= range_max && cosine * off.x + sine * off.z >= least * d;

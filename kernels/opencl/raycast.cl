@@ -30,7 +30,7 @@ int sector_of(const real speed_x, const real speed_y) {
 #endif
 }
 
-// Rows of a group of the planes; without ROW_GROUPS each row stands alone.
+// Rows of a group of the planes; without ROW_GROUPS a group is a single row.
 #if ROW_GROUPS
 #define GROUP 8
 #else

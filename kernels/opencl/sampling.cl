@@ -2,14 +2,14 @@
 // "Probabilistic Robotics" (2005), section 6.3.1: a component is drawn by its weight, and a reading by inverting the
 // component's distribution function. For p_hit it is the normal on both sides of its mean, each with its mass on [0,
 // range_max]. Masses are sums of positive terms: x phi(x) (1 + x^2 / 3 + x^4 / 15 + ...), and beyond SERIES_END one
-// half less the continued fraction of Laplace. Quantiles are those of Wichura, "Algorithm AS 241" (1988). For p_short
-// it is 1 - u (1 - exp(-lambda z*)), written as a sum of positive terms, or as a series where lambda z* is small.
-// Everything is computed in float64 by +, -, *, / and sqrt, so that every device draws the same bits. Other shapes of
-// hits than the normal (MASS_TABLE) have a table of masses and one of quantiles: cells of equal width in log(1 + b), b
-// = u / sqrt 2, and in -log(1 - 2 mass), with the coefficients of a polynomial in the position within the cell. mixture
-// = (z_hit, z_short, z_max, z_rand, sigma_hit, sigma_growth, range_bias, lambda_short, place of the tables) of each bin
-// of angles of incidence, and then the tables. chances = for each bin of expected ranges, the cumulative probabilities
-// of the bins of readings.
+// half less the continued fraction of Laplace. Quantiles: Wichura, "Algorithm AS 241" (1988). For p_short it is 1 - u
+// (1 - exp(-lambda z*)), written as a sum of positive terms, or as a series where lambda z* is small. Everything is
+// computed in float64 by +, -, *, / and sqrt, so that every device draws the same bits. Other shapes of hits than the
+// normal (MASS_TABLE) have a table of masses and one of quantiles: cells of equal width in log(1 + b), b = u / sqrt 2,
+// and in -log(1 - 2 mass), with the coefficients of a polynomial in the position within the cell. mixture = (z_hit,
+// z_short, z_max, z_rand, sigma_hit, sigma_growth, range_bias, lambda_short, place of the tables) of each bin of angles
+// of incidence, and then the tables. chances = for each bin of expected ranges, the cumulative probabilities of the
+// bins of readings.
 // requires: philox sensor_table
 
 #define READING_STREAM 1073741824u

@@ -34,18 +34,40 @@ double reading_of(const int k, global const measured *ranges, global const int *
 #endif
 }
 
+#if END_POINTS
+// Fill a place with the end point of a reading: the reading times the vector of its beam, in cells, with the rounding
+// error in point_low. The guard of a block of places is guard_scale (longest + 2 cells), of its longest reading.
+void fill_end_point(const int place, const double value, const double2 vector, const double longest, global real2 *point,
+                    global real2 *point_low, global real *guard, const double resolution, const double guard_scale) {
+    const double cells = value / resolution, length = isfinite(cells) ? cells : 0;
+    const double x = vector.x * length, y = vector.y * length;
+    const real2 high = (real2)((real)x, (real)y);
+    point[place] = isfinite(cells) ? high : (real2)((real)cells);
+    point_low[place] = (real2)((real)(x - high.x), (real)(y - high.y));
+    if (place % BLOCK_TERMS == 0) guard[place / BLOCK_TERMS] = (real)(guard_scale * (longest / resolution + 2));
+}
+#else
+// Fill a place with a reading, at most top, and with the vectors of its beam, the first of which is read already.
+void fill_rays(const int place, const double value, const double2 vector, global const double *vectors,
+               global real2 *point, global real *reading, const int each, const double top) {
+    point[(long)place * each] = (real2)((real)vector.x, (real)vector.y);
+    for (int j = 1; j < each; ++j)
+        point[(long)place * each + j] = (real2)((real)vectors[2 * j], (real)vectors[2 * j + 1]);
+    const real rounded = (real)value;
+    reading[place] = rounded > (real)top && !isinf(rounded) ? (real)top : rounded;
+}
+#endif
+
 // Place one reading: find its place from all readings, and fill that place; an item beyond the readings fills a place
-// at the end. 16 readings are read before any is used. A place gets its reading, at most top, and as points the vectors
-// of its beam, each of them. With END_POINTS a point is the reading times its vector, in cells, and point_low its
-// rounding error. A max reading is inf. The guard of a block of places is guard_scale (longest + 2 cells). constant_term is
-// that of max readings without a place, -inf if there is a range where none is possible.
+// at the end. 16 readings are read before any is used. A max reading is inf. constant_term is that of max readings
+// without a place, -inf if there is a range where none is possible.
 void place_reading(const int item, global const measured *ranges, global const int *beam, global const double *vector,
                    global real2 *point, global real2 *point_low, global real *reading, global real *guard,
                    global real *constant_term, const double resolution, const ReadingRules rules) {
     // Values that are needed last are read first, so that nothing waits for them.
     const long from = 2 * (long)min(item, rules.beams - 1) * rules.each;
     const double item_reading = reading_of(item, ranges, beam, rules.beams);
-    const double vector_x = item < rules.beams ? vector[from] : 1, vector_y = item < rules.beams ? vector[from + 1] : 0;
+    const double2 vector_of_item = item < rules.beams ? (double2)(vector[from], vector[from + 1]) : (double2)(1, 0);
     int informative = rules.beams;
     if (rules.chosen < rules.beams) {
         informative = 0;
@@ -104,32 +126,17 @@ void place_reading(const int item, global const measured *ranges, global const i
         impossible |= !rules.possible && (used & hits);
         place += popcount(placed);
     }
+    const int left_over = item >= place && item < rules.places;
 #if END_POINTS
-    if (item_place < rules.places) {
-        const double cells = item_value / resolution, length = isfinite(cells) ? cells : 0;
-        const double x = vector_x * length, y = vector_y * length;
-        const real2 high = (real2)((real)x, (real)y);
-        point[item_place] = isfinite(cells) ? high : (real2)((real)cells);
-        point_low[item_place] = (real2)((real)(x - high.x), (real)(y - high.y));
-        if (item_place % BLOCK_TERMS == 0)
-            guard[item_place / BLOCK_TERMS] = (real)(rules.guard_scale * (longest / resolution + 2));
-    }
-    if (item >= place && item < rules.places) {
-        point[item] = (real2)((real)NAN);
-        point_low[item] = (real2)(0);
-        if (item % BLOCK_TERMS == 0) guard[item / BLOCK_TERMS] = (real)(rules.guard_scale * 2);
-    }
+    if (item_place < rules.places)
+        fill_end_point(item_place, item_value, vector_of_item, longest, point, point_low, guard, resolution,
+                       rules.guard_scale);
+    if (left_over)
+        fill_end_point(item, NAN, (double2)(1, 0), 0, point, point_low, guard, resolution, rules.guard_scale);
 #else
-    if (item_place < rules.places) {
-        point[(long)item_place * rules.each] = (real2)((real)vector_x, (real)vector_y);
-        for (int j = 1; j < rules.each; ++j) {
-            const double2 one = (double2)(vector[from + 2 * j], vector[from + 2 * j + 1]);
-            point[(long)item_place * rules.each + j] = (real2)((real)one.x, (real)one.y);
-        }
-        const real rounded = (real)item_value;
-        reading[item_place] = rounded > (real)rules.top && !isinf(rounded) ? (real)rules.top : rounded;
-    }
-    if (item >= place && item < rules.places) {
+    if (item_place < rules.places)
+        fill_rays(item_place, item_value, vector_of_item, vector + from, point, reading, rules.each, rules.top);
+    if (left_over) {
         for (int j = 0; j < rules.each; ++j) point[(long)item * rules.each + j] = (real2)(1, 0);
         reading[item] = (real)NAN;
     }

@@ -2,12 +2,12 @@
 // fall into integer cells, and the cells of all positions on the grid are the same ones, shifted. The score of a position
 // is the sum of the table over the shifted cells (Olson, Real-time correlative scan matching, ICRA 2009). A pooled table
 // holds the largest value of a square of positions, so that its sums are upper bounds of all scores in the square (Hess
-// et al., Real-time loop closure in 2D lidar SLAM, ICRA 2016). All sums are those of integers: a bound is never below a
-// score that it bounds.
+// et al., Real-time loop closure in 2D lidar SLAM, ICRA 2016). All sums are sums of integers, so a bound is never below
+// a score that it bounds.
 //
 // Tables are consecutive, each with a margin of cells around the map. An item is a scan at a heading; its points are
 // first[item] to first[item + 1] - 1, each of which names the table (image) that it reads. A folded table holds every
-// period-th cell of a table as an image of its own: shifts by whole periods read neighbours.
+// period-th cell of a table as a separate image: shifts by whole periods read neighbours.
 // requires: score_cells
 
 // Write the maximum of each cell and the cells up to reach rows and columns further. One work-item takes a cell.

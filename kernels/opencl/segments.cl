@@ -12,7 +12,7 @@
 #define STEPS 5
 // A segment with a larger cost per point is split at its best point, even if a single split does not pay.
 #define POOR ((real)3)
-// Rows are parallel up to this.
+// Rows count as parallel up to this sine.
 #define PARALLEL ((real)1e-6)
 // Splits whose costs differ by less than this share, which exceeds float32 rounding, are tied: the first counts.
 #define TIED ((real)3e-7)
@@ -84,7 +84,7 @@ int best_split(global const real4 *point, const int first, const int last, globa
     for (int i = last - 1; i > first; --i) {
         const real weight = weight_at(point, i, first, last, sigma);
         add_row(&rows, weight * point[i].x, weight * point[i].y, weight);
-        // From here on the cost of this point is that which a split before it saves.
+        // From here on cost[i] is the cost that a split before point i saves.
         cost[i] = *total - cost[i - 1] - rows.cost;
         *gain = fmax(*gain, cost[i]);
     }
@@ -222,7 +222,7 @@ kernel void split_scans(ARGUMENTS) {
     merge_segments(point, first, last, stop, sigma, penalty, gap);
 }
 
-// Fit lines to parts of scans: first point and number of points, which may go on at the scan's first point. One
+// Fit lines to parts of scans: first point and number of points, which may wrap around to the scan's first point. One
 // work-item takes a part.
 kernel void fit_segments(ARGUMENTS) {
     const int k = get_global_id(0);

@@ -17,7 +17,7 @@
 // 2^-(RUNGS - 1).
 #define LOWEST 0.0078125
 #define WEIGHT_SUMS (2 * RUNGS + 1)
-// Places in the state: of a stage, and of what lasts.
+// Places in the state: numbers of a stage, then numbers that outlast it.
 #define LEFT 0
 #define TOTAL 1
 #define SAMPLE_SIZE 2
@@ -63,7 +63,7 @@ double possible_of(global const double *totals, const double largest) {
     return totals[RUNGS - 1] > 0.0 ? largest : -INFINITY;
 }
 
-// Return the column of sums with the weights of a rung; that of the weights before where none is possible.
+// Return the column of sums with the weights of a rung; the column of the previous weights where none is possible.
 int column_of(const double high, const int rung) {
     return high == -INFINITY ? 2 * RUNGS : rung;
 }

@@ -1,5 +1,5 @@
 // Weights of particles from the log-likelihoods of sensors, at the highest temperature that leaves enough particles.
-// w_k = v exp(b_k (l - max l)), where v is the weight before, l the sum over sensors of temperature times log p, and
+// w_k = v exp(b_k (l - max l)), where v is the previous weight, l the sum over sensors of temperature times log p, and
 // b_k = d b / 2^k a ladder of depth d. The first rung whose effective sample size (sum w)^2 / sum w^2 is at least SHARE
 // of the previous one is taken; the rest of b is left to the next stage of the correction (annealing: Neal, "Annealed
 // importance sampling", 2001). Weights are rounded to integers below 2^53 / N, so that their sums are exact in any
@@ -26,15 +26,15 @@ kernel void add_scores(ARGUMENTS) {
     largest[b] = high;
 }
 
-// Find the largest score of every fan blocks: one work-item takes a group of blocks.
+// Find the largest score of each group of fan blocks: one work-item takes a group of blocks.
 kernel void join_scores(ARGUMENTS) {
     const int g = get_global_id(0), begin = g * fan;
     if (begin >= blocks) return;
     largest[g] = largest_of(scores, begin, min(begin + fan, blocks));
 }
 
-// Sum the integer weights of each block on each rung, their squares, and the weights before: one work-item takes a block.
-// The first one writes the largest score.
+// Sum the integer weights of each block on each rung, their squares, and the previous weights: one work-item takes a
+// block. The first one writes the largest score.
 kernel void weigh_particles(ARGUMENTS) {
     const int b = get_global_id(0), begin = b * block;
     if (begin >= particles) return;
@@ -61,7 +61,7 @@ kernel void weigh_particles(ARGUMENTS) {
     if (b == 0) highest[0] = high;
 }
 
-// Add up every fan rows of sums in order; a row becomes the sum of the rows before it in its group: one work-item
+// Add up groups of fan rows of sums in order; a row becomes the sum of the rows before it in its group: one work-item
 // takes a column of a group.
 kernel void join_rows(ARGUMENTS) {
     const int i = get_global_id(0), begin = i / columns * fan, end = min(begin + fan, rows);

@@ -76,13 +76,9 @@ def make(name, flags):
     # Return the log of a truncated Student t: -(nu + 1) / 2 log((1 + u^2 / nu) / k), where k includes the peak.
     @wp.func
     def log_student_t(
-        residual: vec2,
-        near: real,
-        far: real,
-        terms: wp.array(dtype=real),
-        series: wp.array(dtype=real),
+        residual: vec2, near: real, far: real, terms: wp.array(dtype=real), series: wp.array(dtype=real),
         count: wp.int32,
-    ):
+    ):  # fmt: skip
         squared = bounded_square(pair_product(residual, vec2(terms[SCALE], terms[SCALE_LOW])))
         x = pair_sum(vec2(terms[OFFSET], terms[OFFSET_LOW]), squared)
         below = t_mass(near * terms[T_SCALE], terms, series, count)
@@ -92,14 +88,9 @@ def make(name, flags):
     # Return log p of one range at a distance.
     @wp.func
     def log_range(
-        d: vec2,
-        beacon: wp.array(dtype=real),
-        base: wp.int32,
-        terms: wp.array(dtype=real),
-        series: wp.array(dtype=real),
-        count: wp.int32,
-        kind: wp.int32,
-    ):
+        d: vec2, beacon: wp.array(dtype=real), base: wp.int32, terms: wp.array(dtype=real),
+        series: wp.array(dtype=real), count: wp.int32, kind: wp.int32,
+    ):  # fmt: skip
         first = two_sum(d.x, -beacon[base + 4])
         r = two_sum(first.x, first.y + (d.y - beacon[base + 5]))
         near = wp.clamp(d.x + beacon[base + 6], ZERO, terms[RANGE_MAX])

@@ -60,13 +60,9 @@ def make(name, flags):
     # Return the term of one reading in the sum.
     @wp.func
     def reading_term(
-        z: real,
-        expected: real,
-        terms: wp.array(dtype=real),
-        sensor: wp.array(dtype=real),
-        tables: types.MixtureTables,
+        z: real, expected: real, terms: wp.array(dtype=real), sensor: wp.array(dtype=real), tables: types.MixtureTables,
         range_max: real,
-    ):
+    ):  # fmt: skip
         if ALL_READINGS:
             if wp.isnan(z):
                 return ZERO

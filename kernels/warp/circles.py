@@ -25,13 +25,14 @@ def functions(flags):
     # Cost, gradient (3) and information (xx, xy, xr, yy, yr, rr) of a circle.
     sums10 = wp.types.vector(length=10, dtype=real)
     vec3 = wp.types.vector(length=3, dtype=real)
-    ZERO, ONE, HALF, NOTHING = real(0.0), real(1.0), real(0.5), real(-1.0)
+    ZERO, ONE, HALF, MINUS_ONE = real(0.0), real(1.0), real(0.5), real(-1.0)
     WHOLE_TURN, WIDEST, ROUND = real(6.283185307179586), real(1.2), real(0.785)
     # The smallest cosine of an angle of incidence, the largest sine of an edge, and the smallest distance.
     STEEPEST, LARGEST, SMALLEST = real(0.1), real(0.99), real(1e-9)
     DAMPING, LESS, MORE = real(1e-3), real(0.1), real(10.0)
 
-    # A part of a scan: its points, which may go on at the scan's first point, its edges, and the deviation of ranges.
+    # A part of a scan: its points, which may wrap around to the scan's first point, its edges, and the deviation of
+    # ranges.
     @wp.struct
     class Part:
         begin: wp.int32
@@ -41,7 +42,7 @@ def functions(flags):
         edge: vec4
         sigma: real
 
-    # Return a point of a part, which may go on at the scan's first point.
+    # Return a point of a part, which may wrap around to the scan's first point.
     @wp.func
     def point_of(point: wp.array(dtype=vec4), mine: Part, k: wp.int32):
         return point[mine.begin + (mine.first - mine.begin + k) % mine.size]
@@ -129,7 +130,7 @@ def functions(flags):
         square = distance * distance
         inward = slope * circle[2] / (square * distance)
         return add_error(
-            sums, (NOTHING * circle[1] / square - inward * circle[0]) / deviation,
+            sums, (MINUS_ONE * circle[1] / square - inward * circle[0]) / deviation,
             (circle[0] / square - inward * circle[1]) / deviation, slope / distance / deviation, error / deviation,
         )  # fmt: skip
 
@@ -160,7 +161,7 @@ def functions(flags):
                     slope * circle[2] / sigma, error / sigma,
                 )  # fmt: skip
         if mine.edge[2] > ZERO:
-            sums = edge_row(sums, circle, mine.edge[0], mine.edge[2], NOTHING)
+            sums = edge_row(sums, circle, mine.edge[0], mine.edge[2], MINUS_ONE)
             sums = edge_row(sums, circle, mine.edge[1], mine.edge[3], ONE)
         return sums
 
@@ -183,9 +184,9 @@ def functions(flags):
         step = vec3()
         if whole > ZERO:
             step = vec3(
-                NOTHING * (a * sums[1] + b * sums[2] + c * sums[3]) / whole,
-                NOTHING * (b * sums[1] + d * sums[2] + e * sums[3]) / whole,
-                NOTHING * (c * sums[1] + e * sums[2] + f * sums[3]) / whole,
+                MINUS_ONE * (a * sums[1] + b * sums[2] + c * sums[3]) / whole,
+                MINUS_ONE * (b * sums[1] + d * sums[2] + e * sums[3]) / whole,
+                MINUS_ONE * (c * sums[1] + e * sums[2] + f * sums[3]) / whole,
             )
         return step
 
@@ -199,7 +200,7 @@ def functions(flags):
             guess = arc_guess(point, mine)
         circle = guess
         sums = sums10()
-        sums[0] = NOTHING
+        sums[0] = MINUS_ONE
         finite = wp.isfinite(guess[0]) and wp.isfinite(guess[1]) and wp.isfinite(guess[2])
         if guess[2] > ZERO and finite:
             side = side_of(point, mine, guess)

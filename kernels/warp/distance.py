@@ -6,6 +6,8 @@ cell, and searches around it only as far as a nearer obstacle is possible. The g
 indices fit int32.
 """
 
+import functools
+
 import warp as wp
 
 from .bits import cells_left, cells_right
@@ -178,6 +180,28 @@ def distance_search(nearest, blocks, squared, rows, cols, count, most):
     squared[row * cols + col] = result
 
 
+# ---- table of a likelihood field
+
+
+@functools.cache
 def make(name, flags):
-    """Return a kernel of the file; no flag changes it."""
-    return globals()[name]
+    """Return a kernel of the file; only the table of a likelihood field has the precision of the flags."""
+    if name != "fill_field":
+        return globals()[name]
+
+    # Fill width x height cells of a field's table from squared distances: density has a value for each squared distance
+    # up to the cap. The cells begin at index begin of the table and at cell (from_col, from_row) of the grid; cells
+    # outside the grid get beyond.
+    @kernel(flags)
+    def fill_field(squared, density, table, rows, cols, cap, beyond, from_col, from_row, width, height, begin, stride):
+        j, i = wp.tid()
+        if i >= width or j >= height:
+            return
+        col = from_col + i
+        row = from_row + j
+        value = beyond
+        if col >= 0 and col < cols and row >= 0 and row < rows:
+            value = density[wp.min(squared[row * cols + col], cap)]
+        table[begin + j * stride + i] = value
+
+    return fill_field

@@ -51,13 +51,9 @@ def functions(flags):
     # Return the first index whose cumulative residual weight exceeds a fraction of all residual weights.
     @wp.func
     def found_residual(
-        ends: wp.array(dtype=wp.float64),
-        copies: wp.array(dtype=wp.float64),
-        fraction: wp.float64,
-        total: wp.float64,
-        particles: wp.int32,
-        drawn: wp.int32,
-    ):
+        ends: wp.array(dtype=wp.float64), copies: wp.array(dtype=wp.float64), fraction: wp.float64, total: wp.float64,
+        particles: wp.int32, drawn: wp.int32,
+    ):  # fmt: skip
         each = total / wp.float64(drawn)
         mark = fraction * (ends[particles - 1] - copies[particles - 1] * each)
         low = int(0)
@@ -84,15 +80,10 @@ def functions(flags):
     # Copy particle n with its weight, relative to the mean weight.
     @wp.func
     def copy_particle(
-        source: wp.array(dtype=wp.float64),
-        weight: wp.array(dtype=wp.float64),
-        settings: wp.array(dtype=wp.float64),
-        total: wp.float64,
-        target: wp.array(dtype=wp.float64),
-        after: wp.array(dtype=wp.float64),
-        particles: wp.int32,
+        source: wp.array(dtype=wp.float64), weight: wp.array(dtype=wp.float64), settings: wp.array(dtype=wp.float64),
+        total: wp.float64, target: wp.array(dtype=wp.float64), after: wp.array(dtype=wp.float64), particles: wp.int32,
         n: wp.int32,
-    ):
+    ):  # fmt: skip
         copied = n % particles
         for axis in range(3):
             target[3 * n + axis] = source[3 * copied + axis]
@@ -120,18 +111,10 @@ def functions(flags):
     # Draw particle n from the one with index chosen: move it by jitter where a stage follows, or inject a pose.
     @wp.func
     def draw_particle(
-        source: wp.array(dtype=wp.float64),
-        ends: wp.array(dtype=wp.float64),
-        settings: wp.array(dtype=wp.float64),
-        state: wp.array(dtype=wp.float64),
-        pool: wp.array(dtype=wp.float64),
-        target: wp.array(dtype=wp.float64),
-        after: wp.array(dtype=wp.float64),
-        particles: wp.int32,
-        stage: wp.int32,
-        n: wp.int32,
-        chosen: wp.int32,
-    ):
+        source: wp.array(dtype=wp.float64), ends: wp.array(dtype=wp.float64), settings: wp.array(dtype=wp.float64),
+        state: wp.array(dtype=wp.float64), pool: wp.array(dtype=wp.float64), target: wp.array(dtype=wp.float64),
+        after: wp.array(dtype=wp.float64), particles: wp.int32, stage: wp.int32, n: wp.int32, chosen: wp.int32,
+    ):  # fmt: skip
         index = wp.uint32(settings[FIRST]) + wp.uint32(n)
         x = source[3 * chosen]
         y = source[3 * chosen + 1]

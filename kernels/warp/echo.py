@@ -90,17 +90,9 @@ def functions(flags):
     # cosine below critical has none: the surface reflects it like a mirror.
     @wp.func
     def nearest_echo(
-        map_table: wp.array(dtype=ENTRY),
-        normals: wp.array(dtype=vec2),
-        window: types.Window,
-        cell: wp.vec2i,
-        pose: vec4,
-        ray: wp.array(dtype=vec2),
-        first: wp.int32,
-        cone: types.Cone,
-        limit: real,
-        caster: types.Caster,
-    ):
+        map_table: wp.array(dtype=ENTRY), normals: wp.array(dtype=vec2), window: types.Window, cell: wp.vec2i,
+        pose: vec4, ray: wp.array(dtype=vec2), first: wp.int32, cone: types.Cone, limit: real, caster: types.Caster,
+    ):  # fmt: skip
         echo = Echo()
         echo.t = limit
         echo.cosine = TWO
@@ -144,8 +136,8 @@ def make(name, flags):
     # 2 without a return. One work-item takes a particle and cone; a launch has fewer than 2^31.
     @kernel(flags, entry=ENTRY)
     def cast_echoes(
-        map_table, normals, pose_cell, pose, ray, ranges, incidence, window, particles, rays, cone, caster, scale,
-    ):  # fmt: skip
+        map_table, normals, pose_cell, pose, ray, ranges, incidence, window, particles, rays, cone, caster, scale
+    ):
         n, k = wp.tid()
         if k >= rays or n >= particles:
             return

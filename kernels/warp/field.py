@@ -41,21 +41,6 @@ def make(name, flags):
     two_at = reader(vec2, 2)
     block_cells = wp.types.vector(length=BLOCK_TERMS, dtype=wp.int32)
 
-    # Fill width x height cells of the table from squared distances: density has a value for each squared distance up to
-    # the cap. The cells begin at index begin of the table and at cell (from_col, from_row) of the grid; cells outside
-    # the grid get beyond.
-    @kernel(flags)
-    def fill_field(squared, density, table, rows, cols, cap, beyond, from_col, from_row, width, height, begin, stride):
-        j, i = wp.tid()
-        if i >= width or j >= height:
-            return
-        col = from_col + i
-        row = from_row + j
-        value = beyond
-        if col >= 0 and col < cols and row >= 0 and row < rows:
-            value = density[wp.min(squared[row * cols + col], cap)]
-        table[begin + j * stride + i] = value
-
     # Score scans: one work-item takes a particle.
     @kernel(flags)
     def score_field(
@@ -139,8 +124,8 @@ def make(name, flags):
             log_p[n] = score.temperature * (total.x + total.y)
 
     # Write the sums of blocks of readings to parts[n + block * particles], for GPUs. One work-item takes a
-    # particle and every 2^spread-th block. Each block has a guard of its own; with SCANS each scan has as many guards
-    # as the longest one.
+    # particle and every 2^spread-th block. Each block has a separate guard; with SCANS each scan has as many guards as
+    # the longest one.
     @kernel(flags)
     def field_blocks(
         table, pose_cell, pose, pose_low, point, point_low, terms, guard, start, parts, window, particles, readings,

@@ -99,16 +99,9 @@ def functions(flags):
     # interpolated, capped distances in metres.
     @wp.func
     def reading_value(
-        table: wp.array(dtype=real),
-        origin: wp.vec2i,
-        pose: vec4,
-        low: vec4,
-        point: vec2,
-        point_low: vec2,
-        terms: wp.array(dtype=real),
-        window: types.Window,
-        guard: real,
-    ):
+        table: wp.array(dtype=real), origin: wp.vec2i, pose: vec4, low: vec4, point: vec2, point_low: vec2,
+        terms: wp.array(dtype=real), window: types.Window, guard: real,
+    ):  # fmt: skip
         if ALL_READINGS:
             if wp.isnan(point.x):
                 return ZERO
@@ -129,12 +122,7 @@ def functions(flags):
     # missing or max reading has no cell: the sensor's cell is read and not used. The term of a max reading is far.
     @wp.func
     def quick_value(
-        table: wp.array(dtype=real),
-        start_cell: wp.vec2i,
-        lowered: vec4,
-        to: vec2,
-        far: real,
-        window: types.Window,
+        table: wp.array(dtype=real), start_cell: wp.vec2i, lowered: vec4, to: vec2, far: real, window: types.Window
     ):
         if ALL_READINGS:
             is_range = wp.isfinite(to.x)
@@ -151,18 +139,9 @@ def functions(flags):
     # Return the term of a reading in a block where rounding is in doubt: doubtful cells are computed with more digits.
     @wp.func
     def careful_value(
-        table: wp.array(dtype=real),
-        origin: wp.vec2i,
-        lowered: vec4,
-        sensor_pose: vec4,
-        sensor_low: vec4,
-        to: vec2,
-        to_low: vec2,
-        far: real,
-        window: types.Window,
-        guard: real,
-        sure: real,
-    ):
+        table: wp.array(dtype=real), origin: wp.vec2i, lowered: vec4, sensor_pose: vec4, sensor_low: vec4, to: vec2,
+        to_low: vec2, far: real, window: types.Window, guard: real, sure: real,
+    ):  # fmt: skip
         if ALL_READINGS:
             if wp.isnan(to.x):
                 return ZERO

@@ -39,14 +39,9 @@ def functions(flags):
     # one; ahead points have a smaller bearing than the place.
     @wp.func
     def nearest_point(
-        point: wp.array(dtype=vec4),
-        first: wp.int32,
-        count: wp.int32,
-        ahead: wp.int32,
-        skip: wp.int32,
-        place: vec2,
+        point: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, ahead: wp.int32, skip: wp.int32, place: vec2,
         squared: real,
-    ):
+    ):  # fmt: skip
         kept = (count + skip - 1) // skip
         before = (ahead + skip - 1) // skip
         length = place.x * place.x + place.y * place.y
@@ -120,18 +115,9 @@ def functions(flags):
     # pose is (x, y, cos, sin).
     @wp.func
     def agreement(
-        point: wp.array(dtype=vec4),
-        line: wp.array(dtype=vec4),
-        first: wp.int32,
-        count: wp.int32,
-        second: wp.int32,
-        others: wp.int32,
-        stride: wp.int32,
-        skip: wp.int32,
-        pose: vec4,
-        near: real,
-        gap: real,
-    ):
+        point: wp.array(dtype=vec4), line: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, second: wp.int32,
+        others: wp.int32, stride: wp.int32, skip: wp.int32, pose: vec4, near: real, gap: real,
+    ):  # fmt: skip
         scale = near / THREE
         total = vec4()
         i = int(0)

@@ -94,15 +94,9 @@ def functions(flags):
     # Return whether a feature may be landmark j: near its end point, or for lines similar in direction and overlapping.
     @wp.func
     def may_match(
-        off: vec4,
-        turned: vec4,
-        feature: wp.array(dtype=real),
-        base: wp.int32,
-        normal: wp.array(dtype=vec4),
-        signature: wp.array(dtype=vec4),
-        j: wp.int32,
-        most: real,
-    ):
+        off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32, normal: wp.array(dtype=vec4),
+        signature: wp.array(dtype=vec4), j: wp.int32, most: real,
+    ):  # fmt: skip
         may = bool(False)
         if LINE:
             may = overlaps(off, turned, feature, base, facing(normal[j], signature[j], turned), signature[j])
@@ -113,16 +107,9 @@ def functions(flags):
     # Return log(z_detect p(f | j)) of one feature at the offset of landmark j.
     @wp.func
     def log_match(
-        off: vec4,
-        turned: vec4,
-        feature: wp.array(dtype=real),
-        base: wp.int32,
-        normal: wp.array(dtype=vec4),
-        signature: wp.array(dtype=vec4),
-        j: wp.int32,
-        terms: wp.array(dtype=real),
-        arcs: wp.array(dtype=vec2),
-    ):
+        off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32, normal: wp.array(dtype=vec4),
+        signature: wp.array(dtype=vec4), j: wp.int32, terms: wp.array(dtype=real), arcs: wp.array(dtype=vec2),
+    ):  # fmt: skip
         log_p = real(0.0)
         if LINE:
             seen = facing(normal[j], signature[j], turned)
@@ -151,18 +138,10 @@ def functions(flags):
     # Return the match of a feature among the landmarks within its disc.
     @wp.func
     def search(
-        landmark: wp.array(dtype=vec4),
-        normal: wp.array(dtype=vec4),
-        signature: wp.array(dtype=vec4),
-        start: wp.array(dtype=wp.int32),
-        place: vec4,
-        turned: vec4,
-        feature: wp.array(dtype=real),
-        base: wp.int32,
-        terms: wp.array(dtype=real),
-        arcs: wp.array(dtype=vec2),
-        buckets: types.Buckets,
-    ):
+        landmark: wp.array(dtype=vec4), normal: wp.array(dtype=vec4), signature: wp.array(dtype=vec4),
+        start: wp.array(dtype=wp.int32), place: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32,
+        terms: wp.array(dtype=real), arcs: wp.array(dtype=vec2), buckets: types.Buckets,
+    ):  # fmt: skip
         match = Match()
         match.log_p = NEVER
         match.best = NEVER

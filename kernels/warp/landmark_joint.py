@@ -35,6 +35,49 @@ def make(name, flags):
     # Largest number of features.
     LogEach = wp.types.vector(length=8, dtype=real)
 
+    # Let landmark j be seen by one more feature of each set, at most one of each group; log_each has the features' log
+    # p. The particle's sets begin at index sums of best, and their features at index begin of choice and value.
+    @wp.func
+    def add_landmark(
+        j: wp.int32, log_each: LogEach, feature: wp.array(dtype=real), best: wp.array(dtype=real),
+        choice: wp.array(dtype=wp.int32), value: wp.array(dtype=real), sums: wp.int32, begin: wp.int32,
+        features: wp.int32, sets: wp.int32, groups: wp.int32,
+    ):  # fmt: skip
+        # From the full set down, since smaller sets must not yet contain this landmark for the group.
+        step = int(0)
+        while step < groups * (sets - 1):
+            group = step // (sets - 1)
+            s = sets - 1 - step % (sets - 1)
+            k = int(0)
+            while k < features:
+                if ((s >> k) & 1) != 0 and int(feature[FEATURE * k + GROUP]) == group:
+                    less = s ^ (1 << k)
+                    joined = best[sums + less] + log_each[k]
+                    if joined > best[sums + s]:
+                        best[sums + s] = joined
+                        i = int(0)
+                        while i < features:
+                            if i == k:
+                                choice[begin + s * features + i] = j
+                                value[begin + s * features + i] = log_each[k]
+                            else:
+                                choice[begin + s * features + i] = choice[begin + less * features + i]
+                                value[begin + s * features + i] = value[begin + less * features + i]
+                            i += 1
+                k += 1
+            step += 1
+
+    # Return log p of all features if those of set s have landmarks and the remaining ones are false positives.
+    @wp.func
+    def set_total(s: wp.int32, sum_of_set: real, feature: wp.array(dtype=real), features: wp.int32):
+        total = real(sum_of_set)
+        k = int(0)
+        while k < features:
+            if ((s >> k) & 1) == 0:
+                total += feature[FEATURE * k + FALSE_POSITIVE]
+            k += 1
+        return total
+
     # Find the best joint association: one work-item takes a particle. choice[s] has the landmark of each feature of set
     # s, and value[s] its log p; sets is 2^features.
     @kernel(flags)
@@ -78,40 +121,13 @@ def make(name, flags):
                         detected = log_match(off, turned, feature, base, normal, signature, j, terms, arcs)
                         log_each[k] = either(detected, feature[base + FALSE_POSITIVE])
                 k += 1
-            # From the full set down, since smaller sets must not yet contain this landmark for the group.
-            step = int(0)
-            while step < groups * (sets - 1):
-                group = step // (sets - 1)
-                s = sets - 1 - step % (sets - 1)
-                k = int(0)
-                while k < features:
-                    if ((s >> k) & 1) != 0 and int(feature[FEATURE * k + GROUP]) == group:
-                        less = s ^ (1 << k)
-                        joined = best[sums + less] + log_each[k]
-                        if joined > best[sums + s]:
-                            best[sums + s] = joined
-                            i = int(0)
-                            while i < features:
-                                if i == k:
-                                    choice[begin + s * features + i] = j
-                                    value[begin + s * features + i] = log_each[k]
-                                else:
-                                    choice[begin + s * features + i] = choice[begin + less * features + i]
-                                    value[begin + s * features + i] = value[begin + less * features + i]
-                                i += 1
-                    k += 1
-                step += 1
+            add_landmark(j, log_each, feature, best, choice, value, sums, begin, features, sets, groups)
             j += 1
         most = real(-math.inf)
         chosen = int(0)
         s = int(0)
         while s < sets:
-            total = best[sums + s]
-            k = int(0)
-            while k < features:
-                if ((s >> k) & 1) == 0:
-                    total += feature[FEATURE * k + FALSE_POSITIVE]
-                k += 1
+            total = set_total(s, best[sums + s], feature, features)
             if total > most:
                 most = total
                 chosen = s

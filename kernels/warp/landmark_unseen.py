@@ -17,7 +17,7 @@ def make(name, flags):
     sensor_place, offset = density.sensor_place, density.offset
     bucket_at = landmark_grid.functions(flags & {"FLOAT64"}).bucket_at
 
-    # Return whether a landmark is within range, and its angle to the sensor's axis has a cosine of at least least.
+    # Return whether a landmark is within range, and the cosine of its angle to the sensor's axis is at least ``least``.
     @wp.func
     def in_view(off: vec4, cosine: real, sine: real, range_max: real, least: real):
         d = wp.sqrt(off[0] * off[0] + off[2] * off[2])

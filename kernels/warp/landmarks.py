@@ -200,14 +200,9 @@ def functions(flags):
     # Return log(z_detect p(f | j)) of one feature at an offset; signature is (s_j, low part, -log m_s, 0).
     @wp.func
     def log_detection(
-        off: vec4,
-        turned: vec4,
-        feature: wp.array(dtype=real),
-        base: wp.int32,
-        signature: vec4,
-        terms: wp.array(dtype=real),
-        arcs: wp.array(dtype=vec2),
-    ):
+        off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32, signature: vec4,
+        terms: wp.array(dtype=real), arcs: wp.array(dtype=vec2),
+    ):  # fmt: skip
         exponent = vec2(ZERO, ZERO)
         mass = real(1.0)
         norm = real(0.0)

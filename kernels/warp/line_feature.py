@@ -88,15 +88,9 @@ def functions(flags):
     # Return log(z_detect p(f | j)) of one feature at the offset of a line's middle.
     @wp.func
     def log_line(
-        off: vec4,
-        turned: vec4,
-        feature: wp.array(dtype=real),
-        base: wp.int32,
-        normal: vec4,
-        signature: vec4,
-        terms: wp.array(dtype=real),
-        arcs: wp.array(dtype=vec2),
-    ):
+        off: vec4, turned: vec4, feature: wp.array(dtype=real), base: wp.int32, normal: vec4, signature: vec4,
+        terms: wp.array(dtype=real), arcs: wp.array(dtype=vec2),
+    ):  # fmt: skip
         da = angle_pair(across(turned, normal), along(turned, normal), arcs)
         d = along(off, normal)
         first = two_sum(feature[base + RANGE_AT], -d[0])

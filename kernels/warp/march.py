@@ -34,14 +34,9 @@ def functions(flags):
     # Return the distance in cells to a point in an occupied cell, limit where none is nearer.
     @wp.func
     def cast_ray(
-        map_table: wp.array(dtype=ENTRY),
-        window: types.Window,
-        cell: wp.vec2i,
-        pose: vec4,
-        ray: vec2,
-        limit: real,
+        map_table: wp.array(dtype=ENTRY), window: types.Window, cell: wp.vec2i, pose: vec4, ray: vec2, limit: real,
         caster: types.Caster,
-    ):
+    ):  # fmt: skip
         r = make_ray(pose, ray)
         t = real(0.0)
         if ORIGINS_OUTSIDE:

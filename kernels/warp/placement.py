@@ -39,15 +39,10 @@ def functions(flags):
     # fraction 0 and heading (1, 0): it sees nothing, and its indices stay in bounds.
     @wp.func
     def place_pose(
-        particle: wp.int32,
-        poses: wp.array(dtype=coordinate),
-        pose_cell: wp.array(dtype=wp.vec2i),
-        pose: wp.array(dtype=vec4),
-        pose_low: wp.array(dtype=vec4),
-        pose_status: wp.array(dtype=wp.int32),
-        frame: types.Frame,
-        window: types.Window,
-    ):
+        particle: wp.int32, poses: wp.array(dtype=coordinate), pose_cell: wp.array(dtype=wp.vec2i),
+        pose: wp.array(dtype=vec4), pose_low: wp.array(dtype=vec4), pose_status: wp.array(dtype=wp.int32),
+        frame: types.Frame, window: types.Window,
+    ):  # fmt: skip
         x = wp.float64(poses[3 * particle])
         y = wp.float64(poses[3 * particle + 1])
         theta = wp.float64(poses[3 * particle + 2])

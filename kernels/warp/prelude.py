@@ -2,7 +2,7 @@
 
 Flags are those of ``gpusense.interface``. A factory turns them into closure constants. Warp drops the branches of ``if
 FLAG:`` whose condition is such a constant, so code that a set of flags does not need is never generated. Numbers are
-such constants too. A negative number has a constant of its own: some versions of Warp lose the sign of ``-ONE`` in
+such constants too. A negative number has a separate constant: some versions of Warp lose the sign of ``-ONE`` in
 float64.
 """
 

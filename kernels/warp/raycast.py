@@ -50,7 +50,7 @@ def functions(flags):
             sector += wp.where(speed_y > wp.where(steep, STEEPEST, FLATTEST) * speed_x, 1, 0)
         return sector
 
-    # Rows of a group of the planes; without ROW_GROUPS each row stands alone.
+    # Rows of a group of the planes; without ROW_GROUPS a group is a single row.
     GROUP = 8 if ROW_GROUPS else 1
     ROWS = wp.uint32(GROUP)
 
@@ -95,14 +95,9 @@ def functions(flags):
     # Return the distance in cells to the first occupied cell, limit where none is nearer.
     @wp.func
     def cast_ray(
-        map_table: wp.array(dtype=ENTRY),
-        window: types.Window,
-        cell: wp.vec2i,
-        pose: vec4,
-        ray: vec2,
-        limit: real,
+        map_table: wp.array(dtype=ENTRY), window: types.Window, cell: wp.vec2i, pose: vec4, ray: vec2, limit: real,
         caster: types.Caster,
-    ):
+    ):  # fmt: skip
         r = make_ray(pose, ray)
         if ORIGINS_OUTSIDE and OUTSIDE_OCCUPIED:
             if off_grid(cell.x, cell.y, window.rows, window.cols):

@@ -3,9 +3,9 @@
 Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), section 6.3.1: a component is drawn by its weight, and a
 reading by inverting the component's distribution function. For p_hit it is the normal on both sides of its mean, each
 with its mass on [0, range_max]. Masses are sums of positive terms: x phi(x) (1 + x^2 / 3 + x^4 / 15 + ...), and beyond
-SERIES_END one half less the continued fraction of Laplace. Quantiles are those of Wichura, *Algorithm AS 241* (1988).
-For p_short it is 1 - u (1 - exp(-lambda z*)), written as a sum of positive terms, or as a series where lambda z* is
-small. Everything is computed in float64 by +, -, *, / and sqrt, so that every device draws the same bits.
+SERIES_END one half less the continued fraction of Laplace. Quantiles: Wichura, *Algorithm AS 241* (1988). For p_short
+it is 1 - u (1 - exp(-lambda z*)), written as a sum of positive terms, or as a series where lambda z* is small.
+Everything is computed in float64 by +, -, *, / and sqrt, so that every device draws the same bits.
 
 Other shapes of hits than the normal (MASS_TABLE) have a table of masses and one of quantiles: cells of equal width in
 log(1 + b), b = u / sqrt 2, and in -log(1 - 2 mass), with the coefficients of a polynomial in the position within the
@@ -193,13 +193,9 @@ def functions(flags):
     # Return a reading drawn from the mixture; infinity without return, NaN where no reading is possible.
     @wp.func
     def reading_of(
-        u: wp.float64,
-        v: wp.float64,
-        expected: wp.float64,
-        mixture: wp.array(dtype=wp.float64),
-        bins: wp.int32,
+        u: wp.float64, v: wp.float64, expected: wp.float64, mixture: wp.array(dtype=wp.float64), bins: wp.int32,
         range_max: wp.float64,
-    ):
+    ):  # fmt: skip
         p = DRAW_TERMS * bins
         first = mixture[p]
         second = first + wp.where(expected > ZERO, mixture[p + 1], ZERO)
@@ -224,14 +220,9 @@ def functions(flags):
     # Return a reading drawn from a table: uniform in a drawn bin, at a margin from the bin's ends.
     @wp.func
     def cell_reading_of(
-        u: wp.float64,
-        v: wp.float64,
-        column: wp.int32,
-        chances: wp.array(dtype=wp.float64),
-        cells: wp.int32,
-        range_max: wp.float64,
-        margin: wp.float64,
-    ):
+        u: wp.float64, v: wp.float64, column: wp.int32, chances: wp.array(dtype=wp.float64), cells: wp.int32,
+        range_max: wp.float64, margin: wp.float64,
+    ):  # fmt: skip
         row = column * (cells + 1)
         mark = u * chances[row + cells]
         low = int(0)

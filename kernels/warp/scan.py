@@ -59,33 +59,56 @@ def make(name, flags):
                 z = wp.float64(ranges[k])
         return z
 
+    # Fill a place with the end point of a reading: the reading times the vector of its beam, in cells, with the
+    # rounding error in point_low. The guard of a block of places is guard_scale (longest + 2 cells), of its longest
+    # reading.
+    @wp.func
+    def fill_end_point(
+        place: wp.int32, value: wp.float64, vector: wp.vec2d, longest: wp.float64, point: wp.array(dtype=vec2),
+        point_low: wp.array(dtype=vec2), guard: wp.array(dtype=real), resolution: wp.float64, guard_scale: wp.float64,
+    ):  # fmt: skip
+        cells = value / resolution
+        length = wp.where(wp.isfinite(cells), cells, ZERO)
+        x = vector.x * length
+        y = vector.y * length
+        high = vec2(real(x), real(y))
+        point_low[place] = vec2(real(x - wp.float64(high.x)), real(y - wp.float64(high.y)))
+        if not wp.isfinite(cells):
+            high = vec2(real(cells), real(cells))
+        point[place] = high
+        if place % BLOCK_TERMS == 0:
+            guard[place // BLOCK_TERMS] = real(guard_scale * (longest / resolution + wp.float64(2.0)))
+
+    # Fill a place with a reading, at most top, and with the vectors of its beam, the first of which is read already.
+    @wp.func
+    def fill_rays(
+        place: wp.int32, value: wp.float64, vector: wp.vec2d, vectors: wp.array(dtype=wp.float64), source: wp.int32,
+        point: wp.array(dtype=vec2), reading: wp.array(dtype=real), each: wp.int32, top: wp.float64,
+    ):  # fmt: skip
+        point[place * each] = vec2(real(vector.x), real(vector.y))
+        for j in range(1, each):
+            point[place * each + j] = vec2(real(vectors[source + 2 * j]), real(vectors[source + 2 * j + 1]))
+        rounded = real(value)
+        if rounded > real(top) and not wp.isinf(rounded):
+            rounded = real(top)
+        reading[place] = rounded
+
     # Place one reading: find its place from all readings, and fill that place; an item beyond the readings fills a
-    # place at the end. 16 readings are read before any is used. A place gets its reading, at most top, and as points
-    # the vectors of its beam, each of them. With END_POINTS a point is the reading times its vector, in cells, and
-    # point_low its rounding error. A max reading is inf. The guard of a block of places is guard_scale (longest + 2
-    # cells). constant_term is that of max readings without a place, -inf if there is a range where none is possible.
+    # place at the end. 16 readings are read before any is used. A max reading is inf. constant_term is that of max
+    # readings without a place, -inf if there is a range where none is possible.
     @wp.func
     def place_reading(
-        item: wp.int32,
-        ranges: wp.array(dtype=measured),
-        beam: wp.array(dtype=wp.int32),
-        vector: wp.array(dtype=wp.float64),
-        point: wp.array(dtype=vec2),
-        point_low: wp.array(dtype=vec2),
-        reading: wp.array(dtype=real),
-        guard: wp.array(dtype=real),
-        constant_term: wp.array(dtype=real),
-        resolution: wp.float64,
-        rules: types.ReadingRules,
-    ):
+        item: wp.int32, ranges: wp.array(dtype=measured), beam: wp.array(dtype=wp.int32),
+        vector: wp.array(dtype=wp.float64), point: wp.array(dtype=vec2), point_low: wp.array(dtype=vec2),
+        reading: wp.array(dtype=real), guard: wp.array(dtype=real), constant_term: wp.array(dtype=real),
+        resolution: wp.float64, rules: types.ReadingRules,
+    ):  # fmt: skip
         # Values that are needed last are read first, so that nothing waits for them.
         source = 2 * item * rules.each
         item_reading = reading_of(item, ranges, beam, rules.beams)
-        vector_x = wp.float64(1.0)
-        vector_y = wp.float64(0.0)
+        vector_of_item = wp.vec2d(wp.float64(1.0), wp.float64(0.0))
         if item < rules.beams:
-            vector_x = vector[source]
-            vector_y = vector[source + 1]
+            vector_of_item = wp.vec2d(vector[source], vector[source + 1])
         informative = int(rules.beams)
         if rules.chosen < rules.beams:
             informative = int(0)
@@ -155,35 +178,18 @@ def make(name, flags):
         left_over = item >= place and item < rules.places
         if END_POINTS:
             if item_place < rules.places:
-                cells = item_value / resolution
-                length = wp.where(wp.isfinite(cells), cells, ZERO)
-                x = vector_x * length
-                y = vector_y * length
-                high = vec2(real(x), real(y))
-                point_low[item_place] = vec2(real(x - wp.float64(high.x)), real(y - wp.float64(high.y)))
-                if not wp.isfinite(cells):
-                    high = vec2(real(cells), real(cells))
-                point[item_place] = high
-                if item_place % BLOCK_TERMS == 0:
-                    guard[item_place // BLOCK_TERMS] = real(
-                        rules.guard_scale * (longest / resolution + wp.float64(2.0))
-                    )
+                fill_end_point(
+                    item_place, item_value, vector_of_item, longest, point, point_low, guard, resolution,
+                    rules.guard_scale,
+                )  # fmt: skip
             if left_over:
-                point[item] = vec2(NO_READING, NO_READING)
-                point_low[item] = vec2(NOTHING, NOTHING)
-                if item % BLOCK_TERMS == 0:
-                    guard[item // BLOCK_TERMS] = real(rules.guard_scale * wp.float64(2.0))
+                fill_end_point(
+                    item, wp.float64(MISSING), wp.vec2d(wp.float64(1.0), wp.float64(0.0)), ZERO, point, point_low,
+                    guard, resolution, rules.guard_scale,
+                )  # fmt: skip
         else:
             if item_place < rules.places:
-                point[item_place * rules.each] = vec2(real(vector_x), real(vector_y))
-                for j in range(1, rules.each):
-                    point[item_place * rules.each + j] = vec2(
-                        real(vector[source + 2 * j]), real(vector[source + 2 * j + 1])
-                    )
-                rounded = real(item_value)
-                if rounded > real(rules.top) and not wp.isinf(rounded):
-                    rounded = real(rules.top)
-                reading[item_place] = rounded
+                fill_rays(item_place, item_value, vector_of_item, vector, source, point, reading, rules.each, rules.top)
             if left_over:
                 for j in range(rules.each):
                     point[item * rules.each + j] = AHEAD

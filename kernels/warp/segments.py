@@ -26,10 +26,10 @@ def functions(flags):
     real, vec4 = types.real, types.vec4
     # The triangular root of rows that were added (11, 12, right side 1, 22, right side 2), and the cost.
     rows6 = wp.types.vector(length=6, dtype=real)
-    ZERO, ONE, NOTHING = real(0.0), real(1.0), real(-1.0)
+    ZERO, ONE, MINUS_ONE = real(0.0), real(1.0), real(-1.0)
     # A segment with a larger cost per point is split at its best point, even if a single split does not pay.
     POOR = real(3.0)
-    # Rows are parallel up to this. Splits that lower the cost equally but for a share of it are tied.
+    # Rows count as parallel up to this sine. Splits whose costs differ by less than a share are tied.
     PARALLEL, TIED, TIED_AT = real(1e-6), real(3e-7), real(1e5)
     LAST_STEP = STEPS + 1
 
@@ -112,7 +112,7 @@ def functions(flags):
             i = last - 1
             while i > first:
                 rows = with_point(rows, point, i, first, last, sigma)
-                # From here on the cost of this point is that which a split before it saves.
+                # From here on cost[i] is the cost that a split before point i saves.
                 lowered = total - cost[i - 1] - rows[5]
                 cost[i] = lowered
                 gain = wp.max(gain, lowered)
@@ -219,10 +219,10 @@ def functions(flags):
                     weight = expected * expected / sigma
                     error = (p[3] - expected) / sigma
                     if not (expected > ZERO):
-                        cost = NOTHING
+                        cost = MINUS_ONE
                     if cost >= ZERO:
                         cost += error * error
-                    rows = add_row(rows, NOTHING * weight * c, NOTHING * weight * s, error)
+                    rows = add_row(rows, MINUS_ONE * weight * c, MINUS_ONE * weight * s, error)
             if cost < ZERO:
                 step = LAST_STEP
                 rows = rows6()
@@ -265,8 +265,8 @@ def make(name, flags):
                 made.move_ends(point, first, last, cost, stop, sigma, penalty, gap)
             made.merge_segments(point, first, last, stop, sigma, penalty, gap)
 
-    # Fit lines to parts of scans: first point and number of points, which may go on at the scan's first point. One
-    # work-item takes a part.
+    # Fit lines to parts of scans: first point and number of points, which may wrap around to the scan's first point.
+    # One work-item takes a part.
     @kernel(flags)
     def fit_segments(point, start, noise, part, scan, line, scans, points, parts):
         k = wp.tid()

@@ -28,11 +28,7 @@ def functions(flags):
     # Return log p of a reading for an expected range.
     @wp.func
     def tabulated_density(
-        z: real,
-        expected: real,
-        sensor: wp.array(dtype=real),
-        tables: types.MixtureTables,
-        range_max: real,
+        z: real, expected: real, sensor: wp.array(dtype=real), tables: types.MixtureTables, range_max: real
     ):
         column = range_bin(expected, tables.per_metre, tables.cells, range_max)
         return sensor[range_bin(z, tables.per_metre, tables.cells, range_max) * (tables.cells + 1) + column]

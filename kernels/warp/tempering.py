@@ -19,7 +19,7 @@ SHARE, THRESHOLD, SCALE = (wp.constant(place) for place in (19, 20, 21))
 PER_BEAM_SCALE, SLOW_RATE, FAST_RATE, MOST_INJECTED = (wp.constant(place) for place in (22, 23, 24, 25))
 RUNGS, WEIGHT_SUMS = wp.constant(8), wp.constant(17)
 DEPTH = wp.constant(60)
-# Places in the state: of a stage, and of what lasts.
+# Places in the state: numbers of a stage, then numbers that outlast it.
 LEFT, TOTAL, SAMPLE_SIZE, RESAMPLED, DEGENERATE, RUNG = (wp.constant(place) for place in range(6))
 STAGE = wp.constant(8)
 # 2^-(RUNGS - 1).
@@ -75,7 +75,7 @@ def possible_of(totals: wp.array(dtype=wp.float64), largest: wp.float64):
     return high
 
 
-# Return the column of sums with the weights of a rung; that of the weights before where none is possible.
+# Return the column of sums with the weights of a rung; the column of the previous weights where none is possible.
 @wp.func
 def column_of(high: wp.float64, rung: wp.int32):
     column = rung
@@ -130,12 +130,9 @@ def rung_of(totals: wp.array(dtype=wp.float64), settings: wp.array(dtype=wp.floa
 # Update the averages of the likelihood per beam, and the share of particles to inject.
 @wp.func
 def follow_evidence(
-    total: wp.float64,
-    before: wp.float64,
-    largest: wp.float64,
-    settings: wp.array(dtype=wp.float64),
+    total: wp.float64, before: wp.float64, largest: wp.float64, settings: wp.array(dtype=wp.float64),
     state: wp.array(dtype=wp.float64),
-):
+):  # fmt: skip
     if not wp.isinf(largest) and total > ZERO and before > ZERO:
         evidence = largest + log_of(total / before)
         mean = exp_of(wp.min(settings[PER_BEAM_SCALE] * evidence, LARGEST_EXPONENT))
@@ -156,16 +153,9 @@ def follow_evidence(
 # Write the state of a stage that uses a rung; at stage 0, follow the evidence of the whole temperature.
 @wp.func
 def set_stage(
-    totals: wp.array(dtype=wp.float64),
-    settings: wp.array(dtype=wp.float64),
-    state: wp.array(dtype=wp.float64),
-    high: wp.float64,
-    left: wp.float64,
-    rung: wp.int32,
-    particles: wp.int32,
-    stage: wp.int32,
-    stages: wp.int32,
-):
+    totals: wp.array(dtype=wp.float64), settings: wp.array(dtype=wp.float64), state: wp.array(dtype=wp.float64),
+    high: wp.float64, left: wp.float64, rung: wp.int32, particles: wp.int32, stage: wp.int32, stages: wp.int32,
+):  # fmt: skip
     if stage == 0 and settings[DEPTH] == ONE:
         follow_evidence(totals[0], totals[2 * RUNGS], high, settings, state)
     size = totals[rung] * totals[rung] / (settings[SCALE] * totals[RUNGS + rung])

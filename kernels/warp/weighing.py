@@ -1,7 +1,7 @@
 """Weights of particles from the log-likelihoods of sensors, at the highest temperature that leaves enough particles.
 
-w_k = v exp(b_k (l - max l)), where v is the weight before, l the sum over sensors of temperature times log p, and b_k =
-d b / 2^k a ladder of depth d. The first rung whose effective sample size (sum w)^2 / sum w^2 is at least SHARE of the
+w_k = v exp(b_k (l - max l)), where v is the previous weight, l the sum over sensors of temperature times log p, and b_k
+= d b / 2^k a ladder of depth d. The first rung whose effective sample size (sum w)^2 / sum w^2 is at least SHARE of the
 previous one is taken; the rest of b is left to the next stage of the correction (annealing: Neal, *Annealed importance
 sampling*, 2001). Weights are rounded to integers below 2^53 / N, so that their sums are exact in any order.
 """
@@ -59,7 +59,7 @@ def make(name, flags):
             high = wp.max(high, value)
         largest[b] = high
 
-    # Find the largest score of every fan blocks: one work-item takes a group of blocks.
+    # Find the largest score of each group of fan blocks: one work-item takes a group of blocks.
     @kernel(flags)
     def join_scores(scores, largest, blocks, fan):
         g = wp.tid()
@@ -67,12 +67,12 @@ def make(name, flags):
         if begin < blocks:
             largest[g] = largest_of(scores, begin, wp.min(begin + fan, blocks))
 
-    # Sum the integer weights of each block on each rung, their squares, and the weights before: one work-item takes a
+    # Sum the integer weights of each block on each rung, their squares, and the previous weights: one work-item takes a
     # block. The first one writes the largest score.
     @kernel(flags)
     def weigh_particles(
-        score, before, largest, settings, state, sums, highest, particles, block, blocks, groups, stage,
-    ):  # fmt: skip
+        score, before, largest, settings, state, sums, highest, particles, block, blocks, groups, stage
+    ):
         b = wp.tid()
         begin = b * block
         if begin >= particles:
@@ -103,7 +103,7 @@ def make(name, flags):
         if b == 0:
             highest[0] = high
 
-    # Add up every fan rows of sums in order; a row becomes the sum of the rows before it in its group: one
+    # Add up groups of fan rows of sums in order; a row becomes the sum of the rows before it in its group: one
     # work-item takes a column of a group.
     @kernel(flags)
     def join_rows(sums, joined, rows, columns, fan):

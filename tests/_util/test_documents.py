@@ -8,7 +8,7 @@ import yaml
 from gpusense._util.documents import check_yaml, read_mapping
 
 
-def test_a_bound_of_the_parser_reads_like_the_own_one(monkeypatch, tmp_path):
+def test_both_limits_of_depth_give_the_same_error(monkeypatch, tmp_path):
     """Newer versions of libyaml end before the first event."""
 
     def parse(*_):

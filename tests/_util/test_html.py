@@ -1,4 +1,4 @@
-"""What notebooks show of maps, models, fits, estimates, matches and fixes: sound, escaped and small."""
+"""HTML of maps, models, fits, estimates, matches and fixes in notebooks: well-formed, escaped and small."""
 
 from __future__ import annotations
 

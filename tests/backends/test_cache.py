@@ -1,4 +1,4 @@
-"""The entries of the cache: what is kept, what is no entry, and what is deleted."""
+"""The cache: kept entries, files that are not entries, and deletions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs whose caches are damaged, locked, full, unsafe or shared; and what lies beside a cache."""
+"""Runs with damaged, locked, full, unsafe or shared caches; files beside a cache."""
 
 from __future__ import annotations
 
@@ -57,23 +57,12 @@ def entries(folder: Path) -> dict[str, int]:
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("family", ["opencl", "warp:cpu"])
 def test_a_second_process_compiles_nothing(needs, tmp_path, expected, family):
-    """A compiled kernel is stored as an entry; a second process stores none."""
+    """A compiled kernel is stored as an entry; a second process stores none, and neither touches what lies beside.
+
+    The folder is a user's own: it holds more than a cache may, under names that a cache of gpusense once had.
+    """
     needs(family.split(":")[0])
-    environment = fake_driver.environment(tmp_path)
-    assert outcome(start(family, environment)) == (0, expected, "")
-    first = entries(tmp_path / "cold")
-    assert len(first) > 5
-    assert outcome(start(family, environment)) == (0, expected, "")
-    assert entries(tmp_path / "cold") == first
-    assert [path.name for path in (tmp_path / "cold").iterdir()] == [folders.OWN]
-    others = [path.name for path in (tmp_path / "cold" / folders.OWN).iterdir() if path.suffix != ".gpusense"]
-    assert others == [folders.MARKER]
-
-
-def test_nothing_beside_the_cache_is_touched(needs, tmp_path, expected):
-    """A folder of a user's own, with names that a cache of gpusense once had, holds more than a cache may."""
-    needs("opencl")
-    folder = tmp_path / "cold"
+    folder, environment = tmp_path / "cold", fake_driver.environment(tmp_path)
     (folder / "run-07").mkdir(parents=True)
     for path in [folder / f"{number}.bin" for number in range(160)]:
         with path.open("wb") as file:
@@ -83,10 +72,15 @@ def test_nothing_beside_the_cache_is_touched(needs, tmp_path, expected):
     for path in folder.rglob("*"):
         os.utime(path, (time.time() - 1e6,) * 2)
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
-    environment = fake_driver.environment(tmp_path, GPUSENSE_PROOF="off")
-    assert outcome(start("opencl", environment)) == (0, expected, "")
+    assert outcome(start(family, environment)) == (0, expected, "")
+    first = entries(folder)
+    assert len(first) > 5
+    assert outcome(start(family, environment)) == (0, expected, "")
+    assert entries(folder) == first
     after = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if folders.OWN not in path.parts}
-    assert after == before and len(before) == 164 and len(entries(folder)) > 5
+    assert after == before and len(before) == 164
+    others = [path.name for path in (folder / folders.OWN).iterdir() if path.suffix != ".gpusense"]
+    assert others == [folders.MARKER]
 
 
 # The other backend by default than the test of a second process.
@@ -135,7 +129,7 @@ def test_damaged_files_of_every_kind_are_made_anew(needs, tmp_path, expected, fa
 @pytest.mark.slow
 @pytest.mark.parametrize(("family", "how"), [("opencl", BLOCKED[0]), ("opencl", BLOCKED[2]), ("warp:cpu", BLOCKED[1])])
 def test_a_cache_that_cannot_be_written_is_named_and_stops_nothing(needs, tmp_path, expected, family, how):
-    """gpusense's own folder, and where PoCL and Warp would put theirs."""
+    """The folder of gpusense, and the default folders of PoCL and Warp."""
     needs(family.split(":")[0])
     place = str(blocked(tmp_path, how))
     (tmp_path / "tmp").mkdir()

@@ -22,7 +22,7 @@ NUMPY = Device("numpy", "NumPy reference", "cpu", True, "", "numpy")
 
 @pytest.fixture
 def machine(monkeypatch):
-    """Return a function that makes a machine of some devices, of which some fail; it returns the list of those opened.
+    """Return a function that makes a machine of devices, some of which fail; it returns the list of opened ones.
 
     A failure is an error at opening, or a verdict.
     """
@@ -89,7 +89,7 @@ def test_one_line_says_what_failed_and_why(machine, caplog, kind):
 
 @pytest.mark.parametrize("kind", [BROKEN, PASSING, KEPT])
 def test_numpy_is_taken_with_one_line_whatever_else_is_said(machine, monkeypatch, caplog, kind):
-    """Folders of kernels mean nothing to NumPy. The line is said in each process, even of verdicts that were kept."""
+    """NumPy needs no folder of kernels. The line appears in each process, even for kept verdicts."""
     machine([GPU, WARP], {"opencl:0:0": kind, "warp:cpu": kind})
     real = selection._open
 

@@ -1,4 +1,4 @@
-"""Arrays on a device, of which Warp's processor stands in for a GPU, and of real frameworks where there is one."""
+"""Arrays on a device: Warp's processor as a stand-in for a GPU, and real frameworks where there is one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The folders that code is read from: whose they are, who may write there, and which are gpusense's own."""
+"""The folders of code: owners, permissions, and the folders of gpusense."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def driver(monkeypatch):
-    """Return a function that makes a driver whose families fail as asked, and that records the settings tried."""
+    """Return a function that makes a driver whose families fail in given ways, and records the tried settings."""
     tried: list[tuple[int, bool]] = []
 
     def make(fails: dict[tuple[str, int], str], conclusive: bool = True) -> list[tuple[int, bool]]:
@@ -161,7 +161,7 @@ def test_proofs_can_be_switched_off(driver, monkeypatch):
 
 
 def test_a_system_that_starts_no_child_leaves_devices_usable(monkeypatch, caplog):
-    """It is no failure of the driver, which is trusted in this process; the next one proves it."""
+    """It is not a failure of the driver, which is trusted in this process; the next process proves it."""
     monkeypatch.setattr(sys, "executable", "/nowhere/python3")
     for _ in range(2):
         assert verdict_on(INFO) == proof.trust(INFO)

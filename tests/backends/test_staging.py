@@ -100,7 +100,7 @@ def test_memory_of_results_is_used_again():
 
 
 def test_memory_of_few_results_waits(monkeypatch):
-    """Two blocks wait, the newest ones, and small results have memory of their own."""
+    """The two newest blocks wait, and small results have separate memory."""
     memory, real = recycled.ResultMemory(), np.dtype(np.float64)
     results = [memory.empty((1 << 17,), real) for _ in range(4)]
     places = [one.ctypes.data for one in results]

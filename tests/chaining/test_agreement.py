@@ -14,7 +14,7 @@ COUNT = 12
 
 
 def passages(right: list[float], off: tuple[float, ...] = (2.0, -1.0, 0.2)) -> tuple[np.ndarray, Links]:
-    """Return poses of two passages, the second of which has drifted, and matches of like places with these p_right."""
+    """Return poses of two passages, the second with drift, and matches of equal places with these p_right."""
     one = np.stack([0.8 * np.arange(COUNT), 0.05 * np.arange(COUNT), 0.02 * np.arange(COUNT)], axis=1)
     poses = np.concatenate([one, compose_poses(np.array(off), one)])
     at = np.arange(len(right))

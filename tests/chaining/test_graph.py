@@ -35,7 +35,7 @@ def scene(seed: int, count: int = 12, outlier: bool = False) -> tuple[np.ndarray
 
 
 def dense(start: np.ndarray, links: Links, kernel: float) -> tuple[np.ndarray, float]:
-    """Return the poses of least cost by SciPy, with numerical derivatives and residuals of its own."""
+    """Return the poses of least cost by SciPy, with numerical derivatives and independent residuals."""
     from scipy.optimize import least_squares
 
     values, axes = np.linalg.eigh(links.information)

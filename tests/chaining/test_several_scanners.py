@@ -1,4 +1,4 @@
-"""Chains of a robot with several lasers: one trajectory, loops between lasers, and what one of them does not see."""
+"""Chains of a robot with several lasers: one trajectory, loops between lasers, and places that one of them misses."""
 
 from __future__ import annotations
 

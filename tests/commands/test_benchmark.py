@@ -87,7 +87,7 @@ def test_table_on_the_terminal(capsys):
     assert "field on numpy, 1 x 7, error at most 0.01 nats: field, float32: " in out
 
 
-def test_a_wish_decides_what_is_recommended(capsys):
+def test_the_recommendation_follows_the_request(capsys):
     """A time that nothing keeps, one that all keep, and an error that only the model itself keeps."""
     own = [*FIELD, *SMALL, "--backend", "numpy"]
     for wish, answer in (

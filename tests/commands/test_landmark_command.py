@@ -104,7 +104,7 @@ def test_poor_odometry_is_survived(capsys, tmp_path):
     assert "verdict: LOST since " in text
 
 
-def test_wrong_map_is_told(capsys, tmp_path):
+def test_a_wrong_map_is_reported(capsys, tmp_path):
     folder = world.write_run(tmp_path / "wrong", seconds=20.0, wrong=True)
     text = run(capsys, folder, "--unknown", "--particles", "300", "--fit-motion", code=1)
     assert "verdict: LOST since " in text and "is this the map of the run" in text

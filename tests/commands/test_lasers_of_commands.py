@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support.bags import BASE, Writer
 from support.command_line import error_of, script
+from support.room_log import write_room_map
 
 import gpusense as gs
 from gpusense.commands import cli
@@ -24,10 +25,7 @@ READERS = ("localize", "score", "fit", "map", "match", "likelihood-map", "featur
 def place(tmp_path_factory):
     """Write a map, a bag of two lasers in it, one without transforms, and true poses; return the folder."""
     folder = tmp_path_factory.mktemp("lasers")
-    cells = np.pad(np.zeros((60, 80), int), 2, constant_values=100)
-    cells[30, :26] = 100
-    grid = gs.OccupancyGrid(cells, resolution=0.1)
-    gs.write_map(grid, folder / "map.yaml")
+    grid = write_room_map(folder)
     caster, rng = gs.RayCaster(grid, range_max=20.0, backend="numpy"), np.random.default_rng(0)
     poses = [np.array([3.0, 1.5, 0.2])]
     for _ in range(7):

@@ -220,7 +220,7 @@ def test_bad_input_is_one_line(place, capsys, more, message):
 
 
 class FakeStream:
-    """A stream of Rerun that keeps what is logged."""
+    """A stream of Rerun that keeps its log."""
 
     def __init__(self, name):
         self.logged, self.times = [], []

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from support.command_line import error_of
+from support.room_log import write_room_map
 
 import gpusense as gs
 from gpusense.commands import cli
@@ -23,10 +24,7 @@ COUNT = 14
 def place(tmp_path_factory):
     """Return a folder with a map, a log whose poses are its odometry, and the true trajectory of every other scan."""
     folder, rng = tmp_path_factory.mktemp("references"), np.random.default_rng(1)
-    cells = np.pad(np.zeros((60, 80), int), 2, constant_values=100)
-    cells[30, :26] = 100
-    grid = gs.OccupancyGrid(cells, resolution=0.1)
-    gs.write_map(grid, folder / "map.yaml")
+    grid = write_room_map(folder)
     caster = gs.RayCaster(grid, range_max=20.0, backend="numpy")
     poses, odometry, lines = [np.array([3.0, 1.5, 3.0])], np.zeros(3), []
     for step in range(COUNT):

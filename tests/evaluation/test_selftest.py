@@ -278,6 +278,14 @@ def test_a_breach_is_detected(capsys, monkeypatch, module, name, broken, quantit
     whole = selftest.built_in_scene()
     monkeypatch.setattr(selftest, "built_in_scene", lambda: dataclasses.replace(whole, poses=whole.poses[::9]))
     partner = others()[0] if name in ("cast_ranges", "cast_echoes") else "numpy"
+    kept, compare = [], selftest.run
+
+    def compare_once(*arguments, checks, **options):
+        if not kept:
+            compare(*arguments, checks=kept, **options)
+        checks += kept
+
+    monkeypatch.setattr(selftest, "run", compare_once)
     code, out, _ = run(capsys, "--backend", "numpy", "--backend", partner, "--json")
     document = json.loads(out)
     assert code == 1

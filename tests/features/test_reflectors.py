@@ -1,4 +1,4 @@
-"""Reflectors: bright runs of beams in simulated scans, and those of a recording against the sensor's own positions."""
+"""Reflectors: bright runs of beams in simulated scans, and a recording's against the positions by the sensor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables made of a map: distances, bits, empty rectangles and the field have the same numbers in every language."""
+"""Tables of a map: distances, bits, empty rectangles and the field have the same numbers in every language."""
 
 from __future__ import annotations
 

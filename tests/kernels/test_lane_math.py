@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
-from types import ModuleType
 
 import mpmath as mp
 import numpy as np
 import pytest
 from scipy import special
-from support.paths import ROOT
+from support.bench_scripts import derived
 
 from gpusense.evaluation.tolerances import TOLERANCES
 from gpusense.interface.kernel_files import opencl_source
@@ -113,21 +111,8 @@ def test_ends(evaluate):
     assert at("erf_lanes", 0.0, 4.0, 1e9, np.inf) == [0, 1, 1, 1]
 
 
-def derived() -> ModuleType:
-    """Import bench/derive/lane_constants.py."""
-    path = ROOT / "bench" / "derive" / "lane_constants.py"
-    spec = importlib.util.spec_from_file_location("lane_constants", path)
-    module = importlib.util.module_from_spec(spec)
-    digits = mp.mp.dps
-    try:
-        spec.loader.exec_module(module)
-    finally:
-        mp.mp.dps = digits
-    return module
-
-
 def test_constants_are_those_that_were_derived():
-    made, expected = derived(), {}
+    made, expected = derived("lane_constants"), {}
     with mp.workdps(50):
         polynomials = (made.exponential(), made.logarithm(), made.error_function(), made.arc(), made.log_complement())
         for name, (powers, error) in zip("ELWAV", polynomials, strict=True):

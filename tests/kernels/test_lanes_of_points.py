@@ -38,14 +38,14 @@ LANDMARKS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 
 
 def landmarks(side: float) -> gs.LandmarkMap:
-    """Return 60 landmarks in a square, of which some share a place."""
+    """Return 60 landmarks in a square; some of them coincide."""
     xy = np.random.default_rng(3).uniform(-side, side, (60, 2))
     xy[5:9] = xy[4]
     return gs.LandmarkMap(xy, np.arange(60) % 7)
 
 
 def cloud(side: float) -> np.ndarray:
-    """Return poses together, then others all over a square."""
+    """Return poses in a cluster, then poses all over a square."""
     rng = np.random.default_rng(4)
     poses = rng.normal(0, (0.2, 0.2, 0.1), (PARTICLES, 3))
     poses[40:] = rng.uniform((-side, -side, -4), (side, side, 4), (PARTICLES - 40, 3))

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import importlib.util
 import itertools
 import math
 import re
-from types import ModuleType
 
 import mpmath as mp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.bench_scripts import derived
 from support.oracles import placed
-from support.paths import ROOT
 
 import gpusense as gs
 from gpusense.backends import Backend, get_backend
@@ -88,22 +86,9 @@ def test_no_heading_leaves_the_circle():
     np.testing.assert_allclose(np.hypot(cos, sin), 1, rtol=3e-16)
 
 
-def derived() -> ModuleType:
-    """Import bench/derive/heading_constants.py."""
-    path = ROOT / "bench" / "derive" / "heading_constants.py"
-    spec = importlib.util.spec_from_file_location("heading_constants", path)
-    module = importlib.util.module_from_spec(spec)
-    digits = mp.mp.dps
-    try:
-        spec.loader.exec_module(module)
-    finally:
-        mp.mp.dps = digits
-    return module
-
-
 def test_constants_are_those_that_were_derived_in_all_three_languages(needs):
     needs("warp")
-    made = derived()
+    made = derived("heading_constants")
     with mp.workdps(400):
         quarters, pair, words = made.quarter_parts(), made.quarter_pair(), made.words()
     with mp.workdps(50):

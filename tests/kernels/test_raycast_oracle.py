@@ -73,7 +73,7 @@ def test_every_backend_has_the_bits_of_numpy_for_any_number_of_sectors(family, b
 def unexplained(
     scene: Scene, found: np.ndarray, suspects: np.ndarray, move: float, turn: float, tolerance: float
 ) -> list[int]:
-    """Return the rays whose range is no near-by ray's either."""
+    """Return the rays whose range is also not a nearby ray's."""
     cells = scene.occupied.tolist()
     return [
         i

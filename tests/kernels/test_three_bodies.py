@@ -31,7 +31,7 @@ OTHER_FILES = {
 
 @dataclass(frozen=True)
 class Purpose:
-    """Functions of a concept that some languages have on purpose, and why the others do not."""
+    """Functions of a concept that only some languages have, with the reason."""
 
     concept: str
     functions: str
@@ -49,7 +49,7 @@ QUICK = "kernels round end points first and repeat the doubtful ones with twice 
 KERNELS_ONLY, REFERENCE_ONLY = (OPENCL, WARP), (NUMPY,)
 
 ON_PURPOSE = [
-    Purpose("beam", "readings_of_scan sum_terms", REFERENCE_ONLY, ARRAYS),
+    Purpose("beam", "expected_ranges readings_of_scan sum_terms", REFERENCE_ONLY, ARRAYS),
     Purpose("bits", "lowest_bit highest_bit", KERNELS_ONLY, "the reference unpacks words to bool"),
     Purpose("bits", "unpacked", REFERENCE_ONLY, "the reference unpacks words to bool"),
     Purpose("circles", "point_of add_error", KERNELS_ONLY, "points come one after another"),

@@ -409,7 +409,7 @@ def test_readings_may_be_overwritten_after_the_correction(backend):
 
 
 def test_a_filter_that_never_draws_keeps_what_it_knows(backend):
-    """With a threshold below 1 / N no weight may vanish in its rounding to an integer."""
+    """With a threshold below 1 / N no weight may round to the integer 0."""
     pf = gs.ParticleFilter(gps(backend), particles=1000, seed=2, threshold=1e-15, stages=1)
     pf.initialize(mean=(0, 0, 0), covariance=np.diag([0.09, 0.09, 1e-6]))
     for _ in range(3):

@@ -46,7 +46,7 @@ def test_right_poses_are_tracked_and_wrong_ones_lost(model):
     assert "wrong start" in told.text and monitor.diagnose(search=False).elsewhere is None
 
 
-def test_another_map_and_another_mount_are_told_apart(model):
+def test_wrong_maps_and_wrong_mounts_are_distinguished(model):
     blocks = np.zeros((80, 80), int)
     for row, column in np.ndindex(4, 4):
         blocks[20 * row + 6 : 20 * row + 14, 20 * column + 6 : 20 * column + 14] = 100

@@ -40,7 +40,7 @@ def test_beams_of_a_person_are_left_out(beams):
     assert np.count_nonzero(~missing) == pytest.approx((beams or 60) * (60 - 13) / 60, abs=3)
 
 
-def test_a_scan_that_nobody_explains_is_used_as_a_whole():
+def test_a_scan_that_no_particle_explains_is_used_whole():
     ranges = np.full(60, 0.5)
     assert skipped(ranges) is ranges
     assert skipped(np.full(60, np.nan)) is not None

@@ -17,6 +17,7 @@ from gpusense.backends import get_backend
 from gpusense.mapping.build import MapBuilder
 from gpusense.mapping.counts import BandCounts
 from gpusense.mapping.rays import RayEnds
+from gpusense.world.grid_frame import GridFrame
 from gpusense.world.windows import Window
 
 UNIT = 4096
@@ -224,7 +225,7 @@ def test_rays_from_far_do_not_bend(backend):
     shape, (hits, misses) = (40, 50), far_counts()
     assert misses.sum() > 150 and hits.sum() == 4
     starts, ends = (np.array([ray[k] for ray in FAR]) for k in (0, 1))
-    counts = BandCounts(get_backend(backend), gs.OccupancyGrid([[0]], 1.0), shape, Window(0, 0, *shape))
+    counts = BandCounts(get_backend(backend), GridFrame(1.0, (0.0, 0.0, 0.0)), shape, Window(0, 0, *shape))
     ends_of = object.__new__(RayEnds)
     ends_of.start, ends_of.end, ends_of.hit, ends_of.scan = starts, ends, np.ones(len(FAR), bool), np.arange(len(FAR))
     counts.add(ends_of)

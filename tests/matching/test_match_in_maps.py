@@ -75,7 +75,7 @@ def test_fields_find_poses_to_the_cell(device, local, method, cells):
 
 
 def test_the_search_returns_the_best_pose_of_its_grid(local):
-    """A correlative match is as good as every other pose of the window by its own integer scores: brute force."""
+    """No pose of the window has a better integer score than a correlative match, by brute force."""
     grid = drawn()
     matcher = MapMatcher(grid, RING, get_backend("numpy"), "float32", MatchOptions(0.01, 1.0, (0.3, 0.1)))
     scans = scans_at(grid, local[:2])

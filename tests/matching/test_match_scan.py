@@ -73,7 +73,7 @@ def test_covariance_is_that_of_the_errors():
 
 
 def successive(rng: np.random.Generator, shape: tuple[int, int], rho: float) -> np.ndarray:
-    """Return numbers of unit variance, each of which has the correlation rho with the one before it in its row."""
+    """Return numbers of unit variance, each with the correlation rho to the previous one in its row."""
     noise = rng.normal(size=shape)
     for k in range(1, shape[1]):
         noise[:, k] = rho * noise[:, k - 1] + math.sqrt(1 - rho * rho) * noise[:, k]

@@ -1,4 +1,4 @@
-"""Likelihoods over all poses of a map: the model's own values, entropy, modes, tiles and pictures."""
+"""Likelihoods over all poses of a map: the model's values, entropy, modes, tiles and pictures."""
 
 from __future__ import annotations
 

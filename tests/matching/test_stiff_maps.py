@@ -90,7 +90,7 @@ def test_what_a_map_does_not_say_is_a_failure(method, case):
 
 
 def test_lines_of_a_scan_have_the_information_of_their_normals():
-    """A scan's own information is the sum of J J' of its walls, whose normals are known, in the robot's frame."""
+    """The information of a scan is the sum of J J' over its walls with known normals, in the robot's frame."""
     mount, scanner_pose = (0.3, -0.2, 0.0), (0.2, 0.1, 0.0)
     scanner = gs.Scanner(RING.bearings, range_max=30.0, mount=mount)
     scan, pose = segments_scan(ROOM[:4], scanner_pose, scanner), np.array([[5.0, -3.0, 0.7]])

@@ -73,7 +73,7 @@ for _name in absolute_models("numpy"):
 COPIES = {"copy": copy.copy, "deepcopy": copy.deepcopy, "pickle": lambda model: pickle.loads(pickle.dumps(model))}
 
 
-@pytest.mark.sampled(0.2)
+@pytest.mark.sampled(0.2, without="warp:cpu")
 @pytest.mark.parametrize("how", COPIES)
 @pytest.mark.parametrize("name", CASES)
 def test_copies_have_the_bits_and_the_options(name, how, backend):

@@ -30,9 +30,19 @@ def evaluated(code: str) -> Any:
 
 
 def test_the_script_chooses_as_python_does() -> None:
-    listed = [("a", 0.0, 5.0), ("b", 1e-9, 4.0), ("c", 0.3, 1.0), ("d", 0.2, 2.0), ("e", 0.9, 3.0), ("f", 0.9, 0.5)]
-    rows = json.dumps([{"name": name, "error": error, "time": time} for name, error, time in listed])
-    budgets = [0.1, 0.6, 1.5, 2.5, 4.5, 9.0]
+    listed = [
+        ("a", 0.0, 5.0),
+        ("b", 1e-9, 4.0),
+        ("c", 0.3, 1.0),
+        ("d", 0.2, 2.0),
+        ("e", 0.21, 1.5),
+        ("f", 0.9, 0.5),
+        ("g", 0.31, 0.9),
+    ]
+    rows = json.dumps([{"name": name, "error": error, "time": time, "place": i}
+                       for i, (name, error, time) in enumerate(listed)])  # fmt: skip
+    budgets = [0.1, 0.6, 1.2, 1.6, 2.5, 4.5, 9.0]
+    assert evaluated("[CLOSE, ALIKE]") == [choice.CLOSE, choice.ALIKE]
     front, chosen = evaluated(
         f"(list => [paretoFront(list).map(row => row.name), {budgets}.map(s => (recommended(list, s) ?? {{}}).name "
         f"?? null)])({rows})"
@@ -41,6 +51,7 @@ def test_the_script_chooses_as_python_does() -> None:
     assert front == [entry.method for entry in choice.front(entries)]
     found = [choice.choose(entries, None, seconds) for seconds in budgets]
     assert chosen == [None if entry is None else entry.method for entry in found]
+    assert chosen == [None, "f", "c", "e", "e", "b", "a"]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -119,7 +130,7 @@ def test_a_scene_without_any_method_does_not_count() -> None:
     assert {entry.method for entry in chosen} == {"exact", "march"}
 
 
-def test_devices_of_one_title_are_told_apart() -> None:
+def test_devices_with_equal_titles_are_distinguished() -> None:
     points = [made_point(backend=name, device="pthread-X") for name in ("opencl:0:0", "opencl:1:0")]
     rows = model_rows(report_of(points=[*points, made_point(backend="outside", outside=True)]))
     assert {row.device for row in rows if not row.outside} == {

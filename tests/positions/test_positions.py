@@ -198,7 +198,7 @@ def test_robust_losses_forget_an_outlier(name, loss):
 
 @pytest.mark.parametrize("loss", sorted(LOSSES))
 def test_losses_are_those_of_scipy(loss):
-    """The cost is twice SciPy's for its own loss of the same name, and its slope is that of the cost."""
+    """The cost is twice SciPy's for the loss of the same name, and its slope is the cost's derivative."""
     z = np.array([0.0, 1e-9, 0.3, 0.999, 1.001, 7.0, 1e6])
     value, slope, curve = LOSSES[loss](z)
     for residual, mine in zip(np.sqrt(z), value, strict=True):

@@ -224,7 +224,7 @@ def test_three_bearings_in_bad_places(place):
 
 
 def test_poses_that_see_beacons_behind_their_bearings():
-    """For random bearings, "behind" is said exactly where no pose of a fine lattice comes near them."""
+    """For random bearings, "behind" is reported exactly where no pose of a fine lattice comes near them."""
     rng = np.random.default_rng(2)
     places = np.stack(np.meshgrid(*[np.linspace(-30, 34, 257)] * 2), axis=-1).reshape(-1, 2)
     seen = np.arctan2(SQUARE[:3, 1] - places[:, 1:], SQUARE[:3, 0] - places[:, :1])

@@ -16,7 +16,7 @@ FAR = [(0.0, 0.0), (5e6, 4.5e5)]
 
 
 def exact_circles(xy, ranges):
-    """Return both crossings by the lectures' formulas in their own frame, turned and moved back."""
+    """Return both crossings by the lectures' formulas in their frame, turned and moved back."""
     (x1, y1), (x2, y2) = [[mp.mpf(float(v)) for v in row] for row in xy]
     d1, d2 = (mp.mpf(float(d)) for d in ranges)
     a = mp.hypot(x2 - x1, y2 - y1)

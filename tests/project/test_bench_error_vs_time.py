@@ -170,8 +170,9 @@ def test_filters_of_others_follow_the_robot(measure: ModuleType, monkeypatch: py
     settings = list(module.rivals(run, (0.5, 0.5, 0.26), 2))
     assert [one.options for one in settings] == [f"{n} x 60" for n in (500, 2000, 10_000) * 2 + (500, 2000)]
     assert {one.method for one in settings} == {"nav2_amcl, defaults", "nav2_amcl, product", "nav2_amcl, beam"}
-    errors, seconds = settings[0].run(7)
-    assert taken == [60] * 5 and len(seconds) == 3 and errors == pytest.approx([0.05] * 3)
+    errors, steps = settings[0].run(7)
+    assert taken == [60] * 5 and len(steps.seconds) == len(steps.processor) == 3
+    assert errors == pytest.approx([0.05] * 3)
 
 
 def test_tasks_are_measured(
@@ -196,8 +197,10 @@ def test_tasks_are_measured(
 def test_settings_that_the_time_leaves_no_room_for_are_listed(measure: ModuleType) -> None:
     needs = importlib.import_module("needs")
 
-    def run(seed: int) -> tuple[np.ndarray, np.ndarray]:
-        return np.array([0.1, 0.3]), np.array([seed + 1.0])
+    def run(seed: int) -> tuple[np.ndarray, argparse.Namespace]:
+        return np.array([0.1, 0.3 + seed]), argparse.Namespace(
+            seconds=np.array([seed + 1.0]), processor=np.array([2.0])
+        )
 
     settings = [needs.Setting("matching", name, "", "", "float32", run) for name in "ab"]
     given = argparse.Namespace(rounds=3, seconds=-1.0, longest=0.5)
@@ -209,5 +212,9 @@ def test_settings_that_the_time_leaves_no_room_for_are_listed(measure: ModuleTyp
         assert {row["seconds"] for row in rows} == {None}
         settings = [needs.Setting("matching", "a", "", "", "float32", run)]
         (row,) = needs.measure("matching", device, argparse.Namespace(rounds=3, seconds=60.0, longest=0.5))
-    assert (row["runs"], row["error"]["median"], row["seconds"]["median"]) == (1, 0.2, 1.0)
-    assert "measured once" in row["reason"]
+        assert (row["runs"], row["error"]["median"], row["seconds"]["median"]) == (1, 0.2, 1.0)
+        assert "measured once" in row["reason"]
+        settings = [needs.Setting("matching", "a", "", "", "float32", run, repeats=times) for times in (1, 2)]
+        few, more = needs.measure("matching", device, argparse.Namespace(rounds=2, seconds=60.0, longest=9.0))
+    assert (few["runs"], more["runs"]) == (2, 4)
+    assert more["by_run"] == {"error": pytest.approx([0.2, 0.7, 1.2, 1.7]), "processor_s": [2.0] * 4}

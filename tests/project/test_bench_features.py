@@ -27,7 +27,7 @@ def test_features_are_measured(data_dir: Path, needs: Callable[[str], str], tmp_
     assert all(row["scans_per_s"] > 0 for row in report["rates"].values())
 
 
-def test_corners_beyond_their_covariances_are_told(needs: Callable[[str], str], tmp_path: Path) -> None:
+def test_corners_beyond_their_covariances_are_listed(needs: Callable[[str], str], tmp_path: Path) -> None:
     arguments = ["--backend", needs("opencl"), "--floors", "2", "--scans", "3"]
     report = run_script("accuracy/feature_outliers.py", *arguments, output=tmp_path / "outliers")
     within = report["1081 0.01 within"]

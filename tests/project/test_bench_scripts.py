@@ -5,8 +5,6 @@ from __future__ import annotations
 import importlib
 import json
 import math
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -131,21 +129,23 @@ def test_trees_are_compared(needs: Callable[[str], str], tmp_path: Path) -> None
         assert row["quartiles"][0] <= row["ratio"] <= row["quartiles"][1] and row["old_s"] > 0 and row["new_s"] > 0
 
 
-def test_bits_of_trees_are_compared(needs: Callable[[str], str], tmp_path: Path) -> None:
+def test_bits_of_trees_are_compared(
+    needs: Callable[[str], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A tree has the bits of itself; a record in which one result is changed is found."""
-    backend, cases = needs("numpy"), ["--rays", "300", "--models", "40", "--filters", "1", "--matches", "2"]
-    script, only = [sys.executable, str(BENCH / "compare_trees.py")], ["--only", "rays", "filters", "matches"]
-    both = [*script, "bits", "--old", str(BENCH.parent), "--backend", backend, *cases, *only]
-    done = subprocess.run(both, capture_output=True, text=True, check=False, timeout=300)
-    assert done.returncode == 0 and "0 results of 0 numbers differ" in done.stdout, done.stderr[-2000:]
+    monkeypatch.syspath_prepend(str(BENCH))
+    script, backend = importlib.import_module("trees.bits"), needs("numpy")
+    cases = ["--rays", "300", "--models", "40", "--filters", "1", "--matches", "2"]
+    both = ["bits", "--old", str(BENCH.parent), "--backend", backend, *cases]
+    assert script.main([*both, "--only", "rays", "filters", "matches"]) == 0
+    assert "0 results of 0 numbers differ" in capsys.readouterr().out
     old, new = tmp_path / "old.json", tmp_path / "new.json"
-    record = [*script, "record", "--backend", backend, "--rays", "300", "--only", "rays", "--output", str(old)]
-    subprocess.run(record, capture_output=True, check=True, timeout=300)
+    with np.errstate():
+        script.main(["record", "--backend", backend, "--rays", "300", "--only", "rays", "--output", str(old)])
     text = json.loads(old.read_text())
     next(iter(text["cases"].values()))[0][3] = "another digest"
     new.write_text(json.dumps(text))
-    done = subprocess.run([*script, "compare", str(old), str(new)], capture_output=True, text=True, check=False)
-    assert done.returncode == 1 and "1 results of" in done.stdout
+    assert script.main(["compare", str(old), str(new)]) == 1 and "1 results of" in capsys.readouterr().out
 
 
 @pytest.mark.slow
@@ -155,13 +155,6 @@ def test_map_memory_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     assert [row["what"] for row in rows] == ["opencl", "numpy", "PGM", "PNG, 8 bits", "PNG, 1 bit"]
     assert rows[0]["result, SHA-256"] == rows[1]["result, SHA-256"] != rows[2]["result, SHA-256"]
     assert rows[2]["result, SHA-256"] == rows[3]["result, SHA-256"] != rows[4]["result, SHA-256"]
-
-
-def test_preparation_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
-    arguments = ["--backend", needs("opencl"), "--cells", "220", "--repeats", "1"]
-    report = run_script("speed/preparation.py", *arguments, output=tmp_path / "preparation")
-    assert report["exact"] and {row["map"] for row in report["rows"]} > {"building", "sparse"}
-    assert {"distances", "rectangles, 4 sectors", "field, a new model"} <= {row["step"] for row in report["rows"]}
 
 
 def test_fuzz_rays_runs(needs: Callable[[str], str], tmp_path: Path) -> None:

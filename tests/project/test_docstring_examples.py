@@ -1,4 +1,4 @@
-"""Examples in docstrings run and print the results that they show."""
+"""Examples in docstrings run in separate namespaces, and print the results that they show."""
 
 from __future__ import annotations
 
@@ -22,6 +22,12 @@ def modules_with_examples() -> list[str]:
 @pytest.mark.parametrize("name", modules_with_examples())
 def test_examples(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # examples write files
-    result = doctest.testmod(importlib.import_module(name), optionflags=doctest.NORMALIZE_WHITESPACE)
-    assert result.attempted > 0
-    assert result.failed == 0
+    attempted = 0
+    for test in doctest.DocTestFinder(exclude_empty=True).find(importlib.import_module(name), globs={}):
+        report: list[str] = []
+        result = doctest.DocTestRunner(verbose=False, optionflags=doctest.NORMALIZE_WHITESPACE).run(
+            test, out=report.append
+        )
+        assert result.failed == 0, "".join(report)
+        attempted += result.attempted
+    assert attempted > 0

@@ -171,7 +171,7 @@ VISITS = {
 
 
 def scan_texts(figures: ModuleType) -> tuple[str, str]:
-    """Return what the page of the scan must say at two poses."""
+    """Return the expected text of the scan's page at two poses."""
     data = figures.scan_data()
     beam, field, ranges = models_of(data)
     x, y, theta = data["truth"]

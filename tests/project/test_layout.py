@@ -73,7 +73,7 @@ def test_helpers_define_no_fixture():
 
 
 def test_this_looks_at_all_there_is():
-    """A rule that looks at no file, or sees no fixture and no import, would hold as well."""
+    """A rule that reads no file, or finds no fixture and no import, would also hold."""
     assert len(TEST_FILES) > 100 and len(SUPPORT) > 20
     assert {"backend", "needs", "place"} <= set(fixtures(tree_of(TESTS / "conftest.py")))
     assert ("support.paths", "ROOT") in set(imported(tree_of(Path(__file__))))

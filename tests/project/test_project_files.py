@@ -1,4 +1,4 @@
-"""Files about the project and pages that list names say what the code says."""
+"""Files about the project and pages with lists of names agree with the code."""
 
 from __future__ import annotations
 

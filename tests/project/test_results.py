@@ -22,7 +22,8 @@ COMMAND = re.compile(r"(?:python )?bench/[\w/]+\.py")
 SCRIPT = re.compile(r"(?:python |\"script\": \")(bench/[\w/]+\.py)")
 # Scripts of older reports, by today's; bench/RESULTS.md says so.
 FORMER = {
-    "absolute": "point_models", "landmarks": "point_models", "several_scans": "small_calls", "speed": "limits",
+    "absolute": "point_models", "landmarks": "point_models", "localization": "localization_logs",
+    "several_scans": "small_calls", "speed": "limits",
 }  # fmt: skip
 
 
@@ -39,7 +40,7 @@ def test_each_report_is_published(published: str) -> None:
 
 
 def parts_of(file: Path) -> list[str]:
-    """Return the reports of a file: the elements of a list, or what stands under headings of the first level."""
+    """Return the reports of a file: the elements of a list, or the sections of the first level."""
     text = file.read_text(encoding="utf-8")
     if file.suffix == ".json":
         whole = json.loads(text)
@@ -63,7 +64,7 @@ def test_scripts_of_reports_are_here(file: Path) -> None:
         assert (ROOT / script).is_file() or FORMER.get(stem, stem) in names, script
 
 
-def test_reports_of_a_file_are_told_apart(tmp_path: Path) -> None:
+def test_reports_in_a_file_are_distinguished(tmp_path: Path) -> None:
     (tmp_path / "a.md").write_text("# One\n\n## Rows\n# Two\n")
     (tmp_path / "a.json").write_text('[{"commit": 1}, {"commit": 2}]')
     assert parts_of(tmp_path / "a.md") == ["# One\n\n## Rows\n", "# Two\n"]

@@ -1,4 +1,4 @@
-"""Truths of absolute, radio and contact sensors by mpmath, from their definitions; nothing here imports the library."""
+"""Exact log p of absolute, radio and contact sensors by mpmath, from their definitions and without the library."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def heading(theta: float, reading: float, p: Any) -> float:
 
 
 def normal_density(r: Any, near: Any, far: Any, sigma: Any) -> Any:
-    """Return a normal density at r from its mean, truncated to an interval that ends near and far from the mean."""
+    """Return the density at r from the mean of a normal that is truncated to an interval."""
     mass = (mp.erf(near / sigma / mp.sqrt(2)) + mp.erf(far / sigma / mp.sqrt(2))) / 2
     return mp.exp(-((r / sigma) ** 2) / 2) / (sigma * mp.sqrt(2 * mp.pi)) / mass
 
@@ -101,10 +101,10 @@ def beacon(pose: Any, xy: Any, reading: float, p: Any) -> float:
 
 
 def bump(squared_cells: int, side: float, radius: float, pressed: bool, p: Any) -> float:
-    """Return log P of a bumper, from the squared distance of the nearest obstacle's centre to the outline's cell's."""
+    """Return log P of a bumper, from the squared distance between the outline's cell and the nearest obstacle."""
     gap = mp.sqrt(int(squared_cells)) * number(side) - number(side) / 2 - number(radius)
     x = gap / number(p.sigma) / mp.sqrt(2)
-    # Beyond a few thousand nats mpmath's erfc is slow to ask and 0 all the same beside anything else.
+    # Beyond a few thousand nats mpmath's erfc is slow, and negligible beside other terms.
     touching, clear = mp.erfc(x) / 2, mp.erfc(-x) / 2
     contact, false = number(p.p_contact), number(p.p_false)
     if not pressed:

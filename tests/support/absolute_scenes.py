@@ -47,7 +47,7 @@ MISSING: dict[str, Any] = {"position": (NAN, 3.0), "heading": NAN, "beacons": [N
 
 
 def assert_close(found: np.ndarray, truth: object, precision: str, terms: np.ndarray | None = None) -> None:
-    """Check results to within 16 eps (1 + |log p|) of each reading; infinite where the truth is."""
+    """Check results to within 16 eps (1 + |log p|) of each reading, and that they are infinite where the truth is."""
     truth = np.array(truth, float)
     size = 1 + np.abs(truth) if terms is None else (1 + np.abs(terms)).sum(axis=-1)
     assert not np.isnan(found).any()

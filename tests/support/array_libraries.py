@@ -37,7 +37,7 @@ def to_device(array: np.ndarray):
 
 
 class Array:
-    """Delegates DLPack to another array, and claims memory of a kind of ``device``."""
+    """Delegates DLPack to another array, and claims to be on a kind of ``device``."""
 
     def __init__(self, held: Any, device: int = CPU) -> None:
         self.held, self.device = held, device
@@ -67,7 +67,7 @@ class OldArray(Array):
 
 
 class Recorded(Array):
-    """Records gradients, as PyTorch's arrays do: it is not exported, and does not become NumPy's."""
+    """Records gradients like PyTorch's arrays: it can neither be exported nor converted to NumPy."""
 
     requires_grad = True
 

@@ -1,8 +1,7 @@
 """Types and files for bad input to the map, the scanner, the parameters and the logs.
 
-Each case is (id, action, exception type, message). The action takes an empty folder; the files that it reads it first
-writes to ``input`` in there, so anything outside ``input`` was left behind by the library. ``{tmp}`` in a message
-stands for the folder.
+Each case is (id, action, exception type, message). The action takes an empty folder and writes its input files to
+``input`` in it, so the library has left everything outside ``input``. ``{tmp}`` in a message stands for the folder.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ GOOD_PGM = b"P5 2 1 255\n\x00\xfe"
 
 
 def map_with(content: bytes = GOOD_PGM, name: str = "map.pgm", drop: str = "", **changes: str) -> Action:
-    """Read a map of which the image or some YAML entries differ from a good one."""
+    """Read a map whose image or YAML entries differ from a good one's."""
 
     def action(tmp: Path) -> object:
         put(tmp, name, content)

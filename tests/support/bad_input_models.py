@@ -1,7 +1,7 @@
 """Bad input to the models, the caster, the distance transform and the choice of a device, with the exact messages.
 
 ``CASES`` holds (id, action, exception type, message). A message that depends on the devices of the machine is a
-function. Everything runs on NumPy, except where the choice of a device is the matter.
+function. Everything runs on NumPy, except the choice of a device.
 """
 
 from __future__ import annotations
@@ -34,27 +34,27 @@ CASTERS = ", ".join(map(repr, ENTRIES))
 
 
 def beam(**changes: Any) -> Action:
-    """Make a beam model of which some arguments are bad."""
+    """Make a beam model with some bad arguments."""
     return lambda: gs.BeamModel(**{"grid": GRID, "scanner": SCANNER, "backend": "numpy", **changes})
 
 
 def field(**changes: Any) -> Action:
-    """Make a likelihood field of which some arguments are bad."""
+    """Make a likelihood field with some bad arguments."""
     return lambda: gs.LikelihoodFieldModel(**{"grid": GRID, "scanner": SCANNER, "backend": "numpy", **changes})
 
 
 def caster(**changes: Any) -> Action:
-    """Make a ray caster of which some arguments are bad."""
+    """Make a ray caster with some bad arguments."""
     return lambda: gs.RayCaster(**{"grid": GRID, "range_max": 5.0, "backend": "numpy", **changes})
 
 
 def score(poses: Any = POSE, ranges: Any = SCAN) -> Action:
-    """Score a scan with the model that is kept."""
+    """Score a scan with the shared model."""
     return lambda: MODEL.log_likelihood(poses, ranges)
 
 
 def cast(poses: Any = POSE, bearings: Any = (0.0,)) -> Action:
-    """Cast rays with the caster that is kept."""
+    """Cast rays with the shared caster."""
     return lambda: CASTER.cast(poses, bearings)
 
 
@@ -64,7 +64,7 @@ def distances(obstacles: Any) -> Action:
 
 
 def absent(selection: str) -> Callable[[], str]:
-    """Return the message for a device that is absent: those present, or why there is none and the remedy."""
+    """Return the message for an absent device: the present ones, or the reason and the remedy where there are none."""
 
     def message() -> str:
         own = [device for device in gs.devices() if device.backend == selection.partition(":")[0]]

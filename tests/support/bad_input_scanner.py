@@ -14,7 +14,7 @@ SCANNER = Scanner([0.0, 0.1, 0.2], 5.0, 0.1)
 
 
 def uniform(**changes: Any) -> Action:
-    """Make a uniform scanner of which some arguments are bad."""
+    """Make a uniform scanner with some bad arguments."""
     good = dict(angle_min=0.0, angle_increment=0.1, count=3, range_max=5.0)
     return lambda tmp: Scanner.uniform(**{**good, **changes})
 

@@ -1,4 +1,4 @@
-"""Parameters that a precision holds exactly, and the truth of each density, found once."""
+"""Parameters that a precision represents exactly, and the truth of each density, computed once."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def rounded(value: float, precision: str) -> float:
 
 
 def parameters(precision: str, range_max: float, sigma: float, rate: float, weights: tuple[float, ...]):
-    """Return parameters that the precision holds exactly, so that the truth is asked the same question."""
+    """Return parameters that the precision represents exactly, so that the truth has the same inputs."""
     own = [rounded(w, precision) for w in weights]
     return gs.BeamParameters(
         *own, sigma_hit=rounded(sigma * range_max, precision), lambda_short=rounded(rate / range_max, precision)

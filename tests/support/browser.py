@@ -1,4 +1,4 @@
-"""Headless Chromium and Node, for the tests of pages that move."""
+"""Headless Chromium and Node, for tests of interactive pages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 
 
 def in_browser(page: str, script: str, folder: Path) -> dict[str, str]:
-    """Open a page, run a script at its end, and return the texts that it left in ``document.body.dataset``."""
+    """Open a page, run a script at its end, and return the texts in ``document.body.dataset``."""
     if CHROMIUM is None:
         pytest.skip("Chromium is not installed")
     file = folder / "page.html"
@@ -27,7 +27,7 @@ def in_browser(page: str, script: str, folder: Path) -> dict[str, str]:
 
 
 def in_node(source: str) -> str:
-    """Return what a script prints."""
+    """Return the output of a script."""
     node = shutil.which("node")
     if node is None:
         pytest.skip("Node is not installed")

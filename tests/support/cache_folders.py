@@ -1,4 +1,4 @@
-"""Places where a cache cannot be, and folders of a cache."""
+"""Places that cannot hold a cache, and folders of a cache."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ BLOCKED = ["a file in its place", "a file above it", "a read-only system"]
 
 
 def blocked(tmp_path: Path, how: str) -> Path:
-    """Return a cache folder that no user can make or write."""
+    """Return a cache folder that no user can create or write."""
     if how == "a file in its place":
         (tmp_path / "file").write_text("not a folder")
         return tmp_path / "file"
     if how == "a file above it":
         (tmp_path / "file").write_text("not a folder")
         return tmp_path / "file" / "cache"
-    # Not even root writes there.
+    # Not even root can write there.
     return Path("/proc/gpusense")
 
 

@@ -1,4 +1,4 @@
-"""Models whose readings are tested by simulation-based calibration, each with poses of a prior."""
+"""Models for simulation-based calibration, each with poses of a prior."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def _landmarks(narrow: bool, options: dict[str, Any]) -> Scene:
 
 
 def _lines(options: dict[str, Any]) -> Scene:
-    # So long that the middle of the part in view is the foot of the normal: the ends say nothing.
+    # Walls are so long that the middle of the part in view is the foot of the normal: the ends carry no information.
     lines = LineMap([(99.0, 7.0, -99.0, 7.0), (7.0, -99.0, 7.0, 99.0), (-99.0, -30.0, 99.0, 30.0)], [False, True, True])
     p = LineParameters(sigma_angle=0.3, sigma_distance=0.8, z_detect=0.7, z_false=0.3, range_max=12.0)
     model = LineModel(lines, p, mount=(0.2, 0.1, 0.3), **options)

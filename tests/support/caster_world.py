@@ -18,7 +18,7 @@ def by_name(kind: object) -> str:
 
 
 def each_caster(bins: int) -> list[Caster]:
-    """Return one of each caster, with default knobs but for angle bins, of which tests want few."""
+    """Return one of each caster with default knobs, except for fewer angle bins."""
     options = {name: {knob.name for knob in dataclasses.fields(kind)} for name, kind in CASTERS.items()}
     return [kind(**({"bins": bins} if "bins" in options[name] else {})) for name, kind in CASTERS.items()]
 
@@ -53,7 +53,7 @@ numpy_cast = functools.cache(functools.partial(cast, backend="numpy"))
 
 
 def lists_of(table: np.ndarray, bins: int) -> dict[tuple[int, int], list[int]]:
-    """Return a table's contents: the places where obstacles begin, for each bin and line, in 2^-10 cells."""
+    """Return a table's contents: the places where obstacles begin for each bin and line [2^-10 cells]."""
     lines, first = int(table[0]), 1 + 3 * bins
     found = {}
     for bin in range(bins):

@@ -1,4 +1,4 @@
-"""Certificates of an authority of one's own, for TLS on the loopback."""
+"""Certificates of a private authority, for TLS on the loopback."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from cryptography.x509.oid import NameOID
 
 
 def write_certificates(folder):
-    """Write ``ca.pem``, and ``cert.pem`` with ``key.pem`` that it has signed; return the three paths."""
+    """Write ``ca.pem``, and ``cert.pem`` signed by it with ``key.pem``; return the three paths."""
     folder.mkdir(exist_ok=True)
     authority, own = (ec.generate_private_key(ec.SECP256R1()) for _ in range(2))
     name = _name("test authority")
-    # Without identifiers and the use of the key Python 3.13 refuses them.
+    # Python 3.13 refuses certificates without key identifiers and key usage.
     use = x509.KeyUsage(False, False, False, False, False, True, False, False, False)
     root = _signed(_builder(name, name, authority, authority, authority=True).add_extension(use, True), authority)
     leaf = _signed(_builder(_name("test node"), name, own, authority, authority=False), authority)

@@ -44,7 +44,7 @@ def scans_of(
 
 
 def drifting(poses: np.ndarray, stretch: float = 1.03, turn: float = 0.01) -> np.ndarray:
-    """Return poses of an odometer that reports too long ways, and turns that are not [rad/m]."""
+    """Return poses of an odometer that overestimates distances and adds turns [rad/m]."""
     steps = relative(poses[:-1], poses[1:])
     steps[:, 2] += turn * np.hypot(steps[:, 0], steps[:, 1])
     steps[:, :2] *= stretch
@@ -55,7 +55,7 @@ def drifting(poses: np.ndarray, stretch: float = 1.03, turn: float = 0.01) -> np
 
 
 def errors(chain: gs.ScanChain, truth: np.ndarray) -> np.ndarray:
-    """Return distances of the poses from the true ones, in the frame of the first scan [m]."""
+    """Return distances between estimated and true poses in the frame of the first scan [m]."""
     found = relative(np.repeat(chain.poses[:1], len(truth), axis=0), chain.poses)
     wanted = relative(np.repeat(truth[:1], len(truth), axis=0), truth)
     return np.hypot(*(found - wanted)[:, :2].T)

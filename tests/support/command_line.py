@@ -1,4 +1,4 @@
-"""The command line for tests: calls in this process and in others."""
+"""The command line for tests: calls in this process and in other ones."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def script(code: str, *, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 
 def error_of(argv: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """Return the one line that a bad call prints, without the program's name."""
+    """Return the only line that a bad call prints, without the program's name."""
     assert cli.main(argv) == 2
     out, err = capsys.readouterr()
     assert out == ""

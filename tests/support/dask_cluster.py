@@ -1,4 +1,4 @@
-"""Dask clusters on the loopback that gpusense has not started, as processes of their own."""
+"""Dask clusters on the loopback in separate processes, which gpusense has not started."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Cluster:
 
     Args:
         folder: For the scheduler's file.
-        workers: Arguments of each worker's command, beside the address.
+        workers: Arguments of each worker's command besides the address.
         scheduler: Arguments of the scheduler's command.
         environment: Variables of all processes.
     """
@@ -56,7 +56,7 @@ class Cluster:
             time.sleep(0.05)
 
     def close(self):
-        """End all processes; a nanny ends its worker, which would look for the scheduler for a while."""
+        """End all processes; a nanny ends its worker, which would otherwise wait for the scheduler."""
         for process in (self.scheduler, *self.workers):
             nanny = process is not self.scheduler and "--no-nanny" not in process.args
             (process.terminate if nanny else process.kill)()

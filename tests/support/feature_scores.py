@@ -23,9 +23,9 @@ class Score:
 
     Attributes:
         required: True features that are seen well.
-        found: Of these, those found.
+        found: The number of them that were found.
         features: Features that were returned.
-        right: Of these, those that exist.
+        right: The number of them that exist.
         squares: Squared error over covariance, per degree of freedom, of each that exists.
         errors: Position error of each that exists [m]; across the line for lines and hallways.
     """

@@ -51,7 +51,7 @@ def features(step: int) -> np.ndarray:
 
 
 def readings(pf: Filter, step: int) -> Any:
-    """Return what the filter's models measure at a step of the run."""
+    """Return the readings of the filter's models at a step of the run."""
     poses, ranges = scans(12)
     if len(pf.models) == 2:
         return {pf.models[0]: ranges[step], pf.models[1]: float(poses[step][2])}

@@ -11,7 +11,7 @@ import pytest
 
 @contextmanager
 def full_device(device: Any, most: int) -> Iterator[list[int]]:
-    """Refuse buffers of more than ``most`` numbers; yield the list of the numbers that are asked for."""
+    """Refuse buffers of more than ``most`` numbers; yield the list of requested sizes."""
     empty, asked = type(device).empty, []
 
     def short_of_memory(self, count, dtype, *, zero=False):

@@ -1,4 +1,4 @@
-"""Interrupts at a chosen line: Ctrl-C comes between any two lines of the library."""
+"""Interrupts at a chosen line: Ctrl-C between any two lines of the library."""
 
 from __future__ import annotations
 

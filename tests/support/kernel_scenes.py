@@ -23,7 +23,7 @@ UNREACHABLE = (1 << 31) - 1
 PLANES = (Planes(1), Planes(2), Planes(4))
 GROUPED = Planes(2, ROWS)
 SCALE = RangeScale(LIMIT, RESOLUTION, LIMIT * RESOLUTION)
-# Particles of each scan and those before a launch, which are not read where there is one scan.
+# Particles of each scan and particles before a launch, which are not read for a single scan.
 ONE_SCAN = ScanBatch(1, 0)
 
 
@@ -72,7 +72,7 @@ each_grid = pytest.mark.parametrize("occupied", GRIDS.values(), ids=list(GRIDS))
 
 
 def directions(real: type) -> np.ndarray:
-    """Return (M, 2) cosines and sines: the axes and diagonals exactly, next to them, denormal, and ordinary ones."""
+    """Return (M, 2) cosines and sines: exact axes and diagonals, values next to them, denormal and ordinary ones."""
     half, tiny = np.sqrt(0.5), np.finfo(real).smallest_subnormal
     exact = [(1, 0), (-1, 0), (0, 1), (0, -1), (-1, -0.0), (-0.0, 1)]
     diagonal = [(half, half), (-half, half), (half, -half), (-half, -half)]
@@ -82,7 +82,7 @@ def directions(real: type) -> np.ndarray:
 
 
 def adversarial_poses(occupied: np.ndarray, real: type, *, outside: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return cells and poses: fractions on edges, corners and next to them, in every kind of direction."""
+    """Return cells and poses: fractions on and next to edges and corners, in every kind of direction."""
     rng = np.random.default_rng(13)
     rows, cols = occupied.shape
     tiny, below_one = np.finfo(real).smallest_subnormal, np.nextafter(real(1), real(0))
@@ -134,7 +134,7 @@ def row_after_row(planes: np.ndarray, form: Planes, rows: int) -> np.ndarray:
 
 @functools.lru_cache(maxsize=32)
 def _planes(cells: bytes, shape: tuple[int, int], form: Planes, kind: str) -> np.ndarray:
-    # A backend of its own: that of the tests may pretend to be a GPU.
+    # A separate backend, since the tests' one may pretend to be a GPU.
     backend = NumpyBackend()
     backend.info = dataclasses.replace(backend.info, kind=kind)
     planes = np.empty((4, form.sectors, form.lines(shape[0]), shape[1] + 2), np.uint16)

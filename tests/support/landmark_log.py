@@ -28,7 +28,7 @@ def wrap(angle):
 
 
 def simulate(seed, *, scans=120, landmarks=12, field_of_view=2 * math.pi, bias=(0.0, 0.0), noise=1.0):
-    """Draw features by the landmark model's own definition: in view, detected, within the limits, some replaced."""
+    """Draw features by the definition of the landmark model: in view, detected, within the limits, some replaced."""
     rng = np.random.default_rng(seed)
     xy = rng.uniform(-5, 5, (landmarks, 2))
     poses = np.column_stack([rng.uniform(-4, 4, (scans, 2)), rng.uniform(-9, 9, scans)])

@@ -1,7 +1,6 @@
 """The landmark model in mpmath, written from its definition: every landmark, no gate, no buckets, no logarithm sums.
 
-``exact_inputs`` takes the numbers that kernels get, so that what is judged is their arithmetic and not the rounding of
-positions, which no kernel can undo.
+``exact_inputs`` takes the kernels' inputs, so that only their arithmetic is judged, and not the rounding of positions.
 """
 
 from __future__ import annotations
@@ -69,7 +68,7 @@ def span_of(p: gs.LandmarkParameters, signatures: Any) -> tuple[Any, Any]:
 def density(
     p: gs.LandmarkParameters, seen: Seen, landmark: Any, feature: Any, turn: Any, signature: Any, span: Any
 ) -> Any:
-    """Return p(f | j); ``turn`` is (cosine, sine) of the bearing on the robot."""
+    """Return p(f | j); ``turn`` is the (cosine, sine) of the bearing on the robot."""
     dx, dy = landmark[0] - seen.x, landmark[1] - seen.y
     d, found = mp.sqrt(dx * dx + dy * dy), mp.mpf(1)
     if p.sigma_range is not None and feature[0] is not None:
@@ -166,7 +165,7 @@ def exact_inputs(model: gs.LandmarkModel, poses: Any, features: Any, *, rounded:
 
 
 def prepared(model: gs.LandmarkModel, features: Any) -> np.ndarray:
-    """Return the numbers of features that all carry information."""
+    """Return the features as numbers; all of them carry information."""
     from gpusense.models.landmark.features import check_features, prepare_features
 
     p, sensor = model.parameters, model._sensor
@@ -194,7 +193,7 @@ def table(model: gs.LandmarkModel, world: World) -> Table:
 
 
 def likelihoods(model: gs.LandmarkModel, tabled: Table, correspondence: Any = None) -> np.ndarray:
-    """Return (N, F) float64 log p of each feature; by itself, so not for a joint association."""
+    """Return (N, F) float64 log p of each feature alone, which excludes a joint association."""
     p, (densities, false, _) = model.parameters, tabled
     detect, miss = mp.mpf(p.z_detect), mp.mpf(p.z_false)
     found = np.empty((len(densities), len(false)))
@@ -216,7 +215,7 @@ def joint(model: gs.LandmarkModel, tabled: Table) -> np.ndarray:
     detect, miss = mp.mpf(p.z_detect), mp.mpf(p.z_false)
     found = np.full(len(densities), -np.inf)
     for n, rows in enumerate(densities):
-        # Of each feature what it adds as no landmark, and as each one that it may be.
+        # The terms of each feature: as a false positive, and as each possible landmark.
         options = [
             [(-1, log(miss * none))] + [(j, log(detect * d + miss * none)) for j, (d, may) in enumerate(row) if may]
             for row, none in zip(rows, false, strict=True)

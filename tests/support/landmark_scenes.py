@@ -14,7 +14,7 @@ NAN = np.nan
 
 @dataclass(frozen=True)
 class Scene:
-    """Holds parameters beside the defaults, the model's options, and the parts of features that are not measured."""
+    """Holds parameters that differ from the defaults, the model's options, and the unmeasured parts of features."""
 
     parameters: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Readings to learn from, and problems made of them."""
+"""Readings to learn from, and problems of them."""
 
 from __future__ import annotations
 

@@ -15,19 +15,19 @@ from gpusense.world.frames import place_poses, split
 
 mp.mp.dps = 40
 
-# A room; a wall 10 cm before its upper one; a line through the sensor's place; a short one far behind the others.
+# A room; a wall 10 cm before its upper one; a line through the sensor; a short wall far behind the other ones.
 SEGMENTS = np.array([
     (-3, -2, 5, -2), (5, -2, 5, 4), (5, 4, -3, 4), (-3, 4, -3, -2), (1, 3.9, -1, 3.9), (-1, -1, 1, 1), (8, 0, 8, 1),
 ], float)  # fmt: skip
 SIDES = np.array([False, False, True, True, False, True, True])
-# The wall, and the part of it that is seen, from its middle to its first and second end in half lengths.
+# The wall, and its visible part: first and second end relative to the middle, in half lengths.
 SEEN = ((0, -0.9, -0.1), (0, 0.1, 0.8), (1, -0.5, 0.9), (4, -1, 1), (2, -0.9, -0.4), (3, -0.2, 0.3))
 KNOWN = (0, 0, -1, 4, 2, 3)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Holds parameters beside the defaults, options of the model, and the place of the map in the world."""
+    """Holds parameters that differ from the defaults, the model's options, and the map's place in the world."""
 
     parameters: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
@@ -104,7 +104,7 @@ def exact(values: Any, low: Any = 0.0) -> list[Any]:
 
 
 def inputs(model: gs.LineModel, poses: np.ndarray, features: np.ndarray) -> World:
-    """Return the kernels' inputs, so that their arithmetic is judged and not the rounding of places."""
+    """Return the kernels' inputs, so that only their arithmetic is judged, and not the rounding of positions."""
     buckets, real = model._buckets, model._real
     at_poses = place_poses(poses, buckets, model.mount, real)
     sensors = []
@@ -195,7 +195,7 @@ def table(model: gs.LineModel, world: World, features: np.ndarray) -> list[list[
 
 
 def likelihoods(model: gs.LineModel, tabled: Any, correspondence: Any = None) -> np.ndarray:
-    """Return (N, F) log p of each feature by itself."""
+    """Return (N, F) log p of each feature alone."""
     p = model.parameters
     false = mp.mpf(p.z_false) / (2 * mp.pi * mp.mpf(p.range_max))
     found = np.empty((len(tabled), len(tabled[0])))

@@ -1,7 +1,6 @@
-"""A shape of hits that the package does not have: Student's t with 3 degrees of freedom, 1.7 times as wide.
+"""A shape of hits that is not in the package: Student's t with 3 degrees of freedom, 1.7 times as wide.
 
-``same`` describes the same density by a shape that the package has, so that every user of densities must give equal
-results for both.
+``same`` describes the same density by a shape of the package, so every user of densities must give equal results.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ FACTOR, DOF = 1.7, 3.0
 
 
 class MadeUpHit(StudentHit):
-    """The shape, of which kernels know nothing but numbers."""
+    """The shape; kernels get only its numbers."""
 
     fitted = ()
     limits = ()

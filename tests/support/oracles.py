@@ -1,7 +1,7 @@
 """Truths that share no code and no formula with the library: frames, densities at 60 digits, end points.
 
-Every oracle follows the definitions of the models from scratch, slowly and plainly. Densities are evaluated by mpmath,
-rays are walked in ``ray_oracles``; nothing here imports ``gpusense``.
+Every oracle implements the definition of a model from scratch, slowly and plainly. mpmath evaluates densities, and
+``ray_oracles`` walks rays; nothing here imports ``gpusense``.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def placed(
 
 
 def as_fraction(value: Any) -> Fraction:
-    """Return the multiple of 2^-120 just below an mpmath number."""
+    """Return the largest multiple of 2^-120 up to an mpmath number."""
     return Fraction(int(mp.floor(mp.ldexp(value, 120))), 1 << 120)
 
 
@@ -56,7 +56,7 @@ class Mixture:
 
     @classmethod
     def of(cls, parameters: Any, range_max: float) -> Mixture:
-        """Return the mixture of any object with the parameters' names."""
+        """Return the mixture of any object with attributes of the parameters' names."""
         p = parameters
         return cls(p.z_hit, p.z_short, p.z_max, p.z_rand, p.sigma_hit, p.lambda_short, range_max)
 

@@ -1,9 +1,9 @@
 """Run the blocks of a documentation page, in their order, in a folder of their own.
 
-Python blocks share a namespace. Blocks of a shell run where they hold a command of gpusense, in this process; those
-that install, or start programs of others, are left to readers. A YAML block whose first line is ``# name.yaml`` is
-written as that file. Comments of Markdown hold hidden blocks, ``<!-- invisible-code-block: python`` or ``sh``, and
-``<!-- skip: next "reason" -->``, as Sybil has them.
+Python blocks share a namespace. Shell blocks with a command of gpusense run in this process; other ones, which install
+or start other programs, do not. A YAML block whose first line is ``# name.yaml`` is written as that file. Comments of
+Markdown hold hidden blocks, ``<!-- invisible-code-block: python`` or ``sh``, and ``<!-- skip: next "reason" -->``, as
+Sybil has them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _FILE = re.compile(r"# (\w[\w.-]*\.ya?ml)\b")
 
 @dataclass
 class PageRun:
-    """Counts the blocks of a page that readers see: those that ran and those that were skipped."""
+    """Counts the visible blocks of a page that ran and that were skipped."""
 
     ran: int = 0
     skipped: int = 0
@@ -73,7 +73,7 @@ def parsed(page: Path) -> Document:
 
 
 def visible(example: Example) -> bool:
-    """Return whether readers see an example as a block that is to run."""
+    """Return whether an example is a visible block that is to run."""
     text = example.document.text[example.region.start : example.region.end]
     return re.match(r"\s*(`{3,}|~{3,})(python|sh)\b", text) is not None
 

@@ -42,8 +42,8 @@ def _gone(index: int, step: int, size: int) -> bool:
 def fraction_walk(occupied: np.ndarray, ray: Ray, outside_occupied: bool = False) -> Fraction | None:
     """Return the distance to the first occupied cell by Amanatides and Woo's walk in fractions, or None.
 
-    Cells are half-open. A tie, the ray through a corner, steps in x first. The limit is looked at before the cell.
-    The distance is in units of the direction's length, which is 1 but for rounding.
+    Cells are half-open. At a tie, where the ray passes a corner, the step in x comes first. The limit is checked before
+    the cell. The distance is in units of the direction's length, which is 1 up to rounding.
     """
     rows, cols = occupied.shape
     x, y = ray.cell
@@ -82,7 +82,8 @@ class Hit:
 
 
 def walk(occupied: Sequence[Sequence[bool]], ray: Ray, outside_occupied: bool = False) -> Hit:
-    """Return the same by a walk in integers, exact too and ten times as fast; a test holds it to ``fraction_walk``.
+    """Return the end of an equally exact walk in integers, ten times as fast; a test compares it with
+    ``fraction_walk``.
 
     With fractions a / one and directions d / unit, the boundary k lies at (k * one + a) * unit / (one * d).
     """
@@ -134,8 +135,8 @@ def backward_error_is_small(
 ) -> bool:
     """Return whether a range is that of a ray with its origin moved by at most ``move`` and turned by ``turn``.
 
-    Rays on both sides of the asked one are walked. On one face the range varies continuously with the ray, so any
-    value between two rays that end on the same face belongs to a ray between them.
+    Rays on both sides of the given one are walked. On one face the range varies continuously with the ray, so any value
+    between two rays that end on the same face belongs to a ray between them.
     """
     dx, dy = float(ray.direction[0]), float(ray.direction[1])
     faces: dict[Any, list[float]] = {}
@@ -159,7 +160,7 @@ def world_ray(
     range_max: float,
     mount: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Ray:
-    """Return the ray of a beam, its frame made by mpmath; the limit is in exact cells."""
+    """Return the ray of a beam in a frame computed by mpmath; the limit is in exact cells."""
     x, y, _, _ = placed(pose, origin, resolution, mount)
     angle = mp.mpf(float(pose[2])) + mp.mpf(float(mount[2])) + mp.mpf(float(bearing)) - mp.mpf(float(origin[2]))
     fx, fy = as_fraction(x), as_fraction(y)

@@ -1,4 +1,4 @@
-"""Families of small maps and rays whose numbers both precisions hold exactly, with the walks of the oracle."""
+"""Families of small maps and rays that both precisions represent exactly, with the oracle's walks."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FLOAT64_RELATIVE, FLOAT64_MOVE, FLOAT64_TURN = 1e-12, 1e-13, 1e-15
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Holds rays in cell units. Every number is a float32, so both precisions are asked exactly the same."""
+    """Holds rays in cell units. Every number is a float32, so both precisions have the same inputs."""
 
     occupied: np.ndarray
     cell: np.ndarray
@@ -50,14 +50,14 @@ ONE_SECTOR = Planes(1)
 
 @functools.cache
 def cast(scene: Scene, backend: str, precision: str, form: Planes = ONE_SECTOR, *, wide: bool = False) -> np.ndarray:
-    """Return the kernel's ranges in cells; poses carry the direction as their heading, the one ray is along it.
+    """Return the kernel's ranges in cells; a pose's heading is the direction of its single ray.
 
     Args:
         scene: Map and rays.
-        backend: Where they are cast.
+        backend: The device.
         precision: ``"float32"`` or ``"float64"``.
         form: Form of the planes of rectangles.
-        wide: Whether the kernel is the one for the device's lanes, where there is one.
+        wide: Whether to use the kernel for the device's lanes, where there is one.
     """
     device, real = get_backend(backend), np.dtype(precision)
     rows, cols = scene.occupied.shape
@@ -164,7 +164,7 @@ def diagonal_scenes(rng: np.random.Generator) -> list[Scene]:
 
 
 def tiny_component_scenes(rng: np.random.Generator) -> list[Scene]:
-    """Yield direction components that are denormal, near the least that differs from zero, or merely small."""
+    """Yield direction components that are denormal, close to the smallest positive number, or merely small."""
     scenes = []
     sizes = as_float32(np.array([1e-45, 1e-40, 9e-31, 1.1e-30, 1e-20, 1e-8, 3e-7]))
     for number in range(4):

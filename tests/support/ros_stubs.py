@@ -1,6 +1,6 @@
 """Stand-ins for the modules of ROS 2 that the example's nodes and its launch file import.
 
-Messages have the fields of ROS 2 Humble, out of rosbags' definitions, and take only the types that rclpy takes.
+Messages have the fields of ROS 2 Humble by rosbags' definitions, and accept only rclpy's types.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ DEFAULTS = {str: "", bool: False, bytes: b"\0", float: 0.0, int: 0}
 
 
 class Message:
-    """A message; a field that its definition lacks, or a value of another type, is an error, as in rclpy."""
+    """A message; an undefined field or a value of another type is an error, as in rclpy."""
 
     def __init__(self, kind: str, **values: Any) -> None:
         vars(self).update(kind=kind, types={})
@@ -78,7 +78,7 @@ class TransformError(Exception):
 
 
 class Buffer:
-    """tf2_ros.Buffer: the mount is fixed, and odometry is known for a time."""
+    """tf2_ros.Buffer with a fixed mount, and odometry at some times."""
 
     mount: ClassVar[tuple[float, float, float]] = (0.1, 0.0, 0.0)
 
@@ -118,7 +118,7 @@ class Publisher:
 
 
 class Node:
-    """rclpy.node.Node: what it creates is in ``made``, by topic, service or period."""
+    """rclpy.node.Node; ``made`` holds the created objects by topic, service or period."""
 
     given: ClassVar[dict[str, Any]] = {}
 
@@ -163,7 +163,7 @@ class Node:
 
 
 class LifecycleNode(Node):
-    """rclpy.lifecycle.LifecycleNode: an exception in a transition is swallowed there, and is not here."""
+    """rclpy.lifecycle.LifecycleNode, but exceptions in a transition are raised."""
 
     state = "unconfigured"
 
@@ -203,7 +203,7 @@ class LifecycleNode(Node):
 
 
 class Recorded:
-    """An object of a launch file: its arguments, and nothing more."""
+    """An object of a launch file, which only holds its arguments."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         self.arguments, self.options = arguments, options
@@ -224,7 +224,7 @@ def _messages() -> dict[str, dict[str, Any]]:
 
 
 def _modules() -> dict[str, dict[str, Any]]:
-    """Return names of modules, and what is in them."""
+    """Return the modules' names and contents."""
     codes = SimpleNamespace(SUCCESS="success", FAILURE="failure", ERROR="error")
     broadcaster = type("Broadcaster", (), {"__init__": lambda self, node: setattr(self, "sent", []),
                                            "sendTransform": lambda self, one: self.sent.append(one)})  # fmt: skip

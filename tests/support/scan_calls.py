@@ -1,4 +1,4 @@
-"""A small map, clouds and scans, and models whose calls take every path that a call may take."""
+"""A small map, clouds and scans, and models whose calls cover every path of a call."""
 
 from __future__ import annotations
 

@@ -125,7 +125,7 @@ def field_scene(name: str, real: type, *, all_readings: bool) -> dict[str, np.nd
     }
 
 
-# As models have them: float32 has end points in two parts, float64 needs none.
+# As in models: float32 has end points in two parts, float64 in one.
 FIELD_SCENES = [
     *(
         (name, names, np.float32)
@@ -142,7 +142,7 @@ FIELD_SCENES = [
 OCCUPIED = GRIDS["rooms"]
 RANGE = LIMIT * RESOLUTION
 WINDOW = window_of(OCCUPIED)
-# Where scans begin, which is not read where there is one.
+# Starts of the scans, which are not read for a single scan.
 NOWHERE = np.zeros(1, np.int32)
 
 
@@ -171,7 +171,7 @@ def parts_at(parts: np.ndarray, count: int, each: int) -> np.ndarray:
 
 
 def room_for(count: int, each: int, real: type) -> np.ndarray:
-    """Return room for parts, and one more number, that is filled with -77."""
+    """Return an array for parts and one more number, filled with -77."""
     return np.full(count * each + 1, -77, real)
 
 

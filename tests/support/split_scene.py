@@ -1,4 +1,4 @@
-"""A scene for filters that are split over devices, whose models other processes can make."""
+"""A scene for filters that are split over devices; other processes can make its models."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def scans(count):
 
 
 def states(pf, steps=4, *, everywhere=False):
-    """Return all that a filter shows after each step of a run."""
+    """Return the public state of a filter after each step of a run."""
     if everywhere:
         pf.initialize_uniform()
     else:

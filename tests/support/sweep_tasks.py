@@ -1,4 +1,4 @@
-"""Tasks of sweeps that take no time, fail, or end their worker."""
+"""Tasks of sweeps that end at once, fail, or end their worker."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def failing(job, store):
 
 
 def deadly(job, store):
-    """Kill the worker at seed 3, once: a file says that it was done; at seed 4 always, if the option asks for it."""
+    """Kill the worker at seed 3 once, recorded by a file; at seed 4 always, if the option says so."""
     done = Path(job.option("folder")) / "killed"
     if (job.seed == 3 and not done.exists()) or (job.seed == 4 and job.option("always")):
         done.touch()
@@ -44,7 +44,7 @@ def slow(job, store):
 
 
 def written_down(folder):
-    """Write down the process."""
+    """Write the process's id."""
     with open(Path(folder) / "runs", "a") as file:
         file.write(f"{os.getpid()}\n")
 
@@ -78,7 +78,7 @@ def _fill():
 
 
 def _fork():
-    # The other process holds everything open that it has inherited.
+    # The other process keeps all inherited files open.
     if os.fork():
         os._exit(9)
     time.sleep(600)
@@ -102,12 +102,12 @@ ENDS = {
 
 
 def raised():
-    """Raise what Ctrl-C raises."""
+    """Raise KeyboardInterrupt."""
     raise KeyboardInterrupt
 
 
 def ending(job, store):
-    """End as the option of the seed says, if there is one."""
+    """End as the seed's option says, if there is one."""
     started(job)
     end = job.option(f"end{job.seed}")
     return {"value": ENDS[end]() if end else job.seed / 3}

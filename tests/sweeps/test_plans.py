@@ -1,4 +1,4 @@
-"""Jobs, plans and tables of sweeps: what they accept, what they keep, and how they survive a crash."""
+"""Jobs, plans and tables of sweeps: their arguments, contents and survival of a crash."""
 
 from __future__ import annotations
 

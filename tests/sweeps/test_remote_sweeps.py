@@ -1,4 +1,4 @@
-"""Sweeps on a Dask cluster that gpusense has not started: what it supervises, what it reports, and TLS."""
+"""Sweeps on a Dask cluster that gpusense has not started: supervision, reports and TLS."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def swept(jobs, path, executor=None, **options):
 
 
 def endings(folder, ends, count):
-    """Return jobs of which the first ones end as given, each between sound ones."""
+    """Return jobs whose first ones end as given, each between sound ones."""
     options = {"folder": str(folder)} | {f"end{2 * k}": end for k, end in enumerate(ends)}
     return [Job(task="support.sweep_tasks:ending", seed=seed, options=options) for seed in range(count)]
 
@@ -168,7 +168,7 @@ def test_an_interrupt_keeps_what_has_ended_and_ends_what_runs(tmp_path, engine):
 
 
 def running_children():
-    """Return the workers of this process: each leads a session of its own."""
+    """Return the workers of this process: each leads a session."""
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
             try:

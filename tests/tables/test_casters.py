@@ -76,7 +76,7 @@ def test_a_cropped_map_has_the_bits_of_the_whole_map(kind, outside, backend, mon
 
 @pytest.mark.parametrize("kind", each_caster(36), ids=by_name)
 def test_origins_far_off_the_map(kind, backend):
-    """Up to what a place can be; rays that lead away, or end before the map, are exactly range_max."""
+    """Up to the limits of places; rays that lead away, or end before the map, are exactly range_max."""
     cells = np.zeros((20, 30), int)
     cells[5:15, 25] = 100
     grid, limit = gs.OccupancyGrid(cells, 1.0), 1e6

@@ -13,7 +13,7 @@ from gpusense.tables.reachable import ReachableMap
 from gpusense.world import windows
 
 
-@pytest.mark.sampled(0.3)
+@pytest.mark.sampled(0.3, without="warp:cpu")
 @pytest.mark.parametrize("kind", [*KINDS, "caster"])
 @pytest.mark.parametrize("outside", ["free", "occupied"])
 def test_a_cropped_map_gives_the_same_bits(kind, outside, backend, monkeypatch):

@@ -262,7 +262,7 @@ def big_images():
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize(("name", "content", "most"), big_images(), ids=["png-1-bit", "png", "pgm", "pgm-plain"])
 def test_a_map_is_read_at_a_byte_a_cell(tmp_path, name, content, most):
-    """NumPy's and Python's own memory; Pillow holds one more byte a pixel of a grey PNG, which it does not report."""
+    """Memory of NumPy and Python; Pillow holds one more byte a pixel of a grey PNG, which it does not report."""
     (tmp_path / name).write_bytes(content)
     (tmp_path / "map.yaml").write_text(yaml_text(name))
     read_map(tmp_path / "map.yaml")

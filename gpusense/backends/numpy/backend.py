@@ -16,7 +16,7 @@ from gpusense.interface.signatures import KERNELS
 
 
 def describe() -> BackendInfo:
-    """Return the host as a model sees it."""
+    """Describe the host as a device."""
     memory = host_memory()
     return BackendInfo("numpy", "numpy", "NumPy reference", "cpu", np.__version__, memory, memory, True)
 

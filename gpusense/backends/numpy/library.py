@@ -1,4 +1,4 @@
-"""NumPy as the registry sees it."""
+"""NumPy as a library of the registry, whose one device is the host."""
 
 from __future__ import annotations
 

@@ -21,10 +21,10 @@ def check_in_order(queue: cl.CommandQueue, name: str) -> None:
     """Refuse a queue that is not an in-order queue.
 
     Raises:
-        ValueError: Its commands may run in another order than they were queued.
+        ValueError: Its commands may run out of order.
     """
     if queue.properties & cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE:
-        raise ValueError(f"{name}: must be a queue that does commands in their order, got one that does not")
+        raise ValueError(f"{name}: must be an in-order queue, got an out-of-order one")
 
 
 def is_array(candidate: object) -> bool:
@@ -34,7 +34,7 @@ def is_array(candidate: object) -> bool:
 
 
 def alignment_of(device: cl.Device) -> int:
-    """Return the number of bytes at whose multiples parts of buffers begin."""
+    """Return the alignment of parts of buffers [bytes]."""
     return max(int(device.mem_base_addr_align) // 8, 1)
 
 
@@ -42,7 +42,7 @@ def part_of(buffer: Buffer, first: int, size: int, alignment: int) -> Buffer:
     """Return ``size`` bytes of a buffer from byte ``first`` on, without a copy.
 
     Raises:
-        ValueError: Parts cannot begin at this byte.
+        ValueError: ``first`` is not a multiple of the alignment.
     """
     if first == 0 or size == 0:
         return buffer
@@ -61,13 +61,13 @@ def part_of(buffer: Buffer, first: int, size: int, alignment: int) -> Buffer:
 
 
 def _plain(buffer: Any) -> Any:
-    """Return a buffer of a memory pool, which its array keeps alive, as a plain one; an empty array has none."""
+    """Return a plain buffer for a buffer of a memory pool, which its array keeps alive; None for an empty array."""
     is_plain = buffer is None or isinstance(buffer, cl.Buffer)
     return buffer if is_plain else cl.Buffer.from_int_ptr(buffer.int_ptr, retain=True)
 
 
 def adopted(array: Any, queue: cl.CommandQueue, selection: str, name: str, *, in_place: bool) -> Adopted:
-    """See Backend.adopt. The commands of another queue on the array are waited for."""
+    """See Backend.adopt. Wait for commands of another queue on the array."""
     if array.context != queue.context:
         raise TypeError(
             f"{name}: must be of the context of {selection}'s queue, got an array of another: make the model with "
@@ -110,7 +110,7 @@ def adopted(array: Any, queue: cl.CommandQueue, selection: str, name: str, *, in
 
 def lent(buffer: cl.Buffer, queue: cl.CommandQueue, shape: tuple[int, ...], dtype: np.dtype) -> pyopencl.array.Array:
     """See Backend.lend."""
-    # Takes a while, and NumPy arrays do not need it.
+    # Imported on use, since the import takes a while and NumPy arrays do not need it.
     import pyopencl.array
 
     return pyopencl.array.Array(queue, shape, dtype, data=buffer if math.prod(shape) else None)

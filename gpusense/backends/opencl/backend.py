@@ -32,7 +32,7 @@ from gpusense.interface.sources import assemble, relevant, uses_double, with_pla
 # The fill command of one driver hangs beyond 2 GiB.
 _CLEAR = "kernel void clear(global uint *words, const ulong first) { words[first + get_global_id(0)] = 0; }"
 _CLEARED_WORDS = 1 << 28
-# NVIDIA's driver takes nearly twice as long over copies to a GPU between these sizes [bytes] if they do not block.
+# Copies to a GPU of these sizes [bytes] take NVIDIA's driver nearly twice as long if they do not block.
 _SLOW = (64 << 10, 256 << 10)
 _ROUNDED_DIVISION = cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT
 
@@ -41,7 +41,7 @@ def _binary_cache(info: BackendInfo, device: cl.Device) -> BinaryCache | None:
     """Return the cache of programs; None for PoCL, whose kernels are kept one by one.
 
     For a binary, PoCL would compile every kernel of the program for work-groups of any size, which takes three times as
-    long as everything else.
+    long as the rest of the build.
     """
     return None if pocl.is_pocl(device) else BinaryCache(info)
 
@@ -49,8 +49,8 @@ def _binary_cache(info: BackendInfo, device: cl.Device) -> BinaryCache | None:
 class OpenCLBackend(ProcessBound, Backend):
     """One OpenCL device: a context, an in-order queue and the programs compiled for it.
 
-    A copy is a command, which takes a driver for processors some 25 us. Where host and device share memory, NumPy
-    copies instead: it waits for all commands before the copy, which has ended when it returns.
+    A copy that is a command takes a driver for processors some 25 us. Where host and device share memory, NumPy copies
+    instead, after a wait for all commands.
     """
 
     def __init__(self, info: BackendInfo, device: cl.Device, queue: cl.CommandQueue | None = None) -> None:
@@ -63,15 +63,16 @@ class OpenCLBackend(ProcessBound, Backend):
         self._queue = cl.CommandQueue(self._context) if queue is None else queue
         self._shared = shares_memory(device)
         self._results = ResultMemory() if info.kind == "gpu" else None
-        # Large copies; only where they were measured.
+        # Staged copies, only for the driver with which they were measured.
         staged = info.kind == "gpu" and not self._shared and "NVIDIA" in device.vendor
         self._staging = Staging(functools.partial(slots_of, self._queue)) if staged else None
-        # Numbers of commands that were queued, and that are known to have ended. Garbage may be collected anywhere.
+        # Numbers of commands that were queued, and that are known to have ended. The lock is reentrant, since garbage
+        # may be collected while it is held.
         self._count = threading.RLock()
         self._queued = self._ended = 0
         self.alignment = arrays.alignment_of(device)
         self._launchers: dict[tuple[str, frozenset[str]], Launch] = {}
-        # Each with the key of its entry in the cache.
+        # Programs with the keys of their entries in the cache.
         self._programs: dict[tuple[str, frozenset[str]], tuple[cl.Program, str]] = {}
         self._keys = BinaryCache(info)
         self._cache = _binary_cache(info, device)
@@ -80,7 +81,7 @@ class OpenCLBackend(ProcessBound, Backend):
         rounded = bool(device.single_fp_config & _ROUNDED_DIVISION)
         self.options = ["-cl-fp32-correctly-rounded-divide-sqrt"] if rounded else []
         if self._pocl is not None:
-            # PoCL writes the number of warnings to the terminal. Its hash of a kernel has the options in it, not the
+            # PoCL would write the number of warnings to the terminal. Its hash of a kernel covers the options, not the
             # processor.
             self.options += ["-w", f"-DTARGET_{re.sub(r'[^a-z0-9]', '_', info.target)}"]
 
@@ -127,7 +128,7 @@ class OpenCLBackend(ProcessBound, Backend):
         """Refuse a buffer that is larger than the device's largest.
 
         Raises:
-            MemoryError: It is.
+            MemoryError: The buffer is larger.
         """
         if size > self.info.max_buffer:
             raise MemoryError(
@@ -135,7 +136,7 @@ class OpenCLBackend(ProcessBound, Backend):
             )
 
     def _clear(self, buffer: cl.Buffer, size: int) -> None:
-        """Queue the clearing of a buffer of ``size`` bytes."""
+        """Enqueue a command that sets ``size`` bytes of a buffer to 0."""
         if size <= 4 * _CLEARED_WORDS:
             cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.uint8), 0, size)
             return
@@ -157,10 +158,6 @@ class OpenCLBackend(ProcessBound, Backend):
             with driver_errors():
                 cl.enqueue_copy(self._queue, out, buffer, is_blocking=wait)
         return out
-
-    def empty_result(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-        """See Backend.empty_result."""
-        return np.empty(shape, dtype) if self._results is None else self._results.empty(shape, dtype)
 
     def part(self, buffer: Buffer, first: int, count: int, dtype: np.dtype) -> Buffer:
         """See Backend.part."""
@@ -235,13 +232,14 @@ class OpenCLBackend(ProcessBound, Backend):
             self._pocl.save()
 
     def _settle(self) -> None:
-        """Wait until every command has ended that this thread may have queued."""
+        """Wait for all commands that this thread may have queued."""
         if self._ended != self._queued:
             self.synchronize()
 
     def enqueue(self, kernel: cl.Kernel, size: tuple[int, ...], group: tuple[int, ...]) -> None:
         """Enqueue a launch of a kernel whose arguments are set."""
-        # Before, so that an interrupt leaves no launch uncounted; and after, for a thread that waits in between.
+        # Count it before the launch, so that an interrupt leaves none uncounted, and after it for threads that wait in
+        # between.
         with self._count:
             self._queued += 1
         cl.enqueue_nd_range_kernel(self._queue, kernel, size, group)
@@ -254,7 +252,7 @@ class OpenCLBackend(ProcessBound, Backend):
             self._queued += launches
 
     def _launcher(self, kernel: str, flags: frozenset[str]) -> Launch:
-        """Return a kernel of a program that is built where that has not happened yet."""
+        """Return a kernel; its program is built on first use."""
         row = KERNELS[kernel]
         flags = relevant(row.file, flags)
         if (row.file, flags) not in self._programs:
@@ -291,7 +289,7 @@ class OpenCLBackend(ProcessBound, Backend):
         return program, key
 
     def _kept(self, source: str) -> cl.Program | None:
-        """Return the program as an earlier run compiled it; None if the driver accepts none."""
+        """Return the program that an earlier run compiled; None if the driver accepts no stored one."""
         binary = None if self._cache is None else self._cache.load(source, self.options)
         if self._cache is None or binary is None:
             return None

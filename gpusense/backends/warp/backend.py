@@ -130,10 +130,6 @@ class WarpBackend(ProcessBound, Backend):
         out.reshape(-1)[...] = numbers[: out.size]
         return out
 
-    def empty_result(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-        """See Backend.empty_result."""
-        return np.empty(shape, dtype) if self._results is None else self._results.empty(shape, dtype)
-
     def part(self, buffer: wp.array, first: int, count: int, dtype: np.dtype) -> wp.array:
         """See Backend.part."""
         kind = SCALARS[np.dtype(dtype)]

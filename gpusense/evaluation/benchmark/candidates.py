@@ -47,6 +47,7 @@ class Candidate:
         missing: Reason why it cannot run here; such a candidate is listed and not measured.
         temperature: Factor that makes its log-likelihoods comparable with those of all beams: n for every n-th beam.
         code: The Python expression that makes it, for readers of the report.
+        whole: Whether its table is of the whole map, and so the same for all clouds.
         table_rays: Number of rays that build the table of a scene's map; None for tables built without rays.
     """
 
@@ -62,6 +63,7 @@ class Candidate:
     missing: str = ""
     temperature: float = 1.0
     code: str = ""
+    whole: bool = False
     table_rays: Callable[[Scene], float] | None = None
 
     @property
@@ -131,7 +133,7 @@ def candidates(problems: Sequence[str], *, quick: bool = False) -> list[Candidat
             listed += [
                 Candidate(
                     problem, curve.method, make(caster), curve.variant, curve.knob, value, exact=caster.exact,
-                    code=f"gs.{made}, caster={code})", table_rays=rays,
+                    code=f"gs.{made}, caster={code})", whole=caster.whole, table_rays=rays,
                 )
                 for problem, make, made in (
                     ("ranges", _ranges, "RayCaster(grid, range_max"), ("beam", _beam, "BeamModel(grid, scanner"),

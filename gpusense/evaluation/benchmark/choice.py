@@ -1,8 +1,9 @@
 """Choose the method for an affordable error or time: the fastest within the error, or the most exact within the time.
 
 A method is judged over all scenes and clouds of a report together, by its largest error and the geometric mean of its
-times. Methods within ``ALIKE`` of the fastest count as equally fast, so that noise does not decide; the most exact of
-them is chosen.
+times. A run of another day should choose the same, so no difference that noise makes decides: methods within ``ALIKE``
+of the fastest count as equally fast and those within ``CLOSE`` of the least error as equally exact, and of equal ones
+:attr:`Entry.preference` decides, in which nothing is measured. An error must keep its limit for other seeds as well.
 """
 
 from __future__ import annotations
@@ -15,8 +16,10 @@ from typing import Any
 
 from gpusense.evaluation.benchmark.profiles import error_of, label, pareto_front, setting, time_of
 
-ALIKE = 1.15
+ALIKE = 1.25
 """Factor of the times below which two methods are equally fast."""
+CLOSE = 1.25
+"""Factor of the errors below which two methods are equally exact."""
 ROUNDING = 1e-6
 """Errors below this are equal: rounding of float32."""
 
@@ -46,6 +49,11 @@ MEASURES = {"ranges": {"%": WRONG, "cells": CELLS}, "beam": {"nats": KL, "m": SH
 """By problem and unit, the measure to which a limit applies; the first one is the default."""
 DEFAULTS = {"ranges": ("%", 0.01), "beam": ("nats", 0.01), "field": ("nats", 0.01)}
 """By problem, the unit and the largest error if no limit is passed."""
+_NUMBER = re.compile(r"[0-9.]+")
+# Methods that gpusense takes where none is named.
+_DEFAULT = ("exact", "field", "beam", "auto", "em", "nearest")
+# Knobs whose smaller values are finer; of the others larger ones are.
+_SMALLER = ("tolerance", "every", "bin width")
 _QUANTITY = re.compile(r"\s*([0-9.]+(?:[eE][-+]?[0-9]+)?)\s*([a-z%]+)\s*")
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 
@@ -63,6 +71,7 @@ class Entry:
         seconds: Geometric mean of the times of a call [s].
         code: Code that makes it.
         exact: Whether it computes the model itself.
+        doubt: Factor of the error within which that of another run lies; 1 where all runs have the same errors.
     """
 
     device: str
@@ -73,6 +82,15 @@ class Entry:
     seconds: float
     code: str = ""
     exact: bool = False
+    doubt: float = 1.0
+
+    @property
+    def preference(self) -> tuple[bool, bool, int, bool, str, float]:
+        """Place among equal methods: exact, float32, few assumptions, a default, name, and the coarsest setting."""
+        numbers = math.prod(float(number) for number in _NUMBER.findall(self.setting))
+        coarse = -numbers if self.setting.startswith(_SMALLER) else numbers
+        other = self.method not in _DEFAULT
+        return not self.exact, self.precision != "float32", self.method.count(","), other, self.method, coarse
 
     @property
     def text(self) -> str:
@@ -183,8 +201,8 @@ def front(listed: Sequence[Entry]) -> list[Entry]:
 def choose(listed: Sequence[Entry], error: float | None, seconds: float | None) -> Entry | None:
     """Choose the entry for a largest error and a longest time.
 
-    With a largest error, the fastest method within both limits is chosen; of equally fast methods, the most exact. With
-    a longest time alone, the most exact method within it is chosen; of equally exact methods, the fastest.
+    With a largest error, the fastest method within both limits is chosen. With a longest time alone, the fastest of the
+    most exact methods within it is chosen. Of equal ones the preferred one is chosen.
 
     Args:
         listed: Entries of one device and one measure.
@@ -197,18 +215,19 @@ def choose(listed: Sequence[Entry], error: float | None, seconds: float | None) 
     able = [
         entry
         for entry in listed
-        if (error is None or entry.error <= error) and (seconds is None or entry.seconds <= seconds)
+        if (error is None or entry.error * entry.doubt <= error) and (seconds is None or entry.seconds <= seconds)
     ]
     if not able:
         return None
-
-    def exactness(entry: Entry) -> tuple[float, bool, float]:
-        return (entry.error if entry.error > ROUNDING else 0.0, not entry.exact, entry.seconds)
-
     if error is None:
-        return min(able, key=exactness)
-    fastest = min(entry.seconds for entry in able)
-    return min((entry for entry in able if entry.seconds <= ALIKE * fastest), key=exactness)
+        most = CLOSE * max(min(entry.error for entry in able), ROUNDING)
+        able = [entry for entry in able if entry.error <= most]
+    longest = ALIKE * min(entry.seconds for entry in able)
+    return min((entry for entry in able if entry.seconds <= longest), key=_preference)
+
+
+def _preference(entry: Entry) -> tuple[bool, bool, int, bool, str, float]:
+    return entry.preference
 
 
 def error_text(value: float, unit: str) -> str:

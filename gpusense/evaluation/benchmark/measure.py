@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -140,7 +140,7 @@ class Cost:
         first_s: Making the runner and its first call, compiling included.
         build_s: Time that a second runner, with compiled kernels, takes before its steady state: building the map's
             tables. If the first took more than ``slow_to_make`` of ``measure`` there is no second one, and compiling is
-            included.
+            included. A runner of an earlier cloud keeps its times.
         compile_s: First time minus second time: compiling, or loading kernels from a cache on disk. Kernels that this
             process compiled before add nothing. None without a second runner.
         call_min_s, call_q1_s, call_median_s, call_q3_s: A call with NumPy arrays in and out: least time and quartiles.
@@ -175,6 +175,15 @@ class Cost:
     peak_bytes: int | None = None
 
 
+class Earlier(NamedTuple):
+    """A runner of an earlier cloud of the scene, with its times."""
+
+    meter: Meter | None
+    runner: Runner
+    first_s: float
+    build_s: float
+
+
 def measure(
     make: Callable[[Any], Runner],
     backend: Backend | None,
@@ -182,6 +191,7 @@ def measure(
     repeats: int,
     seconds: float = float("inf"),
     slow_to_make: float | None = None,
+    earlier: list[Earlier] | None = None,
 ) -> tuple[Cost, Runner]:
     """Measure a candidate, and return its runner with built tables.
 
@@ -192,13 +202,20 @@ def measure(
         repeats: Most timed calls.
         seconds: Longest time of the timed calls, of which there are at least three [s].
         slow_to_make: Duration of a first call above which no second runner is made [s]; None: ``SLOW_TO_MAKE``.
+        earlier: A runner of another cloud, if there is one, is measured instead of a new one. Otherwise it receives a
+            runner that took longer than ``slow_to_make``. None: every cloud has runners of its own.
     """
     limit = SLOW_TO_MAKE if slow_to_make is None else slow_to_make
     meter = None if backend is None else Meter(backend)
     begin = time.perf_counter()
-    runner, built = _prepared(make, meter, poses)
-    runner.run(poses)
-    first = time.perf_counter() - begin
+    built: float | None
+    if earlier:
+        meter, runner, first, built = earlier[0]
+        runner.run(poses)
+    else:
+        runner, built = _prepared(make, meter, poses)
+        runner.run(poses)
+        first = time.perf_counter() - begin
     used: list[float] = []
     calls = series(lambda: runner.run(poses), repeats, FEWEST, seconds, used)
     on_device: dict[str, Any] = {}
@@ -218,8 +235,10 @@ def measure(
         second = time.perf_counter() - begin
         compiling = max(first - second, 0.0)
         built = max(second - min(calls), 0.0) if built is None else built
-    elif built is None:
-        built = first - min(calls)
+    else:
+        built = first - min(calls) if built is None else built
+        if earlier is not None and not earlier:
+            earlier.append(Earlier(meter, runner, first, built))
     on_device |= quartiles("call", calls)
     cost = Cost(
         first_s=first, build_s=built, compile_s=compiling, processor_s=statistics.fmean(used), calls=len(calls),

@@ -66,6 +66,7 @@ class Row:
         maps: "8 of 10 clouds" if some were left out because of the time that a table takes; such a row is never chosen.
         cases: For a row of all maps, each scene by itself.
         origin: Command that measured it, with date and commit.
+        doubt: See :class:`~gpusense.evaluation.benchmark.choice.Entry`.
     """
 
     need: str
@@ -85,6 +86,7 @@ class Row:
     maps: str = ""
     cases: tuple[Case, ...] = ()
     origin: str = ""
+    doubt: float = 1.0
 
     @property
     def text(self) -> str:
@@ -97,7 +99,7 @@ class Row:
         """Return the row as an entry to choose from, by one of its measures."""
         return Entry(
             self.device, self.method, self.setting, self.precision, self.errors[measure], self.seconds, self.code,
-            self.exact,
+            self.exact, self.doubt,
         )  # fmt: skip
 
 

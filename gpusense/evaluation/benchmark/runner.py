@@ -12,7 +12,7 @@ import numpy as np
 from gpusense.backends import Backend
 from gpusense.evaluation.benchmark.accuracy import Truth, UnstableError, errors, fine_errors, truth_device
 from gpusense.evaluation.benchmark.candidates import Candidate
-from gpusense.evaluation.benchmark.measure import Cost, Runner, measure
+from gpusense.evaluation.benchmark.measure import Cost, Earlier, Runner, measure
 from gpusense.evaluation.benchmark.scenes import CLOUDS, MapSource, Scene, make_scene
 from gpusense.localization.weights import normalize_weights
 
@@ -48,7 +48,8 @@ class Plan:
         seed: Seed of all random numbers.
         build_limit: Longest time to build a table [s]; a point above it is left out.
         deadline: Measuring time, without compiling, after which no further point begins [s].
-        slow_to_make: Duration of a first call above which building includes compiling [s]; None: see ``measure``.
+        slow_to_make: Duration of a first call above which building includes compiling [s], and tables of the whole map
+            are built for the first cloud of a scene alone; None: all clouds have tables of their own, see ``measure``.
     """
 
     sources: Sequence[MapSource]
@@ -141,6 +142,7 @@ def run(plan: Plan, step: Callable[[str], None] = lambda text: None, outcome: Ou
         outcome.scenes.append(_description(scene))
         paces: dict[tuple[str, str], float] = {}
         built: dict[tuple[str, ...], float] = {}
+        earlier: dict[Job, list[Earlier]] = {}
         for cloud in CLOUDS:
             truth = Truth(scene, scene.clouds[cloud][: plan.checked], device)
             outcome.scenes[-1]["clouds"][cloud] = _cloud_description(truth)
@@ -148,7 +150,8 @@ def run(plan: Plan, step: Callable[[str], None] = lambda text: None, outcome: Ou
                 step(f"{scene.name}, {cloud}, {job.candidate.label}")
                 reason = _left_out(plan, job, scene, paces, built, spent)
                 begin = time.perf_counter()
-                point = point_of(plan, job, truth, cloud, reason)
+                shared = job.candidate.whole and plan.slow_to_make is not None
+                point = point_of(plan, job, truth, cloud, reason, earlier.setdefault(job, []) if shared else None)
                 outcome.points.append(point)
                 spent += time.perf_counter() - begin
                 if point["time"]:
@@ -160,7 +163,9 @@ def run(plan: Plan, step: Callable[[str], None] = lambda text: None, outcome: Ou
     return outcome
 
 
-def point_of(plan: Plan, job: Job, truth: Truth, cloud: str, reason: str = "") -> dict[str, Any]:
+def point_of(
+    plan: Plan, job: Job, truth: Truth, cloud: str, reason: str = "", earlier: list[Earlier] | None = None
+) -> dict[str, Any]:
     """Measure one point; a failure becomes its status and reason.
 
     Args:
@@ -169,6 +174,7 @@ def point_of(plan: Plan, job: Job, truth: Truth, cloud: str, reason: str = "") -
         truth: The exact results of the cloud.
         cloud: Name of the cloud.
         reason: Reason to leave the point out; empty to measure it.
+        earlier: Runners of the scene's other clouds, see ``measure``.
 
     Returns:
         Plain values. ``status`` is ``"ok"``, ``"failed"`` after an exception, ``"unstable"`` for results that are not
@@ -193,7 +199,7 @@ def point_of(plan: Plan, job: Job, truth: Truth, cloud: str, reason: str = "") -
     try:
         cost, runner = measure(
             lambda device: candidate.make(scene, device, job.precision), backend, scene.clouds[cloud][:particles],
-            plan.repeats, plan.seconds, plan.slow_to_make,
+            plan.repeats, plan.seconds, plan.slow_to_make, earlier,
         )  # fmt: skip
         point |= _split(cost)
         point["errors"] = _errors(truth, candidate, runner, fine=cloud == FINE_CLOUD)

@@ -52,7 +52,7 @@ KERNELS: dict[str, Kernel] = {
         "real limit",
     ),
     "fill_field": kernel(
-        "field", "col row", "int squared [rows * cols]", "real density [cap + 1]",
+        "distance", "col row", "int squared [rows * cols]", "real density [cap + 1]",
         "out real table [begin + height * stride]", *_MAP, "int cap", "real beyond", "int from_col", "int from_row",
         "int width", "int height", "int begin", "int stride",
     ),

@@ -26,6 +26,7 @@ import numpy as np
 
 from gpusense.learning.beam.point import BIAS, FORM, HIT, RATE, SHORT, SIGMA, Floats, Point
 from gpusense.learning.beam.problem import NOTHING, SMALL_FORM, Problem, Value
+from gpusense.learning.information import newton_direction
 
 # Longest step of a log shape.
 _LONGEST = 2.0
@@ -143,7 +144,7 @@ def newton_step(problem: Problem, value: Value) -> tuple[Value, float]:
     Returns:
         The new value, or the old one; and the gain [nats] that the quadratic model predicted.
     """
-    step, left = newton_direction(problem, value)
+    step, left = free_direction(problem, value)
     if left <= 0:
         return value, 0.0
     form = step[FORM:] / np.maximum(value.point.shape.coordinates, SMALL_FORM)
@@ -159,24 +160,11 @@ def newton_step(problem: Problem, value: Value) -> tuple[Value, float]:
     return value, left
 
 
-def newton_direction(problem: Problem, value: Value) -> tuple[Floats, float]:
-    """Return the Newton step, uphill even if the objective is not concave, and its predicted gain [nats].
-
-    The gain is half the slope along the step.
-    """
+def free_direction(problem: Problem, value: Value) -> tuple[Floats, float]:
+    """Return the Newton step along the free coordinates, and its predicted gain [nats]."""
     assert value.hessian is not None
-    free = problem.free(value)
-    places, step = np.flatnonzero(free), np.zeros(len(free))
-    if not len(places):
-        return step, 0.0
-    curve = -value.hessian[np.ix_(places, places)]
-    gradient = value.gradient[places]
-    scale = 1 / np.sqrt(np.maximum(np.abs(np.diag(curve)), 1e-12 * problem.total + 1e-300))
-    size, axes = np.linalg.eigh(curve * np.outer(scale, scale))
-    slope = axes.T @ (scale * gradient)
-    along = slope / np.maximum(np.abs(size), 1e-9)
-    step[places] = scale * (axes @ along)
-    return step, 0.5 * float(slope @ along)
+    places = np.flatnonzero(problem.free(value))
+    return newton_direction(value.gradient, value.hessian, places, 1e-12 * problem.total + 1e-300)
 
 
 def without_needless(problem: Problem, value: Value) -> Value:

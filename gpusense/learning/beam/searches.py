@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gpusense.learning.beam.em import Climb, Watch, newton_direction, without_needless
+from gpusense.learning.beam.em import Climb, Watch, free_direction, without_needless
 from gpusense.learning.beam.point import BIAS, RAND, Floats, Point
 from gpusense.learning.beam.problem import Problem, Value
 
@@ -88,7 +88,7 @@ class _Search:
     def left(self) -> float:
         """Return the remaining gain that the quadratic model predicts at the best point [nats]."""
         self.best = without_needless(self.problem, self.problem.value(self.best.point, second=True))
-        return newton_direction(self.problem, self.best)[1]
+        return free_direction(self.problem, self.best)[1]
 
 
 def climb_gradient(problem: Problem, start: Point, *, max_iterations: int, tolerance: float, watch: Watch) -> Climb:

@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gpusense.learning.information import newton_direction
 from gpusense.learning.landmark.pairs import (
     RANGE,
     RANGE_BIAS,
@@ -181,20 +182,3 @@ def _newton_step(pairs: Pairs, value: Value, bias: bool) -> tuple[Value, float]:
         scale /= 4
     # A remaining gain below rounding counts as none.
     return value, min(left, 0.0) if left <= _noise(value) else left
-
-
-def newton_direction(gradient: Floats, second: Floats, places: Integers) -> tuple[Floats, float]:
-    """Return the (6,) Newton step along ``places``, uphill even if the function is not concave, and its gain [nats].
-
-    The predicted gain is half the slope along the step.
-    """
-    step = np.zeros(6)
-    if not len(places):
-        return step, 0.0
-    curve = -second[np.ix_(places, places)]
-    scale = 1 / np.sqrt(np.maximum(np.abs(np.diag(curve)), 1e-300))
-    size, axes = np.linalg.eigh(curve * np.outer(scale, scale))
-    slope = axes.T @ (scale * gradient[places])
-    along = slope / np.maximum(np.abs(size), 1e-9)
-    step[places] = scale * (axes @ along)
-    return step, 0.5 * float(slope @ along)

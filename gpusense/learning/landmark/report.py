@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from gpusense.learning.information import scaled_axes
 from gpusense.learning.landmark.em import NOTHING, SIGMAS, bounds_of, free
 from gpusense.learning.landmark.pairs import BEARING_BIAS, ODDS, RANGE_BIAS, Floats, Integers, Pairs, Value, hessian
 from gpusense.learning.landmark.result import LandmarkFit
@@ -111,9 +112,7 @@ def _errors(second: Floats, places: Integers) -> Floats:
     """Return (6,) standard errors along the coordinates; NaN outside ``places``, infinite without information."""
     errors = np.full(6, np.nan)
     if len(places):
-        curve = -second[np.ix_(places, places)]
-        scale = 1 / np.sqrt(np.maximum(np.abs(np.diag(curve)), 1e-300))
-        size, axes = np.linalg.eigh(curve * np.outer(scale, scale))
+        scale, size, axes = scaled_axes(-second[np.ix_(places, places)])
         errors[places] = np.inf
         if size[0] > _FLAT:
             errors[places] = scale * np.sqrt((axes**2 / size).sum(axis=1))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
+from gpusense._util.angles import wrapped
 from gpusense.learning.point.densities import von_mises, wrapped_normal
 from gpusense.learning.point.problem import Floats, Problem, check_labels, mix, number_blocks, of_weight
 from gpusense.learning.point.report import report
@@ -42,10 +43,10 @@ class _Headings(Problem):
         starts = []
         mean = math.atan2(float(np.sin(self.turned).mean()), float(np.cos(self.turned).mean()))
         for around in (mean, *np.linspace(-math.pi, math.pi, _OFFSETS, endpoint=False)):
-            residual = _wrap(self.turned - around)
+            residual = wrapped(self.turned - around)
             near = residual[np.abs(residual) < math.pi / 6] if around != mean else residual
             offset = around + float(np.median(near)) if len(near) else around
-            spread = 1.4826 * float(np.median(np.abs(_wrap(self.turned - offset))))
+            spread = 1.4826 * float(np.median(np.abs(wrapped(self.turned - offset))))
             for sigma, weight in ((spread, 0.05), (0.3 * spread, 0.3), (0.1 * spread, 0.5)):
                 sigma = min(max(sigma, 1e-6), 3.0)
                 shape = math.log(sigma) * (1 if self.kind == "wrapped_normal" else -2)
@@ -54,7 +55,7 @@ class _Headings(Problem):
 
     def log_p(self, theta: Floats) -> tuple[Floats, Floats]:
         density = wrapped_normal if self.kind == "wrapped_normal" else von_mises
-        hit, by_shape, by_offset = density(_wrap(self.turned - theta[2]), math.exp(theta[0]))
+        hit, by_shape, by_offset = density(wrapped(self.turned - theta[2]), math.exp(theta[0]))
         rand = np.full(len(hit), -math.log(2 * math.pi))
         log_p, shares, ratios = mix([(1 - theta[1], hit), (theta[1], rand)])
         return log_p, np.stack([shares[0] * by_shape, ratios[1] - ratios[0], shares[0] * by_offset], axis=1)
@@ -112,16 +113,11 @@ def fit_heading_parameters(
     if not used.any():
         raise ValueError(f"headings: must hold one that is finite, got {len(z)} without")
     numbers = number_blocks(None if labels is None else labels[used])
-    turned = _wrap(_wrap(z[used]) - _wrap(pose[used, 2]))
+    turned = wrapped(wrapped(z[used]) - wrapped(pose[used, 2]))
     problem = _Headings(turned, kind)
     end = maximize(problem, most, least)
     values = problem.values(end.theta)
-    offset = float(_wrap(np.array([values["offset"]]))[0])
+    offset = wrapped(values["offset"])
     end.theta[2] = offset
     parameters = HeadingParameters(**(values | {"offset": offset}), kind=kind)
     return report(problem, end, parameters, numbers, int((~used).sum()))
-
-
-def _wrap(angles: Floats) -> Floats:
-    """Return angles in [-pi, pi]."""
-    return np.asarray(np.remainder(angles + math.pi, 2 * math.pi) - math.pi)

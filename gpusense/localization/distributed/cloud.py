@@ -149,7 +149,7 @@ class SplitCloud(FilterCloud):
             Sums of weights of each shard and of all, the column that counts, and the settings that were used.
         """
         number, settings = stage.number, step.settings
-        highest = max(self._all("score", stage.source, step.given))
+        highest = max(self._all("score", stage.source, step.readings))
         while True:
             each, totals = self._all("weigh", highest, stage), np.zeros(WEIGHT_SUMS)
             join_rows(_PLAIN, np.concatenate(each), totals, self._size, WEIGHT_SUMS, self._size)

@@ -118,39 +118,39 @@ class Shard:
         self._upload_settings(self._part)
         yield
 
-    def score(self, source: int, given: Sequence[SensorReadings]) -> Step:
+    def score(self, source: int, readings: Sequence[SensorReadings]) -> Step:
         """Score the poses of a buffer by readings, and return the largest score."""
         cloud, part = self._cloud, self._part
         if not part.size:
             yield
             return -math.inf
-        if self._gpu and all(self._sensors[index].records(reading) for index, reading in given):
-            for index, reading in given:
+        if self._gpu and all(self._sensors[index].records(reading) for index, reading in readings):
+            for index, reading in readings:
                 self._sensors[index].upload(reading)
-            self._recorded(source, given).start()
+            self._recorded(source, readings).start()
         else:
-            for place, (index, reading) in enumerate(given):
+            for place, (index, reading) in enumerate(readings):
                 out = self._scores(place)
                 self._sensors[index].score(self._poses(source), reading, out, timed=self._timed)
-            self._backend.run(cloud.scoring(len(given)))
+            self._backend.run(cloud.scoring(len(readings)))
         yield
         return float(self._read(cloud.sums.largest, cloud.blocks).max())
 
-    def _recorded(self, source: int, given: Sequence[SensorReadings]) -> RecordedProgram:
+    def _recorded(self, source: int, readings: Sequence[SensorReadings]) -> RecordedProgram:
         """Return the recorded program that scores a buffer; starting it does not wait, so devices work concurrently."""
-        sensors = tuple((index, self._sensors[index].version) for index, _ in given)
+        sensors = tuple((index, self._sensors[index].version) for index, _ in readings)
         key = (source, self._part.size, self._part.block, sensors)
         kept = self._recordings.get(key)
         if kept is not None:
             return kept
         program: Program = ()
         poses, owners = self._poses(source), []
-        for place, (index, _) in enumerate(given):
+        for place, (index, _) in enumerate(readings):
             out = self._scores(place)
             launches, owner = self._sensors[index].program(poses, out)
             program += launches
             owners.append((out, owner))
-        program += self._cloud.scoring(len(given))
+        program += self._cloud.scoring(len(readings))
         return self._recordings.keep(key, RecordedProgram(self._backend, program, (poses, owners)))
 
     def _poses(self, source: int) -> Any:
@@ -280,7 +280,7 @@ class Shard:
         return self._read(self._cloud.weights[index], count)
 
     def sum_poses(self, buffers: tuple[int, int], count: int, block: int, reference: np.ndarray) -> Step:
-        """Return (blocks, 13) sums of weighted poses relative to a reference pose, given the buffers of both."""
+        """Return (blocks, 13) sums of weighted poses relative to a reference pose, both from their buffers."""
         cloud, blocks = self._cloud, -(-count // block)
         if not count:
             yield

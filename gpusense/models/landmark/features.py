@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,13 @@ from gpusense.world.plausible import look_at_bearings
 
 # Discs are widened by this share, for rounding errors of distances.
 _WIDER = 1e-5
+# Columns of low parts, and the columns that they belong to.
+_LOW_PARTS = (
+    (at.RANGE_LOW, at.RANGE_AT), (at.COSINE_LOW, at.COSINE), (at.SINE_LOW, at.SINE),
+    (at.SIGNATURE_LOW, at.SIGNATURE_AT), (at.RANGE_SCALE_LOW, at.RANGE_SCALE),
+    (at.BEARING_SCALE_LOW, at.BEARING_SCALE), (at.SIGNATURE_SCALE_LOW, at.SIGNATURE_SCALE),
+    (at.PEAK_LOW, at.PEAK), (at.UPPER_LOW, at.UPPER),
+)  # fmt: skip
 
 
 def _read(features: object, p: LandmarkParameters) -> np.ndarray:
@@ -232,25 +240,34 @@ def prepare_features(
     numbers[:, at.MOST] = highest
     # A landmark below this adds less than eps to the density of a false positive.
     smallest = false[columns] + math.log(np.finfo(real).eps) - 1
+    bounds = np.full(len(columns), np.inf)
+    if gated:
+        with np.errstate(invalid="ignore"):
+            bounds = np.where(np.isneginf(highest), -np.inf, highest - smallest)
     slack = 16 * np.finfo(real).eps * (extent + 2 * p.range_max)
     # (d + slack)^2 <= 1.01 d^2 + 101 slack^2, and kernels look for 1.01 d^2.
     numbers[:, at.SLACK] = 101 * slack**2
-    for i in range(len(columns)):
-        bound = -math.inf if np.isneginf(highest[i]) else float(highest[i] - smallest[i])
-        reach = reach_of(p, sensor, float(values[i, 0]), measured[i], bound if gated else math.inf)
+    for row, distance, known, bound in zip(numbers, values[:, 0].tolist(), measured, bounds.tolist(), strict=True):
+        reach = reach_of(p, sensor, distance, known, bound)
         radius = reach.radius if reach.radius < 0 else reach.radius * (1 + _WIDER) + slack
-        numbers[i, at.REACH : at.HOLE + 1] = reach.reach, radius, max(reach.hole * (1 - _WIDER) - slack, 0.0)
+        row[at.REACH : at.HOLE + 1] = reach.reach, radius, max(reach.hole * (1 - _WIDER) - slack, 0.0)
+    return PreparedFeatures(columns, in_two_parts(numbers, real, _LOW_PARTS), measured, false)
+
+
+def in_two_parts(numbers: np.ndarray, real: np.dtype, low_parts: Sequence[tuple[int, int]]) -> np.ndarray:
+    """Round numbers, and set columns of low parts to the rounding errors of other columns.
+
+    Args:
+        numbers: (K, FEATURE) float64 numbers.
+        real: Precision of the result.
+        low_parts: Pairs of a column of low parts and the column that it belongs to.
+    """
     with np.errstate(invalid="ignore", over="ignore"):
         high, rest = split(numbers, real)
         low = np.where(np.isfinite(numbers), rest, 0).astype(real)
-    for column, of in (
-        (at.RANGE_LOW, at.RANGE_AT), (at.COSINE_LOW, at.COSINE), (at.SINE_LOW, at.SINE),
-        (at.SIGNATURE_LOW, at.SIGNATURE_AT), (at.RANGE_SCALE_LOW, at.RANGE_SCALE),
-        (at.BEARING_SCALE_LOW, at.BEARING_SCALE), (at.SIGNATURE_SCALE_LOW, at.SIGNATURE_SCALE),
-        (at.PEAK_LOW, at.PEAK), (at.UPPER_LOW, at.UPPER),
-    ):  # fmt: skip
+    for column, of in low_parts:
         high[:, column] = low[:, of]
-    return PreparedFeatures(columns, high, measured, false)
+    return high
 
 
 def _log(weight: float) -> float:

@@ -10,8 +10,8 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.interface import feature_layout as at
 from gpusense.interface.terms import log_weight
-from gpusense.models.landmark.features import PreparedFeatures
-from gpusense.world.frames import Mount, split
+from gpusense.models.landmark.features import PreparedFeatures, in_two_parts
+from gpusense.world.frames import Mount
 from gpusense.world.sensor_parameters import LARGEST_ANGLE_DEVIATION, LineParameters
 
 ANGLE, DISTANCE, FIRST, LAST, ANGLE_VARIANCE, MIXED, DISTANCE_VARIANCE = range(7)
@@ -19,6 +19,12 @@ ANGLE, DISTANCE, FIRST, LAST, ANGLE_VARIANCE, MIXED, DISTANCE_VARIANCE = range(7
 _COLUMNS = (2, 4, 7)
 # Distance that stands for unknown ends [m].
 _UNKNOWN_END = 1e9
+# Columns of low parts, and the columns that they belong to.
+_LOW_PARTS = (
+    (at.RANGE_LOW, at.RANGE_AT), (at.COSINE_LOW, at.COSINE), (at.SINE_LOW, at.SINE),
+    (at.RANGE_SCALE_LOW, at.RANGE_SCALE), (at.BEARING_SCALE_LOW, at.BEARING_SCALE),
+    (at.MIXED_SCALE_LOW, at.MIXED_SCALE), (at.PEAK_LOW, at.PEAK),
+)  # fmt: skip
 # Gates are widened by this share, for rounding errors.
 _WIDER = 1e-5
 # Two features may belong to the same line if their angles differ by less than this [rad].
@@ -136,16 +142,8 @@ def prepare_lines(
     if len(kept) <= grouped:
         numbers[:, at.GROUP] = _groups(kept)
     _gate(numbers, kept, w, p, real, extent=extent, longest=longest, gated=gated)
-    with np.errstate(invalid="ignore", over="ignore"):
-        high, rest = split(numbers, real)
-        low = np.where(np.isfinite(numbers), rest, 0).astype(real)
-    for column, of in (
-        (at.RANGE_LOW, at.RANGE_AT), (at.COSINE_LOW, at.COSINE), (at.SINE_LOW, at.SINE),
-        (at.RANGE_SCALE_LOW, at.RANGE_SCALE), (at.BEARING_SCALE_LOW, at.BEARING_SCALE),
-        (at.MIXED_SCALE_LOW, at.MIXED_SCALE), (at.PEAK_LOW, at.PEAK),
-    ):  # fmt: skip
-        high[:, column] = low[:, of]
-    return PreparedFeatures(columns, high, np.ones((len(columns), 3), bool), false)
+    rounded = in_two_parts(numbers, real, _LOW_PARTS)
+    return PreparedFeatures(columns, rounded, np.ones((len(columns), 3), bool), false)
 
 
 def _gate(

@@ -6,18 +6,18 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray, CasterName, Compat, Precision, Space
 from gpusense.backends import Selection
 from gpusense.backends.results import Result
-from gpusense.interface.plan import Note, Omission
+from gpusense.interface.plan import SceneNotes
 from gpusense.models.arguments import check_absent, check_discrete
+from gpusense.models.scan.beam_density import density_of
 from gpusense.models.scan.beam_explain import scene_notes
 from gpusense.models.scan.beam_pipeline import BeamPipeline
-from gpusense.models.scan.cones import bins_of, cones_of, require_exact
+from gpusense.models.scan.cones import cones_of, require_exact
 from gpusense.models.scan.map_caster import MapCaster
 from gpusense.models.scan.mixture import mixture_on_device
 from gpusense.models.scan.model import ScanModel
@@ -96,38 +96,23 @@ class BeamModel(ScanModel):
         specialize: bool = True,
     ) -> None:
         weights = choose(compat)
-        table = parameters if isinstance(parameters, SensorTable) else None
-        if table is not None:
-            check_discrete(table, scanner, compat, sensor_table)
-        # A table of a sensor replaces the mixture.
-        mixture = weights.beam if parameters is None or table else parameters
-        if not isinstance(mixture, BeamParameters):
-            rule = "must be BeamParameters or a DiscreteBeamModel"
-            raise TypeError(f"parameters: {rule}, got {checks.show(parameters)}")
-        # The parameters of each bin of angles of incidence.
-        mixtures: tuple[BeamParameters, ...] = (mixture,)
-        cosines = np.zeros(1)
-        if incidence is not None:
-            _check_incidence(incidence, parameters=parameters, sensor_table=sensor_table, compat=compat)
-            mixtures, cosines = bins_of(incidence)
-        check_weights(mixture, compat)
+        if isinstance(parameters, SensorTable):
+            check_discrete(parameters, scanner, compat, sensor_table)
+        density = density_of(parameters, weights.beam, incidence, sensor_table=sensor_table, compat=compat)
+        check_weights(density.mixtures[0] if incidence is None else weights.beam, compat)
         if isinstance(weights, Peer):
             _check_peer(weights, sensor_table)
         method = _method_of(caster, weights)
-        max_depends = table is not None or len({p.z_max for p in mixtures}) > 1
         super().__init__(
             grid, scanner, backend=backend, precision=precision,
             unknown=weights.unknown if unknown is None else unknown,
             outside=weights.outside if outside is None else outside,
-            temperature=temperature, beams=beams, compat=compat, cubes=weights.is_peer,
-            specialize=specialize, z_max=max(p.z_max for p in mixtures) if table is None else 1.0,
-            max_depends=max_depends, constant_term=weights.constant_term,
-            # If max readings depend on the pose, the kernel detects impossible ranges.
-            possible=max_depends or any(p.z_hit or p.z_short or p.z_rand for p in mixtures),
+            temperature=temperature, beams=beams, compat=compat, cubes=weights.is_peer, specialize=specialize,
+            z_max=density.z_max, max_depends=density.max_depends, constant_term=weights.constant_term,
+            possible=density.possible,
         )  # fmt: skip
         setting = self._setting
-        self._parameters = mixture if table is None else table
-        self._mixtures, self.incidence_parameters, self.sensor_table = mixtures, incidence, sensor_table
+        self._density, self.sensor_table = density, sensor_table
         self._caster = MapCaster(
             setting.backend, setting.real, grid, scanner.mount, scanner.range_max, method, unknown=self.unknown,
             outside=self.outside, crop=specialize, obstacles_of=weights.obstacles,
@@ -135,10 +120,9 @@ class BeamModel(ScanModel):
         self._beam_pipeline = BeamPipeline(
             setting, self._caster, cones_of(scanner, method, incidence=incidence is not None),
             mixture_on_device(
-                mixtures, cosines, table, scanner.range_max, setting.real, width=sensor_table, compat=weights.name,
-                specialize=specialize, max_depends=max_depends,
+                density, scanner.range_max, setting.real, width=sensor_table, compat=weights.name, specialize=specialize
             ),
-            max_evaluated=max_depends and table is None,
+            max_evaluated=density.max_depends and density.table is None,
         )  # fmt: skip
 
     @property
@@ -146,9 +130,10 @@ class BeamModel(ScanModel):
         return self._beam_pipeline
 
     def _arguments(self) -> dict[str, Any]:
-        angles = self.incidence_parameters
-        options = dict(parameters=None if angles is not None else self._parameters, incidence=angles,
-                       caster=self._caster.method, sensor_table=self.sensor_table)  # fmt: skip
+        options = dict(
+            parameters=self._density.parameters, incidence=self.incidence_parameters, caster=self._caster.method,
+            sensor_table=self.sensor_table,
+        )  # fmt: skip
         return super()._arguments() | options
 
     def _options(self) -> tuple[str, ...]:
@@ -161,9 +146,15 @@ class BeamModel(ScanModel):
         Raises:
             AttributeError: They depend on the angle of incidence; see ``incidence_parameters``.
         """
-        if self.incidence_parameters is not None:
+        parameters = self._density.parameters
+        if parameters is None:
             raise AttributeError("parameters: depend on the angle of incidence here, see incidence_parameters")
-        return self._parameters
+        return parameters
+
+    @property
+    def incidence_parameters(self) -> IncidenceParameters | None:
+        """The parameters by angle of incidence, or None."""
+        return self._density.incidence
 
     @property
     def table_bytes(self) -> int:
@@ -259,23 +250,17 @@ class BeamModel(ScanModel):
         if self._setting.weights.is_peer:
             raise ValueError(f"compat: must be None where readings are drawn, got {self.compat!r}, no density")
         checked, shape = poses_to_draw_at(poses, self._setting.backend)
-        table = self._parameters if isinstance(self._parameters, SensorTable) else None
-        mixture = self._beam_pipeline.mixture
         drawing = drawing_of(
-            self._mixtures, mixture.cosines, table, self.scanner.range_max, self._setting.real, seed=seed, step=step,
-            per_scan=shape[-1],
-        )  # fmt: skip
+            self._density, self.scanner.range_max, self._setting.real, seed=seed, step=step, per_scan=shape[-1]
+        )
         pipeline, shape = self._beam_pipeline, (*shape, self.scanner.count)
         result = Result(poses, out, shape, pipeline.real, pipeline.backend, on_device=checked.on_device)
         cones = dataclasses.replace(pipeline.cones, incidence=drawing.bins > 1)
         self._caster.draw(checked, pipeline.cone_vectors, result.flat, cones, drawing)
         return result.user_array()
 
-    def _notes(self) -> tuple[str, list[Omission], list[Note], list[Note]]:
-        return scene_notes(
-            self._beam_pipeline, self._last, self._mixtures, self.incidence_parameters,
-            discrete=isinstance(self._parameters, SensorTable), weights_note=self._weights_note(),
-        )  # fmt: skip
+    def _notes(self) -> SceneNotes:
+        return scene_notes(self._beam_pipeline, self._last, self._density, self._weights_note())
 
     def _cast(self, poses: AnyArray, out: Any, *, incidence: bool) -> Any:
         pipeline = self._beam_pipeline
@@ -304,15 +289,3 @@ def _check_peer(peer: Peer, sensor_table: object) -> None:
     check_absent("with compat", sensor_table=sensor_table)
     if peer.prob:
         raise ValueError(f"compat: prob must be False for a beam model, got {checks.show(peer)}")
-
-
-def _check_incidence(incidence: object, **others: object) -> None:
-    """Refuse parameters by angle of incidence of a wrong type, or with conflicting options.
-
-    Raises:
-        TypeError: Not IncidenceParameters.
-        ValueError: A conflicting option is set.
-    """
-    if not isinstance(incidence, IncidenceParameters):
-        raise TypeError(f"incidence: must be IncidenceParameters, got {checks.show(incidence)}")
-    check_absent("with incidence", **others)

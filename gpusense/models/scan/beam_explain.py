@@ -4,8 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gpusense.interface.plan import Note, Omission, component_notes, launch_omissions, precision_notes, share
+from gpusense.interface.plan import (
+    Note,
+    Omission,
+    SceneNotes,
+    component_notes,
+    launch_omissions,
+    precision_notes,
+    share,
+)
 from gpusense.interface.terms import HIGH_PEAK
+from gpusense.models.scan.beam_density import BeamDensity
 from gpusense.models.scan.beam_pipeline import BeamPipeline
 from gpusense.models.scan.mixture import hit_peak
 from gpusense.models.scan.scoring import LastCall
@@ -24,54 +33,30 @@ _MOMENTS = (
 )
 
 
-def scene_notes(
-    pipeline: BeamPipeline,
-    last: LastCall,
-    mixtures: Sequence[BeamParameters],
-    incidence: IncidenceParameters | None,
-    *,
-    discrete: bool,
-    weights_note: str,
-) -> tuple[str, list[Omission], list[Note], list[Note]]:
+def scene_notes(pipeline: BeamPipeline, last: LastCall, density: BeamDensity, weights_note: str) -> SceneNotes:
     """Return the report's title and the parts left out, kept, and removable, as of the last call.
 
     Args:
         pipeline: The stages of the model.
         last: The last call.
-        mixtures: Parameters of each bin of angles of incidence.
-        incidence: The parameters by angle of incidence, or None.
-        discrete: Whether the model is the table of a sensor.
+        density: The density of the model.
         weights_note: Words of the title about weights of other programs.
     """
-    caster, flags, scan = pipeline.caster, last.flags, last.scan
-    scanner, real, weights = pipeline.scanner, pipeline.real.name, pipeline.setting.weights
-    tabulated = pipeline.mixture.table is not None
+    flags, real, weights = last.flags, pipeline.real.name, pipeline.setting.weights
+    mixtures, discrete = density.mixtures, density.table is not None
+    tabulated = discrete or pipeline.mixture.table is not None
     components = [(name, max(getattr(p, name) for p in mixtures), cost) for name, cost in _COSTS]
     omissions, kept = component_notes([] if discrete else components)
     kept_precision, could_go = precision_notes(real)
     kept += kept_precision
-    if not (discrete or tabulated or weights.is_peer):
+    if not (tabulated or weights.is_peer):
         mixture_kept, mixture_could_go = _kept_of_mixture(pipeline, mixtures)
         kept += mixture_kept
         could_go += mixture_could_go
     if "ORIGINS_OUTSIDE" in flags:
         kept.append(Note("entry from outside", "a beam starts outside the map, or may do so"))
-    if scan is not None and scan.shared:
-        spared = len(scan.readings) - len(scan.rays)
-        omissions.append(
-            Omission(
-                "repeated bearings",
-                f"{len(scan.readings)} readings lie on {len(scan.rays)} rays",
-                f"{share(spared, len(scan.readings))} of the ray casts",
-            )
-        )
-    if flags and "ORIGINS_OUTSIDE" not in flags:
-        entry = frozenset({"ORIGINS_OUTSIDE"})
-        omissions.append(Omission("entry from outside", "every beam starts inside the map", "a branch per ray", entry))
-    if "STOPS" in flags:
-        why = "nothing beyond a reading and a few sigma_hit changes its density by a bit"
-        omissions.append(Omission("rays behind readings", why, "the rest of these rays", ends=frozenset({"STOPS"})))
-    if flags and "LINEAR" in flags and not (discrete or tabulated):
+    omissions += _ray_omissions(last)
+    if flags and "LINEAR" in flags and not tabulated:
         omissions.append(
             Omission("log-domain sum", "z_rand bounds the mixture from below", "2 exp and 3 log per particle-beam")
         )
@@ -80,16 +65,37 @@ def scene_notes(
     else:
         omissions += _mixture_omissions(pipeline, discrete=discrete)
     omissions += launch_omissions(flags, LEAST_ORDERED if pipeline.backend.info.kind == "gpu" else None)
-    if (far := caster.omission()) is not None:
+    if (far := pipeline.caster.omission()) is not None:
         omissions.append(far)
-    method = "" if caster.method.name == "exact" else f", ranges by {caster.method}"
-    method += pipeline.cones.words(scanner.critical_incidence)
+    name = "beam model" if not discrete else "discrete beam model"
+    return SceneNotes(f"{name}{weights_note}{_method(pipeline, density.incidence)}, {real}", omissions, kept, could_go)
+
+
+def _method(pipeline: BeamPipeline, incidence: IncidenceParameters | None) -> str:
+    """Return the words of the title about ray casting, cones and angles of incidence."""
+    method = "" if pipeline.caster.method.name == "exact" else f", ranges by {pipeline.caster.method}"
+    method += pipeline.cones.words(pipeline.scanner.critical_incidence)
     if incidence is not None:
         method += f", parameters for {len(incidence.parameters)} ranges of the angle of incidence"
         method += " and for none" if incidence.no_surface is not None else ""
         method += " (max readings depend on it)" if pipeline.rules.max_depends else ""
-    name = "beam model" if not discrete else "discrete beam model"
-    return f"{name}{weights_note}{method}, {real}", omissions, kept, could_go
+    return method
+
+
+def _ray_omissions(last: LastCall) -> list[Omission]:
+    """Return the rays of the last call, or parts of them, that are not cast."""
+    omissions, flags, scan = [], last.flags, last.scan
+    if scan is not None and scan.shared:
+        readings, rays = len(scan.readings), len(scan.rays)
+        why = f"{readings} readings lie on {rays} rays"
+        omissions.append(Omission("repeated bearings", why, f"{share(readings - rays, readings)} of the ray casts"))
+    if flags and "ORIGINS_OUTSIDE" not in flags:
+        entry = frozenset({"ORIGINS_OUTSIDE"})
+        omissions.append(Omission("entry from outside", "every beam starts inside the map", "a branch per ray", entry))
+    if "STOPS" in flags:
+        why = "nothing beyond a reading and a few sigma_hit changes its density by a bit"
+        omissions.append(Omission("rays behind readings", why, "the rest of these rays", ends=frozenset({"STOPS"})))
+    return omissions
 
 
 def _kept_of_mixture(pipeline: BeamPipeline, mixtures: Sequence[BeamParameters]) -> tuple[list[Note], list[Note]]:

@@ -5,17 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from gpusense._util import checks
 from gpusense.interface import structs
 from gpusense.interface.flags import flags_if
 from gpusense.tables.casters import Caster
-from gpusense.world.parameters import BeamParameters, IncidenceParameters
 from gpusense.world.scanner import Scanner
-
-# Between 1, the largest cosine, and 2, which kernels use for a ray without a return.
-_BEYOND = 1.5
 
 
 @dataclass(frozen=True)
@@ -63,14 +57,6 @@ def cones_of(scanner: Scanner, method: Caster, *, incidence: bool) -> Cones:
     if incidence:
         require_exact("caster", method)
     return Cones(scanner.cone_rays, least, incidence)
-
-
-def bins_of(incidence: IncidenceParameters) -> tuple[tuple[BeamParameters, ...], np.ndarray]:
-    """Return the mixtures in the kernels' order, first for beams without a hit, and the cosines between them."""
-    cosines = np.cos(incidence.edges[1:])
-    if incidence.no_surface is None:
-        return incidence.parameters, cosines
-    return (incidence.no_surface, *incidence.parameters), np.append(_BEYOND, cosines)
 
 
 def require_exact(argument: str, method: Caster) -> None:

@@ -12,7 +12,14 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray, Compat, Precision, Space
 from gpusense.backends import Selection
-from gpusense.interface.plan import Note, Omission, component_notes, launch_omissions, precision_notes
+from gpusense.interface.plan import (
+    Note,
+    Omission,
+    SceneNotes,
+    component_notes,
+    launch_omissions,
+    precision_notes,
+)  # fmt: skip
 from gpusense.interface.terms import HIGH_PEAK
 from gpusense.models.run import finish
 from gpusense.models.scan.differentiable import Differentiable
@@ -183,7 +190,7 @@ class LikelihoodFieldModel(ScanModel):
             "beam's readings depends on the pose: draw from a BeamModel of the same map"
         )
 
-    def _notes(self) -> tuple[str, list[Omission], list[Note], list[Note]]:
+    def _notes(self) -> SceneNotes:
         p, pipeline = self.parameters, self._field_pipeline
         bilinear = p.interpolation == "bilinear"
         omissions, kept = component_notes(
@@ -219,4 +226,4 @@ class LikelihoodFieldModel(ScanModel):
         omissions += launch_omissions(self._last.flags)
         if (far := pipeline.map.omission(pipeline.real.itemsize)) is not None:
             omissions.append(far)
-        return f"likelihood field{self._weights_note()}, {self.precision}", omissions, kept, could_go
+        return SceneNotes(f"likelihood field{self._weights_note()}, {self.precision}", omissions, kept, could_go)

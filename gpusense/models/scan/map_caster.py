@@ -26,7 +26,6 @@ from gpusense.models.scan.tiles import all_within, order_of, tiles_of
 from gpusense.tables import casters
 from gpusense.tables.caster_base import Caster, CasterInput
 from gpusense.tables.lookup_files import describe, write_lookup
-from gpusense.tables.normals import normal_table
 from gpusense.tables.reachable import ObstaclesOf, ReachableMap, TableMemoryError, obstacles_of
 from gpusense.world.frames import Mount
 from gpusense.world.grid import OccupancyGrid
@@ -102,6 +101,8 @@ class MapCaster:
         if "INCIDENCE" not in flags:
             return self._no_normals
         if self._normals is None or self._normals[0] != window:
+            from gpusense.tables.normals import normal_table
+
             self._normals = None
             try:
                 table = normal_table(self.map.obstacles, window, self.outside, self.real)

@@ -11,11 +11,11 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.interface.flags import flags_if
 from gpusense.interface.terms import HIGH_PEAK, log_weight, rounded_terms, sums_linearly
+from gpusense.models.scan.beam_density import BeamDensity
 from gpusense.world.hit_shapes import shape_of
 from gpusense.world.hit_tables import mass_tables
 from gpusense.world.parameters import BeamParameters
 from gpusense.world.range_causes import NoReturn, RandomDensity, ShortDensity
-from gpusense.world.sensor_table import SensorTable
 
 # Largest number of bins of a sensor's table along each axis: 268 MB in float32.
 _MOST_BINS = 8192
@@ -49,39 +49,34 @@ class Mixture:
 
 
 def mixture_on_device(
-    mixtures: Sequence[BeamParameters],
-    cosines: np.ndarray,
-    table: SensorTable | None,
+    density: BeamDensity,
     range_max: float,
     real: np.dtype,
     *,
     width: float | None,
     compat: str | None,
     specialize: bool,
-    max_depends: bool,
 ) -> Mixture:
     """Return a beam model's mixture as arguments of kernels.
 
     Args:
-        mixtures: Parameters of each bin of angles of incidence.
-        cosines: Cosines between these bins.
-        table: The table of a sensor in place of a mixture, or None.
+        density: The density.
         range_max: Longest range [m].
         real: Precision.
         width: Width of the bins in which the mixture is tabulated [m]; None evaluates it.
         compat: The program whose weights are reproduced, or None.
         specialize: False leaves nothing out.
-        max_depends: Whether the probability of a max reading depends on the pose.
 
     Raises:
         ValueError: A number is beyond what the precision can hold.
         TypeError, ValueError: A width that is not a number, too small or more than range_max.
     """
+    mixtures, cosines = density.mixtures, density.cosines
     if compat is not None:
         return Mixture(*peer_mixture(mixtures[0], range_max, real, amcl=compat == "amcl"), cosines)
-    flags, terms = mixture_of(mixtures, range_max, real, specialize=specialize, max_depends=max_depends)
-    if table is not None:
-        values = table.sensor_table(real)
+    flags, terms = mixture_of(mixtures, range_max, real, specialize=specialize, max_depends=density.max_depends)
+    if density.table is not None:
+        values = density.table.sensor_table(real)
         # Sums of finite numbers need no check for impossible readings.
         flags = flags_if(SENSOR_TABLE=True, LINEAR=bool(np.isfinite(values).all()))
         return Mixture(flags, terms, cosines, values)

@@ -17,12 +17,13 @@ from gpusense._util.html import card, split_options
 from gpusense._util.typing import AnyArray, Compat, Precision
 from gpusense.backends import Backend, BackendInfo, Selection, get_backend
 from gpusense.backends.workspace import Workspace
-from gpusense.interface.plan import Note, Omission, Plan, share
+from gpusense.interface.plan import Plan, SceneNotes
 from gpusense.models.arguments import check_scene, map_words, real_dtype
 from gpusense.models.pickled import Pickled
 from gpusense.models.poses import Poses
 from gpusense.models.run import finish
 from gpusense.models.scan.differentiable import Differentiable, is_recorded, log_likelihood_of
+from gpusense.models.scan.explain import plan_of_call
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.request import Request, make_request
 from gpusense.models.scan.rules import Beams, ModelContext, Rules, check_beams
@@ -334,18 +335,15 @@ class ScanModel(Pickled):
         Raises:
             RuntimeError: As :meth:`explain`.
         """
-        title, omissions, kept, could_go = self._notes()
-        plan = self._plan(title, omissions, kept, could_go)
-        if measure:
-            from gpusense.models.scan.savings import measured_savings
+        plan = plan_of_call(self._notes(), self._setting, self._last)
+        if not measure:
+            return plan
+        from gpusense.models.scan.savings import measured_savings
 
-            with self._lock:
-                savings = measured_savings(
-                    functools.partial(make_request, self._setting), self._pipeline, self._last, plan,
-                    self.scanner.count,
-                )  # fmt: skip
-            plan = dataclasses.replace(plan, measured=savings)
-        return plan
+        with self._lock:
+            requests = functools.partial(make_request, self._setting)
+            savings = measured_savings(requests, self._pipeline, self._last, plan, self.scanner.count)
+        return dataclasses.replace(plan, measured=savings)
 
     def sources(self) -> dict[str, str]:
         """Return the text of the kernels that score a scan, as compiled for the last call.
@@ -358,7 +356,7 @@ class ScanModel(Pickled):
         return sources_of(self._setting.backend, self._last)
 
     @abstractmethod
-    def _notes(self) -> tuple[str, list[Omission], list[Note], list[Note]]:
+    def _notes(self) -> SceneNotes:
         """Return the report's title, and the parts that are left out, kept, and removable."""
 
     def prepare(self, poses: AnyArray) -> None:
@@ -375,25 +373,3 @@ class ScanModel(Pickled):
 
     def _weights_note(self) -> str:
         return "" if self.compat is None else f" with the weights of {self._setting.weights.name} (no likelihood)"
-
-    def _plan(self, title: str, omissions: list[Omission], kept: list[Note], could_go: list[Note]) -> Plan:
-        """Return the plan as of the last call."""
-        title = f"{title}, {self.device.selection} ({self.device.name})"
-        if not self._setting.rules.specialize:
-            return Plan(f"{title}, specialize=False", self._last.flags, ())
-        if (together := self._last.together) > 1:
-            saved = f"{together - 1} of {together} sets of launches"
-            omissions.append(Omission("launches of single scans", f"{together} scans are scored together", saved))
-        scan = self._last.scan
-        if scan is not None:
-            count, left_out = self.scanner.count, scan.left_out
-            for left, what, why in (
-                (left_out.missing, "missing readings", "say nothing"),
-                (left_out.ignored_max, "max readings", "say nothing while z_max = 0"),
-                (len(left_out.constant_max), "max readings", "have probability z_max at every pose"),
-                (left_out.thinned, "thinned beams", "are not among those that beams= chose"),
-            ):
-                if left:
-                    why = f"{left} of {count} readings {why}"
-                    omissions.append(Omission(what, why, f"{share(left, count)} of the beams"))
-        return Plan(title, self._last.flags, tuple(omissions), tuple(kept), tuple(could_go))

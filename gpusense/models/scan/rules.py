@@ -93,7 +93,7 @@ class Rules:
     @functools.cached_property
     def separate(self) -> bool:
         """Tell whether each reading has a separate ray, because all bearings differ or nothing is left out."""
-        return not self.specialize or len(np.unique(self.vectors, axis=0)) == len(self.vectors)
+        return not self.specialize or len(set(map(tuple, self.vectors.tolist()))) == len(self.vectors)
 
     @functools.cached_property
     def limits(self) -> tuple[float, float]:

@@ -16,6 +16,7 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Launch, launch
 from gpusense.interface.structs import MixtureTables, RangeScale
 from gpusense.models.poses import Poses
+from gpusense.models.scan.beam_density import BeamDensity
 from gpusense.world.hit_shapes import HitShape, shape_of
 from gpusense.world.hit_tables import mass_table, quantile_table
 from gpusense.world.parameters import BeamParameters
@@ -104,15 +105,7 @@ class Drawing:
 
 
 def drawing_of(
-    mixtures: tuple[BeamParameters, ...],
-    cosines: np.ndarray,
-    table: SensorTable | None,
-    range_max: float,
-    real: np.dtype,
-    *,
-    seed: object,
-    step: object,
-    per_scan: int,
+    density: BeamDensity, range_max: float, real: np.dtype, *, seed: object, step: object, per_scan: int
 ) -> Drawing:
     """Return the numbers by which a model draws.
 
@@ -121,10 +114,11 @@ def drawing_of(
     """
     key = checks.integer("seed", seed, low=0, high=MOST_SEED)
     first = checks.integer("step", step, low=0, high=MOST_STEP)
+    mixtures, table = density.mixtures, density.table
     chances, cells = (np.zeros(1), 0) if table is None else (chances_of(table), table.bins)
     return Drawing(
-        mixture_numbers(mixtures), cosines.astype(real), chances, cells, range_max, real, key, first, max(per_scan, 1),
-        shape_of(mixtures[0]).flags & {"MASS_TABLE"},
+        mixture_numbers(mixtures), density.cosines.astype(real), chances, cells, range_max, real, key, first,
+        max(per_scan, 1), shape_of(mixtures[0]).flags & {"MASS_TABLE"},
     )  # fmt: skip
 
 

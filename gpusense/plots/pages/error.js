@@ -1,7 +1,7 @@
 "use strict";
 const $ = id => document.getElementById(id), {rows, origins, text} = JSON.parse($("data").textContent);
 const COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#7f4f24", "#5e3c99", "#7a7a7a", "#66a61e", "#e7298a", "#8b0000", "#1b7f79"];
-const ALL = "all maps", SMALLEST = 1e-6, W = 900, H = 460, LEFT = 74, STRIP = 72, RIGHT = 20, TOP = 16, BOTTOM = 44;
+const ALL = "all maps", SMALLEST = 1e-6, CLOSE = 1.25, ALIKE = 1.25, W = 900, H = 460, LEFT = 74, STRIP = 72, RIGHT = 20, TOP = 16, BOTTOM = 44;
 const unique = list => [...new Set(list)];
 
 function fill(select, options) {
@@ -38,9 +38,11 @@ function paretoFront(list) {
   return front;
 }
 
-/** The most exact row within a time; of equally exact ones the fastest. */
+/** The most exact row within a time; of equally exact ones the fastest, of equally fast ones the first by place, as choose() of Python. */
 function recommended(list, seconds) {
-  return list.filter(row => row.time <= seconds).sort((a, b) => rounded(a) - rounded(b) || a.time - b.time)[0];
+  const least = (rows, value) => Math.min(...rows.map(value)), able = list.filter(row => row.time <= seconds);
+  const exact = able.filter(row => row.error <= CLOSE * Math.max(SMALLEST, least(able, one => one.error)));
+  return exact.filter(row => row.time <= ALIKE * least(exact, one => one.time)).sort((a, b) => a.place - b.place)[0];
 }
 
 /** The steps [factor, share] of each method's performance profile (Dolan and More 2002), best first; of a method its best setting. */

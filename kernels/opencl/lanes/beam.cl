@@ -1,8 +1,8 @@
 // Beam model of a whole scan, LANES rays at once: score_beams of beam.cl, with sums in the same order.
 // requires: error_free lanes/returns lanes/mixture lanes/sensor_table
 
-// Vectors of a particle's rays that are cast before their densities are computed. A cast ends by a branch that processors
-// cannot foresee; the densities that follow one another have none, so that processors compute several at once.
+// Vectors of a particle's rays that are cast before their densities are computed. A cast ends in a branch that
+// processors mispredict; consecutive densities have no branch, so that processors compute several at once.
 #define VECTORS 4
 
 // Return the distances in cells to which the rays of readings are cast.

@@ -17,7 +17,7 @@
 #define FAR_CELLS 1e9f
 #define LOG_TWO 0.693147181f
 #define LOG_TWO_ROOT_PI 1.26551212f
-// From here on the series has the digits of float32.
+// From here on the series is accurate to float32.
 #define LARGE 4.0f
 #define SERIES 12
 

@@ -7,7 +7,7 @@
 #define ROUND_INT 12582912.0f
 #define ROUND_BITS 0x4b400000
 
-// Poses of LANES particles: cells of the padded table, fractions of a cell, and directions. Low parts are those of
+// Poses of LANES particles: cells of the padded table, fractions of a cell, and directions. Low parts belong to
 // float32.
 typedef struct {
     ilanes col, row;

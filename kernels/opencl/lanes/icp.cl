@@ -11,7 +11,7 @@
 #define TAN_EIGHTH 0.414213562f
 #define ARCSIN 0.571f
 #define BEARING_ERROR 1e-5f
-// Up to as many points are compared one and all.
+// Scans of up to this many points are searched completely.
 #define FEW_POINTS 64
 
 // Return the smallest lane.
@@ -42,7 +42,7 @@ real turned_bearing(global const real4 *point, const int count, const int skip, 
                  : i >= count ? point[skip * (i - count)].z + FULL_TURN : point[skip * i].z;
 }
 
-// Keep the points from one to before another where they are nearer; see turned_bearing.
+// Compare with the points from one to before another, and keep those that are nearer; see turned_bearing.
 void compare_lanes(global const real4 *point, const int count, const int skip, const int from, const int to,
                    const lanes x, const lanes y, lanes *best, ilanes *which) {
     lanes least = *best;

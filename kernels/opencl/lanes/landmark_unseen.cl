@@ -1,5 +1,5 @@
 // Negative information: count_unseen of landmark_unseen.cl, for LANES landmarks of a particle at once, with the same
-// bits. Landmarks of neighbouring buckets lie side by side, so that it does not matter how particles lie.
+// bits. Landmarks of neighbouring buckets lie side by side, wherever the particles are.
 // requires: landmark_grid lanes/offsets
 
 // Return the high parts of the offsets from a sensor to landmarks.
@@ -8,7 +8,8 @@ lanes offset_to_lanes(const lanes landmark, const lanes landmark_low, const real
     return sum.hi + (sum.lo + (landmark_low - place_low));
 }
 
-// Where a particle's sensor is, the axis of its view, and the buckets in its range: first and last column, then row.
+// The place of a particle's sensor, the axis of its view, and the buckets in its range: first and last column, then
+// row.
 typedef struct {
     real4 place;
     real cosine, sine;
@@ -58,7 +59,7 @@ kernel void count_unseen(ARGUMENTS) {
             if (!(same.x & same.y & same.z & same.w)) break;
         }
         for (int row = seen.z; row <= seen.w; ++row) {
-            // Whole rows follow one another.
+            // Whole rows are contiguous, so that they are one run.
             const int whole = seen.x == 0 && seen.y == buckets.cols - 1, to = whole ? seen.w : row;
             const int last = start[to * buckets.cols + seen.y + 1];
             for (int j = start[row * buckets.cols + seen.x]; j < last; j += LANES) {

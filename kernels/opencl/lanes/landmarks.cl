@@ -147,7 +147,7 @@ lanes log_detection_lanes(const LanePlace off, const LanePlace turned, global co
 #endif
 #if SIGNATURE
     if (feature[SIGNATURE_SCALE] > 0) {
-        // It is the same for all particles.
+        // The error of the signature is the same for all particles.
         const real2 first = two_sum(feature[SIGNATURE_AT], -signature.x);
         const real2 s = two_sum(first.x, first.y + (feature[SIGNATURE_LOW] - signature.y));
         const real2 alone = add_square(0, s, feature[SIGNATURE_SCALE], feature[SIGNATURE_SCALE_LOW]);

@@ -1,7 +1,7 @@
 // Lines through LANES points of a scan at once: fit_lines of lines.cl.
 // requires: lanes/math
 
-// Fit lines to LANES points and their neighbours. At most MOST points on either side.
+// Fit lines to LANES points and at most MOST neighbours on either side.
 #define MOST 48
 #define WHOLE_TURN 6.283185307179586f
 kernel void fit_lines(ARGUMENTS) {

@@ -1,5 +1,5 @@
-// Exponentials, logarithms, the error function and the arc tangent in lanes. PoCL's own are calls that pass vectors
-// through memory; for float64 they are used nonetheless. With |r| <= log(2) / 2 and 1 + f from sqrt(1/2) to sqrt(2):
+// Exponentials, logarithms, the error function and the arc tangent in lanes. PoCL's functions are calls that pass
+// vectors through memory; only float64 uses them. With |r| <= log(2) / 2 and 1 + f from sqrt(1/2) to sqrt(2):
 //     e^a = 2^k e^r,  e^r = 1 + r + r^2 E(r);   log(2^k (1 + f)) = k log 2 + f - f^2 / 2 + f^3 L(f);
 //     erf(x) = 1 - exp(-x W(x));   log erfc(x) = -x V(x);   arctan t = t + t^3 A(t^2).
 // bench/derive/lane_constants.py derives the constants; tests/kernels/test_lane_math.py measures the worst errors that

@@ -7,7 +7,7 @@
 #else
 #define SMALL_DECAY 2.98023224e-08f
 #endif
-// Number i of the terms; bins of angles of incidence have terms of their own, from index bin_at on.
+// Number i of the terms; the terms of a bin of angles of incidence begin at index bin_at.
 #if INCIDENCE
 #define TERM(i) GATHER(lanes, (terms + (i)), bin_at)
 #else

@@ -1,4 +1,4 @@
-// Rays of LANES beams in the grid's frame, and what the bodies in lanes share on them: ray.cl in lanes.
+// Rays of LANES beams in the grid's frame, and functions on rays that the bodies in lanes share: ray.cl in lanes.
 // requires: ray lanes/types
 
 // Bits of the count 0; they have the integers of counts in their last bits.

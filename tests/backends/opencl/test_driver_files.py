@@ -105,7 +105,7 @@ def test_half_a_wheel_is_none(machine, intel, monkeypatch, problem):
 
 @pytest.fixture
 def trials(machine, monkeypatch):
-    """Let children run, as a list of failures in turn says; return the list of drivers that each has loaded."""
+    """Run children with a list of failures in turn; return the list of drivers that each one has loaded."""
     failures, loaded = [], []
 
     def run_text(arguments, job, variables):

@@ -244,7 +244,7 @@ def test_backends_of_queues(queue):
     gc.collect()
     assert queue.int_ptr not in selection._BACKENDS_OF_QUEUES
     properties = cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
-    with pytest.raises(ValueError, match="backend: must be a queue that does commands in their order"):
+    with pytest.raises(ValueError, match="backend: must be an in-order queue"):
         get_backend(cl.CommandQueue(queue.context, properties=properties))
     for wrong in (queue.context, 3, None):
         with pytest.raises(TypeError, match="backend: must be a selection string or a queue of pyopencl, got"):

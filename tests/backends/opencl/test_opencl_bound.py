@@ -66,7 +66,7 @@ def test_bound_calls_on_another_queue(as_gpu, queue, there):
         with pytest.raises(TypeError, match=r"^stream: must be a queue of the model's context and device, got"):
             call(stream)
     properties = cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
-    with pytest.raises(ValueError, match="stream: must be a queue that does commands in their order"):
+    with pytest.raises(ValueError, match="stream: must be an in-order queue"):
         call(cl.CommandQueue(queue.context, properties=properties))
     # Nothing that a queue still works on is freed.
     call(other)
@@ -75,7 +75,7 @@ def test_bound_calls_on_another_queue(as_gpu, queue, there):
 
 
 def test_a_bound_call_binds_no_argument_again(as_gpu, queue, there, monkeypatch):
-    """A call is three launches, started by kernels of its own."""
+    """A call is three launches with kernel objects of its own."""
     from gpusense.backends.opencl import replay as _opencl_replay
 
     model = FIELD(GRID, NEAR, backend=queue)

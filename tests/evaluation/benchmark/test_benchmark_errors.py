@@ -120,7 +120,8 @@ def test_comparable_temperatures_undo_a_factor():
 
 
 def test_thinned_beams_count_as_often_as_they_stand_for():
-    """Every fourth beam at four times the temperature comes near the posterior of all, and at its own does not."""
+    """Every fourth beam approximates the posterior of all beams at four times the temperature, and not at the same
+    one."""
     scene = quick_scene("building", beams=360, particles=200)
     truth = accuracy.Truth(scene, scene.clouds["tracking"], get_backend("numpy"))
     (made,) = [one for one in candidates.candidates(["field"]) if one.variant == "fewer beams" and one.value == 4]
@@ -154,7 +155,7 @@ def test_scored_ranges_are_the_beam_models():
 
 @pytest.mark.parametrize("selection", ["opencl", "warp"])
 def test_truth_is_the_numpy_reference(selection, needs):
-    """The device that gives the truth computes what float64 NumPy does."""
+    """The device for the truth computes the values of float64 NumPy."""
     scene, backend = quick_scene("building"), get_backend(needs(selection))
     truth, reference = (
         accuracy.Truth(scene, scene.clouds["global"], device) for device in (backend, get_backend("numpy"))

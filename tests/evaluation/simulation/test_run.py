@@ -1,4 +1,4 @@
-"""Simulated runs: paths, odometry, people, changes of the world, glass, kidnapping, and what follows from a seed."""
+"""Simulated runs: paths, odometry, people, changes of the world, glass, kidnapping, and seeds."""
 
 from __future__ import annotations
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.gradients import check_gradients
 
 import gpusense as gs
 from gpusense.learning.beam import growth
@@ -29,13 +30,8 @@ def test_gradients_are_those_of_differences(bias: bool, monkeypatch: pytest.Monk
     monkeypatch.setattr(growth, "maximize", lambda p, *rest: seen.append(p) or real(p, *rest))
     z, expected = draw(500, 1)
     gs.fit_beam_parameters(z, expected, 10.0, sigma_growth=True, range_bias=bias, backend="numpy")
-    problem = seen[0]
     theta = np.array([0.1, 0.2, 0.15, np.log(0.1), 0.02, np.log(0.5), *([0.05] if bias else [])])
-    gradient = problem.log_p(theta)[1]
-    for k, step in enumerate(1e-6 * problem.scales(theta)):
-        ends = [problem.log_p(theta + sign * step * np.eye(len(theta))[k])[0] for sign in (1, -1)]
-        size = 1 + np.abs(gradient[:, k]).max()
-        np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), gradient[:, k], rtol=0, atol=1e-8 * size)
+    check_gradients(seen[0], theta)
 
 
 def test_all_parameters_are_found(needs) -> None:

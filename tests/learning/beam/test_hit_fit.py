@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from scipy.optimize import minimize
+from support.gradients import check_gradients
 
 import gpusense as gs
 from gpusense.learning.beam import growth
@@ -111,12 +112,7 @@ def test_gradients_are_those_of_differences(bias: bool, monkeypatch: pytest.Monk
         z, expected, RANGE, range_bias=bias, sigma_growth=True, hit="student", backend="numpy", max_iterations=2
     )
     theta = np.array([0.1, 0.2, 0.15, np.log(0.1), 0.01, np.log(0.5), *([0.05] if bias else []), 0.3])
-    gradient = seen[0].log_p(theta)[1]
-    for k in range(len(theta)):
-        step = 1e-6 * seen[0].scales(theta)[k]
-        ends = [seen[0].log_p(theta + sign * step * np.eye(len(theta))[k])[0] for sign in (1, -1)]
-        size = 1 + np.abs(gradient[:, k]).max()
-        np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), gradient[:, k], rtol=0, atol=1e-7 * size)
+    check_gradients(seen[0], theta, 1e-7)
 
 
 def test_a_fit_may_start_from_its_shape() -> None:

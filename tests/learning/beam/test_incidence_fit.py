@@ -26,6 +26,7 @@ def scene(counts: tuple[int, int], seed: int = 0) -> tuple[np.ndarray, np.ndarra
     return np.concatenate(z), expected, angles
 
 
+@pytest.mark.sampled(1, without="warp:cpu")
 def test_every_bin_finds_its_own_parameters(backend: str) -> None:
     z, expected, angles = scene((3000, 3000))
     fit = gs.fit_incidence_parameters(z, expected, angles, RANGE_MAX, bins=2, backend=backend, strength=0)
@@ -133,6 +134,7 @@ def test_beams_that_hit_nothing_may_need_a_cause_that_walls_do_not() -> None:
     assert fit.parameters.no_surface.z_max == pytest.approx(20 / 50, rel=1e-6) and fit.converged
 
 
+@pytest.mark.sampled(1, without="warp:cpu")
 def test_a_model_gives_readings_the_likelihood_of_their_fit(backend: str) -> None:
     cells = np.zeros((60, 80), np.int8)
     cells[5, 5:75], cells[5:50, 5], cells[40, 30:60] = 100, 100, 100

@@ -12,7 +12,7 @@ RANGE_MAX, BINS = 10.0, 40
 
 
 def draw(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Draw readings in the middles of steps, from the model's own table."""
+    """Draw readings in the middles of bins, from the model's table."""
     rng = np.random.default_rng(seed)
     table = gs.DiscreteBeamModel(TRUTH, RANGE_MAX, BINS)
     rows = rng.integers(4, 36, count)

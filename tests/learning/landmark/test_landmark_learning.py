@@ -1,4 +1,4 @@
-"""Learning the landmark model: the likelihood against the model's own, truth within errors, degenerate data named."""
+"""Learning the landmark model: the model's likelihood, truth within errors, degenerate data."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_detections_are_counted():
 
 @pytest.mark.parametrize("view", VIEWS)
 def test_likelihood_is_the_models(view):
-    """Known landmarks: LandmarkModel's own number; unknown ones: its sum over a map that is all in view."""
+    """Known landmarks: the number of LandmarkModel; unknown ones: its sum over a map entirely in view."""
     seen = world.simulate(5, field_of_view=view, scans=8)
     found = fit(seen, field_of_view=view)
     lm = gs.LandmarkMap(seen.xy)

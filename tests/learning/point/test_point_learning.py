@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import optimize
+from support.gradients import check_gradients
 
 import gpusense as gs
 from gpusense.learning.point import beacons, bumper, heading, position
@@ -56,12 +57,7 @@ def problems() -> list[tuple[str, Problem, list[float]]]:
 @pytest.mark.parametrize("name, problem, at", problems(), ids=[each[0] for each in problems()])
 def test_gradients_are_those_of_differences(name: str, problem: Problem, at: list[float]) -> None:
     theta = np.array(at)
-    gradient = problem.log_p(theta)[1]
-    for k, step in enumerate(1e-6 * problem.scales(theta)):
-        ends = [problem.log_p(theta + sign * step * np.eye(len(theta))[k])[0] for sign in (1, -1)]
-        # Central differences of this step are within 1e-8 of the largest.
-        size = 1 + np.abs(gradient[:, k]).max()
-        np.testing.assert_allclose((ends[0] - ends[1]) / (2 * step), gradient[:, k], rtol=0, atol=1e-8 * size)
+    check_gradients(problem, theta)
 
 
 def no_better(problem: Problem, theta: np.ndarray, value: float) -> None:

@@ -80,6 +80,7 @@ def test_specialize_false_has_the_same_numbers(backend, how):
     assert "nothing is left out" in whole.explain() and "nothing is left out" not in own.explain()
 
 
+@pytest.mark.sampled(1, without="warp:cpu")
 def test_known_landmarks_without_features_and_without_landmarks(backend):
     nowhere = gs.LandmarkModel(gs.LandmarkMap([]), backend=backend, **FLOAT64)
     false = np.log(0.05 / 20 / (2 * np.pi))
@@ -123,6 +124,7 @@ def test_joint_association_is_exclusive_where_the_nearest_is_not(backend):
     assert nearest.tolist() == [[0, 0]] and joint.tolist() == [[0, 1]]
 
 
+@pytest.mark.sampled(1, without="warp:cpu")
 def test_negative_information_by_counting(backend):
     rng = np.random.default_rng(2)
     landmarks, poses, features = forest(60, 40.0)

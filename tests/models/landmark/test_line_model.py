@@ -126,7 +126,7 @@ def test_a_line_through_the_sensor_has_two_forms():
     assert first[0] > first[4]
 
 
-def test_parallel_walls_10_cm_apart_are_told_apart_where_both_are_seen():
+def test_parallel_walls_10_cm_apart_are_distinguished_where_both_are_seen():
     """The nearer of two faces is in front for x > 0 only; beside its end the farther one is seen."""
     model = gs.LineModel(gs.LineMap([(-5, 2.1, 5, 2.1), (0, 2, 5, 2)]), gs.LineParameters(sigma_distance=0.015),
                          backend="numpy")  # fmt: skip

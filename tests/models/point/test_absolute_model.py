@@ -61,7 +61,8 @@ def test_without_outliers_the_code_for_them_changes_no_bit(backend, monkeypatch)
 
 @pytest.mark.parametrize("z", [-0.001, 20.001, INF, -INF, NAN])
 def test_ranges_that_no_radio_reports_are_left_out(backend, z):
-    """As readings of a scan: live data must not stop a filter, and a factor that is 0 everywhere is no information."""
+    """As with readings of a scan, live data must not stop a filter, and a factor of 0 everywhere carries no
+    information."""
     xy = [(5e6, 0.0), (5e6 + 9, 3.0)]
     model = gs.BeaconModel(xy, gs.BeaconParameters(range_max=20.0), backend=backend)
     alone = model.log_likelihood(POSES, [4.0], [1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 from collections.abc import Callable
 
@@ -19,14 +20,20 @@ MOST_FIELD, MOST_BEAMS, MOST_STEP, MOST_BOUND = 80, 90, 230, 90
 
 
 def calls_of(run: Callable[[], object]) -> int:
-    """Return the number of Python functions that are called while a function runs, without itself."""
-    found = []
-    sys.setprofile(lambda frame, event, argument: found.append(frame.f_code) if event == "call" else None)
+    """Return the number of Python functions that are called while a function runs, without itself.
+
+    Finalizers of other tests' objects do not count: nothing is collected meanwhile.
+    """
+    called = []
+    gc.collect()
+    gc.disable()
+    sys.setprofile(lambda frame, event, argument: called.append(frame.f_code) if event == "call" else None)
     try:
         run()
     finally:
         sys.setprofile(None)
-    return len(found) - 1
+        gc.enable()
+    return len(called) - 1
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""``explain()`` names what a scene does not need, why, and what that saves; and nothing that it needs."""
+"""``explain()`` lists all that a scene does not need, the reason and the saving, and nothing that it needs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ def left_out(model: Any) -> dict[str, str]:
 
 
 def test_explain_names_what_is_left_out(monkeypatch):
-    """Each omission with the number that decides it, and what it saves; nothing about a scan before there is one."""
+    """Each omission is listed with the number that decides it and its saving; scans are not mentioned before the first
+    one."""
     monkeypatch.setattr(windows, "SMALLEST_CELLS", 1)
     grid = room((400, 500))
     z = scan(REPEATED)
@@ -143,6 +144,7 @@ def test_the_text_of_the_kernel_lacks_what_is_left_out(part, needs):
         assert (part in marked(model, "+")) != listed
 
 
+@pytest.mark.sampled(1, without="warp:cpu")
 def test_measured_savings(backend):
     grid = room()
     model = make("beam", grid, backend)
@@ -179,7 +181,7 @@ def test_sources_are_those_of_every_backend(backend):
 
 @pytest.fixture
 def pretend(monkeypatch) -> Callable[[str], Backend]:
-    """Return the reference, which says that it is a processor or a GPU: the host decides what is listed."""
+    """Return the reference as a processor or a GPU: the host decides the list."""
 
     def as_kind(kind: str) -> Backend:
         device = get_backend("numpy")

@@ -200,7 +200,7 @@ def lattice(resolution: float) -> tuple:
 
 @pytest.mark.parametrize("resolution", [0.05, 0.25])
 def test_float32_look_ups_on_the_edges_of_cells(resolution, backend):
-    """40 000 end points of which most lie on an edge, but for the rounding of cosines: the same cell all the same."""
+    """Most of 40 000 end points lie on an edge up to the rounding of cosines: their cells are the same."""
     wrong = differing_cells(*lattice(resolution), ("float64", "numpy"), ("float32", backend))
     assert not len(wrong), (len(wrong), wrong[:3])
 
@@ -227,7 +227,7 @@ def test_an_end_point_just_below_the_cell_of_the_pose(backend):
 
 
 def test_a_cloud_in_a_map_longer_than_distances_reach(backend):
-    """60 000 cells in a row, of which the cloud reaches 1300: the rest is left out, however far it goes on."""
+    """The cloud reaches 1300 of 60 000 cells in a row: the other ones are left out."""
     cells = np.zeros((1, 60_001), int)
     cells[0, [0, 50_000]] = 100
     grid = gs.OccupancyGrid(cells, 0.05)

@@ -1,4 +1,4 @@
-"""Gradient of the interpolated likelihood field: Warp's tape differentiates the kernel's own functions."""
+"""The gradient of the interpolated likelihood field against Warp's tape through the kernel's functions."""
 
 from types import SimpleNamespace
 

@@ -29,7 +29,7 @@ def model_of(backend, **options) -> gs.BeamModel:
 
 
 def brute_force(model: gs.BeamModel, poses: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Return (N, K) log densities, each with the parameters of its own angle."""
+    """Return (N, K) log densities, each with the parameters of its angle."""
     parameters = model.incidence_parameters
     expected, angle = model.expected_ranges(poses).astype(float), model.incidence(poses).astype(float)
     which = np.searchsorted(parameters.edges[1:-1], np.nan_to_num(angle), side="right")
@@ -104,6 +104,7 @@ def test_tiles_and_orders_change_nothing(as_gpu, backend, monkeypatch):
     assert differing(model.log_likelihood(poses[7:9], z), one_by_one[7:9]) == 0
 
 
+@pytest.mark.sampled(1, without="warp:cpu")
 def test_max_readings_where_their_probability_depends_on_the_pose(backend):
     _, poses, bearings = place()
     some = (P(0.9, 0.05, 0.0, 0.05), P(0.5, 0.2, 0.2, 0.1), P(0.0, 0.0, 1.0, 0.0))
@@ -122,6 +123,7 @@ def test_max_readings_where_their_probability_depends_on_the_pose(backend):
     assert np.isneginf(never.log_likelihood(poses, z)).all()
 
 
+@pytest.mark.sampled(1, without="warp:cpu")
 def test_omissions_change_nothing(backend):
     _, poses, _ = place()
     z = a_scan()

@@ -1,7 +1,8 @@
 """Laws that a range model keeps whatever its numbers are: no oracle, only two scenes whose results must fit.
 
-Most hold to the bit, because the second scene is the first one exactly in the grid's frame: poses lie at odd multiples
-of 1/256 cell, resolutions are powers of two, and free cells around the walls are wider than any distance counts.
+Most laws are exact to the bit, because the second scene equals the first one in the grid's frame: poses lie at odd
+multiples of 1/256 cell, resolutions are powers of two, and free cells around the walls are wider than any distance
+counts.
 """
 
 from __future__ import annotations
@@ -158,7 +159,7 @@ def turned_and_mirrored_scores(after: Scene, before: Scene, parameters: Any, on:
     assert_near(found, expected, 2 * per_beam(expected, expected.dtype))
 
 
-@pytest.mark.sampled(0.2)
+@pytest.mark.sampled(0.2, without="warp:cpu")
 @LAWS
 @given(SEEDS, SMOOTH, st.sampled_from([-1, 1, 2]))
 def test_turn(kind, on, seed, name, quarters):
@@ -177,7 +178,7 @@ def test_turn(kind, on, seed, name, quarters):
     turned_and_mirrored_scores(after, before, PARAMETERS[kind][name], on)
 
 
-@pytest.mark.sampled(0.35)
+@pytest.mark.sampled(0.35, without="warp:cpu")
 @LAWS
 @given(SEEDS, SMOOTH)
 def test_mirror(kind, on, seed, name):
@@ -187,7 +188,7 @@ def test_mirror(kind, on, seed, name):
     turned_and_mirrored_scores(after, before, PARAMETERS[kind][name], on)
 
 
-@pytest.mark.sampled(0.15)
+@pytest.mark.sampled(0.15, without="warp:cpu")
 @LAWS
 @given(SEEDS, NAMES, st.integers(-10, 10), st.floats(-7, 7), st.integers(0, 40))
 def test_shift(kind, on, seed, name, far, yaw, cells):
@@ -200,6 +201,7 @@ def test_shift(kind, on, seed, name, far, yaw, cells):
     same_scores(replace(wide, origin=(-side, -side, 0.0)), plain, p, on)
 
 
+@pytest.mark.sampled(1, without="warp:cpu")
 @LAWS
 @given(SEEDS, st.floats(-7, 7))
 def test_turn_by_the_yaw_of_a_far_origin(on, seed, yaw):
@@ -209,7 +211,7 @@ def test_turn_by_the_yaw_of_a_far_origin(on, seed, yaw):
     near_ranges(replace(before, origin=(1e6, -1e6, yaw), poses=moved).cast(**on), before.cast(**on), FAR_FLOAT64)
 
 
-@pytest.mark.sampled(0.2)
+@pytest.mark.sampled(0.2, without="warp:cpu")
 @LAWS
 @given(SEEDS, NAMES, st.sampled_from([-11, -1, 1, 11]))
 def test_all_lengths_times_a_power_of_two(kind, on, seed, name, power):
@@ -228,6 +230,7 @@ def test_all_lengths_times_a_power_of_two(kind, on, seed, name, power):
         same_bits(after.cast(**on), (s * before.cast(**on)).astype(on["precision"]))
 
 
+@pytest.mark.sampled(0.5, without="warp:cpu")
 @LAWS
 @given(SEEDS, SMOOTH, st.floats(-7, 7))
 def test_a_wall_lengthens_no_range_and_no_distance(kind, on, seed, name, yaw):
@@ -246,7 +249,7 @@ def cut_in_four(coarse: Scene) -> Scene:
     return replace(coarse, cells=coarse.cells.repeat(2, 0).repeat(2, 1), resolution=CELL / 2)
 
 
-@pytest.mark.sampled(0.5)
+@pytest.mark.sampled(0.5, without="warp:cpu")
 @LAWS
 @given(SEEDS, NAMES)
 def test_cells_cut_in_four_change_no_range(on, seed, name):
@@ -257,12 +260,13 @@ def test_cells_cut_in_four_change_no_range(on, seed, name):
     near_ranges(cut_in_four(other).cast(**on), other.cast(**on), 2 * TOLERANCES["float64 ranges"].value * RANGE)
 
 
+@pytest.mark.sampled(1, without="warp:cpu")
 @pytest.mark.parametrize(("interpolation", "longer", "shorter"), [("nearest", 0, 0.5), ("bilinear", 2, 2)])
 @LAWS
 @given(SEEDS)
 def test_cells_cut_in_four_change_distances_by_a_diagonal(interpolation, longer, shorter, on, seed):
-    """In cells, d - sqrt(1/2) <= d' <= d: the quarter of a wall that lies to it as the end point's own quarter does is
-    d away, and either of them moves by sqrt(1/8) at most. Interpolated, d' and d are sqrt(2) apart at most: they differ
+    """In cells, d - sqrt(1/2) <= d' <= d: the quarter of a wall in the same position as the end point's quarter is d
+    away, and each of them moves by sqrt(1/8) at most. Interpolated, d' and d are sqrt(2) apart at most: they differ
     from the distance of the end point itself by sqrt(1/8) and sqrt(1/2), and walls move by sqrt(1/8).
     """
     coarse, bounds = scene("field", seed), []
@@ -276,7 +280,7 @@ def test_cells_cut_in_four_change_distances_by_a_diagonal(interpolation, longer,
     assert (coarse_low <= fine_high + math.sqrt(shorter)).all()
 
 
-@pytest.mark.sampled(0.2)
+@pytest.mark.sampled(0.2, without="warp:cpu")
 @LAWS
 @given(SEEDS, NAMES)
 def test_permuting_beams_and_particles(kind, on, seed, name):
@@ -294,7 +298,7 @@ def test_permuting_beams_and_particles(kind, on, seed, name):
     plain_sum(other, some)
 
 
-@pytest.mark.sampled(0.2)
+@pytest.mark.sampled(0.2, without="warp:cpu")
 @LAWS
 @given(SEEDS, NAMES, st.integers(0, 24))
 def test_splitting_a_scan(kind, on, seed, name, count):
@@ -313,7 +317,7 @@ def test_splitting_a_scan(kind, on, seed, name, count):
     assert_near(total, log_p, 2 * sum_error(parts))
 
 
-@pytest.mark.sampled(0.2)
+@pytest.mark.sampled(0.2, without="warp:cpu")
 @LAWS
 @given(SEEDS, NAMES, st.floats(2**-10, 1, width=32))
 def test_temperature(kind, on, seed, name, temperature):
@@ -327,6 +331,7 @@ def test_temperature(kind, on, seed, name, temperature):
     plain_sum(plain, parts)
 
 
+@pytest.mark.sampled(0.3, without="warp:cpu")
 @pytest.mark.parametrize("name", FIELD)
 def test_no_information_is_exactly_0(kind, on, name):
     made = scene(kind, 0)
@@ -337,6 +342,7 @@ def test_no_information_is_exactly_0(kind, on, name):
         same_bits(parts, np.zeros((12, len(z)), on["precision"]))
 
 
+@pytest.mark.sampled(1, without="warp:cpu")
 def test_laws_can_be_broken(on):
     """By poses that are moved by the least that counts, and by a beam too many in the sum."""
     before, p = scene("beam", 0), PARAMETERS["beam"]["ordinary"]

@@ -133,6 +133,7 @@ def test_the_code_for_them_changes_nothing_where_they_are_0(name, real):
     assert (same | (np.abs(np.where(same, 0, plain) - np.where(same, 0, found)) <= 2 * eps * np.abs(plain))).all()
 
 
+@pytest.mark.sampled(1, without="warp:cpu")
 def test_tables_and_angles_of_incidence_have_them(backend):
     grid, scanner, poses, expected = scene("float32")
     p = gs.BeamParameters(range_bias=0.3, sigma_growth=0.02)

@@ -94,7 +94,7 @@ def test_a_particle_off_the_map(backend):
 
 
 def test_readings_beyond_range_max():
-    """Literals of the compiled nav2_amcl: +inf has the weight 1, a longer reading only that of a hit."""
+    """Values of the compiled nav2_amcl: +inf has the weight 1, a longer reading only the weight of a hit."""
     grid = gs.OccupancyGrid(np.zeros((3, 40), int), 1.0)
     model = gs.BeamModel(grid, gs.Scanner([0.0], 12.0), compat="amcl", backend="numpy", precision="float64")
     weights = [math.exp(model.log_likelihood([(5.5, 1.5, 0.0)], [z])[0]) for z in (math.inf, 12.1, 12.0)]
@@ -108,7 +108,7 @@ def test_readings_beyond_range_max():
 
 @pytest.mark.parametrize("peer", ["amcl", "beluga"])
 def test_cells_in_mode_scale(peer, backend):
-    """Cells of 1 to 99 per cent stop beams, and are no obstacles of the field, whatever the threshold."""
+    """Cells of 1 to 99 per cent stop beams but are not obstacles of the field, at any threshold."""
     cells = np.zeros((3, 9), int)
     cells[:, 6] = 1
     cells[:, 8] = 99

@@ -1,7 +1,7 @@
 """Densities of short, max and random readings have one home on the host, which all users of densities follow.
 
 Each is replaced by a made-up one: lambda_short counts twice, random readings spread over 2 range_max, the probability
-of no return is halved. Every user must then give what other parameters give without the change.
+of no return is halved. Every user must then give the results of other parameters without the change.
 """
 
 from __future__ import annotations
@@ -81,7 +81,8 @@ def models(p):
 
 
 def learned(at):
-    """Return what fits compute of parameters: numbers of kernels, terms of starts, of growth and of blocks."""
+    """Return the quantities that fits compute from parameters: numbers of kernels, terms of starts, growth and
+    blocks."""
     pairs = make_pairs(WITH_MAX, EXPECTED, RANGE)
     device = DeviceSums(get_backend("numpy"), np.dtype(np.float64), pairs)
     sample = starts.Sample.of(pairs)

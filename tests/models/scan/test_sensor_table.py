@@ -42,6 +42,7 @@ def bits(array: np.ndarray) -> np.ndarray:
     return array.view(array.dtype.str.replace("f", "u"))
 
 
+@pytest.mark.sampled(1, without="warp:cpu")
 def test_one_reading_by_hand(backend):
     """1.3 m where 2 m are expected, in bins of 0.5 m: the mixture at 1.25 m and 2.25 m; range_max stays range_max."""
     _, scanner, _ = scene()
@@ -94,6 +95,7 @@ def test_narrower_bins_are_more_exact(weights):
         assert (np.array(largest[:-1]) / largest[1:] > 1.6).all() and largest[0] / largest[-1] > 6
 
 
+@pytest.mark.sampled(1, without="warp:cpu")
 @pytest.mark.parametrize("specialize", [True, False])
 def test_missing_and_max_readings_are_treated_as_the_formula_treats_them(specialize, backend):
     _, _, poses = scene()
@@ -111,6 +113,7 @@ def test_missing_and_max_readings_are_treated_as_the_formula_treats_them(special
         assert (tabulated.log_likelihood(poses, [NAN] * 8) == 0).all()
 
 
+@pytest.mark.sampled(1, without="warp:cpu")
 def test_impossible_scans_are_minus_infinity_and_no_others(backend):
     """Unexpected obstacles only, so a reading in a bin beyond the expected range's is impossible."""
     grid, scanner, poses = scene()
@@ -144,6 +147,7 @@ def test_every_backend_has_the_bits_of_numpy_with_and_without_specialisation(wei
                 np.testing.assert_array_equal(bits(found), bits(wanted))
 
 
+@pytest.mark.sampled(1, without="warp:cpu")
 def test_any_caster_may_feed_the_table(backend):
     _, _, poses = scene()
     lines, alone = model(0.01, backend=backend, caster="bresenham"), model(0.01, backend=backend)

@@ -1,4 +1,4 @@
-"""Several scans in one call: their launches are common ones, and every bit is that of calls of one scan each."""
+"""Several scans in one call share launches, and have the bits of single calls."""
 
 from __future__ import annotations
 

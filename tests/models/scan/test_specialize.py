@@ -1,4 +1,4 @@
-"""Leaving out what a scene does not need changes no number."""
+"""Omissions for a scene change no number."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ def scan(seed: int) -> np.ndarray:
 
 
 class Watch:
-    """Counts what a backend allocates and compiles, and the bytes that it copies."""
+    """Counts a backend's allocations, compilations and copied bytes."""
 
     def __init__(self, device, monkeypatch) -> None:
         kind = type(device)
@@ -69,7 +69,7 @@ class Watch:
         self._count_buffers(device, monkeypatch)
 
     def _count_buffers(self, device, monkeypatch) -> None:
-        """Count the buffers that the driver is asked for, from any place."""
+        """Count all requests for buffers of the driver."""
         if device.info.backend == "opencl":
             from gpusense.backends.opencl import backend as _opencl
 

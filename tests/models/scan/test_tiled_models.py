@@ -1,4 +1,4 @@
-"""Models and casters on a GPU, which take tiles and blocks there, give what single particles give: to the bit.
+"""Models and casters on a GPU, which use tiles and blocks, have the bits of single particles.
 
 No GPU is needed: any device may pretend to be one.
 """
@@ -89,7 +89,7 @@ def same_as_one_by_one(make: Callable[[object], object], as_gpu: Pretend, poses:
     np.testing.assert_allclose(found, plain, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.sampled(0.25)
+@pytest.mark.sampled(0.25, without="warp:cpu")
 @pytest.mark.parametrize("kind", ["all over", "inside"])
 def test_models(kind, ordered, as_gpu, backend):
     grid, scanner, z = world()
@@ -255,7 +255,7 @@ def border_poses(grid: gs.OccupancyGrid, reach: float) -> np.ndarray:
 
 
 def test_end_points_at_the_border(as_gpu, backend):
-    """The border is known to the cell: code with and without clamping gives the same."""
+    """The border is known to the cell: code with and without clamping gives equal results."""
     cells = world()[0].cells
     grid = gs.OccupancyGrid(cells, 0.1)
     scanner = gs.Scanner(np.linspace(-3, 3, BEAMS), 2.0)
@@ -283,7 +283,7 @@ def test_origins_at_the_border(as_gpu):
 
 
 def test_a_window_that_grows(as_gpu):
-    """Clouds far from each other on a map of which each sees a part."""
+    """Clouds far from each other, each of which sees a part of the map."""
     cells = np.where(np.random.default_rng(6).random((400, 400)) < 0.01, 100, 0).astype(np.int8)
     grid, scanner = gs.OccupancyGrid(cells, 0.1), gs.Scanner(np.linspace(-3, 3, 21), 2.0)
     z = np.random.default_rng(9).uniform(0, 2, 21)

@@ -59,7 +59,7 @@ def changed_by_hand(grid, cells, place):
 
 
 def check_edits(make, result, grid, rng, count=7):
-    """Edit a model's map again and again, and hold its results against those of new models."""
+    """Edit a model's map repeatedly, and compare its results with those of new models."""
     model = make(grid)
     result(model)
     for cells, place in patches(rng, grid.shape, count):

@@ -1,0 +1,174 @@
+"""Compare the answers that reports of different days give: those of docs/error-vs-time.md should be the same.
+
+    python bench/error_vs_time/agreement.py                      # all pairs of reports of a device in the history
+    python bench/error_vs_time/agreement.py ONE.json TWO.json    # all pairs of these reports
+    python bench/error_vs_time/agreement.py --history ONE.json   # of both
+
+Two reports of a device are compared on the points or settings that both have, so a map or a setting that one of them
+lacks makes no difference. A report that another one extends does not count. Tasks of a processor that were timed as
+whole runs, before 2026-11-26, are not compared with those that were timed step by step. Commits differ: some
+differences are those of the code.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from error_vs_time.choices import SHOWN, WISHES, answer, chosen
+from error_vs_time.reports import ROWS, git
+
+from gpusense.evaluation.benchmark.report import SCHEMA, table
+
+KEYS = {
+    "models": ("scene", "cloud", "problem", "method", "variant", "knob", "value", "precision", "particles", "beams"),
+    "tasks": ("need", "method", "setting", "precision"),
+}
+
+
+@dataclass(frozen=True)
+class Report:
+    """A report of one device.
+
+    Attributes:
+        name: File and commit that it is read from.
+        kind: ``"models"`` or ``"tasks"``.
+        document: Its contents.
+        measured: Its measured points or rows, by what was measured.
+    """
+
+    name: str
+    kind: str
+    document: Mapping[str, Any]
+    measured: dict[tuple[Any, ...], Mapping[str, Any]] = field(default_factory=dict)
+
+    @property
+    def whole_runs(self) -> bool:
+        """Whether a processor's tasks are timed as whole runs."""
+        return (
+            any(row["kind"] == "cpu" and "by_run" not in row for row in self.measured.values()) and self.kind == "tasks"
+        )
+
+    def within(self, common: set[tuple[Any, ...]]) -> dict[str, Any]:
+        """Return the document with some of its points or rows."""
+        kept = [point for key, point in self.measured.items() if key in common]
+        return {**self.document, "points" if self.kind == "models" else "rows": kept}
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The answers of two reports to a wish.
+
+    Attributes:
+        device, wish: Title of the device, and the wish.
+        old, new: The answers with their figures.
+        same: Whether they name the same method.
+    """
+
+    device: str
+    wish: str
+    old: str
+    new: str
+    same: bool
+
+
+def report_of(name: str, text: str) -> Report | None:
+    """Return a report from its text; None for one of another form, or of several devices."""
+    document = json.loads(text)
+    kind = "tasks" if document.get("kind") == "needs" else "models"
+    if kind == "models" and document.get("schema") != SCHEMA:
+        return None
+    points = [point for point in document["points" if kind == "models" else "rows"] if point["backend"] != "outside"]
+    able = [point for point in points if (point["status"] == "ok" if kind == "models" else point["seconds"])]
+    measured = {tuple(point[name] for name in KEYS[kind]): point for point in able}
+    return Report(name, kind, document, measured) if len({point["backend"] for point in points}) == 1 else None
+
+
+def history() -> Iterator[Report]:
+    """Yield the reports of all commits, newest first, without those that a later one of them extends."""
+    found: list[Report] = []
+    listed = git("log", "--format=%h", "--name-only", "--diff-filter=AM", "--", "bench/results/error_vs_time_*.json")
+    commit = ""
+    for line in filter(None, listed.splitlines()):
+        if not line.endswith(".json"):
+            commit = line
+            continue
+        report = report_of(f"{Path(line).stem} at {commit}", git("show", f"{commit}:{line}"))
+        if report is None or any(_extends(later, report) for later in found if later.kind == report.kind):
+            continue
+        found.append(report)
+        yield report
+
+
+def _extends(later: Report, report: Report) -> bool:
+    """Return whether a report has the first measured point of another one, with its times."""
+    first = next(iter(report.measured), None)
+    return first is None or later.measured.get(first) == report.measured[first]
+
+
+def compare(old: Report, new: Report) -> list[Answer]:
+    """Return the answers of two reports of a kind to the wishes that both can answer; empty for other devices."""
+    common = old.measured.keys() & new.measured.keys()
+    rows = [
+        [row for row in ROWS[one.kind](one.within(common)) if SHOWN[row.need][0] in row.errors] for one in (old, new)
+    ]
+    devices = [{row.device for row in each} for each in rows]
+    answers = []
+    for device, wish in itertools.product(sorted(devices[0] & devices[1]), WISHES):
+        picks = [chosen(each, wish, device) for each in rows]
+        if any(row is None for row, _ in picks):
+            continue
+        texts = [answer(each, wish, device) for each in rows]
+        same = len({(row.text if row else "", kept) for row, kept in picks}) == 1
+        answers.append(Answer(device, wish.words, texts[0], texts[1], same))
+    return answers
+
+
+def pairs(reports: Sequence[Report]) -> Iterator[tuple[Report, Report, list[Answer]]]:
+    """Yield all pairs of reports that can be compared, with their answers."""
+    for new, old in itertools.combinations(reports, 2):
+        answers = compare(old, new) if (old.kind, old.whole_runs) == (new.kind, new.whole_runs) else []
+        if answers:
+            yield old, new, answers
+
+
+def summary(reports: Sequence[Report]) -> list[str]:
+    """Return the table of pairs and that of differences."""
+    shares, differences, total, equal = [], [], 0, 0
+    for old, new, answers in pairs(reports):
+        same = sum(one.same for one in answers)
+        total, equal = total + len(answers), equal + same
+        shares.append((answers[0].device, old.name, new.name, f"{same} of {len(answers)}"))
+        differences += [(one.device, one.wish, old.name, one.old, new.name, one.new) for one in answers if not one.same]
+    lines = [f"{equal} of {total} answers of {len(shares)} pairs of reports are the same.", ""]
+    lines += table(("device", "older", "newer", "same"), shares, 4)
+    return [*lines, "", *table(("device", "to do", "older", "answer", "newer", "answer"), differences, 6)]
+
+
+def main() -> int:
+    """Print; exit code 1 where answers differ."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("reports", nargs="*", type=Path, help="reports of measure.py; default: those of the history")
+    parser.add_argument("--history", action="store_true", help="the history's reports beside the others")
+    arguments = parser.parse_args()
+    try:
+        reports = [report_of(file.name, file.read_text(encoding="utf-8")) for file in arguments.reports]
+        reports += list(history()) if arguments.history or not reports else []
+    except (OSError, ValueError, KeyError, subprocess.SubprocessError) as error:
+        parser.error(f"{type(error).__name__}: {error}")
+    lines = summary([report for report in reports if report is not None])
+    print("\n".join(lines))
+    return int(lines[0].split()[0] != lines[0].split()[2])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,84 @@
+"""The density of a beam model: parameters for each bin of angles of incidence, or the table of a sensor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gpusense._util import checks
+from gpusense.models.arguments import check_absent
+from gpusense.world.parameters import BeamParameters, IncidenceParameters
+from gpusense.world.sensor_table import SensorTable
+
+# Between 1, the largest cosine, and 2, which kernels use for a ray without a return.
+_BEYOND = 1.5
+
+
+@dataclass(frozen=True)
+class BeamDensity:
+    """The density of a beam model.
+
+    Attributes:
+        mixtures: Parameters of each bin in the kernels' order, first for beams without a hit.
+        cosines: Cosines between the bins.
+        incidence: The parameters by angle of incidence, or None.
+        table: The table of a sensor in place of the mixtures, or None.
+    """
+
+    mixtures: tuple[BeamParameters, ...]
+    cosines: np.ndarray
+    incidence: IncidenceParameters | None = None
+    table: SensorTable | None = None
+
+    @property
+    def parameters(self) -> BeamParameters | SensorTable | None:
+        """The mixture, or the table of a sensor; None where parameters depend on the angle of incidence."""
+        if self.incidence is not None:
+            return None
+        return self.mixtures[0] if self.table is None else self.table
+
+    @property
+    def max_depends(self) -> bool:
+        """Whether the probability of a max reading depends on the pose."""
+        return self.table is not None or len({p.z_max for p in self.mixtures}) > 1
+
+    @property
+    def z_max(self) -> float:
+        """Largest probability of a max reading; 1 for a table."""
+        return max(p.z_max for p in self.mixtures) if self.table is None else 1.0
+
+    @property
+    def possible(self) -> bool:
+        """Whether some range is possible; if max readings depend on the pose, the kernel detects impossible ranges."""
+        return self.max_depends or any(p.z_hit or p.z_short or p.z_rand for p in self.mixtures)
+
+
+def density_of(parameters: object, default: BeamParameters, incidence: object, **options: object) -> BeamDensity:
+    """Return the density that the arguments of a beam model choose.
+
+    Args:
+        parameters: The mixture, the table of a sensor, or None.
+        default: The mixture without ``parameters``.
+        incidence: Parameters by angle of incidence, or None.
+        **options: Options that must be None with ``incidence``.
+
+    Raises:
+        TypeError: An argument is of the wrong kind.
+        ValueError: Several densities, or conflicting options, are given.
+    """
+    table = parameters if isinstance(parameters, SensorTable) else None
+    # A table of a sensor replaces the mixture.
+    mixture = default if parameters is None or table else parameters
+    if not isinstance(mixture, BeamParameters):
+        rule = "must be BeamParameters or a DiscreteBeamModel"
+        raise TypeError(f"parameters: {rule}, got {checks.show(parameters)}")
+    if incidence is None:
+        return BeamDensity((mixture,), np.zeros(1), table=table)
+    if not isinstance(incidence, IncidenceParameters):
+        raise TypeError(f"incidence: must be IncidenceParameters, got {checks.show(incidence)}")
+    check_absent("with incidence", parameters=parameters, **options)
+    cosines = np.cos(incidence.edges[1:])
+    if incidence.no_surface is None:
+        return BeamDensity(incidence.parameters, cosines, incidence)
+    return BeamDensity((incidence.no_surface, *incidence.parameters), np.append(_BEYOND, cosines), incidence)

@@ -8,6 +8,9 @@ are thinned to the beams at whole degrees, and their odometry is that of the cor
 "within" are the closures in the logs themselves, "across" those between them. "matches across" are those of a high
 p_right; "group" is the number of those that agree with one another with the most evidence, and this evidence: closures
 across a break of the chain need 6.5, see ``gpusense.chaining.agreement``. Times are of the processor.
+
+The second table counts the steps of a chain of many short pieces of these logs, whose borders are all breaks: those
+whose match is used, and those of them that are not weak (``gpusense.chaining.front.Front.weak``).
 """
 
 from __future__ import annotations
@@ -30,9 +33,13 @@ from common import make_parser, note, parse, publish, table
 
 from gpusense.chaining.agreement import groups_of
 from gpusense.chaining.chain import Chainer
+from gpusense.chaining.matcher import SURE
 
 NAMES = ("acapulco", "aces", "belgioioso", "csail", "fhw", "freiburg-079", "infinite-corridor", "intel", "seattle")
 LIMIT = 50.0
+# Length of a piece [m], and its least and most scans.
+PIECE, LEAST, MOST = 5.0, 9, 80
+BEAMS = 180
 
 
 def load(folder: Path, name: str, scans: int) -> Log:
@@ -70,11 +77,47 @@ def joined(one: Log, two: Log, with_odometry: bool, backend: str) -> dict[str, A
     }  # fmt: skip
 
 
+def pieces(logs: list[Log], count: int) -> tuple[Log, np.ndarray]:
+    """Return pieces of logs as one log, each of a building other than the one before, and the first scans of pieces."""
+    rng, ranges, odometry, starts, last = np.random.default_rng(0), [], [np.zeros((1, 3))], [0], -1
+    while len(ranges) < count:
+        k = int(rng.integers(len(logs)))
+        begin = int(rng.integers(len(logs[k].ranges) - LEAST))
+        poses = logs[k].odometry[begin:]
+        path = np.append(0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+        length = max(int(np.searchsorted(path, PIECE)), LEAST)
+        if k == last or length > min(MOST, len(poses)):
+            continue
+        last, poses = k, poses[:length]
+        ranges.append(logs[k].ranges[begin : begin + length])
+        moved = gs.pose_difference(np.repeat(poses[:1], length, axis=0), poses)
+        odometry.append(gs.compose_poses(odometry[-1][-1], moved))
+        starts.append(starts[-1] + length)
+    poses = np.concatenate(odometry[1:])
+    return Log("pieces", np.concatenate(ranges), logs[0].scanner, poses, poses, None), np.array(starts[1:-1])
+
+
+def steps_of(log: Log, starts: np.ndarray, with_odometry: bool, backend: str) -> list[Any]:
+    """Count the steps over borders and all others: matches that are used, and those of them that are not weak."""
+    chainer = Chainer(
+        log.ranges, log.scanner, log.odometry if with_odometry else None, close_loops=False, backend=backend
+    )
+    for _ in chainer.steps():
+        pass
+    front = chainer.fronts[0]
+    over = np.isin(np.arange(len(front.p_right)), np.searchsorted(front.nodes, starts) - 1)
+    used, row = front.p_right >= SURE, ["with" if with_odometry else "no"]
+    for some in (over, ~over):
+        row += [int(some.sum()), int((some & used).sum()), int((some & used & ~front.weak).sum())]
+    return row
+
+
 def main(argv: list[str] | None = None) -> None:
     """Measure, and publish a table."""
     parser = make_parser(__doc__, backend="auto", data=True)
     parser.add_argument("--scans", type=int, default=250, help="scans of each log (default: %(default)s)")
     parser.add_argument("--log", action="append", choices=NAMES, help="default: all")
+    parser.add_argument("--pieces", type=int, default=300, help="pieces of the second table (default: %(default)s)")
     arguments = parse(parser, argv)
     folder = Path(arguments.data) / "carmen_logs"
     logs = [load(folder, name, arguments.scans) for name in arguments.log or NAMES]
@@ -97,7 +140,12 @@ def main(argv: list[str] | None = None) -> None:
         "border is doubtful", "s",
     ]  # fmt: skip
     total = f"{len(rows)} chains of {len(rows) // 2} pairs: {sum(row['across'] for row in rows)} closures across."
-    publish(__file__, arguments, table(columns, lines) + "\n\n" + total, {"rows": rows})
+    parts = [log for log in (load(folder, name, sys.maxsize) for name in NAMES) if log.scanner.count == BEAMS]
+    log, starts = pieces(parts, arguments.pieces)
+    found = [steps_of(log, starts, with_odometry, arguments.backend) for with_odometry in (True, False)]
+    heads = ["odometry", "borders", "used", "of these not weak", "further steps", "used", "of these not weak"]
+    text = "\n\n".join([table(columns, lines), total, table(heads, found)])
+    publish(__file__, arguments, text, {"rows": rows, "pieces": found})
 
 
 if __name__ == "__main__":

@@ -23,8 +23,9 @@ Flags = NDArray[np.bool]
 
 # Least number of matches that agree with a match, including itself.
 _AGREE = 3
-# Evidence of a group, the sum of -log10(1 - p_right) with p_right at most a largest one; different scans on both sides.
-_EVIDENCE, _MOST_RIGHT, _SCANS = 6.5, 0.999, 3
+# Evidence that a group needs where nothing else is known, the sum of -log10(1 - p_right) with p_right at most a largest
+# one, and where one of a hundred weak steps is a break; different scans on both sides.
+EVIDENCE, EVIDENCE_OVER_WEAK, _MOST_RIGHT, _SCANS = 6.5, 4.5, 0.999, 3
 # Compared matches are at most this far apart on both sides [m], and at most this many key scans; matches of a batch.
 _PASSAGE, _KEYS, _MATCHES = 8.0, 64, 1024
 # Largest gap of a closed loop of two matches [m, rad], and its growth with the path [m/m, rad/m].
@@ -32,13 +33,13 @@ _MISSED, _MISSED_TURN, _SHARE, _SHARE_TURN = 0.15, 0.03, 0.03, 0.01
 _NONE = np.zeros(0, np.int64)
 
 
-def agreeing(matches: Links, poses: Floats, strict: Flags) -> Flags:
+def agreeing(matches: Links, poses: Floats, needed: Floats) -> Flags:
     """Return which matches (L,) are supported by enough further matches of the same passages.
 
     Args:
         matches: Matches of places.
         poses: (K, 3) poses of the key scans.
-        strict: (L,) whether a match must belong to a group.
+        needed: (L,) evidence of the group to which a match must belong; 0: none.
     """
     if not len(matches):
         return np.zeros(0, bool)
@@ -46,9 +47,9 @@ def agreeing(matches: Links, poses: Floats, strict: Flags) -> Flags:
     kept = np.ones(len(matches), bool)
     while True:
         kept = _supported(table, kept)
-        lone = kept & strict
+        lone = kept & (needed > 0)
         group, evidence, scans = _groups(table, lone, matches)
-        lone[lone] = ((evidence < _EVIDENCE) | (scans < _SCANS))[group]
+        lone[lone] = (evidence[group] < needed[lone]) | (scans[group] < _SCANS)
         if not lone.any():
             return kept
         kept = kept & ~lone

@@ -157,6 +157,11 @@ class Chainer:
         return min(ends, default=len(self._data))
 
     @property
+    def fronts(self) -> tuple[Front, ...]:
+        """The front end of each scanner."""
+        return tuple(self._fronts)
+
+    @property
     def loops(self) -> Loops | None:
         """The search for places that are seen again; None before it begins."""
         return None if self._loops is None else self._loops[1]
@@ -233,10 +238,10 @@ class Chainer:
         links = Links.joined([links, joint.couplings_of_keys(poses)])
         places = data.places()
         matcher = TeamMatcher([front.matcher for front in joint.fronts], data.sensor, places)
-        nodes = joint.nodes[keys]
+        nodes, weak = joint.nodes[keys], np.append(0, np.cumsum(joint.weak))
         return Loops(
-            matcher, nodes, (joint.owner[keys], joint.ranks()), place_points_of(data, nodes), joint.broken[keys], links,
-            solve(poses[keys], links), TEMPERATURE, (LOCAL + 1) * len(joint.fronts),
+            matcher, nodes, (joint.owner[keys], joint.ranks()), place_points_of(data, nodes), joint.broken[keys],
+            weak[keys], links, solve(poses[keys], links), TEMPERATURE, (LOCAL + 1) * len(joint.fronts),
         )  # fmt: skip
 
     def _all_links(self, joint: Joint) -> Links:

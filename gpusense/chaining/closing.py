@@ -4,7 +4,8 @@ Candidates are key scans that show the same cells of the plane. Each is matched 
 expected drift in the pose graph so far. A closure is accepted if its p_right is high, it agrees with the drift, and
 further matches of the same passages agree with it (see ``agreement``). Small drifts are closed first, which reduces the
 larger ones. Where the chain is broken between two places, or they are farther apart than the drift allows, a group of
-agreeing matches is needed. A closure across a break removes the break.
+agreeing matches is needed. Over a weak step, which rests on few or unsure matches, a group of less evidence suffices. A
+closure across a break removes the break.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense.chaining.agreement import agreeing
+from gpusense.chaining.agreement import EVIDENCE, EVIDENCE_OVER_WEAK, agreeing
 from gpusense.chaining.drift import Drift
 from gpusense.chaining.graph import KERNEL, Solution, solve
 from gpusense.chaining.links import CLOSURE, Links
@@ -67,6 +68,7 @@ class Loops:
         sequence: (K,) scanners of the key scans, and (K,) their numbers among those of their scanner.
         places: End points of the key scans.
         broken: (K,) number of breaks of the chain before each key scan; a closed break counts for its earlier side.
+        weak: (K,) number of breaks and weak steps of the chain before each key scan, likewise.
         links: Links between key scans, without closures.
         solution: The solution so far.
         closures: Closures so far.
@@ -81,6 +83,7 @@ class Loops:
     sequence: tuple[Integers, Integers]
     places: list[Floats]
     broken: Integers
+    weak: Integers
     links: Links
     solution: Solution
     temperature: float
@@ -194,9 +197,10 @@ class Loops:
         """Accept the matches that agree with the drift and with each other, solve, and drop contradicted closures."""
         left = self.matches
         squared = self._squared(left)
-        across = self.broken[left.first] != self.broken[left.second]
+        across, over = (part[left.first] != part[left.second] for part in (self.broken, self.weak))
+        needed = np.where(across | (squared >= _GATE), EVIDENCE, np.where(over, EVIDENCE_OVER_WEAK, 0.0))
         near, agree = np.flatnonzero(squared < _FAR), np.zeros(len(left), bool)
-        agree[near] = agreeing(left[near], self.solution.poses, (across | (squared >= _GATE))[near])
+        agree[near] = agreeing(left[near], self.solution.poses, needed[near])
         for _ in range(3):
             taken = left[agree]
             links, poses = Links.joined([self.links, taken]), self.solution.poses
@@ -208,7 +212,7 @@ class Loops:
                 break
             agree[np.flatnonzero(agree)[weight < _WEIGHT]] = False
         self.closures = left[agree]
-        self.broken = joined_breaks(self.broken, self.closures)
+        self.broken, self.weak = (joined_breaks(part, self.closures) for part in (self.broken, self.weak))
 
     def _squared(self, matches: Links) -> Floats:
         """Return squared distances (L,) in deviations of matches from the drift of the graph so far."""

@@ -23,6 +23,7 @@ from gpusense.world.scanner import Scanner
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+Flags = NDArray[np.bool]
 
 # Number of preceding key scans to which a key scan is matched.
 LOCAL = 4
@@ -30,6 +31,10 @@ LOCAL = 4
 _LIKELY = 0.1
 # Least p_right of a match that bridges failed ones, and most failed ones in a row that it bridges.
 _BRIDGE, _GAP = 0.8, 5
+# A match is beyond doubt from this p_right, or with this many further matches over its step.
+_BEYOND, _CONFIRMED = 0.9, 2
+# Odometry agrees with a match within this much [m, rad], and this share of the motion.
+_AGREES, _AGREES_SHARE = 0.1, 0.15
 # Readings differ if they are apart by more than this [m] and this share; scans are unlike if more than this share of
 # their readings differs.
 _DIFFERENCE, _DIFFERENCE_SHARE, _UNLIKE = 0.15, 0.1, 0.3
@@ -111,6 +116,29 @@ class Front:
         np.add.at(change, ends[1], -1)
         spanning: Integers = np.cumsum(change)[:-1] - self.bridged
         return spanning
+
+    @property
+    def weak(self) -> Flags:
+        """(M - 1,) whether each step may as well be a break of the chain.
+
+        A step is weak if its own scans do not match, or if its match is not beyond doubt and neither the odometry nor
+        two further matches confirm it; after a jump of time it must be beyond doubt and confirmed by matches.
+        """
+        sure, confirmed = self.p_right >= _BEYOND, self.confirmations() >= _CONFIRMED
+        jumped = self.jumps[self.nodes[1 : self.done]]
+        strong = np.where(jumped, sure & confirmed, sure | confirmed | self._by_odometry())
+        weak: Flags = (self.p_right < SURE) | self.bridged | ~strong
+        return weak
+
+    def _by_odometry(self) -> Flags:
+        """Return (M - 1,) whether the odometry agrees with each step."""
+        if self._odometry is None:
+            return np.zeros(self.done - 1, bool)
+        reported = self._odometry[self.nodes[: self.done]]
+        moved = pose_difference(reported[:-1], reported[1:])
+        off = moved - self.steps
+        agrees: Flags = np.hypot(off[:, 0], off[:, 1]) <= _AGREES + _AGREES_SHARE * np.hypot(moved[:, 0], moved[:, 1])
+        return agrees & (np.abs(wrap_angle(off[:, 2])) <= _AGREES + _AGREES_SHARE * np.abs(moved[:, 2]))
 
     def advance(self) -> bool:
         """Match the next group; return whether there was one. An interrupt keeps the previous groups."""

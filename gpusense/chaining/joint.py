@@ -87,6 +87,15 @@ class Joint:
         result: Integers = np.append(0, np.cumsum(self.failed & ~spanned))
         return result
 
+    @property
+    def weak(self) -> Flags:
+        """(M - 1,) whether the motion from a node to the next may be a break of the chain, by each scanner."""
+        weak = np.ones(len(self.failed), bool)
+        for front, of in self._each():
+            step, inside = _steps_of(of, len(self.nodes))
+            weak[inside] &= front.weak[step[inside]]
+        return weak
+
     def jumped(self) -> Flags:
         """Return whether the time jumps from a node to the next for all scanners with scans there."""
         jumped = np.ones(len(self.nodes) - 1, bool)

@@ -19,7 +19,7 @@ REASONS = {
     "no match": "the scan matches neither its predecessor nor key scans: its motion is from odometry or a guess",
     "unobserved": "the scans do not observe a direction of the motion, as along a corridor, and there is no odometry",
     "contested": "the scans agree about as well for a second motion, and there is no odometry to decide between both",
-    "unconfirmed": "a single match determines the motion, and there is no odometry: no further match confirms it",
+    "unconfirmed": "an unsure match, or without odometry a single one, determines the motion: nothing confirms it",
     "jump": "the time jumps, and the robot may be anywhere after it",
 }
 """The meaning of each doubt."""
@@ -143,7 +143,8 @@ def doubts_of(joint: Joint, alone: bool) -> tuple[Doubt, ...]:
     """
     failed, open_, nodes = joint.failed, joint.open & alone, joint.nodes
     contested = joint.contested & ~failed & ~open_
-    single = (joint.confirmations() == 0) & ~failed & ~open_ & ~contested & alone & (len(nodes) > 2)
+    single = (joint.confirmations() == 0) & alone | joint.weak
+    single &= ~failed & ~open_ & ~contested & (len(nodes) > 2)
     reasons = {
         "no match": failed, "unobserved": open_, "contested": contested, "unconfirmed": single,
         "jump": joint.jumped() & failed,

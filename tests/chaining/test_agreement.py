@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gpusense.chaining.agreement import agreeing, groups_of
+from gpusense.chaining.agreement import EVIDENCE, EVIDENCE_OVER_WEAK, agreeing, groups_of
 from gpusense.chaining.closing import joined_breaks
 from gpusense.chaining.links import CLOSURE, Links
 from gpusense.localization.pose_algebra import compose_poses, pose_difference
@@ -24,25 +24,29 @@ def passages(right: list[float], off: tuple[float, ...] = (2.0, -1.0, 0.2)) -> t
 
 def test_two_matches_do_not_suffice_and_a_wrong_one_is_left_out() -> None:
     poses, links = passages([0.95, 0.95])
-    assert not agreeing(links, poses, np.zeros(2, bool)).any()
+    assert not agreeing(links, poses, np.zeros(2)).any()
     poses, links = passages([0.95] * 5)
     links.pose[3] += (1.0, 0.0, 0.2)
-    assert agreeing(links, poses, np.zeros(5, bool)).tolist() == [True, True, True, False, True]
+    assert agreeing(links, poses, np.zeros(5)).tolist() == [True, True, True, False, True]
     assert groups_of(links, poses).group.tolist() == [0, 0, 0, -1, 0]
-    assert not len(agreeing(links[:0], poses, np.zeros(0, bool)))
+    assert not len(agreeing(links[:0], poses, np.zeros(0)))
 
 
 @pytest.mark.parametrize(("right", "taken"), [([0.9] * 6, False), ([0.9] * 7, True), ([0.99] * 4, True)])
 def test_where_the_drift_tells_nothing_a_group_needs_evidence(right: list[float], taken: bool) -> None:
     poses, links = passages(right)
-    assert agreeing(links, poses, np.zeros(len(right), bool)).all()
-    assert agreeing(links, poses, np.ones(len(right), bool)).tolist() == [taken] * len(right)
+    assert agreeing(links, poses, np.zeros(len(right))).all()
+    assert agreeing(links, poses, np.full(len(right), EVIDENCE)).tolist() == [taken] * len(right)
     found = groups_of(links, poses)
     assert found.group.tolist() == [0] * len(right)
     assert found.evidence == pytest.approx([-np.log10(1 - np.array(right)).sum()])
     assert found.scans.tolist() == [len(right)]
+    # Over weak steps less is needed.
+    weak = np.full(len(right), EVIDENCE_OVER_WEAK)
+    assert agreeing(links, poses, weak).all()
+    assert agreeing(links[:4], poses, weak[:4]).tolist() == [right[0] > 0.9] * 4
     # Matches that need none do not count for those that do.
-    mixed = np.arange(len(right)) < 2
+    mixed = np.where(np.arange(len(right)) < 2, EVIDENCE, 0.0)
     assert agreeing(links, poses, mixed).tolist() == [False] * 2 + [len(right) > 4] * (len(right) - 2)
 
 
@@ -50,8 +54,8 @@ def test_matches_of_one_scan_are_no_group() -> None:
     poses, links = passages([0.999] * 6)
     one = Links.of(CLOSURE, np.zeros(6, int), links.second, pose_difference(poses[:1], compose_poses(
         np.array([-2.0, 1.0, 0.0]), poses[links.second])), links.information, links.p_right)  # fmt: skip
-    assert agreeing(one, poses, np.zeros(6, bool)).all()
-    assert not agreeing(one, poses, np.ones(6, bool)).any()
+    assert agreeing(one, poses, np.zeros(6)).all()
+    assert not agreeing(one, poses, np.full(6, EVIDENCE)).any()
 
 
 def test_closures_join_the_sides_of_breaks() -> None:

@@ -229,12 +229,22 @@ def test_a_failed_match_is_bridged_over(needs) -> None:
     scans = scans_of(ROOM, truth, RING)
     rng = np.random.default_rng(3)
     scans[5] = np.where(rng.random(RING.count) < 0.75, rng.uniform(0.3, 1.2, RING.count), scans[5])
-    chain = gs.chain_scans(scans, RING, backend=needs("opencl"))
+    chainer = Chainer(scans, RING, None, backend=needs("opencl"))
+    list(chainer.steps())
+    chain = chainer.chain()
     good = np.arange(10) != 5
     assert errors(chain, truth)[good].max() < 0.05
     assert chain.doubtful[5:7].all() and not chain.doubtful[:5].any() and not chain.doubtful[7:9].any()
     # The scans beside it are linked.
     assert ((chain.links.first <= 4) & (chain.links.second >= 6)).any()
+    # Both steps may be breaks, and so may one that rests on an unsure match, or on a single one after a jump of time.
+    (front,) = chainer.fronts
+    assert np.flatnonzero(front.weak).tolist() == [4, 5]
+    front.p_right[7] = 0.6
+    assert np.flatnonzero(front.weak).tolist() == [4, 5]
+    front._parts = [front.links[front.links.second - front.links.first == 1]]
+    front.jumps[2] = True
+    assert np.flatnonzero(front.weak).tolist() == [1, 4, 5, 7]
 
 
 @pytest.mark.slow

@@ -53,9 +53,9 @@ class Report:
 
     @property
     def whole_runs(self) -> bool:
-        """Whether a processor's tasks are timed as whole runs."""
-        return (
-            any(row["kind"] == "cpu" and "by_run" not in row for row in self.measured.values()) and self.kind == "tasks"
+        """Tell whether a processor's tasks are timed as whole runs."""
+        return self.kind == "tasks" and any(
+            row["kind"] == "cpu" and "by_run" not in row for row in self.measured.values()
         )
 
     def within(self, common: set[tuple[Any, ...]]) -> dict[str, Any]:

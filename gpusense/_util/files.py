@@ -49,9 +49,7 @@ def write_several(writers: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
     Args:
         writers: Functions that write the contents to a binary stream, by file.
     """
-    import secrets
-
-    tag = secrets.token_hex(4)
+    tag = _tag(4)
     fresh = {target: target.with_name(f".{target.name}.{tag}.new") for target in writers}
     backup = {target: target.with_name(f".{target.name}.{tag}.old") for target in writers}
     existed = {target: target.exists() for target in writers}
@@ -84,11 +82,17 @@ def write_several(writers: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
         clean()
 
 
-def _write_fresh(path: Path, write: Callable[[BinaryIO], object], target: Path | None) -> None:
-    """Write a new file in the folder of ``path``, and rename it to the target, or delete it."""
+def _tag(size: int) -> str:
+    """Return a random word of ``size`` bytes in hexadecimal digits."""
+    # Imported on use, since first calls do not need it.
     import secrets
 
-    fresh = path.parent / f".gpusense-{secrets.token_hex(6)}.new"
+    return secrets.token_hex(size)
+
+
+def _write_fresh(path: Path, write: Callable[[BinaryIO], object], target: Path | None) -> None:
+    """Write a new file in the folder of ``path``, and rename it to the target, or delete it."""
+    fresh = path.parent / f".gpusense-{_tag(6)}.new"
     # An interrupt may come before the first clean-up.
     try:
         try:

@@ -119,7 +119,7 @@ class Front:
 
     @property
     def weak(self) -> Flags:
-        """(M - 1,) whether each step may as well be a break of the chain.
+        """Tell for each of the M - 1 steps whether it may be a break of the chain.
 
         A step is weak if its own scans do not match, or if its match is not beyond doubt and neither the odometry nor
         two further matches confirm it; after a jump of time it must be beyond doubt and confirmed by matches.

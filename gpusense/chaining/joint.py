@@ -89,7 +89,7 @@ class Joint:
 
     @property
     def weak(self) -> Flags:
-        """(M - 1,) whether the motion from a node to the next may be a break of the chain, by each scanner."""
+        """Tell for each of the M - 1 motions between nodes whether it may be a break of the chain by every scanner."""
         weak = np.ones(len(self.failed), bool)
         for front, of in self._each():
             step, inside = _steps_of(of, len(self.nodes))

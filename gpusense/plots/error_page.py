@@ -15,10 +15,9 @@ _PAGES = Path(__file__).parent / "pages"
 def error_page(rows: Sequence[Row], shown: Mapping[str, Sequence[str]] | None = None, text: str = "") -> str:
     """Return the page: a figure of time over error, a budget, and performance profiles.
 
-    A reader chooses need, device, map and error. The most exact method within the budget is marked, chosen as
-    :func:`~gpusense.evaluation.benchmark.choice.choose` does. The other view is
-    the performance profile of Dolan and More (2002): the share of scenes that a method solves to a largest error within
-    a factor of the best time.
+    A reader chooses need, device, map and error. The most exact method within the budget is marked, as
+    :func:`~gpusense.evaluation.benchmark.choice.choose` chooses it. The other view is the performance profile of Dolan
+    and More (2002): the share of scenes that a method solves to a largest error within a factor of the best time.
 
     Args:
         rows: Rows of reports.

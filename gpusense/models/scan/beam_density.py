@@ -40,7 +40,7 @@ class BeamDensity:
 
     @property
     def max_depends(self) -> bool:
-        """Whether the probability of a max reading depends on the pose."""
+        """Tell whether the probability of a max reading depends on the pose."""
         return self.table is not None or len({p.z_max for p in self.mixtures}) > 1
 
     @property
@@ -50,7 +50,10 @@ class BeamDensity:
 
     @property
     def possible(self) -> bool:
-        """Whether some range is possible; if max readings depend on the pose, the kernel detects impossible ranges."""
+        """Tell whether ranges can be possible.
+
+        If ``max_depends``, the kernel detects impossible ranges.
+        """
         return self.max_depends or any(p.z_hit or p.z_short or p.z_rand for p in self.mixtures)
 
 

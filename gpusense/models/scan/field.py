@@ -12,14 +12,7 @@ from numpy.typing import ArrayLike
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray, Compat, Precision, Space
 from gpusense.backends import Selection
-from gpusense.interface.plan import (
-    Note,
-    Omission,
-    SceneNotes,
-    component_notes,
-    launch_omissions,
-    precision_notes,
-)  # fmt: skip
+from gpusense.interface.plan import Note, Omission, SceneNotes, component_notes, launch_omissions, precision_notes
 from gpusense.interface.terms import HIGH_PEAK
 from gpusense.models.run import finish
 from gpusense.models.scan.differentiable import Differentiable

@@ -6,9 +6,9 @@
 
 Two reports of a device are compared on the points or settings that both have, so a map or a setting that one of them
 lacks makes no difference. The older answer stands until another one is clearly better, as on the page; "afresh" counts
-the answers that are the same without that. A report that another one extends does not count. Tasks of a processor that were timed as
-whole runs, before 2026-11-26, are not compared with those that were timed step by step. Commits differ: some
-differences are those of the code.
+the answers that are the same without that. A report that another one extends does not count. Tasks of a processor that
+were timed as whole runs, before 2026-11-26, are not compared with those that were timed step by step. Commits differ:
+some differences are those of the code.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
-"""Compare the answers that reports of different days give: those of docs/error-vs-time.md should be the same.
+"""Compare the answers of reports of different days: docs/error-vs-time.md should recommend the same methods.
 
     python bench/error_vs_time/agreement.py                      # all pairs of reports of a device in the history
     python bench/error_vs_time/agreement.py ONE.json TWO.json    # all pairs of these reports
     python bench/error_vs_time/agreement.py --history ONE.json   # of both
 
 Two reports of a device are compared on the points or settings that both have, so a map or a setting that one of them
-lacks makes no difference. A report that another one extends does not count. Tasks of a processor that were timed as
-whole runs, before 2026-11-26, are not compared with those that were timed step by step. Commits differ: some
-differences are those of the code.
+lacks makes no difference. Reports that another one extends are left out. Tasks of a processor that were timed as whole
+runs, before 2026-11-26, are not compared with tasks that were timed step by step. Reports are of different commits, so
+that some differences are due to the code.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ class Report:
     """A report of one device.
 
     Attributes:
-        name: File and commit that it is read from.
+        name: Its file and commit.
         kind: ``"models"`` or ``"tasks"``.
         document: Its contents.
-        measured: Its measured points or rows, by what was measured.
+        measured: Its measured points or rows, by method and setting.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Report:
         )
 
     def within(self, common: set[tuple[Any, ...]]) -> dict[str, Any]:
-        """Return the document with some of its points or rows."""
+        """Return the document with only these points or rows."""
         kept = [point for key, point in self.measured.items() if key in common]
         return {**self.document, "points" if self.kind == "models" else "rows": kept}
 
@@ -70,8 +70,8 @@ class Answer:
 
     Attributes:
         device, wish: Title of the device, and the wish.
-        old, new: The answers with their figures.
-        same: Whether they name the same method.
+        old, new: Both answers with their figures.
+        same: Whether both name the same method.
     """
 
     device: str
@@ -94,7 +94,7 @@ def report_of(name: str, text: str) -> Report | None:
 
 
 def history() -> Iterator[Report]:
-    """Yield the reports of all commits, newest first, without those that a later one of them extends."""
+    """Yield the reports of all commits, newest first, except those that a later report extends."""
     found: list[Report] = []
     listed = git("log", "--format=%h", "--name-only", "--diff-filter=AM", "--", "bench/results/error_vs_time_*.json")
     commit = ""
@@ -155,7 +155,7 @@ def summary(reports: Sequence[Report]) -> list[str]:
 
 
 def main() -> int:
-    """Print; exit code 1 where answers differ."""
+    """Print the tables; return 1 if answers differ."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("reports", nargs="*", type=Path, help="reports of measure.py; default: those of the history")
     parser.add_argument("--history", action="store_true", help="the history's reports beside the others")

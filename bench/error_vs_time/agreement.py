@@ -1,4 +1,4 @@
-"""Compare the answers that reports of different days give: those of docs/error-vs-time.md should be the same.
+"""Compare the answers of reports of different days: docs/error-vs-time.md should recommend the same methods.
 
     python bench/error_vs_time/agreement.py                      # all pairs of reports of a device in the history
     python bench/error_vs_time/agreement.py ONE.json TWO.json    # all pairs of these reports
@@ -6,9 +6,9 @@
 
 Two reports of a device are compared on the points or settings that both have, so a map or a setting that one of them
 lacks makes no difference. The older answer stands until another one is clearly better, as on the page; "afresh" counts
-the answers that are the same without that. A report that another one extends does not count. Tasks of a processor that
-were timed as whole runs, before 2026-11-26, are not compared with those that were timed step by step. Commits differ:
-some differences are those of the code.
+the answers that are the same without that. Reports that another one extends are left out. Tasks of a processor that
+were timed as whole runs, before 2026-11-26, are not compared with tasks that were timed step by step. Reports are of
+different commits, so that some differences are due to the code.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ class Report:
     """A report of one device.
 
     Attributes:
-        name: File and commit that it is read from, and its date.
+        name: Its file, commit and date.
         kind: ``"models"`` or ``"tasks"``.
         document: Its contents.
-        measured: Its measured points or rows, by what was measured.
+        measured: Its measured points or rows, by method and setting.
     """
 
     name: str
@@ -60,7 +60,7 @@ class Report:
         )
 
     def within(self, common: set[tuple[Any, ...]]) -> dict[str, Any]:
-        """Return the document with some of its points or rows."""
+        """Return the document with only these points or rows."""
         kept = [point for key, point in self.measured.items() if key in common]
         return {**self.document, "points" if self.kind == "models" else "rows": kept}
 
@@ -71,7 +71,7 @@ class Answer:
 
     Attributes:
         device, wish: Title of the device, and the wish.
-        old, new: The answers with their figures.
+        old, new: Both answers with their figures.
         same: Whether they name the same method, where the older answer stands until another one is clearly better.
         afresh: Whether they do where it does not.
     """
@@ -98,7 +98,7 @@ def report_of(name: str, text: str) -> Report | None:
 
 
 def history() -> Iterator[Report]:
-    """Yield the reports of all commits, newest first, without those that a later one of them extends."""
+    """Yield the reports of all commits, newest first, except those that a later report extends."""
     found: list[Report] = []
     listed = git("log", "--format=%h", "--name-only", "--diff-filter=AM", "--", "bench/results/error_vs_time_*.json")
     commit = ""
@@ -163,7 +163,7 @@ def summary(reports: Sequence[Report]) -> list[str]:
 
 
 def main() -> int:
-    """Print; exit code 1 where answers differ."""
+    """Print the tables; return 1 if answers differ."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("reports", nargs="*", type=Path, help="reports of measure.py; default: those of the history")
     parser.add_argument("--history", action="store_true", help="the history's reports beside the others")

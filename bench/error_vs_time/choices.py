@@ -1,4 +1,4 @@
-"""Which method for a limit of error or time: what docs/error-vs-time.md begins with."""
+"""Choose the method for a limit of error or time: the first table of docs/error-vs-time.md."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ WRONG, MEDIAN, TAIL, LARGEST = (
 )  # fmt: skip
 KL, FINE = "KL divergence at a comparable temperature", "KL divergence from the true posterior"
 SHIFT, GLOBAL, LOG_P = "shift of the mean position", "the same, all over the map", "RMS error of log p"
-# By need: the measures of its figure and of its table, the first one that of choices.
+# Measures of a need's figure and table; choices use the first one.
 SHOWN = {
     "rays": (WRONG, MEDIAN, TAIL, LARGEST), "beam model": (KL, GLOBAL, FINE, SHIFT, LOG_P),
     "likelihood field": (KL, GLOBAL, FINE, SHIFT, LOG_P),
@@ -31,11 +31,11 @@ class Wish:
     """An upper limit of the error or of the time.
 
     Attributes:
-        words: In words.
+        words: The wish in words.
         need: Its need.
-        error: The largest error of the need's first measure; None without a limit.
+        error: The largest error, by the need's first measure; None without a limit.
         seconds: The longest time [s]; None without a limit.
-        only: Chooses rows.
+        only: Function that selects rows.
     """
 
     words: str
@@ -105,7 +105,7 @@ def chosen(rows: Sequence[Row], wish: Wish, device: str, standing: str = "") -> 
     best = choose(entries, wish.error, wish.seconds, earlier)
     if best is not None:
         return able[entries.index(best)], True
-    # The nearest one is the fastest where none is fast enough, or the most exact one, chosen among equal ones likewise.
+    # If none keeps the limit, choose the fastest or the most exact one, among equal ones by the same rule.
     nearest = choose(entries, None if wish.error else math.inf, None, earlier)
     return (able[entries.index(nearest)] if nearest else None), False
 
@@ -137,7 +137,7 @@ PLACES = (("laptop", "a laptop's processor", False), ("gpu", "a GPU", True))
 
 
 def lead(rows: Sequence[Row], devices: Sequence[str], standing: Standing) -> list[str]:
-    """Return the first wish's methods on the first processor and the first GPU that have any, and their code."""
+    """Return the methods and code for the first wish, on the first processor and the first GPU that have any."""
     lines, codes = [], []
     for name, place, gpu in PLACES:
         for device in devices:

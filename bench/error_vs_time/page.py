@@ -1,10 +1,10 @@
 """Make docs/error-vs-time.md and its figures from the reports in bench/results, and standing.csv beside this script.
 
     python bench/error_vs_time/page.py           # write
-    python bench/error_vs_time/page.py --check   # exit code 1 where a file differs, or a report is of older code
+    python bench/error_vs_time/page.py --check   # exit code 1 if a file differs or a report is of older code
 
 The same reports give the same bytes everywhere. Answers of the last page, which standing.csv lists, stand until reports
-show a method that is clearly better. The site's build writes the interactive page.
+show a method that is clearly better. The build of the site writes the interactive page.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ PAGE = Path("docs/error-vs-time.md")
 IMAGES = Path("docs/img")
 STANDING = Path("bench/error_vs_time/standing.csv")
 NEEDS = tuple(SHOWN)
-# Methods whose knob other implementations share.
+# Methods with a knob that other implementations share.
 TABLES = ("cddt", "lookup", "march, centre")
 
 
@@ -57,7 +57,7 @@ def best(rows: Sequence[Row], measure: str) -> list[Row]:
 
 
 def chart(rows: Sequence[Row], need: str, devices: Sequence[str]) -> str:
-    """Draw a need: a panel for each device, other implementations among its own methods."""
+    """Draw the chart of a need: a panel for each device, with the methods of gpusense and of others."""
     measure, charts = SHOWN[need][0], []
     for device in devices:
         chosen = [row for row in rows if (row.need, row.device, row.scene) == (need, device, ALL)]
@@ -75,7 +75,7 @@ def chart(rows: Sequence[Row], need: str, devices: Sequence[str]) -> str:
 
 
 def methods(rows: Sequence[Row], need: str, devices: Sequence[str], *, fronts: bool = False) -> list[str]:
-    """Return the table of a need: times on all devices, errors, code; only the fronts where there are many settings."""
+    """Return the table of a need: times on all devices, errors and code; of many settings only the Pareto fronts."""
     measures = SHOWN[need]
     shown: dict[str, dict[str, Row]] = {}
     for device in devices:
@@ -105,7 +105,7 @@ def _time(row: Row | None) -> str:
 
 
 def peers(rows: Sequence[Row]) -> list[str]:
-    """Return the table of other implementations beside the rows that they stand against."""
+    """Return the table of other implementations beside the rows of gpusense that they compare with."""
     outside = [row for row in rows if row.outside and row.scene == ALL]
     lines = []
     for need in ("rays", "beam model", "likelihood field"):
@@ -196,11 +196,11 @@ def files(folder: Path = RESULTS, last: Standing | None = None) -> dict[Path, st
         last: Answers of the last page; None: those of standing.csv.
 
     Raises:
-        ValueError: a report is damaged or of uncommitted changes, or there is none.
+        ValueError: A report is damaged or of uncommitted changes, or there is none.
     """
     found = sources(folder)
     every = rows_of(found)
-    # A table that took too long in all tracking clouds has no error of the need's first measure.
+    # A table that took too long for all tracking clouds lacks the need's first measure of error.
     rows = [row for row in every if SHOWN[row.need][0] in row.errors]
     if not rows:
         raise ValueError(f"reports: {folder.name} must have reports error_vs_time_*.json, got none")
@@ -227,7 +227,7 @@ def files(folder: Path = RESULTS, last: Standing | None = None) -> dict[Path, st
 
 
 def main() -> int:
-    """Write the files, or compare them."""
+    """Write the files, or check them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="write nothing, compare")
     arguments = parser.parse_args()

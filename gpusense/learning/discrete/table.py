@@ -177,7 +177,6 @@ class DiscreteBeamModel(SensorTable):
         return np.where(i < 0, 0.0, log_p)
 
     def sensor_table(self, dtype: DTypeLike) -> NDArray[Any]:
-        """See SensorTable.sensor_table."""
         return np.ascontiguousarray(self._rows(dtype, density=True).T)
 
     def _rows(self, dtype: DTypeLike, *, density: bool) -> NDArray[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 from gpusense.backends.base import Backend
@@ -11,6 +12,7 @@ from gpusense.backends.info import BackendInfo
 def _forwarded(name: str) -> Any:
     """Make a method that calls the method of the same name of the backend behind."""
 
+    @functools.wraps(getattr(Backend, name), updated=())
     def method(self: Proxy, *arguments: Any, **options: Any) -> Any:
         return getattr(self._backend, name)(*arguments, **options)
 

@@ -10,7 +10,7 @@
 
 // With IN_TEAMS the work-items of a group share the points of a match, each with the same pose and sums.
 #if IN_TEAMS
-#define TEAM 64
+#define TEAM 256
 #else
 #define TEAM 1
 #endif
@@ -94,8 +94,11 @@ void add_over_team(real *numbers, const int count, const Team team) {
     for (int i = 0; i < count; ++i) mine[TEAM * i] = numbers[i];
     for (int apart = TEAM / 2; apart > 0; apart /= 2) {
         barrier(CLK_LOCAL_MEM_FENCE);
-        if (team.member < apart)
-            for (int i = 0; i < count; ++i) mine[TEAM * i] += mine[TEAM * i + apart];
+        if (team.member >= apart) continue;
+        // All loads come first, so that none waits for a store.
+        real part[MATCH_SUMS];
+        for (int i = 0; i < count; ++i) part[i] = mine[TEAM * i + apart];
+        for (int i = 0; i < count; ++i) mine[TEAM * i] = numbers[i] += part[i];
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     for (int i = 0; i < count; ++i) numbers[i] = team.shared[TEAM * i];

@@ -17,7 +17,7 @@ MATCH_SUMS = 18
 MATCH_BLOCKS = 8
 # Work-items of a team. With IN_TEAMS the work-items of a group share the points of a match, each with the same pose and
 # sums.
-TEAM = 64
+TEAM = 256
 # Bodies of functions of a team. Work-items of processors share nothing: the first member takes all points.
 _COOPERATES = """
 #if defined(__CUDA_ARCH__)
@@ -30,15 +30,18 @@ _ADD_OVER_TEAM = """
 #if defined(__CUDA_ARCH__)
 __shared__ {real} shared[{sums} * {team}];
 {real} *mine = shared + threadIdx.x;
+wp::vec_t<{sums}, {real}> total = numbers;
 __syncthreads();
 for (int i = 0; i < {sums}; ++i) mine[{team} * i] = numbers.c[i];
 for (int apart = {team} / 2; apart > 0; apart /= 2) {{
     __syncthreads();
-    if (threadIdx.x < apart)
-        for (int i = 0; i < {sums}; ++i) mine[{team} * i] += mine[{team} * i + apart];
+    if (threadIdx.x >= apart) continue;
+    // All loads come first, so that none waits for a store.
+    {real} part[{sums}];
+    for (int i = 0; i < {sums}; ++i) part[i] = mine[{team} * i + apart];
+    for (int i = 0; i < {sums}; ++i) mine[{team} * i] = total.c[i] += part[i];
 }}
 __syncthreads();
-wp::vec_t<{sums}, {real}> total;
 for (int i = 0; i < {sums}; ++i) total.c[i] = shared[{team} * i];
 return total;
 #else

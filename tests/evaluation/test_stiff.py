@@ -23,7 +23,7 @@ from gpusense.models.scan.densities import log_mixture
 
 PRECISIONS = ("float32", "float64")
 PAGE = ROOT / "docs" / "numerics.md"
-# eps (1 + |log p|); processors and NVIDIA's GPUs are far better in float64 than the tolerance, which is for any driver.
+# In eps (1 + |log p|). In float64, processors and NVIDIA's GPUs are far below the tolerance, which is for all drivers.
 BOUND = {"float32": 16, "float64": 16}
 
 make_density_grid = stiff.density_grid
@@ -31,7 +31,7 @@ make_density_grid = stiff.density_grid
 
 @functools.cache
 def density_grid(backend: str, precision: str) -> stiff.Densities:
-    """Score the grid of densities, once on each backend."""
+    """Score the grid of densities, once for each backend."""
     return make_density_grid(backend, precision)
 
 
@@ -68,7 +68,7 @@ def test_density_grid_against_60_digits(backend, precision):
     worst = int(np.argmax(errors))
     where = {name: column[worst] for name, column in grid.parameters.items()}
     assert errors[worst] <= BOUND[precision], (grid.z[worst], grid.expected[worst], where, grid.log_p[worst])
-    # The truth that users' machines have instead of mpmath.
+    # The truth on machines without mpmath.
     assert stiff.error_in_eps(grid.truth(), truth, "float64").max() <= 16
 
 

@@ -70,10 +70,14 @@ def code_of(model) -> frozenset[str]:
     return model._last.flags
 
 
-def same_as_one_by_one(make: Callable[[object], object], as_gpu: Pretend, poses: np.ndarray, z: np.ndarray) -> None:
+def same_as_one_by_one(
+    make: Callable[[object], object], as_gpu: Pretend, poses: np.ndarray, z: np.ndarray
+) -> frozenset[str]:
+    """Compare a model on a GPU with one on a processor; return the flags of the GPU's kernel."""
     model = make(as_gpu())
     found = model.log_likelihood(poses, z)
-    assert "PER_BEAM" not in code_of(model)
+    code = code_of(model)
+    assert "PER_BEAM" not in code
     together, parts = model.log_likelihood(poses, z, per_beam=True)
     assert differing(found, together) == 0
     device = as_gpu(False)
@@ -81,12 +85,34 @@ def same_as_one_by_one(make: Callable[[object], object], as_gpu: Pretend, poses:
     if device.info.lanes == 1:
         assert differing(parts, plain_parts) == 0
         assert differing(found, plain) == 0
-        return
+        return code
     # Functions of vectors may round otherwise.
     if model.compat is None:
         assert_near(parts, plain_parts.astype(np.float64), 2 * per_beam(plain_parts, model.precision))
         assert_near(found, plain.astype(np.float64), 2 * per_scan(plain_parts, model.precision))
     np.testing.assert_allclose(found, plain, rtol=1e-4, atol=1e-4)
+    return code
+
+
+# Parts of a beam model's tiles that the other tests leave to a sample: options, and the flags of the code.
+PARTS = [
+    (
+        dict(parameters=gs.BeamParameters(range_bias=0.02, sigma_growth=0.01), outside="occupied"),
+        {"BIAS", "GROWTH", "OUTSIDE_OCCUPIED"},
+    ),
+    (dict(parameters=gs.BeamParameters(0.8, 0.0, 0.1, 0.1, sigma_hit=0.01), caster="dda"), {"DDA", "STOPS"}),
+    (dict(compat="amcl"), {"CUBES"}),
+]
+
+
+@pytest.mark.parametrize(("options", "flags"), PARTS, ids=["offset", "dda", "cubes"])
+def test_parts_of_beam_models(options, flags, as_gpu):
+    grid, _, z = world()
+    scanner = gs.Scanner(np.linspace(-3, 3, BEAMS), RANGE)
+    code = same_as_one_by_one(
+        lambda device: gs.BeamModel(grid, scanner, backend=device, **options), as_gpu, poses_of("inside"), z
+    )
+    assert flags <= code
 
 
 @pytest.mark.sampled(0.25, without="warp:cpu")
@@ -107,7 +133,7 @@ def test_models(kind, ordered, as_gpu, backend):
             )  # fmt: skip
 
 
-@pytest.mark.sampled(0.25)
+@pytest.mark.sampled(0.17)
 @pytest.mark.parametrize("compat", ["amcl", "beluga"])
 @pytest.mark.parametrize("model", [gs.BeamModel, gs.LikelihoodFieldModel])
 def test_weights_of_other_programs(model, compat, ordered, as_gpu):

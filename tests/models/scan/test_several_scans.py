@@ -87,7 +87,7 @@ MODELS: dict[str, tuple[Any, bool]] = {
 
 
 class Counting(Proxy):
-    """Counts the launches of a backend by kernel."""
+    """A backend that counts launches by kernel."""
 
     def __init__(self, backend: Any) -> None:
         super().__init__(backend)
@@ -117,7 +117,7 @@ def assert_as_one_by_one(model: Any, poses: np.ndarray, z: np.ndarray) -> None:
 @on_every_backend(name=MODELS, gpu=(False, True), on_warp=lambda name, gpu: MODELS[name][1])
 def test_bits_are_those_of_single_calls(name, gpu, as_gpu, monkeypatch):
     device = as_gpu(gpu)
-    # Particles in an order as well, which GPUs would make of many.
+    # Particles in an order as well, as GPUs sort large clouds.
     monkeypatch.setattr("gpusense.models.scan.tiles.LEAST_ORDERED", (1, 1))
     model = MODELS[name][0](backend=device)
     z = scans_of(model.scanner)

@@ -279,7 +279,7 @@ def test_100_000_landmarks_by_brute_force(needs, association):
         for z, bearing in features:
             turn = (bearing - b + np.pi) % (2 * np.pi) - np.pi
             density = np.exp(-0.5 * ((z - d) / p.sigma_range) ** 2 - 0.5 * (turn / p.sigma_bearing) ** 2)
-            # Mass of a range on [0, range_max], for landmarks beyond it that of one at range_max; a bearing's is nearly 1.
+            # Mass of a range on [0, range_max], for farther landmarks that of one there; a bearing's is nearly 1.
             near = np.minimum(d, p.range_max) / p.sigma_range
             mass = ndtr(near) - ndtr(near - p.range_max / p.sigma_range)
             density /= 2 * np.pi * p.sigma_range * p.sigma_bearing * mass

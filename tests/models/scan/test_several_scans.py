@@ -59,7 +59,7 @@ def field(scanner: gs.Scanner = SCANNER, **options: Any) -> Any:
     return functools.partial(gs.LikelihoodFieldModel, GRID, scanner, **{"temperature": 0.7} | options)
 
 
-# Arguments of models, and whether Warp, which compiles each set of flags for seconds, has its turn.
+# Arguments of models, and whether they run on Warp, which compiles each set of flags for seconds.
 MODELS: dict[str, tuple[Any, bool]] = {
     "beam": (beam(), True),
     "beam, float64": (beam(precision="float64"), True),
@@ -153,13 +153,13 @@ def test_scans_with_readings_share_one_set_of_launches(kind, gpu, as_gpu, monkey
     device.launches.clear()
     model.log_likelihood(poses[5:], z[5:])
     launches(1)
-    # Launches of at most 150 particles, which are three scans.
+    # Launches of at most 150 particles, those of three scans.
     monkeypatch.setattr(run, "CHUNK", 150)
     assert_as_one_by_one(model, poses, z)
     device.launches.clear()
     model.log_likelihood(poses[5:], z[5:])
     launches(2)
-    # Scans that fill a launch by themselves.
+    # Each scan fills a launch.
     before = pipeline.TOGETHER
     monkeypatch.setattr(pipeline, "TOGETHER", {"cpu": 50 * BEAMS - 1, "gpu": 50 * BEAMS - 1})
     device.launches.clear()

@@ -35,7 +35,7 @@ FIELD = {
 OPTIONS = [*itertools.product(("free", "occupied"), ("float32", "float64"), (True, False))]
 # Kernels are compiled for each set of flags.
 FEW = [("free", "float32", True), ("occupied", "float64", False)]
-# With every option; other tests hold tiles of the other kinds to the reference in float64.
+# Kinds with every option; other tests compare tiles of the other kinds with the reference in float64.
 APART = ("book", "hit", "bilinear")
 
 
@@ -60,7 +60,7 @@ Pretend = Callable[..., object]
 
 @pytest.fixture(params=[False, True], ids=["as given", "ordered"])
 def ordered(request, monkeypatch) -> bool:
-    """Return whether every cloud is put in an order."""
+    """Return whether every cloud is sorted."""
     if request.param:
         monkeypatch.setattr(tiles, "LEAST_ORDERED", (1, 1))
     return request.param
@@ -185,7 +185,7 @@ def test_any_number_of_particles(count, ordered, as_gpu):
 
 @pytest.mark.parametrize("chunk", ["CHUNK", "CHUNK_BYTES"])
 def test_in_pieces(chunk, ordered, as_gpu, monkeypatch):
-    """Each piece has a window, a place in the result and an order of its own."""
+    """Each piece has its own window, place in the result and order."""
     grid, scanner, z = world()
     poses = np.concatenate([poses_of("inside", 40), poses_of("all over", 77)])
     models = gs.BeamModel(grid, scanner, backend=as_gpu()), gs.LikelihoodFieldModel(grid, scanner, backend=as_gpu())
@@ -206,7 +206,7 @@ def test_in_pieces(chunk, ordered, as_gpu, monkeypatch):
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_work_items_that_add_up_strands_change_nothing(precision, ordered, as_gpu, monkeypatch):
-    """Many particles, and few enough rays: alone, in scans of other lengths together, and with impossible readings."""
+    """Many particles and few rays: single scans, scans of several lengths, and scans with impossible readings."""
     grid, scanner, z = world()
     several = np.stack([poses_of("all over"), poses_of("inside"), poses_of("inside") + 0.1])
     scans = np.stack([z, np.where(np.arange(BEAMS) % 3 == 0, z, np.nan), np.full(BEAMS, np.nan)])
@@ -246,7 +246,7 @@ def test_batches(kind, ordered, as_gpu):
 
 
 def lattice(resolution: float, quarter_turns: bool) -> np.ndarray:
-    """Return poses on edges and corners of cells, whose end points lie on edges and corners too."""
+    """Return poses on edges and corners of cells, with end points on edges and corners."""
     at = np.arange(16, 80, 8) * resolution
     x, y = np.meshgrid(at, at)
     turns = np.arange(x.size) % 8 * (math.pi / 2 if quarter_turns else math.pi / 4)
@@ -309,7 +309,7 @@ def test_origins_at_the_border(as_gpu):
 
 
 def test_a_window_that_grows(as_gpu):
-    """Clouds far from each other, each of which sees a part of the map."""
+    """Clouds are far from each other, and each sees a part of the map."""
     cells = np.where(np.random.default_rng(6).random((400, 400)) < 0.01, 100, 0).astype(np.int8)
     grid, scanner = gs.OccupancyGrid(cells, 0.1), gs.Scanner(np.linspace(-3, 3, 21), 2.0)
     z = np.random.default_rng(9).uniform(0, 2, 21)

@@ -196,7 +196,7 @@ def test_scans_that_do_not_fit_together_are_scored_one_by_one(kind, backend, mon
 
     def refuse(self, name, count, dtype, *, zero=False):
         if name in ("pose", "log_p") and count > 4 * 100:
-            raise MemoryError("so many do not fit")
+            raise MemoryError("more than 400 do not fit")
         return empty(self, name, count, dtype, zero=zero)
 
     monkeypatch.setattr(Workspace, "empty", refuse)

@@ -267,7 +267,8 @@ def existing_file(file: Path) -> Path:
     """
     # For an impossible name os.path reports a missing file, where Path raises another error.
     if not os.path.exists(file):
-        raise FileNotFoundError(f"{file}: must exist, got no such file")
+        found = "a link that leads to no file" if os.path.islink(file) else "no such file"
+        raise FileNotFoundError(f"{file}: must exist, got {found}")
     if not os.path.isfile(file):
         raise ValueError(f"{file}: must be a regular file, got another kind")
     return file

@@ -41,10 +41,10 @@ NAME = "demo"
 HELP = "Localise a robot in a generated building with every backend, compare them, and draw the result."
 
 _DESCRIPTION = """\
-Generates a building and a noisy laser scan in it, and computes for many poses how likely the scan is:
-log P(z | x, m) by the beam model and by the likelihood field. Every backend present does the same work; a table
-compares their times, their errors against the float64 NumPy reference and their ranks of the true pose. A picture
-shows the building, the scan at the best pose, the particles and the likelihood over the whole map."""
+Generate a building and a noisy laser scan in it, and compute for many poses how likely the scan is: log P(z | x, m)
+by the beam model and by the likelihood field. Every backend present does the same work; a table compares their times,
+their errors against the float64 NumPy reference and their ranks of the true pose. A picture shows the building, the
+scan at the best pose, the particles and the likelihood over the whole map."""
 
 _EPILOG = """\
 examples:

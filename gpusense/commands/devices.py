@@ -25,7 +25,7 @@ the particles or beams per work-item, followed by the processor that the driver 
 'auto' opens devices in the order of their speed, and takes the first that works; NumPy is the last. One that does not
 open is listed as unusable. The exit code is 0 whatever is found.
 
-example:
+examples:
   gpusense devices
   gpusense devices --prove
   gpusense devices --json"""

@@ -44,14 +44,14 @@ the fit by angles of incidence is scored too.
 A map made from the same scans hides their errors. Fit with other scans than the map's: for a map of the even scans,
 use --every 2 --offset 1.
 
---out writes parameters.yaml (for 'gpusense localize --params' and for nav2's amcl) and pictures: readings.png,
+--out writes parameters.yaml (for 'gpusense localize --parameters' and for nav2's amcl) and pictures: readings.png,
 density.png, trace.png, surface.png, and incidence.png where angles of incidence are fitted.
 
 Ctrl-C ends the fit and prints the best parameters so far.
 
 Exit codes: 0 success, 1 the fit did not converge, 2 bad input, 130 interrupted, 143 terminated.
 
-example:
+examples:
   gpusense fit --map map.yaml --log run.log.gz --every 2 --offset 1 --holdout --fit-motion --out fitted
   gpusense fit --pairs readings.csv --range-max 8 --range-bias"""
 

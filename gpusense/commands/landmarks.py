@@ -51,7 +51,7 @@ than poses anywhere among the landmarks, as on a wrong map.
 
 Exit codes: 0 success, 1 lost at the end, 2 bad input.
 
-example:
+examples:
   gpusense landmarks --folder MRCLAM_Dataset1 --robot 1
   gpusense landmarks --folder MRCLAM_Dataset1 --robot 2 --unknown --particles 5000 --plot run.png"""
 
@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = _EPILOG
     add = parser.add_argument
     add("--folder", required=True, type=Path, metavar="DIR", help="the recorded run, in the format below")
-    add("--robot", required=True, type=whole_number(low=1), metavar="N", help="which robot")
+    add("--robot", required=True, type=whole_number(low=1), metavar="N", help="number in its files' names")
     kind = parser.add_mutually_exclusive_group()
     kind.add_argument("--known", dest="known", action="store_true", default=True,
         help="the landmark of each reading is known by its barcode (default)")  # fmt: skip

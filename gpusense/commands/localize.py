@@ -53,7 +53,7 @@ Ctrl-C ends the run with the results so far, and writes the files.
 Exit codes: 0 the verdict is 'tracking', 1 uncertain or lost at the end, or no reading there to judge by, 2 bad input,
 130 interrupted, 143 terminated.
 
-example:
+examples:
   gpusense localize --map map.yaml --log run.log.gz
   gpusense localize --map map.yaml --log run.log.gz --global --particles 20000 --tum run.tum --plot run.png
   gpusense localize --map map.yaml --log run.bag --topic /front --start 1.5 -2 0.3

@@ -38,7 +38,7 @@ Ctrl-C ends the run with the results so far.
 
 Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
-example:
+examples:
   gpusense match --log run.log.gz --limit 300
   gpusense match --log run.log.gz --guess identity --plot worst.png
   gpusense match --log run.bag --topic /scan --noise 0.03 --tum run.tum

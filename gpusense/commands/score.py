@@ -50,7 +50,7 @@ A row is printed as soon as its scan is scored. Ctrl-C ends the run with the res
 Exit codes: 0 the log fits the map, 1 it does not or the verdict is uncertain, or two backends rank the particles
 differently by more than rounding explains, 2 bad input, 130 interrupted, 143 terminated.
 
-example:
+examples:
   gpusense score --map map.yaml --log run.log.gz --model field --particles 20000
   gpusense score --map map.yaml --log run.log.gz --parameters fitted/parameters.yaml
   gpusense score --map map.yaml --log run.log.gz --every 2 --offset 1 --backend opencl --backend numpy --limit 3"""

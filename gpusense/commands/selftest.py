@@ -37,7 +37,7 @@ Exit codes: 0 every difference is within its tolerance, 1 one is not, 2 bad inpu
 1e6 of range_max, lambda up to 1e6, weights of exactly 0 and 1, extreme maps, resolutions, poses and scans. Errors are
 in eps (1 + |log p|) unless the unit is another; the textbook's formulas are listed for comparison.
 
-example:
+examples:
   gpusense selftest
   gpusense selftest --stiff
   gpusense selftest --backend opencl --backend warp:cpu --json"""

@@ -254,9 +254,9 @@ PAIRS = ["--pairs", "{file}", "--range-max", "5"]
     ("1,1", [*PAIRS, "--incidence", "3"],
      "--incidence: must have pairs with a third column, the angle, got two in {file}"),
     ("1,1", [*PAIRS, "--backend", "opencl:no such"], "no such"),
-    ("", PAIRS, "pairs: must hold a pair of number 0, which is the first one chosen, got 0 in {file}"),
+    ("", PAIRS, "pairs: must hold a pair of index 0, the first one chosen, got 0 pairs in {file}"),
     ("1,1\n2,2\n", [*PAIRS, "--offset", "2"],
-     "pairs: must hold a pair of number 2, which is the first one chosen, got 2"),
+     "pairs: must hold a pair of index 2, the first one chosen, got 2 pairs"),
     ("z,e\n1,1\nx,2\n", PAIRS, "{file}: line 3: must hold numbers, got 'x'"),
     ("z,e\nz,e\n", PAIRS, "{file}: line 2: must hold numbers, got 'z'"),
     ("1,1\n\n1,2,3\n", PAIRS, "{file}: line 3: must hold 2 numbers with commas between them, got 3"),
@@ -264,10 +264,12 @@ PAIRS = ["--pairs", "{file}", "--range-max", "5"]
     ("1,2,3,4\n", PAIRS, "{file}: line 1: must hold 2 or 3 numbers with commas between them, got 4"),
     ("1,2\n" + "1," * 3000, PAIRS, "{file}: line 2: must have at most 4096 bytes, got more"),
     ("nan,1\nnan,1\n", PAIRS, "ranges: must hold a reading that is not missing, got 2 of which none is"),
-    ("1,9\n", PAIRS,
-     "expected: every value must be in [0, range_max] where the reading is not missing, got 9.0 at index 0"),
+    ("z,e\n1,1\n1,9\n", PAIRS,
+     "{file}: pair 1: the expected range must be in [0, 5.0] where the reading is not missing, got 9.0"),
+    ("1,1\n" * 8 + "1,nan\n", [*PAIRS, "--offset", "2", "--every", "2", "--holdout", "--block", "1"],
+     "{file}: pair 8: the expected range must be in [0, 5.0] where the reading is not missing, got nan"),
     (b"\x1f\x8b\x08junk", PAIRS, "{file}:1: must be a whole gzip file, got "),
-    (b"\xff\xfe\x00", PAIRS, "pairs: must hold a pair of number 0"),
+    (b"\xff\xfe\x00", PAIRS, "pairs: must hold a pair of index 0"),
     (None, ["--pairs", "{folder}/none.csv", "--range-max", "5"], "none.csv: must exist, got no such file"),
 ])  # fmt: skip
 def test_bad_input_is_one_line(capsys, recorded, tmp_path, contents, arguments, message):
@@ -285,7 +287,7 @@ def test_bad_input_is_one_line(capsys, recorded, tmp_path, contents, arguments, 
 def test_help_explains_itself(capsys):
     assert main(["fit", "--help"]) == 0
     text = capsys.readouterr().out
-    assert "example:" in text and "gpusense fit --pairs readings.csv" in text and "z_hit" in text
+    assert "examples:" in text and "gpusense fit --pairs readings.csv" in text and "z_hit" in text
     assert command.NAME == "fit"
 
 

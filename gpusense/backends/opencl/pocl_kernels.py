@@ -5,9 +5,9 @@ loads them without a check. Its folder is one of this process. The folder of a p
 the cache before the program is built, and back into an entry after its kernels have run.
 
 For that hash PoCL preprocesses its own headers and the source, which takes 27 ms for each program. So a program is made
-of its bitcode where the version of PoCL takes that, which takes 1 ms. PoCL names the kernels of bitcode by nothing but the
-kernel's name and the size of its groups. Kernels are therefore compiled under a name that ends in a hash of all that
-their code depends on.
+of its bitcode where the version of PoCL takes that, which takes 1 ms. PoCL names the kernels of bitcode by nothing but
+the kernel's name and the size of its groups. Kernels are therefore compiled under a name that ends in a hash of all
+that their code depends on.
 """
 
 from __future__ import annotations

@@ -5,9 +5,10 @@
     python bench/error_vs_time/agreement.py --history ONE.json   # of both
 
 Two reports of a device are compared on the points or settings that both have, so a map or a setting that one of them
-lacks makes no difference. Reports that another one extends are left out. Tasks of a processor that were timed as whole
-runs, before 2026-11-26, are not compared with tasks that were timed step by step. Reports are of different commits, so
-that some differences are due to the code.
+lacks makes no difference. The older answer stands until another one is clearly better, as on the page; "afresh" counts
+the answers that are the same without that. Reports that another one extends are left out. Tasks of a processor that
+were timed as whole runs, before 2026-11-26, are not compared with tasks that were timed step by step. Reports are of
+different commits, so that some differences are due to the code.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class Report:
     """A report of one device.
 
     Attributes:
-        name: Its file and commit.
+        name: Its file, commit and date.
         kind: ``"models"`` or ``"tasks"``.
         document: Its contents.
         measured: Its measured points or rows, by method and setting.
@@ -71,7 +72,8 @@ class Answer:
     Attributes:
         device, wish: Title of the device, and the wish.
         old, new: Both answers with their figures.
-        same: Whether both name the same method.
+        same: Whether they name the same method, where the older answer stands until another one is clearly better.
+        afresh: Whether they do where it does not.
     """
 
     device: str
@@ -79,6 +81,7 @@ class Answer:
     old: str
     new: str
     same: bool
+    afresh: bool
 
 
 def report_of(name: str, text: str) -> Report | None:
@@ -90,6 +93,7 @@ def report_of(name: str, text: str) -> Report | None:
     points = [point for point in document["points" if kind == "models" else "rows"] if point["backend"] != "outside"]
     able = [point for point in points if (point["status"] == "ok" if kind == "models" else point["seconds"])]
     measured = {tuple(point[name] for name in KEYS[kind]): point for point in able}
+    name = f"{name}, {document['date']}"
     return Report(name, kind, document, measured) if len({point["backend"] for point in points}) == 1 else None
 
 
@@ -124,12 +128,15 @@ def compare(old: Report, new: Report) -> list[Answer]:
     devices = [{row.device for row in each} for each in rows]
     answers = []
     for device, wish in itertools.product(sorted(devices[0] & devices[1]), WISHES):
-        picks = [chosen(each, wish, device) for each in rows]
-        if any(row is None for row, _ in picks):
+        first, second = (chosen(each, wish, device) for each in rows)
+        if first[0] is None or second[0] is None:
             continue
-        texts = [answer(each, wish, device) for each in rows]
-        same = len({(row.text if row else "", kept) for row, kept in picks}) == 1
-        answers.append(Answer(device, wish.words, texts[0], texts[1], same))
+        standing = first[0].text
+        later, kept = chosen(rows[1], wish, device, standing)
+        same = later is not None and (later.text, kept) == (standing, first[1])
+        afresh = (second[0].text, second[1]) == (standing, first[1])
+        texts = answer(rows[0], wish, device), answer(rows[1], wish, device, standing)
+        answers.append(Answer(device, wish.words, *texts, same, afresh))
     return answers
 
 
@@ -143,14 +150,15 @@ def pairs(reports: Sequence[Report]) -> Iterator[tuple[Report, Report, list[Answ
 
 def summary(reports: Sequence[Report]) -> list[str]:
     """Return the table of pairs and that of differences."""
-    shares, differences, total, equal = [], [], 0, 0
+    shares, differences, total, equal, fresh = [], [], 0, 0, 0
     for old, new, answers in pairs(reports):
         same = sum(one.same for one in answers)
-        total, equal = total + len(answers), equal + same
-        shares.append((answers[0].device, old.name, new.name, f"{same} of {len(answers)}"))
+        afresh = sum(one.afresh for one in answers)
+        total, equal, fresh = total + len(answers), equal + same, fresh + afresh
+        shares.append((answers[0].device, old.name, new.name, f"{same} of {len(answers)}", f"{afresh}"))
         differences += [(one.device, one.wish, old.name, one.old, new.name, one.new) for one in answers if not one.same]
-    lines = [f"{equal} of {total} answers of {len(shares)} pairs of reports are the same.", ""]
-    lines += table(("device", "older", "newer", "same"), shares, 4)
+    lines = [f"{equal} of {total} answers of {len(shares)} pairs of reports are the same, {fresh} afresh.", ""]
+    lines += table(("device", "older", "newer", "same", "afresh"), shares, 4)
     return [*lines, "", *table(("device", "to do", "older", "answer", "newer", "answer"), differences, 6)]
 
 

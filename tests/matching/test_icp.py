@@ -10,7 +10,7 @@ from gpusense.backends import get_backend
 from gpusense.interface.structs import MatchRules
 from gpusense.matching.icp import IcpPairs, space_of
 from gpusense.matching.points import scan_points
-from gpusense.reference import icp as reference
+from gpusense.reference import icp_pairs as reference
 from gpusense.reference.lines import fit_lines
 
 RULES = MatchRules(40, 2, 3, 1, 0, 0, 1.0, 0.3, 1.0, 0.03, 0.85, 0.06, 0.3, 1e-4)

@@ -312,13 +312,6 @@ def test_scenes_of_the_compiled_peers_are_those_of_the_tests(monkeypatch: pytest
         assert [case.field.to_dict() for case in cases] == [s["field"] for s in one["scores"]]
 
 
-def test_whole_calls_run(needs: Callable[[str], str], tmp_path: Path) -> None:
-    small = ["--size", "12", "--particles", "40", "--beams", "7", "--calls", "3", "--load", "1"]
-    report = run_script("speed/whole_calls.py", "--backend", needs("opencl"), *small, output=tmp_path / "small")
-    assert {row["way"] for row in report["rows"]} >= {"launches alone", "log_likelihood", "bound"}
-    assert all(row["ms"] == sorted(row["ms"]) and row["ms"][0] > 0 for row in report["rows"])
-
-
 def test_field_gradients_are_measured(needs: Callable[[str], str], tmp_path: Path) -> None:
     small = ["--particles", "60", "--beams", "11", "--repeats", "1", "--backend", needs("opencl")]
     report = run_script("speed/field_gradient.py", *small, output=tmp_path / "small")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import importlib
 import json
 import math
@@ -19,7 +20,7 @@ from support.paths import ROOT
 
 from gpusense.evaluation.benchmark.rows import titles_of
 
-DEVICE = "2 cores of an X, PoCL"
+DEVICE, WISH = "2 cores of an X, PoCL", "localisation to 2 cm"
 
 
 @pytest.fixture(scope="module")
@@ -176,6 +177,20 @@ def test_noise_of_times_gives_the_same_answers(page: ModuleType, tmp_path: Path,
     assert found[0] == found[1] and len(found[0]) == 6
 
 
+def test_answers_of_the_last_page_stand(page: ModuleType, tmp_path: Path) -> None:
+    """The beam model is slower than the field by less than noise of two days, then by more."""
+    found = []
+    for seconds in (0.0029, 0.0033):
+        write_tasks(tmp_path, [*ROWS, task("beam", "500 x 60", seconds, 0.006)])
+        files = page.files(tmp_path, {(DEVICE, WISH): "beam, 500 x 60", ("gone", "x"): "y"})
+        (answer,) = (row for row in csv.DictReader(files[page.STANDING].splitlines()) if row["to do"] == WISH)
+        assert answer["device"] == DEVICE and "gone" not in files[page.STANDING]
+        assert f"| {WISH} | **{answer['answer']}**: " in files[page.PAGE]
+        assert files == page.files(tmp_path, {(DEVICE, WISH): answer["answer"]})
+        found.append(answer["answer"])
+    assert found == ["beam, 500 x 60", "field, 1000 x 60"]
+
+
 def test_reports_of_other_days_are_compared(page: ModuleType, tmp_path: Path) -> None:
     """Only common settings count: the beam model is now slower than the limit, and 100 000 particles are new."""
     agreement, texts = importlib.import_module("error_vs_time.agreement"), []
@@ -186,9 +201,12 @@ def test_reports_of_other_days_are_compared(page: ModuleType, tmp_path: Path) ->
     old, new = (agreement.report_of(name, text) for name, text in zip("ab", texts, strict=True))
     assert agreement.report_of("c", json.dumps({"schema": 1, "points": []})) is None
     lines = agreement.summary([new, old])
-    assert lines[0] == "2 of 3 answers of 1 pairs of reports are the same."
-    assert f"| {DEVICE} | 1000 particles at 100 Hz | a | **beam, 1000 x 60**: 9 ms, 6 mm | b |" in lines[-1]
-    assert agreement.summary([old])[0] == "0 of 0 answers of 0 pairs of reports are the same."
+    assert lines[0] == "2 of 3 answers of 1 pairs of reports are the same, 2 afresh."
+    device = (
+        f"| {DEVICE} | 1000 particles at 100 Hz | a, 2026-01-01 | **beam, 1000 x 60**: 9 ms, 6 mm | b, 2026-01-01 |"
+    )
+    assert device in lines[-1]
+    assert agreement.summary([old])[0] == "0 of 0 answers of 0 pairs of reports are the same, 0 afresh."
 
 
 def test_a_variant_of_a_device_stands_behind_it(reports: ModuleType) -> None:

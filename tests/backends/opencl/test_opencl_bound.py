@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import re
 import weakref
 from typing import Any
 
@@ -87,7 +88,8 @@ def test_a_bound_call_binds_no_argument_again(as_gpu, queue, there, monkeypatch)
     )  # fmt: skip
     monkeypatch.setattr(as_gpu, "compile", None)
     call()
-    assert names == ["place_inputs", "field_blocks", "sum_parts"]
+    # PoCL's kernels have a hash behind their names.
+    assert [re.sub("_[0-9a-f]{24}$", "", name) for name in names] == ["place_inputs", "field_blocks", "sum_parts"]
 
 
 def test_a_bound_call_whose_device_is_gone(as_gpu, queue, there, monkeypatch):

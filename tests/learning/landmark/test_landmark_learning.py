@@ -224,7 +224,7 @@ POSES, FEATURES = np.zeros((2, 3)), [[2.0, 1.0], [5.0, 0.9]]
         ({"scan": [0]}, ValueError, "scan: shape must be (2,), got (1,)"),
         ({"range_max": 0}, ValueError, "range_max: must be finite and > 0, got 0"),
         ({"bias": 1}, TypeError, "bias: must be True or False, got 1"),
-        ({"initial": 0.2}, TypeError, "initial: must be LandmarkParameters, got 0.2"),
+        ({"initial": 0.2}, TypeError, "initial: must be LandmarkParameters or None, got 0.2"),
         ({"max_iterations": 0}, ValueError, "max_iterations: must be >= 1, got 0"),
         ({"tolerance": 0}, ValueError, "tolerance: must be finite and > 0, got 0"),
         ({"mount": (0, 0)}, ValueError, "mount: shape must be (3,), got (2,)"),

@@ -19,7 +19,7 @@ OPENCL, WARP, NUMPY = LANGUAGES = "OpenCL", "Warp", "NumPy"
 FOLDERS = {WARP: kernel_root() / "warp", NUMPY: Path(gpusense.reference.__file__).parent}
 # Functions that make a file's Warp functions and kernels for a set of flags; they are no part of the concept.
 FACTORIES = {"functions", "make"}
-# Files of one language that are no concept of kernels.
+# Files of a single language, which are no concepts.
 OTHER_FILES = {
     WARP: {"__init__": "makes the folder a package", "prelude": "types and decorators of all Warp kernels"},
     NUMPY: {
@@ -101,14 +101,14 @@ each_concept = pytest.mark.parametrize("concept", CONCEPTS)
 
 
 def opencl_functions(text: str) -> list[str]:
-    """Names of the functions and kernels that an OpenCL file defines, in order; both branches of an #if are read."""
+    """Return the names of an OpenCL file's functions and kernels, in order, from both branches of each #if."""
     code = re.sub(r"//[^\n]*", "", text)
     definition = r"^(?!typedef|#)(?:[a-zA-Z_][\w()]*[\s*]+)+(\w+)\([^;{}]*\)\s*\{"
     return list(dict.fromkeys(re.findall(definition, code, re.MULTILINE)))
 
 
 def python_functions(text: str) -> list[str]:
-    """Names of the functions that a Python file defines, in order, nested ones too, but for factories."""
+    """Return the names of a Python file's functions, in order, nested ones included and factories left out."""
     found = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef)]
     found.sort(key=lambda node: node.lineno)
     return list(dict.fromkeys(node.name for node in found if node.name not in FACTORIES))
@@ -116,7 +116,7 @@ def python_functions(text: str) -> list[str]:
 
 @functools.cache
 def functions(concept: str, language: str) -> list[str]:
-    """Names of a concept's functions in a language, in order."""
+    """Return the names of a concept's functions in a language, in order."""
     if language == OPENCL:
         return opencl_functions(opencl_source(concept))
     return python_functions((FOLDERS[language] / f"{concept}.py").read_text(encoding="utf-8"))

@@ -17,7 +17,7 @@ from gpusense.reference import icp_pairs as reference
 from gpusense.reference.lines import fit_lines
 
 RULES = MatchRules(40, 2, 3, 1, 0, 0, 1.0, 0.3, 1.0, 0.03, 0.85, 0.06, 0.3, 1e-4)
-# Sums are added in another order than by NumPy: information is compared relative to its largest number.
+# Sums have another order than NumPy's: information is compared relative to its largest number.
 TOLERANCE = {"float32": (2e-5, 2e-4), "float64": (1e-10, 1e-9)}
 
 

@@ -77,6 +77,7 @@ class OpenCLBackend(ProcessBound, Backend):
         self._keys = BinaryCache(info)
         self._cache = _binary_cache(info, device)
         self._pocl = pocl_kernels.pocl_kernels() if pocl.is_pocl(device) else None
+        self._of_bitcode = pocl.takes_bitcode(device)
         # Ranges are the same bits everywhere only if division is rounded correctly, which is an option on GPUs.
         rounded = bool(device.single_fp_config & _ROUNDED_DIVISION)
         self.options = ["-cl-fp32-correctly-rounded-divide-sqrt"] if rounded else []
@@ -246,7 +247,8 @@ class OpenCLBackend(ProcessBound, Backend):
             self._programs[row.file, flags] = self._build(row.file, flags)
         program, key = self._programs[row.file, flags]
         first = None if self._pocl is None else functools.partial(self._pocl.mark, key)
-        return Launch(self, new_kernel(program, kernel), row, flags, first)
+        name = pocl_kernels.own_name(kernel, key) if self._of_bitcode else kernel
+        return Launch(self, new_kernel(program, name), row, flags, first)
 
     def _build(self, file: str, flags: frozenset[str]) -> tuple[cl.Program, str]:
         """Build the program of a kernel file; return it with its key in the cache.
@@ -260,10 +262,15 @@ class OpenCLBackend(ProcessBound, Backend):
         if not self.info.float64 and uses_double(file, flags):
             raise ValueError(f"{file}.cl: computes in float64, which {self.info.name} does not have")
         source = assemble(file, flags)
-        key = self._keys.key(source, self.options)
+        # Bitcode belongs to the version of LLVM, which the platform's version names.
+        key = self._keys.key(
+            source, [*self.options, self._device.platform.version] if self._of_bitcode else self.options
+        )
         if (program := self._kept(source)) is not None:
             return program, key
         try:
+            if self._pocl is not None and self._of_bitcode:
+                return self._built_of_bitcode(self._pocl, file, source, key), key
             with contextlib.nullcontext() if self._pocl is None else self._pocl.building(key):
                 program = self._built(cl.Program(self._context, source))
         except cl.RuntimeError as error:
@@ -274,6 +281,17 @@ class OpenCLBackend(ProcessBound, Backend):
             devices: Any = program.get_info(cl.program_info.DEVICES)
             self._cache.store(source, self.options, binaries[devices.index(self._device)])
         return program, key
+
+    def _built_of_bitcode(self, compiled: pocl_kernels.PoclKernels, file: str, source: str, key: str) -> cl.Program:
+        """Return a program of a kernel file whose kernels have names of their own."""
+        names = {name: pocl_kernels.own_name(name, key) for name, row in KERNELS.items() if row.file == file}
+        options = [*self.options, *(f"-D{name}={other}" for name, other in names.items())]
+        return compiled.built(
+            key,
+            list(names.values()),
+            lambda: self._built(cl.Program(self._context, source), options),
+            lambda bitcode: self._built(cl.Program(self._context, [self._device], [bitcode]), options),
+        )
 
     def _kept(self, source: str) -> cl.Program | None:
         """Return the program that an earlier run compiled; None if the driver accepts no stored one."""
@@ -286,9 +304,9 @@ class OpenCLBackend(ProcessBound, Backend):
             self._cache.discard(source, self.options)
             return None
 
-    def _built(self, program: cl.Program) -> cl.Program:
-        """Compile a program, or load its binary."""
+    def _built(self, program: cl.Program, options: list[str] | None = None) -> cl.Program:
+        """Compile a program, or load its binary; the options are the backend's where none are passed."""
         with warnings.catch_warnings(), without_caches():
             # Some drivers write a log for every program; pyopencl shows it where PYOPENCL_COMPILER_OUTPUT is set.
             warnings.simplefilter("ignore", cl.CompilerWarning)
-            return program.build(self.options, [self._device])
+            return program.build(self.options if options is None else options, [self._device])

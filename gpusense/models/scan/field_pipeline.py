@@ -165,7 +165,8 @@ class FieldPipeline(ScanPipeline):
     def flags(self, conditions: frozenset[str], *, tiled: bool, per_beam: bool) -> frozenset[str]:
         flags = self.components | conditions
         if not tiled:
-            flags = with_lanes_flag(self.backend.info.lanes, "score_field", flags | flags_if(PER_BEAM=per_beam))
+            info, flags = self.backend.info, flags | flags_if(PER_BEAM=per_beam)
+            flags = with_lanes_flag(info.lanes, "score_field", flags, float64=info.float64)
         return flags | flags_if(ROUNDED_CELLS=self.quick and (tiled or self.backend.info.vector_loops))
 
     def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:

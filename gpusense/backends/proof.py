@@ -4,8 +4,8 @@ A compiler that does not know a processor aborts, hangs or makes wrong code in t
 child computes a small scene and compares it with NumPy, once for each combination of device, driver, processor and
 version of gpusense. A family of kernels that fails is not used: lanes are replaced by narrower ones and then by scalar
 kernels, float64 counts as absent, and a device whose scalar kernels fail is unusable. The verdict is kept in the cache,
-and so are the programs that the child compiled; a hang is, once it has happened twice. ``GPUSENSE_PROOF=off`` trusts every driver. If no child can be started,
-a device without a cached verdict is trusted, and the log says so.
+and so are the programs that the child compiled; a hang is kept once it has happened twice. ``GPUSENSE_PROOF=off``
+trusts every driver. If no child can be started, a device without a cached verdict is trusted, and the log says so.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ USAGE = "usage: compare_trees.py {speed,bits,record,compare} ..."
 
 
 def main() -> int:
-    """Run a subcommand, which alone decides what of a tree is imported."""
+    """Run a subcommand; each imports only the modules that it needs."""
     if len(sys.argv) > 1 and sys.argv[1] == "speed":
         from trees import speed
 

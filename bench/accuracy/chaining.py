@@ -4,21 +4,24 @@
 
 Rows of a log: its raw odometry; "scan to scan", successive matches without key scans and loops; "chain" is
 ``gpusense.chain_scans``, with and without odometry, with and without closures; "KISS-ICP" where that library is
-installed, on points with z = 0, with the voxels of 0.1, 0.3 and 1 m, and with or without its correction of motion
-during scans where they have a duration, whatever errs least; "CSM", from scan to scan, where a copy of it is given.
-"jarvis-both" has the scans of both lasers. Times are wall time without the first call's compilation.
+installed, on points with z = 0, with the best of voxels of 0.1, 0.3 and 1 m, with or without its correction of motion
+during scans that have a duration; "CSM", from scan to scan, if its sources are given. "jarvis-both" has the scans of
+both lasers. Times are wall time without the first call's compilation.
 
 "error" is the root mean square distance from the reference after alignment. "drift" is the mean error of relative
 poses over a path of 5, 20 and 100 m, per length. "contradicted" closures differ from the reference by more than 0.5 m
-or 0.15 rad; "wrong motions" from scan to scan by more than 0.3 m or 0.1 rad, of which "said" ones are in doubtful
-stretches; the references themselves have errors. So "fit better" counts the contradicted closures at which the end
-points of five scans around one place lie more often within 10 cm of those around the other than at the reference. The
-reference of jarvis is a track by reflectors, whose clock is not the lasers'; that of olin is of scans taken as
-instantaneous: both are read where the error of a row is least, within 0.25 s.
+or 0.15 rad. "wrong motions" from scan to scan differ by more than 0.3 m or 0.1 rad; those "said" lie in doubtful
+stretches. The references have errors as well. Therefore "fit better" counts the contradicted closures that put more end
+points of five scans around one place within 10 cm of those around the other than the reference does. The reference of
+jarvis is a track by reflectors with a clock of its own, that of olin takes scans as instantaneous: each is shifted in
+time by up to 0.25 s, to where the error of a row is least.
+
 "held out" is the share of end points up to 20 m of odd scans within 5 and 15 cm of an occupied cell of the even scans'
 map, at the poses of the row with odometry and closures, and at those of the reference.
-The last table has groups of matches of places that agree with one another, taken or not: of those with references for
-their matches, how many have mostly right ones, by evidence. Where the drift does not tell, closures need 6.5.
+
+The last table has groups of matches between places that agree with one another, whether used or not: by evidence, the
+groups whose matches have references, and those of them that are mostly right. Where the drift cannot decide, closures
+need an evidence of 6.5.
 """
 
 from __future__ import annotations
@@ -116,7 +119,7 @@ def chain_row(log: Log, arguments: argparse.Namespace, with_odometry: bool, loop
 
 
 def contradicted(links: Any, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the links between scans with references, and whether these contradict each."""
+    """Return the links between scans with references, and whether the references contradict each."""
     rows = np.flatnonzero(np.isfinite(truth[links.first] + truth[links.second]).all(axis=1))
     if not len(rows):
         return rows, np.zeros(0, bool)
@@ -125,7 +128,7 @@ def contradicted(links: Any, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def judged_groups(loops: Loops, truth: np.ndarray) -> list[dict[str, float]]:
-    """Return evidence, matches with references, and right ones among these of each group that has any."""
+    """Return the evidence of each group with references, its matches with references, and the right ones of these."""
     groups = groups_of(loops.matches, loops.solution.poses)
     rows, wrong = contradicted(loops.matches.renumbered(loops.nodes), truth)
     result = []
@@ -162,7 +165,7 @@ def fits(
 ) -> tuple[float, float]:
     """Return the shares of end points around a scan near those around another one: at a pose, and at the reference.
 
-    The scans around each stand in its frame as the chain has them.
+    The chain places the scans around each in its frame.
     """
     from scipy.spatial import cKDTree
 
@@ -186,7 +189,7 @@ def fits(
 
 
 def wrong_motions(chain: gs.ScanChain, truth: np.ndarray) -> dict[str, int]:
-    """Return how many motions from scan to scan are off by more than 0.3 m or 0.1 rad, and how many are said."""
+    """Count the motions from scan to scan that are off by more than 0.3 m or 0.1 rad, and those of them in doubt."""
     known = np.flatnonzero(np.isfinite(truth[:-1] + truth[1:]).all(axis=1))
     off = gs.pose_difference(*(gs.pose_difference(p[known], p[known + 1]) for p in (truth, chain.poses)))
     wrong = (np.hypot(off[:, 0], off[:, 1]) > 0.3) | (np.abs(off[:, 2]) > 0.1)
@@ -230,7 +233,7 @@ def held_out(log: Log, poses: np.ndarray, motions: np.ndarray | None, backend: s
 
 
 def peers(log: Log, arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """Return the rows of other programs that are there: KISS-ICP, whatever errs least, and CSM from scan to scan."""
+    """Return the rows of other programs that are installed: the best of KISS-ICP, and CSM from scan to scan."""
     rows = []
     found = kiss_icp(log)
     if found:
@@ -247,7 +250,7 @@ def peers(log: Log, arguments: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def measured(log: Log, arguments: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any] | None]:
-    """Return the rows of a log, and that of its maps, which is None for several lasers."""
+    """Return the rows of a log, and the row of its maps, which is None for several lasers."""
     rows = [figures(log, "odometry", log.odometry, 0.0)]
     if log.lasers is None:
         gs.chain_scans(log.ranges[:6], log.scanner, log.odometry[:6], backend=arguments.backend)
@@ -270,7 +273,7 @@ def measured(log: Log, arguments: argparse.Namespace) -> tuple[list[dict[str, An
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Measure, and publish tables."""
+    """Measure the logs and publish the tables."""
     parser = make_parser(__doc__, backend="auto", data=True)
     parser.add_argument("--log", action="append", choices=LOGS, help="default: all")
     parser.add_argument("--csm", type=Path, help="a copy of CSM's repository, which is compiled")

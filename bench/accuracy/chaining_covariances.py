@@ -1,15 +1,16 @@
-"""Choose the inflation of covariances of chains on some logs, and look at covariances on others.
+"""Fit the inflation of covariances of chains to some logs, and test the covariances on others.
 
     python bench/accuracy/chaining_covariances.py --backend opencl --output bench/results/chaining_covariances
 
-Chains are made without closures, from odometry. Errors are those of relative poses between scans that are 2 to 20 m of
-the way apart, with covariances of relative poses of the pose graph times an inflation. The normalised squared error
-(NEES) is divided by 3, so that 1 is right; "within" are the shares of errors in the ellipsoids of 50, 80 and 95 %.
-The inflation of a log is the mean NEES without one, with the largest tenth left out, where references are wrong. That
-of a half of the logs is the median of theirs; it is judged on the other half. References of recorded logs have errors
-of their own, but for jarvis; simulated runs have none. The tracks of jarvis and olin are of another frame and clock
-than the scans: the heading and place of the mount, and the clock's offset, which make drifts least, are those of one
-half of a log for the errors on the other half.
+Chains are made without closures, from odometry. Errors are those of relative poses between scans that are 2 to 20 m
+apart along the path; their covariances are those of the pose graph times an inflation. The normalised squared error
+(NEES) is divided by 3, so that 1 is right; "within" has the shares of errors in the ellipsoids of 50, 80 and 95 %.
+
+The inflation of a log is the mean NEES without inflation; the largest tenth is left out, since the references are wrong
+there. The inflation of half of the logs is the median of theirs, and is tested on the other half. References of
+recorded logs have errors, except those of jarvis; simulated runs have exact poses. The tracks of jarvis and olin have
+another frame and clock than the scans. The mount's heading and place and the clock's offset that make drifts least on
+one half of a log are used for the errors on the other half.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ def simulated(name: str, seed: int) -> Log:
 
 
 def squared_errors(log: Log, backend: str) -> np.ndarray:
-    """Return squared errors of relative poses in deviations, divided by 3."""
+    """Return the squared errors of relative poses in standard deviations, divided by 3."""
     timed = log.times is not None
     chainer = Chainer(
         log.ranges, log.scanner, log.odometry, times=log.times, duration=log.duration if timed else 0.0,
@@ -104,7 +105,7 @@ def squared_errors(log: Log, backend: str) -> np.ndarray:
 
 
 def matched_frames(log: Log, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return poses and references (S, 3) in one frame and of one clock; pairs of poses of both halves have neither."""
+    """Return poses and references (S, 3) in one frame and of one clock, for pairs of poses within a half of the log."""
     if log.track is None:
         return poses, references(log, 0.0)
     half = len(poses) // 2
@@ -127,7 +128,7 @@ def row(name: str, squared: np.ndarray, ratio: float) -> dict[str, Any]:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Measure, and publish tables."""
+    """Measure the logs and publish the tables."""
     parser = make_parser(__doc__, backend="auto", data=True)
     parser.add_argument("--seeds", type=int, default=2, help="runs of each simulated building")
     arguments = parse(parser, argv)

@@ -2,14 +2,15 @@
 
     python bench/accuracy/chaining_joined.py --backend opencl --output bench/results/chaining_joined
 
-The scans of the second log follow those of the first one, with odometry that goes on from where the first one ends, and
-without odometry. Logs are cut to their first scans. Scans of both must have equal beams to be those of one scanner: all
-are thinned to the beams at whole degrees, and their odometry is that of the corrected poses, which makes drifts small.
-"within" are the closures in the logs themselves, "across" those between them. "matches across" are those of a high
-p_right; "group" is the number of those that agree with one another with the most evidence, and this evidence: closures
-across a break of the chain need 6.5, see ``gpusense.chaining.agreement``. Times are of the processor.
+The scans of the second log follow those of the first one, without odometry, or with odometry that continues from the
+end of the first log. Only the first scans of a log are used. Since all scans must be of one scanner, they are thinned
+to the beams at whole degrees. Odometry is that of the corrected poses, which makes drifts small.
 
-The second table counts the steps of a chain of many short pieces of these logs, whose borders are all breaks: those
+"within" counts the closures in each log, "across" those between the logs. "matches across" have a high p_right; "group"
+is the size of the group of agreeing matches with the most evidence, and this evidence. Closures across a break of the
+chain need 6.5, see ``gpusense.chaining.agreement``. Times are processor times.
+
+The second table is of a chain of many short pieces of these logs, whose borders are all breaks. It counts the steps
 whose match is used, and those of them that are not weak (``gpusense.chaining.front.Front.weak``).
 """
 
@@ -37,7 +38,7 @@ from gpusense.chaining.matcher import SURE
 
 NAMES = ("acapulco", "aces", "belgioioso", "csail", "fhw", "freiburg-079", "infinite-corridor", "intel", "seattle")
 LIMIT = 50.0
-# Length of a piece [m], and its least and most scans.
+# Length of a piece [m], and its smallest and largest number of scans.
 PIECE, LEAST, MOST = 5.0, 9, 80
 BEAMS = 180
 
@@ -78,7 +79,7 @@ def joined(one: Log, two: Log, with_odometry: bool, backend: str) -> dict[str, A
 
 
 def pieces(logs: list[Log], count: int) -> tuple[Log, np.ndarray]:
-    """Return pieces of logs as one log, each of a building other than the one before, and the first scans of pieces."""
+    """Return alternating pieces of logs of different buildings as one log, and the first scan of each piece."""
     rng, ranges, odometry, starts, last = np.random.default_rng(0), [], [np.zeros((1, 3))], [0], -1
     while len(ranges) < count:
         k = int(rng.integers(len(logs)))
@@ -98,7 +99,7 @@ def pieces(logs: list[Log], count: int) -> tuple[Log, np.ndarray]:
 
 
 def steps_of(log: Log, starts: np.ndarray, with_odometry: bool, backend: str) -> list[Any]:
-    """Count the steps over borders and all others: matches that are used, and those of them that are not weak."""
+    """Count the steps over borders, and all others: those whose match is used, and those of them that are not weak."""
     chainer = Chainer(
         log.ranges, log.scanner, log.odometry if with_odometry else None, close_loops=False, backend=backend
     )

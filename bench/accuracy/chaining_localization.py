@@ -2,18 +2,18 @@
 
     python bench/accuracy/chaining_localization.py --backend opencl --output bench/results/chaining_localization
 
-All scans of a log are chained, and the even ones make a map at these poses, as the data folder's were made at the poses
-of another program. The odd ones, which are in no map, correct a particle filter with the defaults of ``gpusense
-localize``, from around the pose of their first one. "given" is the map of the data folder, of the even scans at the
-corrected poses of the log (of all scans for jarvis); "at references" is of the same scans at the same poses, but
-counted by ``build_map``, so that it differs from "made" in poses alone.
+All scans of a log are chained, and its even scans make a map at the poses of the chain, "made". The odd scans, which
+are in no map, correct a particle filter with the defaults of ``gpusense localize``, which starts around the pose of the
+first odd scan. "given" is the map of the data folder, made by another program of the even scans at the corrected poses
+of the log (of all scans for jarvis). "at references" is made of the same scans at the same poses by ``build_map``, so
+that it differs from "made" only in its poses.
 
 "on the map" are distances from the poses at which the map was made: the references for "given" and "at references",
-those of the chain for "made". They say how well a robot finds its place on each map. "against references" are distances
-from the references after the best rigid alignment of each track, which hold how far the made map is bent against them,
-and so the errors of the chain and those of the references. "over 5 m" and "over 20 m" are errors of relative poses over
-this length of the way against the references, "-" where the track is shorter. The first 5 % of each track are left out.
-Figures are medians over the seeds of the median and of the 95 % quantile.
+those of the chain for "made". They measure how well a robot finds its place on each map. "against references" are
+distances from the references after the best rigid alignment of each track. They include the distortion of the made map
+against the references, and so the errors of the chain and of the references. "over 5 m" and "over 20 m" are errors of
+relative poses over this length of the path against the references, "-" where the track is shorter. The first 5 % of
+each track are left out. Figures are medians over the seeds of the median and of the 95 % quantile.
 """
 
 from __future__ import annotations

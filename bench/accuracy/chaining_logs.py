@@ -22,7 +22,7 @@ BOTH = "jarvis-both"
 
 @dataclass
 class Log:
-    """Scans with odometry and reference poses, NaN where unknown, or a track of another clock: t, x, y, theta."""
+    """Scans with odometry and reference poses (NaN where unknown), or a track (t, x, y, theta) of another clock."""
 
     name: str
     ranges: np.ndarray
@@ -36,7 +36,7 @@ class Log:
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Arguments of ``chain_scans`` for its scanners."""
+        """Return the arguments of ``chain_scans`` for the log's scanners."""
         duration = self.duration if self.times is not None else 0.0
         if self.lasers is None:
             return {"scanner": self.scanner, "duration": duration}
@@ -68,7 +68,7 @@ def from_scans(name: str, scans: list[gs.Scan], odometry: np.ndarray, truth: np.
 
 
 def intel(folder: Path) -> Log:
-    """Return the log with raw odometry; a few of its scans have corrected poses."""
+    """Return the log with raw odometry, a few of whose scans have corrected poses."""
     scans = list(gs.read_log(folder / "intel-rawodom-every5.log.gz"))
     truth = np.full((len(scans), 3), np.nan)
     with (folder / "intel-rawodom-matches.csv").open() as file:
@@ -78,7 +78,7 @@ def intel(folder: Path) -> Log:
 
 
 def olin(folder: Path) -> Log:
-    """Return the bag with the reference that was refined in its own map."""
+    """Return the bag, with a reference that was refined in its own map."""
     scans = list(gs.read_log(folder / "macfirst_floor_take_2"))
     rows = np.loadtxt(folder / "derived_reference.csv", delimiter=",", skiprows=1)
     log = from_scans("olin", scans, np.array([scan.odometry for scan in scans]), np.zeros((len(scans), 3)))
@@ -86,7 +86,7 @@ def olin(folder: Path) -> Log:
 
 
 def jarvis(folder: Path, laser: str) -> Log:
-    """Return a laser of the bag; the scanner for navigation takes an eighth of a second for a turn."""
+    """Return the log of one of the bag's lasers; the navigation scanner turns once in an eighth of a second."""
     topic = {"s3000": "security", "nav350": "navigation"}[laser]
     bag = folder / "jarvis_complex_path_fast.bag"
     scans = list(gs.read_log(bag, topic=f"/driver_laser_{topic}/laser_scan"))
@@ -107,7 +107,7 @@ def both(one: Log, two: Log) -> Log:
 
 
 def references(log: Log, earlier: float) -> np.ndarray:
-    """Return the reference poses of the scans, of a track those some seconds earlier."""
+    """Return the reference poses of the scans; a track is read ``earlier`` seconds before their times."""
     if log.track is None:
         return log.truth
     at, (t, x, y, theta) = log.times - earlier, log.track.T

@@ -1,15 +1,15 @@
-"""Measure the share of the drift of jarvis' lasers that the mounts in the log's transforms cause.
+"""Measure the share of the drift of jarvis's lasers that the mounts in the log's transforms cause.
 
     python bench/accuracy/chaining_mount.py --backend opencl --output bench/results/chaining_mount
 
-A chain of each laser is made with odometry and closures. The mount (x, y, heading) and the clock's offset that make the
-drift over 5 m least against the references of one half of the run are found by Nelder and Mead's method, and judged on
-the other half. "corrected" there is with the mount of the other half; "as stated" with the transforms' one, and the
-clock's offset of the other half as well.
+A chain of each laser is made with odometry and closures. Nelder and Mead's method finds the mount (x, y, heading) and
+the clock's offset that make the drift over 5 m against the references least on one half of the run; the other half
+tests them. "corrected" has the mount of the other half, "as stated" that of the transforms; both have the clock's
+offset of the other half.
 
-The second table has the headings of mounts that make the motions of quarters of a log over 0.5 m those of its odometry,
-or of its reference: least squares with a robust kernel for the mount (x, y, heading), with factors of distances and
-turns. If odometry told the heading of a mount, its quarters would agree with one another, and with the reference's.
+The second table has the headings of mounts at which the motions of quarters of a log over 0.5 m best fit its odometry,
+or its reference. Least squares with a robust kernel fit the mount (x, y, heading) and scales of distances and turns. If
+odometry determined the heading of a mount, its quarters would agree with one another, and with the reference's.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from common import make_parser, parse, publish, table
 
 LASERS = ("jarvis-s3000", "jarvis-nav350")
 LENGTH = 5.0
-# Logs with raw odometry, and the length of motions to which mounts are fitted [m].
+# Logs with raw odometry, and the length of the motions that mounts are fitted to [m].
 LOGS = (*LASERS, "olin", "aces", "csail")
 MOTION = 0.5
 # First steps of the search [m, m, rad, s].
@@ -45,7 +45,7 @@ def remounted(poses: np.ndarray, mount: np.ndarray, off: np.ndarray) -> np.ndarr
 
 
 def fitted(log: Log, poses: np.ndarray, part: slice, steps: tuple[float, ...]) -> np.ndarray:
-    """Return the offset of the mount and that of the clock (4,) with the least drift on a part; 0 where a step is."""
+    """Return the offsets of mount and clock (4,) with the least drift on a part; those with a step of 0 stay 0."""
     free = np.flatnonzero(steps)
     start = np.array([0.0, 0.0, 0.0, 0.05])
 
@@ -64,7 +64,7 @@ def fitted(log: Log, poses: np.ndarray, part: slice, steps: tuple[float, ...]) -
 
 
 def measured(log: Log, backend: str) -> list[dict[str, Any]]:
-    """Return the rows of a laser: of each half."""
+    """Return the rows of a laser, one for each half."""
     chain = gs.chain_scans(log.ranges, odometry=log.odometry, times=log.times, backend=backend, **log.arguments)
     mount, half = np.array(log.scanner.mount), len(log.ranges) // 2
     parts = {"first": slice(0, half), "second": slice(half, None)}
@@ -81,7 +81,7 @@ def measured(log: Log, backend: str) -> list[dict[str, Any]]:
 
 
 def heading_of_mount(poses: np.ndarray, others: np.ndarray) -> float:
-    """Return the heading [rad] by which the scanner is mounted otherwise, if poses (S, 3) are to move as others do."""
+    """Return the offset of the mount's heading [rad] with which poses (S, 3) best follow the motions of others."""
     path = np.append(0.0, np.cumsum(np.hypot(*np.diff(others[:, :2], axis=0).T)))
     first, second = np.arange(len(path)), np.searchsorted(path, path + MOTION)
     first, second = first[second < len(path)], second[second < len(path)]
@@ -98,7 +98,7 @@ def heading_of_mount(poses: np.ndarray, others: np.ndarray) -> float:
 
 
 def quarters(log: Log, backend: str) -> dict[str, Any]:
-    """Return the headings of the mount by odometry and by references, of each quarter of a log."""
+    """Return the headings of the mount for each quarter of a log, by odometry and by references."""
     chain = gs.chain_scans(log.ranges, odometry=log.odometry, times=log.times, backend=backend, **log.arguments)
     truth = references(log, figures(log, "", chain.poses, 0.0)["earlier_s"])
     row: dict[str, Any] = {"log": log.name}

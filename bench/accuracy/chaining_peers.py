@@ -1,6 +1,6 @@
 """Other programs that follow a robot by its scans, for ``chaining.py``: KISS-ICP where it is installed, and CSM.
 
-CSM (Censi 2008) is compiled from a copy of its sources, which the user gives.
+CSM (Censi 2008) is compiled from a copy of its sources that the user provides.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import gpusense as gs
 
 CODE = Path(__file__).resolve().parent / "peer_code" / "csm.c"
 VOXELS = (0.1, 0.3, 1.0)
-# Parts that draw, that need other libraries, or that are programs.
+# Files of CSM that draw, need other libraries, or are programs of their own.
 _LEFT_OUT = ("test", "cairo", "drawing", "mbicp", "_load")
 _CONFIGURATION = "#define STDC_HEADERS 1\n" + "\n".join(
     f"#define HAVE_{name} 1"
@@ -28,12 +28,12 @@ _CONFIGURATION = "#define STDC_HEADERS 1\n" + "\n".join(
 
 
 def build(source: Path, gsl: Path | None, folder: Path, *, shared: bool = False) -> Path:
-    """Compile the program of ``peer_code/csm.c``, and return it; with ``shared`` a library that has its functions.
+    """Compile ``peer_code/csm.c`` and return the program, or with ``shared`` a library of its functions.
 
     Args:
         source: A copy of CSM's repository.
-        gsl: Where GSL's ``include`` and ``lib`` are; None where the compiler finds them.
-        folder: Place of the program.
+        gsl: The folder of GSL's ``include`` and ``lib``; None if the compiler finds them.
+        folder: The folder for the program.
     """
     root, program = source / "sm", folder / ("csm.so" if shared else "csm")
     files = [path for part in ("csm", "lib") for path in sorted((root / part).rglob("*.c"))]
@@ -55,7 +55,7 @@ def steps(program: Path, ranges: np.ndarray, scanner: gs.Scanner, guess: np.ndar
     """Match each scan to the one before, and return the motions of the robot (S - 1, 3); guesses where CSM fails.
 
     Args:
-        program: From ``build``.
+        program: The program that ``build`` made.
         ranges: (S, K) readings [m].
         scanner: Their scanner.
         guess: (S - 1, 3) motions of the robot.
@@ -79,7 +79,7 @@ def steps(program: Path, ranges: np.ndarray, scanner: gs.Scanner, guess: np.ndar
 def csm_steps(
     source: Path, gsl: Path | None, ranges: np.ndarray, scanner: gs.Scanner, guess: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Compile CSM, and return the motions (S - 1, 3) from scan to scan, and the time."""
+    """Compile CSM, and return the motions (S - 1, 3) from scan to scan and the time [s]."""
     with tempfile.TemporaryDirectory() as name:
         program = build(source, gsl, Path(name))
         begun = time.perf_counter()
@@ -88,7 +88,7 @@ def csm_steps(
 
 
 def kiss_icp(log: Any) -> list[tuple[np.ndarray, float, float]]:
-    """Return poses of KISS-ICP, times, and voxels, with several options; nothing where it is not installed."""
+    """Return poses of KISS-ICP with several options, its times and voxels; empty if it is not installed."""
     try:
         from kiss_icp.config import KISSConfig
         from kiss_icp.kiss_icp import KissICP

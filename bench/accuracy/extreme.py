@@ -3,9 +3,10 @@
     python bench/accuracy/extreme.py --backend opencl --backend warp:cpu --output bench/results/extreme-cpu
     python bench/accuracy/extreme.py --full --part sizes               # sizes meant for a GPU; nothing is left out
 
-Parts: *sizes* are long scans and large clouds; *products* the weights of nav2 and Beluga for the same beams;
-*maps* large grids with a local and a global cloud; *levels* log-likelihoods around -1e9. Prints tables and writes JSON.
-Exit code 1 where log p is not finite, weights do not sum to 1 within 1e-6, a bound breaks or ranges have other bits.
+Parts: *sizes* has long scans and large clouds; *products* the weights of nav2 and Beluga for the same beams; *maps*
+large grids with a local and a global cloud; *levels* log-likelihoods around -1e9. The script prints tables and writes
+JSON. The exit code is 1 if a log p is not finite, weights do not sum to 1 within 1e-6, an error exceeds its bound, or
+bits of ranges differ from NumPy's.
 """
 
 from __future__ import annotations
@@ -37,10 +38,11 @@ from common import make_parser, note, parse, publish, table, table_line
 RANGE_MAX, SIGMA, FARTHEST = 30.0, 0.2, 2.0  # metres; the last two are nav2's defaults for its field
 SIZES, LARGER = ((1_000, 100_000), (1_000_000, 1_000), (10_000_000, 4)), ((10_000, 100_000), (10_000_000, 60))
 PRODUCTS = (30, 360, 1_000, 100_000)
-# Particle-beams per second that processors surely reach (beam model, field), and the seconds waited without --full.
+# Rates that every processor exceeds [particle-beams / s] (beam model, field), and the longest run without --full [s].
 SPEED, LONGEST = {"opencl": (6e6, 6e7), "warp": (3e6, 3e7), "numpy": (4e5, 1.5e7)}, 200.0
 BEAM, FIELD, NAV2 = "beam model", "field", "field, nav2's density"
-# nav2 leaves the Gaussian unnormalised: 0.5 exp(-d^2 / 2 s^2) + 0.5 / range_max is RATIO times ours with other weights.
+# nav2 does not normalise the Gaussian: 0.5 exp(-d^2 / 2 s^2) + 0.5 / range_max is RATIO times our density with the
+# weights UNNORMALISED.
 SCALE = SIGMA * math.sqrt(2 * math.pi)
 RATIO, UNNORMALISED = (1 + SCALE) / 2, (SCALE / (1 + SCALE), 0.0, 1 / (1 + SCALE))
 MODELS: dict[str, tuple[Callable[..., Any], Any]] = {
@@ -52,22 +54,22 @@ Row = dict[str, Any]
 
 
 def exp_of_sum(density: np.ndarray) -> np.ndarray:
-    """Weigh as nav2_amcl's likelihood_field_model_prob.cpp and Beluga's likelihood_field_prob_model.hpp do."""
+    """Return weights like nav2_amcl's likelihood_field_model_prob.cpp and Beluga's likelihood_field_prob_model.hpp."""
     return np.exp(np.log(density).sum(axis=1))
 
 
 def product(density: np.ndarray) -> np.ndarray:
-    """Weigh as the book's table 6.3 does as it stands: ``q = q * p``."""
+    """Return weights by the book's table 6.3 to the letter: ``q = q * p``."""
     return np.prod(density, axis=1)
 
 
 def nav2_weights(raw: np.ndarray) -> np.ndarray:
-    """Normalise as nav2_amcl's pf_update_sensor does: uniform without a warning where the total is 0."""
+    """Normalise like nav2_amcl's pf_update_sensor: weights are silently uniform if their total is 0."""
     return raw / raw.sum() if raw.sum() > 0 else np.full(len(raw), 1 / len(raw))
 
 
 def beluga_weights(raw: np.ndarray) -> np.ndarray:
-    """Normalise as Beluga's actions/normalize.hpp does, whatever the total is."""
+    """Normalise like Beluga's actions/normalize.hpp, which divides by any total, 0 included."""
     return raw / raw.sum()
 
 
@@ -91,13 +93,13 @@ class Scene:
 
 
 def around(beams: int) -> gs.Scanner:
-    """Make a scanner that looks all around."""
+    """Return a scanner whose field of view is a full circle."""
     step = 2 * math.pi / beams
     return gs.Scanner.uniform(angle_min=-math.pi, angle_increment=step, count=beams, range_max=RANGE_MAX)
 
 
 def weighed(log_p: np.ndarray) -> Row:
-    """Describe log-likelihoods and their weights in numbers."""
+    """Return statistics of log-likelihoods and of their normalised weights."""
     row = {"finite": int(np.count_nonzero(np.isfinite(log_p))), "least": float(log_p.min()), "most": float(log_p.max())}
     made = gs.normalize_weights(log_p)
     apart, zero = abs(math.fsum(made.weights) - 1), int(np.count_nonzero(made.weights == 0))
@@ -106,7 +108,7 @@ def weighed(log_p: np.ndarray) -> Row:
 
 
 def judged(make: Callable[..., Any], backend: str, poses: np.ndarray, ranges: np.ndarray, found: np.ndarray) -> Row:
-    """Score a few particles again: errors against float64 on their rounded inputs, and bits that batching changed."""
+    """Score a few particles again; return errors against float64 on the same rounded inputs, and bits that differ."""
     recorder = Recorder(get_backend(backend))
     again, _ = make(backend=recorder).log_likelihood(poses, ranges, per_beam=True)
     truth, parts = replay(launch := recorder.launches[0])
@@ -144,7 +146,7 @@ def sizes(backend: str, precision: str, arguments: argparse.Namespace) -> Iterat
 
 
 def products(backend: str, precision: str, arguments: argparse.Namespace) -> Iterator[Row]:
-    """Yield weights of 1000 particles, ours and those that peers make of the same densities."""
+    """Yield the weights of 1000 particles, by gpusense and by its peers from the same densities."""
     scene, particles = Scene(arguments.seed), 1_000
     for beams in PRODUCTS:
         scanner, ranges, hits = scene.scan(beams)
@@ -185,7 +187,7 @@ def rooms(side: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def cut(grid: gs.OccupancyGrid, pose: np.ndarray) -> gs.OccupancyGrid:
-    """Cut out the part that a scan can reach from a pose, exactly: cells of 1 / 16 m add up without rounding."""
+    """Crop a map to the reach of a scan from a pose; multiples of 1 / 16 m need no rounding."""
     reach, col, row = math.ceil((RANGE_MAX + FARTHEST) / grid.resolution) + 4, *(pose[:2] // grid.resolution)
     low_row, low_col = max(int(row) - reach, 0), max(int(col) - reach, 0)
     cells = grid.cells[low_row : int(row) + reach, low_col : int(col) + reach]
@@ -193,7 +195,7 @@ def cut(grid: gs.OccupancyGrid, pose: np.ndarray) -> gs.OccupancyGrid:
 
 
 def maps(backend: str, precision: str, arguments: argparse.Namespace) -> Iterator[Row]:
-    """Yield large grids: clouds in one place and all over, some particles held to NumPy on a cut-out around each."""
+    """Yield large grids with a local and a global cloud; NumPy checks some particles on a crop around each."""
     for side in arguments.side or [20_000]:
         rng, metres = np.random.default_rng(arguments.seed), side / 16
         grid, scanner = gs.OccupancyGrid(rooms(side, rng), 1 / 16), around(60)
@@ -224,7 +226,7 @@ def maps(backend: str, precision: str, arguments: argparse.Namespace) -> Iterato
 
 
 def levels(backend: str, precision: str, arguments: argparse.Namespace) -> Iterator[Row]:
-    """Yield scans of 1000 beams that only p_hit may explain, with a sigma that makes log p about -1e9."""
+    """Yield scans of 1000 beams under p_hit alone, with a sigma_hit that makes log p about -1e9."""
     scene = Scene(arguments.seed)
     scanner, ranges, _ = scene.scan(1_000)
     narrow = cloud_around(scene.pose, 1_000, 1e-9, 1e-10, np.random.default_rng(scene.seed))
@@ -266,7 +268,7 @@ def cells(part: str, row: Row) -> list[str]:
 
 
 def main() -> int:
-    """Measure and write."""
+    """Run the parts and publish their tables."""
     parser = make_parser(__doc__, backend="kernels")
     parser.add_argument("--precision", action="append", choices=("float32", "float64"), help="default: float32")
     parser.add_argument("--part", action="append", choices=tuple(PARTS), help="default: all")

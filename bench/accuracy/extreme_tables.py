@@ -3,7 +3,8 @@
     python bench/accuracy/extreme_tables.py docs/numerics.md
 
 The first table has the seconds of each size and device, the second the weights that are exactly 0 where the product of
-densities is taken without logarithms. Both stand between the page's marks; a test compares them with the reports.
+densities is taken without logarithms. The script writes both between marks of the page; a test compares them with the
+reports.
 """
 
 from __future__ import annotations
@@ -32,10 +33,10 @@ Row = dict[str, Any]
 
 
 def write_tables(page: Path, tables: dict[str, str]) -> None:
-    """Replace what stands between the marks of a page.
+    """Replace the text between the marks of a page.
 
     Raises:
-        ValueError: a mark is missing.
+        ValueError: A mark is missing.
     """
     text = page.read_text(encoding="utf-8")
     for name, lines in tables.items():
@@ -53,7 +54,7 @@ def grouped(number: int) -> str:
 
 
 def row_of(rows: list[Row], backend: str, **values: Any) -> Row:
-    """Return the row of a backend that has the values."""
+    """Return a backend's first row with these values."""
     return next(r for r in rows if r["backend"].startswith(backend) and all(r[k] == v for k, v in values.items()))
 
 
@@ -68,7 +69,7 @@ def seconds(row: Row) -> str:
 
 
 def source(reports: dict[str, Any]) -> str:
-    """Name the reports with date and commit."""
+    """Return a sentence that names the reports with their dates and commits."""
     made = (
         f"[{file}](../bench/results/{file}.json) of {report['machine']['date']}, commit {report['machine']['commit']}"
         for file, report in reports.items()
@@ -95,7 +96,7 @@ def sizes(reports: dict[str, Any]) -> str:
 
 
 def zeros(reports: dict[str, Any]) -> str:
-    """Format how many of 1000 weights are exactly 0 where the exponential of the sum is taken unshifted."""
+    """Format how many of 1000 weights are exactly 0 if the largest sum is not subtracted before the exponential."""
     rows = [r for r in reports["extreme-cpu"]["rows"]["products"] if r["backend"].startswith("opencl")]
     lines = []
     for beams, hits in dict.fromkeys((r["beams"], r["hits"]) for r in rows):

@@ -1,9 +1,9 @@
-"""Tell what corners are whose errors are beyond 99.9 % of chi squared, in floors of known geometry.
+"""Classify the corners whose errors are beyond 99.9 % of chi squared, on floors of known geometry.
 
     python bench/accuracy/feature_outliers.py --backend opencl --output bench/results/feature_outliers_cpu
 
-Each corner is the vertex of two segments. Their beams tell which walls they are of: two walls that meet, with none, one
-or several beams of others among them, or two walls that do not meet.
+Each corner is the vertex of two segments. The beams of a segment show its wall. Causes are two walls that meet, with
+none, one or several beams of other walls among theirs, and two walls that do not meet.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ CAUSES = ("walls that meet", "one beam of another wall", "several beams of other
 
 
 def sides_of(segments: Segments, scan: int, vertex: np.ndarray) -> list[int]:
-    """Return the segments of a scan whose lines go through a vertex, those that end nearest to it first."""
+    """Return the segments of a scan whose lines pass through a vertex, by the distance of their ends from it."""
     near = []
     for g in np.flatnonzero((segments.scan == scan) & np.isfinite(segments.distance)).tolist():
         c, s = math.cos(segments.angle[g]), math.sin(segments.angle[g])
@@ -49,7 +49,7 @@ def sides_of(segments: Segments, scan: int, vertex: np.ndarray) -> list[int]:
 
 
 def walls_of(segments: Segments, g: int, bearing: np.ndarray, surface: np.ndarray) -> tuple[int, int]:
-    """Return the wall of most beams of a segment, and the number of its other beams."""
+    """Return the wall that most beams of a segment hit, and the number of its other beams."""
     points, scan = segments.points, segments.scan[g]
     begin, total = points.start[scan], points.counts[scan]
     index = begin + (segments.first[g] - begin + np.arange(segments.count[g])) % total
@@ -59,7 +59,7 @@ def walls_of(segments: Segments, g: int, bearing: np.ndarray, surface: np.ndarra
 
 
 def cause_of(floor: Floor, sides: list[tuple[int, int]]) -> str:
-    """Return the name of what the two sides of a corner are."""
+    """Return the cause of a corner, from its two sides."""
     (one, others), (two, more) = sides
     meet = max(one, two) < len(floor.walls) and one != two
     if meet:
@@ -69,7 +69,7 @@ def cause_of(floor: Floor, sides: list[tuple[int, int]]) -> str:
 
 
 def counted(arguments: argparse.Namespace, beams: int, noise: float) -> dict[bool, Counter[str]]:
-    """Return the causes of corners within the limit and beyond it."""
+    """Count the causes of corners within the limit and beyond it."""
     scanner, counts = scanner_of(beams), {False: Counter[str](), True: Counter[str]()}
     device = get_backend(arguments.backend)
     order = np.argsort(np.mod(scanner.bearings, 2 * math.pi))

@@ -2,16 +2,19 @@
 
     python bench/accuracy/features.py --backend opencl --output bench/results/features_cpu
 
-``GPUSENSE_DATA`` names the folder of recorded data. ``simulated``: floors of known geometry (see
-``tests/support/feature_scenes.py``: corridors, rooms, doors open, half open and closed, square pillars, poles,
-boxes): the share of features that are seen well and found, the share of returned ones that exist, median errors, and
-the squared error over the covariance per degree of freedom (NEES; 1 is right), in the mean without errors beyond
-99.9 % of chi squared, and the share of those. ``ransac``: lines by scikit-image's RANSAC, one after another, beside
-ours. ``real``: features of recorded scans that are found again from another place, and how far they are apart in
-deviations; the reference poses, which are not perfect, have deviations of 3 cm and 0.01 rad (jarvis 1 cm and
-0.004 rad). ``localisation``: a filter with points
-(corners, doors and poles), with lines, and with both, in the maps that the other half of the scans gives, beside
-the same filter with the likelihood field. ``rates``: scans a second of 1080 beams.
+``GPUSENSE_DATA`` names the folder of recorded data. The parts are:
+
+- ``simulated``: floors of known geometry (see ``tests/support/feature_scenes.py``: corridors, rooms, doors open, half
+  open and closed, square pillars, poles, boxes). Recall is the share of well-visible features that are found, precision
+  the share of returned features that exist. Median errors follow, the mean squared error over the covariance per degree
+  of freedom (NEES; 1 is right) without errors beyond 99.9 % of chi squared, and the share of those.
+- ``ransac``: lines by scikit-image's RANSAC, one after another, beside gpusense's.
+- ``real``: the share of features of recorded scans that are found again from another place, and their distances in
+  standard deviations. The reference poses are not exact: their deviations are taken as 3 cm and 0.01 rad (jarvis 1 cm
+  and 0.004 rad).
+- ``localisation``: a filter with points (corners, doors and poles), with lines, and with both, on a map made of the
+  other half of the scans, beside the same filter with the likelihood field.
+- ``rates``: scans of 1080 beams a second.
 """
 
 from __future__ import annotations
@@ -40,14 +43,14 @@ from support.feature_truth import truth_of
 
 PARTS = ("simulated", "ransac", "real", "localisation", "rates")
 BEAMS, NOISES = (180, 360, 1081), (0.0, 0.01, 0.03, 0.05)
-# Recordings, deviations of their reference poses, and scans of each that are compared.
+# Recordings, standard deviations of their reference poses, and scans of each to compare.
 RECORDINGS = {
     "intel": (0.03, 0.01), "csail": (0.03, 0.01), "olin": (0.03, 0.01), "jarvis-nav350": (0.01, 0.004),
     "jarvis-s3000": (0.01, 0.004),
 }  # fmt: skip
-# Motions between scans that are compared [m], farthest features [m], and how near another one is the same [m, rad].
+# Motions between compared scans [m], the range of features [m], and the largest difference of equal ones [m, rad].
 MOVED, FAR, NEAR, TURN = (0.3, 2.0), 8.0, 0.3, 0.35
-# Kinds that a filter uses, and its parameters.
+# Kinds of features that a filter uses, and the parameters of its models.
 LANDMARKS = ("corner", "door", "pole")
 MAPPED = ("line", *LANDMARKS)
 PARAMETERS = gs.LandmarkParameters(
@@ -57,7 +60,7 @@ LINES = gs.LineParameters(sigma_angle=0.03, sigma_distance=0.1, z_detect=0.7, z_
 
 
 def scanner_of(beams: int) -> gs.Scanner:
-    """Return a scanner of 270 degrees and 0.25 degrees a beam, or one that looks all around."""
+    """Return a scanner of 270 degrees with a beam every 0.25 degrees, or one of 360 degrees."""
     if beams == 1081:
         return gs.Scanner.uniform(
             angle_min=-0.75 * math.pi, angle_increment=math.radians(0.25), count=1081, range_max=25
@@ -113,7 +116,7 @@ def simulated(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
 
 
 def ransac_lines(points: np.ndarray, noise: float, rng: np.random.Generator) -> list[np.ndarray]:
-    """Return lines (x, y, theta, length) by scikit-image's RANSAC, each of the points left, with gaps up to 0.5 m."""
+    """Return lines (x, y, theta, length) by scikit-image's RANSAC, one after another, with gaps up to 0.5 m."""
     from skimage.measure import LineModelND, ransac
 
     left, found = points, []
@@ -145,7 +148,7 @@ def as_features(lines: list[np.ndarray]) -> Features:
 
 
 def rivals(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
-    """Return our lines beside those of RANSAC, of the same scans."""
+    """Compare gpusense's lines with those of RANSAC on the same scans."""
     try:
         import skimage
     except ImportError:
@@ -182,7 +185,7 @@ def rivals(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
 
 
 def expected_again(features: Features, relative: np.ndarray, ranges: np.ndarray, scanner: gs.Scanner) -> np.ndarray:
-    """Return which features (F,) another scan should show: in its field of view, near, with nothing before them."""
+    """Return which features (F,) another scan should show: near, in its field of view, and not occluded."""
     c, s = math.cos(relative[2]), math.sin(relative[2])
     xy = (features.pose[:, :2] - relative[:2]) @ np.array([[c, -s], [s, c]]) - np.array(scanner.mount[:2])
     far = np.hypot(xy[:, 0], xy[:, 1])
@@ -195,7 +198,7 @@ def expected_again(features: Features, relative: np.ndarray, ranges: np.ndarray,
 
 
 def compared(one: Features, two: Features, relative: np.ndarray, spread: tuple[float, float]) -> list[float | None]:
-    """Return, for each feature of a scan, its squared distance to the same one of another scan, or None."""
+    """Return the squared distance of each feature to the same feature of another scan, or None."""
     c, s = math.cos(relative[2]), math.sin(relative[2])
     turn = np.array([[c, -s], [s, c]])
     place, heading = two.pose[:, :2] @ turn.T + relative[:2], two.pose[:, 2] + relative[2]
@@ -218,7 +221,7 @@ def compared(one: Features, two: Features, relative: np.ndarray, spread: tuple[f
 
 
 def real(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
-    """Return how often features of recordings are found again from another place."""
+    """Measure how often features of recordings are found again from another place."""
     rows, report = [], {}
     for name, spread in RECORDINGS.items():
         recording = recordings.load(name)
@@ -252,7 +255,7 @@ def real(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
 
 
 def followed(models: list[Any], events: list[Any], readings: list[list[Any]], seed: int) -> dict[str, float]:
-    """Return errors and time of a filter over events, with the readings of each for each of its models."""
+    """Return errors and time of a filter over events, which have readings for each of its models."""
     pf = gs.ParticleFilter(models, particles=1000, seed=seed)
     pf.initialize(mean=events[0].truth, covariance=np.diag([0.25, 0.25, 0.04]))
     errors, seconds = [], 0.0
@@ -274,7 +277,7 @@ def followed(models: list[Any], events: list[Any], readings: list[list[Any]], se
 
 
 def halves(recording: Any) -> tuple[np.ndarray, np.ndarray, list[Any]]:
-    """Return readings and poses of one half of a run's scans, and the events of the other."""
+    """Return the readings and poses of half of a run's scans, and the events of the other half."""
     if recording.name in recordings.CARMEN:
         log = recordings.data() / "carmen_logs" / f"{recordings.CARMEN[recording.name]}-corrected.log.gz"
         even = recordings.read_steps(log, every=2, offset=0)
@@ -284,7 +287,7 @@ def halves(recording: Any) -> tuple[np.ndarray, np.ndarray, list[Any]]:
 
 
 def localisation(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
-    """Return filters with points and lines beside those with the field: same odometry, particles and seeds."""
+    """Compare filters with points and lines with filters with the field, on the same odometry, particles and seeds."""
     rows, report = [], {}
     for name in ("jarvis-s3000", "jarvis-nav350", "intel", "csail"):
         recording = recordings.load(name)
@@ -320,7 +323,7 @@ def localisation(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
 
 
 def rates(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
-    """Return scans a second of 1080 beams, in turns."""
+    """Measure scans of 1080 beams a second, in turns."""
     scanner = scanner_of(1080)
     ranges = np.concatenate([scans_of(seed, scanner, 0.01, 50)[0] for seed in range(4)])
     rows, report, limits = [], {}, (arguments.repeats, arguments.seconds)
@@ -336,7 +339,7 @@ def rates(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
 
 
 def plain(value: Any) -> int | float | None:
-    """Return a number as JSON has it, None for NaN."""
+    """Return a number for JSON, None for NaN."""
     number = value.item() if hasattr(value, "item") else value
     return None if isinstance(number, float) and math.isnan(number) else number
 

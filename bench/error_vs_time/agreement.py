@@ -1,13 +1,14 @@
-"""Compare the answers that reports of different days give: those of docs/error-vs-time.md should be the same.
+"""Compare the answers of reports of different days: docs/error-vs-time.md should recommend the same methods.
 
     python bench/error_vs_time/agreement.py                      # all pairs of reports of a device in the history
     python bench/error_vs_time/agreement.py ONE.json TWO.json    # all pairs of these reports
     python bench/error_vs_time/agreement.py --history ONE.json   # of both
 
 Two reports of a device are compared on the points or settings that both have, so a map or a setting that one of them
-lacks makes no difference. A report that another one extends does not count. Tasks of a processor that were timed as
-whole runs, before 2026-11-26, are not compared with those that were timed step by step. Commits differ: some
-differences are those of the code.
+lacks makes no difference. The older answer stands until another one is clearly better, as on the page; "afresh" counts
+the answers that are the same without that. Reports that another one extends are left out. Tasks of a processor that
+were timed as whole runs, before 2026-11-26, are not compared with tasks that were timed step by step. Reports are of
+different commits, so that some differences are due to the code.
 """
 
 from __future__ import annotations
@@ -40,10 +41,10 @@ class Report:
     """A report of one device.
 
     Attributes:
-        name: File and commit that it is read from.
+        name: Its file, commit and date.
         kind: ``"models"`` or ``"tasks"``.
         document: Its contents.
-        measured: Its measured points or rows, by what was measured.
+        measured: Its measured points or rows, by method and setting.
     """
 
     name: str
@@ -59,7 +60,7 @@ class Report:
         )
 
     def within(self, common: set[tuple[Any, ...]]) -> dict[str, Any]:
-        """Return the document with some of its points or rows."""
+        """Return the document with only these points or rows."""
         kept = [point for key, point in self.measured.items() if key in common]
         return {**self.document, "points" if self.kind == "models" else "rows": kept}
 
@@ -70,8 +71,9 @@ class Answer:
 
     Attributes:
         device, wish: Title of the device, and the wish.
-        old, new: The answers with their figures.
-        same: Whether they name the same method.
+        old, new: Both answers with their figures.
+        same: Whether they name the same method, where the older answer stands until another one is clearly better.
+        afresh: Whether they do where it does not.
     """
 
     device: str
@@ -79,6 +81,7 @@ class Answer:
     old: str
     new: str
     same: bool
+    afresh: bool
 
 
 def report_of(name: str, text: str) -> Report | None:
@@ -90,11 +93,12 @@ def report_of(name: str, text: str) -> Report | None:
     points = [point for point in document["points" if kind == "models" else "rows"] if point["backend"] != "outside"]
     able = [point for point in points if (point["status"] == "ok" if kind == "models" else point["seconds"])]
     measured = {tuple(point[name] for name in KEYS[kind]): point for point in able}
+    name = f"{name}, {document['date']}"
     return Report(name, kind, document, measured) if len({point["backend"] for point in points}) == 1 else None
 
 
 def history() -> Iterator[Report]:
-    """Yield the reports of all commits, newest first, without those that a later one of them extends."""
+    """Yield the reports of all commits, newest first, except those that a later report extends."""
     found: list[Report] = []
     listed = git("log", "--format=%h", "--name-only", "--diff-filter=AM", "--", "bench/results/error_vs_time_*.json")
     commit = ""
@@ -124,12 +128,15 @@ def compare(old: Report, new: Report) -> list[Answer]:
     devices = [{row.device for row in each} for each in rows]
     answers = []
     for device, wish in itertools.product(sorted(devices[0] & devices[1]), WISHES):
-        picks = [chosen(each, wish, device) for each in rows]
-        if any(row is None for row, _ in picks):
+        first, second = (chosen(each, wish, device) for each in rows)
+        if first[0] is None or second[0] is None:
             continue
-        texts = [answer(each, wish, device) for each in rows]
-        same = len({(row.text if row else "", kept) for row, kept in picks}) == 1
-        answers.append(Answer(device, wish.words, texts[0], texts[1], same))
+        standing = first[0].text
+        later, kept = chosen(rows[1], wish, device, standing)
+        same = later is not None and (later.text, kept) == (standing, first[1])
+        afresh = (second[0].text, second[1]) == (standing, first[1])
+        texts = answer(rows[0], wish, device), answer(rows[1], wish, device, standing)
+        answers.append(Answer(device, wish.words, *texts, same, afresh))
     return answers
 
 
@@ -143,19 +150,20 @@ def pairs(reports: Sequence[Report]) -> Iterator[tuple[Report, Report, list[Answ
 
 def summary(reports: Sequence[Report]) -> list[str]:
     """Return the table of pairs and that of differences."""
-    shares, differences, total, equal = [], [], 0, 0
+    shares, differences, total, equal, fresh = [], [], 0, 0, 0
     for old, new, answers in pairs(reports):
         same = sum(one.same for one in answers)
-        total, equal = total + len(answers), equal + same
-        shares.append((answers[0].device, old.name, new.name, f"{same} of {len(answers)}"))
+        afresh = sum(one.afresh for one in answers)
+        total, equal, fresh = total + len(answers), equal + same, fresh + afresh
+        shares.append((answers[0].device, old.name, new.name, f"{same} of {len(answers)}", f"{afresh}"))
         differences += [(one.device, one.wish, old.name, one.old, new.name, one.new) for one in answers if not one.same]
-    lines = [f"{equal} of {total} answers of {len(shares)} pairs of reports are the same.", ""]
-    lines += table(("device", "older", "newer", "same"), shares, 4)
+    lines = [f"{equal} of {total} answers of {len(shares)} pairs of reports are the same, {fresh} afresh.", ""]
+    lines += table(("device", "older", "newer", "same", "afresh"), shares, 4)
     return [*lines, "", *table(("device", "to do", "older", "answer", "newer", "answer"), differences, 6)]
 
 
 def main() -> int:
-    """Print; exit code 1 where answers differ."""
+    """Print the tables; return 1 if answers differ."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("reports", nargs="*", type=Path, help="reports of measure.py; default: those of the history")
     parser.add_argument("--history", action="store_true", help="the history's reports beside the others")

@@ -21,10 +21,10 @@ class Mark:
     """A point of a chart.
 
     Attributes:
-        error, seconds: Its place; an error below ``SMALLEST`` is none.
+        error, seconds: Its coordinates; an error below ``SMALLEST`` counts as none.
         name: Name for the tooltip.
-        group: Group that gives its colour.
-        best: Whether it belongs to the Pareto front, and is named.
+        group: Group, which has a colour.
+        best: Whether it belongs to the Pareto front, and has a label.
     """
 
     error: float
@@ -115,7 +115,7 @@ def _panel(chart: Chart, groups: Sequence[str]) -> list[str]:
 
 
 def _names(best: Sequence[Mark], x, y, end: float) -> list[str]:
-    """Name the marks of the front; one whose name would cover another one stays without."""
+    """Label the marks of the front, except where a label would cover another one."""
     placed: list[tuple[float, float, float]] = []
     parts = []
     for mark in best:
@@ -130,7 +130,7 @@ def _names(best: Sequence[Mark], x, y, end: float) -> list[str]:
 
 
 def _decades(numbers: Sequence[float]) -> tuple[int, int]:
-    """Return the decades around some positive numbers."""
+    """Return the decades that enclose positive numbers."""
     low, high = math.floor(math.log10(min(numbers))), math.ceil(math.log10(max(numbers)))
     return low, max(high, low + 1)
 

@@ -1,9 +1,10 @@
-"""Which method for a limit of error or time: what docs/error-vs-time.md begins with."""
+"""Choose the method for a limit of error or time: the first table of docs/error-vs-time.md."""
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from gpusense.evaluation.benchmark.choice import choose, error_text, time_text
@@ -15,7 +16,7 @@ WRONG, MEDIAN, TAIL, LARGEST = (
 )  # fmt: skip
 KL, FINE = "KL divergence at a comparable temperature", "KL divergence from the true posterior"
 SHIFT, GLOBAL, LOG_P = "shift of the mean position", "the same, all over the map", "RMS error of log p"
-# By need: the measures of its figure and of its table, the first one that of choices.
+# Measures of a need's figure and table; choices use the first one.
 SHOWN = {
     "rays": (WRONG, MEDIAN, TAIL, LARGEST), "beam model": (KL, GLOBAL, FINE, SHIFT, LOG_P),
     "likelihood field": (KL, GLOBAL, FINE, SHIFT, LOG_P),
@@ -30,11 +31,11 @@ class Wish:
     """An upper limit of the error or of the time.
 
     Attributes:
-        words: In words.
+        words: The wish in words.
         need: Its need.
-        error: The largest error of the need's first measure; None without a limit.
+        error: The largest error, by the need's first measure; None without a limit.
         seconds: The longest time [s]; None without a limit.
-        only: Chooses rows.
+        only: Function that selects rows.
     """
 
     words: str
@@ -87,23 +88,45 @@ def own(rows: Iterable[Row], need: str, device: str, scene: str = ALL) -> list[R
     return [row for row in rows if (row.need, row.device, row.scene) == (need, device, scene) and not row.outside]
 
 
-def chosen(rows: Sequence[Row], wish: Wish, device: str) -> tuple[Row | None, bool]:
-    """Return the method for a wish and whether it keeps the limit, else the nearest one; None without any."""
+def chosen(rows: Sequence[Row], wish: Wish, device: str, standing: str = "") -> tuple[Row | None, bool]:
+    """Return the method for a wish and whether it keeps the limit, else the nearest one; None without any.
+
+    Args:
+        rows: Rows of all devices.
+        wish: The wish.
+        device: Title of the device.
+        standing: Text of the answer of an earlier day, which stands until another one is clearly better.
+    """
     able = [row for row in own(rows, wish.need, device) if wish.only(row) and not row.maps]
     if not able:
         return None, False
     entries = [row.entry(SHOWN[wish.need][0]) for row in able]
-    best = choose(entries, wish.error, wish.seconds)
+    earlier = next((entry for row, entry in zip(able, entries, strict=True) if row.text == standing), None)
+    best = choose(entries, wish.error, wish.seconds, earlier)
     if best is not None:
         return able[entries.index(best)], True
-    # The nearest one is the fastest where none is fast enough, or the most exact one, chosen among equal ones likewise.
-    nearest = choose(entries, None if wish.error else math.inf, None)
+    # If none keeps the limit, choose the fastest or the most exact one, among equal ones by the same rule.
+    nearest = choose(entries, None if wish.error else math.inf, None, earlier)
     return (able[entries.index(nearest)] if nearest else None), False
 
 
-def answer(rows: Sequence[Row], wish: Wish, device: str) -> str:
+Standing = Mapping[tuple[str, str], str]
+"""Answers of an earlier day by device and words of the wish."""
+
+
+def standing_of(rows: Sequence[Row], devices: Sequence[str], standing: Standing) -> dict[tuple[str, str], str]:
+    """Return the texts of the answers of all devices to all wishes."""
+    found = {}
+    for device, wish in itertools.product(devices, WISHES):
+        row, _ = chosen(rows, wish, device, standing.get((device, wish.words), ""))
+        if row is not None:
+            found[device, wish.words] = row.text
+    return found
+
+
+def answer(rows: Sequence[Row], wish: Wish, device: str, standing: str = "") -> str:
     """Return the method for a wish with its time and error."""
-    row, kept = chosen(rows, wish, device)
+    row, kept = chosen(rows, wish, device, standing)
     if row is None:
         return "-"
     figures = _figures(row, SHOWN[wish.need][0])
@@ -113,12 +136,12 @@ def answer(rows: Sequence[Row], wish: Wish, device: str) -> str:
 PLACES = (("laptop", "a laptop's processor", False), ("gpu", "a GPU", True))
 
 
-def lead(rows: Sequence[Row], devices: Sequence[str]) -> list[str]:
-    """Return the first wish's methods on the first processor and the first GPU that have any, and their code."""
+def lead(rows: Sequence[Row], devices: Sequence[str], standing: Standing) -> list[str]:
+    """Return the methods and code for the first wish, on the first processor and the first GPU that have any."""
     lines, codes = [], []
     for name, place, gpu in PLACES:
         for device in devices:
-            row, kept = chosen(rows, FIRST[0], device)
+            row, kept = chosen(rows, FIRST[0], device, standing.get((device, FIRST[0].words), ""))
             if row is not None and kept and ("NVIDIA" in device) == gpu:
                 figures = _figures(row, SHOWN[row.need][0])
                 lines.append(f"- **{FIRST[0].words} on {place}** ({device}): {row.text}: {figures}")
@@ -132,7 +155,10 @@ def _figures(row: Row, measure: str) -> str:
     return f"{time_text(row.seconds)}, {value(row.errors[measure], unit)}{' nats' * (unit == 'nats')}"
 
 
-def answers(rows: Sequence[Row], devices: Sequence[str], wishes: Sequence[Wish]) -> list[str]:
+def answers(rows: Sequence[Row], devices: Sequence[str], wishes: Sequence[Wish], standing: Standing) -> list[str]:
     """Return the table of wishes."""
-    lines = [(wish.words, *(answer(rows, wish, device) for device in devices)) for wish in wishes]
+    lines = [
+        (wish.words, *(answer(rows, wish, device, standing.get((device, wish.words), "")) for device in devices))
+        for wish in wishes
+    ]
     return table(("to do", *devices), lines, 1 + len(devices))

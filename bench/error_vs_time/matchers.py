@@ -1,9 +1,9 @@
 """Other programs that match pairs of scans, for ``needs.py``: small_gicp where it is installed, and CSM.
 
 small_gicp (``pip install small_gicp``) aligns clouds in space. ``icp`` gets the end points at height 0; ``gicp`` gets
-them at three heights, so that walls are planes that stand upright. CSM (Censi 2008) is compiled where the variable CSM
-names a copy of its sources; GSL names the folder with GSL's ``include`` and ``lib`` where the compiler does not find
-them. Both run one thread, pair by pair.
+them at three heights, so that walls are vertical planes. CSM (Censi 2008) is compiled if the variable CSM names a copy
+of its sources; GSL names the folder with GSL's ``include`` and ``lib`` if the compiler does not find them. Both run one
+thread, pair by pair.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from accuracy import chaining_peers
 
 import gpusense as gs
 
-# Heights of the copies of a scan [m], and the grid to which clouds are thinned [m].
+# Heights of the copies of a scan [m], and the cell size to which clouds are thinned [m].
 HEIGHTS, THINNED = (-0.1, 0.0, 0.1), 0.02
-# A scan has no far points to reach from a guess that is off by half a metre and 10 degrees.
+# Largest distance between corresponding points [m]; guesses are off by at most half a metre and 10 degrees.
 REACH = 1.0
 _kept: list[tempfile.TemporaryDirectory[str]] = []
 Match = Callable[[np.ndarray, np.ndarray, gs.Scanner, np.ndarray], np.ndarray]
@@ -36,10 +36,10 @@ class Matcher:
 
     Attributes:
         method: Name of program and method.
-        code: How it is called.
+        code: Its call.
         outside: Version and threads.
-        match: From (P, K) ranges of both scans, scanner and (P, 3) guesses to (P, 3) poses of the second scan in the
-            frame of the first; NaN where it fails.
+        match: Function of (P, K) ranges of both scans, scanner and (P, 3) guesses that returns (P, 3) poses of the
+            second scan in the frame of the first; NaN where it fails.
         missing: Why it cannot run; empty if it can.
     """
 
@@ -51,7 +51,7 @@ class Matcher:
 
 
 def matchers() -> Iterator[Matcher]:
-    """Yield all; those that cannot run say why."""
+    """Yield all matchers; ``missing`` says why one cannot run."""
     yield from small_gicp()
     yield csm()
 

@@ -24,25 +24,25 @@ from task_settings import Setting, Steps
 
 PAIRS = 60
 BEAMS = (90, 180, 360, 720)
-# Runs in place of one, of a call each; the methods that take a hundred times as long between scans have one.
+# Runs of a setting, each of one call; methods between scans that take a hundred times as long run once.
 REPEATS, SLOW = 3, ("gauss_newton", "correlative")
 
 
 def free_poses(grid: gs.OccupancyGrid, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw poses with room around them."""
+    """Draw poses with free space around them."""
     return np.array([gs.worlds.free_pose(grid, rng, 0.4) for _ in range(count)])
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """Pairs of scans with as many beams.
+    """Pairs of scans with one number of beams.
 
     Attributes:
         grid: The map.
         scanner: The scanner.
         one, two: (P, K) readings of both scans [m].
         places: (P, 3) poses of the second scans.
-        moved: (P, 3) the same in the frames of the first ones.
+        moved: (P, 3) these poses in the frames of the first scans.
         off: (P, 3) errors of the guesses.
     """
 
@@ -56,7 +56,7 @@ class Pairs:
 
 
 def pairs(device: Backend) -> Iterator[Pairs]:
-    """Yield the pairs, by numbers of beams."""
+    """Yield the pairs for each number of beams."""
     rng, grid = np.random.default_rng(5), gs.worlds.building(2, (50.0, 50.0))
     first = free_poses(grid, PAIRS, rng)
     second = first + rng.uniform(-1, 1, first.shape) * (1.0, 1.0, np.radians(30))
@@ -125,7 +125,7 @@ def matcher(
     device: Backend,
     precision: Any,
 ) -> Callable[[int], tuple[np.ndarray, Steps]]:
-    """Make the run of a way to match all pairs in one call."""
+    """Return a run that matches all pairs in one call."""
 
     def run(seed: int) -> tuple[np.ndarray, Steps]:
         steps = Steps(len(right))

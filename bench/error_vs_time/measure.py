@@ -1,13 +1,13 @@
-"""Make the reports of a device, of which page.py makes docs/error-vs-time.md.
+"""Measure the reports of a device; page.py makes docs/error-vs-time.md of them.
 
     python bench/error_vs_time/measure.py --backend opencl --output bench/results/error_vs_time_cpu
     python bench/error_vs_time/measure.py --backend warp:cuda:0 --deadline 280 --output bench/results/error_vs_time_h200
 
 NAME_tasks.json is the report of needs.py, NAME_models.json one of ``gpusense bench`` with 10 000 particles and 360
-beams: all methods in float32, exact ones also in float64. Needs and scenes are measured one after the other, and the
-report is written after each; after --deadline no further one begins. --extend keeps what NAME's reports have, and adds
-the needs and scenes that they lack; they must be of the same commit, machine, devices and sizes. A checkout with
-uncommitted changes is refused; --commit names that of a copy without a repository.
+beams: all methods in float32, exact ones also in float64. Needs and scenes are measured one after the other. The report
+is written after each of them, and none begins after --deadline. --extend adds the needs and scenes that NAME's reports
+lack; commit, machine, devices and sizes must be the same. A checkout with uncommitted changes is refused; --commit
+states the commit of a copy without a repository.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ from gpusense.evaluation.machine import machine
 
 SIZE = ["--particles", "10000", "--beams", "360", "--repeats", "15"]
 QUICK = ["--particles", "512", "--beams", "60", "--repeats", "3", "--checked", "64"]
-# Arguments that points of one report share.
+# Arguments that all points of a report share.
 ALIKE = ("particles", "checked", "beams", "repeats", "seconds", "seed", "build_limit")
-# Scenes that are measured first.
+# Scenes to measure first.
 FIRST = ("building", "basement", "intel", "clutter", "willow", "spielberg")
 
 
 def plans_of(arguments: argparse.Namespace) -> tuple[list[Plan], dict[str, Any], list[str]]:
-    """Return a plan for each scene, exact methods in float64 included; the arguments, and what is absent."""
+    """Return a plan for each scene, exact methods in float64 included, the arguments, and notes on absent programs."""
     parser = argparse.ArgumentParser()
     bench.add_arguments(parser)
     words = [
@@ -75,7 +75,7 @@ def models(
     """Measure the scenes that an old report lacks until the deadline; yield the report after each one.
 
     Raises:
-        ValueError: the old report has other sizes or devices.
+        ValueError: The old report has other sizes or devices.
     """
     plans, given, absent = plans_of(arguments)
     outcome, command = Outcome([], []), command_line("bench/error_vs_time/measure.py")
@@ -115,7 +115,7 @@ def tasks(
     """Measure the needs that an old report lacks until the deadline; yield the report after each one.
 
     Raises:
-        ValueError: the old report has other devices.
+        ValueError: The old report has other devices.
     """
     devices, command = [get_backend(name) for name in arguments.backend], command_line("bench/error_vs_time/measure.py")
     rows: list[dict[str, Any]] = []
@@ -134,16 +134,16 @@ def tasks(
 
 
 def same(old: object, new: object, what: str) -> None:
-    """Raise ``ValueError`` where a report to extend has something else."""
+    """Raise ``ValueError`` if a report to extend differs in ``what``."""
     if old != new:
         raise ValueError(f"--extend: {what} must be as in the report, {old}, got {new}")
 
 
 def earlier(output: Path, kind: str, stated: str) -> dict[str, Any] | None:
-    """Return the report to extend; None where there is none.
+    """Return the report to extend, or None.
 
     Raises:
-        ValueError: it is damaged, or of another commit or machine.
+        ValueError: It is damaged, or of another commit or machine.
     """
     file = output.with_name(f"{output.name}_{kind}.json")
     if not file.is_file():
@@ -155,7 +155,7 @@ def earlier(output: Path, kind: str, stated: str) -> dict[str, Any] | None:
 
 
 def main() -> None:
-    """Measure and write."""
+    """Measure the needs and scenes, and write the reports."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--backend", action="append", required=True, help="selection string, repeatable")
     parser.add_argument("--scene", action="append", help="scene of gpusense bench, repeatable; default: all")

@@ -3,22 +3,22 @@
     python bench/error_vs_time/needs.py --backend opencl --output NAME
     python bench/error_vs_time/needs.py --backend opencl --need localisation --seconds 20 --longest 0.05   # quick
 
-*Localisation*: a robot drives through a generated building, in which people hide a fifth of the beams and 2 % of the
-walls have moved since the map was made, with a laser of 1080 beams over 270 degrees. Each setting of particles, beams,
-model, temperature, stages and precision follows it from a start around the true pose. Errors are those of the position,
-of all scans after the first ten and all seeds; times are those of a step: predict, correct, estimate.
+*Localisation*: a robot with a laser of 1080 beams over 270 degrees drives through a generated building. People hide a
+fifth of the beams, and 2 % of the walls have moved since the map was made. Each setting of particles, beams, model,
+temperature, stages and precision follows the robot from a start around its true pose. Errors are those of the position
+at all scans after the first ten, over all seeds; times are those of a step: predict, correct, estimate.
 
-*Matching*: pairs of scans in the same building, 1.4 m and 30 degrees apart at most, with noise of 2 cm, from guesses
-that are off by 0.5 m and 10 degrees at most. All pairs are one call; its time is divided by their number. *In a map*:
-scans on their map, from such guesses.
+*Matching*: pairs of scans in the same building, at most 1.4 m and 30 degrees apart, with noise of 2 cm, from guesses
+that are off by at most 0.5 m and 10 degrees. One call matches all pairs; its time is divided by their number. *In a
+map*: scans on their map, from such guesses.
 
-*Learning*: the parameters of the beam model from readings of known parameters; errors are the root mean square of the
-six relative ones. *Landmarks*: errors are the KL divergence of the posterior of 10 000 particles from that of known
-correspondences in float64, at a comparable temperature.
+*Learning*: the parameters of the beam model from readings of known parameters; the error is the root mean square of the
+six relative errors. *Landmarks*: the error is the KL divergence of the posterior of 10 000 particles from the posterior
+of known correspondences in float64, at a comparable temperature.
 
-Settings run in rounds, so that a busy machine slows all alike; drives of few particles and beams run in more of them,
-since their errors differ by seed. A setting that takes longer than --longest a step runs
-once; one that the time of its need leaves no room for is listed as left out.
+Settings run in rounds, so that a busy machine slows all alike; drives with few particles and beams run in more rounds,
+since their errors vary with the seed. A setting whose steps take longer than --longest runs once; one that would exceed
+the time of its need is listed as left out.
 """
 
 from __future__ import annotations
@@ -53,16 +53,16 @@ from speed.point_models import landmark_scene
 from task_settings import NEEDS, Setting, Steps
 
 SCHEMA = 1
-# Scans of the drive, and those at its beginning that do not count.
+# Scans of the drive, and scans at its beginning that do not count.
 SCANS, SETTLING = 60, 10
 SCANNER = gs.Scanner.uniform(angle_min=-2.356, angle_increment=4.712 / 1079, count=1080, range_max=30.0)
 START = (0.5, 0.5, 0.26)
 # Most particles x beams of a setting, by the kind of device.
 MOST = {"cpu": 4_000_000, "gpu": 1_100_000_000}
-# Runs of a drive in place of one, by the largest particles x beams: the median error of one run with few particles has
-# a standard deviation of a seventh of it, and no run may depend on the time that others took.
+# Number of runs of a drive, by the largest particles x beams: with few particles, the median error of a run has a
+# relative standard deviation of a seventh. The number must not depend on the time that other runs took.
 REPEATS = {100_000: 4, 1_000_000: 2}
-# Methods that take some hundred passes over the readings, and the most readings that they get; runs of other methods.
+# Methods that take about a hundred passes over the readings, and their most readings; runs of other methods.
 SEARCHES, MOST_SEARCHED, FITS = ("hill_climb", "genetic"), 100_000, 4
 PARTICLES = 10_000
 
@@ -71,13 +71,13 @@ PARTICLES = 10_000
 
 
 def mapped(world: gs.OccupancyGrid) -> gs.OccupancyGrid:
-    """Return the map that a laser makes of a world: surfaces are occupied, and unknown is all behind them."""
+    """Return the map that a laser makes of a world: surfaces are occupied, and cells behind them unknown."""
     cells = np.where(world.occupied & ~surface_of(world), -1, world.cells).astype(np.int8)
     return gs.OccupancyGrid(cells, world.resolution, world.origin, occupied_threshold=world.occupied_threshold)
 
 
 def scan_model(kind: str, run: Any, beams: int, device: Backend, precision: str) -> tuple[Any, str]:
-    """Make a model of the drive's laser; return it with its code."""
+    """Return a model of the drive's laser, and its code."""
     made: dict[str, Any] = {"backend": device, "precision": precision, "beams": beams}
     words = f"beams={beams}" + (', precision="float64"' if precision == "float64" else "")
     if kind == "field":
@@ -129,7 +129,7 @@ def localisation(device: Backend) -> Iterator[Setting]:
         "beam, march": ((1000, 10_000), (60,)), "beam, cddt": ((1000, 10_000), (60,)),
     }  # fmt: skip
     grid = [(kind, n, k, "float32", {}) for kind, (ns, ks) in sizes.items() for n, k in itertools.product(ns, ks)]
-    # Beside the filters of other programs.
+    # Settings for comparison with the filters of other programs.
     grid += [
         (kind, n, rival_filters.BEAMS, "float32", {}) for kind in ("field", "beam") for n in rival_filters.PARTICLES[:2]
     ]
@@ -225,7 +225,7 @@ RIVALS: dict[str, Callable[[Backend], Iterator[Setting]]] = {
 
 
 def measure(need: str, device: Backend, arguments: argparse.Namespace, *, peers: bool = False) -> list[dict[str, Any]]:
-    """Run all settings of a need in rounds, with ``peers`` those of other programs; return their rows."""
+    """Run all settings of a need in rounds, with ``peers`` also those of other programs; return their rows."""
     settings = [*(RIVALS[need](device) if peers and need in RIVALS else ()), *SETTINGS[need](device)]
     begin = time.perf_counter()
     for number in range(arguments.rounds * max((one.repeats for one in settings), default=0)):
@@ -277,7 +277,7 @@ def add_options(parser: argparse.ArgumentParser, seconds: float = 120.0) -> None
 
 
 def main() -> None:
-    """Measure, print and write."""
+    """Measure the needs, print their tables and write the report."""
     parser = make_parser(__doc__, backend="kernels")
     add_options(parser)
     arguments = parse(parser)
@@ -288,7 +288,7 @@ def main() -> None:
 
 
 def report_of(arguments: argparse.Namespace, backends: Sequence[str], command: str) -> dict[str, Any]:
-    """Measure, and return the report."""
+    """Measure the needs and return the report."""
     stated, devices = arguments.commit or commit(), [get_backend(name) for name in backends]
     rows = [row for need in arguments.need or NEEDS for row in measured(need, devices, arguments)]
     return document(rows, stated, command)

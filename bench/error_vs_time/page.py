@@ -1,14 +1,17 @@
-"""Make docs/error-vs-time.md and its figures from the reports in bench/results.
+"""Make docs/error-vs-time.md and its figures from the reports in bench/results, and standing.csv beside this script.
 
     python bench/error_vs_time/page.py           # write
-    python bench/error_vs_time/page.py --check   # exit code 1 where a file differs, or a report is of older code
+    python bench/error_vs_time/page.py --check   # exit code 1 if a file differs or a report is of older code
 
-The same reports give the same bytes everywhere. The site's build writes the interactive page.
+The same reports give the same bytes everywhere. Answers of the last page, which standing.csv lists, stand until reports
+show a method that is clearly better. The build of the site writes the interactive page.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import io
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +19,19 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from error_vs_time.charts import Chart, Mark, drawing
-from error_vs_time.choices import FIRST, KL, SHOWN, WISHES, WRONG, answers, lead, own, value
+from error_vs_time.choices import (
+    FIRST,
+    KL,
+    SHOWN,
+    WISHES,
+    WRONG,
+    Standing,
+    answers,
+    lead,
+    own,
+    standing_of,
+    value,
+)
 from error_vs_time.reports import LIMIT, RESULTS, ROOT, Source, commit_trouble, rows_of, sources
 
 from gpusense._util.files import write_whole
@@ -28,8 +43,9 @@ from gpusense.plots.error_page import error_page
 HERE = Path(__file__).parent
 PAGE = Path("docs/error-vs-time.md")
 IMAGES = Path("docs/img")
+STANDING = Path("bench/error_vs_time/standing.csv")
 NEEDS = tuple(SHOWN)
-# Methods whose knob other implementations share.
+# Methods with a knob that other implementations share.
 TABLES = ("cddt", "lookup", "march, centre")
 
 
@@ -41,7 +57,7 @@ def best(rows: Sequence[Row], measure: str) -> list[Row]:
 
 
 def chart(rows: Sequence[Row], need: str, devices: Sequence[str]) -> str:
-    """Draw a need: a panel for each device, other implementations among its own methods."""
+    """Draw the chart of a need: a panel for each device, with the methods of gpusense and of others."""
     measure, charts = SHOWN[need][0], []
     for device in devices:
         chosen = [row for row in rows if (row.need, row.device, row.scene) == (need, device, ALL)]
@@ -59,7 +75,7 @@ def chart(rows: Sequence[Row], need: str, devices: Sequence[str]) -> str:
 
 
 def methods(rows: Sequence[Row], need: str, devices: Sequence[str], *, fronts: bool = False) -> list[str]:
-    """Return the table of a need: times on all devices, errors, code; only the fronts where there are many settings."""
+    """Return the table of a need: times on all devices, errors and code; of many settings only the Pareto fronts."""
     measures = SHOWN[need]
     shown: dict[str, dict[str, Row]] = {}
     for device in devices:
@@ -89,7 +105,7 @@ def _time(row: Row | None) -> str:
 
 
 def peers(rows: Sequence[Row]) -> list[str]:
-    """Return the table of other implementations beside the rows that they stand against."""
+    """Return the table of other implementations beside the rows of gpusense that they compare with."""
     outside = [row for row in rows if row.outside and row.scene == ALL]
     lines = []
     for need in ("rays", "beam model", "likelihood field"):
@@ -157,25 +173,46 @@ def interactive(folder: Path = RESULTS) -> str:
     return error_page(rows_of(sources(folder)), SHOWN)
 
 
-def files(folder: Path = RESULTS) -> dict[Path, str]:
+def last_answers() -> Standing:
+    """Return the answers of the last page by device and wish; empty before the first page."""
+    if not (ROOT / STANDING).is_file():
+        return {}
+    with (ROOT / STANDING).open(encoding="utf-8", newline="") as stream:
+        return {(row["device"], row["to do"]): row["answer"] for row in csv.DictReader(stream)}
+
+
+def _written(standing: Standing) -> str:
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerows([("device", "to do", "answer"), *(sorted((*key, text) for key, text in standing.items()))])
+    return stream.getvalue()
+
+
+def files(folder: Path = RESULTS, last: Standing | None = None) -> dict[Path, str]:
     """Return all files of the page by their paths in the checkout.
 
+    Args:
+        folder: The folder of the reports.
+        last: Answers of the last page; None: those of standing.csv.
+
     Raises:
-        ValueError: a report is damaged or of uncommitted changes, or there is none.
+        ValueError: A report is damaged or of uncommitted changes, or there is none.
     """
     found = sources(folder)
     every = rows_of(found)
-    # A table that took too long in all tracking clouds has no error of the need's first measure.
+    # A table that took too long for all tracking clouds lacks the need's first measure of error.
     rows = [row for row in every if SHOWN[row.need][0] in row.errors]
     if not rows:
         raise ValueError(f"reports: {folder.name} must have reports error_vs_time_*.json, got none")
     devices = list(dict.fromkeys(row.device for row in rows))
     needs = [need for need in NEEDS if any(row.need == need for row in rows)]
     made = {picture(need): chart(rows, need, devices) for need in needs}
+    standing = standing_of(rows, devices, last_answers() if last is None else last)
+    made[STANDING] = _written(standing)
     able = [device for device in devices if own(rows, FIRST[0].need, device)]
     blocks = {
-        "lead": lead(rows, devices), "first": answers(rows, able, FIRST),
-        "answers": answers(rows, devices, WISHES), "peers": peers(rows),
+        "lead": lead(rows, devices, standing), "first": answers(rows, able, FIRST, standing),
+        "answers": answers(rows, devices, WISHES, standing), "peers": peers(rows),
         "matchers": rivals(rows, "matching", "a match"), "filters": rivals(rows, "localisation", "a scan"),
         "maps": by_map(rows, devices), "reports": listing(found), "limit": [str(LIMIT)],
     }  # fmt: skip
@@ -190,7 +227,7 @@ def files(folder: Path = RESULTS) -> dict[Path, str]:
 
 
 def main() -> int:
-    """Write the files, or compare them."""
+    """Write the files, or check them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="write nothing, compare")
     arguments = parser.parse_args()

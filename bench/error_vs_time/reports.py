@@ -18,13 +18,13 @@ from gpusense.evaluation.benchmark.stored import read_report
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "bench" / "results"
 PATTERN = "error_vs_time_*_{}.json"
-# Code whose changes make a report old, and the commits to it after which the report is too old to be published.
+# Folders whose changes make a report old, and the number of commits to them after which it must not be published.
 FOLDERS = ("kernels", "gpusense/models", "gpusense/tables", "gpusense/backends")
 LIMIT = 100
 TASK_MEASURES = {"median": "median error", "p95": "95 % error", "max": "largest error"}
 UNITS = {"%": "relative"}
 DISCRETE = "gs.DiscreteBeamModel(gs.BeamParameters(), range_max=scanner.range_max)"
-# Relative standard deviation of a run's median error, by need: that of reports of few runs.
+# Relative standard deviation of a run's median error by need, for reports of few runs.
 SPREAD = {"localisation": 0.15, "learning": 0.3}
 
 
@@ -46,7 +46,7 @@ class Source:
 
     @property
     def missing(self) -> str:
-        """Say how many points or settings were left out or failed, of how many."""
+        """Return a phrase with the number of points or settings, and of those left out or failed."""
         points = self.report["points" if self.kind == "models" else "rows"]
         lost = sum(one["status"] != "ok" if self.kind == "models" else one["seconds"] is None for one in points)
         return f"{lost} of {len(points)}"
@@ -96,7 +96,7 @@ def sources(folder: Path = RESULTS) -> list[Source]:
     """Read all reports of a folder, those of processors first.
 
     Raises:
-        ValueError: a report is damaged, or of uncommitted changes, or two are of the same device.
+        ValueError: A report is damaged, or of uncommitted changes, or two are of the same device.
     """
     found = []
     for kind, read in (("models", read_report), ("tasks", read_tasks)):
@@ -117,7 +117,7 @@ def sources(folder: Path = RESULTS) -> list[Source]:
 
 
 def _place(source: Source) -> tuple[bool, str, str]:
-    """Return the place of a report: processors first, and a variant behind the device that it varies."""
+    """Return the sort key of a report: processors first, and a variant after the device that it varies."""
     device = source.name.removesuffix(f"_{source.kind}.json")
     return any("NVIDIA" in title for title in source.titles), device, source.kind
 
@@ -126,7 +126,7 @@ def read_tasks(file: Path) -> dict[str, Any]:
     """Read a report of needs.py.
 
     Raises:
-        ValueError: it is none.
+        ValueError: The file is not such a report.
     """
     report = json.loads(file.read_text(encoding="utf-8"))
     if not isinstance(report, dict) or report.get("kind") != "needs" or report.get("schema") != 1:
@@ -166,7 +166,7 @@ def code_of(text: str) -> str:
 
 
 def doubt(row: Mapping[str, Any]) -> float:
-    """Return the factor of a row's error below which that of other seeds lies, two standard deviations away."""
+    """Return the factor by which the error of other seeds may exceed a row's error, at two standard deviations."""
     errors = row.get("by_run", {}).get("error", ())
     spread = SPREAD.get(row["need"], 0.0)
     if len(errors) > 2 and spread:

@@ -1,10 +1,10 @@
-"""Whole filters of nav2_amcl and Beluga on the drive of ``needs.py``, as compiled from copies of their sources.
+"""Whole filters of nav2_amcl and Beluga on the drive of ``needs.py``, compiled from copies of their sources.
 
 NAV2, BELUGA and BELUGA_INCLUDE name the copies, see ``bench/speed/filters.py``. Both run one thread. A step is motion,
-weights, resampling and the pose that the program reports; each scan is taken, with as many beams as gpusense takes, and
+weights, resampling and the pose that the program reports. Each scan is used, with as many beams as gpusense uses, and
 the number of particles is fixed. *Defaults* are the parameters of the program's node: its likelihood field (a sum of
-cubes), deviations of 0.2 m, and 0.2 for the odometry's noise. *Product* and *beam* have the parameters of gpusense's
-rows: those of a field whose densities are multiplied, and of a beam model.
+cubes), a standard deviation of 0.2 m, and 0.2 for the odometry's noise. *Product* and *beam* have the parameters of
+gpusense's rows: a field whose densities are multiplied, and a beam model.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import gpusense as gs
 from gpusense.localization.defaults import DEFAULTS
 
 PARTICLES, BEAMS = (500, 2000, 10_000), 60
-# Most particles of a beam model, whose rays these programs walk cell by cell.
+# Most particles of a beam model: these programs walk its rays cell by cell.
 MOST_CAST = 2000
 # By method: the peers' model; z_hit, z_short, z_max, z_rand, sigma_hit, lambda_short, max_distance; noise of odometry.
 _FIELD = DEFAULTS.field
@@ -74,7 +74,7 @@ def rivals(run: Any, start: Sequence[float], settling: int) -> Iterator[Setting]
 
 
 class Drive:
-    """Follows the robot with a program's filter; returns errors of the position [m] and the steps."""
+    """A run that follows the robot with a program's filter; it returns errors of the position [m] and the steps."""
 
     def __init__(
         self,
@@ -94,7 +94,7 @@ class Drive:
         self._particles, self._start, self._settling = particles, start, settling
 
     def __call__(self, seed: int) -> tuple[np.ndarray, Steps]:
-        """Follow it once."""
+        """Follow the robot once."""
         run = self._run
         follower = Follower(self._weigher, self._particles, run.poses[0], self._start, self._alpha, seed)
         errors, steps = [], Steps(settling=self._settling)

@@ -1,4 +1,4 @@
-"""A setting of a task: a way to do it, the runs of it, and the row of the report."""
+"""Settings of tasks: methods with their options, their runs, and the rows of the report."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Steps:
     """Time the steps of a run, each in a ``with`` block.
 
     Args:
-        together: Number of results of a step, by which its seconds are divided.
+        together: Number of results of a step; its seconds are divided by it.
         settling: Number of steps at the beginning that do not count.
     """
 
@@ -37,31 +37,31 @@ class Steps:
 
     @property
     def seconds(self) -> np.ndarray:
-        """Elapsed seconds of each step."""
+        """Return the elapsed time of each step [s]."""
         return np.array(self._elapsed[self._settling :])
 
     @property
     def processor(self) -> np.ndarray:
-        """Seconds of the processor of each step, those of all threads."""
+        """Return the processor time of each step, of all threads [s]."""
         return np.array(self._processor[self._settling :])
 
 
 @dataclass
 class Setting:
-    """A setting of one need, and what its runs gave.
+    """A setting of one need, with the results of its runs.
 
     Attributes:
         need: One of ``NEEDS``.
         method: Name of the method.
-        options: Its setting in words.
-        code: How it is called.
+        options: Its options in words.
+        code: Its call.
         precision: The precision.
-        run: Makes a run of a seed; returns errors, and its steps.
+        run: Function that makes a run from a seed, and returns errors and steps.
         outside: Version and threads of another program; empty for gpusense.
-        repeats: Runs of it in place of one, where errors differ much between seeds.
-        errors, seconds, processor: Of each run so far; both times are those of steps.
-        runs: Number of runs.
-        reason: Why it was left out; empty where it was not.
+        repeats: Number of runs, more than one where errors vary much with the seed.
+        errors, seconds, processor: Errors and times of the steps of each run so far.
+        runs: Number of runs so far.
+        reason: Why it was left out; empty if it was not.
     """
 
     need: str
@@ -79,7 +79,7 @@ class Setting:
     reason: str = ""
 
     def once(self, seed: int) -> None:
-        """Make a run; the first one also runs before it counts, to compile."""
+        """Make a run; the first call makes one more beforehand, to compile."""
         if not self.runs:
             self.run(seed)
         errors, steps = self.run(seed)
@@ -113,5 +113,5 @@ def quantiles(numbers: np.ndarray) -> dict[str, float]:
 
 
 def medians(runs: Sequence[np.ndarray]) -> list[float]:
-    """Return the median of each run."""
+    """Return the median over each run."""
     return [float(np.median(one)) for one in runs]

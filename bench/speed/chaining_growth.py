@@ -2,13 +2,13 @@
 
     python bench/speed/chaining_growth.py --backend opencl --output bench/results/chaining_growth
 
-Rows of less than a pass have the first scans of a recorded log. Rows of more passes repeat it: forward, in reverse
-order of its scans, forward, ... Each scan then has independent noise: 1 cm on ranges, and 2 % on odometry. The last row
-of fr079 has 5000 scans.
+Rows of less than a pass have the first scans of a recorded log. Rows of more passes repeat it, forward and in reverse
+in turn, with independent noise: 1 cm on ranges, and 2 % on the odometry of a pass. The last row of fr079 has 5000
+scans.
 
-"searched" counts the pairs of key scans that were matched to close loops, "links" those of the pose graph, "launches"
-those of kernels. Each row has its own process; "memory" is the growth of its peak resident set during the chain,
-"processor" the time of all threads, "main" the time of the calling thread, both without compilation.
+"searched" counts the pairs of key scans that were matched to close loops, "links" the links of the pose graph,
+"launches" the launches of kernels. Each row has its own process; "memory" is the growth of its peak resident set during
+the chain, "processor" the time of all threads, "main" the time of the calling thread, both without compilation.
 
 The second table has the stages of the longest chain of each log. "device" is the time in calls of the backend, which
 copy, launch and wait; "host" is the remaining time of the stage, which no device shortens.
@@ -43,7 +43,7 @@ from common import make_parser, note, parse, publish, table
 # Passes of each log.
 SCANS = 5000
 PASSES = {"intel": (0.25, 0.5, 1.0), "fr079": (0.25, 0.5, SCANS / 4791), "seattle": (1.0, 2.0, 4.0, 8.0)}
-# Noise of ranges [m], and of each pass's odometry.
+# Noise of ranges [m], and relative noise of the odometry of a pass.
 NOISE, STRETCH = 0.01, 0.02
 # Functions of the stages.
 STAGES: tuple[tuple[str, Any, str], ...] = (

@@ -1,4 +1,4 @@
-"""Do what a case does; yield labels and results."""
+"""Actions of cases; each yields labels and results."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ import gpusense as gs
 from trees.cases import Case, Outcome, draw_cloud, draw_count, draw_grid, draw_poses, draw_readings
 from trees.configurations import knobs, learned
 
-# Rays of a case of rays.
+# Number of rays in a case of rays.
 POSES_OF_RAYS, BEARINGS_OF_RAYS = 150, 44
-# Particle-beams from which GPUs put particles in an order.
+# Particle-beams from which GPUs sort the particles.
 LARGE = 1 << 22
 
 
 def on_host(value: Any) -> np.ndarray:
-    """Copy a result to the host; every library has its way."""
+    """Copy a result to the host, by the function of its library."""
     if isinstance(value, np.ndarray):
         return value
     found = value.get() if hasattr(value, "get") else value.numpy()
@@ -28,7 +28,7 @@ def on_host(value: Any) -> np.ndarray:
 
 
 def score(case: Case) -> Outcome:
-    """Score a scan in one of the ways in which its arrays may be given."""
+    """Score a scan, with one of the accepted types and layouts of its arrays."""
     rng, real = case.rng, case.model.precision
     poses, ranges = draw_cloud(case, draw_count(case)), draw_readings(rng, case.world)
     way = rng.integers(8)
@@ -45,7 +45,7 @@ def score(case: Case) -> Outcome:
 
 
 def score_each(case: Case) -> Outcome:
-    """Score a scan with what every beam adds."""
+    """Score a scan with ``per_beam=True``."""
     poses, ranges = draw_cloud(case, draw_count(case)), draw_readings(case.rng, case.world)
     log_p, parts = case.model.log_likelihood(poses, ranges, per_beam=True)
     yield "log_p", log_p
@@ -53,7 +53,7 @@ def score_each(case: Case) -> Outcome:
 
 
 def score_scans(case: Case) -> Outcome:
-    """Score several scans, each with particles of its own."""
+    """Score several scans, each with its own particles."""
     scans = int(case.rng.choice([0, 1, 2, 3, 7], p=[0.02, 0.23, 0.25, 0.25, 0.25]))
     count = draw_count(case)
     count = count // max(scans, 1) if case.rng.random() < 0.9 else count
@@ -131,7 +131,7 @@ def score_there(case: Case) -> Outcome:
 
 
 def expect(case: Case) -> Outcome:
-    """Find expected ranges and angles of incidence."""
+    """Compute expected ranges and angles of incidence."""
     poses = draw_cloud(case, draw_count(case))
     if not isinstance(case.model, gs.BeamModel):
         yield "log_p", case.model.log_likelihood(poses, draw_readings(case.rng, case.world))
@@ -156,7 +156,7 @@ def score_large(case: Case) -> Outcome:
 
 
 def refuse(case: Case) -> Outcome:
-    """Give a model what it must refuse."""
+    """Call a model with arguments that it must refuse."""
     poses, ranges = draw_cloud(case, 5), draw_readings(case.rng, case.world)
     way = case.rng.integers(6)
     if way == 0:
@@ -182,7 +182,7 @@ SCAN_ACTIONS: dict[Callable[[Case], Outcome], float] = {
 
 
 def act_scan(case: Case) -> Outcome:
-    """Do something with a model of a scan."""
+    """Run one of the actions of scan models."""
     action = case.rng.choice(np.array(list(SCAN_ACTIONS)), p=list(SCAN_ACTIONS.values()))
     if case.device.there is not None and case.rng.random() < 0.3:
         action = score_there
@@ -191,7 +191,7 @@ def act_scan(case: Case) -> Outcome:
 
 
 def act_several(case: Case) -> Outcome:
-    """Score by several models at once: one cloud and scan for all, or others for each."""
+    """Score by several models in one call, with a cloud and a scan that they share or with one for each."""
     rng = case.rng
     scans = int(rng.integers(2, 5)) if rng.random() < 0.2 else None
     count = draw_count(case)
@@ -211,7 +211,7 @@ def act_several(case: Case) -> Outcome:
 
 
 def act_landmark(case: Case) -> Outcome:
-    """Score features by landmarks: known, unknown, and which they are."""
+    """Score features by landmarks, with known and with unknown correspondences, and find the correspondences."""
     rng, model = case.rng, case.model
     joint = model.association == "joint"
     poses = case.world.pose + rng.standard_normal((int(10 ** rng.uniform(0, 2 if joint else 3.3)), 3)) * [1, 1, 0.3]
@@ -234,7 +234,7 @@ def act_landmark(case: Case) -> Outcome:
 
 
 def draw_features(rng: np.random.Generator, case: Case, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Draw features as they are seen, false ones, and some of which parts are missing or impossible."""
+    """Draw features of landmarks, false ones, and some with missing or impossible parts."""
     landmarks = case.model.landmarks
     if not len(landmarks):
         return rng.uniform(0, 3, (count, 2)), np.full(count, -1)
@@ -281,7 +281,7 @@ def act_tables(case: Case) -> Outcome:
     """Make tables of a map."""
     rng, grid = case.rng, draw_grid(case.rng, 2.3)
     kinds: list[Any] = ["free", "occupied"]
-    # Older trees return squared cells, and have no such argument.
+    # Older trees return squared distances in cells, and lack this argument.
     squared = {"squared": True} if "squared" in inspect.signature(gs.distance_transform).parameters else {}
     yield "distances", gs.distance_transform(grid.occupied, backend=case.device.backend, **squared)
     if rng.random() < 0.5:
@@ -293,7 +293,7 @@ def act_tables(case: Case) -> Outcome:
 
 
 def act_rays(case: Case) -> Outcome:
-    """Cast rays by one way to find them; most by the exact one in float32."""
+    """Cast rays by one of the casters; most of them by the exact one in float32."""
     rng = case.rng
     ways = ["exact", "dda", "march", knobs("March", tolerance=0.01, rule="centre"), "bresenham", "cddt", "lookup"]
     ways += [knobs("March", tolerance=1.0), knobs("Cddt", bins=36, pruned=True), knobs("Lookup", bins=48)]

@@ -1,4 +1,4 @@
-"""Same bits: does a change of the code leave every number that the package computes as it was?
+"""Compare the bits of two trees: does a change of the code change any number that the package computes?
 
     python bench/compare_trees.py bits --old ../before --rays 2000000 --models 15000
 
@@ -8,15 +8,15 @@
 
 ``record`` draws cases from fixed seeds, runs them with the package that Python finds, through its public interface
 alone, and keeps a digest of every result: rays by every caster, likelihoods by every model in many configurations,
-bound calls, arrays on the device, tables of maps, steps of filters, matches of scans. ``compare`` says what differs;
-exit code 1 where anything does. ``bits`` does all three, one tree after the other.
+bound calls, arrays on the device, tables of maps, steps of filters, matches of scans. ``compare`` lists differences,
+and its exit code is 1 if there are any. ``bits`` records both trees, one after the other, and compares them.
 
-Maps, poses and readings are drawn to be awkward, as in bench/accuracy/fuzz_rays.py. A case depends on its
-configuration and its number alone, and cases of a configuration share models, so ``--part 0/4`` to ``--part 3/4`` may
-run beside each other; ``compare old.json new-0.json new-1.json ...`` takes parts together. Run both sides on one
-machine with the same options. ``--as-gpu`` (OpenCL) lets a processor pass for a GPU, whose launches are others: this
-alone reaches for a name that is not public, ``gpusense.backends.get_backend``. ``--only`` takes the configurations
-with these words in their names, among them rays, filters and matches.
+Maps, poses and readings are drawn to be awkward, as in bench/accuracy/fuzz_rays.py. A case depends only on its
+configuration and its number, and the cases of a configuration share models, so ``--part 0/4`` to ``--part 3/4`` may
+run at the same time; ``compare old.json new-0.json new-1.json ...`` joins the parts. Run both sides on one machine with
+the same options. ``--as-gpu`` (OpenCL) makes a processor pass for a GPU, whose launches differ; only this option uses a
+name that is not public, ``gpusense.backends.get_backend``. ``--only`` selects the configurations with these words in
+their names; rays, filters and matches are configurations as well.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from trees.models import make_models
 from trees.tasks import run_filter, run_match
 
 ROOT, SCRIPT = Path(__file__).resolve().parents[2], Path(__file__).resolve().parents[1] / "compare_trees.py"
-# Cases of a model, and values of a result that are shown.
+# Cases of a model, and values of a result to show.
 ROUND, SHOWN = 10, 3
 
 
@@ -91,7 +91,7 @@ class Record:
         self._begin = self._said = time.perf_counter()
 
     def add(self, name: str, kept: list[list[Any]]) -> None:
-        """Keep a case, and print progress from time to time."""
+        """Add a case, and print progress from time to time."""
         self.cases[name] = kept
         self.numbers += sum(each[1] for each in kept)
         self.errors += sum(each[0].startswith("error") for each in kept)
@@ -100,7 +100,7 @@ class Record:
             print(f"{now - self._begin:6.0f} s  {self.summary()}, at {name}", file=sys.stderr, flush=True)
 
     def summary(self) -> str:
-        """Return counts in words."""
+        """Return a sentence with the counts."""
         return f"{len(self.cases)} cases, {self.rays} rays, {self.numbers} numbers, {self.errors} errors"
 
 
@@ -191,7 +191,7 @@ def differences(old: list[list[Any]], new: list[list[Any]], messages: bool) -> I
 
 
 def compare_command(arguments: argparse.Namespace) -> int:
-    """Compare a record with another one, which may be in parts."""
+    """Compare a record with another one, which may consist of parts."""
     head, old = read(arguments.old)
     new: dict[str, Any] = {}
     for path in arguments.new:
@@ -243,7 +243,7 @@ def bits_command(arguments: argparse.Namespace) -> int:
 
 
 def part_of(text: str) -> tuple[int, int]:
-    """Read "i/n"."""
+    """Parse a part ``i/n``."""
     part, parts = (int(number) for number in text.split("/"))
     if not 0 <= part < parts:
         raise argparse.ArgumentTypeError(f"must be i/n with 0 <= i < n, got {text}")
@@ -263,7 +263,7 @@ def add_cases(parser: argparse.ArgumentParser) -> None:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Record, compare, or both."""
+    """Run the subcommand: record, compare, or both."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
     bits = commands.add_parser("bits", help="record both trees and compare")

@@ -25,12 +25,12 @@ import numpy as np
 import gpusense as gs
 
 MODELS = {"field": gs.LikelihoodFieldModel, "beam model": gs.BeamModel}
-# Number of bound calls before a wait.
+# Number of bound calls between waits.
 IN_A_ROW = 20
 
 
 class Host:
-    """NumPy arrays, which every call waits for."""
+    """NumPy arrays; calls with them block."""
 
     label = ""
 
@@ -42,7 +42,7 @@ class Host:
         return values.copy()
 
     def wait(self) -> None:
-        """Do nothing: calls have ended when they return."""
+        """Do nothing, since calls block."""
 
     def read(self, array: Any) -> np.ndarray:
         """Return an array's values."""
@@ -229,7 +229,7 @@ def main() -> None:
     """Answer requests until the input ends."""
     with np.load(sys.argv[1], allow_pickle=False) as file:
         arrays = {name: file[name] for name in file}
-    # Libraries that print do so on standard error.
+    # Libraries print to standard error; standard output is for answers.
     answers, sys.stdout = sys.stdout, sys.stderr
 
     def answer(value: Any) -> None:

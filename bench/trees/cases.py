@@ -29,7 +29,7 @@ class World:
 
 @dataclasses.dataclass
 class Device:
-    """Name a device: the backend that models take; ``there`` copies an array to it, ``change`` writes into one."""
+    """Hold a device: its backend, a function that copies an array to it, and one that overwrites an array there."""
 
     backend: Any
     there: Callable[[np.ndarray], Any] | None
@@ -76,7 +76,7 @@ def in_world(grid: gs.OccupancyGrid, col: np.ndarray, row: np.ndarray, theta: np
 
 
 def draw_poses(rng: np.random.Generator, grid: gs.OccupancyGrid, count: int, huge: float, out: float) -> np.ndarray:
-    """Draw poses in, on the edges of, and around the map; some of them with headings of many turns."""
+    """Draw poses in the map, on its edges and around it; some headings are of many turns."""
     rows, cols = grid.shape
     reach = out * (0.3 * np.array([cols, rows]) + 2)
     col, row = rng.uniform(-reach[0], cols + reach[0], count), rng.uniform(-reach[1], rows + reach[1], count)
@@ -102,7 +102,7 @@ def draw_cloud(case: Case, count: int) -> np.ndarray:
 
 
 def draw_scanner(rng: np.random.Generator, grid: gs.OccupancyGrid, wanted: dict[str, Any]) -> gs.Scanner:
-    """Draw a scanner of up to 400 beams; attributes in ``wanted`` are not drawn."""
+    """Draw a scanner of up to 400 beams, except for the attributes in ``wanted``."""
     options = dict(wanted)
     few = int(10 ** rng.uniform(0, 2.6))
     count = int(rng.choice([few, 0, 1, 17, 64, 65, 129, 181, 400], p=[0.65, 0.01, 0.04, *[0.05] * 6]))
@@ -162,7 +162,7 @@ def draw_readings(rng: np.random.Generator, world: World, scans: int | None = No
 
 
 def draw_count(case: Case) -> int:
-    """Draw the number of particles: none to a few thousand, at times more than one launch of several scans may have."""
+    """Draw the number of particles: none to a few thousand, at times more than a launch of several scans can take."""
     rng, rays = case.rng, max(case.world.scanner.count * case.world.scanner.cone_rays, 1)
     if rng.random() < 0.01:
         return 0

@@ -40,13 +40,13 @@ MIXTURES = {
 
 
 def knobs(name: str, **values: Any) -> Any:
-    """Return a caster with other knobs than the default ones, or its name in versions without knobs."""
+    """Return a caster with these knobs, or its name in versions without knobs."""
     return name.lower() if casters is None else getattr(casters, name)(**values)
 
 
 @functools.cache
 def learned() -> Any:
-    """Learn a discrete model from a small simulated set."""
+    """Learn a discrete model from a small simulated data set."""
     rng = np.random.default_rng(5)
     expected = rng.uniform(0.2, 12.0, 4000)
     ranges = expected + 0.1 * rng.standard_normal(4000)
@@ -55,7 +55,7 @@ def learned() -> Any:
 
 
 def beam(name: str = "book", scanner: dict[str, Any] | None = None, **options: Any) -> dict[str, Any]:
-    """Return a configuration of a beam model; settings of world and scanner stand beside its options."""
+    """Return a configuration of a beam model: its options, with settings of the world and the scanner."""
     own = {key: options.pop(key) for key in ("most", "slow", "resolutions", "bins") if key in options}
     if not {"incidence", "compat", "parameters"} & set(options):
         options["parameters"] = gs.BeamParameters(*MIXTURES[name])
@@ -93,7 +93,7 @@ def beam_casters() -> Kinds:
 
 
 def beam_options() -> Kinds:
-    """Return beam models with tables, peers' weights, some of the beams, and without specialisation."""
+    """Return beam models with tables, peers' weights, a choice of beams, and without specialisation."""
     mounted = {"mount": (0.7, -0.4, 0.9)}
     discrete = {"scanner": {"range_max": 10.0}, "resolutions": (0.05, 0.1, 0.5)}
     separate = gs.DiscreteBeamModel(gs.BeamParameters(), 10.0, 40)
@@ -122,7 +122,7 @@ def beam_options() -> Kinds:
 
 
 def beam_echoes() -> Kinds:
-    """Return beam models with cones, surfaces that are mirrors, and parameters for each angle of incidence."""
+    """Return beam models with cones, mirrors, and parameters by angle of incidence."""
     book, other = gs.BeamParameters(), gs.BeamParameters(0.5, 0.1, 0.1, 0.3, 0.2, 0.4)
     rarely = gs.BeamParameters(0.3, 0.0, 0.5, 0.2, 0.1, 0.2)
     edges = (0.0, 0.4, 1.0, math.pi / 2)
@@ -249,8 +249,10 @@ def points() -> Kinds:
 
 
 def configurations() -> Kinds:
-    """Return every configuration of models by name; every fourth has huge headings, every third also runs on a
-    queue."""
+    """Return every configuration of models by name.
+
+    Every fourth has huge headings, and every third also runs on a queue of the user.
+    """
     found = beam_mixtures() | beam_casters() | beam_options() | beam_echoes() | fields() | severals() | landmarks()
     found |= points() | {"tables": {"kind": "tables"}}
     for i, config in enumerate(found.values()):

@@ -11,7 +11,7 @@ from trees.cases import World
 
 
 def make_scan_model(config: dict[str, Any], world: World, backend: Any, rng: np.random.Generator) -> Any:
-    """Make a model of a scan."""
+    """Make a scan model."""
     options, count = dict(config["options"]), world.scanner.count
     if "bins" in config:
         options["sensor_table"] = world.scanner.range_max / config["bins"]

@@ -6,17 +6,17 @@
 
 Rows are those of limits.py and small_calls.py that the public interface has: rays, beam model and field with a cloud
 over the whole map and one around a pose, calls of 2000 and 4000 particles x 60 beams, ordinary and bound, several scans
-in one call, steps of filters with 500 and 4000 particles (predict, correct, estimate), and the preparation of the map;
-with NumPy arrays, and on GPUs also with poses and results on the device, where a call is only its launches.
+in one call, steps of filters with 500 and 4000 particles (predict, correct, estimate), and the preparation of the map.
+Arrays are NumPy's; on GPUs, rows with poses and results on the device time the launches alone.
 
 Each tree runs in its own process (calls.py) on the same arrays. The processes take turns in the order old, new, new,
-old, so that a machine that slows down favours neither. A turn takes --seconds; its time is the one of its shortest
-call. Each pair of neighbouring turns gives a ratio. A block is a new pair of processes, since two processes of one tree
-also differ.
+old, so that a machine that slows down favours neither. A turn takes --seconds; its time is that of its shortest call.
+Each pair of neighbouring turns gives a ratio. A block is a new pair of processes, since processes of the same tree also
+differ.
 
 The table shows the median times of the turns, the median and the quartiles of all ratios, the medians of the blocks,
-and the ratio of the shortest turns. A row is slower where all of these but the upper quartile are above --limit. The
-exit code is 1 where a row is slower, or where --bits is set and bits of a result differ.
+and the ratio of the shortest turns. A row counts as slower if all of these but the upper quartile exceed --limit. The
+exit code is 1 if a row is slower, or if --bits is set and bits of a result differ.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ COLUMNS = ("backend", "what", "old, ms", "new, ms", "new / old", "quartiles", "b
 
 
 def write_arrays(path: Path, arguments: argparse.Namespace) -> str:
-    """Write the map, clouds and scans for both trees, and return the map in words."""
+    """Write the map, clouds and scans for both trees, and return a description of the map."""
     scene = Scene(arguments)
     wide, few = scene.scanner(arguments.beams), scene.scanner(FEW)
     count = max(arguments.particles, 1000)
@@ -62,7 +62,7 @@ class Tree:
     """A process that times calls of one tree.
 
     Attributes:
-        about: Its first line: the package's file, backend, device and rows.
+        about: Its first answer: the package's file, backend, device and rows.
     """
 
     def __init__(self, tree: Path, arrays: Path, backend: str) -> None:
@@ -117,7 +117,7 @@ def measure(backend: str, arrays: Path, arguments: argparse.Namespace) -> list[d
     found: dict[str, dict[str, Any]] = {}
     for block in range(arguments.blocks):
         places = (arguments.old, arguments.new)
-        # Blocks start with either process in turn.
+        # The process that goes first alternates from block to block.
         made = {number: Tree(places[number], arrays, backend) for number in ((0, 1) if block % 2 == 0 else (1, 0))}
         trees = made[0], made[1]
         about = trees[0].about
@@ -140,7 +140,7 @@ def measure(backend: str, arrays: Path, arguments: argparse.Namespace) -> list[d
 
 
 def summary(row: dict[str, Any], limit: float) -> dict[str, Any]:
-    """Add medians, quartiles and the judgement to the seconds of a row."""
+    """Add medians, quartiles and whether the new tree is slower to the seconds of a row."""
     seconds = np.array(row["pairs"])
     ratios = seconds[..., 1] / seconds[..., 0]
     low, middle, high = np.quantile(ratios, (0.25, 0.5, 0.75)).tolist()
@@ -165,7 +165,7 @@ def cells(r: dict[str, Any]) -> list[str]:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Compare and write."""
+    """Compare the trees and publish the table."""
     parser = make_parser(__doc__)
     parser.add_argument("--old", type=Path, required=True, help="a checkout")
     parser.add_argument("--new", type=Path, default=ROOT, help="a checkout (default: this one)")

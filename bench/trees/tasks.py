@@ -1,4 +1,4 @@
-"""Whole tasks on one tree, for a comparison of bits: filters that follow a robot, and matches of scans."""
+"""Whole tasks for the comparison of bits: filters that follow a robot, and matches of scans."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import gpusense as gs
 from trees.cases import seeds
 
 BEAMS, RANGE, STEPS = 60, 8.0, 12
-# Options of filters, which take them in turn.
+# Options of filters, assigned in turn.
 FILTERS: tuple[dict[str, Any], ...] = (
     {}, {"temperature": 0.3, "stages": 1, "recovery": None}, {"particles": (50, 400)}, {"resampling": "residual"},
     {"recovery": "augmented"}, {"beam_skip": 0.3},

@@ -140,7 +140,22 @@ def _finite(text: str) -> float:
     return value if math.isfinite(value) else math.nan
 
 
-def output_path(*suffixes: str) -> Callable[[str], Path]:
+class Output:
+    """A type for ``add_argument``: a file to write, which must not be one of the command's other files.
+
+    Args:
+        convert: Function that makes a path from the text.
+    """
+
+    def __init__(self, convert: Callable[[str], Path] = Path) -> None:
+        self._convert = convert
+
+    def __call__(self, text: str) -> Path:
+        """Convert an argument to a path."""
+        return self._convert(text)
+
+
+def output_path(*suffixes: str) -> Output:
     """Make a type for ``add_argument``: a file that can be written, which is checked before any work is done.
 
     The library that writes the file must also be installed.
@@ -161,7 +176,7 @@ def output_path(*suffixes: str) -> Callable[[str], Path]:
             raise argparse.ArgumentTypeError(f"must be a file that can be written, got {text!r}: {reason}") from None
         return path
 
-    return convert
+    return Output(convert)
 
 
 def check_writer(suffix: str) -> None:

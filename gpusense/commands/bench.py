@@ -33,7 +33,7 @@ _QUICK_DEADLINE, _QUICK_BUILD = 40.0, 3.0
 # Tables that take longer [s] are built once in a quick run; their times then include compiling.
 _QUICK_TWICE = 0.1
 
-_EPILOG = """\
+EPILOG = """\
 Every method with every value of its knob computes the same ranges and scores the same scan, for particles over the
 whole map ('global') and around the true pose ('tracking'). Errors are against the exact caster and the float64 models.
 
@@ -48,10 +48,10 @@ their reasons.
 --html FILE writes the interactive page of docs/error-vs-time.md for this measurement: time over error, the method for a
 budget, and performance profiles.
 
-At the end stands, for each device and problem, which method to take: the fastest with an error of at most --max-error,
-or the most exact with a call of at most --max-time. Nats are the KL divergence of the posterior, lengths the shift of
-its mean, both at a comparable temperature; percents are rays wrong by more than a cell, cells the range error that 95 %
-of the rays keep. The times are of calls of --particles times --beams.
+The report ends with a recommendation for each device and problem: the fastest method with an error of at most
+--max-error, or the most exact one whose call takes at most --max-time. Nats are the KL divergence of the posterior,
+lengths the shift of its mean, both at a comparable temperature; per cent are rays wrong by more than a cell, cells the
+range error that 95 % of the rays keep. Times are those of calls of --particles times --beams.
 
 --quick builds a table that takes more than 0.1 s once, and its time to build then includes compiling; a look-up table
 or CDDT serves both clouds of a scene.
@@ -61,7 +61,7 @@ them, and lists points that became slower or less exact; --compare OLD NEW compa
 
 Exit codes: 0 success, 1 something is less exact than in the old report, 2 bad input.
 
-example:
+examples:
   gpusense bench --quick --html bench.html
   gpusense bench --output results --backend opencl --backend warp:cpu
   gpusense bench --scene basement --method exact --method lookup --problem ranges
@@ -71,7 +71,6 @@ example:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     add = parser.add_argument
     add("--output", type=Path, metavar="DIR", help="folder for report and diagrams, created if absent")
     add("--html", type=Path, metavar="FILE", help="interactive page of the measurement, one file that works offline")
@@ -102,10 +101,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--peers", type=Path, metavar="FILE", help="a Python file with outside candidates; it is executed")
     add("--no-peers", action="store_true", help="no outside candidates")
     add("--max-error", action="append", default=[], type=_limit(parse_error), metavar="E",
-        help="error that one can afford, such as '0.01 nats', '2 cm', '1 %%' or '0.5 cells': choose the fastest method "
+        help="recommend the fastest method with at most this error, such as '0.01 nats', '2 cm', '1 %%' or '0.5 cells' "
         "(default: 0.01 nats, 1 %%); may be repeated with other units")  # fmt: skip
     add("--max-time", type=_limit(parse_time), metavar="T",
-        help="time of a call that one can afford, such as '1 ms': choose the most exact method")  # fmt: skip
+        help="recommend the most exact method whose call takes at most this time, such as '1 ms'")  # fmt: skip
     add("--time", choices=("call", "launch"), default="call", help="time axis of the diagrams (default: %(default)s)")
     add("--seed", type=whole_number(low=0), metavar="N", help="seed of maps, scans and particles (default: 0)")
     add_json(parser)

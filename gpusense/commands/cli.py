@@ -35,10 +35,11 @@ _EPILOG = """\
 start here:
   gpusense demo               localise a robot in a generated building, and draw the result
   gpusense devices            list the devices, and the remedy for each that is absent
-  gpusense COMMAND --help     describe a command and its options, with an example
+  gpusense COMMAND --help     describe a command and its options, with examples
 
-Exit codes: 0 success, 2 bad input (described in one line on standard error), 130 interrupted (Ctrl-C),
-143 terminated. A command that is interrupted or terminated keeps and prints the results so far."""
+Exit codes: 0 success, 1 a negative result such as 'lost' (see the command's help), 2 bad input (described in
+one line on standard error), 130 interrupted (Ctrl-C), 143 terminated. A command that is interrupted or terminated
+keeps and prints the results so far."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -47,6 +48,30 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the message without the usage, and exit."""
         self.exit(BAD_INPUT, _error_line(message))
+
+    def parse_known_args(  # type: ignore[override]
+        self, args: Any = None, namespace: Any = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """Parse arguments as the base class does, and check that no output is another file of the command."""
+        found, rest = super().parse_known_args(args, namespace)
+        self._check_outputs(found)
+        return found, rest
+
+    def _check_outputs(self, found: argparse.Namespace) -> None:
+        """Report an output that would replace another output, or a file that the command reads."""
+        values = [(action, getattr(found, action.dest, None)) for action in self._actions]
+        files = [(action, os.path.realpath(value)) for action, value in values if isinstance(value, os.PathLike)]
+        if not files:
+            return
+        from gpusense.commands.arguments import Output
+
+        for action, file in files:
+            for other, same in files if isinstance(action.type, Output) else ():
+                if other is not action and same == file:
+                    name = other.option_strings[0]
+                    self.error(
+                        f"argument {action.option_strings[0]}: must be another file than that of {name}, got both"
+                    )
 
 
 class Layout(argparse.RawDescriptionHelpFormatter):
@@ -164,8 +189,9 @@ def _build(names: Sequence[str]) -> Parser:
     for name in names:
         module = importlib.import_module(f"gpusense.commands.{name.replace('-', '_')}")
         command = commands.add_parser(
-            module.NAME, help=module.HELP, description=module.HELP, formatter_class=layout, allow_abbrev=False
-        )
+            module.NAME, help=module.HELP, description=module.HELP, epilog=module.EPILOG, formatter_class=layout,
+            allow_abbrev=False,
+        )  # fmt: skip
         module.add_arguments(command)
         command.set_defaults(run=module.run)
     return parser

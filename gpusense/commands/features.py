@@ -11,7 +11,7 @@ import numpy as np
 
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import add_backend, add_json, output_path, positive_number, whole_number
-from gpusense.commands.output import print_json
+from gpusense.commands.output import counted, print_json
 from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans
 from gpusense.evaluation.machine import machine, machine_line
 
@@ -26,14 +26,14 @@ HELP = "Extract lines, corners, doors, hallways, poles and reflectors from the s
 # Scans of one call: a step of the progress bar.
 _CALL = 256
 
-_EPILOG = """\
+EPILOG = """\
 Each scan is split into lines, and corners, doors, hallways and poles are made of them (docs/landmarks.md). With
 --map-out the lines, corners, doors, poles and reflectors of all scans become a map, at the logged poses or those of
 --reference; --map-in makes a map of an occupancy grid instead. Reflectors need a log with intensities.
 
 Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
-example:
+examples:
   gpusense features --log run.log.gz --limit 300 --plot scan.png
   gpusense features --log run.log.gz --map-out landmarks.csv --map-plot landmarks.png
   gpusense features --map-in map.yaml --map-out landmarks.csv"""
@@ -41,7 +41,6 @@ example:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     add = parser.add_argument
     add_log(parser, "a log with scans", required=False)
     add_reference(parser)
@@ -52,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="standard deviation of ranges [m] (default: that of each scan)")  # fmt: skip
     add_choice(parser)
     add("--least", type=whole_number(low=1), default=2, metavar="N",
-        help="least scans that show a landmark (default: %(default)s)")  # fmt: skip
+        help="smallest number of scans that must show a landmark (default: %(default)s)")  # fmt: skip
     add_backend(parser)
     add_json(parser)
     add("--out", type=output_path(".csv"), metavar="CSV", help="write all features")
@@ -147,9 +146,9 @@ def _report(
             "landmarks": None if landmarks is None else _landmark_rows(landmarks), "machine": machine(),
         })  # fmt: skip
         return
-    print(f"{done} scans, {1e3 * seconds / done:.3g} ms each with the first call's compilation")
+    print(f"{counted(done, 'scan')}, {1e3 * seconds / done:.3g} ms each with the first call's compilation")
     for kind, count in counts.items():
-        print(f"  {count} {kind}{'s' * (count > 1)}: {count / done:.2f} a scan")
+        print(f"  {counted(count, kind)}: {count / done:.2f} a scan")
     if landmarks is not None:
         print(f"landmarks: {landmarks!r}")
     if done < len(scans):

@@ -34,7 +34,7 @@ HELP = "Fit the noise of landmark readings in a recorded run, check the map, and
 
 LOST = 1
 
-_EPILOG = """\
+EPILOG = """\
 The folder holds files in the format of the UTIAS MRCLAM data, plain or with .gz after the name:
   Landmark_Groundtruth.dat  subject x y deviation deviation    Barcodes.dat           subject barcode
   RobotN_Odometry.dat       time v w                           RobotN_Measurement.dat time barcode range bearing
@@ -51,17 +51,16 @@ than poses anywhere among the landmarks, as on a wrong map.
 
 Exit codes: 0 success, 1 lost at the end, 2 bad input.
 
-example:
+examples:
   gpusense landmarks --folder MRCLAM_Dataset1 --robot 1
   gpusense landmarks --folder MRCLAM_Dataset1 --robot 2 --unknown --particles 5000 --plot run.png"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     add = parser.add_argument
     add("--folder", required=True, type=Path, metavar="DIR", help="the recorded run, in the format below")
-    add("--robot", required=True, type=whole_number(low=1), metavar="N", help="which robot")
+    add("--robot", required=True, type=whole_number(low=1), metavar="N", help="number in its files' names")
     kind = parser.add_mutually_exclusive_group()
     kind.add_argument("--known", dest="known", action="store_true", default=True,
         help="the landmark of each reading is known by its barcode (default)")  # fmt: skip

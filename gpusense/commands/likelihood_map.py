@@ -25,7 +25,7 @@ HELP = "Draw the likelihood of a scan over all positions and headings of a map."
 # Number of printed modes.
 _MODES = 5
 
-_EPILOG = """\
+EPILOG = """\
 The darker a position in the picture, the larger P(z | x, m) at its best heading. The table lists the best poses that
 are no neighbours of a better one. The entropy is that of the pose for a uniform prior.
 
@@ -33,14 +33,13 @@ Ctrl-C ends the run; the picture then shows the positions so far.
 
 Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
-example:
+examples:
   gpusense likelihood-map --map map.yaml --log run.log.gz --scan 101 --out likelihood.png
   gpusense likelihood-map --map map.yaml --log run.log.gz --model beam --temperature 0.1 --out beam.pdf"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     add = parser.add_argument
     add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
     add_log(parser, "a log with scans")
@@ -48,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", required=True, type=output_path(".png", ".pdf", ".svg"), metavar="FILE", help="the picture")
     add("--model", choices=("beam", "field"), default="field", help="measurement model (default: %(default)s)")
     add("--resolution", type=positive_number, default=0.1, metavar="M",
-        help="distance between neighbouring positions [m] (default: %(default)s)")  # fmt: skip
+        help="distance between neighbouring positions, at least a cell [m] (default: %(default)s)")  # fmt: skip
     add("--headings", type=whole_number(low=1), default=72, metavar="A", help="headings (default: %(default)s)")
     add("--positions", choices=("free", "all"), default="free", help="cells that are evaluated (default: %(default)s)")
     add("--beams", type=whole_number(low=1), metavar="B", help="thin the scan evenly to B beams (default: all)")

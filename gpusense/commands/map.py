@@ -16,7 +16,7 @@ from gpusense.commands.arguments import (
     positive_number,
 )
 from gpusense.commands.map_chain import add_chain, chain_log, check_chain, document, is_chained, words, write_chain
-from gpusense.commands.output import print_json
+from gpusense.commands.output import counted, print_json
 from gpusense.commands.scans import add_choice, add_log, add_reference, read_scans_of_lasers, scanners_of
 from gpusense.commands.signals import code_of, word_of
 from gpusense.evaluation.machine import machine
@@ -33,7 +33,7 @@ HELP = "Build an occupancy grid from the scans of a log."
 # Scans of a step of the progress bar.
 _SCANS = 64
 
-_EPILOG = """\
+EPILOG = """\
 Each ray makes the cells that it crosses more likely free, and the cell where it ends more likely occupied. Cells
 without a ray stay unknown. The map is written as map_server's YAML file with an image beside it, white where it is
 free, black where occupied, grey where unknown: an image editor removes people and closes gaps.
@@ -51,7 +51,7 @@ the last one's scans.
 
 Exit codes: 0 success, 2 bad input, 130 interrupted, 143 terminated.
 
-example:
+examples:
   gpusense map --log run.bag --out map.yaml --tum run.tum --plot map.png
   gpusense localize --map map.yaml --log run.bag --start 0 0 0
   gpusense map --log run.bag --topic /front /rear --out map.yaml
@@ -62,7 +62,6 @@ example:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     add = parser.add_argument
     add_log(parser, "a log with scans", several="lasers of the map")
     add_reference(parser)
@@ -148,7 +147,7 @@ def _report(
     if chained is not None:
         print(words(args, chained))
     print(f"{args.out}: {rows} x {cols} cells of {grid.resolution} m, {occupied} occupied, {free} free; "
-          f"{builder.rays} rays of {scans[0]} scans\nimage: {image}")  # fmt: skip
+          f"{counted(builder.rays, 'ray')} of {counted(scans[0], 'scan')}\nimage: {image}")  # fmt: skip
 
 
 def _build(builder: MapBuilder) -> tuple[float, KeyboardInterrupt | None]:

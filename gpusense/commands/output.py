@@ -130,6 +130,11 @@ def table_lines(columns: Sequence[str], rows: Sequence[Sequence[str]], *, right:
     return lines
 
 
+def counted(number: int, noun: str) -> str:
+    """Return a number of things in words: ``"1 scan"``, ``"3 scans"``."""
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
 def grouped(number: int) -> str:
     """Format a number with spaces between its thousands."""
     return f"{number:,}".replace(",", " ")

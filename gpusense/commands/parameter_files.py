@@ -124,7 +124,7 @@ def parameters_yaml(result: FitResult) -> str:
         lines.append(block("incidence_model", result.incidence.parameters.to_dict()))
     if result.motion is not None:
         lines.append(
-            "# For 'gpusense localize --params': OdometryMotion. nav2_amcl lacks least, sideways and systematic:"
+            "# For 'gpusense localize --parameters': OdometryMotion. nav2_amcl lacks least, sideways and systematic:"
         )
         lines.append("# alpha alone is too little noise there.")
         lines.append(block("odometry_motion", _plain(asdict(result.motion.motion))))

@@ -35,7 +35,7 @@ HELP = "Score particles with the scans of a recorded log, and rank the logged po
 
 DIFFERENT = 1
 
-_EPILOG = """\
+EPILOG = """\
 Each scan is scored for N particles: the logged pose, half of the others around it, half uniform over the free cells.
 The percentile is the share of the other particles that score worse than the logged pose, ties counting half. The
 weighted mean excludes the logged pose. Default parameters are those of BeamParameters and LikelihoodFieldParameters.
@@ -50,7 +50,7 @@ A row is printed as soon as its scan is scored. Ctrl-C ends the run with the res
 Exit codes: 0 the log fits the map, 1 it does not or the verdict is uncertain, or two backends rank the particles
 differently by more than rounding explains, 2 bad input, 130 interrupted, 143 terminated.
 
-example:
+examples:
   gpusense score --map map.yaml --log run.log.gz --model field --particles 20000
   gpusense score --map map.yaml --log run.log.gz --parameters fitted/parameters.yaml
   gpusense score --map map.yaml --log run.log.gz --every 2 --offset 1 --backend opencl --backend numpy --limit 3"""
@@ -64,7 +64,6 @@ _COLUMNS = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     add = parser.add_argument
     add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
     add_log(parser, "a log with corrected poses, or any with --reference")

@@ -6,7 +6,7 @@ import argparse
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from gpusense.commands.output import print_json
+from gpusense.commands.output import counted, print_json
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
@@ -72,7 +72,8 @@ def _print(args: argparse.Namespace, models: list[Model], scores: list[BackendSc
     for score in scores:
         s = {name: number_text(value) for name, value in summary(score).items()}
         print(
-            f"\n{score.device.selection} ({score.device.name}): {s['scans']} scans, {score.particles} particles each\n"
+            f"\n{score.device.selection} ({score.device.name}): {counted(len(score.scans), 'scan')}, "
+            f"{score.particles} particles each\n"
             f"  rank of the {pose}: median {s['rank_median']}\n"
             f"  percentile of the {pose}: median {s['percentile_median']}, least {s['percentile_min']}\n"
             f"  error of the weighted mean: median {s['error_position_median']} m and {s['error_heading_median']} rad, "

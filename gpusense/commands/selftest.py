@@ -24,7 +24,7 @@ HELP = "Check that the backends present agree with the float64 truth and with ea
 
 BREACH = 1
 
-_EPILOG = """\
+EPILOG = """\
 In a generated building, every backend present computes distance transforms, expected ranges, angles of incidence and
 log-likelihoods of a laser and of a ring of sonars, in both precisions. 'truth' is the float64 reference on the
 backend's rounded inputs and expected ranges; 'SciPy' is its distance transform; 'specialize=False' is the same model
@@ -37,7 +37,7 @@ Exit codes: 0 every difference is within its tolerance, 1 one is not, 2 bad inpu
 1e6 of range_max, lambda up to 1e6, weights of exactly 0 and 1, extreme maps, resolutions, poses and scans. Errors are
 in eps (1 + |log p|) unless the unit is another; the textbook's formulas are listed for comparison.
 
-example:
+examples:
   gpusense selftest
   gpusense selftest --stiff
   gpusense selftest --backend opencl --backend warp:cpu --json"""
@@ -45,7 +45,6 @@ example:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     parser.add_argument(
         "--backend", action="append", default=[], metavar="DEVICE",
         help=f"{BACKEND_HELP}; may be repeated; a single one is compared with numpy (default: all present except "

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gpusense.commands.arguments import (
+    Output,
     add_backend,
     add_json,
     add_seed,
@@ -17,7 +18,7 @@ from gpusense.commands.arguments import (
     positive_number,
     whole_number,
 )
-from gpusense.commands.output import print_json
+from gpusense.commands.output import counted, print_json
 
 if TYPE_CHECKING:
     from gpusense.evaluation.simulation.run import SimulatedRun
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 NAME = "simulate"
 HELP = "Make the log of a robot that drives through a map, with noise, people and changes of the world."
 
-_EPILOG = """\
+EPILOG = """\
 The robot drives between random places, or along the poses of --path. Its readings are drawn from the beam model around
 the ranges to walls and people; its odometry has the noise of the odometry motion model. With --moved, --removed,
 --added and --glass the world differs from the map; with --true-map it is another one, so that --map is wrong. The same
@@ -39,7 +40,7 @@ the laser. Bags hold LaserScan, Odometry and transforms; --tum writes the true p
 
 Exit codes: 0 success, 2 bad input.
 
-example:
+examples:
   gpusense simulate --world office --map-out office.yaml --log-out run.log
   gpusense localize --map office.yaml --log run.log
   gpusense simulate --map office.yaml --log-out crowded.log.gz --hidden 0.3 --moved 0.1 --seed 7
@@ -48,13 +49,12 @@ example:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     add = parser.add_argument
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--map", type=Path, metavar="YAML", help="a map_server map: the map that the robot has")
     source.add_argument("--world", metavar="NAME", help="a generated map instead: office, corridor, hall or twins, "
                         "or one of these with a separate seed, as in office:3")  # fmt: skip
-    add("--log-out", required=True, type=Path, metavar="FILE", help="the log to write")
+    add("--log-out", required=True, type=Output(), metavar="FILE", help="the log to write")
     add("--format", choices=("carmen", "ros1", "ros2"),
         help="a CARMEN log, compressed where the name ends in .gz; a bag of ROS 1 (.bag); a new folder with a bag of "
         "ROS 2 (default: by the name, ros1 for .bag and carmen for others)")  # fmt: skip
@@ -225,7 +225,7 @@ def _report(args: argparse.Namespace, made: SimulatedRun) -> None:
             "last_pose": made.poses[-1], "last_odometry": made.odometry[-1],
         })  # fmt: skip
         return
-    print(f"{args.log_out}: {len(made.times)} scans of {made.scanner.count} beams over {length:.1f} m; "
-          f"{none:.1%} without return, {made.hidden.mean():.1%} hidden by people")  # fmt: skip
+    size = f"{counted(len(made.times), 'scan')} of {counted(made.scanner.count, 'beam')} over {length:.1f} m"
+    print(f"{args.log_out}: {size}; {none:.1%} without return, {made.hidden.mean():.1%} hidden by people")
     if made.kidnapped.any():
         print(f"carried elsewhere before scans {', '.join(map(str, np.flatnonzero(made.kidnapped).tolist()))}")

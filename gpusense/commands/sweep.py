@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from gpusense._util import checks
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import BACKEND_HELP, add_json, output_path, positive_number, whole_number
-from gpusense.commands.output import print_json
+from gpusense.commands.output import counted, print_json
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ _TLS = {
     "key": "private key of this client",
 }
 
-_EPILOG = """\
+EPILOG = """\
 A plan is a YAML file: each combination of its axes is a job. docs/sweeps.md describes it.
 
 A row is appended to the table as soon as its job ends. A failed job is a row with its error; one that ends its worker,
@@ -46,7 +46,7 @@ code there: use one at an address in a network that you trust, or with TLS. Maps
 
 Exit codes: 0 success, 1 some jobs failed, 2 bad input, or the cluster ended, 130 interrupted, 143 terminated.
 
-example:
+examples:
   gpusense sweep examples/sweep_logs.yaml --root data --table sweep.csv --processes 2 --plot sweep.png
   gpusense sweep plan.yaml --device warp:cuda:0 --device warp:cuda:1
   gpusense sweep plan.yaml --processes 8 --job-timeout 600 --memory-limit 4GB
@@ -56,7 +56,6 @@ example:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     add = parser.add_argument
     add("plan", type=Path, metavar="PLAN", help="the plan, a YAML file")
     add("--table", type=Path, metavar="FILE",
@@ -72,11 +71,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         add(f"--tls-{name}", type=Path, metavar="FILE", help=f"with --dask: {what}, PEM")
     add("--no-send", action="store_true", help="with --dask: workers read maps and logs from --root themselves")
     add("--attempts", type=whole_number(low=1), default=3, metavar="A",
-        help="most starts of a job whose worker ends (default: %(default)s)")  # fmt: skip
+        help="largest number of starts of a job whose worker ends (default: %(default)s)")  # fmt: skip
     add("--job-timeout", type=positive_number, metavar="SECONDS",
         help="longest time of a job, which then fails, and its worker is replaced (default: none)")  # fmt: skip
     add("--memory-limit", type=_memory, metavar="SIZE",
-        help="most memory of a worker, such as 4GB; a worker beyond it is ended, and its job started again, "
+        help="largest memory of a worker, such as 4GB; a worker beyond it is ended, and its job started again, "
         "up to --attempts times (default: none)")  # fmt: skip
     add("--list", action="store_true", help="print the jobs with their keys, and run none")
     add_json(parser)
@@ -117,7 +116,7 @@ def _list(jobs: tuple[Job, ...], *, as_json: bool) -> int:
     for job in jobs:
         texts = [f"{name}={value}" for name, value in job.labels]
         print(job.key, job.task, *(texts or (job.log, job.map, job.model)))
-    print(f"\n{len(jobs)} jobs")
+    print(f"\n{counted(len(jobs), 'job')}")
     return 0
 
 
@@ -218,7 +217,8 @@ def _report(args: argparse.Namespace, ended: Sweep, seconds: float) -> None:
         figures = {name: getattr(ended, name) for name in ("jobs", "done", "failed", "skipped", "repeated")}
         print_json({"table": args.table, "plot": args.plot, **figures, "seconds": seconds, "machine": machine()})
         return
-    print(f"{ended.jobs} jobs: {ended.done} done, {ended.failed} failed, {ended.skipped} were in the table already")
+    done = f"{ended.done} done, {ended.failed} failed, {ended.skipped} were in the table already"
+    print(f"{counted(ended.jobs, 'job')}: {done}")
     if ended.repeated:
         print(f"{ended.repeated} runs ended with their worker and were started again")
     print(f"{seconds:.1f} s\n\n{machine_line()}")

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from gpusense._util import checks
 from gpusense._util.lines import numbered_lines
 from gpusense.backends import Selection
+from gpusense.learning.beam.pairs import impossible_ranges
 from gpusense.logs import Scan
 from gpusense.models.scan.beam import BeamModel
 from gpusense.world.grid import OccupancyGrid
@@ -142,16 +143,23 @@ def data_of_pairs(
 
     Raises:
         FileNotFoundError: the file is missing.
-        ValueError: a line breaks the format, and the message names it; or no pair is chosen.
+        ValueError: A line breaks the format, or an expected range is impossible, and the message names it; or no pair
+            is chosen.
     """
     file = checks.existing_file(checks.path("pairs", path))
     range_max = checks.real("range_max", range_max, above=0)
     block = checks.integer("block", block, low=1)
     table = _chosen_rows(file, every, offset, limit)
     incidence = table[:, 2].copy() if table.shape[1] == 3 else None
-    return RangeData(
+    data = RangeData(
         table[:, 0].copy(), table[:, 1].copy(), incidence, np.arange(len(table)) // block, range_max, range_min
     )
+    outside = np.flatnonzero(impossible_ranges(data.kinds, data.expected, range_max))
+    if outside.size:
+        index = int(outside[0])
+        rule = f"the expected range must be in [0, {range_max}] where the reading is not missing"
+        raise ValueError(f"{file}: pair {offset + every * index}: {rule}, got {data.expected[index]}")
+    return data
 
 
 def _chosen_rows(file: Any, every: int, offset: int, limit: int | None) -> Floats:
@@ -167,8 +175,7 @@ def _chosen_rows(file: Any, every: int, offset: int, limit: int | None) -> Float
         if limit is not None and kept >= limit:
             break
     if not kept:
-        rule = f"must hold a pair of number {offset}, which is the first one chosen"
-        raise ValueError(f"pairs: {rule}, got {seen} in {file}")
+        raise ValueError(f"pairs: must hold a pair of index {offset}, the first one chosen, got {seen} pairs in {file}")
     return np.concatenate(parts)
 
 

@@ -206,7 +206,7 @@ def chosen_scans(
     scans = read_laser(path, topic, range_max=range_max, mount=mount)
     chosen = list(itertools.islice(enumerate(scans), offset, last, every))
     if not chosen:
-        raise ValueError(f"log: must have a scan of index {offset}, which is the first one chosen, got fewer in {path}")
+        raise ValueError(f"log: must have a scan of index {offset}, the first one chosen, got fewer scans in {path}")
     return chosen
 
 

@@ -91,7 +91,7 @@ def read_steps(
                 break
         counts[sensor] += 1
     if not steps:
-        raise ValueError(f"log: must have a scan of index {offset}, which is the first one chosen, got fewer in {path}")
+        raise ValueError(f"log: must have a scan of index {offset}, the first one chosen, got fewer scans in {path}")
     return steps
 
 

@@ -1,6 +1,8 @@
-"""The flag of kernels in lanes, which compute several particles or beams at once on devices that prefer them."""
+"""Flags of kernels in lanes, which compute several particles or beams at once, and in teams, which share an item."""
 
 from __future__ import annotations
+
+from gpusense.interface.signatures import KERNELS
 
 # By kernel: flags with which it has no body in lanes, and sets of flags of which it requires at least one.
 _SCALAR = frozenset({"FLOAT64", "ALL_READINGS", "EXACT_EXPONENT", "CUBES"})
@@ -31,11 +33,32 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
     "sum_poses": (set(),),
     "weigh_particles": (set(),),
 }
+# By kernel: flags with which its body in lanes computes in float64 where real numbers are float32.
+_DOUBLE: dict[str, frozenset[str]] = {
+    "score_beams": frozenset({"EXACT_EXPONENT", "GROWTH"}),
+    "score_field": frozenset({"BILINEAR"}),
+}
 
 
-def with_lanes_flag(lanes: int, kernel: str, flags: frozenset[str] | set[str]) -> frozenset[str]:
-    """Return the flags of a launch, with IN_LANES where device and kernel compute in lanes."""
+def with_lanes_flag(
+    lanes: int, kernel: str, flags: frozenset[str] | set[str], *, float64: bool = True
+) -> frozenset[str]:
+    """Return the flags of a launch, with IN_LANES where device and kernel compute in lanes.
+
+    Args:
+        lanes: Lanes of the device.
+        kernel: The kernel.
+        flags: Its other flags.
+        float64: Whether the device has float64, which some bodies in lanes need.
+    """
     never = _NEVER.get(kernel, _SCALAR)
+    if not float64 and kernel in _DOUBLE and _DOUBLE[kernel] <= flags:
+        return frozenset(flags)
     if lanes == 1 or flags & never or not any(needed <= flags for needed in _NEEDED.get(kernel, ())):
         return frozenset(flags)
     return frozenset(flags) | {"IN_LANES"}
+
+
+def with_teams_flag(kind: str, kernel: str, flags: frozenset[str]) -> tuple[frozenset[str], int]:
+    """Return the flags of a launch, with IN_TEAMS on a GPU, and the work-items that share an item."""
+    return (flags | {"IN_TEAMS"}, KERNELS[kernel].team) if kind == "gpu" else (flags, 1)

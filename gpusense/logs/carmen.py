@@ -123,7 +123,7 @@ def _count(where: str, fields: Sequence[bytes], index: int) -> int:
     left = len(fields) - index - 1
     text = fields[index].decode(errors="replace") if left >= 0 else ""
     if not (text.isascii() and text.isdigit() and len(text) <= 10):
-        raise ValueError(f"{where}: {name}: field {index} must be a count, got {text!r}")
+        raise ValueError(f"{where}: {name}: field {index} must be a count, got {text[:40]!r}")
     if int(text) > left:
         raise ValueError(f"{where}: {name}: field {index} must count at most {left} values, got {text}")
     return int(text)

@@ -71,7 +71,7 @@ def read_lasers(
         if not form.topics:
             raise _wrong_laser(form, sensors)
         if mount is not None:
-            raise ValueError(f"mount: must be None for {len(sensors)} lasers, whose transforms have them, got one")
+            raise ValueError(f"mount: must be left out for {len(sensors)} lasers, whose transforms have them, got one")
     topics: Sequence[str | None] = sensors or (None,)
     each = [
         _of(index, _records(form, path, topic, range_max=range_max, mount=mount, odometry=index == 0))

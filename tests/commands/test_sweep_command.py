@@ -83,6 +83,7 @@ def test_jobs_are_listed(place, capsys):
             ["--dask", "tls://127.0.0.1:9", "--tls-ca", "no.pem", "--tls-cert", "no.pem", "--tls-key", "no.pem"],
             "no.pem: must exist",
         ),
+        (["--dask", "nowhere"], "dask: must be an address such as tcp://10.0.0.1:8786, got 'nowhere': missing port"),
     ],
 )
 def test_bad_input_is_one_line(place, capsys, more, message):

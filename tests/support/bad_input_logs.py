@@ -42,13 +42,18 @@ LOG_CASES = [
         ValueError,
         f"{{tmp}}/input: must be {KNOWN}, got a folder without metadata.yaml",
     ),
-    ("log-topic", log_with(GOOD_LINE, topic="/scan"), ValueError, "topic: must be None for a CARMEN log, got '/scan'"),
+    (
+        "log-topic",
+        log_with(GOOD_LINE, topic="/scan"),
+        ValueError,
+        "topic: must be left out for a CARMEN log, got '/scan'",
+    ),
     ("log-topic-type", log_with(GOOD_LINE, topic=1), TypeError, "topic: must be a string or None, got 1"),
     (
         "log-mount",
         log_with(GOOD_LINE, mount=(0, 0, 0)),
         ValueError,
-        "mount: must be None for a CARMEN log, got (0, 0, 0)",
+        "mount: must be left out for a CARMEN log, got (0, 0, 0)",
     ),
     (
         "log-bag-rear",
@@ -86,6 +91,11 @@ LOG_CASES = [
         "log-negative-count",
         ":1: FLASER: field 1 must be a count, got '-3'",
         GOOD_LINE.replace("FLASER 3", "FLASER -3"),
+    ),
+    bad_lines(
+        "log-count-of-many-digits",
+        f":1: FLASER: field 1 must be a count, got '{'7' * 40}'",
+        GOOD_LINE.replace("FLASER 3", f"FLASER {'7' * 1000}"),
     ),
     bad_lines(
         "log-count-of-a-billion",

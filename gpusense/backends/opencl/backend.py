@@ -77,6 +77,7 @@ class OpenCLBackend(ProcessBound, Backend):
         self._keys = BinaryCache(info)
         self._cache = _binary_cache(info, device)
         self._pocl = pocl_kernels.pocl_kernels() if pocl.is_pocl(device) else None
+        self._of_bitcode = pocl.takes_bitcode(device)
         # Ranges are the same bits everywhere only if division is rounded correctly, which is an option on GPUs.
         rounded = bool(device.single_fp_config & _ROUNDED_DIVISION)
         self.options = ["-cl-fp32-correctly-rounded-divide-sqrt"] if rounded else []
@@ -91,7 +92,6 @@ class OpenCLBackend(ProcessBound, Backend):
         return self._queue
 
     def upload(self, array: np.ndarray, out: Buffer | None = None, *, wait: bool = True) -> Buffer:
-        """See Backend.upload."""
         if os.getpid() != self._process:
             self.check_process()
         buffer = self.empty(array.size, array.dtype) if out is None else out
@@ -110,7 +110,6 @@ class OpenCLBackend(ProcessBound, Backend):
         return buffer
 
     def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
-        """See Backend.empty."""
         size = -(-max(count, 1) * np.dtype(dtype).itemsize // 4) * 4
         self._check_size(size)
         with driver_errors():
@@ -146,7 +145,6 @@ class OpenCLBackend(ProcessBound, Backend):
             cl.enqueue_nd_range_kernel(self._queue, kernel, (min(_CLEARED_WORDS, words - first),), None)
 
     def download(self, buffer: Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
-        """See Backend.download."""
         if out.size:
             if isinstance(buffer, SHARED):
                 if self._ended != self._queued:
@@ -160,16 +158,13 @@ class OpenCLBackend(ProcessBound, Backend):
         return out
 
     def part(self, buffer: Buffer, first: int, count: int, dtype: np.dtype) -> Buffer:
-        """See Backend.part."""
         size = np.dtype(dtype).itemsize
         return arrays.part_of(buffer, first * size, count * size, self.alignment)
 
     def reads(self, array: object) -> bool:
-        """See Backend.reads."""
         return arrays.is_array(array)
 
     def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
-        """See Backend.adopt."""
         return arrays.adopted(array, self._queue, self.info.selection, name, in_place=in_place)
 
     def blank(self, count: int, dtype: np.dtype) -> Buffer:
@@ -180,7 +175,6 @@ class OpenCLBackend(ProcessBound, Backend):
             return DeviceBuffer(self._context, cl.mem_flags.READ_WRITE, size)
 
     def copy(self, source: Buffer, target: Buffer, size: int, *, begin: int = 0, to: int = 0) -> None:
-        """See Backend.copy."""
         if not size:
             return
         with driver_errors():
@@ -191,21 +185,17 @@ class OpenCLBackend(ProcessBound, Backend):
                 cl.enqueue_copy(self._queue, target, source, byte_count=size, src_offset=begin, dst_offset=to)
 
     def lend(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
-        """See Backend.lend."""
         return arrays.lent(buffer, self._queue, shape, dtype)
 
     @property
     def replays(self) -> bool:
-        """See Backend.replays."""
         return self.info.kind == "gpu"
 
     def record(self, program: Program) -> OpenCLRecording:
-        """See Backend.record."""
         launches = [self.compile(one.kernel, one.flags).bind(one.size, one.arguments) for one in program]
         return OpenCLRecording(self._queue, launches, self._counted)
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launch:
-        """See Backend.compile."""
         if os.getpid() != self._process:
             self.check_process()
         launcher = self._launchers.get((kernel, flags))
@@ -214,12 +204,10 @@ class OpenCLBackend(ProcessBound, Backend):
         return launcher
 
     def source(self, kernel: str, flags: frozenset[str]) -> str:
-        """See Backend.source."""
         file = KERNELS[kernel].file
         return assemble(file, relevant(file, flags))
 
     def synchronize(self) -> None:
-        """See Backend.synchronize."""
         with self._count:
             queued = self._queued
         try:
@@ -259,7 +247,8 @@ class OpenCLBackend(ProcessBound, Backend):
             self._programs[row.file, flags] = self._build(row.file, flags)
         program, key = self._programs[row.file, flags]
         first = None if self._pocl is None else functools.partial(self._pocl.mark, key)
-        return Launch(self, new_kernel(program, kernel), row, flags, first)
+        name = pocl_kernels.own_name(kernel, key) if self._of_bitcode else kernel
+        return Launch(self, new_kernel(program, name), row, flags, first)
 
     def _build(self, file: str, flags: frozenset[str]) -> tuple[cl.Program, str]:
         """Build the program of a kernel file; return it with its key in the cache.
@@ -273,10 +262,15 @@ class OpenCLBackend(ProcessBound, Backend):
         if not self.info.float64 and uses_double(file, flags):
             raise ValueError(f"{file}.cl: computes in float64, which {self.info.name} does not have")
         source = assemble(file, flags)
-        key = self._keys.key(source, self.options)
+        # Bitcode belongs to the version of LLVM, which the platform's version names.
+        key = self._keys.key(
+            source, [*self.options, self._device.platform.version] if self._of_bitcode else self.options
+        )
         if (program := self._kept(source)) is not None:
             return program, key
         try:
+            if self._pocl is not None and self._of_bitcode:
+                return self._built_of_bitcode(self._pocl, file, source, key), key
             with contextlib.nullcontext() if self._pocl is None else self._pocl.building(key):
                 program = self._built(cl.Program(self._context, source))
         except cl.RuntimeError as error:
@@ -287,6 +281,17 @@ class OpenCLBackend(ProcessBound, Backend):
             devices: Any = program.get_info(cl.program_info.DEVICES)
             self._cache.store(source, self.options, binaries[devices.index(self._device)])
         return program, key
+
+    def _built_of_bitcode(self, compiled: pocl_kernels.PoclKernels, file: str, source: str, key: str) -> cl.Program:
+        """Return a program of a kernel file whose kernels have names of their own."""
+        names = {name: pocl_kernels.own_name(name, key) for name, row in KERNELS.items() if row.file == file}
+        options = [*self.options, *(f"-D{name}={other}" for name, other in names.items())]
+        return compiled.built(
+            key,
+            list(names.values()),
+            lambda: self._built(cl.Program(self._context, source), options),
+            lambda bitcode: self._built(cl.Program(self._context, [self._device], [bitcode]), options),
+        )
 
     def _kept(self, source: str) -> cl.Program | None:
         """Return the program that an earlier run compiled; None if the driver accepts no stored one."""
@@ -299,9 +304,9 @@ class OpenCLBackend(ProcessBound, Backend):
             self._cache.discard(source, self.options)
             return None
 
-    def _built(self, program: cl.Program) -> cl.Program:
-        """Compile a program, or load its binary."""
+    def _built(self, program: cl.Program, options: list[str] | None = None) -> cl.Program:
+        """Compile a program, or load its binary; the options are the backend's where none are passed."""
         with warnings.catch_warnings(), without_caches():
             # Some drivers write a log for every program; pyopencl shows it where PYOPENCL_COMPILER_OUTPUT is set.
             warnings.simplefilter("ignore", cl.CompilerWarning)
-            return program.build(self.options, [self._device])
+            return program.build(self.options if options is None else options, [self._device])

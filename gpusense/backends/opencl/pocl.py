@@ -70,6 +70,8 @@ LIBRARIES = (
 # Words of a device's description that are searched for names, and the longest name.
 _WORDS = 256
 _NAME = 24
+# The version whose programs were made of bitcode; others were not tried.
+_OF_BITCODE = (3, 0)
 # The first version that compiles for the processor of its library.
 _FITTING = (5, 0)
 
@@ -130,10 +132,19 @@ def _flags(device: cl.Device) -> frozenset[str]:
 
 def _is_misfit(device: cl.Device) -> bool:
     """Return whether this PoCL takes its library by instruction sets, and the processor's name from LLVM."""
-    version = re.match(r"(\d+)\.(\d+)", device.driver_version.strip())
-    if version is None or tuple(map(int, version.groups())) >= _FITTING:
-        return False
-    return _has_libraries()
+    version = _version(device)
+    return version is not None and version < _FITTING and _has_libraries()
+
+
+def takes_bitcode(device: cl.Device) -> bool:
+    """Return whether a device's driver is a PoCL that makes programs of LLVM's bitcode."""
+    return is_pocl(device) and _version(device) == _OF_BITCODE
+
+
+def _version(device: cl.Device) -> tuple[int, ...] | None:
+    """Return the first two numbers of the driver's version; None where it has none."""
+    match = re.match(r"(\d+)\.(\d+)", device.driver_version.strip())
+    return None if match is None else tuple(map(int, match.groups()))
 
 
 @functools.cache

@@ -4,6 +4,9 @@ A method is judged over all scenes and clouds of a report together, by its large
 times. A run of another day should choose the same, so no difference that noise makes decides: methods within ``ALIKE``
 of the fastest count as equally fast and those within ``CLOSE`` of the least error as equally exact, and of equal ones
 :attr:`Entry.preference` decides, in which nothing is measured. An error must keep its limit for other seeds as well.
+
+Still a method near one of these factors is within it on one day and not on the next. So an earlier choice may stand: it
+is kept until another method is better by more than what noise of both days makes, the square of the factor.
 """
 
 from __future__ import annotations
@@ -198,7 +201,9 @@ def front(listed: Sequence[Entry]) -> list[Entry]:
     return [listed[i] for i in pareto_front(places)]
 
 
-def choose(listed: Sequence[Entry], error: float | None, seconds: float | None) -> Entry | None:
+def choose(
+    listed: Sequence[Entry], error: float | None, seconds: float | None, standing: Entry | None = None
+) -> Entry | None:
     """Choose the entry for a largest error and a longest time.
 
     With a largest error, the fastest method within both limits is chosen. With a longest time alone, the fastest of the
@@ -208,6 +213,8 @@ def choose(listed: Sequence[Entry], error: float | None, seconds: float | None) 
         listed: Entries of one device and one measure.
         error: The largest error; None without a limit.
         seconds: The longest time [s]; None without a limit.
+        standing: The choice of an earlier day among ``listed``: it stands where its error and time keep the limits and
+            no method is better by more than the squares of ``ALIKE`` and ``CLOSE``. None: there is none.
 
     Returns:
         The entry; None if no entry is within the limits.
@@ -215,15 +222,17 @@ def choose(listed: Sequence[Entry], error: float | None, seconds: float | None) 
     able = [
         entry
         for entry in listed
-        if (error is None or entry.error * entry.doubt <= error) and (seconds is None or entry.seconds <= seconds)
+        if (error is None or entry.error * (1 if entry == standing else entry.doubt) <= error)
+        and (seconds is None or entry.seconds <= seconds)
     ]
     if not able:
         return None
-    if error is None:
-        most = CLOSE * max(min(entry.error for entry in able), ROUNDING)
-        able = [entry for entry in able if entry.error <= most]
-    longest = ALIKE * min(entry.seconds for entry in able)
-    return min((entry for entry in able if entry.seconds <= longest), key=_preference)
+    least = max(min(entry.error for entry in able), ROUNDING) if error is None else math.inf
+    exact = [entry for entry in able if entry.error <= CLOSE * least]
+    fastest = min(entry.seconds for entry in exact)
+    if standing in able and standing.error <= CLOSE**2 * least and standing.seconds <= ALIKE**2 * fastest:
+        return standing
+    return min((entry for entry in exact if entry.seconds <= ALIKE * fastest), key=_preference)
 
 
 def _preference(entry: Entry) -> tuple[bool, bool, int, bool, str, float]:

@@ -90,9 +90,7 @@ def make_pairs(ranges: ArrayLike, expected: ArrayLike, range_max: float, range_m
     look_at_readings("ranges", z, range_max)
     if not (kinds != Reading.MISSING).any():
         raise ValueError(f"ranges: must hold a reading that is not missing, got {z.size} of which none is")
-    # A ray without an obstacle has the expected range range_max, possibly rounded to float32.
-    limit = max(z_expected.dtype.type(range_max), range_max)
-    outside = (kinds != Reading.MISSING) & ~((z_expected >= 0) & (z_expected <= limit))
+    outside = impossible_ranges(kinds, z_expected, range_max)
     if outside.any():
         index = int(np.argmax(outside))
         raise ValueError(
@@ -123,3 +121,17 @@ def quantum_of(reading: NDArray[np.floating]) -> float:
     step = float(np.median(gaps[gaps < 1.5 * step]))
     steps = gaps / step
     return step if bool((np.abs(steps - np.round(steps)) < 0.05 + noise / step).all()) and math.isfinite(step) else 0.0
+
+
+def impossible_ranges(kinds: NDArray[np.uint8], expected: NDArray[np.floating], range_max: float) -> NDArray[np.bool_]:
+    """Return (n,) whether each expected range is outside [0, range_max] while its reading is not missing.
+
+    A ray without an obstacle has the expected range range_max, possibly rounded to float32.
+
+    Args:
+        kinds: (n,) class of every reading.
+        expected: (n,) expected ranges [m].
+        range_max: Longest range [m].
+    """
+    limit = max(float(expected.dtype.type(range_max)), range_max)
+    return (kinds != Reading.MISSING) & ~((expected >= 0) & (expected <= limit))

@@ -7,17 +7,6 @@ ilanes within_lanes(const ilanes i, const int last) {
     return raised < last ? raised : (ilanes)last;
 }
 
-#if TWO_PART_POINTS
-// Return frac + a b + sign c d to about twice the working precision; every factor is a sum of two numbers.
-LanePair careful_offset_lanes(const lanes frac, const lanes frac_low, const lanes a, const lanes a_low, const real2 b,
-                              const lanes c, const lanes c_low, const real2 d, const real sign) {
-    const LanePair ab = two_product_lanes(a, (lanes)b.x), cd = two_product_lanes(c, (lanes)d.x);
-    const LanePair products = two_sum_lanes(ab.hi, sign * cd.hi), sum = two_sum_lanes(products.hi, frac);
-    const lanes low = (a * b.y + a_low * b.x) + sign * (c * d.y + c_low * d.x);
-    return (LanePair){sum.hi, ((ab.lo + sign * cd.lo) + (products.lo + frac_low)) + (low + sum.lo)};
-}
-#endif
-
 // Return the whole cells below an offset, with the remainder in [0, 1) and 1 minus it.
 ilanes whole_cells_lanes(const LanePair offset, LanePair *rest, LanePair *to_next) {
     const lanes up = offset.hi + (real)0.5;

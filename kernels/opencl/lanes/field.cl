@@ -30,38 +30,12 @@ kernel void score_field(ARGUMENTS) {
     Particles all[VECTORS];
     lanes total[VECTORS], total_low[VECTORS];
     for (int v = 0; v * LANES < count; ++v) {
-        Particles *particle = &all[v];
         total[v] = constant_term;
         total_low[v] = 0;
         for (int i = 0; i < LANES; ++i) {
             const int lane = v * LANES + i, n = begin + (lane < count ? lane : count - 1);
-            ((lane_int *)&particle->col)[i] = pose_cell[n].x + FIELD_RING;
-            ((lane_int *)&particle->row)[i] = pose_cell[n].y + FIELD_RING;
-            ((real *)&particle->x)[i] = pose[n].x;
-            ((real *)&particle->y)[i] = pose[n].y;
-            ((real *)&particle->cos)[i] = pose[n].z;
-            ((real *)&particle->sin)[i] = pose[n].w;
-#if TWO_PART_POINTS
-            ((real *)&particle->x_low)[i] = pose_low[n].x;
-            ((real *)&particle->y_low)[i] = pose_low[n].y;
-            ((real *)&particle->cos_low)[i] = pose_low[n].z;
-            ((real *)&particle->sin_low)[i] = pose_low[n].w;
-#endif
+            set_particle(&all[v], i, pose_cell[n], pose[n], pose_low[n]);
         }
-        // Subtract half a cell: interpolation is between centres, and rounding to nearest must give the cell.
-#if TWO_PART_POINTS
-#if BILINEAR
-        const LanePair x = two_sum_lanes(particle->x, (lanes)-0.5f), y = two_sum_lanes(particle->y, (lanes)-0.5f);
-        particle->x = x.hi, particle->x_low = x.lo + particle->x_low;
-        particle->y = y.hi, particle->y_low = y.lo + particle->y_low;
-#else
-        particle->x -= 0.5f;
-        particle->y -= 0.5f;
-#endif
-#elif BILINEAR
-        particle->x -= 0.5;
-        particle->y -= 0.5;
-#endif
     }
     real most[BLOCK_TERMS];
     for (int from = 0; from < all_readings; from += BLOCK_TERMS) {
@@ -83,14 +57,9 @@ kernel void score_field(ARGUMENTS) {
             lanes block = 0;
 #if BILINEAR
             EndPoints ends;
-            lanes distance[BLOCK_TERMS];
+            LanePair square[BLOCK_TERMS];
             find_places(&ends, &all[v], point + from, point_low + from, size, window);
-#if EXACT_EXPONENT
-            lanes distance_low[BLOCK_TERMS];
-            interpolate(distance, distance_low, &ends, table, size, window);
-#else
-            interpolate(distance, distance, &ends, table, size, window);
-#endif
+            find_squares(square, &ends, table, terms, size, window);
 #elif FLOAT64
             EndPoints ends;
             find_cells(&ends, &all[v], point + from, size, window);
@@ -103,11 +72,7 @@ kernel void score_field(ARGUMENTS) {
 #endif
             for (int k = 0; k < size; ++k) {
 #if BILINEAR
-#if EXACT_EXPONENT
-                const lanes term = log_distance_lanes((LanePair){distance[k], distance_low[k]}, terms);
-#else
-                const lanes term = log_distance_lanes((LanePair){distance[k], 0}, terms);
-#endif
+                const lanes term = log_square_lanes(square[k], terms);
 #else
                 const int *at = (const int *)&ends.cell[k];
                 const lanes term = GATHER_AT(lanes, table, at);

@@ -7,53 +7,10 @@
 #define ROUND_INT 12582912.0f
 #define ROUND_BITS 0x4b400000
 
-// Poses of LANES particles: cells of the padded table, fractions of a cell, and directions. Low parts belong to
-// float32.
-typedef struct {
-    ilanes col, row;
-    lanes x, y, cos, sin, x_low, y_low, cos_low, sin_low;
-} Particles;
-
-// Return the offset of end points in cells from the corners of the particles' cells, or with BILINEAR from their centres.
-void offsets_lanes(const Particles *particle, const real2 point, const real2 point_low, LanePair *x, LanePair *y) {
-#if TWO_PART_POINTS
-    const real2 p = (real2)(point.x, point_low.x), q = (real2)(point.y, point_low.y);
-    *x = careful_offset_lanes(particle->x, particle->x_low, particle->cos, particle->cos_low, p, particle->sin,
-                              particle->sin_low, q, -1);
-    *y = careful_offset_lanes(particle->y, particle->y_low, particle->sin, particle->sin_low, p, particle->cos,
-                              particle->cos_low, q, 1);
-#else
-    *x = (LanePair){particle->x + (particle->cos * point.x - particle->sin * point.y), 0};
-    *y = (LanePair){particle->y + (particle->sin * point.x + particle->cos * point.y), 0};
-#endif
-}
-
 #if BILINEAR
-// Return the weighted sum of distances of one part; only weights and sums of EXACT_EXPONENT have two.
-LanePair between_cells_lanes(const LanePair weight_a, const lanes a, const LanePair weight_b, const lanes b) {
-#if EXACT_EXPONENT
-    return pair_sum_lanes(pair_times_lanes(weight_a, a), pair_times_lanes(weight_b, b));
-#else
-    return (LanePair){weight_a.hi * a + weight_b.hi * b, 0};
-#endif
-}
-
-// Return the weighted sum of a and b.
-LanePair between_lanes(const LanePair weight_a, const LanePair a, const LanePair weight_b, const LanePair b) {
-#if EXACT_EXPONENT
-    return pair_sum_lanes(pair_product_lanes(weight_a, a), pair_product_lanes(weight_b, b));
-#else
-    return (LanePair){weight_a.hi * a.hi + weight_b.hi * b.hi, 0};
-#endif
-}
-
-// Return log p of distances from end points to the nearest obstacles: log_field of field_term.cl.
-lanes log_distance_lanes(const LanePair distance, global const real *terms) {
-#if EXACT_EXPONENT
-    const LanePair square = pair_product_lanes(pair_product_lanes(distance, distance), (LanePair){terms[1], terms[5]});
-#else
-    const LanePair square = {distance.hi * (distance.hi * terms[1]), 0};
-#endif
+// Return log p of end points, from the squares of their distances to the nearest obstacles over 2 sigma^2: log_field of
+// field_term.cl.
+lanes log_square_lanes(const LanePair square, global const real *terms) {
     const LanePair exponent = shape_exponent_lanes(square, terms[6], terms[7]);
 #if LINEAR
     lanes p = terms[2];
@@ -79,13 +36,27 @@ lanes log_distance_lanes(const LanePair distance, global const real *terms) {
 #endif
 }
 
+#if FLOAT64
+// Poses of LANES particles: cells of the padded table, fractions of a cell less half of one, and directions.
+typedef struct {
+    ilanes col, row;
+    lanes x, y, cos, sin;
+} Particles;
+
+// Set the pose of a lane. Half a cell is subtracted: interpolation is between centres.
+void set_particle(Particles *particle, const int lane, const int2 cell, const real4 pose, const real4 pose_low) {
+    ((lane_int *)&particle->col)[lane] = cell.x + FIELD_RING;
+    ((lane_int *)&particle->row)[lane] = cell.y + FIELD_RING;
+    ((real *)&particle->x)[lane] = pose.x - 0.5;
+    ((real *)&particle->y)[lane] = pose.y - 0.5;
+    ((real *)&particle->cos)[lane] = pose.z;
+    ((real *)&particle->sin)[lane] = pose.w;
+}
+
 // End points of a block of beams between four cell centres: the cell of the first, and the place between them.
 typedef struct {
     ilanes cell[BLOCK_TERMS];
-    lanes rest_x[BLOCK_TERMS], rest_y[BLOCK_TERMS], to_next_x[BLOCK_TERMS], to_next_y[BLOCK_TERMS];
-#if EXACT_EXPONENT
-    lanes rest_x_low[BLOCK_TERMS], rest_y_low[BLOCK_TERMS], to_next_x_low[BLOCK_TERMS], to_next_y_low[BLOCK_TERMS];
-#endif
+    LanePair rest_x[BLOCK_TERMS], rest_y[BLOCK_TERMS], to_next_x[BLOCK_TERMS], to_next_y[BLOCK_TERMS];
 } EndPoints;
 
 // Find the places of a block's end points. Both cells of the ring hold the same value, so the four cells are neighbours
@@ -93,48 +64,179 @@ typedef struct {
 void find_places(EndPoints *ends, const Particles *particle, global const real2 *point, global const real2 *point_low,
                  const int size, const Window window) {
     const int stride = window.cols + 2 * FIELD_RING;
+    const lanes cos = particle->cos, sin = particle->sin;
     for (int k = 0; k < size; ++k) {
-        LanePair x, y, rest_x, rest_y, to_next_x, to_next_y;
-        offsets_lanes(particle, point[k], point_low[k], &x, &y);
-        const ilanes to_col = whole_cells_lanes(x, &rest_x, &to_next_x);
-        const ilanes to_row = whole_cells_lanes(y, &rest_y, &to_next_y);
+        const LanePair x = {particle->x + (cos * point[k].x - sin * point[k].y), 0};
+        const LanePair y = {particle->y + (sin * point[k].x + cos * point[k].y), 0};
+        const ilanes to_col = whole_cells_lanes(x, &ends->rest_x[k], &ends->to_next_x[k]);
+        const ilanes to_row = whole_cells_lanes(y, &ends->rest_y[k], &ends->to_next_y[k]);
         const ilanes c = within_lanes(particle->col + to_col, stride - 2);
         const ilanes r = within_lanes(particle->row + to_row, window.rows + 2 * FIELD_RING - 2);
         ends->cell[k] = r * stride + c;
-        ends->rest_x[k] = rest_x.hi, ends->rest_y[k] = rest_y.hi;
-        ends->to_next_x[k] = to_next_x.hi, ends->to_next_y[k] = to_next_y.hi;
-#if EXACT_EXPONENT
-        ends->rest_x_low[k] = rest_x.lo, ends->rest_y_low[k] = rest_y.lo;
-        ends->to_next_x_low[k] = to_next_x.lo, ends->to_next_y_low[k] = to_next_y.lo;
-#endif
     }
 }
 
-// Interpolate the distances of a block's end points; those of EXACT_EXPONENT have two parts. distance_low may be distance.
-void interpolate(lanes *distance, lanes *distance_low, const EndPoints *ends, global const real *table, const int size,
-                 const Window window) {
-    global const real *above = table + window.cols + 2 * FIELD_RING;
+// Return the weighted sum of a and b; only weights and sums of EXACT_EXPONENT have two parts.
+LanePair between_lanes(const LanePair weight_a, const LanePair a, const LanePair weight_b, const LanePair b) {
+#if EXACT_EXPONENT
+    return pair_sum_lanes(pair_product_lanes(weight_a, a), pair_product_lanes(weight_b, b));
+#else
+    return (LanePair){weight_a.hi * a.hi + weight_b.hi * b.hi, 0};
+#endif
+}
+
+// Find the squares of the distances of a block's end points over 2 sigma^2.
+void find_squares(LanePair *square, const EndPoints *ends, global const real *table, global const real *terms,
+                  const int size, const Window window) {
     for (int k = 0; k < size; ++k) {
         const lane_int *at = (const lane_int *)&ends->cell[k];
-        lanes a, b, d, e;
-        gather_pairs(table, at, &a, &b);
-        gather_pairs(above, at, &d, &e);
+        LanePair a = {0, 0}, b = {0, 0}, c = {0, 0}, d = {0, 0};
+        gather_pairs(table, at, &a.hi, &b.hi);
+        gather_pairs(table + window.cols + 2 * FIELD_RING, at, &c.hi, &d.hi);
+        const LanePair low = between_lanes(ends->to_next_x[k], a, ends->rest_x[k], b);
+        const LanePair high = between_lanes(ends->to_next_x[k], c, ends->rest_x[k], d);
+        const LanePair distance = between_lanes(ends->to_next_y[k], low, ends->rest_y[k], high);
 #if EXACT_EXPONENT
-        const LanePair rest_x = {ends->rest_x[k], ends->rest_x_low[k]}, rest_y = {ends->rest_y[k], ends->rest_y_low[k]};
-        const LanePair to_next_x = {ends->to_next_x[k], ends->to_next_x_low[k]};
-        const LanePair to_next_y = {ends->to_next_y[k], ends->to_next_y_low[k]};
+        square[k] = pair_product_lanes(pair_product_lanes(distance, distance), (LanePair){terms[1], terms[5]});
 #else
-        const LanePair rest_x = {ends->rest_x[k], 0}, rest_y = {ends->rest_y[k], 0};
-        const LanePair to_next_x = {ends->to_next_x[k], 0}, to_next_y = {ends->to_next_y[k], 0};
+        square[k] = (LanePair){distance.hi * (distance.hi * terms[1]), 0};
 #endif
-        const LanePair low = between_cells_lanes(to_next_x, a, rest_x, b);
-        const LanePair high = between_cells_lanes(to_next_x, d, rest_x, e);
-        const LanePair found = between_lanes(to_next_y, low, rest_y, high);
-        distance_low[k] = found.lo;
-        distance[k] = found.hi;
     }
 }
-#elif FLOAT64
+#else
+// Half of the particles. Their places are computed in float64: sums of two numbers of float32 take three times as many
+// operations.
+typedef double8 half_lanes;
+// A sum of it and an integer of either sign has the integer in its last 32 bits.
+#define HALF_INTEGERS 6755399441055744.0
+
+// Poses of LANES particles: cells of the padded table, fractions of a cell less one, and directions.
+typedef struct {
+    ilanes col, row;
+    half_lanes x[2], y[2], cos[2], sin[2];
+} Particles;
+
+// Set the pose of a lane. Half a cell is subtracted since interpolation is between centres, and half a cell more, so that
+// rounding to nearest gives the cell below.
+void set_particle(Particles *particle, const int lane, const int2 cell, const real4 pose, const real4 pose_low) {
+    ((int *)&particle->col)[lane] = cell.x + FIELD_RING;
+    ((int *)&particle->row)[lane] = cell.y + FIELD_RING;
+    ((double *)particle->x)[lane] = ((double)pose.x - 1) + pose_low.x;
+    ((double *)particle->y)[lane] = ((double)pose.y - 1) + pose_low.y;
+    ((double *)particle->cos)[lane] = (double)pose.z + pose_low.z;
+    ((double *)particle->sin)[lane] = (double)pose.w + pose_low.w;
+}
+
+// End points of a block of beams between four cell centres: the cell of the first, and the place between them.
+typedef struct {
+    ilanes cell[BLOCK_TERMS];
+#if EXACT_EXPONENT
+    half_lanes rest_x[BLOCK_TERMS][2], rest_y[BLOCK_TERMS][2];
+#else
+    lanes rest_x[BLOCK_TERMS], rest_y[BLOCK_TERMS];
+#endif
+} EndPoints;
+
+// Return a b + c, rounded once where the processor has a fused multiply-add.
+half_lanes multiply_add(const half_lanes a, const double b, const half_lanes c) {
+    return FUSES ? fma(a, (half_lanes)b, c) : a * b + c;
+}
+
+// Return both halves in float32.
+lanes both_halves(const half_lanes *halves) {
+    return (lanes)(convert_float8(halves[0]), convert_float8(halves[1]));
+}
+
+// Find the places of a block's end points. Both cells of the ring hold the same value, so the four cells are neighbours
+// even beyond an edge. An end point on a cell's edge may count to either side: the interpolated distance is the same.
+void find_places(EndPoints *ends, const Particles *particle, global const real2 *point, global const real2 *point_low,
+                 const int size, const Window window) {
+    const int stride = window.cols + 2 * FIELD_RING;
+    for (int k = 0; k < size; ++k) {
+        const double to_x = (double)point[k].x + point_low[k].x, to_y = (double)point[k].y + point_low[k].y;
+        half_lanes col[2], row[2], rest_x[2], rest_y[2];
+        for (int i = 0; i < 2; ++i) {
+            const half_lanes cos = particle->cos[i], sin = particle->sin[i];
+            const half_lanes x = multiply_add(cos, to_x, multiply_add(-sin, to_y, particle->x[i]));
+            const half_lanes y = multiply_add(sin, to_x, multiply_add(cos, to_y, particle->y[i]));
+            col[i] = x + HALF_INTEGERS, row[i] = y + HALF_INTEGERS;
+            rest_x[i] = (x - (col[i] - HALF_INTEGERS)) + 0.5;
+            rest_y[i] = (y - (row[i] - HALF_INTEGERS)) + 0.5;
+#if EXACT_EXPONENT
+            ends->rest_x[k][i] = rest_x[i], ends->rest_y[k][i] = rest_y[i];
+#endif
+        }
+#if !EXACT_EXPONENT
+        ends->rest_x[k] = both_halves(rest_x), ends->rest_y[k] = both_halves(rest_y);
+#endif
+        const ilanes to_col = (ilanes)(as_int16(col[0]).even, as_int16(col[1]).even);
+        const ilanes to_row = (ilanes)(as_int16(row[0]).even, as_int16(row[1]).even);
+        const ilanes c = within_lanes(particle->col + to_col, stride - 2);
+        const ilanes r = within_lanes(particle->row + to_row, window.rows + 2 * FIELD_RING - 2);
+        ends->cell[k] = r * stride + c;
+    }
+}
+
+#if EXACT_EXPONENT
+// Return the squares of interpolated distances, times a factor.
+half_lanes scaled_square(const float8 a, const float8 b, const float8 c, const float8 d, const half_lanes rest_x,
+                         const half_lanes rest_y, const double factor) {
+    const half_lanes left = convert_double8(a), low = left + rest_x * (convert_double8(b) - left);
+    const half_lanes above = convert_double8(c), high = above + rest_x * (convert_double8(d) - above);
+    const half_lanes distance = low + rest_y * (high - low);
+    return distance * distance * factor;
+}
+#endif
+
+// Find the squares of the distances of a block's end points over 2 sigma^2.
+void find_squares(LanePair *square, const EndPoints *ends, global const real *table, global const real *terms,
+                  const int size, const Window window) {
+    for (int k = 0; k < size; ++k) {
+        const int *at = (const int *)&ends->cell[k];
+        lanes a, b, c, d;
+        gather_pairs(table, at, &a, &b);
+        gather_pairs(table + window.cols + 2 * FIELD_RING, at, &c, &d);
+#if EXACT_EXPONENT
+        const double factor = (double)terms[1] + terms[5];
+        half_lanes both[2];
+        both[0] = scaled_square(a.lo, b.lo, c.lo, d.lo, ends->rest_x[k][0], ends->rest_y[k][0], factor);
+        both[1] = scaled_square(a.hi, b.hi, c.hi, d.hi, ends->rest_x[k][1], ends->rest_y[k][1], factor);
+        const lanes high = both_halves(both);
+        both[0] -= convert_double8(high.lo), both[1] -= convert_double8(high.hi);
+        square[k] = (LanePair){high, both_halves(both)};
+#else
+        const lanes rest_x = ends->rest_x[k], rest_y = ends->rest_y[k], to_next_x = 1 - rest_x;
+        const lanes low = to_next_x * a + rest_x * b, high = to_next_x * c + rest_x * d;
+        const lanes distance = (1 - rest_y) * low + rest_y * high;
+        square[k] = (LanePair){distance * (distance * terms[1]), 0};
+#endif
+    }
+}
+#endif
+#else
+// Poses of LANES particles: cells of the padded table, fractions of a cell, and directions. Half a cell is subtracted from
+// those of float32, since rounding to nearest must give the cell.
+typedef struct {
+    ilanes col, row;
+    lanes x, y, cos, sin;
+} Particles;
+
+// Set the pose of a lane.
+void set_particle(Particles *particle, const int lane, const int2 cell, const real4 pose, const real4 pose_low) {
+    ((lane_int *)&particle->col)[lane] = cell.x + FIELD_RING;
+    ((lane_int *)&particle->row)[lane] = cell.y + FIELD_RING;
+#if FLOAT64
+    ((real *)&particle->x)[lane] = pose.x;
+    ((real *)&particle->y)[lane] = pose.y;
+#else
+    ((real *)&particle->x)[lane] = pose.x - 0.5f;
+    ((real *)&particle->y)[lane] = pose.y - 0.5f;
+#endif
+    ((real *)&particle->cos)[lane] = pose.z;
+    ((real *)&particle->sin)[lane] = pose.w;
+}
+
+#if FLOAT64
 // Cells of a block's end points. Their coordinates are whole numbers of float64, which every processor clamps and
 // multiplies fast.
 typedef struct {
@@ -161,9 +263,9 @@ void find_cells(EndPoints *ends, const Particles *particle, global const real2 *
     const lanes last_col = stride - 1, last_row = window.rows + 2 * FIELD_RING - 1;
     const lanes col = to_lanes(particle->col), row = to_lanes(particle->row);
     for (int k = 0; k < size; ++k) {
-        LanePair x, y;
-        offsets_lanes(particle, point[k], point[k], &x, &y);
-        const lanes c = held_lanes(col + cells_below(x.hi), last_col), r = held_lanes(row + cells_below(y.hi), last_row);
+        const lanes x = particle->x + (particle->cos * point[k].x - particle->sin * point[k].y);
+        const lanes y = particle->y + (particle->sin * point[k].x + particle->cos * point[k].y);
+        const lanes c = held_lanes(col + cells_below(x), last_col), r = held_lanes(row + cells_below(y), last_row);
         ends->cell[k] = convert_int8_rtz(r * stride + c);
     }
 }
@@ -213,4 +315,5 @@ __attribute__((noinline)) void refine_cells(EndPoints *ends, const real *most, c
         }
     }
 }
+#endif
 #endif

@@ -31,26 +31,77 @@ lanes mean_range_lanes(const lanes expected, global const real *terms, const ila
 #endif
 }
 
-// Return sigma_hit / sigma at ranges, as sums of two numbers.
+// Return sigma_hit / sigma at ranges, as sums of two numbers; where exponents are computed in float64, only the first.
 LanePair hit_scale_lanes(const lanes expected, global const real *terms, const ilanes bin_at) {
 #if GROWTH
+#if FLOAT64
 #if EXACT_EXPONENT
     const LanePair growth = pair_times_lanes((LanePair){TERM(12), TERM(13)}, expected);
     const LanePair x = pair_sum_lanes((LanePair){1, 0}, growth);
     const lanes y = 1 / x.hi;
     const LanePair back = two_product_lanes(y, x.hi);
     return (LanePair){y, (((1 - back.hi) - back.lo) - y * x.lo) * y};
-#else
-    return (LanePair){1 / (1 + TERM(12) * expected), 0};
 #endif
+#endif
+    return (LanePair){1 / (1 + TERM(12) * expected), 0};
 #else
     return (LanePair){1, 0};
 #endif
 }
 
+#if GROWTH
+#if EXACT_EXPONENT
+#if !FLOAT64
+// Half of the readings of a vector. Sums of two numbers of float32 take twice as many operations as float64.
+typedef double8 half_lanes;
+
+// Return sums of two numbers.
+half_lanes sum_of_parts(const float8 high, const float8 low) { return convert_double8(high) + convert_double8(low); }
+
+// Return (z - mean)^2 / (2 sigma^2) of half of the readings; scale is sigma_hit / sigma, rounded to float32.
+half_lanes half_exponent(const float8 z, const float8 expected, const float8 scale, const half_lanes bias,
+                         const half_lanes growth, const half_lanes factor, const double range_max) {
+    const half_lanes at = convert_double8(expected), rough = convert_double8(scale);
+#if BIAS
+    const half_lanes wanted = at + bias, raised = wanted < 0 ? (half_lanes)0 : wanted;
+    const half_lanes off = convert_double8(z) - (raised > range_max ? (half_lanes)range_max : raised);
+#else
+    const half_lanes off = convert_double8(z) - at;
+#endif
+    // A step of Newton's method for the reciprocal of 1 + growth z*.
+    const half_lanes scaled = off * (rough * (2 - (1 + growth * at) * rough));
+    return scaled * scaled * factor;
+}
+
+// Return (z - mean)^2 / (2 sigma^2) as sums of two numbers, computed in float64.
+LanePair exponent_of_halves(const lanes z, const lanes expected, const lanes scale, global const real *terms,
+                            const ilanes bin_at) {
+    const lanes bias = TERM(10), bias_low = TERM(11), growth = TERM(12), growth_low = TERM(13);
+    const lanes factor = TERM(1), factor_low = TERM(9);
+    const half_lanes first = half_exponent(z.lo, expected.lo, scale.lo, sum_of_parts(bias.lo, bias_low.lo),
+                                           sum_of_parts(growth.lo, growth_low.lo),
+                                           sum_of_parts(factor.lo, factor_low.lo), terms[6]);
+    const half_lanes second = half_exponent(z.hi, expected.hi, scale.hi, sum_of_parts(bias.hi, bias_low.hi),
+                                            sum_of_parts(growth.hi, growth_low.hi),
+                                            sum_of_parts(factor.hi, factor_low.hi), terms[6]);
+    const float8 high = convert_float8(first), other = convert_float8(second);
+    return (LanePair){(lanes)(high, other), (lanes)(convert_float8(first - convert_double8(high)),
+                                                    convert_float8(second - convert_double8(other)))};
+}
+#endif
+#endif
+#endif
+
 // Return (z - mean)^2 / (2 sigma^2) as sums of two numbers.
 LanePair normal_exponent_lanes(const lanes z, const lanes expected, const lanes mean, const ilanes clamped,
                                const LanePair scale, global const real *terms, const ilanes bin_at) {
+#if GROWTH
+#if EXACT_EXPONENT
+#if !FLOAT64
+    return exponent_of_halves(z, expected, scale.hi, terms, bin_at);
+#endif
+#endif
+#endif
     LanePair off = {z - expected, 0};
 #if BIAS
     // z, z* and the bias nearly cancel.

@@ -74,6 +74,23 @@ def test_of_equal_methods_nothing_measured_decides():
             assert choice.choose(rest, *limits) == listed[first]
 
 
+@pytest.mark.parametrize(
+    ("error", "seconds", "changes", "stands"),
+    [
+        # Up to 1.5 times the fastest and 1.5 times the most exact one; not beyond, and not beyond a limit.
+        (1.0, None, {"seconds": 1.5}, True), (1.0, None, {"seconds": 1.6}, False),
+        (None, 9.0, {"error": 0.15}, True), (None, 9.0, {"error": 0.16}, False), (None, 9.0, {"seconds": 1.6}, False),
+        (0.2, None, {"error": 0.19, "doubt": 1.2}, True), (0.2, None, {"error": 0.21}, False),
+        (None, 1.4, {"seconds": 1.5}, False),
+    ],
+)  # fmt: skip
+def test_an_earlier_choice_stands_until_another_method_is_clearly_better(error, seconds, changes, stands):
+    best, earlier = entry("a", 0.1, 1.0), entry("z", **({"error": 0.1, "seconds": 1.0} | changes))
+    assert choice.choose([best, earlier], error, seconds) == best
+    assert choice.choose([best, earlier], error, seconds, earlier) == (earlier if stands else best)
+    assert choice.choose([best], error, seconds, earlier) == best
+
+
 def test_an_error_keeps_its_limit_for_other_seeds():
     sure, doubtful = entry("b", 0.019, 2.0), entry("a", 0.017, 1.0, doubt=1.2)
     assert choice.choose([sure, doubtful], 0.02, None) == sure and choice.choose([doubtful], 0.021, None) == doubtful

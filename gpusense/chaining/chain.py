@@ -219,7 +219,8 @@ class Chainer:
             loops = self._loops[1]
             closures = loops.closures.renumbered(joint.keys)
             poses = _carried(poses, joint.keys, loops.solution.poses)
-        solution = solve(poses, Links.joined([links, closures]), settle=True)
+        # Without closures hardly anything tells how a long chain bends, and the chain of matches bends least.
+        solution = solve(poses, Links.joined([links, closures]), settle=len(closures) > 0)
         spread = INFLATION * pose_covariances(solution)
         found = solution.links.kind == CLOSURE
         moved = relative(joint.poses, solution.links.first[found], solution.links.second[found])

@@ -1,9 +1,10 @@
 """Covariances of all poses of a pose graph: the diagonal blocks of the inverse of its sparse normal equations.
 
-The matrix of 3 x 3 blocks is eliminated front by front along the elimination tree (Duff and Reid 1983), successive
-columns with equal rows at once. From its root down, the blocks of the inverse within each front follow from those of
-its parent (Takahashi et al. 1973): with L the columns below pivots D, and Z the inverse, Z_sj = -Z_ss L and Z_jj = D^-1
-+ L' Z_ss L. No further blocks are computed, so time and memory are those of the elimination.
+The matrix of 3 x 3 blocks is eliminated front by front along the elimination tree (Duff and Reid 1983): successive
+columns with equal rows at once, and fronts of equal shape whose children are done together. From its root down, the
+blocks of the inverse within each front follow from those of its parent (Takahashi et al. 1973): with L the columns
+below pivots D, and Z the inverse, Z_sj = -Z_ss L and Z_jj = D^-1 + L' Z_ss L. No further blocks are computed, so time
+and memory are those of the elimination.
 """
 
 from __future__ import annotations
@@ -42,35 +43,31 @@ def inverse_blocks(matrix: Any, damping: float) -> Floats:
     """
     blocks = matrix.tobsr((3, 3))
     blocks.sort_indices()
-    count = blocks.shape[0] // 3
-    order = _order(blocks, count)
-    parts = _parts_of(blocks, order)
-    home = np.repeat(np.arange(len(parts)), [end - begin for begin, end, _ in parts])
-    factors, inverses = _eliminated(blocks, order, parts, home, damping)
-    children = np.bincount([home[rows[0]] for _, _, rows in parts if len(rows)], minlength=len(parts))
+    order = _order(blocks, blocks.shape[0] // 3)
+    tree = Tree(_parts_of(blocks, order), len(order))
+    factors, inverses = _eliminated(blocks, order, tree, damping)
     fronts: dict[int, Floats] = {}
-    result = np.empty((count, 3, 3))
-    for k in range(len(parts) - 1, -1, -1):
-        begin, end, rows = parts[k]
-        factor, size = factors[k], 3 * (end - begin)
-        front = np.empty((size + 3 * len(rows), size + 3 * len(rows)))
-        front[:size, :size] = inverses[k]
-        if len(rows):
-            parent = int(home[rows[0]])
-            first, last, known = parts[parent]
-            at = _scalars(np.searchsorted(np.append(np.arange(first, last), known), rows))
-            inner = fronts[parent][np.ix_(at, at)]
-            side = -inner @ factor
-            front[size:, size:], front[size:, :size], front[:size, size:] = inner, side, side.T
-            front[:size, :size] -= factor.T @ side
-            children[parent] -= 1
-            if not children[parent]:
-                del fronts[parent]
-        pivots = np.arange(end - begin)
-        found = front[:size, :size].reshape(end - begin, 3, end - begin, 3)[pivots, :, pivots, :]
-        result[order[begin:end]] = 0.5 * (found + found.transpose(0, 2, 1))
-        if children[k]:
-            fronts[k] = front
+    result = np.empty((len(order), 3, 3))
+    for k in range(len(tree.groups) - 1, -1, -1):
+        which = tree.groups[k]
+        size, factor = 3 * int(tree.size[which[0]]), factors[k]
+        side = 3 * int(tree.below[which[0]])
+        front = np.empty((len(which), size + side, size + side))
+        front[:, :size, :size] = inverses[k]
+        if side:
+            inner = front[:, size:, size:]
+            for group, some, at in tree.parents(which):
+                place = tree.number[tree.parent[which[some]]]
+                inner[some] = fronts[group][place[:, None, None], at[:, :, None], at[:, None, :]]
+            across = -inner @ factor
+            front[:, size:, :size], front[:, :size, size:] = across, across.transpose(0, 2, 1)
+            front[:, :size, :size] -= factor.transpose(0, 2, 1) @ across
+        pivots = np.arange(size // 3)
+        found = front[:, :size, :size].reshape(len(which), size // 3, 3, size // 3, 3)[:, pivots, :, pivots, :]
+        result[order[tree.begin[which] + pivots[:, None]]] = 0.5 * (found + found.transpose(0, 1, 3, 2))
+        fronts[k] = front
+        for group in tree.last_used[k]:
+            del fronts[group]
     return result
 
 
@@ -110,45 +107,103 @@ def _parts_of(blocks: Any, order: Integers) -> list[tuple[int, int, Integers]]:
     return parts
 
 
-def _eliminated(
-    blocks: Any, order: Integers, parts: list[tuple[int, int, Integers]], home: Integers, damping: float
-) -> tuple[list[Floats], list[Floats]]:
-    """Return for each run of steps of the elimination the factor L and the inverse of the pivots.
+class Tree:
+    """The elimination tree of parts; parts of equal shape whose children are done are eliminated at once, as a group.
 
-    ``home`` (N,) has the run of each step.
+    Args:
+        parts: For each part its first and its end step, and the rows below that its steps share.
+        count: Number of steps.
+
+    Attributes:
+        begin: (P,) first step of each part.
+        size: (P,) number of its steps.
+        below: (P,) number of its rows below.
+        parent: (P,) part of the first row below; -1 for a root.
+        home: (N,) part of each step.
+        groups: Parts of each group, children first.
+        number: (P,) number of each part in its group.
+        last_used: For each group the groups that none but it and groups after it need on the way up.
     """
+
+    def __init__(self, parts: list[tuple[int, int, Integers]], count: int) -> None:
+        self.begin = np.array([begin for begin, _, _ in parts])
+        self.size = np.array([end - begin for begin, end, _ in parts])
+        self.below = np.array([len(rows) for _, _, rows in parts])
+        self.home = np.repeat(np.arange(len(parts)), self.size)
+        self._start = np.append(0, np.cumsum(self.below))
+        rows = np.concatenate([rows for _, _, rows in parts]).astype(np.int64)
+        self._count, self._keys = count, np.repeat(np.arange(len(parts)), self.below) * count + rows
+        self.parent = np.full(len(parts), -1)
+        inner = self.below > 0
+        self.parent[inner] = self.home[rows[self._start[:-1][inner]]]
+        self._at = self.place(np.repeat(self.parent, self.below), rows)
+        level = np.zeros(len(parts), np.int64)
+        for part, parent in enumerate(self.parent.tolist()):
+            if parent >= 0:
+                level[parent] = max(level[parent], level[part] + 1)
+        shape = np.stack([self.below, self.size, level])
+        order = np.lexsort(shape)
+        ends = np.flatnonzero((np.diff(shape[:, order], axis=1) != 0).any(axis=0)) + 1
+        self.groups = np.split(order, ends)
+        self.number, self._group = np.empty(len(parts), np.int64), np.empty(len(parts), np.int64)
+        for group, which in enumerate(self.groups):
+            self.number[which], self._group[which] = np.arange(len(which)), group
+        first = np.arange(len(self.groups))
+        np.minimum.at(first, self._group[self.parent[inner]], self._group[inner])
+        self.last_used = [np.flatnonzero(first == group).tolist() for group in range(len(first))]
+
+    def place(self, part: Integers, row: Integers) -> Integers:
+        """Return the places of rows in the fronts of parts: its own steps, then the rows below."""
+        within = np.searchsorted(self._keys, part * self._count + row) - self._start[part] + self.size[part]
+        step = row - self.begin[part]
+        places: Integers = np.where(step < self.size[part], step, within)
+        return places
+
+    def parents(self, which: Integers) -> list[tuple[int, Integers, Integers]]:
+        """Return for each group of parents of a group's parts: its number, its parts' children, and their places.
+
+        Places (C, R) are those of the scalar rows below in the fronts of the parents.
+        """
+        rows = self._at[self._start[which][:, None] + np.arange(self.below[which[0]])]
+        group = self._group[self.parent[which]]
+        chosen = [(one, np.flatnonzero(group == one)) for one in np.unique(group).tolist()]
+        return [(one, some, (3 * rows[some][:, :, None] + np.arange(3)).reshape(len(some), -1)) for one, some in chosen]
+
+
+def _eliminated(blocks: Any, order: Integers, tree: Tree, damping: float) -> tuple[list[Floats], list[Floats]]:
+    """Return for each group of the tree the factors L and the inverses of the pivots of its parts."""
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
+    step, row = place[np.repeat(np.arange(len(order)), np.diff(blocks.indptr))], place[blocks.indices]
+    # Columns of the pivots; only the lower triangle of the pivots is used.
+    entry = np.flatnonzero(row >= step)
+    entry = entry[np.argsort(tree.home[step[entry]], kind="stable")]
+    part = tree.home[step[entry]]
+    start, at = np.searchsorted(part, np.arange(len(tree.size) + 1)), tree.place(part, row[entry])
     factors: list[Floats] = []
     inverses: list[Floats] = []
-    waiting: list[list[tuple[Integers, Floats]]] = [[] for _ in parts]
-    for k, (begin, end, below) in enumerate(parts):
-        rows, size = np.append(np.arange(begin, end), below), 3 * (end - begin)
-        front = np.zeros((3 * len(rows), 3 * len(rows)))
-        # Columns of the pivots; only the lower triangle of the pivots is used.
-        split = front.reshape(len(rows), 3, len(rows), 3)
-        for step in range(begin, end):
-            part = slice(blocks.indptr[order[step]], blocks.indptr[order[step] + 1])
-            columns, values = place[blocks.indices[part]], blocks.data[part]
-            later = columns >= step
-            split[np.searchsorted(rows, columns[later]), :, step - begin, :] += values[later].transpose(0, 2, 1)
-        for others, update in waiting[k]:
-            at = _scalars(np.searchsorted(rows, others))
-            front[np.ix_(at, at)] += update
-        waiting[k] = []
-        pivot = np.tril(front[:size, :size])
-        pivot += np.tril(pivot, -1).T + damping * np.eye(size)
+    waiting: list[list[tuple[Integers, Integers, Floats]]] = [[] for _ in tree.groups]
+    for k, which in enumerate(tree.groups):
+        size, below = int(tree.size[which[0]]), int(tree.below[which[0]])
+        front = np.zeros((len(which), size + below, 3, size + below, 3))
+        each = (start[1:] - start[:-1])[which]
+        one = np.repeat(np.arange(len(which)), each)
+        some = np.arange(len(one)) + np.repeat(start[which] - np.cumsum(each) + each, each)
+        column = step[entry[some]] - tree.begin[which[one]]
+        front[one, at[some], :, column, :] = blocks.data[entry[some]].transpose(0, 2, 1)
+        front = front.reshape(len(which), 3 * (size + below), -1)
+        for number, rows, update in waiting[k]:
+            np.add.at(front, (number[:, None, None], rows[:, :, None], rows[:, None, :]), update)
+        waiting[k], size = [], 3 * size
+        pivot = np.tril(front[:, :size, :size])
+        pivot += np.tril(pivot, -1).transpose(0, 2, 1) + damping * np.eye(size)
         inverse: Floats = np.asarray(np.linalg.inv(pivot), np.float64)
-        side = front[size:, :size]
+        side = front[:, size:, :size]
         factor: Floats = side @ inverse
-        if len(below):
-            waiting[home[below[0]]].append((below, front[size:, size:] - factor @ side.T))
+        if below:
+            update = front[:, size:, size:] - factor @ side.transpose(0, 2, 1)
+            for group, children, rows in tree.parents(which):
+                waiting[group].append((tree.number[tree.parent[which[children]]], rows, update[children]))
         factors.append(factor)
         inverses.append(inverse)
     return factors, inverses
-
-
-def _scalars(blocks: Integers) -> Integers:
-    """Return the scalar rows of blocks of three."""
-    rows: Integers = (3 * blocks[:, None] + np.arange(3)).ravel()
-    return rows

@@ -124,15 +124,16 @@ def test_joint_association_is_exclusive_where_the_nearest_is_not(backend):
     assert nearest.tolist() == [[0, 0]] and joint.tolist() == [[0, 1]]
 
 
-@on_every_backend(on_warp=lambda association: association == "nearest", association=("nearest", "joint"))
-def test_negative_information_by_counting(association, backend):
+@pytest.mark.parametrize(("association", "precision"), [("nearest", "float32"), ("joint", "float64")])
+def test_negative_information_by_counting(association, precision, backend):
     rng = np.random.default_rng(2)
     landmarks, poses, features = forest(60, 40.0)
     p = gs.LandmarkParameters(field_of_view=2.5, range_max=9.0, p_detect=0.7, z_detect=0.9, z_false=0.1)
     features = check_features(features[np.abs(features[:, 1]) < 1.2][:, :2].clip(-1.2, 9), p, (0, 1))[:, :2]
     poses, mount = np.concatenate([poses, rng.uniform(-3, 3, (50, 3))]), (0.2, 0.1, 0.4)
-    plain = gs.LandmarkModel(landmarks, p, backend=backend, association=association, mount=mount)
-    model = gs.LandmarkModel(landmarks, p, backend=backend, association=association, mount=mount, negative=True)
+    options = dict(backend=backend, association=association, precision=precision, mount=mount)
+    plain = gs.LandmarkModel(landmarks, p, **options)
+    model = gs.LandmarkModel(landmarks, p, negative=True, **options)
     which = model.associate(poses, features)[0]
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     sensor = poses[:, :2] + np.stack([c * 0.2 - s * 0.1, s * 0.2 + c * 0.1], axis=1)

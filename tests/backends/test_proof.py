@@ -72,8 +72,7 @@ ABORT = "ends the process with SIGABRT (LLVM ERROR: no)"
     ("fails", "tried", "left"),
     [
         ({(VECTORS, 16): ABORT}, [(16, True), (8, True)], (True, 8, True)),
-        ({(VECTORS, 16): ABORT, (VECTORS, 8): "hangs: no answer in 60 s"}, [(16, True), (8, True), (1, True)],
-         (True, 1, True)),
+        ({(VECTORS, 16): ABORT, (VECTORS, 8): "wrong"}, [(16, True), (8, True), (1, True)], (True, 1, True)),
         ({(FLOAT64, 0): "wrong: ranges"}, [(16, True), (16, False)], (True, 16, False)),
         ({(FLOAT64, 0): ABORT, (VECTORS, 16): "wrong"}, [(16, True), (16, False), (8, False)], (True, 8, False)),
         ({(SCALAR, 0): ABORT}, [(16, True)], (False, 1, False)),
@@ -115,6 +114,20 @@ def test_a_verdict_is_made_anew_when_its_key_changes(driver, monkeypatch, change
     assert len(tried) == 2
     verdict_on(INFO, anew=True)
     assert len(tried) == 3
+
+
+def test_a_hang_lasts_once_it_has_happened_in_two_processes(driver):
+    """A machine that was busy once does not lose a device for good."""
+    tried = driver({(VECTORS, 16): "hangs: no answer in 60 s"})
+    for _ in range(3):
+        proof._known.clear()
+        assert verdict_on(INFO).lanes == 8
+        verdict_on(INFO)
+    assert tried == 2 * [(16, True), (8, True)]
+    verdict_on(INFO, anew=True)
+    proof._known.clear()
+    verdict_on(INFO)
+    assert tried == 4 * [(16, True), (8, True)]
 
 
 def test_a_child_that_something_else_ended_is_no_lasting_verdict(driver):

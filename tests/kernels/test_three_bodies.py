@@ -46,6 +46,7 @@ FLOAT64 = "error_free.cl has the precision of real, which may be float32; Warp a
 EIGHT = "a work-item reads eight numbers before it uses any; the reference takes all of them at once"
 BLOCKS = "a work-item reads blocks of 16 readings as sets of bits; the reference takes all readings at once"
 TILES = "a work-item of a GPU finds its particle and rays; the reference takes all of them at once"
+TEAMS = "work-items of a GPU share the points of a scan; the reference takes all points at once"
 QUICK = "kernels round end points first and repeat the doubtful ones with twice the digits; the reference repeats all"
 KERNELS_ONLY, REFERENCE_ONLY = (OPENCL, WARP), (NUMPY,)
 
@@ -70,6 +71,8 @@ ON_PURPOSE = [
     Purpose("field_term", "quick_value careful_value", KERNELS_ONLY, QUICK),
     Purpose("heading", "two_sum_float64 high_half_float64 pair_product_float64", (OPENCL,), FLOAT64),
     Purpose("icp_step", "add_to_blocks close_blocks", KERNELS_ONLY, "points come one after another"),
+    Purpose("icp_step", "cooperates", (WARP,), "OpenCL's processors have teams as well"),
+    Purpose("icp_step", "log_share add_over_team add_joint_blocks", KERNELS_ONLY, TEAMS),
     Purpose("icp_step", "block_squares", REFERENCE_ONLY, ARRAYS),
     Purpose(
         "landmark_grid", "squared_reach with_landmark", KERNELS_ONLY,

@@ -1,6 +1,6 @@
 """Run a script with PoCL as on a processor without AVX-512, at the speed of this processor.
 
-    python bench/speed/as_avx2.py bench/speed/whole_calls.py --backend opencl --calls 200
+    python bench/speed/as_avx2.py bench/speed/options.py --backend opencl --rounds 30
     python bench/speed/as_avx2.py bench/speed/options.py --backend opencl
 
 PoCL's compiler asks by the instruction ``xgetbv`` which registers the system saves. A copy of PoCL's wheel has ``push

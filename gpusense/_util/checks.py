@@ -8,14 +8,16 @@ import numbers
 import os
 import reprlib
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from gpusense._util import masks
+
+T = TypeVar("T")
 
 _REPR = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = 120
@@ -120,6 +122,28 @@ def boolean(name: str, value: object) -> bool:
     if not isinstance(value, (bool, np.bool)):
         raise TypeError(f"{name}: must be True or False, got {show(value)}")
     return bool(value)
+
+
+def instance(name: str, value: object, kind: type[T], *, optional: bool = False) -> T:
+    """Return ``value`` after checking that it is an instance of ``kind``, or with ``optional`` None.
+
+    Raises:
+        TypeError: ``value`` is of another type.
+    """
+    if not isinstance(value, kind) and not (optional and value is None):
+        word = kind.__name__
+        article = "" if word.endswith("s") else "an " if word[0] in "AEIOU" else "a "
+        raise TypeError(f"{name}: must be {article}{word}{' or None' if optional else ''}, got {show(value)}")
+    return cast(T, value)
+
+
+def or_default(name: str, value: object, kind: Callable[[], T]) -> T:
+    """Return ``value`` after checking that it is an instance of ``kind``; for None, one with default values.
+
+    Raises:
+        TypeError: ``value`` is of another type.
+    """
+    return kind() if value is None else instance(name, value, cast("type[T]", kind))
 
 
 def as_array(name: str, value: object, *, masked: bool = False) -> NDArray[Any]:

@@ -212,15 +212,12 @@ class _ProgramRecording(Recording):
         self._backend, self._program = backend, program
 
     def __call__(self, stream: Any = None) -> None:
-        """See Recording.__call__."""
         if stream is not None:
             raise TypeError(f"stream: must be None on {self._backend.info.selection}, got {stream!r}")
         self._backend.run(self._program)
 
     def wait(self) -> None:
-        """See Recording.wait."""
         self._backend.synchronize()
 
     def explain(self) -> str:
-        """See Recording.explain."""
         return f"{pluralize(len(self._program), 'launch')} one by one: {self._backend.info.selection} has no graphs"

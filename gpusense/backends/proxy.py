@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
-import numpy as np
-
-from gpusense.backends.base import Adopted, Backend, Buffer, Launcher
+from gpusense.backends.base import Backend
 from gpusense.backends.info import BackendInfo
+
+
+def _forwarded(name: str) -> Any:
+    """Make a method that calls the method of the same name of the backend behind."""
+
+    @functools.wraps(getattr(Backend, name), updated=())
+    def method(self: Proxy, *arguments: Any, **options: Any) -> Any:
+        return getattr(self._backend, name)(*arguments, **options)
+
+    return method
+
+
+def _forwarded_property(name: str) -> Any:
+    """Make a property that is that of the backend behind."""
+    return property(lambda self: getattr(self._backend, name))
 
 
 class Proxy(Backend):
@@ -24,97 +38,12 @@ class Proxy(Backend):
         """See Backend."""
         return self._backend.info
 
-    @property
-    def alignment(self) -> int:  # type: ignore[override]
-        """See Backend."""
-        return self._backend.alignment
-
-    def upload(self, array: np.ndarray, out: Buffer | None = None, *, wait: bool = True) -> Buffer:
-        """See Backend.upload."""
-        return self._backend.upload(array, out, wait=wait)
-
-    def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
-        """See Backend.empty."""
-        return self._backend.empty(count, dtype, zero=zero)
-
-    def download(self, buffer: Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
-        """See Backend.download."""
-        return self._backend.download(buffer, out, wait=wait)
-
-    def empty_result(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-        """See Backend.empty_result."""
-        return self._backend.empty_result(shape, dtype)
-
-    def part(self, buffer: Buffer, first: int, count: int, dtype: np.dtype) -> Buffer:
-        """See Backend.part."""
-        return self._backend.part(buffer, first, count, dtype)
-
-    def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
-        """See Backend.compile."""
-        return self._backend.compile(kernel, flags)
-
-    def source(self, kernel: str, flags: frozenset[str]) -> str:
-        """See Backend.source."""
-        return self._backend.source(kernel, flags)
-
-    def synchronize(self) -> None:
-        """See Backend.synchronize."""
-        self._backend.synchronize()
-
-    def begin_batch(self) -> None:
-        """See Backend.begin_batch."""
-        self._backend.begin_batch()
-
-    def submit(self) -> None:
-        """See Backend.submit."""
-        self._backend.submit()
-
-    def end_batch(self) -> None:
-        """See Backend.end_batch."""
-        self._backend.end_batch()
-
-    @property
-    def in_batch(self) -> bool:
-        """See Backend.in_batch."""
-        return self._backend.in_batch
-
-    @property
-    def replays(self) -> bool:
-        """See Backend.replays."""
-        return self._backend.replays
-
-    def address(self, buffer: Buffer) -> int:
-        """See Backend.address."""
-        return self._backend.address(buffer)
-
-    def check_process(self) -> None:
-        """See Backend.check_process."""
-        self._backend.check_process()
-
-    def reads(self, array: object) -> bool:
-        """See Backend.reads."""
-        return self._backend.reads(array)
-
-    def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
-        """See Backend.adopt."""
-        return self._backend.adopt(array, name, in_place=in_place)
-
-    def view(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> Adopted:
-        """See Backend.view."""
-        return self._backend.view(buffer, shape, dtype)
-
-    def blank(self, count: int, dtype: np.dtype) -> Buffer:
-        """See Backend.blank."""
-        return self._backend.blank(count, dtype)
-
-    def copy(self, source: Buffer, target: Buffer, size: int, *, begin: int = 0, to: int = 0) -> None:
-        """See Backend.copy."""
-        self._backend.copy(source, target, size, begin=begin, to=to)
-
-    def copies_from(self, other: Backend) -> bool:
-        """See Backend.copies_from."""
-        return self._backend.copies_from(other)
-
-    def lend(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
-        """See Backend.lend."""
-        return self._backend.lend(buffer, shape, dtype)
+    alignment = _forwarded_property("alignment")
+    in_batch = _forwarded_property("in_batch")
+    replays = _forwarded_property("replays")
+    upload, empty, download, part = map(_forwarded, ("upload", "empty", "download", "part"))
+    empty_result, blank, copy, copies_from = map(_forwarded, ("empty_result", "blank", "copy", "copies_from"))
+    compile, source, synchronize = map(_forwarded, ("compile", "source", "synchronize"))
+    begin_batch, submit, end_batch = map(_forwarded, ("begin_batch", "submit", "end_batch"))
+    address, reads, adopt, view, lend = map(_forwarded, ("address", "reads", "adopt", "view", "lend"))
+    check_process = _forwarded("check_process")

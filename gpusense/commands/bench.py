@@ -33,7 +33,7 @@ _QUICK_DEADLINE, _QUICK_BUILD = 40.0, 3.0
 # Tables that take longer [s] are built once in a quick run; their times then include compiling.
 _QUICK_TWICE = 0.1
 
-_EPILOG = """\
+EPILOG = """\
 Every method with every value of its knob computes the same ranges and scores the same scan, for particles over the
 whole map ('global') and around the true pose ('tracking'). Errors are against the exact caster and the float64 models.
 
@@ -71,7 +71,6 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     add = parser.add_argument
     add("--output", type=Path, metavar="DIR", help="folder for report and diagrams, created if absent")
     add("--html", type=Path, metavar="FILE", help="interactive page of the measurement, one file that works offline")

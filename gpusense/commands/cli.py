@@ -189,8 +189,9 @@ def _build(names: Sequence[str]) -> Parser:
     for name in names:
         module = importlib.import_module(f"gpusense.commands.{name.replace('-', '_')}")
         command = commands.add_parser(
-            module.NAME, help=module.HELP, description=module.HELP, formatter_class=layout, allow_abbrev=False
-        )
+            module.NAME, help=module.HELP, description=module.HELP, epilog=module.EPILOG, formatter_class=layout,
+            allow_abbrev=False,
+        )  # fmt: skip
         module.add_arguments(command)
         command.set_defaults(run=module.run)
     return parser

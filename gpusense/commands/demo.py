@@ -46,7 +46,7 @@ by the beam model and by the likelihood field. Every backend present does the sa
 their errors against the float64 NumPy reference and their ranks of the true pose. A picture shows the building, the
 scan at the best pose, the particles and the likelihood over the whole map."""
 
-_EPILOG = """\
+EPILOG = """\
 examples:
   gpusense demo
   gpusense demo --particles 1000000 --backend opencl --backend warp:cuda:0
@@ -60,7 +60,7 @@ NOTE = "Generated building; scan drawn from the beam model's mixture. Colour sca
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.description, parser.epilog = _DESCRIPTION, _EPILOG
+    parser.description = _DESCRIPTION
     parser.add_argument(
         "--particles", type=arguments.whole_number(low=1, high=100_000_000), default=100_000, metavar="N",
         help="poses to score: half around the true one, half over the whole building (default: %(default)s)",

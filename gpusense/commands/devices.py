@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 NAME = "devices"
 HELP = "List the devices that gpusense can use, and the remedy for each that is absent or unusable."
 
-_EPILOG = """\
+EPILOG = """\
 The column 'selection' is the value for --backend of the other commands and for backend= of the library.
 'auto' selects the device marked with *; the environment variable GPUSENSE_BACKEND changes it.
 Before a device is used for the first time, a child process runs kernels of each family on it and compares them with
@@ -33,7 +33,6 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     parser.add_argument(
         "--prove", action="store_true", help="prove all devices anew, as after a change to the machine or its drivers"
     )

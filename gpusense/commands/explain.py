@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 NAME = "explain"
 HELP = "Report the parts that the kernels leave out, keep or could leave out for a scene, each with the reason."
 
-_EPILOG = """\
+EPILOG = """\
 The scene is a map, a scan of a log, the model's parameters, and 2000 particles in the free cells of the map. Without
 --map it is the building of 'gpusense demo'; without --log a scan that the beam model draws at a free pose of the map.
 
@@ -43,7 +43,6 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     add = parser.add_argument
     add("--map", type=Path, metavar="YAML", help="a map_server map (default: the building of 'gpusense demo')")
     add_log(parser, "a log with scans, of the robot in the map", required=False)

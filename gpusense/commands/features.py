@@ -26,7 +26,7 @@ HELP = "Extract lines, corners, doors, hallways, poles and reflectors from the s
 # Scans of one call: a step of the progress bar.
 _CALL = 256
 
-_EPILOG = """\
+EPILOG = """\
 Each scan is split into lines, and corners, doors, hallways and poles are made of them (docs/landmarks.md). With
 --map-out the lines, corners, doors, poles and reflectors of all scans become a map, at the logged poses or those of
 --reference; --map-in makes a map of an occupancy grid instead. Reflectors need a log with intensities.
@@ -41,7 +41,6 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     add = parser.add_argument
     add_log(parser, "a log with scans", required=False)
     add_reference(parser)

@@ -31,7 +31,7 @@ and deviation of correct ranges (z_hit, sigma_hit), weight and rate of unexpecte
 weight of 'no return' (z_max) and of random readings (z_rand). It needs readings with expected ranges: either a map and
 a log with good poses, at which expected ranges are cast, or a file of pairs."""
 
-_EPILOG = """\
+EPILOG = """\
 A file of pairs has a line for each reading: the reading z, a comma, the expected range z*, and optionally another comma
 and the angle of incidence in radians. A first line without numbers is a header; .gz files are read too. inf means 'no
 return', nan a missing reading.
@@ -67,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     from gpusense.world.hit_shapes import SHAPES
 
-    parser.description, parser.epilog = _DESCRIPTION, _EPILOG
+    parser.description = _DESCRIPTION
     add = parser.add_argument
     add("--map", type=Path, metavar="YAML", help="a map_server map; needs --log")
     add_log(parser, "a log with corrected poses, or any with --reference; needs --map", required=False)

@@ -34,7 +34,7 @@ HELP = "Fit the noise of landmark readings in a recorded run, check the map, and
 
 LOST = 1
 
-_EPILOG = """\
+EPILOG = """\
 The folder holds files in the format of the UTIAS MRCLAM data, plain or with .gz after the name:
   Landmark_Groundtruth.dat  subject x y deviation deviation    Barcodes.dat           subject barcode
   RobotN_Odometry.dat       time v w                           RobotN_Measurement.dat time barcode range bearing
@@ -58,7 +58,6 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     add = parser.add_argument
     add("--folder", required=True, type=Path, metavar="DIR", help="the recorded run, in the format below")
     add("--robot", required=True, type=whole_number(low=1), metavar="N", help="number in its files' names")

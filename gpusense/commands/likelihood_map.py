@@ -25,7 +25,7 @@ HELP = "Draw the likelihood of a scan over all positions and headings of a map."
 # Number of printed modes.
 _MODES = 5
 
-_EPILOG = """\
+EPILOG = """\
 The darker a position in the picture, the larger P(z | x, m) at its best heading. The table lists the best poses that
 are no neighbours of a better one. The entropy is that of the pose for a uniform prior.
 
@@ -40,7 +40,6 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     add = parser.add_argument
     add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
     add_log(parser, "a log with scans")

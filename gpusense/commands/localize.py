@@ -33,7 +33,7 @@ HELP = "Localise a robot along a recorded log with a particle filter."
 
 LOST = 1
 
-_EPILOG = """\
+EPILOG = """\
 The filter begins around the first reference pose or that of --start, with deviations of 0.5 m and 0.26 rad, or with
 --global anywhere in the free space of the map. It moves with the log's odometry and weighs each chosen scan. Errors
 are those of the weighted mean against reference poses: those of --reference, or the logged ones. Coverage is the share
@@ -63,7 +63,6 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     add = parser.add_argument
     add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
     add_log(parser, "a log with laser scans and odometry", several="lasers that correct the filter")

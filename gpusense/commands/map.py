@@ -33,7 +33,7 @@ HELP = "Build an occupancy grid from the scans of a log."
 # Scans of a step of the progress bar.
 _SCANS = 64
 
-_EPILOG = """\
+EPILOG = """\
 Each ray makes the cells that it crosses more likely free, and the cell where it ends more likely occupied. Cells
 without a ray stay unknown. The map is written as map_server's YAML file with an image beside it, white where it is
 free, black where occupied, grey where unknown: an image editor removes people and closes gaps.
@@ -62,7 +62,6 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     add = parser.add_argument
     add_log(parser, "a log with scans", several="lasers of the map")
     add_reference(parser)

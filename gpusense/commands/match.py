@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 NAME = "match"
 HELP = "Match the scans of a recorded log to one another, or to a map."
 
-_EPILOG = """\
+EPILOG = """\
 Each scan is matched to the one before, from the odometry's guess; with --map to the map, from its logged pose. Errors
 are those against the logged poses, where the log has them. A match is wrong beyond 0.2 m or 5 degrees.
 Ctrl-C ends the run with the results so far.
@@ -47,7 +47,6 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     add = parser.add_argument
     add_log(parser, "a log with scans")
     add_reference(parser)

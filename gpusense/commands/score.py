@@ -35,7 +35,7 @@ HELP = "Score particles with the scans of a recorded log, and rank the logged po
 
 DIFFERENT = 1
 
-_EPILOG = """\
+EPILOG = """\
 Each scan is scored for N particles: the logged pose, half of the others around it, half uniform over the free cells.
 The percentile is the share of the other particles that score worse than the logged pose, ties counting half. The
 weighted mean excludes the logged pose. Default parameters are those of BeamParameters and LikelihoodFieldParameters.
@@ -64,7 +64,6 @@ _COLUMNS = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     add = parser.add_argument
     add("--map", required=True, type=Path, metavar="YAML", help="a map_server map")
     add_log(parser, "a log with corrected poses, or any with --reference")

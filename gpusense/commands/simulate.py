@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 NAME = "simulate"
 HELP = "Make the log of a robot that drives through a map, with noise, people and changes of the world."
 
-_EPILOG = """\
+EPILOG = """\
 The robot drives between random places, or along the poses of --path. Its readings are drawn from the beam model around
 the ranges to walls and people; its odometry has the noise of the odometry motion model. With --moved, --removed,
 --added and --glass the world differs from the map; with --true-map it is another one, so that --map is wrong. The same
@@ -49,7 +49,6 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     add = parser.add_argument
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--map", type=Path, metavar="YAML", help="a map_server map: the map that the robot has")

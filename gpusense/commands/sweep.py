@@ -33,7 +33,7 @@ _TLS = {
     "key": "private key of this client",
 }
 
-_EPILOG = """\
+EPILOG = """\
 A plan is a YAML file: each combination of its axes is a job. docs/sweeps.md describes it.
 
 A row is appended to the table as soon as its job ends. A failed job is a row with its error; one that ends its worker,
@@ -56,7 +56,6 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
-    parser.epilog = _EPILOG
     add = parser.add_argument
     add("plan", type=Path, metavar="PLAN", help="the plan, a YAML file")
     add("--table", type=Path, metavar="FILE",

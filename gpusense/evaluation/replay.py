@@ -62,7 +62,6 @@ class Recorder(Proxy):
         self.launches: list[Launch] = []
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
-        """See Backend.compile."""
         launcher = self._backend.compile(kernel, flags)
         if kernel not in ("score_beams", "score_field"):
             return launcher

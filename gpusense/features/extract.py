@@ -82,8 +82,7 @@ def extract_features(
         >>> gs.extract_features(room, scanner, backend="numpy")
         Features(5 lines, 4 corners)
     """
-    if not isinstance(scanner, Scanner):
-        raise TypeError(f"scanner: must be a Scanner, got {checks.show(scanner)}")
+    checks.instance("scanner", scanner, Scanner)
     wanted = check_kinds("kinds", kinds)
     given = None if isinstance(noise, str) and noise == "auto" else checks.real("noise", noise, above=0, high=10)
     device = get_backend(backend)

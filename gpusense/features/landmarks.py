@@ -59,8 +59,7 @@ def map_features(
         >>> gs.map_features(features, np.zeros((3, 3)))
         FeatureMap(4 lines, 4 corners)
     """
-    if not isinstance(features, Features):
-        raise TypeError(f"features: must be Features, got {checks.show(features)}")
+    checks.instance("features", features, Features)
     wanted = kinds_of(kinds, MAP_KINDS)
     placed = checks.array("poses", poses, ("S", 3))
     scans = int(features.scan.max(initial=-1)) + 1
@@ -107,8 +106,7 @@ def landmarks_of_map(
         >>> gs.landmarks_of_map(gs.OccupancyGrid(cells, resolution=0.05), backend="numpy")
         FeatureMap(4 lines, 4 corners)
     """
-    if not isinstance(grid, OccupancyGrid):
-        raise TypeError(f"grid: must be an OccupancyGrid, got {checks.show(grid)}")
+    checks.instance("grid", grid, OccupancyGrid)
     kinds = kinds_of(kinds, MAP_KINDS)
     limit = checks.real("range_max", range_max, above=0)
     poses = _free_places(grid, checks.real("spacing", spacing, above=0))

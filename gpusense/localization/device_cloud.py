@@ -24,7 +24,6 @@ class DeviceCloud(Cloud, FilterCloud):
         self._scored, self._scoring = sensors, FilterScoring(sensors)
 
     def correct(self, step: Step) -> None:
-        """See FilterCloud.correct."""
         score = self._scoring.of(self, step.readings)
         stages = self.places.stages(self.kept, step.stages, step.drawn, step.kind)
         self.run_stages(step.settings, stages, step.drawn, len(step.readings), score)
@@ -35,5 +34,4 @@ class DeviceCloud(Cloud, FilterCloud):
         return sum(sensor.seconds for sensor in self._scored)
 
     def time_scoring(self) -> None:
-        """See FilterCloud.time_scoring."""
         self._scoring.timed = True

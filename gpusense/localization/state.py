@@ -123,11 +123,10 @@ def check_state(state: object, options: dict[str, Any], models: tuple[str, ...])
         TypeError: ``state`` is no FilterState.
         ValueError: it belongs to a filter with another option or other models.
     """
-    if not isinstance(state, FilterState):
-        raise TypeError(f"state: must be a FilterState, got {checks.show(state)}")
-    if state.models != models:
-        raise ValueError(f"state: must be of a filter of {', '.join(models)}, got one of {', '.join(state.models)}")
+    checked = checks.instance("state", state, FilterState)
+    if checked.models != models:
+        raise ValueError(f"state: must be of a filter of {', '.join(models)}, got one of {', '.join(checked.models)}")
     for name, value in options.items():
-        if name != "motion" and state.options.get(name) != value:
-            raise ValueError(f"state: {name} must be {value!r} as in the filter, got {state.options.get(name)!r}")
-    return state
+        if name != "motion" and checked.options.get(name) != value:
+            raise ValueError(f"state: {name} must be {value!r} as in the filter, got {checked.options.get(name)!r}")
+    return checked

@@ -76,8 +76,7 @@ def locate_scan(
         >>> found.status, found.poses, round(found.score, 1)
         ('ambiguous', 22528, 1.0)
     """
-    if not isinstance(model, LikelihoodFieldModel):
-        raise TypeError(f"model: must be a LikelihoodFieldModel, got {checks.show(model)}")
+    checks.instance("model", model, LikelihoodFieldModel)
     if model.compat is not None:
         raise ValueError(
             f"model: must have compat=None, since weights of peers are no likelihood, got {model.compat!r}"

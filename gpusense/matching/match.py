@@ -97,8 +97,7 @@ def match_scan(
         >>> match.pose[:2].round(3).tolist()
         [0.2, 0.1]
     """
-    if not isinstance(scanner, Scanner):
-        raise TypeError(f"scanner: must be a Scanner, got {checks.show(scanner)}")
+    checks.instance("scanner", scanner, Scanner)
     checks.choice("method", method, METHODS)
     given = not (isinstance(noise, str) and noise == "auto")
     options = check_options(noise if given else ASSUMED_NOISE, capture, window)

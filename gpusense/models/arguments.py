@@ -25,13 +25,12 @@ def check_scene(grid: object, range_max: float) -> OccupancyGrid:
         TypeError: Not an OccupancyGrid.
         ValueError: More than 1 048 576 cells per range_max.
     """
-    if not isinstance(grid, OccupancyGrid):
-        raise TypeError(f"grid: must be an OccupancyGrid, got {checks.show(grid)}")
-    look_at_scene(range_max, math.hypot(grid.width, grid.height))
-    cells = range_max / grid.resolution
+    checked = checks.instance("grid", grid, OccupancyGrid)
+    look_at_scene(range_max, math.hypot(checked.width, checked.height))
+    cells = range_max / checked.resolution
     if cells > _MOST_CELLS_PER_RANGE:
         raise ValueError(f"range_max: must be at most {_MOST_CELLS_PER_RANGE} cells of the grid, got {cells:.15g}")
-    return grid
+    return checked
 
 
 def map_words(grid: OccupancyGrid) -> str:

@@ -24,6 +24,22 @@ def ray_limit(flags: frozenset[str], z: np.ndarray, terms: np.ndarray, scale: st
     return np.fmin(last_range(z, terms) / scale.resolution, scale.limit)
 
 
+def cast_beam(
+    flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
+    ray: np.ndarray, rays: int, window: structs.Window, cone: structs.Cone, caster: structs.Caster,
+    scale: structs.RangeScale,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return the (N * R,) expected ranges of rays or cones [m], and the cosines of incidence of cones; none of rays."""
+    if "CONES" in flags:
+        t, cosine, _ = echoes(
+            flags, map_table, normals, window, pose_cell, pose, ray, rays, cone, scale.limit, caster
+        )  # fmt: skip
+        return expected_range(flags, t, scale), cosine
+    ranges = np.empty(len(pose) * rays, pose.dtype)
+    cast_ranges(flags, map_table, pose_cell, pose, ray, ranges, window, len(pose), rays, caster, scale)
+    return ranges, np.empty(0, pose.dtype)
+
+
 def reading_term(
     flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray, sensor: np.ndarray,
     tables: structs.MixtureTables, range_max: float,
@@ -44,6 +60,17 @@ def reading_term(
 def scan_log(flags: frozenset[str], total: np.ndarray) -> np.ndarray:
     """Return the scan's logarithm from its sum."""
     return np.log(total) if "CUBES" in flags else total
+
+
+def readings_of_scan(
+    flags: frozenset[str], scan: int, start: np.ndarray, first: np.ndarray, reading: np.ndarray
+) -> tuple[int, int, np.ndarray, np.ndarray]:
+    """Return one of several scans: its first ray, its number of rays, the first reading of each ray, its readings."""
+    begin, rays = int(start[scan]), int(start[scan + 1] - start[scan])
+    if "SHARED_RAYS" not in flags:
+        return begin, rays, np.arange(rays + 1), reading[begin:]
+    scan_first = first[begin : begin + rays + 1]
+    return begin, rays, scan_first - scan_first[0], reading[scan_first[0] :]
 
 
 def score_beams(
@@ -72,7 +99,7 @@ def score_beams(
     for begin in range(0, particles, block):
         end = min(begin + block, particles)
         part, bin_terms = slice(begin, end), terms
-        ranges, cosine = expected_ranges(
+        ranges, cosine = cast_beam(
             flags, map_table, normals, pose_cell[part], pose[part], ray, rays, window, cone, caster, scale
         )
         if "INCIDENCE" in flags:
@@ -126,33 +153,6 @@ def beam_tiles(
     term = single.reshape(particles, readings)
     term = strand_sums(term) if "STRANDED" in flags else term
     parts[places[:, None] + np.arange(term.shape[1]) * particles] = term
-
-
-def expected_ranges(
-    flags: frozenset[str], map_table: np.ndarray, normals: np.ndarray, pose_cell: np.ndarray, pose: np.ndarray,
-    ray: np.ndarray, rays: int, window: structs.Window, cone: structs.Cone, caster: structs.Caster,
-    scale: structs.RangeScale,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Return the (N * R,) expected ranges of rays or cones [m], and the cosines of incidence of cones; none of rays."""
-    if "CONES" in flags:
-        t, cosine, _ = echoes(
-            flags, map_table, normals, window, pose_cell, pose, ray, rays, cone, scale.limit, caster
-        )  # fmt: skip
-        return expected_range(flags, t, scale), cosine
-    ranges = np.empty(len(pose) * rays, pose.dtype)
-    cast_ranges(flags, map_table, pose_cell, pose, ray, ranges, window, len(pose), rays, caster, scale)
-    return ranges, np.empty(0, pose.dtype)
-
-
-def readings_of_scan(
-    flags: frozenset[str], scan: int, start: np.ndarray, first: np.ndarray, reading: np.ndarray
-) -> tuple[int, int, np.ndarray, np.ndarray]:
-    """Return one of several scans: its first ray, its number of rays, the first reading of each ray, its readings."""
-    begin, rays = int(start[scan]), int(start[scan + 1] - start[scan])
-    if "SHARED_RAYS" not in flags:
-        return begin, rays, np.arange(rays + 1), reading[begin:]
-    scan_first = first[begin : begin + rays + 1]
-    return begin, rays, scan_first - scan_first[0], reading[scan_first[0] :]
 
 
 def sum_terms(

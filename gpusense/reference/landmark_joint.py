@@ -59,6 +59,16 @@ def set_total(s: int, sums: np.ndarray, numbers: np.ndarray) -> np.ndarray:
     return total
 
 
+def best_set(sums: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sets with the largest log p, and these, from the (N, 2^F) largest sums of the sets."""
+    most, chosen = np.full(len(sums), -np.inf, sums.dtype), np.zeros(len(sums), np.int64)
+    for s in range(sums.shape[1]):
+        total = set_total(s, sums[:, s], numbers)
+        better = total > most
+        most[better], chosen[better] = total[better], s
+    return chosen, most
+
+
 def joint_features(
     flags: frozenset[str], landmark: np.ndarray, normal: np.ndarray, signature: np.ndarray, pose_cell: np.ndarray,
     pose: np.ndarray, pose_low: np.ndarray, feature: np.ndarray, terms: np.ndarray, arcs: np.ndarray, best: np.ndarray,
@@ -89,11 +99,7 @@ def joint_features(
                 may = may_match(flags, off, turned[k], numbers[k], normal, signature, same)
                 log_each[k] = np.where(may, detected, -np.inf)
         add_landmark(j, log_each, numbers[:features], sums, partners, each)
-    most, chosen = np.full(particles, -np.inf, real), np.zeros(particles, np.int64)
-    for s in range(sets):
-        total = set_total(s, sums[:, s], numbers[:features])
-        better = total > most
-        most[better], chosen[better] = total[better], s
+    chosen, most = best_set(sums, numbers[:features])
     log_p[:particles] = np.where(np.isneginf(most), most, score.temperature * (score.constant_term + most))
     if "PER_BEAM" in flags:
         n = np.arange(particles)

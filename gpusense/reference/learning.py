@@ -49,17 +49,11 @@ def hit_phi(flags: frozenset[str], x: np.ndarray, terms: np.ndarray) -> np.ndarr
     return density
 
 
-def add_pair(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray, sums: np.ndarray) -> None:
-    """Return the terms of pairs in the sums, (S, pairs).
-
-    log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm, r_hit h_mm, r_short s_ll; r_hit W u^2, r_short
-    z. INFORMATION: 1 where rand is the likeliest cause; the upper triangle of y y' with y = (r_hit, r_short, r_rand,
-    r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2, r_hit h_s h_m, r_hit h_m^2, r_short s_l^2.
-    """
-    real = terms.dtype.type
-    log_p, r_hit, r_short, r_rand = responsibilities(flags, z, expected, terms)
-
-    mean, numbers, half = mean_range(flags, expected, terms), terms[17:19], real(0.5)
+def hit_slopes(
+    flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return W u^2, and the derivatives h_s, h_m, h_ss, h_sm and h_mm of log p_hit of pairs."""
+    mean, numbers, half = mean_range(flags, expected, terms), terms[17:19], terms.dtype.type(0.5)
     u, x_0, x_1 = hit_offset(flags, z, expected, terms)[0] * terms[14], mean * terms[14], (terms[6] - mean) * terms[14]
     weight = shape_weight(flags, half * u * u, numbers)
     pull = weight * u
@@ -72,27 +66,38 @@ def add_pair(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: 
     q = x_1 * pull_1 - x_0 * pull_0 + p * t
     w = x_0 * x_0 * pull_0 + x_1 * x_1 * pull_1
     bend = shape_bend(flags, square, numbers)
-    hit = r_hit > 0
     # A clamped mean does not move with the bias.
-    moved = hit & (mean == expected + terms[10])
-    square = np.where(hit, square, 0)
-    h_s = np.where(hit, square - 1 + t, 0)
-    h_m = np.where(moved, pull + p, 0)
-    h_ss = np.where(hit, square * (bend - 2) - t + w + t * t, 0)
-    h_sm = np.where(moved, pull * (bend - 2) - p + q, 0)
-    h_mm = np.where(moved, weight * (bend - 1) + pull_0 + pull_1 + p * p, 0)
+    moves = mean == expected + terms[10]
+    h_m = np.where(moves, pull + p, 0)
+    h_sm = np.where(moves, pull * (bend - 2) - p + q, 0)
+    h_mm = np.where(moves, weight * (bend - 1) + pull_0 + pull_1 + p * p, 0)
+    return square, square - 1 + t, h_m, square * (bend - 2) - t + w + t * t, h_sm, h_mm
 
+
+def short_slopes(z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives s_l and s_ll of log p_short of pairs."""
     x = terms[4] * expected
     f = short_factor(x)
     v = f - x
-    s_l = np.where(r_short > 0, 1 - v - terms[4] * z, 0)
-    s_ll = np.where(r_short > 0, v * (f - 1) - terms[4] * z, 0)
+    return 1 - v - terms[4] * z, v * (f - 1) - terms[4] * z
 
+
+def add_pair(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray, sums: np.ndarray) -> None:
+    """Return the terms of pairs in the sums, (S, pairs).
+
+    log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm, r_hit h_mm, r_short s_ll; r_hit W u^2, r_short
+    z. INFORMATION: 1 where rand is the likeliest cause; the upper triangle of y y' with y = (r_hit, r_short, r_rand,
+    r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2, r_hit h_s h_m, r_hit h_m^2, r_short s_l^2.
+    """
+    log_p, r_hit, r_short, r_rand = responsibilities(flags, z, expected, terms)
+    slopes = hit_slopes(flags, z, expected, terms)
+    square, h_s, h_m, h_ss, h_sm, h_mm = (np.where(r_hit > 0, slope, 0) for slope in slopes)
+    s_l, s_ll = (np.where(r_short > 0, slope, 0) for slope in short_slopes(z, expected, terms))
     added = [log_p, r_hit, r_short, r_rand]
     added += [r_hit * h_s, r_hit * h_m, r_short * s_l, r_hit * h_ss, r_hit * h_sm, r_hit * h_mm, r_short * s_ll]
     added += [r_hit * square, r_short * z]
     if "INFORMATION" in flags:
-        added.append(((r_rand > r_hit) & (r_rand > r_short)).astype(real))
+        added.append(((r_rand > r_hit) & (r_rand > r_short)).astype(terms.dtype))
         y = (r_hit, r_short, r_rand, r_hit * h_s, r_hit * h_m, r_short * s_l)
         added += [y[i] * y[j] for i in range(6) for j in range(i, 6)]
         added += [r_hit * h_s * h_s, r_hit * h_s * h_m, r_hit * h_m * h_m, r_short * s_l * s_l]

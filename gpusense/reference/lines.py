@@ -7,6 +7,31 @@ import numpy as np
 WHOLE_TURN = 6.283185307179586
 
 
+def line_through(point: np.ndarray, sums: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Return the lines through points and their neighbours: unit normals, offsets, 1 / (sums of squares along them).
+
+    Without neighbours a line is perpendicular to the point's beam, with -1 in place of that sum.
+
+    Args:
+        point: (N, 4) points.
+        sums: (5, N) sums of the neighbours' x, y, x x, x y and y y relative to the points.
+        size: (N,) numbers of points.
+    """
+    mean_x, mean_y = sums[0] / size, sums[1] / size
+    a, b = sums[2] - size * mean_x * mean_x, sums[3] - size * mean_x * mean_y
+    d = sums[4] - size * mean_y * mean_y
+    middle = (a - d) / 2
+    root = np.sqrt(middle * middle + b * b)
+    length = (a + d) / 2 + root
+    along = np.where(middle >= 0, [middle + root, b], [b, root - middle])
+    is_line = (length > 0) & ((along**2).sum(axis=0) > 0)
+    along = np.where(is_line, along, [-point[:, 1], point[:, 0]])
+    along = along / np.where(is_line, np.hypot(*along), point[:, 3])
+    offset = -along[1] * (point[:, 0] + mean_x) + along[0] * (point[:, 1] + mean_y)
+    doubt = np.where(is_line, 1 / np.where(is_line, length, 1), -1)
+    return np.stack([-along[1], along[0], offset, doubt], axis=1)
+
+
 def fit_lines(
     flags: frozenset[str], point: np.ndarray, start: np.ndarray, which: np.ndarray, line: np.ndarray, scans: int,
     points: int, chosen: int, reach: int, most: int, ratio: float, slack: float, width: float, gap: float,
@@ -38,16 +63,4 @@ def fit_lines(
                 sums += np.stack([x, y, x * x, x * y, y * y])
                 size += joined
                 last = following
-        mean_x, mean_y = sums[0] / size, sums[1] / size
-        a, b = sums[2] - size * mean_x * mean_x, sums[3] - size * mean_x * mean_y
-        d = sums[4] - size * mean_y * mean_y
-        middle = (a - d) / 2
-        root = np.sqrt(middle * middle + b * b)
-        length = (a + d) / 2 + root
-        along = np.where(middle >= 0, [middle + root, b], [b, root - middle])
-        is_line = (length > 0) & ((along**2).sum(axis=0) > 0)
-        along = np.where(is_line, along, [-mine[:, 1], mine[:, 0]])
-        along = along / np.where(is_line, np.hypot(*along), mine[:, 3])
-        offset = -along[1] * (mine[:, 0] + mean_x) + along[0] * (mine[:, 1] + mean_y)
-        doubt = np.where(is_line, 1 / np.where(is_line, length, 1), -1)
-        line[start[scan] : start[scan + 1]] = np.stack([-along[1], along[0], offset, doubt], axis=1)
+        line[start[scan] : start[scan + 1]] = line_through(mine, sums, size)

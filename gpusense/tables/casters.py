@@ -43,13 +43,11 @@ class Exact(Caster):
     precomputation = "empty rectangles, one pass over the map per quadrant"
 
     def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
-        """See Caster.prepare."""
         planes = planes_of(backend, *inputs.obstacles.shape)
         table = empty_rectangles(backend, inputs.obstacles, planes)
         return Table(table, 2 * planes.entries(*inputs.obstacles.shape), planes.flags)
 
     def refresh(self, backend: Backend, inputs: CasterInput, table: Buffer, changed: windows.Window) -> bool:
-        """See Caster.refresh."""
         empty_rectangles(backend, inputs.obstacles, planes_of(backend, *inputs.obstacles.shape), table, changed)
         return True
 
@@ -65,7 +63,6 @@ class Dda(Caster):
     precomputation = "none"
 
     def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
-        """See Caster.prepare."""
         return _padded_cells(backend, inputs)
 
 
@@ -100,11 +97,9 @@ class Bresenham(Caster):
 
     @property
     def beyond(self) -> int:
-        """See Caster."""
         return 2 if self.lines == "amcl" else 0
 
     def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
-        """See Caster.prepare."""
         table = _padded_cells(backend, inputs)
         return table if self.lines is None else replace(table, flags=frozenset({_LINES[self.lines]}))
 
@@ -138,7 +133,6 @@ class March(Caster):
         checks.choice("rule", self.rule, ("safe", "centre"))
 
     def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
-        """See Caster.prepare."""
         # Walls outside the grid are also obstacles.
         ring = int(inputs.outside == "occupied")
         obstacles = np.pad(inputs.obstacles, ring, constant_values=True)
@@ -148,7 +142,6 @@ class March(Caster):
         return Table(backend.upload(distances), distances.nbytes)
 
     def struct(self) -> structs.Caster:
-        """See Caster.struct."""
         return structs.Caster(0, math.sqrt(2) if self.rule == "safe" else 0.0, self.tolerance)
 
 
@@ -181,13 +174,11 @@ class Cddt(Caster):
         checks.boolean("pruned", self.pruned)
 
     def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
-        """See Caster.prepare."""
         outside = inputs.outside == "occupied"
         table = directional_table(inputs.obstacles, self.bins, pruned=self.pruned, outside=outside)
         return Table(backend.upload(table), table.nbytes)
 
     def struct(self) -> structs.Caster:
-        """See Caster.struct."""
         return structs.Caster(self.bins, 0.0, 0.0)
 
 
@@ -221,7 +212,6 @@ class Lookup(Caster):
             object.__setattr__(self, "file", checks.path("file", self.file))
 
     def prepare(self, backend: Backend, inputs: CasterInput) -> Table:
-        """See Caster.prepare."""
         size = 2 * inputs.obstacles.size * self.bins
         if self.file is not None:
             entries = read_lookup(Path(self.file), inputs.obstacles, inputs.limit, inputs.outside, self.bins)
@@ -245,7 +235,6 @@ class Lookup(Caster):
         return table
 
     def struct(self) -> structs.Caster:
-        """See Caster.struct."""
         return structs.Caster(self.bins, 0.0, 0.0)
 
 

@@ -68,8 +68,7 @@ def surface_normals(grid: OccupancyGrid, *, unknown: Space = "free", outside: Sp
         >>> np.abs(gs.surface_normals(gs.OccupancyGrid(cells))[4, 4]).round(3).tolist()
         [0.0, 1.0]
     """
-    if not isinstance(grid, OccupancyGrid):
-        raise TypeError(f"grid: must be an OccupancyGrid, got {checks.show(grid)}")
+    checks.instance("grid", grid, OccupancyGrid)
     checks.choice("unknown", unknown, ("free", "occupied"))
     checks.choice("outside", outside, ("free", "occupied"))
     obstacles = grid.obstacles("occupied" if unknown == "occupied" else "free")

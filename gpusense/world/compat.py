@@ -151,7 +151,6 @@ class Amcl(Peer):
         return _unnormalised(distance.astype(np.float32).astype(np.float64), p, range_max)
 
     def beyond(self, p: LikelihoodFieldParameters, range_max: float) -> float:
-        """See Peer.beyond."""
         return float(_unnormalised(np.array(p.max_distance), p, range_max))
 
 
@@ -231,7 +230,6 @@ class Beluga(Peer):
         return _normalised(np.minimum((squared * resolution * resolution).astype(np.float32), farthest), p, range_max)
 
     def beyond(self, p: LikelihoodFieldParameters, range_max: float) -> float:
-        """See Peer.beyond."""
         return float(np.float32(RandomDensity(range_max).peak(1)))
 
     def overlay(self, p: LikelihoodFieldParameters, range_max: float) -> float:

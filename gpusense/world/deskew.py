@@ -117,8 +117,7 @@ def deskew_scan(ranges: ArrayLike, scanner: Scanner, motion: ArrayLike) -> Float
         >>> gs.deskew_scan([2.04, 1.91, 1.8], scanner, motion=(0.2, 0.0, 0.0)).round(2).tolist()
         [2.04, 2.01, 2.0]
     """
-    if not isinstance(scanner, Scanner):
-        raise TypeError(f"scanner: must be a Scanner, got {checks.show(scanner)}")
+    checks.instance("scanner", scanner, Scanner)
     read = checks.as_array("ranges", ranges, masked=True)
     shape = ("S", scanner.count) if read.ndim == 2 else (scanner.count,)
     values = np.atleast_2d(checks.array("ranges", read, shape, finite=False))

@@ -142,33 +142,26 @@ class NormalHit(HitShape):
 
     @classmethod
     def of(cls, parameters: Any) -> Self:
-        """See HitShape.of."""
         return cls()
 
     @property
     def width(self) -> float:
-        """See HitShape.width."""
         return math.sqrt(2 * math.pi)
 
     @property
     def log_width(self) -> float:
-        """See HitShape.log_width."""
         return 0.5 * math.log(2 * math.pi)
 
     def exponent(self, u: Floats) -> Floats:
-        """See HitShape.exponent."""
         return 0.5 * u**2
 
     def slope(self, u: Floats) -> Floats:
-        """See HitShape.slope."""
         return u
 
     def reach(self, exponent: float) -> float:
-        """See HitShape.reach."""
         return math.sqrt(2 * exponent)
 
     def half_mass(self, u: Floats) -> Floats:
-        """See HitShape.half_mass."""
         scaled = u * u.dtype.type(math.sqrt(0.5))
         if scaled.min(initial=np.inf) >= _ERF_IS_ONE:
             # SciPy, which takes as long to load as a whole call of a model, is not needed.
@@ -178,14 +171,12 @@ class NormalHit(HitShape):
         return u.dtype.type(0.5) * erf(scaled)
 
     def drawn(self, share: Floats, low: Floats, high: Floats) -> Floats:
-        """See HitShape.drawn."""
         from scipy.special import ndtr, ndtri
 
         below = ndtr(-low)
         return np.asarray(ndtri(below + share * (ndtr(high) - below)))
 
     def quantile(self, level: Floats) -> Floats:
-        """See HitShape.quantile."""
         from scipy.special import erfcinv, erfinv
 
         root = np.where(level < math.log(2), erfinv(-np.expm1(-level)), erfcinv(np.exp(-level)))
@@ -211,26 +202,21 @@ class StudentHit(HitShape):
 
     @classmethod
     def of(cls, parameters: Any) -> Self:
-        """See HitShape.of."""
         return cls(parameters.hit_dof)
 
     @classmethod
     def at(cls, coordinates: Floats) -> Self:
-        """See HitShape.at."""
         return cls(min(max(1 / float(coordinates[0]), LEAST_DOF), MOST_DOF))
 
     @property
     def coordinates(self) -> Floats:
-        """See HitShape.coordinates."""
         return np.array([1 / self.dof])
 
     def values(self) -> dict[str, float]:
-        """See HitShape.values."""
         return {"hit_dof": self.dof}
 
     @property
     def width(self) -> float:
-        """See HitShape.width."""
         return math.exp(self.log_width)
 
     @property
@@ -249,30 +235,24 @@ class StudentHit(HitShape):
         return 0.5 * (self.dof + 1), 2 / self.dof
 
     def exponent(self, u: Floats) -> Floats:
-        """See HitShape.exponent."""
         return 0.5 * (self.dof + 1) * np.log1p(u * u / self.dof)
 
     def slope(self, u: Floats) -> Floats:
-        """See HitShape.slope."""
         return (self.dof + 1) * u / (self.dof + u * u)
 
     def reach(self, exponent: float) -> float:
-        """See HitShape.reach."""
         return math.sqrt(self.dof * math.expm1(min(2 * exponent / (self.dof + 1), 700.0)))
 
     def half_mass(self, u: Floats) -> Floats:
-        """See HitShape.half_mass."""
         return _student_half_mass(u, self.dof)
 
     def drawn(self, share: Floats, low: Floats, high: Floats) -> Floats:
-        """See HitShape.drawn."""
         below = self.half_mass(low)
         mark = share * (below + self.half_mass(high)) - below
         level = -np.log1p(-2 * np.minimum(np.abs(mark), _MOST_HALF))
         return np.clip(np.copysign(self.quantile(level), mark), -low, high)
 
     def quantile(self, level: Floats) -> Floats:
-        """See HitShape.quantile."""
         from scipy.special import betaincinv
 
         # Invert the incomplete beta function from its nearer end, which keeps the digits for small and large dof.

@@ -153,8 +153,7 @@ def write_map(
     """
     import yaml
 
-    if not isinstance(grid, OccupancyGrid):
-        raise TypeError(f"grid: must be an OccupancyGrid, got {checks.show(grid)}")
+    checks.instance("grid", grid, OccupancyGrid)
     target = checks.path("path", path)
     if target.suffix.lower() not in (".yaml", ".yml"):
         raise ValueError(f"path: must end in .yaml or .yml, got {target}")

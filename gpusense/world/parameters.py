@@ -166,12 +166,10 @@ class IncidenceParameters:
             raise ValueError(f"edges: must rise from 0 to pi / 2, got {checks.show(self.edges)}")
         parameters = tuple(self.parameters)
         for each in parameters:
-            if not isinstance(each, BeamParameters):
-                raise TypeError(f"parameters: must be BeamParameters, got {checks.show(each)}")
+            checks.instance("parameters", each, BeamParameters)
         if len(parameters) != len(edges) - 1:
             raise ValueError(f"parameters: must be one for each of {len(edges) - 1} bins, got {len(parameters)}")
-        if self.no_surface is not None and not isinstance(self.no_surface, BeamParameters):
-            raise TypeError(f"no_surface: must be BeamParameters or None, got {checks.show(self.no_surface)}")
+        checks.instance("no_surface", self.no_surface, BeamParameters, optional=True)
         object.__setattr__(self, "edges", edges)
         object.__setattr__(self, "parameters", parameters)
 

@@ -277,8 +277,7 @@ def classify(ranges: ArrayLike, scanner: Scanner) -> NDArray[np.uint8]:
         >>> gs.classify([2.5, 8.0, float("nan")], scanner).tolist()
         [2, 1, 0]
     """
-    if not isinstance(scanner, Scanner):
-        raise TypeError(f"scanner: must be a Scanner, got {checks.show(scanner)}")
+    checks.instance("scanner", scanner, Scanner)
     z = checks.array("ranges", ranges, finite=False, dtype=None)
     if z.ndim not in (1, 2) or z.shape[-1] != scanner.count:
         rule = f"shape must be ({scanner.count},) or (S, {scanner.count})"

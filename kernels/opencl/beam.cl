@@ -12,6 +12,18 @@ real ray_limit(const real z, global const real *terms, const RangeScale scale) {
 #endif
 }
 
+// Return the expected range of beam r, of a ray or a cone of rays, and the cosine of incidence of a cone.
+real2 cast_beam(global const entry *map_table, global const real2 *normals, const Window window, const int2 cell,
+                const real4 pose, global const real2 *ray, const int r, const Cone cone, const real limit,
+                const Caster caster, const RangeScale scale) {
+#if CONES
+    const Echo echo = nearest_echo(map_table, normals, window, cell, pose, ray + r * cone.rays, cone, limit, caster);
+    return (real2)(expected_range(echo.t, scale), echo.cosine);
+#else
+    return (real2)(expected_range(cast_ray(map_table, window, cell, pose, ray[r], limit, caster), scale), 1);
+#endif
+}
+
 // Return the term of one reading in the sum.
 real reading_term(const real z, const real expected, global const real *terms, global const real *sensor,
                   const MixtureTables tables, const real range_max) {
@@ -68,17 +80,10 @@ kernel void score_beams(ARGUMENTS) {
     int impossible = 0;
 #endif
     for (int r = 0; r < size; ++r) {
-#if CONES
-        const Echo echo = nearest_echo(map_table, normals, window, pose_cell[n], pose[n], ray + r * cone.rays, cone,
-                                       ray_limit(reading[r], terms, scale), caster);
-        const real t = echo.t;
-#else
-        const real t = cast_ray(map_table, window, pose_cell[n], pose[n], ray[r],
-                                ray_limit(reading[r], terms, scale), caster);
-#endif
-        const real expected = expected_range(t, scale);
+        const real2 expected = cast_beam(map_table, normals, window, pose_cell[n], pose[n], ray, r, cone,
+                                         ray_limit(reading[r], terms, scale), caster, scale);
 #if INCIDENCE
-        global const real *bin_terms = incidence_terms(terms, edges, tables.incidence_bins, echo.cosine);
+        global const real *bin_terms = incidence_terms(terms, edges, tables.incidence_bins, expected.y);
 #else
         global const real *bin_terms = terms;
 #endif
@@ -88,7 +93,7 @@ kernel void score_beams(ARGUMENTS) {
         const int k = r;
         {
 #endif
-            const real term = reading_term(reading[k], expected, bin_terms, sensor, tables, scale.range_max);
+            const real term = reading_term(reading[k], expected.x, bin_terms, sensor, tables, scale.range_max);
 #if PER_BEAM
             parts[(long)n * readings + k] = term;
 #endif
@@ -146,17 +151,10 @@ kernel void beam_tiles(ARGUMENTS) {
 #else
     for (int r = tile_ray(item, spread); r < size; r += tile_step(spread)) {
 #endif
-#if CONES
-        const Echo echo = nearest_echo(map_table, normals, window, cell, sensor_pose, ray + r * cone.rays, cone,
-                                       ray_limit(reading[r], terms, scale), caster);
-        const real t = echo.t;
-#else
-        const real t = cast_ray(map_table, window, cell, sensor_pose, ray[r], ray_limit(reading[r], terms, scale),
-                                caster);
-#endif
-        const real expected = expected_range(t, scale);
+        const real2 expected = cast_beam(map_table, normals, window, cell, sensor_pose, ray, r, cone,
+                                         ray_limit(reading[r], terms, scale), caster, scale);
 #if INCIDENCE
-        global const real *bin_terms = incidence_terms(terms, edges, tables.incidence_bins, echo.cosine);
+        global const real *bin_terms = incidence_terms(terms, edges, tables.incidence_bins, expected.y);
 #else
         global const real *bin_terms = terms;
 #endif
@@ -166,7 +164,7 @@ kernel void beam_tiles(ARGUMENTS) {
         const int k = r;
         {
 #endif
-            const real term = reading_term(reading[k], expected, bin_terms, sensor, tables, scale.range_max);
+            const real term = reading_term(reading[k], expected.x, bin_terms, sensor, tables, scale.range_max);
 #if STRANDED
             sum += term;
             r += STRANDS;

@@ -5,6 +5,53 @@
 // Particles per work-group of field_blocks.
 #define GROUP 64
 
+#if ROUNDED_CELLS
+// Return the sum of the readings from begin to end by rounded cells, again with more digits where an end point is too near
+// to an edge.
+real rounded_block(global const real *table, const int2 origin, const real4 pose, const real4 low,
+                   global const real2 *point, global const real2 *point_low, const int begin, const int end,
+                   const real far, const Window window, const real guard) {
+    const int2 from = table_origin(origin, window.cols);
+    const real4 lowered = pose - (real4)(0.5f, 0.5f, 0, 0);
+    const real sure = rounding_margin(guard);
+    real sum = 0, worst = 0;
+    if (begin + BLOCK_TERMS <= end) {
+#if SCANS
+#pragma unroll
+        for (int i = 0; i < BLOCK_TERMS; ++i)
+            sum += quick_value(table, from, lowered, point[begin + i], far, window, &worst);
+#else
+        // The points of one scan are aligned, so that two of them can be read at once.
+        global const real4 *two = (global const real4 *)(point + begin);
+#pragma unroll
+        for (int i = 0; i < BLOCK_TERMS / 2; ++i) {
+            const real4 pair = two[i];
+            sum += quick_value(table, from, lowered, pair.xy, far, window, &worst);
+            sum += quick_value(table, from, lowered, pair.zw, far, window, &worst);
+        }
+#endif
+    } else {
+        for (int k = begin; k < end; ++k) sum += quick_value(table, from, lowered, point[k], far, window, &worst);
+    }
+    if (worst > sure) {
+        sum = 0;
+        for (int k = begin; k < end; ++k)
+            sum += careful_value(table, origin, lowered, pose, low, point[k], point_low[k], far, window, guard, sure);
+    }
+    return sum;
+}
+#endif
+
+// Return log p of a scan from its sum of two parts. An impossible reading keeps the first at -inf and turns the second into
+// nan.
+real field_log(const real2 total, const real temperature) {
+#if CUBES
+    return temperature * log(total.x + total.y);
+#else
+    return isinf(total.x) ? total.x : temperature * (total.x + total.y);
+#endif
+}
+
 // Score scans: one work-item takes a particle. ROUNDED_CELLS changes this kernel in Warp alone, on processors, whose
 // compiler makes vector code of loops.
 kernel void score_field(ARGUMENTS) {
@@ -40,11 +87,7 @@ kernel void score_field(ARGUMENTS) {
         }
     }
     total = add_term(total, block);
-#if CUBES
-    log_p[n] = score.temperature * log(total.x + total.y);
-#else
-    log_p[n] = isinf(total.x) ? total.x : score.temperature * (total.x + total.y);
-#endif
+    log_p[n] = field_log(total, score.temperature);
 }
 
 // Write the sums of blocks of readings to parts[n + block * particles], for GPUs. One work-item takes a particle
@@ -68,43 +111,13 @@ kernel void field_blocks(ARGUMENTS) {
 #else
     const real4 low = (real4)(0);
 #endif
-#if ROUNDED_CELLS
-    const int2 from = table_origin(origin, window.cols);
-    const real4 lowered = sensor_pose - (real4)(0.5f, 0.5f, 0, 0);
-    const real far = terms[3];
-#endif
     for (int block = (item / GROUP) & ((1 << spread) - 1); block * BLOCK_TERMS < size; block += 1 << spread) {
         const int begin = block * BLOCK_TERMS, end = min(begin + BLOCK_TERMS, size);
-        real sum = 0;
 #if ROUNDED_CELLS
-        real worst = 0;
-        const real sure = rounding_margin(guard[block]);
-        if (begin + BLOCK_TERMS <= size) {
-#if SCANS
-#pragma unroll
-            for (int i = 0; i < BLOCK_TERMS; ++i)
-                sum += quick_value(table, from, lowered, point[begin + i], far, window, &worst);
+        const real sum = rounded_block(table, origin, sensor_pose, low, point, point_low, begin, end, terms[3], window,
+                                       guard[block]);
 #else
-            // The points of one scan are aligned, so that two of them can be read at once.
-            global const real4 *two = (global const real4 *)(point + begin);
-#pragma unroll
-            for (int i = 0; i < BLOCK_TERMS / 2; ++i) {
-                const real4 pair = two[i];
-                sum += quick_value(table, from, lowered, pair.xy, far, window, &worst);
-                sum += quick_value(table, from, lowered, pair.zw, far, window, &worst);
-            }
-#endif
-        } else {
-            for (int k = begin; k < end; ++k)
-                sum += quick_value(table, from, lowered, point[k], far, window, &worst);
-        }
-        if (worst > sure) {
-            sum = 0;
-            for (int k = begin; k < end; ++k)
-                sum += careful_value(table, origin, lowered, sensor_pose, low, point[k], point_low[k], far, window,
-                                     guard[block], sure);
-        }
-#else
+        real sum = 0;
         for (int k = begin; k < end; ++k)
             sum += reading_value(table, origin, sensor_pose, low, point[k], point_low[k], terms, window, guard[block]);
 #endif

@@ -32,6 +32,22 @@ real4 distance_slope(global const real *table, const int2 cell, const EndPoint e
     return (real4)(distance.x, distance.y, x, y);
 }
 
+// Add the gradient and information of a reading to the sums: slope is the distance, its low part and its derivatives in x
+// and y, and arm the end point relative to the robot in the sensor's frame.
+void add_slope(real *sums, const real4 slope, const real weight, const real4 at, const real2 arm, const real resolution) {
+    const real x = slope.z / resolution, y = slope.w / resolution, pull = -weight * slope.x;
+    const real turn = slope.w * (at.z * arm.x - at.w * arm.y) - slope.z * (at.w * arm.x + at.z * arm.y);
+    sums[0] += pull * x;
+    sums[1] += pull * y;
+    sums[2] += pull * turn;
+    sums[3] += weight * x * x;
+    sums[4] += weight * x * y;
+    sums[5] += weight * x * turn;
+    sums[6] += weight * y * y;
+    sums[7] += weight * y * turn;
+    sums[8] += weight * turn * turn;
+}
+
 // Write log p, its gradient (3) and the information (9) of poses in the grid's frame, each times the temperature. One
 // work-item takes a particle. mount is the sensor's place on the robot in cells.
 kernel void field_gradient(ARGUMENTS) {
@@ -68,20 +84,9 @@ kernel void field_gradient(ARGUMENTS) {
         const real4 slope = distance_slope(table, origin + end.cell, end, window);
         const real2 distance = (real2)(slope.x, slope.y);
         total = add_term(total, log_field(distance, terms));
-        const real2 arm = to + (real2)(mount_x, mount_y);
-        const real x = slope.z / resolution, y = slope.w / resolution;
-        const real turn = slope.w * (at.z * arm.x - at.w * arm.y) - slope.z * (at.w * arm.x + at.z * arm.y);
         const real bend = shape_weight(field_square(distance, terms).x, terms[6], terms[7]);
-        const real weight = 2 * terms[1] * hit_share(distance, terms) * bend, pull = -weight * slope.x;
-        sums[0] += pull * x;
-        sums[1] += pull * y;
-        sums[2] += pull * turn;
-        sums[3] += weight * x * x;
-        sums[4] += weight * x * y;
-        sums[5] += weight * x * turn;
-        sums[6] += weight * y * y;
-        sums[7] += weight * y * turn;
-        sums[8] += weight * turn * turn;
+        const real weight = 2 * terms[1] * hit_share(distance, terms) * bend;
+        add_slope(sums, slope, weight, at, to + (real2)(mount_x, mount_y), resolution);
     }
     global real *out = gradient + (long)GRADIENT_NUMBERS * n;
     out[0] = isinf(total.x) ? total.x : score.temperature * (total.x + total.y);

@@ -39,6 +39,17 @@ real set_total(const int s, const real sum, global const real *feature, const in
     return total;
 }
 
+// Return the set with the largest log p, and write that.
+int best_set(global const real *sums, global const real *feature, const int features, const int sets, real *most) {
+    int chosen = 0;
+    *most = -INFINITY;
+    for (int s = 0; s < sets; ++s) {
+        const real total = set_total(s, sums[s], feature, features);
+        if (total > *most) *most = total, chosen = s;
+    }
+    return chosen;
+}
+
 // Find the best joint association: one work-item takes a particle. choice[s] has the landmark of each feature of set s,
 // and value[s] its log p; sets is 2^features.
 kernel void joint_features(ARGUMENTS) {
@@ -64,12 +75,8 @@ kernel void joint_features(ARGUMENTS) {
         }
         add_landmark(j, log_each, feature, sums, who, each, features, sets, groups);
     }
-    real most = -INFINITY;
-    int chosen = 0;
-    for (int s = 0; s < sets; ++s) {
-        const real total = set_total(s, sums[s], feature, features);
-        if (total > most) most = total, chosen = s;
-    }
+    real most;
+    const int chosen = best_set(sums, feature, features, sets, &most);
     log_p[n] = isinf(most) ? most : score.temperature * (score.constant_term + most);
 #if PER_BEAM
     for (int k = 0; k < features; ++k) {

@@ -36,67 +36,73 @@ real hit_phi(const real x, global const real *terms) {
     return terms[15] * exp(-shape_exponent(t, terms[17], terms[18]).x);
 }
 
+// W u^2, and the derivatives of log p_hit.
+typedef struct {
+    real square, h_s, h_m, h_ss, h_sm, h_mm;
+} HitSlopes;
+
+// Return the derivatives of log p_hit of a pair.
+HitSlopes hit_slopes(const real z, const real expected, global const real *terms) {
+    const real mean = mean_range(expected, terms), u = hit_offset(z, expected, terms).x * terms[14];
+    const real x_0 = mean * terms[14], x_1 = (terms[6] - mean) * terms[14];
+    const real weight = shape_weight((real)0.5 * u * u, terms[17], terms[18]), pull = weight * u, square = pull * u;
+    real t = 0, p = 0, v = 0, q = 0, w = 0;
+    const real mass = mass_within(mean, terms[2], terms);
+    if (mass < 1) {
+        const real phi_0 = hit_phi(x_0, terms) / mass, phi_1 = hit_phi(x_1, terms) / mass;
+        const real pull_0 = shape_weight((real)0.5 * x_0 * x_0, terms[17], terms[18]) * x_0 * phi_0;
+        const real pull_1 = shape_weight((real)0.5 * x_1 * x_1, terms[17], terms[18]) * x_1 * phi_1;
+        t = x_0 * phi_0 + x_1 * phi_1;
+        p = phi_1 - phi_0;
+        v = pull_0 + pull_1;
+        q = x_1 * pull_1 - x_0 * pull_0 + p * t;
+        w = x_0 * x_0 * pull_0 + x_1 * x_1 * pull_1;
+    }
+    const real bend = shape_bend(square, terms[17]), h_s = square - 1 + t, h_ss = square * (bend - 2) - t + w + t * t;
+    // A clamped mean does not move with the bias.
+    if (mean != expected + terms[10]) return (HitSlopes){square, h_s, 0, h_ss, 0, 0};
+    return (HitSlopes){square, h_s, pull + p, h_ss, pull * (bend - 2) - p + q, weight * (bend - 1) + v + p * p};
+}
+
+// Return the derivatives s_l and s_ll of log p_short of a pair.
+real2 short_slopes(const real z, const real expected, global const real *terms) {
+    const real x = terms[4] * expected, f = short_factor(x), v = f - x;
+    return (real2)(1 - v - terms[4] * z, v * (f - 1) - terms[4] * z);
+}
+
 // Add the terms of a pair to the sums. They are log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm,
 // r_hit h_mm, r_short s_ll; r_hit W u^2, r_short z. INFORMATION: 1 where rand is the likeliest cause; the upper triangle
 // of y y' with y = (r_hit, r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2, r_hit h_s h_m, r_hit h_m^2,
 // r_short s_l^2.
 void add_pair(const real z, const real expected, global const real *terms, real *sums) {
     const real4 r = responsibilities(z, expected, terms);
-    real square = 0, h_s = 0, h_m = 0, h_ss = 0, h_sm = 0, h_mm = 0, s_l = 0, s_ll = 0;
-    if (r.y > 0) {
-        const real mean = mean_range(expected, terms), u = hit_offset(z, expected, terms).x * terms[14];
-        const real x_0 = mean * terms[14], x_1 = (terms[6] - mean) * terms[14];
-        const real weight = shape_weight((real)0.5 * u * u, terms[17], terms[18]), pull = weight * u;
-        square = pull * u;
-        real t = 0, p = 0, v = 0, q = 0, w = 0;
-        const real mass = mass_within(mean, terms[2], terms);
-        if (mass < 1) {
-            const real phi_0 = hit_phi(x_0, terms) / mass, phi_1 = hit_phi(x_1, terms) / mass;
-            const real pull_0 = shape_weight((real)0.5 * x_0 * x_0, terms[17], terms[18]) * x_0 * phi_0;
-            const real pull_1 = shape_weight((real)0.5 * x_1 * x_1, terms[17], terms[18]) * x_1 * phi_1;
-            t = x_0 * phi_0 + x_1 * phi_1;
-            p = phi_1 - phi_0;
-            v = pull_0 + pull_1;
-            q = x_1 * pull_1 - x_0 * pull_0 + p * t;
-            w = x_0 * x_0 * pull_0 + x_1 * x_1 * pull_1;
-        }
-        const real bend = shape_bend(square, terms[17]);
-        h_s = square - 1 + t;
-        h_m = pull + p;
-        h_ss = square * (bend - 2) - t + w + t * t;
-        h_sm = pull * (bend - 2) - p + q;
-        h_mm = weight * (bend - 1) + v + p * p;
-        // A clamped mean does not move with the bias.
-        if (mean != expected + terms[10]) h_m = h_sm = h_mm = 0;
-    }
-    if (r.z > 0) {
-        const real x = terms[4] * expected, f = short_factor(x), v = f - x;
-        s_l = 1 - v - terms[4] * z;
-        s_ll = v * (f - 1) - terms[4] * z;
-    }
+    HitSlopes hit = {0, 0, 0, 0, 0, 0};
+    real2 shorter = (real2)(0);
+    if (r.y > 0) hit = hit_slopes(z, expected, terms);
+    if (r.z > 0) shorter = short_slopes(z, expected, terms);
     sums[0] += r.x;
     sums[1] += r.y;
     sums[2] += r.z;
     sums[3] += r.w;
-    sums[4] += r.y * h_s;
-    sums[5] += r.y * h_m;
-    sums[6] += r.z * s_l;
-    sums[7] += r.y * h_ss;
-    sums[8] += r.y * h_sm;
-    sums[9] += r.y * h_mm;
-    sums[10] += r.z * s_ll;
-    sums[11] += r.y * square;
+    sums[4] += r.y * hit.h_s;
+    sums[5] += r.y * hit.h_m;
+    sums[6] += r.z * shorter.x;
+    sums[7] += r.y * hit.h_ss;
+    sums[8] += r.y * hit.h_sm;
+    sums[9] += r.y * hit.h_mm;
+    sums[10] += r.z * shorter.y;
+    sums[11] += r.y * hit.square;
     sums[12] += r.z * z;
 #if INFORMATION
     sums[13] += r.w > r.y && r.w > r.z ? 1 : 0;
-    const real y[6] = {r.y, r.z, r.w, r.y * h_s, r.y * h_m, r.z * s_l};
+    const real y[6] = {r.y, r.z, r.w, r.y * hit.h_s, r.y * hit.h_m, r.z * shorter.x};
     int place = 14;
     for (int i = 0; i < 6; ++i)
         for (int j = i; j < 6; ++j) sums[place++] += y[i] * y[j];
-    sums[35] += r.y * h_s * h_s;
-    sums[36] += r.y * h_s * h_m;
-    sums[37] += r.y * h_m * h_m;
-    sums[38] += r.z * s_l * s_l;
+    sums[35] += r.y * hit.h_s * hit.h_s;
+    sums[36] += r.y * hit.h_s * hit.h_m;
+    sums[37] += r.y * hit.h_m * hit.h_m;
+    sums[38] += r.z * shorter.x * shorter.x;
 #endif
 }
 

@@ -2,6 +2,25 @@
 
 #define WHOLE_TURN ((real)6.283185307179586)
 
+// Return the line through a point and its neighbours, a unit normal, an offset, and 1 / (sum of squared distances along the
+// line), from sums of the neighbours' coordinates relative to the point and of their products. Without neighbours it is
+// perpendicular to the point's beam, with -1 in place of that sum.
+real4 line_through(const real4 centre, const real2 sum, const real xx, const real xy, const real yy, const int size) {
+    const real2 mean = sum / (real)size;
+    const real a = xx - size * mean.x * mean.x, b = xy - size * mean.x * mean.y, d = yy - size * mean.y * mean.y;
+    const real middle = (real)0.5 * (a - d), root = sqrt(middle * middle + b * b), length = (real)0.5 * (a + d) + root;
+    real2 along = middle >= 0 ? (real2)(middle + root, b) : (real2)(b, root - middle);
+    real size_along = sqrt(along.x * along.x + along.y * along.y);
+    const int is_line = length > 0 && size_along > 0;
+    if (!is_line) {
+        along = (real2)(-centre.y, centre.x);
+        size_along = centre.w;
+    }
+    const real2 normal = (real2)(-along.y / size_along, along.x / size_along);
+    const real offset = normal.x * (centre.x + mean.x) + normal.y * (centre.y + mean.y);
+    return (real4)(normal.x, normal.y, offset, is_line ? 1 / length : -1);
+}
+
 // Fit a line to each point and reach neighbours on either side, up to most within a distance of width, none of them
 // farther from the last one than slack plus ratio times its range, nor than gap in bearing: unit normal, offset, and 1
 // / (sum of squared distances along the line). A point without neighbours has a line perpendicular to its beam, -1 in
@@ -33,17 +52,5 @@ kernel void fit_lines(ARGUMENTS) {
             last = next;
         }
     }
-    const real2 mean = sum / (real)size;
-    const real a = xx - size * mean.x * mean.x, b = xy - size * mean.x * mean.y, d = yy - size * mean.y * mean.y;
-    const real middle = (real)0.5 * (a - d), root = sqrt(middle * middle + b * b), length = (real)0.5 * (a + d) + root;
-    real2 along = middle >= 0 ? (real2)(middle + root, b) : (real2)(b, root - middle);
-    real size_along = sqrt(along.x * along.x + along.y * along.y);
-    const int is_line = length > 0 && size_along > 0;
-    if (!is_line) {
-        along = (real2)(-centre.y, centre.x);
-        size_along = centre.w;
-    }
-    const real2 normal = (real2)(-along.y / size_along, along.x / size_along);
-    const real offset = normal.x * (centre.x + mean.x) + normal.y * (centre.y + mean.y);
-    line[first + k] = (real4)(normal.x, normal.y, offset, is_line ? 1 / length : -1);
+    line[first + k] = line_through(centre, sum, xx, xy, yy, size);
 }

@@ -34,7 +34,68 @@ double reading_of(const int k, global const measured *ranges, global const int *
 #endif
 }
 
+// Return the number of informative readings, which is not counted where all are chosen.
+int count_informative(global const measured *ranges, global const int *beam, const ReadingRules rules) {
+    if (rules.chosen >= rules.beams) return rules.beams;
+    int informative = 0;
+    for (int k = 0; k < rules.beams; ++k) {
+        const double z = reading_of(k, ranges, beam, rules.beams);
+        informative += z >= rules.nearest && (z < rules.farthest || rules.max_readings != MAX_LEFT_OUT);
+    }
+    return informative;
+}
+
+// Read the 16 readings from first on. Return the sets of ranges and of max readings: bit i is reading first + i.
+uint2 read_block(const int first, global const measured *ranges, global const int *beam, const ReadingRules rules,
+                 double *several) {
+#pragma unroll
+    for (int i = 0; i < BLOCK_TERMS; ++i) several[i] = reading_of(first + i, ranges, beam, rules.beams);
+    uint hits = 0, fars = 0;
+#pragma unroll
+    for (int i = 0; i < BLOCK_TERMS; ++i) {
+        hits |= (uint)(several[i] >= rules.nearest && several[i] < rules.farthest) << i;
+        fars |= (uint)(several[i] >= rules.farthest) << i;
+    }
+    return (uint2)(hits, fars);
+}
+
+// Return the set of those of a block's informative readings that are chosen; the first one has the rank.
+uint chosen_of(const uint telling, const int rank, const int informative, const int chosen) {
+    uint used = telling;
+    if (chosen >= informative) return used;
+    for (int i = 0; i < BLOCK_TERMS; ++i) {
+        const int rank_of_i = rank + popcount(telling & ((1u << i) - 1));
+        if (!is_chosen(rank_of_i, informative, chosen)) used &= ~(1u << i);
+    }
+    return used;
+}
+
+// Return the sets of a block's chosen readings that get a place, as ranges and as max readings, and of all readings with a
+// place; left readings remain from the first of the block on.
+uint4 placed_of(const uint used, const uint2 sets, const int left, const ReadingRules rules) {
+    const uint as_range = rules.possible ? used & sets.x : 0;
+    const uint as_far = rules.max_readings == MAX_PLACED ? used & sets.y : 0;
+#if ALL_READINGS
+    const uint placed = left >= BLOCK_TERMS ? (1u << BLOCK_TERMS) - 1 : (1u << left) - 1;
+#else
+    const uint placed = as_range | as_far;
+#endif
+    return (uint4)(as_range, as_far, placed, 0);
+}
+
 #if END_POINTS
+// Return the longest of a block's ranges that come to the block of places from begin on; place is that of the first reading.
+double longest_beside(const double *several, const uint as_range, const uint placed, const int place, const int begin) {
+    double longest = 0;
+#pragma unroll
+    for (int i = 0; i < BLOCK_TERMS; ++i) {
+        const int other = place + popcount(placed & ((1u << i) - 1));
+        const int beside = other >= begin && other < begin + BLOCK_TERMS;
+        if ((as_range >> i & 1) && beside) longest = several[i] > longest ? several[i] : longest;
+    }
+    return longest;
+}
+
 // Fill a place with the end point of a reading: the reading times the vector of its beam, in cells, with the rounding
 // error in point_low. The guard of a block of places is guard_scale (longest + 2 cells), of its longest reading.
 void fill_end_point(const int place, const double value, const double2 vector, const double longest, global real2 *point,
@@ -58,6 +119,25 @@ void fill_rays(const int place, const double value, const double2 vector, global
 }
 #endif
 
+// Fill the place of an item's reading, if it has one, and with left_over the place of the item with a missing reading.
+void fill_item(const int item, const int item_place, const int left_over, const double value, const double2 vector_of_item,
+               const double longest, global const double *vectors, global real2 *point, global real2 *point_low,
+               global real *reading, global real *guard, const double resolution, const ReadingRules rules) {
+#if END_POINTS
+    if (item_place < rules.places)
+        fill_end_point(item_place, value, vector_of_item, longest, point, point_low, guard, resolution, rules.guard_scale);
+    if (left_over)
+        fill_end_point(item, NAN, (double2)(1, 0), 0, point, point_low, guard, resolution, rules.guard_scale);
+#else
+    if (item_place < rules.places)
+        fill_rays(item_place, value, vector_of_item, vectors, point, reading, rules.each, rules.top);
+    if (left_over) {
+        for (int j = 0; j < rules.each; ++j) point[(long)item * rules.each + j] = (real2)(1, 0);
+        reading[item] = (real)NAN;
+    }
+#endif
+}
+
 // Place one reading: find its place from all readings, and fill that place; an item beyond the readings fills a place
 // at the end. 16 readings are read before any is used. A max reading is inf. constant_term is that of max readings
 // without a place, -inf if there is a range where none is possible.
@@ -68,79 +148,34 @@ void place_reading(const int item, global const measured *ranges, global const i
     const long from = 2 * (long)min(item, rules.beams - 1) * rules.each;
     const double item_reading = reading_of(item, ranges, beam, rules.beams);
     const double2 vector_of_item = item < rules.beams ? (double2)(vector[from], vector[from + 1]) : (double2)(1, 0);
-    int informative = rules.beams;
-    if (rules.chosen < rules.beams) {
-        informative = 0;
-        for (int k = 0; k < rules.beams; ++k) {
-            const double z = reading_of(k, ranges, beam, rules.beams);
-            informative += z >= rules.nearest && (z < rules.farthest || rules.max_readings != MAX_LEFT_OUT);
-        }
-    }
+    const int informative = count_informative(ranges, beam, rules);
     int rank = 0, place = 0, item_place = rules.places, far_count = 0, impossible = 0;
     // The longest reading in the block of places that begins with this item's place, if a block begins there.
     double item_value = NAN, longest = 0;
     for (int first = 0; first < rules.beams; first += BLOCK_TERMS) {
         double several[BLOCK_TERMS];
-#pragma unroll
-        for (int i = 0; i < BLOCK_TERMS; ++i) several[i] = reading_of(first + i, ranges, beam, rules.beams);
-        // Sets of readings: bit i is reading first + i.
-        uint hits = 0, fars = 0;
-#pragma unroll
-        for (int i = 0; i < BLOCK_TERMS; ++i) {
-            hits |= (uint)(several[i] >= rules.nearest && several[i] < rules.farthest) << i;
-            fars |= (uint)(several[i] >= rules.farthest) << i;
-        }
+        const uint2 sets = read_block(first, ranges, beam, rules, several);
+        const uint hits = sets.x, fars = sets.y;
         const uint telling = rules.max_readings == MAX_LEFT_OUT ? hits : hits | fars;
-        uint used = telling;
-        if (rules.chosen < informative) {
-            for (int i = 0; i < BLOCK_TERMS; ++i) {
-                const int rank_of_i = rank + popcount(telling & ((1u << i) - 1));
-                if (!is_chosen(rank_of_i, informative, rules.chosen)) used &= ~(1u << i);
-            }
-        }
-        const uint as_range = rules.possible ? used & hits : 0;
-        const uint as_far = rules.max_readings == MAX_PLACED ? used & fars : 0;
-#if ALL_READINGS
-        const int left = rules.beams - first;
-        const uint placed = left >= BLOCK_TERMS ? (1u << BLOCK_TERMS) - 1 : (1u << left) - 1;
-#else
-        const uint placed = as_range | as_far;
-#endif
+        const uint used = chosen_of(telling, rank, informative, rules.chosen);
+        const uint4 kinds = placed_of(used, sets, rules.beams - first, rules);
+        const uint as_range = kinds.x, as_far = kinds.y, placed = kinds.z;
         const int item_bit = item - first;
         if (item_bit >= 0 && item_bit < BLOCK_TERMS && (placed >> item_bit & 1)) {
             item_place = place + popcount(placed & ((1u << item_bit) - 1));
             item_value = as_range >> item_bit & 1 ? item_reading : as_far >> item_bit & 1 ? INFINITY : NAN;
         }
 #if END_POINTS
-        if (item_place < rules.places && item_place % BLOCK_TERMS == 0 && place < item_place + BLOCK_TERMS) {
-#pragma unroll
-            for (int i = 0; i < BLOCK_TERMS; ++i) {
-                const int other = place + popcount(placed & ((1u << i) - 1));
-                const int beside = other >= item_place && other < item_place + BLOCK_TERMS;
-                if ((as_range >> i & 1) && beside) longest = several[i] > longest ? several[i] : longest;
-            }
-        }
+        if (item_place < rules.places && item_place % BLOCK_TERMS == 0 && place < item_place + BLOCK_TERMS)
+            longest = fmax(longest, longest_beside(several, as_range, placed, place, item_place));
 #endif
         rank += popcount(telling);
         far_count += popcount(used & fars);
         impossible |= !rules.possible && (used & hits);
         place += popcount(placed);
     }
-    const int left_over = item >= place && item < rules.places;
-#if END_POINTS
-    if (item_place < rules.places)
-        fill_end_point(item_place, item_value, vector_of_item, longest, point, point_low, guard, resolution,
-                       rules.guard_scale);
-    if (left_over)
-        fill_end_point(item, NAN, (double2)(1, 0), 0, point, point_low, guard, resolution, rules.guard_scale);
-#else
-    if (item_place < rules.places)
-        fill_rays(item_place, item_value, vector_of_item, vector + from, point, reading, rules.each, rules.top);
-    if (left_over) {
-        for (int j = 0; j < rules.each; ++j) point[(long)item * rules.each + j] = (real2)(1, 0);
-        reading[item] = (real)NAN;
-    }
-#endif
+    fill_item(item, item_place, item >= place && item < rules.places, item_value, vector_of_item, longest, vector + from,
+              point, point_low, reading, guard, resolution, rules);
     if (item == 0) {
         constant_term[0] = rules.max_readings == MAX_FIXED ? (real)(far_count * rules.log_max) : 0;
         if (impossible > 0) constant_term[0] = -INFINITY;

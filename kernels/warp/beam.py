@@ -46,7 +46,7 @@ def make(name, flags):
     incidence_terms = echo.functions(flags).incidence_terms
     cell_at, pose_at, ray_at = reader(wp.vec2i), reader(vec4), reader(vec2)
     number_at, put = reader(real), writer(real)
-    ZERO = real(0.0)
+    ZERO, ONE = real(0.0), real(1.0)
     NEVER = real(-math.inf)
 
     # Return the distance in cells to which the ray of a reading is cast.
@@ -56,6 +56,20 @@ def make(name, flags):
             return wp.min(last_range(z, terms) / scale.resolution, scale.limit)
         else:
             return scale.limit
+
+    # Return the expected range of beam r, of a ray or a cone of rays, and the cosine of incidence of a cone.
+    @wp.func
+    def cast_beam(
+        map_table: wp.array(dtype=ENTRY), normals: wp.array(dtype=vec2), window: types.Window, cell: wp.vec2i,
+        sensor_pose: vec4, ray: wp.array(dtype=vec2), r: wp.int32, cone: types.Cone, limit: real,
+        caster: types.Caster, scale: types.RangeScale,
+    ):  # fmt: skip
+        if CONES:
+            heard = nearest_echo(map_table, normals, window, cell, sensor_pose, ray, r * cone.rays, cone, limit, caster)
+            return vec2(expected_range(heard.t, scale), heard.cosine)
+        else:
+            t = cast_ray(map_table, window, cell, sensor_pose, ray_at(ray, r), limit, caster)
+            return vec2(expected_range(t, scale), ONE)
 
     # Return the term of one reading in the sum.
     @wp.func
@@ -85,6 +99,15 @@ def make(name, flags):
         else:
             return total
 
+    # Return a scan's first ray, its number of rays, and its first reading.
+    @wp.func
+    def readings_of_scan(scan: wp.int32, start: wp.array(dtype=wp.int32), first: wp.array(dtype=wp.int32)):
+        before = start[scan]
+        readings_before = int(before)
+        if SHARED_RAYS:
+            readings_before = first[before]
+        return before, start[scan + 1] - before, readings_before
+
     # Score scans: one work-item takes a particle. Where rays are shared, ray r has the readings first[r] to first[r +
     # 1] - 1. With SCANS, the rays of a scan begin at start[scan], and first counts the readings of all scans. A launch
     # has fewer than 2^31 parts.
@@ -104,31 +127,21 @@ def make(name, flags):
         constant_term = score.constant_term
         if SCANS:
             scan = (n + batch.ahead) // batch.per_scan
-            before = start[scan]
-            size = start[scan + 1] - before
-            readings_before = before
-            if SHARED_RAYS:
-                readings_before = first[before]
+            before, size, readings_before = readings_of_scan(scan, start, first)
             constant_term = constant_terms[scan]
         total = vec2(constant_term, ZERO)
         strands = vec4()
         impossible = bool(False)
         for r in range(size):
-            bin_terms = terms
             limit = scale.limit
             if STOPS:
                 limit = ray_limit(number_at(reading, readings_before + r), terms, scale)
-            if CONES:
-                heard = nearest_echo(
-                    map_table, normals, window, cell, sensor_pose, ray, (before + r) * cone.rays, cone, limit,
-                    caster,
-                )  # fmt: skip
-                t = heard.t
-                if INCIDENCE:
-                    bin_terms = incidence_terms(terms, edges, tables.incidence_bins, heard.cosine)
-            else:
-                t = cast_ray(map_table, window, cell, sensor_pose, ray_at(ray, before + r), limit, caster)
-            expected = expected_range(t, scale)
+            expected = cast_beam(
+                map_table, normals, window, cell, sensor_pose, ray, before + r, cone, limit, caster, scale
+            )
+            bin_terms = terms
+            if INCIDENCE:
+                bin_terms = incidence_terms(terms, edges, tables.incidence_bins, expected.y)
             begin = r
             end = r + 1
             if SHARED_RAYS:
@@ -136,7 +149,7 @@ def make(name, flags):
                 end = first[before + r + 1] - readings_before
             for k in range(begin, end):
                 z = number_at(reading, readings_before + k)
-                term = reading_term(z, expected, bin_terms, sensor, tables, scale.range_max)
+                term = reading_term(z, expected.x, bin_terms, sensor, tables, scale.range_max)
                 if PER_BEAM:
                     parts[n * readings + k] = term
                 if LINEAR:
@@ -175,33 +188,22 @@ def make(name, flags):
         size = rays
         readings_before = int(0)
         if SCANS:
-            scan = n // batch.per_scan
-            before = start[scan]
-            size = start[scan + 1] - before
-            readings_before = before
-            if SHARED_RAYS:
-                readings_before = first[before]
+            before, size, readings_before = readings_of_scan(n // batch.per_scan, start, first)
         strand_sum = real(0.0)
         if STRANDED:
             r = tile_group(item, spread) * BLOCK_TERMS + item % TILE_RAYS
         else:
             r = tile_ray(item, spread)
         while r < size:
-            bin_terms = terms
             limit = scale.limit
             if STOPS:
                 limit = ray_limit(number_at(reading, readings_before + r), terms, scale)
-            if CONES:
-                heard = nearest_echo(
-                    map_table, normals, window, cell, sensor_pose, ray, (before + r) * cone.rays, cone, limit,
-                    caster,
-                )  # fmt: skip
-                t = heard.t
-                if INCIDENCE:
-                    bin_terms = incidence_terms(terms, edges, tables.incidence_bins, heard.cosine)
-            else:
-                t = cast_ray(map_table, window, cell, sensor_pose, ray_at(ray, before + r), limit, caster)
-            expected = expected_range(t, scale)
+            expected = cast_beam(
+                map_table, normals, window, cell, sensor_pose, ray, before + r, cone, limit, caster, scale
+            )
+            bin_terms = terms
+            if INCIDENCE:
+                bin_terms = incidence_terms(terms, edges, tables.incidence_bins, expected.y)
             k = r
             end = r + 1
             if SHARED_RAYS:
@@ -209,7 +211,7 @@ def make(name, flags):
                 end = first[before + r + 1] - readings_before
             while k < end:
                 z = number_at(reading, readings_before + k)
-                term = reading_term(z, expected, bin_terms, sensor, tables, scale.range_max)
+                term = reading_term(z, expected.x, bin_terms, sensor, tables, scale.range_max)
                 if STRANDED:
                     strand_sum += term
                 else:

@@ -41,6 +41,90 @@ def make(name, flags):
     two_at = reader(vec2, 2)
     block_cells = wp.types.vector(length=BLOCK_TERMS, dtype=wp.int32)
 
+    # Return the cells of the end points of width readings from first on, as indices of the table. On processors the
+    # loop that rounds becomes vector code and takes a third of the time; with points read as vec2, or a maximum in
+    # place of a count, it would not.
+    @wp.func
+    def cells_of_block(
+        origin: wp.vec2i, sensor_pose: vec4, sensor_low: vec4, point: wp.array(dtype=vec2),
+        point_low: wp.array(dtype=vec2), first: wp.int32, width: wp.int32, window: types.Window, guard: real,
+    ):  # fmt: skip
+        cells = block_cells()
+        lowered = sensor_pose - vec4(HALF, HALF, ZERO, ZERO)
+        start_cell = table_origin(origin, window.cols)
+        sure = rounding_margin(guard)
+        doubtful = int(0)
+        i = int(0)
+        while i < width:
+            near, off = rounded_cell(lowered, point_at(point, first + i))
+            doubtful += int(off > sure)
+            cells[i] = table_cell(near, start_cell, window)
+            i += 1
+        if doubtful > 0:
+            i = int(0)
+            while i < width:
+                exact = end_point(sensor_pose, sensor_low, point[first + i], point_low[first + i], ZERO, guard)
+                cells[i] = field_cell(origin.x + exact.cell.x, origin.y + exact.cell.y, window)
+                i += 1
+        return cells
+
+    # Return the sum of the readings from begin to end by rounded cells, again with more digits where an end point is
+    # too near to an edge.
+    @wp.func
+    def rounded_block(
+        table: wp.array(dtype=real), origin: wp.vec2i, sensor_pose: vec4, sensor_low: vec4, point: wp.array(dtype=vec2),
+        point_low: wp.array(dtype=vec2), begin: wp.int32, end: wp.int32, far: real, window: types.Window, guard: real,
+    ):  # fmt: skip
+        lowered = sensor_pose - vec4(HALF, HALF, ZERO, ZERO)
+        start_cell = table_origin(origin, window.cols)
+        sure = rounding_margin(guard)
+        total = real(0.0)
+        worst = real(0.0)
+        if begin + BLOCK_TERMS <= end:
+            if SCANS:
+                for i in range(WHOLE_BLOCK):
+                    value, off = quick_value(table, start_cell, lowered, point_at(point, begin + i), far, window)
+                    worst = wp.max(worst, off)
+                    total += value
+            else:
+                # The points of one scan are aligned, so that two of them can be read at once.
+                for i in range(HALF_BLOCK):
+                    pair = two_at(point, begin + 2 * i)
+                    value, off = quick_value(table, start_cell, lowered, vec2(pair.x, pair.y), far, window)
+                    worst = wp.max(worst, off)
+                    total += value
+                    value, off = quick_value(table, start_cell, lowered, vec2(pair.z, pair.w), far, window)
+                    worst = wp.max(worst, off)
+                    total += value
+        else:
+            k = int(begin)
+            while k < end:
+                value, off = quick_value(table, start_cell, lowered, point_at(point, k), far, window)
+                worst = wp.max(worst, off)
+                total += value
+                k += 1
+        if worst > sure:
+            total = ZERO
+            k = int(begin)
+            while k < end:
+                to, to_low = point_at(point, k), point_at(point_low, k)
+                total += careful_value(
+                    table, origin, lowered, sensor_pose, sensor_low, to, to_low, far, window, guard, sure
+                )
+                k += 1
+        return total
+
+    # Return log p of a scan from its sum of two parts. An impossible reading keeps the first at -inf and turns the
+    # second into nan.
+    @wp.func
+    def field_log(total: vec2, temperature: real):
+        if CUBES:
+            return temperature * wp.log(total.x + total.y)
+        else:
+            if wp.isinf(total.x):
+                return total.x
+            return temperature * (total.x + total.y)
+
     # Score scans: one work-item takes a particle.
     @kernel(flags)
     def score_field(
@@ -68,28 +152,12 @@ def make(name, flags):
         # While loops show the compiler that indices are not negative; range would cost a tenth on processors.
         k = int(0)
         if ROUNDED_CELLS:
-            # First all cells of a block, then all look-ups. On processors the first loop becomes vector code and takes
-            # a third of the time; with points read as vec2, or a maximum in place of a count, it would not.
-            lowered = sensor_pose - vec4(HALF, HALF, ZERO, ZERO)
-            start_cell = table_origin(origin, window.cols)
-            sure = rounding_margin(guard)
-            cells = block_cells()
+            # First all cells of a block, then all look-ups.
             while k < size:
-                first = begin + k
                 width = wp.min(size - k, BLOCK_TERMS)
-                doubtful = int(0)
-                i = int(0)
-                while i < width:
-                    near, off = rounded_cell(lowered, point_at(point, first + i))
-                    doubtful += int(off > sure)
-                    cells[i] = table_cell(near, start_cell, window)
-                    i += 1
-                if doubtful > 0:
-                    i = int(0)
-                    while i < width:
-                        exact = end_point(sensor_pose, sensor_low, point[first + i], point_low[first + i], ZERO, guard)
-                        cells[i] = field_cell(origin.x + exact.cell.x, origin.y + exact.cell.y, window)
-                        i += 1
+                cells = cells_of_block(
+                    origin, sensor_pose, sensor_low, point, point_low, begin + k, width, window, guard
+                )
                 block = ZERO
                 i = int(0)
                 while i < width:
@@ -115,13 +183,7 @@ def make(name, flags):
                     total = add_term(total, block)
                     block = ZERO
             total = add_term(total, block)
-        # An impossible reading keeps total.x at -inf and turns total.y into nan.
-        if CUBES:
-            log_p[n] = score.temperature * wp.log(total.x + total.y)
-        elif wp.isinf(total.x):
-            log_p[n] = total.x
-        else:
-            log_p[n] = score.temperature * (total.x + total.y)
+        log_p[n] = field_log(total, score.temperature)
 
     # Write the sums of blocks of readings to parts[n + block * particles], for GPUs. One work-item takes a
     # particle and every 2^spread-th block. Each block has a separate guard; with SCANS each scan has as many guards as
@@ -140,10 +202,6 @@ def make(name, flags):
         sensor_low = vec4()
         if TWO_PART_POINTS:
             sensor_low = pose_at(pose_low, n)
-        if ROUNDED_CELLS:
-            lowered = sensor_pose - vec4(HALF, HALF, ZERO, ZERO)
-            start_cell = table_origin(origin, window.cols)
-            far = number_at(terms, 3)
         before = int(0)
         size = readings
         guards = int(0)
@@ -159,42 +217,10 @@ def make(name, flags):
             total = real(0.0)
             block_guard = number_at(guard, guards + block)
             if ROUNDED_CELLS:
-                sure = rounding_margin(block_guard)
-                worst = real(0.0)
-                if begin + BLOCK_TERMS <= end:
-                    if SCANS:
-                        for i in range(WHOLE_BLOCK):
-                            to = point_at(point, begin + i)
-                            value, off = quick_value(table, start_cell, lowered, to, far, window)
-                            worst = wp.max(worst, off)
-                            total += value
-                    else:
-                        # The points of one scan are aligned, so that two of them can be read at once.
-                        for i in range(HALF_BLOCK):
-                            pair = two_at(point, begin + 2 * i)
-                            value, off = quick_value(table, start_cell, lowered, vec2(pair.x, pair.y), far, window)
-                            worst = wp.max(worst, off)
-                            total += value
-                            value, off = quick_value(table, start_cell, lowered, vec2(pair.z, pair.w), far, window)
-                            worst = wp.max(worst, off)
-                            total += value
-                else:
-                    k = begin
-                    while k < end:
-                        to = point_at(point, k)
-                        value, off = quick_value(table, start_cell, lowered, to, far, window)
-                        worst = wp.max(worst, off)
-                        total += value
-                        k += 1
-                if worst > sure:
-                    total = ZERO
-                    k = begin
-                    while k < end:
-                        to, to_low = point_at(point, k), point_at(point_low, k)
-                        total += careful_value(
-                            table, origin, lowered, sensor_pose, sensor_low, to, to_low, far, window, block_guard, sure
-                        )
-                        k += 1
+                total = rounded_block(
+                    table, origin, sensor_pose, sensor_low, point, point_low, begin, end, number_at(terms, 3), window,
+                    block_guard,
+                )  # fmt: skip
             else:
                 k = begin
                 while k < end:

@@ -82,6 +82,26 @@ def make(name, flags):
     SCANS = "SCANS" in flags
     ZERO, HALF, TWO = real(0.0), real(0.5), real(2.0)
 
+    # Return the sums with the gradient and information of a reading: slope is the distance, its low part and its
+    # derivatives in x and y, and arm the end point relative to the robot in the sensor's frame.
+    @wp.func
+    def add_slope(before: Sums, slope: vec4, weight: real, at: vec4, arm: vec2, resolution: real):
+        sums = before
+        x = slope.z / resolution
+        y = slope.w / resolution
+        turn = slope.w * (at.z * arm.x - at.w * arm.y) - slope.z * (at.w * arm.x + at.z * arm.y)
+        pull = -weight * slope.x
+        sums[0] += pull * x
+        sums[1] += pull * y
+        sums[2] += pull * turn
+        sums[3] += weight * x * x
+        sums[4] += weight * x * y
+        sums[5] += weight * x * turn
+        sums[6] += weight * y * y
+        sums[7] += weight * y * turn
+        sums[8] += weight * turn * turn
+        return sums
+
     # Write log p, its gradient (3) and the information (9) of poses in the grid's frame, each times the temperature.
     # One work-item takes a particle. mount is the sensor's place on the robot in cells.
     @kernel(flags)
@@ -123,23 +143,9 @@ def make(name, flags):
                 slope = distance_slope(table, origin + end.cell, end, window)
                 distance = vec2(slope.x, slope.y)
                 total = add_term(total, log_field(distance, terms))
-                arm_x = to.x + mount_x
-                arm_y = to.y + mount_y
-                x = slope.z / resolution
-                y = slope.w / resolution
-                turn = slope.w * (at.z * arm_x - at.w * arm_y) - slope.z * (at.w * arm_x + at.z * arm_y)
                 bend = shape_weight(field_square(distance, terms).x, terms[6], terms[7])
                 weight = TWO * terms[1] * hit_share(distance, terms) * bend
-                pull = -weight * slope.x
-                sums[0] += pull * x
-                sums[1] += pull * y
-                sums[2] += pull * turn
-                sums[3] += weight * x * x
-                sums[4] += weight * x * y
-                sums[5] += weight * x * turn
-                sums[6] += weight * y * y
-                sums[7] += weight * y * turn
-                sums[8] += weight * turn * turn
+                sums = add_slope(sums, slope, weight, at, vec2(to.x + mount_x, to.y + mount_y), resolution)
             k += 1
         out = n * GRADIENT_NUMBERS
         if wp.isinf(total.x):

@@ -78,6 +78,22 @@ def make(name, flags):
             k += 1
         return total
 
+    # Return the set with the largest log p, and that. The particle's sets begin at index sums of best.
+    @wp.func
+    def best_set(
+        best: wp.array(dtype=real), sums: wp.int32, feature: wp.array(dtype=real), features: wp.int32, sets: wp.int32
+    ):
+        most = real(-math.inf)
+        chosen = int(0)
+        s = int(0)
+        while s < sets:
+            total = set_total(s, best[sums + s], feature, features)
+            if total > most:
+                most = total
+                chosen = s
+            s += 1
+        return chosen, most
+
     # Find the best joint association: one work-item takes a particle. choice[s] has the landmark of each feature of set
     # s, and value[s] its log p; sets is 2^features.
     @kernel(flags)
@@ -123,15 +139,7 @@ def make(name, flags):
                 k += 1
             add_landmark(j, log_each, feature, best, choice, value, sums, begin, features, sets, groups)
             j += 1
-        most = real(-math.inf)
-        chosen = int(0)
-        s = int(0)
-        while s < sets:
-            total = set_total(s, best[sums + s], feature, features)
-            if total > most:
-                most = total
-                chosen = s
-            s += 1
+        chosen, most = best_set(best, sums, feature, features, sets)
         log_p[n] = wp.where(wp.isinf(most), most, score.temperature * (score.constant_term + most))
         if PER_BEAM:
             k = int(0)

@@ -69,6 +69,51 @@ def make(name, flags):
         t = vec2(HALF * x * x, ZERO)
         return terms[15] * wp.exp(-shape_exponent(t, terms[17], terms[18]).x)
 
+    # Return W u^2, and the derivatives h_s, h_m, h_ss, h_sm and h_mm of log p_hit of a pair.
+    @wp.func
+    def hit_slopes(z: real, expected: real, terms: wp.array(dtype=real)):
+        mean = mean_range(expected, terms)
+        u = hit_offset(z, expected, terms).x * terms[14]
+        x_0 = mean * terms[14]
+        x_1 = (terms[6] - mean) * terms[14]
+        weight = shape_weight(HALF * u * u, terms[17], terms[18])
+        pull = weight * u
+        square = pull * u
+        t = real(0.0)
+        p = real(0.0)
+        v = real(0.0)
+        q = real(0.0)
+        w = real(0.0)
+        mass = mass_within(mean, terms[2], terms)
+        if mass < ONE:
+            phi_0 = hit_phi(x_0, terms) / mass
+            phi_1 = hit_phi(x_1, terms) / mass
+            pull_0 = shape_weight(HALF * x_0 * x_0, terms[17], terms[18]) * x_0 * phi_0
+            pull_1 = shape_weight(HALF * x_1 * x_1, terms[17], terms[18]) * x_1 * phi_1
+            t = x_0 * phi_0 + x_1 * phi_1
+            p = phi_1 - phi_0
+            v = pull_0 + pull_1
+            q = x_1 * pull_1 - x_0 * pull_0 + p * t
+            w = x_0 * x_0 * pull_0 + x_1 * x_1 * pull_1
+        bend = shape_bend(square, terms[17])
+        h_m = pull + p
+        h_sm = pull * (bend - TWO) - p + q
+        h_mm = weight * (bend - ONE) + v + p * p
+        # A clamped mean does not move with the bias.
+        if mean != expected + terms[10]:
+            h_m = ZERO
+            h_sm = ZERO
+            h_mm = ZERO
+        return vec6(square, square - ONE + t, h_m, square * (bend - TWO) - t + w + t * t, h_sm, h_mm)
+
+    # Return the derivatives s_l and s_ll of log p_short of a pair.
+    @wp.func
+    def short_slopes(z: real, expected: real, terms: wp.array(dtype=real)):
+        x = terms[4] * expected
+        f = short_factor(x)
+        v = f - x
+        return vec2(ONE - v - terms[4] * z, v * (f - ONE) - terms[4] * z)
+
     # Add the terms of a pair to the sums. They are log p; r; r_hit h_s, r_hit h_m, r_short s_l; r_hit h_ss, r_hit h_sm,
     # r_hit h_mm, r_short s_ll; r_hit W u^2, r_short z. INFORMATION: 1 where rand is the likeliest cause; the upper
     # triangle of y y' with y = (r_hit, r_short, r_rand, r_hit h_s, r_hit h_m, r_short s_l); r_hit h_s^2, r_hit h_s h_m,
@@ -77,55 +122,15 @@ def make(name, flags):
     def add_pair(z: real, expected: real, terms: wp.array(dtype=real), before: sums_type):
         sums = before
         r = responsibilities(z, expected, terms)
-        square = real(0.0)
-        h_s = real(0.0)
-        h_m = real(0.0)
-        h_ss = real(0.0)
-        h_sm = real(0.0)
-        h_mm = real(0.0)
-        s_l = real(0.0)
-        s_ll = real(0.0)
+        hit = vec6()
+        shorter = vec2()
         if r[1] > ZERO:
-            mean = mean_range(expected, terms)
-            u = hit_offset(z, expected, terms).x * terms[14]
-            x_0 = mean * terms[14]
-            x_1 = (terms[6] - mean) * terms[14]
-            weight = shape_weight(HALF * u * u, terms[17], terms[18])
-            pull = weight * u
-            square = pull * u
-            t = real(0.0)
-            p = real(0.0)
-            v_0 = real(0.0)
-            q = real(0.0)
-            w = real(0.0)
-            mass = mass_within(mean, terms[2], terms)
-            if mass < ONE:
-                phi_0 = hit_phi(x_0, terms) / mass
-                phi_1 = hit_phi(x_1, terms) / mass
-                pull_0 = shape_weight(HALF * x_0 * x_0, terms[17], terms[18]) * x_0 * phi_0
-                pull_1 = shape_weight(HALF * x_1 * x_1, terms[17], terms[18]) * x_1 * phi_1
-                t = x_0 * phi_0 + x_1 * phi_1
-                p = phi_1 - phi_0
-                v_0 = pull_0 + pull_1
-                q = x_1 * pull_1 - x_0 * pull_0 + p * t
-                w = x_0 * x_0 * pull_0 + x_1 * x_1 * pull_1
-            bend = shape_bend(square, terms[17])
-            h_s = square - ONE + t
-            h_m = pull + p
-            h_ss = square * (bend - TWO) - t + w + t * t
-            h_sm = pull * (bend - TWO) - p + q
-            h_mm = weight * (bend - ONE) + v_0 + p * p
-            # A clamped mean does not move with the bias.
-            if mean != expected + terms[10]:
-                h_m = ZERO
-                h_sm = ZERO
-                h_mm = ZERO
+            hit = hit_slopes(z, expected, terms)
         if r[2] > ZERO:
-            x = terms[4] * expected
-            f = short_factor(x)
-            v = f - x
-            s_l = ONE - v - terms[4] * z
-            s_ll = v * (f - ONE) - terms[4] * z
+            shorter = short_slopes(z, expected, terms)
+        h_s = hit[1]
+        h_m = hit[2]
+        s_l = shorter.x
         sums[0] += r[0]
         sums[1] += r[1]
         sums[2] += r[2]
@@ -133,11 +138,11 @@ def make(name, flags):
         sums[4] += r[1] * h_s
         sums[5] += r[1] * h_m
         sums[6] += r[2] * s_l
-        sums[7] += r[1] * h_ss
-        sums[8] += r[1] * h_sm
-        sums[9] += r[1] * h_mm
-        sums[10] += r[2] * s_ll
-        sums[11] += r[1] * square
+        sums[7] += r[1] * hit[3]
+        sums[8] += r[1] * hit[4]
+        sums[9] += r[1] * hit[5]
+        sums[10] += r[2] * shorter.y
+        sums[11] += r[1] * hit[0]
         sums[12] += r[2] * z
         if INFORMATION:
             if r[3] > r[1] and r[3] > r[2]:

@@ -11,9 +11,40 @@ from .prelude import kernel, precision
 def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     types = precision(flags)
-    real, vec4 = types.real, types.vec4
+    real, vec2, vec4 = types.real, types.vec2, types.vec4
     ZERO, ONE, HALF, MISSING = real(0.0), real(1.0), real(0.5), real(-1.0)
     WHOLE_TURN = real(6.283185307179586)
+
+    # Return the line through a point and its neighbours, a unit normal, an offset, and 1 / (sum of squared distances
+    # along the line), from sums of the neighbours' coordinates relative to the point and of their products; weight is
+    # the number of points. Without neighbours it is perpendicular to the point's beam, with -1 in place of that sum.
+    @wp.func
+    def line_through(centre: vec4, total: vec2, xx: real, xy: real, yy: real, weight: real):
+        mean_x = total.x / weight
+        mean_y = total.y / weight
+        a = xx - weight * mean_x * mean_x
+        b = xy - weight * mean_x * mean_y
+        d = yy - weight * mean_y * mean_y
+        middle = HALF * (a - d)
+        root = wp.sqrt(middle * middle + b * b)
+        length = HALF * (a + d) + root
+        along_x = b
+        along_y = root - middle
+        if middle >= ZERO:
+            along_x = middle + root
+            along_y = b
+        size_along = wp.sqrt(along_x * along_x + along_y * along_y)
+        doubt = MISSING
+        if length > ZERO and size_along > ZERO:
+            doubt = ONE / length
+        else:
+            along_x = -centre.y
+            along_y = centre.x
+            size_along = centre.w
+        normal_x = -along_y / size_along
+        normal_y = along_x / size_along
+        offset = normal_x * (centre.x + mean_x) + normal_y * (centre.y + mean_y)
+        return vec4(normal_x, normal_y, offset, doubt)
 
     # Fit a line to each point and reach neighbours on either side, up to most within a distance of width, none of them
     # farther from the last one than slack plus ratio times its range, nor than gap in bearing: unit normal, offset, and
@@ -66,31 +97,6 @@ def make(name, flags):
                     size += 1
                     last = following
                 j += 1
-        weight = real(size)
-        mean_x = sum_x / weight
-        mean_y = sum_y / weight
-        a = xx - weight * mean_x * mean_x
-        b = xy - weight * mean_x * mean_y
-        d = yy - weight * mean_y * mean_y
-        middle = HALF * (a - d)
-        root = wp.sqrt(middle * middle + b * b)
-        length = HALF * (a + d) + root
-        along_x = b
-        along_y = root - middle
-        if middle >= ZERO:
-            along_x = middle + root
-            along_y = b
-        size_along = wp.sqrt(along_x * along_x + along_y * along_y)
-        doubt = MISSING
-        if length > ZERO and size_along > ZERO:
-            doubt = ONE / length
-        else:
-            along_x = -centre.y
-            along_y = centre.x
-            size_along = centre.w
-        normal_x = -along_y / size_along
-        normal_y = along_x / size_along
-        offset = normal_x * (centre.x + mean_x) + normal_y * (centre.y + mean_y)
-        line[first + k] = vec4(normal_x, normal_y, offset, doubt)
+        line[first + k] = line_through(centre, vec2(sum_x, sum_y), xx, xy, yy, real(size))
 
     return locals()[name]

@@ -38,7 +38,7 @@ def is_chosen(rank: wp.int32, informative: wp.int32, chosen: wp.int32):
 def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     types, place = precision(flags), placement.functions(flags)
-    real, vec2 = types.real, types.vec2
+    real, vec2, ReadingRules = types.real, types.vec2, types.ReadingRules
     place_pose = place.place_pose
     measured = wp.float32 if "RANGES_FLOAT32" in flags else wp.float64
     block_terms = wp.types.vector(length=BLOCK_TERMS, dtype=wp.float64)
@@ -58,6 +58,72 @@ def make(name, flags):
             else:
                 z = wp.float64(ranges[k])
         return z
+
+    # Return the number of informative readings, which is not counted where all are chosen.
+    @wp.func
+    def count_informative(ranges: wp.array(dtype=measured), beam: wp.array(dtype=wp.int32), rules: ReadingRules):
+        informative = int(rules.beams)
+        if rules.chosen < rules.beams:
+            informative = int(0)
+            for k in range(rules.beams):
+                z = reading_of(k, ranges, beam, rules.beams)
+                if z >= rules.nearest and (z < rules.farthest or rules.max_readings != MAX_LEFT_OUT):
+                    informative += 1
+        return informative
+
+    # Read the 16 readings from first on. Return them, and the sets of ranges and of max readings: bit i is reading
+    # first + i.
+    @wp.func
+    def read_block(
+        first: wp.int32, ranges: wp.array(dtype=measured), beam: wp.array(dtype=wp.int32), rules: ReadingRules
+    ):
+        several = block_terms()
+        for i in range(BLOCK_TERMS):
+            several[i] = reading_of(first + i, ranges, beam, rules.beams)
+        hits = int(0)
+        fars = int(0)
+        for i in range(BLOCK_TERMS):
+            hits = hits | (int(several[i] >= rules.nearest and several[i] < rules.farthest) << i)
+            fars = fars | (int(several[i] >= rules.farthest) << i)
+        return several, hits, fars
+
+    # Return the set of those of a block's informative readings that are chosen; the first one has the rank.
+    @wp.func
+    def chosen_of(telling: wp.int32, rank: wp.int32, informative: wp.int32, chosen: wp.int32):
+        used = int(telling)
+        if chosen < informative:
+            for i in range(BLOCK_TERMS):
+                rank_of_i = rank + popcount(telling & ((1 << i) - 1))
+                if not is_chosen(rank_of_i, informative, chosen):
+                    used = used & ~(1 << i)
+        return used
+
+    # Return the sets of a block's chosen readings that get a place, as ranges and as max readings, and of all readings
+    # with a place; left readings remain from the first of the block on.
+    @wp.func
+    def placed_of(used: wp.int32, hits: wp.int32, fars: wp.int32, left: wp.int32, rules: ReadingRules):
+        as_range = int(0)
+        if rules.possible != 0:
+            as_range = used & hits
+        as_far = int(0)
+        if rules.max_readings == MAX_PLACED:
+            as_far = used & fars
+        placed = as_range | as_far
+        if ALL_READINGS:
+            placed = (1 << wp.min(left, BLOCK_TERMS)) - 1
+        return as_range, as_far, placed
+
+    # Return the longest of a block's ranges that come to the block of places from begin on; place is that of the first
+    # reading.
+    @wp.func
+    def longest_beside(several: block_terms, as_range: wp.int32, placed: wp.int32, place: wp.int32, begin: wp.int32):
+        longest = wp.float64(0.0)
+        for i in range(BLOCK_TERMS):
+            other = place + popcount(placed & ((1 << i) - 1))
+            beside = other >= begin and other < begin + BLOCK_TERMS
+            if (as_range >> i) & 1 != 0 and beside:
+                longest = wp.max(longest, several[i])
+        return longest
 
     # Fill a place with the end point of a reading: the reading times the vector of its beam, in cells, with the
     # rounding error in point_low. The guard of a block of places is guard_scale (longest + 2 cells), of its longest
@@ -93,6 +159,32 @@ def make(name, flags):
             rounded = real(top)
         reading[place] = rounded
 
+    # Fill the place of an item's reading, if it has one, and with left_over the place of the item with a missing
+    # reading.
+    @wp.func
+    def fill_item(
+        item: wp.int32, item_place: wp.int32, left_over: wp.bool, value: wp.float64, vector_of_item: wp.vec2d,
+        longest: wp.float64, vectors: wp.array(dtype=wp.float64), point: wp.array(dtype=vec2),
+        point_low: wp.array(dtype=vec2), reading: wp.array(dtype=real), guard: wp.array(dtype=real),
+        resolution: wp.float64, rules: ReadingRules,
+    ):  # fmt: skip
+        if END_POINTS:
+            scale = rules.guard_scale
+            if item_place < rules.places:
+                fill_end_point(item_place, value, vector_of_item, longest, point, point_low, guard, resolution, scale)
+            if left_over:
+                ahead = wp.vec2d(wp.float64(1.0), wp.float64(0.0))
+                fill_end_point(item, wp.float64(MISSING), ahead, ZERO, point, point_low, guard, resolution, scale)
+        else:
+            each = rules.each
+            if item_place < rules.places:
+                source = 2 * item * each
+                fill_rays(item_place, value, vector_of_item, vectors, source, point, reading, each, rules.top)
+            if left_over:
+                for j in range(each):
+                    point[item * each + j] = AHEAD
+                reading[item] = NO_READING
+
     # Place one reading: find its place from all readings, and fill that place; an item beyond the readings fills a
     # place at the end. 16 readings are read before any is used. A max reading is inf. constant_term is that of max
     # readings without a place, -inf if there is a range where none is possible.
@@ -101,7 +193,7 @@ def make(name, flags):
         item: wp.int32, ranges: wp.array(dtype=measured), beam: wp.array(dtype=wp.int32),
         vector: wp.array(dtype=wp.float64), point: wp.array(dtype=vec2), point_low: wp.array(dtype=vec2),
         reading: wp.array(dtype=real), guard: wp.array(dtype=real), constant_term: wp.array(dtype=real),
-        resolution: wp.float64, rules: types.ReadingRules,
+        resolution: wp.float64, rules: ReadingRules,
     ):  # fmt: skip
         # Values that are needed last are read first, so that nothing waits for them.
         source = 2 * item * rules.each
@@ -109,13 +201,7 @@ def make(name, flags):
         vector_of_item = wp.vec2d(wp.float64(1.0), wp.float64(0.0))
         if item < rules.beams:
             vector_of_item = wp.vec2d(vector[source], vector[source + 1])
-        informative = int(rules.beams)
-        if rules.chosen < rules.beams:
-            informative = int(0)
-            for k in range(rules.beams):
-                z = reading_of(k, ranges, beam, rules.beams)
-                if z >= rules.nearest and (z < rules.farthest or rules.max_readings != MAX_LEFT_OUT):
-                    informative += 1
+        informative = count_informative(ranges, beam, rules)
         rank = int(0)
         place = int(0)
         item_place = int(rules.places)
@@ -126,33 +212,12 @@ def make(name, flags):
         longest = wp.float64(0.0)
         first = int(0)
         while first < rules.beams:
-            several = block_terms()
-            for i in range(BLOCK_TERMS):
-                several[i] = reading_of(first + i, ranges, beam, rules.beams)
-            # Sets of readings: bit i is reading first + i.
-            hits = int(0)
-            fars = int(0)
-            for i in range(BLOCK_TERMS):
-                hits = hits | (int(several[i] >= rules.nearest and several[i] < rules.farthest) << i)
-                fars = fars | (int(several[i] >= rules.farthest) << i)
+            several, hits, fars = read_block(first, ranges, beam, rules)
             telling = int(hits)
             if rules.max_readings != MAX_LEFT_OUT:
                 telling = hits | fars
-            used = int(telling)
-            if rules.chosen < informative:
-                for i in range(BLOCK_TERMS):
-                    rank_of_i = rank + popcount(telling & ((1 << i) - 1))
-                    if not is_chosen(rank_of_i, informative, rules.chosen):
-                        used = used & ~(1 << i)
-            as_range = int(0)
-            if rules.possible != 0:
-                as_range = used & hits
-            as_far = int(0)
-            if rules.max_readings == MAX_PLACED:
-                as_far = used & fars
-            placed = as_range | as_far
-            if ALL_READINGS:
-                placed = (1 << wp.min(rules.beams - first, BLOCK_TERMS)) - 1
+            used = chosen_of(telling, rank, informative, rules.chosen)
+            as_range, as_far, placed = placed_of(used, hits, fars, rules.beams - first, rules)
             item_bit = item - first
             if item_bit >= 0 and item_bit < BLOCK_TERMS:
                 if (placed >> item_bit) & 1 != 0:
@@ -164,11 +229,7 @@ def make(name, flags):
             if END_POINTS:
                 begins = item_place < rules.places and item_place % BLOCK_TERMS == 0
                 if begins and place < item_place + BLOCK_TERMS:
-                    for i in range(BLOCK_TERMS):
-                        other = place + popcount(placed & ((1 << i) - 1))
-                        beside = other >= item_place and other < item_place + BLOCK_TERMS
-                        if (as_range >> i) & 1 != 0 and beside:
-                            longest = wp.max(longest, several[i])
+                    longest = wp.max(longest, longest_beside(several, as_range, placed, place, item_place))
             rank += popcount(telling)
             far_count += popcount(used & fars)
             if rules.possible == 0 and (used & hits) != 0:
@@ -176,24 +237,10 @@ def make(name, flags):
             place += popcount(placed)
             first += BLOCK_TERMS
         left_over = item >= place and item < rules.places
-        if END_POINTS:
-            if item_place < rules.places:
-                fill_end_point(
-                    item_place, item_value, vector_of_item, longest, point, point_low, guard, resolution,
-                    rules.guard_scale,
-                )  # fmt: skip
-            if left_over:
-                fill_end_point(
-                    item, wp.float64(MISSING), wp.vec2d(wp.float64(1.0), wp.float64(0.0)), ZERO, point, point_low,
-                    guard, resolution, rules.guard_scale,
-                )  # fmt: skip
-        else:
-            if item_place < rules.places:
-                fill_rays(item_place, item_value, vector_of_item, vector, source, point, reading, rules.each, rules.top)
-            if left_over:
-                for j in range(rules.each):
-                    point[item * rules.each + j] = AHEAD
-                reading[item] = NO_READING
+        fill_item(
+            item, item_place, left_over, item_value, vector_of_item, longest, vector, point, point_low, reading, guard,
+            resolution, rules,
+        )  # fmt: skip
         if item == 0:
             constant = NOTHING
             if rules.max_readings == MAX_FIXED:

@@ -28,13 +28,11 @@ class NumpyBackend(Backend):
         self.info = describe() if info is None else info
 
     def upload(self, array: np.ndarray, out: np.ndarray | None = None, *, wait: bool = True) -> np.ndarray:
-        """See Backend.upload."""
         buffer = self.empty(array.size, array.dtype) if out is None else out
         buffer[: array.size] = array.ravel()
         return buffer
 
     def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> np.ndarray:
-        """See Backend.empty."""
         size = count * np.dtype(dtype).itemsize
         if size > self.info.max_buffer:
             raise MemoryError(
@@ -43,16 +41,13 @@ class NumpyBackend(Backend):
         return np.zeros(count, dtype) if zero else np.empty(count, dtype)
 
     def download(self, buffer: np.ndarray, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
-        """See Backend.download."""
         out.reshape(-1)[...] = buffer[: out.size]
         return out
 
     def part(self, buffer: np.ndarray, first: int, count: int, dtype: np.dtype) -> np.ndarray:
-        """See Backend.part."""
         return buffer.view(dtype)[first : first + count]
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
-        """See Backend.compile."""
         row = KERNELS[kernel]
         body = getattr(importlib.import_module(f"gpusense.reference.{row.file}"), kernel)
         real = np.dtype(np.float64 if "FLOAT64" in flags else np.float32)

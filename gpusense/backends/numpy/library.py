@@ -12,11 +12,9 @@ class NumpyLibrary(Library):
     """One device: the host."""
 
     def list_devices(self) -> list[tuple[BackendInfo, None]]:
-        """See Library.list_devices."""
         return [(describe(), None)]
 
     def open(self, info: BackendInfo, handle: None) -> Backend:
-        """See Library.open."""
         return NumpyBackend(info)
 
 

@@ -92,7 +92,6 @@ class OpenCLBackend(ProcessBound, Backend):
         return self._queue
 
     def upload(self, array: np.ndarray, out: Buffer | None = None, *, wait: bool = True) -> Buffer:
-        """See Backend.upload."""
         if os.getpid() != self._process:
             self.check_process()
         buffer = self.empty(array.size, array.dtype) if out is None else out
@@ -111,7 +110,6 @@ class OpenCLBackend(ProcessBound, Backend):
         return buffer
 
     def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
-        """See Backend.empty."""
         size = -(-max(count, 1) * np.dtype(dtype).itemsize // 4) * 4
         self._check_size(size)
         with driver_errors():
@@ -147,7 +145,6 @@ class OpenCLBackend(ProcessBound, Backend):
             cl.enqueue_nd_range_kernel(self._queue, kernel, (min(_CLEARED_WORDS, words - first),), None)
 
     def download(self, buffer: Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
-        """See Backend.download."""
         if out.size:
             if isinstance(buffer, SHARED):
                 if self._ended != self._queued:
@@ -161,16 +158,13 @@ class OpenCLBackend(ProcessBound, Backend):
         return out
 
     def part(self, buffer: Buffer, first: int, count: int, dtype: np.dtype) -> Buffer:
-        """See Backend.part."""
         size = np.dtype(dtype).itemsize
         return arrays.part_of(buffer, first * size, count * size, self.alignment)
 
     def reads(self, array: object) -> bool:
-        """See Backend.reads."""
         return arrays.is_array(array)
 
     def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
-        """See Backend.adopt."""
         return arrays.adopted(array, self._queue, self.info.selection, name, in_place=in_place)
 
     def blank(self, count: int, dtype: np.dtype) -> Buffer:
@@ -181,7 +175,6 @@ class OpenCLBackend(ProcessBound, Backend):
             return DeviceBuffer(self._context, cl.mem_flags.READ_WRITE, size)
 
     def copy(self, source: Buffer, target: Buffer, size: int, *, begin: int = 0, to: int = 0) -> None:
-        """See Backend.copy."""
         if not size:
             return
         with driver_errors():
@@ -192,21 +185,17 @@ class OpenCLBackend(ProcessBound, Backend):
                 cl.enqueue_copy(self._queue, target, source, byte_count=size, src_offset=begin, dst_offset=to)
 
     def lend(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
-        """See Backend.lend."""
         return arrays.lent(buffer, self._queue, shape, dtype)
 
     @property
     def replays(self) -> bool:
-        """See Backend.replays."""
         return self.info.kind == "gpu"
 
     def record(self, program: Program) -> OpenCLRecording:
-        """See Backend.record."""
         launches = [self.compile(one.kernel, one.flags).bind(one.size, one.arguments) for one in program]
         return OpenCLRecording(self._queue, launches, self._counted)
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launch:
-        """See Backend.compile."""
         if os.getpid() != self._process:
             self.check_process()
         launcher = self._launchers.get((kernel, flags))
@@ -215,12 +204,10 @@ class OpenCLBackend(ProcessBound, Backend):
         return launcher
 
     def source(self, kernel: str, flags: frozenset[str]) -> str:
-        """See Backend.source."""
         file = KERNELS[kernel].file
         return assemble(file, relevant(file, flags))
 
     def synchronize(self) -> None:
-        """See Backend.synchronize."""
         with self._count:
             queued = self._queued
         try:

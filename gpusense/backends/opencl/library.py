@@ -25,15 +25,12 @@ class OpenCLLibrary(Library):
     """Any vendor's driver through pyopencl."""
 
     def list_devices(self) -> list[tuple[BackendInfo, cl.Device]]:
-        """See Library.list_devices."""
         return devices.list_devices()
 
     def open(self, info: BackendInfo, handle: cl.Device) -> Backend:
-        """See Library.open."""
         return OpenCLBackend(info, handle)
 
     def absent(self) -> list[Absent]:
-        """See Library.absent."""
         failed = devices.absent_drivers()
         absent = [Absent(name, "cpu", f"it {with_remedy(failure, remedy_for(failure))}") for name, failure in failed]
         if reason := devices.silence_of_pocl():
@@ -50,11 +47,9 @@ class OpenCLLibrary(Library):
         return f"no driver offers a device with {', '.join(hiding)}: {remedy}"
 
     def is_simulator(self, info: BackendInfo) -> bool:
-        """See Library.is_simulator."""
         return any(word in info.name.lower() for word in SIMULATORS)
 
     def trouble(self, handle: cl.Device) -> str:
-        """See Library.trouble."""
         return devices.trouble_of(handle)
 
     def renew(self) -> None:
@@ -66,19 +61,15 @@ class OpenCLLibrary(Library):
         return drivers.as_job()
 
     def set_up_child(self, setup: Any) -> None:
-        """See Library.set_up_child."""
         drivers.take(setup)
 
     def queue_key(self, candidate: object) -> int | None:
-        """See Library.queue_key."""
         return int(candidate.int_ptr) if isinstance(candidate, cl.CommandQueue) else None
 
     def device_of_queue(self, queue: cl.CommandQueue) -> tuple[BackendInfo, cl.Device]:
-        """See Library.device_of_queue."""
         return devices.info_of(queue.device), queue.device
 
     def open_queue(self, queue: cl.CommandQueue, info: BackendInfo) -> Backend:
-        """See Library.open_queue."""
         check_in_order(queue, "backend")
         return OpenCLBackend(info, queue.device, queue)
 

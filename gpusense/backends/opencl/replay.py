@@ -36,7 +36,6 @@ class OpenCLRecording(Recording):
         self._used: list[cl.CommandQueue] = []
 
     def __call__(self, stream: Any = None) -> None:
-        """See Recording.__call__."""
         queue = self._queue if stream is None else self._checked(stream)
         # Before and after; see ``OpenCLBackend.enqueue``.
         self._count(len(self._launches))
@@ -61,7 +60,6 @@ class OpenCLRecording(Recording):
             run(self._wait_for_all)
 
     def wait(self) -> None:
-        """See Recording.wait."""
         self._wait_for_all()
         with self._lock:
             self._used.clear()
@@ -75,7 +73,6 @@ class OpenCLRecording(Recording):
                 queue.finish()
 
     def explain(self) -> str:
-        """See Recording.explain."""
         return f"{pluralize(len(self._launches), 'launch')} one by one, their arguments stay set: OpenCL has no graphs"
 
     def _checked(self, stream: Any) -> cl.CommandQueue:

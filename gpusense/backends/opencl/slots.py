@@ -20,15 +20,12 @@ class OpenCLSlot(Slot):
         self._copied: cl.Event | None = None
 
     def to_device(self, buffer: cl.Buffer, first: int, size: int) -> None:
-        """See Slot.to_device."""
         self._start(buffer, self.bytes[:size], dst_offset=first)
 
     def to_host(self, buffer: cl.Buffer, first: int, size: int) -> None:
-        """See Slot.to_host."""
         self._start(self.bytes[:size], buffer, src_offset=first)
 
     def wait(self) -> None:
-        """See Slot.wait."""
         if self._copied is not None:
             with driver_errors():
                 self._copied.wait()

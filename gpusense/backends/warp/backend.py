@@ -59,7 +59,6 @@ class WarpBackend(ProcessBound, Backend):
         self._asked: dict[tuple[str, frozenset[str]], Launch | SharedLaunch] = {}
 
     def upload(self, array: np.ndarray, out: wp.array | None = None, *, wait: bool = True) -> wp.array:
-        """See Backend.upload."""
         self.check_process()
         array = np.ascontiguousarray(array)
         buffer = self.empty(array.size, array.dtype) if out is None else out
@@ -79,7 +78,6 @@ class WarpBackend(ProcessBound, Backend):
         return buffer
 
     def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> wp.array:
-        """See Backend.empty."""
         count, dtype = max(count, 1), np.dtype(dtype)
         size = count * dtype.itemsize
         if size > self.info.max_buffer or count > _MOST_NUMBERS:
@@ -96,7 +94,6 @@ class WarpBackend(ProcessBound, Backend):
             raise
 
     def download(self, buffer: wp.array, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
-        """See Backend.download."""
         if out.size:
             queue = self.batch()
             if queue is not None:
@@ -131,7 +128,6 @@ class WarpBackend(ProcessBound, Backend):
         return out
 
     def part(self, buffer: wp.array, first: int, count: int, dtype: np.dtype) -> wp.array:
-        """See Backend.part."""
         kind = SCALARS[np.dtype(dtype)]
         if kind is not buffer.dtype:
             view = wp.array(
@@ -142,7 +138,6 @@ class WarpBackend(ProcessBound, Backend):
         return buffer if (first, count) == (0, buffer.size) else buffer[first : first + count]
 
     def reads(self, array: object) -> bool:
-        """See Backend.reads."""
         return self.info.kind == "gpu" and has_protocol(array)
 
     def adopt(self, array: Any, name: str, *, in_place: bool = False) -> Adopted:
@@ -150,11 +145,9 @@ class WarpBackend(ProcessBound, Backend):
         return adopted(array, self._device, name)
 
     def blank(self, count: int, dtype: np.dtype) -> wp.array:
-        """See Backend.blank."""
         return self.part(self.empty(count, dtype), 0, count, dtype)
 
     def copy(self, source: wp.array, target: wp.array, size: int, *, begin: int = 0, to: int = 0) -> None:
-        """See Backend.copy."""
         if not size:
             # Warp takes a count of 0 as the whole array.
             return
@@ -170,16 +163,13 @@ class WarpBackend(ProcessBound, Backend):
         return other is self or (isinstance(other, WarpBackend) and self._device.is_cuda and other._device.is_cuda)
 
     def lend(self, buffer: wp.array, shape: tuple[int, ...], dtype: np.dtype) -> wp.array:
-        """See Backend.lend."""
         return buffer if buffer.shape == shape else buffer.reshape(shape)
 
     @property
     def replays(self) -> bool:
-        """See Backend.replays."""
         return self.info.kind == "gpu" and self.info.graphs
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launch | SharedLaunch:
-        """See Backend.compile."""
         self.check_process()
         launcher = self._asked.get((kernel, flags))
         if launcher is None:
@@ -197,7 +187,6 @@ class WarpBackend(ProcessBound, Backend):
         return inspect.getsource(warp_module(KERNELS[kernel].file))
 
     def synchronize(self) -> None:
-        """See Backend.synchronize."""
         queue = self.batch()
         if queue is not None:
             self._flush(queue)
@@ -206,7 +195,6 @@ class WarpBackend(ProcessBound, Backend):
             queue.deliver()
 
     def begin_batch(self) -> None:
-        """See Backend.begin_batch."""
         if not self.info.graphs:
             return
         try:
@@ -220,13 +208,11 @@ class WarpBackend(ProcessBound, Backend):
         self._thread.queue = queue
 
     def submit(self) -> None:
-        """See Backend.submit."""
         queue = self.batch()
         if queue is not None:
             self._flush(queue)
 
     def end_batch(self) -> None:
-        """See Backend.end_batch."""
         queue = self.batch()
         if queue is not None:
             self._thread.queue = None
@@ -237,7 +223,6 @@ class WarpBackend(ProcessBound, Backend):
 
     @property
     def in_batch(self) -> bool:
-        """See Backend.in_batch."""
         return self.batch() is not None
 
     def record(self, program: Program) -> WarpRecording:
@@ -246,7 +231,6 @@ class WarpBackend(ProcessBound, Backend):
         return WarpRecording(self._device, self._graphs, [step for step in steps if step is not None])
 
     def replay(self, recording: Recording) -> None:
-        """See Backend.replay."""
         queue = self.batch()
         if queue is None or not isinstance(recording, WarpRecording):
             recording()
@@ -254,7 +238,6 @@ class WarpBackend(ProcessBound, Backend):
             queue.steps.append(recording)
 
     def address(self, buffer: wp.array) -> int:
-        """See Backend.address."""
         return int(buffer.ptr or 0)
 
     def batch(self) -> CallQueue | None:
@@ -278,7 +261,7 @@ class WarpBackend(ProcessBound, Backend):
         Raises:
             RuntimeError: Warp does not compile it.
         """
-        group = row.group if self._device.is_cuda else 1
+        group = (row.team if "IN_TEAMS" in flags else row.group) if self._device.is_cuda else 1
         with settings():
             compiled = warp_module(row.file).make(kernel, flags)
             try:

@@ -103,7 +103,6 @@ class LaunchStep(Step):
         self.key = (id(launch), size, *keys)
 
     def start(self, stream: wp.Stream | None) -> None:
-        """See Step.start."""
         self._launch.start(*self._bound, stream)
 
 

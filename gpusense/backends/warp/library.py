@@ -21,20 +21,16 @@ class WarpLibrary(Library):
     """GPUs through CUDA, and the processor."""
 
     def list_devices(self) -> list[tuple[BackendInfo, str]]:
-        """See Library.list_devices."""
         initialize()
         return [(_describe(device), device.alias) for device in wp.get_devices()]
 
     def open(self, info: BackendInfo, handle: str) -> Backend:
-        """See Library.open."""
         return WarpBackend(info, handle)
 
     def trouble(self, handle: str) -> str:
-        """See Library.trouble."""
         return trouble()
 
     def absent(self) -> list[Absent]:
-        """See Library.absent."""
         kinds = {info.kind for info, _ in self.list_devices()}
         if kinds != {"cpu"}:
             return []

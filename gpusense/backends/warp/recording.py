@@ -35,19 +35,15 @@ class WarpRecording(Recording, Step):
         self._lock = threading.Lock()
 
     def start(self, stream: wp.Stream | None) -> None:
-        """See Step.start."""
         start_each(self._steps, stream)
 
     def note(self, started: str) -> None:
-        """See Step.note."""
         self._started = started
 
     def explain(self) -> str:
-        """See Recording.explain."""
         return self._started
 
     def __call__(self, stream: Any = None) -> None:
-        """See Recording.__call__."""
         if stream is None:
             where = self._device.stream if self._device.is_cuda else None
         else:
@@ -64,7 +60,6 @@ class WarpRecording(Recording, Step):
                 wp.capture_launch(self._graph, where)
 
     def wait(self) -> None:
-        """See Recording.wait."""
         used, self._used = self._used, set()
         for stream in used:
             if stream is not None:

@@ -17,17 +17,14 @@ class WarpSlot(Slot):
         self._busy = False
 
     def to_device(self, buffer: wp.array, first: int, size: int) -> None:
-        """See Slot.to_device."""
         wp.copy(self._part_of(buffer, first, size), self._memory, src_offset=self._first, count=size)
         self._started()
 
     def to_host(self, buffer: wp.array, first: int, size: int) -> None:
-        """See Slot.to_host."""
         wp.copy(self._memory, self._part_of(buffer, first, size), dest_offset=self._first, count=size)
         self._started()
 
     def wait(self) -> None:
-        """See Slot.wait."""
         if self._busy:
             wp.synchronize_event(self._copied)
             self._busy = False

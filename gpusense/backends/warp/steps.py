@@ -43,7 +43,6 @@ class Copy(Step):
         self.key = (target.ptr, source.ptr, count)
 
     def start(self, stream: wp.Stream | None) -> None:
-        """See Step.start."""
         target, source, count = self._arguments
         wp.copy(target, source, count=count, stream=stream)
 

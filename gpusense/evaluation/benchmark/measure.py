@@ -59,7 +59,6 @@ class Meter(Proxy):
         return sum(self._bytes)
 
     def upload(self, array: np.ndarray, out: Buffer | None = None, *, wait: bool = True) -> Buffer:
-        """See Backend.upload."""
         if out is None:
             self._room(array.nbytes)
         begin = time.perf_counter()
@@ -73,7 +72,6 @@ class Meter(Proxy):
         return buffer
 
     def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
-        """See Backend.empty."""
         size = count * np.dtype(dtype).itemsize
         self._room(size)
         buffer = self._backend.empty(count, dtype, zero=zero)
@@ -94,7 +92,6 @@ class Meter(Proxy):
         return result
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
-        """See Backend.compile."""
         launcher = self._backend.compile(kernel, flags)
         if not self._on:
             return launcher
@@ -108,7 +105,6 @@ class Meter(Proxy):
         return launch
 
     def synchronize(self) -> None:
-        """See Backend.synchronize."""
         begin = time.perf_counter()
         self._backend.synchronize()
         if self._on:

@@ -44,8 +44,7 @@ def write_run(run: SimulatedRun, path: str | os.PathLike[str], kind: str | None 
         ...     len(list(gs.read_log(log)))
         3
     """
-    if not isinstance(run, SimulatedRun):
-        raise TypeError(f"run: must be a SimulatedRun, got {checks.show(run)}")
+    checks.instance("run", run, SimulatedRun)
     file = checks.path("path", path)
     kind = kind_of(file) if kind is None else checks.choice("kind", kind, FORMATS)
     if kind == "carmen":

@@ -118,8 +118,7 @@ def fit_beam_parameters(
         method, max_iterations, tolerance, restarts, seed, range_bias, progress, callback, responsibilities
     )
     bounds = make_bounds(pairs, sigma_bounds, lambda_bounds)
-    if initial is not None and not isinstance(initial, BeamParameters):
-        raise TypeError(f"initial: must be BeamParameters, got {checks.show(initial)}")
+    checks.instance("initial", initial, BeamParameters, optional=True)
     checks.boolean("sigma_growth", sigma_growth)
     checks.choice("hit", hit, tuple(SHAPES))
     if sigma_growth and method == "em-book":

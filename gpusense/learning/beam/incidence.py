@@ -219,8 +219,7 @@ def fit_incidence_parameters(
     surface = ~np.isnan(angles)
     if not ((pairs.kinds != Reading.MISSING) & surface).any():
         raise ValueError("incidence: some reading that is not missing must have an angle, got NaN beside all")
-    if initial is not None and not isinstance(initial, BeamParameters):
-        raise TypeError(f"initial: must be BeamParameters, got {checks.show(initial)}")
+    checks.instance("initial", initial, BeamParameters, optional=True)
     device = open_device(backend, precision)
     surfaces = pairs.subset(surface)
     bounds = make_bounds(surfaces, sigma_bounds, lambda_bounds)

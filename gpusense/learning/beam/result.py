@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense._util.html import FIT_HEAD, card
+from gpusense.learning.fitted import FitRow, Fitted
 from gpusense.world.parameters import BeamParameters
 
 _UNITS = {"sigma_hit": "m", "lambda_short": "1/m", "range_bias": "m"}
 
 
 @dataclass(frozen=True, eq=False)
-class BeamFit:
+class BeamFit(Fitted[BeamParameters]):
     """Parameters of the beam model, fitted to readings by :func:`fit_beam_parameters`.
 
     ``print(fit)`` shows a table of parameters and standard errors.
@@ -62,21 +60,12 @@ class BeamFit:
         (True, 3, 1, 0.25)
     """
 
-    parameters: BeamParameters
-    log_likelihood: float
-    trace: NDArray[np.float64]
-    converged: bool
-    status: str
-    standard_errors: dict[str, float]
-    held: dict[str, str]
     range_bias: float
     range_bias_error: float
     bias_fitted: bool
-    iterations: int
     passes: int
     hits: int
     max_readings: int
-    missing: int
     outliers: int
     method: str
     precision: str
@@ -85,20 +74,6 @@ class BeamFit:
     blocks: int
     responsibilities: NDArray[np.float64] | None = field(default=None, repr=False)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return all attributes but ``responsibilities`` as plain numbers, lists and strings; None if not finite."""
-        names = ["log_likelihood", "converged", "status", "held", "bias_fitted", "iterations", "passes", "hits"]
-        names += ["max_readings", "missing", "outliers", "method", "precision", "device", "blocks"]
-        return {
-            "parameters": self.parameters.to_dict(),
-            "standard_errors": {name: _finite(error) for name, error in self.standard_errors.items()},
-            "independent_errors": {name: _finite(error) for name, error in self.independent_errors.items()},
-            "range_bias": _finite(self.range_bias),
-            "range_bias_error": _finite(self.range_bias_error),
-            "trace": [_finite(number) for number in self.trace.tolist()],
-            **{name: getattr(self, name) for name in names},
-        }
-
     def __repr__(self) -> str:
         values = ", ".join(
             f"{name}={value!r}" if isinstance(value, str) else f"{name}={value:.4g}"
@@ -106,23 +81,12 @@ class BeamFit:
         )
         return f"BeamFit({values}, converged={self.converged})"
 
-    def _repr_html_(self) -> str:
-        rows: list[tuple[object, ...]] = [
-            (name, getattr(self.parameters, name), _error(error), self.held.get(name, ""))
-            for name, error in self.standard_errors.items()
-        ]
+    def _rows(self) -> list[FitRow]:
         kind = "fitted" if self.bias_fitted else "estimated, not in the parameters"
-        rows.append(("range_bias", self.range_bias, _error(self.range_bias_error), kind))
-        return card(f"BeamFit: {self.status}", rows, head=FIT_HEAD, detail=str(self))
+        return [*super()._rows(), FitRow("range_bias", self.range_bias, self.range_bias_error, kind)]
 
     def __str__(self) -> str:
-        lines = [
-            f"{'parameter':14}{'value':>13}{'std. error':>13}{'if independent' if self.blocks else '':>16}".rstrip()
-        ]
-        for name, error in self.standard_errors.items():
-            lines.append(self._row(name, getattr(self.parameters, name), error, self.held.get(name, "")))
-        kind = "fitted" if self.bias_fitted else "estimated, not in the parameters"
-        lines.append(self._row("range_bias", self.range_bias, self.range_bias_error, kind))
+        lines = self._table(_UNITS, self.independent_errors if self.blocks else {})
         if self.blocks:
             lines.append(f"standard errors over {self.blocks} blocks of readings")
         lines.append(
@@ -131,17 +95,3 @@ class BeamFit:
         )
         lines.append(f"{self.method}, {self.iterations} iterations, {self.precision} on {self.device}: {self.status}")
         return "\n".join(lines)
-
-    def _row(self, name: str, value: float, error: float, note: str) -> str:
-        """Return a line of the table."""
-        number = f"{value:13.6g}" if math.isfinite(value) else f"{'-':>13}"
-        independent = f"{_error(self.independent_errors[name]):>16}" if self.blocks else ""
-        return f"{name:14}{number}{_error(error):>13}{independent} {_UNITS.get(name, ''):4}  {note}".rstrip()
-
-
-def _error(error: float) -> str:
-    return f"{error:.3g}" if math.isfinite(error) else "inf" if error == math.inf else "-"
-
-
-def _finite(number: float) -> float | None:
-    return number if math.isfinite(number) else None

@@ -72,8 +72,7 @@ class DiscreteBeamModel(SensorTable):
                 raise ValueError(f"causes: hit must be 'normal' in a table, got {checks.show(self.causes)}")
         object.__setattr__(self, "range_max", checks.real("range_max", self.range_max, above=0))
         object.__setattr__(self, "bins", checks.integer("bins", self.bins, low=1, high=MOST_BINS))
-        if self.fit is not None and not isinstance(self.fit, DiscreteFit):
-            raise TypeError(f"fit: must be a DiscreteFit or None, got {checks.show(self.fit)}")
+        checks.instance("fit", self.fit, DiscreteFit, optional=True)
 
     @classmethod
     def learn(
@@ -178,7 +177,6 @@ class DiscreteBeamModel(SensorTable):
         return np.where(i < 0, 0.0, log_p)
 
     def sensor_table(self, dtype: DTypeLike) -> NDArray[Any]:
-        """See SensorTable.sensor_table."""
         return np.ascontiguousarray(self._rows(dtype, density=True).T)
 
     def _rows(self, dtype: DTypeLike, *, density: bool) -> NDArray[Any]:

@@ -106,10 +106,8 @@ def fit_landmark_parameters(
         >>> fit.converged, round(fit.parameters.sigma_range, 2), round(fit.parameters.sigma_bearing, 2)
         (True, 0.2, 0.05)
     """
-    if not isinstance(landmarks, LandmarkMap):
-        raise TypeError(f"landmarks: must be a LandmarkMap, got {checks.show(landmarks)}")
-    if initial is not None and not isinstance(initial, LandmarkParameters):
-        raise TypeError(f"initial: must be LandmarkParameters, got {checks.show(initial)}")
+    checks.instance("landmarks", landmarks, LandmarkMap)
+    checks.instance("initial", initial, LandmarkParameters, optional=True)
     checks.boolean("bias", bias)
     most = checks.integer("max_iterations", max_iterations, low=1)
     least = checks.real("tolerance", tolerance, above=0)

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense._util.html import FIT_HEAD, card
+from gpusense.learning.fitted import FitRow, Fitted
 from gpusense.world.parameters import LandmarkParameters
 
 _UNITS = {"sigma_range": "m", "sigma_bearing": "rad", "range_bias": "m", "bearing_bias": "rad"}
 
 
 @dataclass(frozen=True, eq=False)
-class LandmarkFit:
+class LandmarkFit(Fitted[LandmarkParameters]):
     """Parameters of the landmark model, fitted by :func:`fit_landmark_parameters`.
 
     ``print(fit)`` shows a table of parameters and standard errors.
@@ -55,38 +54,16 @@ class LandmarkFit:
         (True, 4, 0.087)
     """
 
-    parameters: LandmarkParameters
-    log_likelihood: float
-    trace: NDArray[np.float64]
-    converged: bool
-    status: str
-    standard_errors: dict[str, float]
-    held: dict[str, str]
     range_bias: float
     range_bias_error: float
     bearing_bias: float
     bearing_bias_error: float
     bias_fitted: bool
-    iterations: int
     features: int
-    missing: int
     false_positives: float
     expected: int
     detected: float
     false: NDArray[np.float64] = field(repr=False)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return all attributes but ``false`` as plain numbers, lists and strings; None if not finite."""
-        biases = ["range_bias", "range_bias_error", "bearing_bias", "bearing_bias_error"]
-        names = ["log_likelihood", "converged", "status", "held", "bias_fitted", "iterations", "features", "missing"]
-        names += ["false_positives", "expected", "detected"]
-        return {
-            "parameters": self.parameters.to_dict(),
-            "standard_errors": {name: _finite(error) for name, error in self.standard_errors.items()},
-            **{name: _finite(getattr(self, name)) for name in biases},
-            "trace": [_finite(number) for number in self.trace.tolist()],
-            **{name: getattr(self, name) for name in names},
-        }
 
     def __repr__(self) -> str:
         names = ("sigma_range", "sigma_bearing", "sigma_signature", "z_detect", "z_false", "p_detect")
@@ -94,27 +71,16 @@ class LandmarkFit:
         text = ", ".join(f"{name}={value:.4g}" for name, value in values if value is not None)
         return f"LandmarkFit({text}, converged={self.converged})"
 
-    def _repr_html_(self) -> str:
-        rows = [
-            (name, value, error, self.held.get(name, ""))
-            for name, error in self.standard_errors.items()
-            if (value := getattr(self.parameters, name)) is not None
+    def _rows(self) -> list[FitRow]:
+        kind = "fitted" if self.bias_fitted else "estimated, not in the parameters"
+        biases = [
+            ("range_bias", self.range_bias, self.range_bias_error),
+            ("bearing_bias", self.bearing_bias, self.bearing_bias_error),
         ]
-        return card(f"LandmarkFit: {self.status}", rows, head=FIT_HEAD, detail=str(self))
+        return [*super()._rows(), *(FitRow(*bias, kind) for bias in biases if math.isfinite(bias[1]))]
 
     def __str__(self) -> str:
-        rows = [
-            (name, getattr(self.parameters, name), error, self.held.get(name, ""))
-            for name, error in self.standard_errors.items()
-        ]
-        kind = "fitted" if self.bias_fitted else "estimated, not in the parameters"
-        rows += [(name, getattr(self, name), getattr(self, f"{name}_error"), kind) for name in
-                 ("range_bias", "bearing_bias") if math.isfinite(getattr(self, name))]  # fmt: skip
-        lines = [f"{'parameter':16}{'value':>13}{'std. error':>13}"]
-        for name, value, error, note in rows:
-            if value is not None:
-                shown = f"{error:13.3g}" if math.isfinite(error) else f"{'-':>13}"
-                lines.append(f"{name:16}{value:13.6g}{shown} {_UNITS.get(name, ''):4} {note}".rstrip())
+        lines = self._table(_UNITS, {})
         lines.append(
             f"log-likelihood {self.log_likelihood:.6f} of {self.features} features; {self.missing} missing, "
             f"{self.false_positives:.1f} false positives"
@@ -123,7 +89,3 @@ class LandmarkFit:
             lines.append(f"{self.detected:.1f} of {self.expected} landmarks in view were seen")
         lines.append(f"{self.iterations} iterations: {self.status}")
         return "\n".join(lines)
-
-
-def _finite(number: float) -> float | None:
-    return number if math.isfinite(number) else None

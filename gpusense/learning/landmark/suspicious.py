@@ -98,10 +98,8 @@ def suspicious_landmarks(
         >>> [(pair.first, pair.second) for pair in errors.exchanged]
         [(0, 1)]
     """
-    if not isinstance(landmarks, LandmarkMap):
-        raise TypeError(f"landmarks: must be a LandmarkMap, got {checks.show(landmarks)}")
-    if not isinstance(parameters, LandmarkParameters):
-        raise TypeError(f"parameters: must be LandmarkParameters, got {checks.show(parameters)}")
+    checks.instance("landmarks", landmarks, LandmarkMap)
+    checks.instance("parameters", parameters, LandmarkParameters)
     full = check_features(features, parameters, span_of(parameters, landmarks))
     known = check_correspondence(correspondence, len(full), len(landmarks))
     robots = checks.array("poses", poses, (len(full), 3))

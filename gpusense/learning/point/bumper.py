@@ -116,8 +116,7 @@ def fit_bumper_parameters(
     """
     most = checks.integer("max_iterations", max_iterations, low=1)
     least = checks.real("tolerance", tolerance, above=0)
-    if not isinstance(grid, OccupancyGrid):
-        raise TypeError(f"grid: must be an OccupancyGrid, got {checks.show(grid)}")
+    checks.instance("grid", grid, OccupancyGrid)
     wide = BumperParameters(p_contact=1.0, p_false=0.0, sigma=_WIDE * grid.resolution)
     precision: Precision = "float64" if get_backend(backend).info.float64 else "float32"
     model = BumperModel(

@@ -86,7 +86,6 @@ class SplitCloud(FilterCloud):
     # ---- steps
 
     def place(self, poses: np.ndarray) -> None:
-        """See FilterCloud.place."""
         places, count = self.places.placed(self.kept), len(poses)
         self._fill([("poses", places.shown, poses), ("weights", places.weight, np.ones(count))])
         self._set(places, count, np.zeros(STATE))
@@ -101,12 +100,10 @@ class SplitCloud(FilterCloud):
         ])  # fmt: skip
 
     def set_pool(self, poses: np.ndarray) -> None:
-        """See FilterCloud.set_pool."""
         self._all("set_pool", poses)
         self._pool = poses
 
     def move(self, settings: np.ndarray, kind: int) -> None:
-        """See FilterCloud.move."""
         places = self.places.moved(self.kept)
         self._begin(settings, self.places.next, places.next, kind)
         self.places = places
@@ -115,7 +112,6 @@ class SplitCloud(FilterCloud):
         self._team.each("begin", [(part, settings, origin, target, kind) for part in self._parts(self.count)])
 
     def correct(self, step: Step) -> None:
-        """See FilterCloud.correct."""
         stages, state = self.places.stages(self.kept, step.stages, step.drawn, step.kind), self._state.copy()
         self._begin(step.settings, stages[0].origin, stages[0].source, step.kind)
         for stage in stages:
@@ -191,14 +187,12 @@ class SplitCloud(FilterCloud):
         return [(float(mark_of(np.array(low), total)), float(mark_of(np.array(high), total))) for low, high in ends]
 
     def explain(self) -> str:
-        """See FilterCloud.explain."""
         parts = zip(self._parts(self.count), self._team.devices, strict=True)
         return f"split: {', '.join(f'{part.size} on {name}' for part, name in parts)}"
 
     # ---- copies to the host
 
     def estimate(self, count: int) -> np.ndarray:
-        """See FilterCloud.estimate."""
         parts, result, shown = self._parts(count), np.zeros(ESTIMATE), self.places.shown
         holder = next(index for index, part in enumerate(parts) if part.size)
         asked = [(shown, 1 if index == holder else 0) for index in range(self._size)]
@@ -218,7 +212,6 @@ class SplitCloud(FilterCloud):
         return result
 
     def summary(self) -> Summary:
-        """See FilterCloud.summary."""
         return summary_of(self._state.copy())
 
     def particles(self, count: int) -> np.ndarray:
@@ -235,18 +228,15 @@ class SplitCloud(FilterCloud):
         return self.estimate(count)[:MOMENTS]
 
     def host_poses(self, index: int, count: int) -> np.ndarray:
-        """See FilterCloud.host_poses."""
         return np.concatenate(self._team.each("poses", [(index, one.size) for one in self._parts(count)]))
 
     def host_weights(self, count: int) -> np.ndarray:
-        """See FilterCloud.host_weights."""
         return self._weights(self.places.weight, count)
 
     def _weights(self, index: int, count: int) -> np.ndarray:
         return np.concatenate(self._team.each("weights", [(index, one.size) for one in self._parts(count)]))
 
     def contents(self, count: int) -> Contents:
-        """See FilterCloud.contents."""
         places, weighed = self.places, self.places.shown != self.places.next
         return Contents(
             self.host_poses(places.shown, count), self.host_weights(count),
@@ -257,7 +247,6 @@ class SplitCloud(FilterCloud):
         )  # fmt: skip
 
     def restore(self, contents: Contents) -> None:
-        """See FilterCloud.restore."""
         if contents.pool is not None:
             self.set_pool(contents.pool)
         places, arrays = contents.places_and_arrays(self.kept)
@@ -268,11 +257,9 @@ class SplitCloud(FilterCloud):
 
     @property
     def scoring_seconds(self) -> float:
-        """See FilterCloud.scoring_seconds."""
         return float(sum(self._all("scoring_seconds")))
 
     def time_scoring(self) -> None:
-        """See FilterCloud.time_scoring."""
         self._all("time_scoring")
 
     def close(self) -> None:

@@ -238,20 +238,38 @@ def prepare_features(
     with np.errstate(divide="ignore"):
         numbers[:, at.RANGE_SPREAD], numbers[:, at.BEARING_SPREAD] = 1 / scales[:, 0], 1 / scales[:, 1]
     numbers[:, at.MOST] = highest
-    # A landmark below this adds less than eps to the density of a false positive.
-    smallest = false[columns] + math.log(np.finfo(real).eps) - 1
+    eps = np.finfo(real).eps
     bounds = np.full(len(columns), np.inf)
     if gated:
+        # A landmark below this adds less than eps to the density of a false positive.
+        smallest = false[columns] + math.log(eps) - 1
         with np.errstate(invalid="ignore"):
             bounds = np.where(np.isneginf(highest), -np.inf, highest - smallest)
-    slack = 16 * np.finfo(real).eps * (extent + 2 * p.range_max)
+    _set_reaches(numbers, p, sensor, values[:, 0], measured, bounds, 16 * eps * (extent + 2 * p.range_max))
+    return PreparedFeatures(columns, in_two_parts(numbers, real, _LOW_PARTS), measured, false)
+
+
+def _set_reaches(
+    numbers: np.ndarray, p: LandmarkParameters, sensor: Sensor, distances: np.ndarray, measured: np.ndarray,
+    bounds: np.ndarray, slack: float,
+) -> None:  # fmt: skip
+    """Set the discs in which landmarks matter, wider by the rounding errors of distances.
+
+    Args:
+        numbers: (K, FEATURE) numbers of the features.
+        p: The parameters.
+        sensor: Constants of the sensor.
+        distances: (K,) measured ranges [m].
+        measured: (K, 3) whether range, bearing and signature were measured.
+        bounds: (K,) largest differences of a landmark's log density from the highest one.
+        slack: Rounding error of a distance [m].
+    """
     # (d + slack)^2 <= 1.01 d^2 + 101 slack^2, and kernels look for 1.01 d^2.
     numbers[:, at.SLACK] = 101 * slack**2
-    for row, distance, known, bound in zip(numbers, values[:, 0].tolist(), measured, bounds.tolist(), strict=True):
+    for row, distance, known, bound in zip(numbers, distances.tolist(), measured, bounds.tolist(), strict=True):
         reach = reach_of(p, sensor, distance, known, bound)
         radius = reach.radius if reach.radius < 0 else reach.radius * (1 + _WIDER) + slack
         row[at.REACH : at.HOLE + 1] = reach.reach, radius, max(reach.hole * (1 - _WIDER) - slack, 0.0)
-    return PreparedFeatures(columns, in_two_parts(numbers, real, _LOW_PARTS), measured, false)
 
 
 def in_two_parts(numbers: np.ndarray, real: np.dtype, low_parts: Sequence[tuple[int, int]]) -> np.ndarray:

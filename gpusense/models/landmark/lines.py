@@ -74,12 +74,8 @@ class LineModel(FeatureModel):
         temperature: float = 1.0,
         specialize: bool = True,
     ) -> None:
-        if not isinstance(lines, LineMap):
-            raise TypeError(f"lines: must be a LineMap, got {checks.show(lines)}")
-        self.lines = lines
-        self.parameters = LineParameters() if parameters is None else parameters
-        if not isinstance(self.parameters, LineParameters):
-            raise TypeError(f"parameters: must be LineParameters, got {checks.show(parameters)}")
+        self.lines = checks.instance("lines", lines, LineMap)
+        self.parameters = checks.or_default("parameters", parameters, LineParameters)
         super().__init__(
             "lines", len(lines), backend, precision, association=association, mount=mount, temperature=temperature,
             specialize=specialize,

@@ -83,12 +83,8 @@ class LandmarkModel(FeatureModel):
         temperature: float = 1.0,
         specialize: bool = True,
     ) -> None:
-        if not isinstance(landmarks, LandmarkMap):
-            raise TypeError(f"landmarks: must be a LandmarkMap, got {checks.show(landmarks)}")
-        self.landmarks = landmarks
-        self.parameters = LandmarkParameters() if parameters is None else parameters
-        if not isinstance(self.parameters, LandmarkParameters):
-            raise TypeError(f"parameters: must be LandmarkParameters, got {checks.show(parameters)}")
+        self.landmarks = checks.instance("landmarks", landmarks, LandmarkMap)
+        self.parameters = checks.or_default("parameters", parameters, LandmarkParameters)
         p = self.parameters
         if p.sigma_signature is not None and landmarks.signatures is None:
             raise ValueError(f"sigma_signature: must be None for a map without signatures, got {p.sigma_signature}")

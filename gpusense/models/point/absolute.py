@@ -60,8 +60,7 @@ class PositionModel(PointModel):
         precision: Precision = "float32",
         temperature: float = 1.0,
     ) -> None:
-        if not isinstance(parameters, PositionParameters):
-            raise TypeError(f"parameters: must be PositionParameters, got {checks.show(parameters)}")
+        checks.instance("parameters", parameters, PositionParameters)
         super().__init__(backend, precision, temperature)
         self.parameters = parameters
         p = parameters
@@ -224,9 +223,7 @@ class HeadingModel(PointModel):
         precision: Precision = "float32",
         temperature: float = 1.0,
     ) -> None:
-        self.parameters = HeadingParameters() if parameters is None else parameters
-        if not isinstance(self.parameters, HeadingParameters):
-            raise TypeError(f"parameters: must be HeadingParameters, got {checks.show(parameters)}")
+        self.parameters = checks.or_default("parameters", parameters, HeadingParameters)
         super().__init__(backend, precision, temperature)
         self._kind, terms = self._mixture()
         self._flags |= flags_if(RAND=self.parameters.z_rand > 0)

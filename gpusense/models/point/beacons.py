@@ -61,9 +61,7 @@ class BeaconModel(PointModel):
         precision: Precision = "float32",
         temperature: float = 1.0,
     ) -> None:
-        self.parameters = BeaconParameters() if parameters is None else parameters
-        if not isinstance(self.parameters, BeaconParameters):
-            raise TypeError(f"parameters: must be BeaconParameters, got {checks.show(parameters)}")
+        self.parameters = checks.or_default("parameters", parameters, BeaconParameters)
         points = checks.as_array("xy", xy)
         # An empty list has no columns.
         self.xy = checks.array("xy", points.reshape(0, 2) if points.shape == (0,) else points, ("M", 2)).copy()

@@ -84,12 +84,8 @@ class BumperModel(PointModel):
         outside: Space = "free",
         temperature: float = 1.0,
     ) -> None:
-        if not isinstance(grid, OccupancyGrid):
-            raise TypeError(f"grid: must be an OccupancyGrid, got {checks.show(grid)}")
-        self.grid = grid
-        self.parameters = BumperParameters() if parameters is None else parameters
-        if not isinstance(self.parameters, BumperParameters):
-            raise TypeError(f"parameters: must be BumperParameters, got {checks.show(parameters)}")
+        self.grid = checks.instance("grid", grid, OccupancyGrid)
+        self.parameters = checks.or_default("parameters", parameters, BumperParameters)
         self.unknown = cast(Space, checks.choice("unknown", unknown, ("free", "occupied")))
         self.outside = cast(Space, checks.choice("outside", outside, ("free", "occupied")))
         super().__init__(backend, precision, temperature)

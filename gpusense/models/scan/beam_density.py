@@ -78,10 +78,9 @@ def density_of(parameters: object, default: BeamParameters, incidence: object, *
         raise TypeError(f"parameters: {rule}, got {checks.show(parameters)}")
     if incidence is None:
         return BeamDensity((mixture,), np.zeros(1), table=table)
-    if not isinstance(incidence, IncidenceParameters):
-        raise TypeError(f"incidence: must be IncidenceParameters, got {checks.show(incidence)}")
+    bins = checks.instance("incidence", incidence, IncidenceParameters)
     check_absent("with incidence", parameters=parameters, **options)
-    cosines = np.cos(incidence.edges[1:])
-    if incidence.no_surface is None:
-        return BeamDensity(incidence.parameters, cosines, incidence)
-    return BeamDensity((incidence.no_surface, *incidence.parameters), np.append(_BEYOND, cosines), incidence)
+    cosines = np.cos(bins.edges[1:])
+    if bins.no_surface is None:
+        return BeamDensity(bins.parameters, cosines, bins)
+    return BeamDensity((bins.no_surface, *bins.parameters), np.append(_BEYOND, cosines), bins)

@@ -97,7 +97,6 @@ class BeamPipeline(ScanPipeline):
         )  # fmt: skip
 
     def sensing(self) -> Sensing:
-        """See ScanPipeline.sensing."""
         rules = self.rules
         vectors = rules.vectors[:, None] if self.cones.rays == 1 else self.cone_vectors
         return Sensing(
@@ -106,17 +105,14 @@ class BeamPipeline(ScanPipeline):
         )  # fmt: skip
 
     def place_arguments(self, filled: dict[str, Buffer]) -> dict[str, Buffer]:
-        """See ScanPipeline.place_arguments."""
         return dict(ray=filled["point"], reading=filled["reading"], first=self._one_each, start=self.nothing)
 
     # ---- program
 
     def spread(self, particles: int, readings: Readings) -> int:
-        """See ScanPipeline.spread."""
         return tiles_of(particles, readings.rays)[1]
 
     def conditions(self, readings: Readings, placed: PlacedPoses, tiles: Tiles | None) -> frozenset[str]:
-        """See ScanPipeline.conditions."""
         shared = "SHARED_RAYS" in readings.flags
         return self.caster.flags | flags_if(
             ORIGINS_OUTSIDE=not (self.specialize and all_within(placed, 0)),
@@ -125,7 +121,6 @@ class BeamPipeline(ScanPipeline):
         )
 
     def flags(self, conditions: frozenset[str], *, tiled: bool, per_beam: bool) -> frozenset[str]:
-        """See ScanPipeline.flags."""
         flags = self._fixed_flags | self.cones.flags | conditions
         if "SHARED_RAYS" in flags or not self.caster.method.stops:
             flags -= {"STOPS"}
@@ -134,13 +129,11 @@ class BeamPipeline(ScanPipeline):
         return with_lanes_flag(self.backend.info.lanes, "score_beams", flags | flags_if(PER_BEAM=per_beam))
 
     def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
-        """See ScanPipeline.layout."""
         if "STRANDED" in flags:
             return strands_in(readings.readings), 1
         return readings.readings, BLOCK_TERMS
 
     def score_launches(self, scoring: ScanLaunch) -> Program:
-        """See ScanPipeline.score_launches."""
         placed, readings, parts, caster = scoring.placed, scoring.readings, self.parts(scoring), self.caster
         window, count = placed.frame.window, placed.count
         common = dict(

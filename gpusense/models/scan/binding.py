@@ -86,13 +86,11 @@ class _HostCall(BoundCall):
         self.pipeline, self.arrays, self._score = pipeline, (poses, ranges), score
 
     def __call__(self, stream: Any = None) -> Any:
-        """See BoundCall.__call__."""
         if stream is not None:
             raise TypeError(f"stream: must be None for a call that waits, got {checks.show(stream)}")
         return self._score(*self.arrays, out=self.out)
 
     def explain(self) -> str:
-        """See BoundCall.explain."""
         return f"the ordinary call: {self.reason}"
 
     def check(self) -> None:
@@ -126,7 +124,6 @@ class _StagedCall(BoundCall):
         self._lock = threading.Lock()
 
     def __call__(self, stream: Any = None) -> Any:
-        """See BoundCall.__call__."""
         if stream is not None:
             return self._host(stream)
         try:
@@ -140,7 +137,6 @@ class _StagedCall(BoundCall):
         return self._host()
 
     def explain(self) -> str:
-        """See BoundCall.explain."""
         return f"NumPy arrays are copied with each call: {self._packed.explain()}"
 
     def check(self) -> None:

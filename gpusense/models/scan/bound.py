@@ -132,12 +132,10 @@ class DeviceCall(BoundCall):
         self._recorded()
 
     def __call__(self, stream: Any = None) -> Any:
-        """See BoundCall.__call__."""
         self._current().recording(stream)
         return self.out
 
     def explain(self) -> str:
-        """See BoundCall.explain."""
         for _, program in self._programs.items():
             return program.recording.explain()
         return "nothing is recorded: the map has changed, and its new table did not fit the device"
@@ -160,7 +158,6 @@ class DeviceCall(BoundCall):
         return self._program()
 
     def check(self) -> None:
-        """See BoundCall.check."""
         self._pipeline.backend.check_process()
         self._wait()
         finish(self._space, on_device=True)

@@ -78,8 +78,7 @@ class LikelihoodFieldModel(ScanModel):
     ) -> None:
         weights = choose(compat)
         self.parameters = weights.field if parameters is None else parameters
-        if not isinstance(self.parameters, LikelihoodFieldParameters):
-            raise TypeError(f"parameters: must be LikelihoodFieldParameters, got {checks.show(parameters)}")
+        checks.instance("parameters", self.parameters, LikelihoodFieldParameters)
         check_weights(self.parameters, compat)
         if weights.is_peer:
             checks.choice("interpolation", self.parameters.interpolation, ("nearest",))

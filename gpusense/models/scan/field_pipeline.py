@@ -143,7 +143,6 @@ class FieldPipeline(ScanPipeline):
         return padded.reshape(scans.scans, blocks, BLOCK_TERMS).max(axis=2)
 
     def sensing(self) -> Sensing:
-        """See ScanPipeline.sensing."""
         rules = self.rules
         return Sensing(
             self.scanner, rules.beams, rules.vectors[:, None], rules.z_max, end_points=True, max_depends=False,
@@ -152,22 +151,18 @@ class FieldPipeline(ScanPipeline):
         )  # fmt: skip
 
     def place_arguments(self, filled: dict[str, Buffer]) -> dict[str, Buffer]:
-        """See ScanPipeline.place_arguments."""
         return dict(point=filled["point"], point_low=filled["point_low"], guard=filled["guard"], start=self.nothing)
 
     # ---- program
 
     def spread(self, particles: int, readings: Readings) -> int:
-        """See ScanPipeline.spread."""
         return spread_of(particles, -(-readings.readings // BLOCK_TERMS), ENOUGH_SHORT)
 
     def conditions(self, readings: Readings, placed: PlacedPoses, tiles: Tiles | None) -> frozenset[str]:
-        """See ScanPipeline.conditions."""
         inside = tiles is not None and self.quick and all_within(placed, readings.reach, RING)
         return _INSIDE if inside else _NONE
 
     def flags(self, conditions: frozenset[str], *, tiled: bool, per_beam: bool) -> frozenset[str]:
-        """See ScanPipeline.flags."""
         flags = self.components | conditions
         if not tiled:
             info, flags = self.backend.info, flags | flags_if(PER_BEAM=per_beam)
@@ -175,7 +170,6 @@ class FieldPipeline(ScanPipeline):
         return flags | flags_if(ROUNDED_CELLS=self.quick and (tiled or self.backend.info.vector_loops))
 
     def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
-        """See ScanPipeline.layout."""
         return readings.readings if "PER_BEAM" in flags else -(-readings.readings // BLOCK_TERMS), 1
 
     def numbers(self, scoring: ScanLaunch) -> dict[str, Any]:
@@ -186,7 +180,6 @@ class FieldPipeline(ScanPipeline):
         return dict(score=score, guard=self.guard * readings.reach) if scoring.tiles is None else dict(score=score)
 
     def score_launches(self, scoring: ScanLaunch) -> Program:
-        """See ScanPipeline.score_launches."""
         placed, readings, parts = scoring.placed, scoring.readings, self.parts(scoring)
         count = placed.count
         common = dict(

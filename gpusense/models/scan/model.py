@@ -60,8 +60,7 @@ class ScanModel(Pickled):
         constant_term: float,
         possible: bool,
     ) -> None:
-        if not isinstance(scanner, Scanner):
-            raise TypeError(f"scanner: must be a Scanner, got {checks.show(scanner)}")
+        checks.instance("scanner", scanner, Scanner)
         check_scene(grid, scanner.range_max)
         self.scanner = scanner
         weights = choose(compat)

@@ -13,13 +13,13 @@ import pytest
 from gpusense.backends import Backend, arrays, get_backend
 from gpusense.backends.base import Adopted
 
-# Failed assertions of helpers show their values, as those of tests do.
+# Failed assertions of helpers show their values, like those of tests.
 pytest.register_assert_rewrite("support")
 from support.array_libraries import Array, counted_copies, installed  # noqa: E402
 from support.map_files import yaml_text  # noqa: E402
 from support.selection import BACKENDS, present, skip_or_fail  # noqa: E402
 
-# JAX would take three quarters of a GPU's memory for each process that imports it.
+# JAX would reserve three quarters of a GPU's memory in each process that imports it.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 
@@ -52,7 +52,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             if where[1] == sampled.kwargs.get("without"):
                 item.add_marker("slow")
                 continue
-            # Multiples of the golden ratio spread over every parameter, however its values follow one another.
+            # Multiples of the golden ratio spread evenly over every parameter, whatever the order of its values.
             if number[function] * GOLDEN % 1 < sampled.args[0]:
                 kept.add(where)
             else:

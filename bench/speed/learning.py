@@ -54,7 +54,7 @@ class Timed(Proxy):
     """A proxy of a backend that measures kernels and copies back to the host.
 
     Attributes:
-        info: That of the other one; without lanes where ``lanes`` is False.
+        info: Information on the device, without lanes if ``lanes`` is False.
         seconds: Seconds of kernels and of downloads since the last reset.
     """
 

@@ -44,9 +44,9 @@ class Option:
 
     Attributes:
         model: "beam model" or "field".
-        name: What it changes.
+        name: The changed property.
         most: The intended upper bound of the ratio to the default's time.
-        make: Makes the model of a backend.
+        make: Function that makes the model on a backend.
     """
 
     model: str

@@ -4,8 +4,8 @@ A compiler that does not know a processor aborts, hangs or makes wrong code in t
 child computes a small scene and compares it with NumPy, once for each combination of device, driver, processor and
 version of gpusense. A family of kernels that fails is not used: lanes are replaced by narrower ones and then by scalar
 kernels, float64 counts as absent, and a device whose scalar kernels fail is unusable. The verdict is kept in the cache,
-and so are the programs that the child compiled. ``GPUSENSE_PROOF=off`` trusts every driver. If no child can be started,
-a device without a cached verdict is trusted, and the log says so.
+and so are the programs that the child compiled; a hang is kept once it has happened twice. ``GPUSENSE_PROOF=off``
+trusts every driver. If no child can be started, a device without a cached verdict is trusted, and the log says so.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from gpusense.backends.processor import fingerprint
 SCALAR, FLOAT64, VECTORS = "scalar kernels", "float64 kernels", "kernels in vectors"
 _PROVE = "gpusense.evaluation.proof:prove"
 _LOG = logging.getLogger("gpusense")
+_HANGS, _HUNG = re.compile(r"\bhangs?\b"), "\nhung"
 # Remedies by the words of a failure.
 _REMEDIES = (
     # These failures already name the remedy.
@@ -38,7 +39,7 @@ _REMEDIES = (
     ),
     (r"No space left|takes \d+ MiB", "free some space, or set GPUSENSE_CACHE_DIR to a folder with more"),
     (
-        r"\bhangs?\b",
+        _HANGS,
         "set GPUSENSE_PROOF_SECONDS higher if the machine is slow, or choose another device with GPUSENSE_BACKEND",
     ),
 )
@@ -97,18 +98,30 @@ def verdict_on(info: BackendInfo, *, setup: Any = None, anew: bool = False) -> V
         if anew and not obstacle:
             _known.pop(key, None)
             discard_entry(key)
+            discard_entry(key + _HUNG)
         verdict = _known.get(key) or _load(key)
         if verdict is None and obstacle:
             _LOG.info("gpusense: %s is trusted without a proof: %s", name_of(info), obstacle)
             verdict = trust(info)
         elif verdict is None:
             verdict, conclusive = _prove(info, setup)
-            if conclusive:
+            if conclusive and not _hangs_first(key, verdict):
                 store_entry(key, json.dumps(dataclasses.asdict(verdict)).encode())
             if verdict.reason:
                 notices.warn(summary(info, verdict))
         _known[key] = verdict
         return verdict
+
+
+def _hangs_first(key: str, verdict: Verdict) -> bool:
+    """Return whether a device hangs for the first time, and note it.
+
+    A busy machine may be the reason, so the next process proves the device once more.
+    """
+    if not _HANGS.search(verdict.reason) or load_entry(key + _HUNG) is not None:
+        return False
+    store_entry(key + _HUNG, b"once")
+    return True
 
 
 def name_of(info: BackendInfo) -> str:

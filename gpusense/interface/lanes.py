@@ -1,6 +1,8 @@
-"""The flag of kernels in lanes, which compute several particles or beams at once on devices that prefer them."""
+"""Flags of kernels in lanes, which compute several particles or beams at once, and in teams, which share an item."""
 
 from __future__ import annotations
+
+from gpusense.interface.signatures import KERNELS
 
 # By kernel: flags with which it has no body in lanes, and sets of flags of which it requires at least one.
 _SCALAR = frozenset({"FLOAT64", "ALL_READINGS", "EXACT_EXPONENT", "CUBES"})
@@ -55,3 +57,8 @@ def with_lanes_flag(
     if lanes == 1 or flags & never or not any(needed <= flags for needed in _NEEDED.get(kernel, ())):
         return frozenset(flags)
     return frozenset(flags) | {"IN_LANES"}
+
+
+def with_teams_flag(kind: str, kernel: str, flags: frozenset[str]) -> tuple[frozenset[str], int]:
+    """Return the flags of a launch, with IN_TEAMS on a GPU, and the work-items that share an item."""
+    return (flags | {"IN_TEAMS"}, KERNELS[kernel].team) if kind == "gpu" else (flags, 1)

@@ -27,7 +27,7 @@ real4 limited_step(const real4 step, const real capture) {
 // Refine a guess until steps are below the tolerance. Every stride-th point and every skip-th of the reference take part
 // until capture radius and scale have shrunk, with thin also afterwards.
 Match refine(global const real4 *point, global const real4 *line, const int count, global const real4 *other,
-             const int others, const real4 guess, const MatchRules rules) {
+             const int others, const real4 guess, const MatchRules rules, const Team team) {
     Match match;
     real capture = rules.capture, scale = rules.scale;
     int settled = 0;
@@ -40,7 +40,7 @@ Match refine(global const real4 *point, global const real4 *line, const int coun
         const int last = capture <= rules.least_capture && scale <= rules.least_scale, full = last && !rules.thin;
         const real4 pose = (real4)(match.pose.xy, cos(match.pose.z), sin(match.pose.z));
         sum_pairs(point, line, count, other, others, full ? 1 : rules.stride, full ? 1 : rules.skip, pose, capture, scale,
-                  last, full, match.sums, match.squares);
+                  last, full, match.sums, match.squares, team);
         ++match.iteration;
         const real4 solved = solve(match.sums);
         if (solved.w == 0) break;
@@ -60,26 +60,28 @@ Match refine(global const real4 *point, global const real4 *line, const int coun
 
 // Return how well two scans agree at a pose (x, y, theta), as the sum of both directions, or of one with one_way.
 real4 mutual_agreement(global const real4 *point, global const real4 *line, const int first, const int count,
-                       const int second, const int others, const real4 pose, const MatchRules rules) {
+                       const int second, const int others, const real4 pose, const MatchRules rules,
+                       const Team team) {
     if (count == 0 || others == 0) return (real4)(0);
     const int skip = rules.thin ? rules.skip : 1;
     const real c = cos(pose.z), s = sin(pose.z);
     const real4 forward = (real4)(pose.x, pose.y, c, s);
     const real4 inverse = (real4)(-c * pose.x - s * pose.y, s * pose.x - c * pose.y, c, -s);
     const real4 there = agreement(point + first, line + first, count, point + second, others, rules.score_stride, skip,
-                                  forward, rules.near, rules.gap);
+                                  forward, rules.near, rules.gap, team);
     if (rules.one_way) return there;
     return there + agreement(point + second, line + second, others, point + first, count, rules.score_stride, skip,
-                             inverse, rules.near, rules.gap);
+                             inverse, rules.near, rules.gap, team);
 }
 
 // Match a pair (reference, second scan) from a guess, and write the result.
 void match_pair(global const real4 *point, global const int *start, global const real4 *line, const int2 which,
-                const real4 guess, global real *out, const MatchRules rules) {
+                const real4 guess, global real *out, const MatchRules rules, const Team team) {
     const int first = start[which.x], count = start[which.x + 1] - first;
     const int second = start[which.y], others = start[which.y + 1] - second;
-    const Match match = refine(point + first, line + first, count, point + second, others, guess, rules);
-    const real4 both = mutual_agreement(point, line, first, count, second, others, match.pose, rules);
+    const Match match = refine(point + first, line + first, count, point + second, others, guess, rules, team);
+    const real4 both = mutual_agreement(point, line, first, count, second, others, match.pose, rules, team);
+    if (team.member > 0) return;
     const real all = both.y + both.z + UNSEEN * both.w;
     out[0] = match.pose.x, out[1] = match.pose.y, out[2] = match.pose.z;
     out[3] = all > 0 ? (both.x - (real)0.5 * both.z) / all : 0;

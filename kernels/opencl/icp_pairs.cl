@@ -69,48 +69,59 @@ real add_pairing(real *sums, const real4 line, const real2 place, const real2 ar
 // points that the other scan should see, points through which it saw, and points that it did not see. pose is (x, y,
 // cos, sin).
 real4 agreement(global const real4 *point, global const real4 *line, const int count, global const real4 *other,
-                const int others, const int stride, const int skip, const real4 pose, const real near, const real gap) {
+                const int others, const int stride, const int skip, const real4 pose, const real near, const real gap,
+                const Team team) {
+    const int used = (others + stride - 1) / stride, share = 1 << log_share(used), begin = team.member * share;
     const real scale = near / 3;
-    real4 sum = (real4)(0);
-    int ahead = 0;
-    for (int i = 0; i < others; i += stride) {
-        const real2 p = other[i].xy;
+    real sum[4] = {0, 0, 0, 0};
+    int ahead = others > 0 ? (int)((long)count * begin * stride / others) : 0;
+    for (int k = begin; k < begin + share && k < used; ++k) {
+        const real2 p = other[stride * k].xy;
         const real2 place = (real2)(pose.z * p.x - pose.w * p.y + pose.x, pose.w * p.x + pose.z * p.y + pose.y);
         ahead = points_before(point, count, 1, bearing_of(place), ahead);
         const int which = nearest_point(point, count, ahead, skip, place, near * near);
         if (which >= 0) {
             const real ratio = (line[which].x * place.x + line[which].y * place.y - line[which].z) / scale;
-            sum.x += 1 / (1 + ratio * ratio);
-            sum.y += 1;
+            sum[0] += 1 / (1 + ratio * ratio);
+            sum[1] += 1;
         } else {
             const real4 low = point[ahead > 0 ? ahead - 1 : count - 1], high = point[ahead < count ? ahead : 0];
             const real between = high.z < low.z ? high.z - low.z + FULL_TURN : high.z - low.z;
             const real range = fmin(low.w, high.w);
             if (between <= gap && dot(place, place) < range * range)
-                sum.z += 1;
+                sum[2] += 1;
             else
-                sum.w += 1;
+                sum[3] += 1;
         }
     }
-    return sum;
+    add_over_team(sum, 4, team);
+    return (real4)(sum[0], sum[1], sum[2], sum[3]);
 }
 
 // Write the sums over the pairs of a scan's points at a pose (x, y, cos, sin), and those of blocks, 0 unless full.
 void sum_pairs(global const real4 *point, global const real4 *line, const int count, global const real4 *other,
                const int others, const int stride, const int skip, const real4 pose, const real capture,
-               const real scale, const int last, const int full, real *sums, real *squares) {
-    real open[MATCH_BLOCKS];
-    int ahead = 0;
+               const real scale, const int last, const int full, real *sums, real *squares, const Team team) {
+    const int used = (others + stride - 1) / stride, log = log_share(used), begin = team.member << log;
+    const int own = max(min(used - begin, 1 << log), 0), levels = min(log + 1, MATCH_BLOCKS);
+    real open[MATCH_BLOCKS], whole = 0;
+    int ahead = others > 0 ? (int)((long)count * begin * stride / others) : 0;
     for (int i = 0; i < MATCH_SUMS; ++i) sums[i] = 0;
     for (int i = 0; i < MATCH_BLOCKS; ++i) squares[i] = open[i] = 0;
-    for (int i = 0; i < others; i += stride) {
-        const real2 p = other[i].xy;
+    for (int k = 0; k < own; ++k) {
+        const real2 p = other[stride * (begin + k)].xy;
         const real2 arm = (real2)(pose.z * p.x - pose.w * p.y, pose.w * p.x + pose.z * p.y), place = arm + pose.xy;
         ahead = points_before(point, count, 1, bearing_of(place), ahead);
         const int near = nearest_point(point, count, ahead, skip, place, capture * capture);
         real pull = 0;
         if (near >= 0 && line[near].w > 0) pull = add_pairing(sums, line[near], place, arm, scale, last);
-        if (full) add_to_blocks(squares, open, MATCH_BLOCKS, i, pull);
+        if (full) add_to_blocks(squares, open, levels, k, pull);
+        whole += pull;
     }
-    if (full) close_blocks(squares, open, MATCH_BLOCKS, others);
+    add_over_team(sums, MATCH_SUMS, team);
+    if (full) {
+        close_blocks(squares, open, levels, own);
+        add_joint_blocks(squares, log, whole, team);
+        add_over_team(squares, MATCH_BLOCKS, team);
+    }
 }

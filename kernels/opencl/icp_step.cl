@@ -1,5 +1,5 @@
 // Steps of point-to-line ICP that scalar bodies and bodies in lanes share: places among the bearings of a
-// scan, the normal equations, and sums of blocks of points.
+// scan, the normal equations, sums of blocks of points, and sums over a team of work-items.
 // Blocks: Flyvbjerg and Petersen (1989), "Error estimates on averages of correlated data".
 
 // Sums over pairs: information (6), gradient (3), errors of the lines (6), weights, squared errors, pairs.
@@ -7,6 +7,29 @@
 // Blocks have 1, 2, 4 to 2^(MATCH_BLOCKS - 1) points.
 #define MATCH_BLOCKS 8
 #define FULL_TURN ((real)6.283185307179586)
+
+// With IN_TEAMS the work-items of a group share the points of a match, each with the same pose and sums.
+#if IN_TEAMS
+#define TEAM 256
+#else
+#define TEAM 1
+#endif
+
+// A work-item's number in its team, and memory of the team for MATCH_SUMS numbers of each.
+typedef struct {
+    int member;
+#if IN_TEAMS
+    local real *shared;
+#endif
+} Team;
+
+// Return the binary logarithm of the points of a member, which are enough for all members to cover count; a team of one
+// takes at least the longest block.
+int log_share(const int count) {
+    int log = TEAM > 1 ? 0 : MATCH_BLOCKS - 1;
+    while ((long)TEAM << log < count) ++log;
+    return log;
+}
 
 // Return the bearing of a place in [0, 2 pi).
 real bearing_of(const real2 place) {
@@ -61,4 +84,39 @@ void close_blocks(real *squares, const real *open, const int levels, const int c
         if (count >> l & 1) rest += open[l];
         squares[l + 1] += rest * rest;
     }
+}
+
+// Replace numbers by their sums over the team.
+void add_over_team(real *numbers, const int count, const Team team) {
+#if IN_TEAMS
+    local real *mine = team.shared + team.member;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (int i = 0; i < count; ++i) mine[TEAM * i] = numbers[i];
+    for (int apart = TEAM / 2; apart > 0; apart /= 2) {
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (team.member >= apart) continue;
+        // All loads come first, so that none waits for a store.
+        real part[MATCH_SUMS];
+        for (int i = 0; i < count; ++i) part[i] = mine[TEAM * i + apart];
+        for (int i = 0; i < count; ++i) mine[TEAM * i] = numbers[i] += part[i];
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (int i = 0; i < count; ++i) numbers[i] = team.shared[TEAM * i];
+#endif
+}
+
+// Add the blocks of several members to squares, given the sum of this member's 2^log points.
+void add_joint_blocks(real *squares, const int log, const real sum, const Team team) {
+#if IN_TEAMS
+    barrier(CLK_LOCAL_MEM_FENCE);
+    team.shared[team.member] = sum;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (int l = log + 1; l < MATCH_BLOCKS; ++l) {
+        const int members = 1 << (l - log);
+        if (team.member % members != 0) continue;
+        real total = 0;
+        for (int k = team.member; k < team.member + members && k < TEAM; ++k) total += team.shared[k];
+        squares[l] += total * total;
+    }
+#endif
 }

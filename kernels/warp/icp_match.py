@@ -46,7 +46,7 @@ def functions(flags):
     @wp.func
     def refine(
         point: wp.array(dtype=vec4), line: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, second: wp.int32,
-        others: wp.int32, guess: vec4, rules: MatchRules,
+        others: wp.int32, guess: vec4, rules: MatchRules, member: wp.int32,
     ):  # fmt: skip
         pose = guess
         moved = vec4()
@@ -68,7 +68,7 @@ def functions(flags):
                 skip = 1
             at = vec4(pose.x, pose.y, wp.cos(pose.z), wp.sin(pose.z))
             sums, blocks = sum_pairs(
-                point, line, first, count, second, others, stride, skip, at, capture, scale, last, full
+                point, line, first, count, second, others, stride, skip, at, capture, scale, last, full, member
             )
             iteration += 1
             solved = solve(sums)
@@ -93,7 +93,7 @@ def functions(flags):
     @wp.func
     def mutual_agreement(
         point: wp.array(dtype=vec4), line: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, second: wp.int32,
-        others: wp.int32, pose: vec4, rules: MatchRules,
+        others: wp.int32, pose: vec4, rules: MatchRules, member: wp.int32,
     ):  # fmt: skip
         both = vec4()
         if count > 0 and others > 0:
@@ -105,10 +105,12 @@ def functions(flags):
             skip = int(1)
             if rules.thin == 1:
                 skip = rules.skip
-            both = agreement(point, line, first, count, second, others, stride, skip, forward, rules.near, rules.gap)
+            both = agreement(
+                point, line, first, count, second, others, stride, skip, forward, rules.near, rules.gap, member
+            )
             if rules.one_way == 0:
                 both += agreement(
-                    point, line, second, others, first, count, stride, skip, inverse, rules.near, rules.gap
+                    point, line, second, others, first, count, stride, skip, inverse, rules.near, rules.gap, member
                 )
         return both
 
@@ -116,14 +118,18 @@ def functions(flags):
     @wp.func
     def match_pair(
         point: wp.array(dtype=vec4), start: wp.array(dtype=wp.int32), line: wp.array(dtype=vec4), which: wp.vec2i,
-        guess: vec4, result: wp.array(dtype=real), out: wp.int32, rules: MatchRules,
+        guess: vec4, result: wp.array(dtype=real), out: wp.int32, rules: MatchRules, member: wp.int32,
     ):  # fmt: skip
         first = start[which.x]
         count = start[which.x + 1] - first
         second = start[which.y]
         others = start[which.y + 1] - second
-        pose, moved, sums, blocks, iteration, calm = refine(point, line, first, count, second, others, guess, rules)
-        both = mutual_agreement(point, line, first, count, second, others, pose, rules)
+        pose, moved, sums, blocks, iteration, calm = refine(
+            point, line, first, count, second, others, guess, rules, member
+        )
+        both = mutual_agreement(point, line, first, count, second, others, pose, rules, member)
+        if member > 0:
+            return
         everything = both.y + both.z + UNSEEN * both.w
         score = real(0.0)
         if everything > ZERO:

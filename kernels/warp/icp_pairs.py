@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import icp_step
+from .icp_step import MATCH_BLOCKS
 from .prelude import precision
 
 
@@ -24,6 +25,8 @@ def functions(flags):
     step = icp_step.functions(flags)
     Sums, bearing_of, points_before = step.Sums, step.bearing_of, step.points_before
     Blocks, add_to_blocks, close_blocks = step.Blocks, step.add_to_blocks, step.close_blocks
+    log_share, add_over_team, add_joint_blocks = step.log_share, step.add_over_team, step.add_joint_blocks
+    IN_TEAMS = "IN_TEAMS" in flags
     ZERO, ONE, THREE = real(0.0), real(1.0), real(3.0)
     FULL_TURN = real(6.283185307179586)
     # Rounding errors of bounds are far below this share.
@@ -110,14 +113,19 @@ def functions(flags):
     @wp.func
     def agreement(
         point: wp.array(dtype=vec4), line: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, second: wp.int32,
-        others: wp.int32, stride: wp.int32, skip: wp.int32, pose: vec4, near: real, gap: real,
+        others: wp.int32, stride: wp.int32, skip: wp.int32, pose: vec4, near: real, gap: real, member: wp.int32,
     ):  # fmt: skip
+        used = (others + stride - 1) // stride
+        share = int(1 << log_share(used))
+        k = int(member * share)
+        end = wp.min(k + share, used)
         scale = near / THREE
         total = vec4()
-        i = int(0)
         ahead = int(0)
-        while i < others:
-            p = point[second + i]
+        if member > 0:
+            ahead = int(wp.int64(count) * wp.int64(k * stride) / wp.int64(others))
+        while k < end:
+            p = point[second + stride * k]
             x = pose.z * p.x - pose.w * p.y + pose.x
             y = pose.w * p.x + pose.z * p.y + pose.y
             place = vec2(x, y)
@@ -138,7 +146,14 @@ def functions(flags):
                     total += vec4(ZERO, ZERO, ONE, ZERO)
                 else:
                     total += vec4(ZERO, ZERO, ZERO, ONE)
-            i += stride
+            k += 1
+        if IN_TEAMS:
+            numbers = Sums()
+            for j in range(4):
+                numbers[j] = total[j]
+            numbers = add_over_team(numbers)
+            for j in range(4):
+                total[j] = numbers[j]
         return total
 
     # Return the sums over the pairs of a scan's points at a pose (x, y, cos, sin), and those of blocks, 0 unless full.
@@ -146,14 +161,22 @@ def functions(flags):
     def sum_pairs(
         point: wp.array(dtype=vec4), line: wp.array(dtype=vec4), first: wp.int32, count: wp.int32, second: wp.int32,
         others: wp.int32, stride: wp.int32, skip: wp.int32, pose: vec4, capture: real, scale: real, last: wp.bool,
-        full: wp.bool,
+        full: wp.bool, member: wp.int32,
     ):  # fmt: skip
+        used = (others + stride - 1) // stride
+        log = log_share(used)
+        begin = int(member << log)
+        own = wp.max(wp.min(used - begin, 1 << log), 0)
+        levels = wp.min(log + 1, MATCH_BLOCKS)
         sums = Sums()
         blocks = Blocks()
+        whole = real(0.0)
         ahead = int(0)
-        i = int(0)
-        while i < others:
-            p = point[second + i]
+        if member > 0:
+            ahead = int(wp.int64(count) * wp.int64(begin * stride) / wp.int64(others))
+        k = int(0)
+        while k < own:
+            p = point[second + stride * (begin + k)]
             arm = vec2(pose.z * p.x - pose.w * p.y, pose.w * p.x + pose.z * p.y)
             place = vec2(arm.x + pose.x, arm.y + pose.y)
             ahead = points_before(point, first, count, bearing_of(place), ahead)
@@ -164,10 +187,21 @@ def functions(flags):
                 if at.w > ZERO:
                     sums, pull = add_pairing(sums, at, place, arm, scale, last)
             if full:
-                blocks = add_to_blocks(blocks, i, pull)
-            i += stride
+                blocks = add_to_blocks(blocks, levels, k, pull)
+            whole += pull
+            k += 1
         if full:
-            blocks = close_blocks(blocks, others)
+            blocks = close_blocks(blocks, levels, own)
+        if IN_TEAMS:
+            sums = add_over_team(sums)
+            if full:
+                blocks = add_joint_blocks(blocks, log, whole)
+                squares = Sums()
+                for level in range(MATCH_BLOCKS):
+                    squares[level] = blocks[level]
+                squares = add_over_team(squares)
+                for level in range(MATCH_BLOCKS):
+                    blocks[level] = squares[level]
         return sums, blocks
 
     return SimpleNamespace(**locals())

@@ -1,5 +1,5 @@
 """Steps of point-to-line ICP that scalar bodies and bodies in lanes share: places among the bearings of a
-scan, the normal equations, and sums of blocks of points.
+scan, the normal equations, sums of blocks of points, and sums over a team of work-items.
 
 Blocks: Flyvbjerg and Petersen (1989), "Error estimates on averages of correlated data".
 """
@@ -15,6 +15,56 @@ from .prelude import precision
 MATCH_SUMS = 18
 # Blocks have 1, 2, 4 to 2^(MATCH_BLOCKS - 1) points.
 MATCH_BLOCKS = 8
+# Work-items of a team. With IN_TEAMS the work-items of a group share the points of a match, each with the same pose and
+# sums.
+TEAM = 256
+# Bodies of functions of a team. Work-items of processors share nothing: the first member takes all points.
+_COOPERATES = """
+#if defined(__CUDA_ARCH__)
+return true;
+#else
+return false;
+#endif
+"""
+_ADD_OVER_TEAM = """
+#if defined(__CUDA_ARCH__)
+__shared__ {real} shared[{sums} * {team}];
+{real} *mine = shared + threadIdx.x;
+wp::vec_t<{sums}, {real}> total = numbers;
+__syncthreads();
+for (int i = 0; i < {sums}; ++i) mine[{team} * i] = numbers.c[i];
+for (int apart = {team} / 2; apart > 0; apart /= 2) {{
+    __syncthreads();
+    if (threadIdx.x >= apart) continue;
+    // All loads come first, so that none waits for a store.
+    {real} part[{sums}];
+    for (int i = 0; i < {sums}; ++i) part[i] = mine[{team} * i + apart];
+    for (int i = 0; i < {sums}; ++i) mine[{team} * i] = total.c[i] += part[i];
+}}
+__syncthreads();
+for (int i = 0; i < {sums}; ++i) total.c[i] = shared[{team} * i];
+return total;
+#else
+return numbers;
+#endif
+"""
+_ADD_JOINT_BLOCKS = """
+wp::vec_t<{blocks}, {real}> blocks = before;
+#if defined(__CUDA_ARCH__)
+__shared__ {real} shared[{team}];
+__syncthreads();
+shared[threadIdx.x] = sum;
+__syncthreads();
+for (int l = log + 1; l < {levels}; ++l) {{
+    const int members = 1 << (l - log), member = threadIdx.x;
+    if (member % members != 0) continue;
+    {real} total = 0;
+    for (int k = member; k < member + members && k < {team}; ++k) total += shared[k];
+    blocks.c[l] += total * total;
+}}
+#endif
+return blocks;
+"""
 
 
 @functools.cache
@@ -22,12 +72,30 @@ def functions(flags):
     """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
+    IN_TEAMS = "IN_TEAMS" in flags
     Sums = wp.types.vector(length=MATCH_SUMS, dtype=real)
     # Squares, and sums of blocks that wait for the second half of their pair.
     Blocks = wp.types.vector(length=2 * MATCH_BLOCKS, dtype=real)
     ZERO, ONE, THREE, FOUR = real(0.0), real(1.0), real(3.0), real(4.0)
     FULL_TURN = real(6.283185307179586)
     DAMPING, LEAST_DAMPING, DAMPED_TURN = real(1e-5), real(1e-9), real(1.00001)
+
+    # Return whether members share memory.
+    @wp.func_native(_COOPERATES)
+    def cooperates() -> bool: ...
+
+    # Return the binary logarithm of the points of a member, which are enough for all members to cover count; a team of
+    # one takes at least the longest block.
+    @wp.func
+    def log_share(count: wp.int32):
+        members = int(1)
+        log = int(MATCH_BLOCKS - 1)
+        if IN_TEAMS and cooperates():
+            members = TEAM
+            log = 0
+        while (members << log) < count:
+            log += 1
+        return log
 
     # Return the bearing of a place in [0, 2 pi).
     @wp.func
@@ -81,12 +149,12 @@ def functions(flags):
 
     # Return blocks with the number of the i-th point: element l is the sum of squared sums of blocks of 2^l points.
     @wp.func
-    def add_to_blocks(before: Blocks, i: wp.int32, number: real):
+    def add_to_blocks(before: Blocks, levels: wp.int32, i: wp.int32, number: real):
         blocks = before
         total = number
         waits = int(0)
         for level in range(MATCH_BLOCKS):
-            if waits == 0:
+            if waits == 0 and level < levels:
                 blocks[level] += total * total
                 if ((i >> level) & 1) == 0:
                     blocks[MATCH_BLOCKS + level] = total
@@ -97,13 +165,27 @@ def functions(flags):
 
     # Return blocks with the last ones, which have fewer points.
     @wp.func
-    def close_blocks(before: Blocks, count: wp.int32):
+    def close_blocks(before: Blocks, levels: wp.int32, count: wp.int32):
         blocks = before
         rest = real(0.0)
         for level in range(MATCH_BLOCKS - 1):
-            if ((count >> level) & 1) == 1:
-                rest += blocks[MATCH_BLOCKS + level]
-            blocks[level + 1] += rest * rest
+            if level + 1 < levels:
+                if ((count >> level) & 1) == 1:
+                    rest += blocks[MATCH_BLOCKS + level]
+                blocks[level + 1] += rest * rest
         return blocks
+
+    numbers = {
+        "real": "double" if real == wp.float64 else "float", "sums": MATCH_SUMS, "blocks": 2 * MATCH_BLOCKS,
+        "levels": MATCH_BLOCKS, "team": TEAM,
+    }  # fmt: skip
+
+    # Return the sums of numbers over the team.
+    @wp.func_native(_ADD_OVER_TEAM.format(**numbers))
+    def add_over_team(numbers: Sums) -> Sums: ...
+
+    # Return blocks with those of several members, given the sum of this member's 2^log points.
+    @wp.func_native(_ADD_JOINT_BLOCKS.format(**numbers))
+    def add_joint_blocks(before: Blocks, log: wp.int32, sum: real) -> Blocks: ...
 
     return SimpleNamespace(**locals())

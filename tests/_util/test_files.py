@@ -1,4 +1,4 @@
-"""Files are written whole or not at all, and an interrupt at any line leaves no unfinished one."""
+"""Files are written whole or not at all, and an interrupt at any line leaves no unfinished file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def write(stream: object) -> None:
     stream.write(NEW[3:])
 
 
-# Calls, each with the contents of a.txt and b.txt after it; None for no file.
+# Calls, with the contents of a.txt and b.txt after each; None for no file.
 CALLS: dict[str, tuple[Callable[[Path], object], dict[str, bytes | None]]] = {
     "check a new file": (lambda folder: check_writable(folder / "b.txt"), {"a.txt": OLD, "b.txt": None}),
     "check an old file": (lambda folder: check_writable(folder / "a.txt"), {"a.txt": OLD, "b.txt": None}),
@@ -61,7 +61,7 @@ def test_an_interrupt_at_any_line_leaves_all_or_nothing(tmp_path, call):
     for line in lines:
         fresh()
         reached += interrupt(lambda: run(tmp_path), line)
-        # A file is whole, whatever an interrupt at the last lines has said.
+        # The files are whole, even if an interrupt at the last lines was raised.
         assert contents(tmp_path) in (before, after), line
     assert reached == len(lines)
     assert not files._UNFINISHED

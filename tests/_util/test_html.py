@@ -18,7 +18,7 @@ SCANNER = gs.Scanner(np.radians(np.arange(-120, 121, 3)), range_max=8.0)
 
 
 class Checked(HTMLParser):
-    """Collects the cells of tables, and checks that tags are closed in their order."""
+    """A parser that collects the cells of tables, and checks that tags are closed in order."""
 
     def __init__(self, text):
         super().__init__()
@@ -123,7 +123,7 @@ def test_a_map_is_a_small_picture_with_its_walls(shape):
     picture = Image.open(io.BytesIO(thumbnail(grid.unknown, grid.occupied)))
     pixels = np.asarray(picture)
     assert picture.mode == "L" and max(pixels.shape) <= WIDEST
-    assert (pixels[-1] == 60).all()  # row 0 of the map is the lowest
+    assert (pixels[-1] == 60).all()  # Row 0 of the map is the lowest.
     assert shape[0] == 1 or pixels[0, -1] == 205
 
 

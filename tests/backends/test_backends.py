@@ -19,7 +19,7 @@ def fake_devices(*rows: tuple[str, str, str]) -> list[backends.Device]:
 
 
 def use_devices(monkeypatch, listed: list[backends.Device], verdicts: dict[str, Verdict] | None = None) -> None:
-    """Let devices be present beside NumPy, and proved unless a verdict differs."""
+    """Pretend that devices are present beside NumPy, and proved unless a verdict says otherwise."""
     rows = [*listed, backends.Device("numpy", "NumPy reference", "cpu", True, "", "numpy")]
     monkeypatch.setattr(listing, "present", lambda entry: ([d for d in rows if d.backend == entry.name], []))
     proved = Verdict(True, 1, True, rate=100.0)
@@ -106,7 +106,7 @@ def test_a_backend_name_alone_prefers_a_gpu_and_refuses_simulators(monkeypatch):
 
 
 def test_a_driver_is_named_like_a_device(monkeypatch):
-    """Intel's driver on any processor; on Intel's processors it precedes other drivers."""
+    """Intel's driver is named on any processor, and precedes other drivers on Intel's."""
     rows = [("AMD EPYC", "Portable Computing Language 3.0"), ("AMD EPYC", "Intel(R) OpenCL 2026")]
     own = [backends.Device("opencl", name, "cpu", True, "", f"opencl:{i}:0", d) for i, (name, d) in enumerate(rows)]
     use_devices(monkeypatch, own)

@@ -52,7 +52,7 @@ class Plain(Backend):
 
 
 class Watching(Proxy):
-    """A proxy that lists the kernels that are launched."""
+    """A proxy that lists the launched kernels."""
 
     def __init__(self, backend: Backend) -> None:
         super().__init__(backend)
@@ -93,7 +93,7 @@ def test_a_recording_starts_nothing_until_it_is_called():
 
 
 def test_abilities_that_a_backend_lacks():
-    """They do nothing where that is correct; else the message names the device."""
+    """Such methods do nothing where that is correct; elsewhere an error names the device."""
     device, array = Plain(), np.zeros(3)
     device.begin_batch()
     device.submit()
@@ -115,7 +115,7 @@ def public(kind: type) -> set[str]:
 
 
 def test_a_proxy_defines_every_method():
-    """But those that start programs, which use ``compile``."""
+    """Methods that start programs are the exception: they use ``compile``."""
     assert public(Backend) - public(Proxy) == {"run", "record", "replay"}
     for name in public(Backend) & public(Proxy):
         mine, theirs = getattr(Proxy, name), getattr(Backend, name)
@@ -167,7 +167,7 @@ def test_a_proxy_forwards_properties():
 
 
 def test_a_proxy_sees_each_launch_of_programs_and_recordings(backend):
-    """Of real devices: the results are theirs, and every launch goes through ``compile``."""
+    """On real devices, results are equal, and every launch goes through ``compile``."""
     device = Watching(get_backend(backend))
     squared = device.upload(np.arange(6, dtype=INT))
     density, table = device.upload(np.arange(10, dtype=REAL)), device.empty(7 * 6, REAL, zero=True)

@@ -67,7 +67,7 @@ def test_a_damaged_entry_is_none_and_is_written_again(place, damage):
 
 
 def test_two_entries_that_were_exchanged_are_none(place):
-    """Each is whole, and was written by gpusense."""
+    """Each of both is whole, and was written by gpusense."""
     store_entry("first", b"one")
     store_entry("second", b"two")
     first, second = (place / folders.OWN / cache._file(key) for key in ("first", "second"))
@@ -125,7 +125,7 @@ def test_what_is_no_regular_file_is_no_entry_and_stays(place, tmp_path, caplog, 
     assert load_entry("key") is None
     discard_entry("key")
     store_entry("key", b"new")
-    # The folder among temporary files has it now.
+    # The entry is in the folder for temporary files now.
     assert load_entry("key") == b"new" and contents(place)[f"{folders.OWN}/{path.name}"] == before
     (message,) = caplog.messages
     assert f"the cache folder {place} cannot be written: " in message and "is no regular file" in message
@@ -170,7 +170,7 @@ def test_the_cache_is_bounded_and_evicts_the_oldest(place, monkeypatch):
 
 
 def foreign_files(folder: Path) -> list[Path]:
-    """Make files that a cache did not write: other names, an entry's name without its head, another key's head."""
+    """Make files that no cache wrote: other names, an entry's name without its head, the head of another key."""
     name = hashlib.sha256(b"x").hexdigest()
     head = cache._head(cache._digest("key"), b"payload") + b"payload"
     texts = {
@@ -277,7 +277,7 @@ def test_packed_files_stay_below_their_folder(name):
 
 
 def test_other_contents_are_no_packed_files(monkeypatch):
-    """Each byte of packed files is changed, and the sizes that they claim are not believed."""
+    """A change of any byte of packed files is found, and the sizes in their heads are not trusted."""
     with pytest.raises(ValueError, match="must hold packed files"):
         unpack(b"something else")
     whole = pack({"a": b"some text" * 9, "b": b""})

@@ -22,7 +22,7 @@ NUMPY = Device("numpy", "NumPy reference", "cpu", True, "", "numpy")
 
 @pytest.fixture
 def machine(monkeypatch):
-    """Return a function that makes a machine of devices, some of which fail; it returns the list of opened ones.
+    """Return a function that imitates a machine's devices, some of which fail; it returns the list of opened ones.
 
     A failure is an error at opening, or a verdict.
     """
@@ -89,7 +89,7 @@ def test_one_line_says_what_failed_and_why(machine, caplog, kind):
 
 @pytest.mark.parametrize("kind", [BROKEN, PASSING, KEPT])
 def test_numpy_is_taken_with_one_line_whatever_else_is_said(machine, monkeypatch, caplog, kind):
-    """NumPy needs no folder of kernels. The line appears in each process, even for kept verdicts."""
+    """NumPy needs no folder of kernels. Each process prints the line, even for stored verdicts."""
     machine([GPU, WARP], {"opencl:0:0": kind, "warp:cpu": kind})
     real = selection._open
 
@@ -164,12 +164,12 @@ def test_a_library_that_fails_to_list_its_devices_is_absent(monkeypatch):
     assert device.reason == "the devices of numpy cannot be listed: [Errno 30] Read-only file system"
 
 
-# ---- one look
+# ---- a single look-up
 
 
 @pytest.fixture
 def looks(machine, monkeypatch):
-    """Return the list of looks for the default device."""
+    """Return the list of look-ups of the default device."""
     machine([], {})
     seen, real = [], listing.present
     monkeypatch.setattr(listing, "present", lambda entry: seen.append(entry.name) or real(entry))
@@ -205,7 +205,7 @@ def test_a_change_of_a_variable_looks_anew(looks, monkeypatch, variable):
 
 
 def test_variables_are_compared_where_the_environment_has_no_dictionary_of_its_own(looks, monkeypatch):
-    """Other implementations of Python, or a mapping in the place of ``os.environ``."""
+    """Other implementations of Python lack it, and so does a mapping in place of ``os.environ``."""
     monkeypatch.setattr(os, "environ", dict(os.environ))
     get_backend("auto")
     count = len(looks)
@@ -220,7 +220,7 @@ def test_a_forked_process_looks_anew(looks, monkeypatch):
     get_backend("auto")
     count = len(looks)
     child = os.getpid() + 1
-    # A device that the parent has opened would be refused.
+    # The child would refuse a device that the parent has opened.
     monkeypatch.setattr(selection, "_OPENED", [])
     monkeypatch.setattr(os, "getpid", lambda: child)
     get_backend("auto")
@@ -285,7 +285,7 @@ for name in ("opencl:portable", "warp:cpu"):
     except ValueError as error:
         print(str(error).startswith("backend: "))
 """
-# File systems of a container: all are read-only; the second has a folder for temporary files without execution.
+# File systems of containers: both are read-only; the second has a temporary folder that is mounted without execution.
 _MOUNTS = """
 set -e
 mount --make-rprivate /
@@ -326,7 +326,7 @@ def test_a_container_without_a_folder_for_code_has_a_slower_device(needs, kind, 
     said = [line for line in done.stderr.splitlines() if "'auto' is" in line]
     assert len(said) == 1 and said[0].startswith(f"gpusense: 'auto' is {chosen}")
     assert "compiled kernels need a folder that takes 16 MiB and from which code may run" in said[0]
-    # Where nothing is compiled no other line is needed.
+    # Nothing is compiled, so no other line is needed.
     assert len(done.stderr.splitlines()) <= (1 if chosen == "numpy" else 2), done.stderr
     listed = in_container(kind, "-P", "-m", "gpusense", "devices")
     assert listed.returncode == 0, listed.stderr
@@ -338,12 +338,12 @@ def test_a_container_without_a_folder_for_code_has_a_slower_device(needs, kind, 
 
 @pytest.mark.parametrize("variable", ["POCL_DEVICES", "OCL_ICD_VENDORS"])
 def test_a_variable_that_hides_devices_is_the_remedy(needs, tmp_path, variable):
-    """Packages that are installed are not to be installed."""
+    """The remedy names no installation of packages that are installed."""
     needs("opencl")
     fake_driver.pocl_library()
     code = "from gpusense.backends import listing\n"
     code += "print(*[device.reason for device in listing.present(listing.BY_NAME['opencl'])[1]], sep='\\n')"
-    # The library itself is the only driver, so that no simulator is in the way.
+    # The library itself is the only driver, so that no simulator is found.
     vendors = {"OCL_ICD_VENDORS": fake_driver.pocl_library()} if variable == "POCL_DEVICES" else {}
     value = "cuda" if variable == "POCL_DEVICES" else str(tmp_path / "nothing.icd")
     (tmp_path / "nothing.icd").write_text("/nowhere/libnothing.so\n")
@@ -368,7 +368,7 @@ except ValueError as error:
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root can give folders away")
 def test_pocl_that_a_program_has_loaded_must_keep_its_kernels_where_only_this_user_writes(needs, tmp_path):
-    """It loads libraries from the folder that it has chosen by itself."""
+    """PoCL loads libraries from the folder that it chose when it was loaded."""
     needs("opencl")
     fake_driver.pocl_library()
     environment = fake_driver.environment(tmp_path, GPUSENSE_PROOF="off")

@@ -44,7 +44,7 @@ def test_poses_on_the_device_stay_there(method, real, warp_as_gpu, warp_copies):
         held = found.held if isinstance(given, Array) else found
         assert type(found) is type(given) and tuple(held.shape) == shape
         assert differing(held.numpy(), expected) == 0
-        # Rays and readings go there, and the two numbers of the status of poses come back.
+        # Rays and readings go to the device, and the two numbers of the pose status come back.
         assert all(size <= 16 * BEAMS for _, size in warp_copies)
         assert [size for way, size in warp_copies if way == "down"] == [8]
 
@@ -64,7 +64,7 @@ def test_out_on_the_device(method, warp_as_gpu, warp_copies):
 
 @pytest.mark.parametrize("selection", ["opencl", "warp"])
 def test_copies_on_the_device(selection, needs):
-    """From any place to any other, after the commands that were started before."""
+    """Copy from any place to any other, after all earlier commands."""
     backend, real = get_backend(needs(selection)), np.dtype(np.float32)
     source, target = backend.blank(8, real), backend.blank(6, real)
     backend.upload(np.arange(8, dtype=real), source)
@@ -132,7 +132,7 @@ def test_in_pieces_on_the_device(method, warp_as_gpu, monkeypatch):
 @pytest.mark.parametrize("count", [COUNT, 0])
 @pytest.mark.parametrize("where", [to_device, np.array], ids=["device", "host"])
 def test_no_array_of_a_call_is_kept(where, count, warp_as_gpu):
-    """A scan's arrays must live until the device has read them, and no longer: filters call for hours."""
+    """A scan's arrays must live until the device has read them, and no longer, since filters run for hours."""
     model, caster = gs.BeamModel(GRID, SCANNER, backend=warp_as_gpu), gs.RayCaster(GRID, RANGE, backend=warp_as_gpu)
     for scan in (SCAN, np.full(BEAMS, np.nan)):
         model.log_likelihood(where(POSES[:count]), scan)

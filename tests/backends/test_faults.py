@@ -37,7 +37,7 @@ def test_out_of_memory_halves_the_batch_and_changes_no_bit(backend, model_type):
     model = model_type(grid, scanner, backend=backend)
     whole = model.log_likelihood(poses, ranges)
     device = get_backend(backend)
-    # Of 2000 particles; GPUs keep the 41 numbers of each of a beam model's 256 until they are summed.
+    # For 2000 particles; GPUs store 41 numbers for each of 256 particles of a beam model until they are summed.
     room_for = 11_000 if device.info.kind == "gpu" and model_type is gs.BeamModel else 2500
 
     model._workspace.release()

@@ -48,7 +48,7 @@ def poison(key: str) -> None:
 def test_no_code_is_read_from_a_folder_that_others_can_change(
     tmp_path, temporary, monkeypatch, caplog, variable, where
 ):
-    """Whichever variable chose it; the message names the variable, the folder, and the rule."""
+    """The message names the folder, the rule, and the variable that chose the folder."""
     for name in ("GPUSENSE_CACHE_DIR", "XDG_CACHE_HOME", "GPUSENSE_CACHE"):
         monkeypatch.delenv(name, raising=False)
     place = {
@@ -74,7 +74,7 @@ def test_no_code_is_read_from_a_folder_that_others_can_change(
         os.chown(folder, 0, -1)
         folder.chmod(0o700)
         folders._checked.clear()
-        # What was refused was not written to.
+        # Nothing was written to a refused folder.
         assert load_entry(f"{variable} {rule}") == b"code"
         for path in [*entries_in(place), *temporary.rglob("*.gpusense")]:
             path.unlink(missing_ok=True)
@@ -152,7 +152,7 @@ def test_the_group_of_one_user_has_the_users_name_and_no_other_member(monkeypatc
 
 @with_owners
 def test_the_owners_outside_of_a_user_namespace_are_trusted(monkeypatch):
-    """They are root of the machine; a user of that number within the namespace is not."""
+    """Such an owner is root of the machine; a user of that number within the namespace is not trusted."""
     import builtins
     import io
 
@@ -231,7 +231,7 @@ assert all(cache.load_entry(f"{sys.argv[1]} {number}") for number in range(40))
 
 
 def test_processes_may_make_the_folder_at_once(place, tmp_path):
-    """None finds a folder without a marker, and none reports anything."""
+    """No process finds a folder without a marker, and no process reports anything."""
     started = [
         subprocess.Popen(
             [sys.executable, "-c", _COLD, f"{number}"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,

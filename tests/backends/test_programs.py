@@ -1,4 +1,4 @@
-"""Programs of earlier calls: which are kept, for how long, and with which objects they go."""
+"""Programs of earlier calls: which are kept, for how long, and which objects free them."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_arguments_change_from_call_to_call(backend):
 
 
 def test_programs_of_threads_are_their_owners():
-    """Models of two threads on one device have separate caches; a shared model has a lock around each call."""
+    """Models of two threads on one device have separate caches; a shared model locks each call."""
     model = gs.LikelihoodFieldModel(GRID, SCANNER, backend="numpy")
     expected = [model.log_likelihood(POSES[:count], RANGES) for count in (1, 2)]
     wrong = []

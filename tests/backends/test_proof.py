@@ -1,4 +1,4 @@
-"""Drivers that fail end no process of a user's: verdicts, the order in which settings give way, and real fakes."""
+"""Failing drivers end no user's process: verdicts, the order in which settings give way, and compiled fake drivers."""
 
 from __future__ import annotations
 
@@ -72,8 +72,7 @@ ABORT = "ends the process with SIGABRT (LLVM ERROR: no)"
     ("fails", "tried", "left"),
     [
         ({(VECTORS, 16): ABORT}, [(16, True), (8, True)], (True, 8, True)),
-        ({(VECTORS, 16): ABORT, (VECTORS, 8): "hangs: no answer in 60 s"}, [(16, True), (8, True), (1, True)],
-         (True, 1, True)),
+        ({(VECTORS, 16): ABORT, (VECTORS, 8): "wrong"}, [(16, True), (8, True), (1, True)], (True, 1, True)),
         ({(FLOAT64, 0): "wrong: ranges"}, [(16, True), (16, False)], (True, 16, False)),
         ({(FLOAT64, 0): ABORT, (VECTORS, 16): "wrong"}, [(16, True), (16, False), (8, False)], (True, 8, False)),
         ({(SCALAR, 0): ABORT}, [(16, True)], (False, 1, False)),
@@ -93,7 +92,7 @@ def test_a_setting_that_fails_gives_way_to_the_next_more_modest_one(driver, capl
     assert "opencl:0:0 (Some device, Driver 1)" in line and verdict.reason in line and "\n" not in line
     left_info = proof.apply(INFO, verdict)
     assert (left_info.lanes, left_info.float64) == left[1:]
-    # It is reported once, and kept.
+    # The verdict is reported once, and stored.
     proof._known.clear()
     assert verdict_on(INFO) == verdict
     assert asked == tried and len(caplog.messages) == 1
@@ -115,6 +114,20 @@ def test_a_verdict_is_made_anew_when_its_key_changes(driver, monkeypatch, change
     assert len(tried) == 2
     verdict_on(INFO, anew=True)
     assert len(tried) == 3
+
+
+def test_a_hang_lasts_once_it_has_happened_in_two_processes(driver):
+    """A machine that was busy once does not lose a device for good."""
+    tried = driver({(VECTORS, 16): "hangs: no answer in 60 s"})
+    for _ in range(3):
+        proof._known.clear()
+        assert verdict_on(INFO).lanes == 8
+        verdict_on(INFO)
+    assert tried == 2 * [(16, True), (8, True)]
+    verdict_on(INFO, anew=True)
+    proof._known.clear()
+    verdict_on(INFO)
+    assert tried == 4 * [(16, True), (8, True)]
 
 
 def test_a_child_that_something_else_ended_is_no_lasting_verdict(driver):
@@ -161,7 +174,7 @@ def test_proofs_can_be_switched_off(driver, monkeypatch):
 
 
 def test_a_system_that_starts_no_child_leaves_devices_usable(monkeypatch, caplog):
-    """It is not a failure of the driver, which is trusted in this process; the next process proves it."""
+    """The driver is not at fault: this process trusts it, and the next one proves it."""
     monkeypatch.setattr(sys, "executable", "/nowhere/python3")
     for _ in range(2):
         assert verdict_on(INFO) == proof.trust(INFO)
@@ -189,7 +202,7 @@ def test_settings_that_failed_before_the_last_child_stay_off(monkeypatch, caplog
 
 
 def test_a_frozen_program_trusts_devices_and_says_so(driver, monkeypatch, caplog):
-    """Unless a program with an interpreter has proved them."""
+    """It does not if a program with an interpreter has proved them."""
     caplog.set_level("INFO")
     tried = driver({(VECTORS, 16): ABORT})
     monkeypatch.setattr(sys, "frozen", True, raising=False)
@@ -247,7 +260,7 @@ print(json.dumps({"selection": info.selection, "lanes": info.lanes, "float64": i
 
 
 def default_of(tmp_path, **variables):
-    """Return the default backend of a process, and OpenCL by name, in a cold cache and again; and its messages."""
+    """Return the default backend of a process, OpenCL by name, with a cold and a warm cache, and its messages."""
     seconds = {"GPUSENSE_PROOF_SECONDS": os.environ.get("GPUSENSE_PROOF_SECONDS", "60")}
     environment = fake_driver.environment(tmp_path, **seconds | variables)
     runs = [
@@ -257,7 +270,7 @@ def default_of(tmp_path, **variables):
     assert [run.returncode for run in runs] == [0, 0], runs[0].stderr
     first, again = (json.loads(run.stdout.splitlines()[-1]) for run in runs)
     assert first == again and first["distance"] == 3.5
-    # It is said once, when the verdict is made.
+    # The message comes once, with the verdict.
     assert runs[1].stderr == ""
     return first, runs[0].stderr
 
@@ -283,7 +296,7 @@ def test_a_driver_that_fails_altogether_is_named_and_another_backend_is_the_defa
     icd = fake_driver.build(tmp_path, mode, *words)
     limit = {}
     if mode == "hang":
-        # Warp is proved before, as it may need longer.
+        # Warp is proved beforehand, as it may take longer.
         proved = [sys.executable, "-P", "-c", "from gpusense.backends import get_backend; get_backend('warp:cpu')"]
         subprocess.run(proved, env=fake_driver.environment(tmp_path), check=True)
         limit = {"GPUSENSE_PROOF_SECONDS": "8"}
@@ -313,7 +326,7 @@ def test_a_driver_that_fails_in_part_keeps_the_rest(needs, tmp_path, mode, words
 
 @pytest.mark.slow
 def test_a_fake_that_fails_nowhere_is_usable(needs, tmp_path):
-    """Otherwise the tests above would show nothing."""
+    """If this failed, the tests above would prove nothing."""
     needs("opencl")
     found, errors = default_of(tmp_path, OCL_ICD_VENDORS=str(fake_driver.build(tmp_path, "")))
     assert (found["selection"], found["named"], errors) == ("opencl:0:0", "", "")
@@ -323,7 +336,7 @@ def test_a_fake_that_fails_nowhere_is_usable(needs, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(("mode", "end"), [("load", "SIGABRT"), ("exit", "exit code 0, without an answer")])
 def test_a_driver_that_dies_when_it_is_loaded_is_left_out_and_the_others_work(needs, tmp_path, mode, end):
-    """PoCL, from beside pyopencl, is still there."""
+    """PoCL, which comes beside pyopencl, is still present."""
     needs("opencl")
     icd = fake_driver.build(tmp_path, mode)
     found, errors = default_of(tmp_path, OCL_ICD_VENDORS=str(icd.parent))
@@ -338,7 +351,7 @@ def test_a_driver_that_dies_when_it_is_loaded_is_left_out_and_the_others_work(ne
 
 @pytest.mark.slow
 def test_without_a_linker_pocl_says_what_to_install(needs, tmp_path):
-    """PoCL needs the system's linker, and aborts without."""
+    """PoCL needs the system's linker, and aborts without it."""
     needs("opencl")
     fake_driver.pocl_library()
     found, errors = default_of(tmp_path, PATH=str(tmp_path))
@@ -367,7 +380,7 @@ def test_a_target_that_does_not_fit_the_library_ends_in_narrower_kernels(needs, 
         pytest.skip(f"{info.name} has no AVX-512, or the driver is not PoCL")
     (tmp_path / "sitecustomize.py").write_text(_MISFIT)
     found, errors = default_of(tmp_path, PYTHONPATH=str(tmp_path), GPUSENSE_PROOF_SECONDS="12")
-    # Which one it is depends on what is slow in this time.
+    # The load of the machine decides which one it is.
     assert found["lanes"] < 16
     assert "kernels in vectors of 16 " in errors
 

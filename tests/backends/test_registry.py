@@ -102,7 +102,7 @@ def test_a_new_backend_is_listed_and_selected(metal):
 
 
 def test_devices_anew_renews_all_verdicts(metal, monkeypatch):
-    """Renew the verdicts on a library, such as on loading drivers, before its devices are listed; then on devices."""
+    """Verdicts on a library, such as on loading drivers, are renewed before its devices are listed and proved."""
     seen = []
     monkeypatch.setattr(metal, "renew", lambda: seen.append("library"))
     monkeypatch.setattr(metal, "list_devices", lambda: seen.append("list") or [(INFO, "handle")])

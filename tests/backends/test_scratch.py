@@ -75,7 +75,7 @@ def no_code(monkeypatch, *places: str) -> None:
 def test_where_no_code_may_run_only_drivers_that_read_files_have_a_folder(place, made, temporary, monkeypatch):
     no_code(monkeypatch, str(place))
     assert made().is_relative_to(temporary)
-    # One folder serves both where it can.
+    # One folder serves both if possible.
     assert made(executable=False).is_relative_to(temporary)
     no_code(monkeypatch, "/")
     with pytest.raises(OSError, match=r"from which code may run, and there is none among .*no code may run from there"):
@@ -123,7 +123,7 @@ def test_the_folder_goes_with_its_process_and_that_of_a_killed_one_later(made):
     killed.kill()
     killed.wait()
     assert second.exists()
-    # It may be a process that has not locked its folder yet.
+    # The folder may be one that its process has not locked yet.
     made()
     assert second.exists()
     for path in (second, third):
@@ -138,7 +138,7 @@ def text(name: str) -> bytes:
     return scratch._lock_text(name)
 
 
-# Names of folders, the contents of their lock files, other files, and whether a killed process of gpusense left it.
+# Name of a folder, contents of its lock file, other files, and whether a killed process of gpusense left it.
 LEFT = {
     "whole": ("gpusense-run-abcdefgh", text("gpusense-run-abcdefgh"), ["warp/module.o"], True),
     "no lock file yet": ("gpusense-run-abcdefgh", None, [], True),
@@ -157,7 +157,7 @@ LEFT = {
 @pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("case", LEFT)
 def test_only_folders_that_processes_of_gpusense_left_are_removed(tmp_path, made, monkeypatch, case, shared):
-    """In the cache, and in a folder for all users' files."""
+    """Folders are in the cache, or in a folder for files of all users."""
     name, lock, others, removed = LEFT[case]
     parent = folders.own_folder(tmp_path / "cache")
     if shared:

@@ -1,4 +1,4 @@
-"""Large copies in pieces, memory of results that is used again, and bounds that threads share."""
+"""Large copies in pieces, reuse of memory of results, and bounds that several threads compute."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gpusense.backends import arrays, helpers, recycled, staging
 
 
 class _Slot(staging.Slot):
-    """A slot whose copies happen when they are waited for, as late as a device may be."""
+    """A slot that copies only at a wait, as late as a device may copy."""
 
     def __init__(self, size: int) -> None:
         self.bytes, self._work = np.empty(size, np.uint8), []
@@ -35,7 +35,7 @@ class _Slot(staging.Slot):
 
 @pytest.fixture
 def slots(monkeypatch):
-    """Small slots, on a host of several threads."""
+    """Use small slots, on a host of several threads."""
     monkeypatch.setattr(staging, "SLOT", 4096)
     monkeypatch.setattr(staging, "LEAST", 100)
     monkeypatch.setattr(staging, "_LEAST_PIECE", 512)
@@ -45,7 +45,7 @@ def slots(monkeypatch):
 
 @pytest.mark.parametrize("size", [100, 8192, 4096 * staging.SLOTS, 4096 * 41 + 7])
 def test_large_copies(slots, size):
-    """Arrays of less than a slot, of all slots and of several turns arrive as they are, both ways."""
+    """Copy arrays smaller than a slot, as large as all slots, and larger, in both directions."""
     made = []
     large = staging.Staging(lambda number, size: made.append((number, size)) or slots)
     array = np.random.default_rng(size).integers(256, size=size).astype(np.uint8)
@@ -83,7 +83,7 @@ def test_a_failed_copy_leaves_the_slots_to_the_next(slots):
 
 
 def test_memory_of_results_is_used_again():
-    """Memory goes to the next result of its size when no array shows it any more, and not before."""
+    """Memory goes to the next result of its size as soon as no array refers to it, and not before."""
     memory, real = recycled.ResultMemory(), np.dtype(np.float32)
     first = memory.empty((1024, 300), real)
     part, place = first[5:], first.ctypes.data
@@ -111,7 +111,7 @@ def test_memory_of_few_results_waits(monkeypatch):
 
 
 def test_bounds_of_many_poses_are_those_of_columns(monkeypatch):
-    """Rows and threads give the bounds of each column, and NaN where a column holds one."""
+    """Bounds by rows and threads are those of each column, NaN where a column holds a NaN."""
     monkeypatch.setattr(arrays, "_SHARE", 1 << 10)
     for count in (arrays._FEW - 1, arrays._FEW + 7, 40_001):
         poses = np.random.default_rng(count).normal(size=(count, 3))

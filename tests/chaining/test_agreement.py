@@ -41,11 +41,11 @@ def test_where_the_drift_tells_nothing_a_group_needs_evidence(right: list[float]
     assert found.group.tolist() == [0] * len(right)
     assert found.evidence == pytest.approx([-np.log10(1 - np.array(right)).sum()])
     assert found.scans.tolist() == [len(right)]
-    # Over weak steps less is needed.
+    # Over weak steps less evidence is needed.
     weak = np.full(len(right), EVIDENCE_OVER_WEAK)
     assert agreeing(links, poses, weak).all()
     assert agreeing(links[:4], poses, weak[:4]).tolist() == [right[0] > 0.9] * 4
-    # Matches that need none do not count for those that do.
+    # Matches that need no evidence do not count for matches that do.
     mixed = np.where(np.arange(len(right)) < 2, EVIDENCE, 0.0)
     assert agreeing(links, poses, mixed).tolist() == [False] * 2 + [len(right) > 4] * (len(right) - 2)
 

@@ -17,7 +17,7 @@ from gpusense.chaining.places import overlaps
 
 @pytest.fixture(scope="module")
 def lap() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return poses of a lap and some more, scans and odometry."""
+    """Return poses of a little more than a lap, scans and odometry."""
     poses = around(0.5)
     return poses, scans_of(BLOCK, poses, FRONT), drifting(poses)
 
@@ -44,7 +44,7 @@ def test_a_loop_is_closed_and_the_error_falls(lap: tuple[np.ndarray, ...], close
     off = closures.pose - relative(truth[closures.first], truth[closures.second])
     assert np.abs(off[:, :2]).max() < 0.1
     assert (closures.p_right >= 0.9).all()
-    # The end of the lap is known by its closure, the far side is not.
+    # A closure determines the end of the lap, but not the far side.
     deviation = np.sqrt(np.trace(chain.covariance[:, :2, :2], axis1=1, axis2=2))
     assert deviation[0] == 0
     assert deviation[int(len(truth) / 1.1) - 1] < 0.7 * deviation.max()
@@ -90,7 +90,7 @@ def test_key_scans_links_and_bytes_grow_with_the_way(needs) -> None:
 
 @pytest.mark.parametrize("path", [around(1.0, laps=1.0), rounds(1)[::2]], ids=["corridors", "room"])
 def test_passes_through_the_same_places_are_compared_with_a_few(path: np.ndarray) -> None:
-    # Earlier passages are more and more, those that a later one is compared with are not.
+    # The number of earlier passages grows; the number of those that a later one is compared with does not.
     walls = ROOM if len(path) == len(rounds(1)[::2]) else BLOCK
     points, compared = [end_points(scan) for scan in scans_of(walls, path, FRONT)], []
     for laps in (30, 60):
@@ -185,7 +185,7 @@ def test_a_jump_of_time_is_said(needs) -> None:
     times = 0.2 * np.arange(12.0)
     times[6:] += 100.0
     chain = gs.chain_scans(scans_of(ROOM, poses, RING), RING, times=times, backend=needs("opencl"))
-    # The place is recognised.
+    # The chain recognises the place.
     assert not chain.doubts
     assert errors(chain, poses).max() < 0.02
     scans = np.concatenate([scans_of(ROOM, poses[:6], RING), scans_of(BLOCK, poses[6:] + np.array([5, 1.2, 0]), RING)])
@@ -210,7 +210,7 @@ def test_wrong_motions_are_doubtful(step: float, needs) -> None:
 
 @pytest.mark.parametrize(("step", "range_max", "most"), [(1.0, 30.0, 0.3), (0.7, 10.0, 2.0), (1.0, 10.0, 5.0)])
 def test_large_motions_without_odometry_are_found_or_said(step: float, range_max: float, most: float, needs) -> None:
-    # From rest, scans of a corridor agree best where the robot has not moved.
+    # In a corridor, scans agree best where the robot has not moved.
     truth = around(step)
     short = gs.Scanner(FRONT.bearings, range_max=range_max)
     chain = gs.chain_scans(scans_of(BLOCK, truth, short), short, close_loops=False, backend=needs("opencl"))
@@ -237,7 +237,7 @@ def test_a_failed_match_is_bridged_over(needs) -> None:
     assert chain.doubtful[5:7].all() and not chain.doubtful[:5].any() and not chain.doubtful[7:9].any()
     # The scans beside it are linked.
     assert ((chain.links.first <= 4) & (chain.links.second >= 6)).any()
-    # Both steps may be breaks, and so may one that rests on an unsure match, or on a single one after a jump of time.
+    # Both steps may be breaks, as may a step with an unsure match, or with a single match after a jump in time.
     (front,) = chainer.fronts
     assert np.flatnonzero(front.weak).tolist() == [4, 5]
     front.p_right[7] = 0.6
@@ -276,7 +276,7 @@ def test_two_lasers_of_a_robot_agree(needs) -> None:
 
 
 def test_motion_during_scans_is_taken_out(needs) -> None:
-    # A scan of 0.25 s at 0.8 m/s and 1 rad/s, each beam from where the robot is then.
+    # A scan of 0.25 s at 0.8 m/s and 1 rad/s; each beam starts at the robot's pose at its time.
     rate, duration = 0.25, 0.249
     times = rate * np.arange(24)
     heading = times

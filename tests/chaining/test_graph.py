@@ -17,7 +17,7 @@ def scene(seed: int, count: int = 12, outlier: bool = False) -> tuple[np.ndarray
     rng = np.random.default_rng(seed)
     angle = 2 * np.pi * np.arange(count) / count
     truth = np.stack([3 * np.cos(angle), 2 * np.sin(angle), angle + np.pi / 2], axis=1)
-    # Links to the next pose and the one after it, and closures.
+    # Links to the next two poses, and closures.
     first = np.concatenate([np.arange(count - 1), np.arange(count - 2), [0, 1, 2]])
     second = np.concatenate([np.arange(1, count), np.arange(2, count), [count - 1, count - 2, count // 2]])
     root = rng.normal(0, 3, (len(first), 3, 3)) + 4 * np.eye(3)
@@ -146,14 +146,14 @@ def test_covariances_are_blocks_of_the_dense_inverse(count: int) -> None:
         wide = np.zeros((3, 3 * count))
         wide[:, 3 * a : 3 * a + 3], wide[:, 3 * b : 3 * b + 3] = one[n], two[n]
         assert np.allclose(relative[n], wide @ joint @ wide.T, rtol=1e-6, atol=1e-10)
-    # Those of a few anchors, with all others eliminated, are the same.
+    # The covariances of a few anchors, with all other poses eliminated, are the same.
     some = Drift(found, most=max(count // 3, 1))
     pairs = np.array([(a, b) for a in some.anchors for b in some.anchors if a < b], np.int64).reshape(-1, 2).T
     assert np.allclose(some.relative(*pairs), Drift(found, most=count).relative(*pairs), rtol=1e-6, atol=1e-10)
 
 
 def test_breaks_of_a_long_graph_are_seen_between_its_anchors() -> None:
-    # Each pose is linked to the next one; a link in the middle tells hardly anything.
+    # Each pose is linked to the next one; a link in the middle has hardly any information.
     count, broken = 320, 161
     information = np.tile(np.diag([1e4, 1e4, 1e5]), (count - 1, 1, 1))
     information[broken - 1] = np.diag([1.0, 1.0, 4.0])
@@ -181,7 +181,7 @@ def test_closures_of_eliminated_poses_count_between_kept_ones() -> None:
     links = Links.of(MATCH, first, second, moved, np.tile(np.diag([1e4, 2e4, 4e4]), (len(first), 1, 1)))
     again = np.arange(1, lap - 1, 3)
     moved = pose_difference(poses[again], poses[again + lap + 1])
-    # As along a corridor nothing is known along x.
+    # As along a corridor, nothing is known along x.
     closures = Links.of(
         CLOSURE, again, again + lap + 1, moved, np.tile(np.diag([0.0, 900.0, 900.0]), (len(again), 1, 1))
     )

@@ -16,7 +16,7 @@ from gpusense.chaining.links import Links
 
 AHEAD = gs.Scanner(FRONT.bearings, FRONT.range_max, mount=(0.25, 0.0, 0.05))
 BACK = gs.Scanner(FRONT.bearings, FRONT.range_max, mount=(-0.3, 0.1, np.pi))
-# Another laser than the others.
+# A laser unlike the others.
 SIDE = gs.Scanner.uniform(angle_min=-2.0, angle_increment=0.02, count=201, range_max=12.0, mount=(0.0, 0.2, 0.7))
 
 
@@ -44,7 +44,7 @@ def wrong(links: Links, truth: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def lap() -> tuple[np.ndarray, list[np.ndarray], np.ndarray, np.ndarray]:
-    """Return poses of a lap and some more, scans of two lasers in turn, the laser of each, and odometry."""
+    """Return poses of a little more than a lap, scans of two lasers in turn, the laser of each, and odometry."""
     poses = around(0.5)
     scans, sensor = seen(BLOCK, poses, [AHEAD, BACK])
     return poses, scans, sensor, drifting(poses)
@@ -65,7 +65,7 @@ def test_lasers_in_turn_are_one_trajectory(lap: tuple, chains: dict, with_odomet
     (truth, _, sensor, _), chain = lap, chains[with_odometry]
     assert chain.poses.shape == truth.shape and chain.sensor.tolist() == sensor.tolist()
     assert errors(chain, truth).max() < 0.2
-    # At first one laser alone tells the motion, without odometry.
+    # At first, without odometry, only one laser determines the motion.
     assert not chain.doubtful[3:-1].any()
     kinds = set(chain.links.kind.tolist())
     assert {"match", "coupling", "closure"} <= kinds and ("odometry" in kinds) == with_odometry
@@ -110,14 +110,14 @@ def test_a_direction_that_one_laser_observes_is_no_doubt(needs) -> None:
     one = gs.chain_scans(scans[1::2], wall, backend=needs("opencl"))
     assert one.doubtful[1:].all()
     both = gs.chain_scans(scans, [FRONT, wall], sensor=sensor, backend=needs("opencl"))
-    # Only to the last scan, which is one of the wall.
+    # The link is only to the last scan, which shows the wall.
     assert both.doubtful.tolist() == [False] * 39 + [True]
     assert errors(both, truth).max() < 0.1
     assert np.sqrt(both.covariance[-2, 0, 0]) < 0.2
 
 
 def test_loops_are_closed_between_lasers_in_front_and_rear(needs) -> None:
-    # There and back again, turned around: what the rear saw is in front.
+    # There and back again, turned around: the front sees the places that the rear saw.
     walls = BLOCK
     ahead = np.array([(x, 1.25, 0.0) for x in np.arange(2.0, 15.0, 0.35)])
     turn = np.array([(15.0, 1.25, t) for t in np.arange(0.15, np.pi, 0.15)])
@@ -142,7 +142,7 @@ def test_lasers_of_different_geometry_start_and_end_apart(needs) -> None:
         backend=needs("opencl"),
     )  # fmt: skip
     assert errors(chain, truth[keep]).max() < 0.05
-    # One laser alone measures the last motion.
+    # Only one laser measures the last motion.
     assert not chain.doubtful[:-1].any()
 
 

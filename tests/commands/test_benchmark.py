@@ -59,7 +59,7 @@ def test_quick_run_writes_whole_files(needs, tmp_path, capsys):
     for name in images:
         assert (folder / name).read_bytes().startswith(b"\x89PNG")
         assert f"]({name})" in (folder / "report.md").read_text(encoding="utf-8")
-    # The same again is as exact, with the old report's sizes.
+    # A repetition has the same errors, with the sizes of the old report.
     argv = [
         "bench", "--no-peers", *chosen, *methods, "--slower", "1e9", "--compare", str(folder / "report.json"),
         "--repeats", "1",
@@ -88,7 +88,7 @@ def test_table_on_the_terminal(capsys):
 
 
 def test_the_recommendation_follows_the_request(capsys):
-    """A time that nothing keeps, one that all keep, and an error that only the model itself keeps."""
+    """Limits are a time below that of every method, one above all, and an error that only the model itself keeps."""
     own = [*FIELD, *SMALL, "--backend", "numpy"]
     for wish, answer in (
         (["--max-time", "1 us"], "field on numpy, 1 x 7, at most 1 us: no method"),

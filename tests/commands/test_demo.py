@@ -46,7 +46,7 @@ def test_demo_picture(needs, tmp_path, monkeypatch, capsys):
         assert image.size == (2250, 1470)
         pixels = np.asarray(image.convert("RGB")).astype(np.int32) @ [1 << 16, 1 << 8, 1]
     assert len(np.unique(pixels)) > 1000
-    # Each of the four maps is drawn: neither one colour nor the same as another.
+    # All four maps are drawn: none has a single colour, and no two are equal.
     parts = [half for row in np.array_split(pixels, 2) for half in np.array_split(row, 2, axis=1)]
     assert len({part.tobytes() for part in parts}) == 4
     assert all(len(np.unique(part)) > 100 for part in parts)

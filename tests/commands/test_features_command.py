@@ -54,7 +54,7 @@ def test_features_of_a_log_are_written_and_drawn(capsys, log, tmp_path):
 
 
 def test_landmarks_are_those_of_map_features(capsys, log, tmp_path, monkeypatch):
-    """Also where calls are shorter than the log."""
+    """They are, even if a call takes fewer scans than the log has."""
     monkeypatch.setattr(command, "_CALL", 5)
     out, plot = tmp_path / "landmarks.csv", tmp_path / "landmarks.svg"
     text = run(capsys, "--log", log, "--map-out", out, "--map-plot", plot, "--kinds", "corner", "door")

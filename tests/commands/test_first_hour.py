@@ -55,7 +55,7 @@ def test_commands_have_the_defaults_of_the_library(capsys, recorded, model, para
 
 
 def interrupt_at(monkeypatch, index):
-    """Let Ctrl-C come while a scan is scored."""
+    """Press Ctrl-C while a scan is scored."""
     add = scoring.LogScoring.add
 
     def interrupted(self, number, scan):

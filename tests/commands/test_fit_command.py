@@ -1,4 +1,4 @@
-"""``gpusense fit``: parameters of a log that is made up here, of a real one, of pairs; files, hold-out, bad input."""
+"""``gpusense fit``: parameters of a simulated log, of a real one, of pairs; files, hold-out, bad input."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def of_log(folder):
 
 
 def test_the_parameters_of_a_simulated_log_are_found(capsys, recorded, tmp_path):
-    """Within 4 standard errors of 6 parameters, which one of 2600 such logs is not."""
+    """All 6 parameters are within 4 standard errors, except in one of 2600 such logs."""
     out = tmp_path / "made" / "here"
     code, text, err = run(capsys, *of_log(recorded), "--json", "--out", out, "--incidence", 3)
     assert (code, err) == (0, "")
@@ -85,7 +85,7 @@ def test_pairs_are_fitted_as_the_log_they_come_from(capsys, recorded):
     for name in ("pairs.csv", "pairs.csv.gz"):
         code, text, _ = run(capsys, "--pairs", recorded / name, "--range-max", RANGE, "--json")
         assert code == 0 and json.loads(text)["fit"]["hits"] + json.loads(text)["fit"]["max_readings"] == SCANS * BEAMS
-    # Every other pair is another choice than every other scan, of as many readings.
+    # Every other pair differs from every other scan, with as many readings.
     _, text, _ = run(capsys, "--pairs", recorded / "pairs.csv", "--range-max", RANGE, *chosen)
     pairs = json.loads(text)
     assert pairs["readings"] == SCANS * BEAMS // 2
@@ -111,7 +111,7 @@ def test_held_out_scans_are_likelier_by_the_fit_than_by_defaults(capsys, recorde
 
 
 def test_the_fit_by_incidence_is_scored_on_held_out_pairs(capsys, tmp_path):
-    """Readings whose deviation rises with the angle: each bin's mixture, beside the one for all angles."""
+    """The deviation rises with the angle: the mixtures of the bins are scored beside the one for all angles."""
     random = np.random.default_rng(1)
     angle, expected = random.uniform(0, 1.5, 4000), random.uniform(2, 8, 4000)
     angle[::50] = math.nan
@@ -161,7 +161,7 @@ def test_log_likelihoods_are_those_of_the_model(recorded):
     model = gs.BeamModel(grid, scans[0].scanner, TRUTH, backend="numpy", precision="float64")
     wanted = [model.log_likelihood([scan.pose], scan.ranges)[0] for scan in scans]
     found = held_out.log_densities(TRUTH, data).reshape(SCANS, BEAMS).sum(axis=1)
-    # Ranges are cast in float32 for the one and in float64 for the other.
+    # Ranges of one are cast in float32, those of the other in float64.
     np.testing.assert_allclose(found, wanted, atol=0.05)
     assert data.block.tolist() == [i // 7 for i in range(SCANS) for _ in range(BEAMS)]
     even, odd = data.halves()
@@ -181,7 +181,7 @@ def test_peers_are_proper_densities():
 
 
 def test_standard_errors_are_those_of_blocks():
-    """40 blocks of 25 equal values know no more than 40 values; a ratio of sums where they differ in size."""
+    """40 blocks of 25 equal values have the information of 40 values; blocks of other sizes give a ratio of sums."""
     random = np.random.default_rng(0)
     values = random.normal(size=40)
     mean, error = held_out.block_mean(np.repeat(values, 25), np.repeat(np.arange(40), 25))
@@ -194,7 +194,7 @@ def test_standard_errors_are_those_of_blocks():
 
 
 def test_impossible_readings_are_counted(capsys, tmp_path):
-    """Without a reading of no return in the fitted half z_max is 0, and those held out are impossible."""
+    """Without a reading of no return in the fitted half, z_max is 0, and such readings of the other half impossible."""
     rows = [f"{1 + 0.01 * (i % 7)},1" if i < 100 or i % 10 else "inf,1" for i in range(200)]
     (tmp_path / "some.csv").write_text("\n".join(rows))
     _, text, _ = run(capsys, "--pairs", tmp_path / "some.csv", "--range-max", 4, "--holdout", "--json")
@@ -219,7 +219,7 @@ def test_pairs_are_read_in_blocks(tmp_path, monkeypatch):
 
 
 def test_real_logs_have_real_parameters(capsys, data_dir):
-    """The Intel log in a map of its even scans: a SICK LMS and a map of 5 cm."""
+    """The Intel log, of a SICK LMS, in a map of its even scans with cells of 5 cm."""
     folder = data_dir / "carmen_logs"
     code, text, _ = run(
         capsys, "--map", folder / "derived_maps" / "intel_even_05cm.yaml", "--log", folder / "intel-corrected.log.gz",

@@ -1,4 +1,4 @@
-"""MRCLAM's files, and the command that reads them: a run made up here, bad files, and the recorded one."""
+"""MRCLAM's files, and the command that reads them: a made-up run, bad files, and a recorded run."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_dead_reckoning_of_an_arc():
 
 @pytest.mark.parametrize("kind", ["--known", "--unknown"])
 def test_command_localises(capsys, folder, kind):
-    # Later scans have so few readings that a filter that does not know them gets lost, and says so.
+    # Later scans have so few readings that a filter without known landmarks gets lost, and reports it.
     document = json.loads(run(capsys, folder, kind, "--particles", "300", "--scans", "72", "--json"))
     p = document["fit"]["parameters"]
     # Deviations of the made-up run are 0.08 m and 0.03 rad, of about 400 readings.
@@ -88,7 +88,7 @@ def test_exchanged_landmarks_are_reported_and_survived(capsys, swapped, tmp_path
 
 @pytest.mark.slow
 def test_poor_odometry_is_survived(capsys, tmp_path):
-    """The heading errs by 0.6 to 0.8 rad in 5 s: noise measured in the run follows it, a fixed small one does not."""
+    """The heading errs by 0.6 to 0.8 rad in 5 s: measured noise makes up for it, a fixed small one does not."""
     folder = world.write_run(tmp_path / "poor", seed=2, seconds=30.0, wander=0.31)
     found = read_mrclam(folder, 1)
     apart = np.searchsorted(found.time, found.time[found.time < found.time[-1] - 5] + 5)
@@ -171,7 +171,7 @@ def test_broken_gzip_is_named(capsys, swapped, tmp_path):
 
 
 def test_recorded_robot(capsys, data_dir, needs):
-    """Robot 3 of the UTIAS data: 11 and 17 are exchanged, and the filter is within the paper's order of error."""
+    """Robot 3 of the UTIAS data: landmarks 11 and 17 are exchanged, and errors are of the paper's order."""
     code = main(["landmarks", "--folder", str(data_dir / "mrclam_ds1"), "--robot", "3", "--particles", "500",
                  "--scans", "500", "--backend", needs("opencl"), "--json"])  # fmt: skip
     document = json.loads(capsys.readouterr().out)
@@ -183,7 +183,7 @@ def test_recorded_robot(capsys, data_dir, needs):
 @pytest.mark.parametrize("association", ["nearest", "joint"])
 @pytest.mark.parametrize("selection", ["numpy", "opencl"])
 def test_scans_of_different_sizes_are_those_of_a_new_model(needs, selection, association):
-    """A model keeps its buffers, which only grow."""
+    """A model reuses its buffers, which only grow."""
     rng = np.random.default_rng(3)
     lm = gs.LandmarkMap(rng.uniform(-4, 4, (10, 2)))
     backend = needs(selection)

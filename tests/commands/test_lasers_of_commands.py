@@ -1,4 +1,4 @@
-"""One vocabulary: each command that reads logs takes --topic and --mount, and bags as well as other logs."""
+"""Each command that reads logs takes --topic and --mount, and bags as well as other logs."""
 
 from __future__ import annotations
 

@@ -117,7 +117,7 @@ def test_a_log_on_a_wrong_map_is_lost(place, capsys):
     out = capsys.readouterr().out
     assert "verdict: LOST, p_lost " in out and "pass through them, most near x = " in out
     assert "likely cause: wrong map" in out
-    # Anywhere on the map there is no place that the particles could agree upon.
+    # The map has no place on which the particles could agree.
     assert cli.main(call(place, "--global", "--particles", "500", grid="other.yaml")) == 1
     assert "verdict: LOST" in (out := capsys.readouterr().out) or "verdict: UNCERTAIN" in out
 
@@ -127,7 +127,7 @@ def test_a_filter_that_has_not_converged_is_uncertain(place, capsys):
     assert cli.main(arguments) == 1
     printed = capsys.readouterr()
     assert "verdict: UNCERTAIN, p_lost " in printed.out and " m and " in printed.out
-    # No pose is one to compare with.
+    # No pose serves as a reference.
     assert "the first 1 of 1 scans" in printed.err and not (place / "none.tum").read_text()
     assert cli.main([*arguments, "--tum-from", "start"]) == 1
     assert len((place / "none.tum").read_text().splitlines()) == 1
@@ -239,7 +239,7 @@ class FakeStream:
 
 
 def test_a_run_is_recorded_for_the_viewer(place, capsys, monkeypatch, tmp_path):
-    """With a module that has the names of rerun-sdk 0.41 that are used, and without it."""
+    """The run is tried with a module that has the needed names of rerun-sdk 0.41, and without one."""
     streams, path = [], tmp_path / "run.rrd"
 
     def open_stream(name):

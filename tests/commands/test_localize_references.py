@@ -79,7 +79,7 @@ def test_convergence_is_counted_in_scans_not_in_references(place):
         track.temperatures.append(1.0)
         track.verdicts.append("tracking")
         track.seconds.append((0.0, 0.0, 0.0, 0.0))
-    # Four references are left, and five of them are wanted.
+    # Four references are left, and five are needed.
     assert summary(track)["converged_at"] is None
     track.poses[4] = np.array(steps[4].reference)
     assert summary(track)["converged_at"] == 4
@@ -88,7 +88,7 @@ def test_convergence_is_counted_in_scans_not_in_references(place):
 def test_logged_poses_that_are_the_odometry_are_named_so(place, capsys):
     arguments = call(place, "--start", "3", "1.5", "3")
     code, found = summary_of(capsys, arguments)
-    # The pose is right, and yet far from the odometry's.
+    # The pose is right, although it is far from the odometry's.
     assert code == 0 and not found["lost"] and found["references_repeat_odometry"] and found["error_median"] > 1
     assert cli.main(arguments) == 0
     out = capsys.readouterr().out
@@ -159,7 +159,7 @@ def test_noise_is_not_learned_from_the_odometry_itself(place, capsys):
     code = cli.main([*arguments, "--json"])
     out, err = capsys.readouterr()
     assert code == 0 and json.loads(out)["summary"]["error_95"] < 0.1
-    # Seven references of a robot that always does the same determine little.
+    # Seven references of a robot that repeats one motion determine little.
     assert "the log does not determine alpha" in err
 
 

@@ -1,4 +1,4 @@
-"""Signals that end a command: SIGTERM and SIGHUP are handled as Ctrl-C is, and nothing unfinished is left."""
+"""Signals that end a command: SIGTERM and SIGHUP are handled like Ctrl-C, and no unfinished file is left."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def place(tmp_path_factory) -> Path:
 
 @pytest.fixture(autouse=True)
 def same_handlers():
-    """Commands put the handlers of the program back."""
+    """Check that commands restore the program's handlers."""
     before = [signal.getsignal(number) for number in ENDS], sys.unraisablehook
     yield
     assert ([signal.getsignal(number) for number in ENDS], sys.unraisablehook) == before
@@ -52,7 +52,7 @@ def same_handlers():
 
 LOG = ["--log", "run.log", "--range-max", "20", "--backend", "numpy"]
 MAP = ["--map", "map.yaml"]
-# Arguments of a command, the step of its progress at which the signal comes, and what it must have printed by its end.
+# Arguments of a command, the step of its progress at which the signal comes, and the output expected at its end.
 COMMANDS: dict[str, tuple[list[str], int, str]] = {
     "map": ([*LOG, "--out", "OUT/made.yaml"], 2, "the map holds 4 of 6 scans"),
     "likelihood_map": ([*MAP, *LOG, "--out", "OUT/made.png", "--headings", "4"], 2, "of the positions are done"),
@@ -171,7 +171,7 @@ def test_a_terminated_sweep_keeps_whole_rows_and_ends_its_processes(place, tmp_p
 
 
 def test_signals_that_the_caller_ignores_stay_ignored(place, tmp_path):
-    """As nohup does."""
+    """The program nohup ignores SIGHUP."""
     process = started(
         "localize", *MAP, *LOG, "--particles", "100", "--tum", str(tmp_path / "made.tum"), cwd=place,
         preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN),
@@ -228,7 +228,7 @@ def test_a_forked_child_ends_by_the_signal():
 
 
 class Noisy:
-    """An object during whose end a signal comes."""
+    """An object whose destructor gets a signal."""
 
     number = signal.SIGTERM
 

@@ -29,7 +29,7 @@ def test_every_model_of_a_density_has_a_scene():
 
 
 def test_poses_of_a_narrow_view_see_all_landmarks():
-    # Else it says something, too, that a feature is left out.
+    # Otherwise the absence of a feature would be information as well.
     scene = make_scene("landmarks, narrow view")
     model = scene.draw.__closure__[0].cell_contents
     at = gs.compose_poses(scene.poses, model.mount)
@@ -60,10 +60,10 @@ def test_another_density_is_found(name):
 
 
 def test_ranks_of_a_known_posterior():
-    # Two poses and a reading that says nothing: ranks of one pose are uniform below one half, of the other above.
+    # Two poses and a reading without information: ranks of one pose are uniform below one half, of the other above.
     poses = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)])
     ranks = posterior_ranks(poses, lambda at, seed: np.zeros(len(at)), lambda at, z: np.zeros(len(at)), 1000, seed=3)
     assert_uniform(ranks)
-    # A reading that says all.
+    # A reading that determines the pose.
     ranks = posterior_ranks(poses, lambda at, seed: at[:, 0], lambda at, z: -1e3 * np.abs(at[:, 0] - z), 1000, seed=3)
     assert_uniform(ranks)

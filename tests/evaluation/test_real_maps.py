@@ -86,7 +86,7 @@ def test_distance_transform_is_scipys(data_dir, opencl, name):
 
 
 def scene_of(data_dir, name):
-    """Return a scene in a map, and the backends that are present besides NumPy, which is slow in wide open space."""
+    """Return a scene in a map, and the backends that are present except NumPy, which is slow in wide open space."""
     scanner = gs.Scanner.uniform(
         angle_min=-2.0, angle_increment=0.05, count=81, range_max=20.0, mount=(0.1, -0.05, 0.02)
     )  # fmt: skip
@@ -97,7 +97,7 @@ def scene_of(data_dir, name):
 
 
 def test_end_points_on_edges_do_not_breach(data_dir):
-    """Without a mount beams along the axes end on the edges that the poses stand on."""
+    """Without a mount, beams along the axes end on the edges on which the poses lie."""
     grid = gs.read_map(data_dir / "wean_hall/wean_10cm.yaml")
     scanner = gs.Scanner.uniform(angle_min=-2.0, angle_increment=0.025, count=161, range_max=20.0)
     checks = selftest.run([get_backend("numpy")], selftest.scene_in(grid, scanner), sonar=False)
@@ -107,7 +107,7 @@ def test_end_points_on_edges_do_not_breach(data_dir):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COMPARED)
 def test_backends_agree(data_dir, name):
-    """Distances, squares, ranges to the bit, and both models in both precisions, with the truth and pairwise."""
+    """Compare distances, squares, bits of ranges, and both models in both precisions, with the truth and pairwise."""
     scene, backends = scene_of(data_dir, name)
     # Two maps are enough for angles of incidence.
     checks = selftest.run(backends, scene, sonar=name in (COMPARED[0], COMPARED[-1]))
@@ -133,7 +133,7 @@ def test_ranges_are_numpys(data_dir, name):
 
 
 def test_yaw_of_a_map_turns_its_poses(data_dir):
-    """stata_basement, whose origin has a yaw of 3.14, against the same cells without it."""
+    """Compare stata_basement, whose origin has a yaw of 3.14, with the same cells without it."""
     grid = gs.read_map(data_dir / "ros_maps/stata_basement.yaml")
     assert grid.origin[2] == 3.14
     plain = gs.OccupancyGrid(grid.cells, grid.resolution)
@@ -147,13 +147,13 @@ def test_yaw_of_a_map_turns_its_poses(data_dir):
     ])  # fmt: skip
     ranges = [gs.RayCaster(g, 20.0, backend="numpy", precision="float64").cast(p, bearings)
               for g, p in ((plain, poses), (grid, turned))]  # fmt: skip
-    # Rounding moves rays by some 1e-14, which one that grazes a corner may notice.
+    # Rounding moves rays by some 1e-14, which matters to one that grazes a corner.
     assert np.quantile(np.abs(ranges[0] - ranges[1]), 0.999) < 1e-9
 
 
 @pytest.mark.slow
 def test_distance_transform_of_120_million_cells(gigantic, opencl):
-    """Exact at 100 000 places all over the map and its corners, by a search among all obstacles; no memory for more."""
+    """Distances at 100 000 places of the map and at its corners are those of a search; memory allows no more places."""
     obstacles = gigantic.obstacles()
     found = gs.distance_transform(obstacles, squared=True, backend=opencl)
     rows, cols = obstacles.shape
@@ -163,13 +163,13 @@ def test_distance_transform_of_120_million_cells(gigantic, opencl):
     walls = np.argwhere(obstacles)
     nearest = walls[cKDTree(walls).query(places)[1]]
     assert differing(found[tuple(places.T)], ((places - nearest) ** 2).sum(axis=1).astype(found.dtype)) == 0
-    # No cell is an obstacle but those that are.
+    # Only obstacles have a distance of 0.
     assert np.count_nonzero(found == 0) == len(walls)
 
 
 @pytest.mark.slow
 def test_models_on_120_million_cells(gigantic, opencl):
-    """Particles all over the map, so that none of it is left out: log-likelihoods against the float64 truth."""
+    """Particles are all over the map, so that no part is left out: compare log-likelihoods with the float64 truth."""
     scanner = gs.Scanner.uniform(angle_min=-2.0, angle_increment=0.08, count=51, range_max=30.0)
     random = np.random.default_rng(9)
     poses = cloud_uniform(gigantic, 300, random)
@@ -190,7 +190,7 @@ def test_models_on_120_million_cells(gigantic, opencl):
 
 @pytest.mark.slow
 def test_ranges_on_120_million_cells(gigantic, opencl):
-    """OpenCL with the whole map prepared against NumPy, which prepares a window for each cluster of poses."""
+    """Compare OpenCL, which prepares the whole map, with NumPy on a window for each cluster of poses."""
     random, bearings = np.random.default_rng(2), np.linspace(-math.pi, math.pi, 40)
     clusters = [cloud_around(p, 30, 1.0, 1.0, random) for p in cloud_uniform(gigantic, 5, random)]
     everywhere = np.concatenate([*clusters, cloud_uniform(gigantic, 50, random)])

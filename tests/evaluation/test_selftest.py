@@ -73,7 +73,7 @@ def test_per_beam_bound_scales_with_the_logarithm_and_is_zero_at_infinity():
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
 @pytest.mark.parametrize("plainly", [block_sums, strand_sums])
 def test_per_scan_bound_holds_for_perturbed_beams(plainly, scale, count):
-    """Worst-case errors of every beam, added up in float32 as the kernels do, stay within the bound."""
+    """Worst-case errors of all beams, summed in float32 as kernels do, stay within the bound."""
     random = np.random.default_rng(count)
     truth = random.normal(-2, 3, (20, count)) * scale
     for sign in (1, -1, random.choice([-1, 1], truth.shape)):
@@ -159,7 +159,7 @@ def test_replay_agrees_with_numpy(scene, make, parameters, precision, temperatur
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_an_end_point_on_an_edge_may_go_to_either_cell_but_no_other_one(precision):
-    """Poses on corners of a resolution that is not exact: rounding decides on which side of the edge they end."""
+    """Poses lie on corners, and the resolution is not exact: rounding decides on which side of the edge beams end."""
     cells = np.zeros((40, 40), np.int8)
     cells[::7, ::5] = 100
     grid = gs.OccupancyGrid(cells, 0.1)
@@ -300,7 +300,7 @@ def test_a_breach_is_detected(capsys, monkeypatch, module, name, broken, quantit
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("kernel", [None, "sum_parts", "order_fill"])
 def test_a_breach_of_a_gpu_is_detected(kernel, monkeypatch):
-    """Tiles, orders and sums, which only GPUs have; the reference pretends to be one."""
+    """Only GPUs use tiles, orders and sums; the reference pretends to be one."""
     backend = NumpyBackend()
     backend.info = dataclasses.replace(backend.info, kind="gpu")
     monkeypatch.setattr(selftest, "_REPEATS", 2)

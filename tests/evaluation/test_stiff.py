@@ -23,7 +23,7 @@ from gpusense.models.scan.densities import log_mixture
 
 PRECISIONS = ("float32", "float64")
 PAGE = ROOT / "docs" / "numerics.md"
-# eps (1 + |log p|); processors and NVIDIA's GPUs are far better in float64 than the tolerance, which is for any driver.
+# In eps (1 + |log p|). In float64, processors and NVIDIA's GPUs are far below the tolerance, which is for all drivers.
 BOUND = {"float32": 16, "float64": 16}
 
 make_density_grid = stiff.density_grid
@@ -31,7 +31,7 @@ make_density_grid = stiff.density_grid
 
 @functools.cache
 def density_grid(backend: str, precision: str) -> stiff.Densities:
-    """Score the grid of densities, once on each backend."""
+    """Score the grid of densities, once for each backend."""
     return make_density_grid(backend, precision)
 
 
@@ -68,7 +68,7 @@ def test_density_grid_against_60_digits(backend, precision):
     worst = int(np.argmax(errors))
     where = {name: column[worst] for name, column in grid.parameters.items()}
     assert errors[worst] <= BOUND[precision], (grid.z[worst], grid.expected[worst], where, grid.log_p[worst])
-    # The truth that users' machines have instead of mpmath.
+    # The truth on machines without mpmath.
     assert stiff.error_in_eps(grid.truth(), truth, "float64").max() <= 16
 
 
@@ -86,7 +86,7 @@ def test_density_grid_covers_its_ranges(precision):
     assert {0.0, 1e6}.issubset(np.round(rate, 6).tolist())
     for name in ("z_hit", "z_short", "z_rand"):
         assert {0.0, 1.0}.issubset(grid.parameters[name].tolist())
-    # The textbook's formulas fail where these do not.
+    # The textbook's formulas fail where gpusense's do not.
     naive = stiff.error_in_eps(grid.naive(), exact_grid(precision), precision)
     assert np.mean(naive > 16) >= 0.3
     assert np.mean(np.isinf(naive)) >= 0.15
@@ -148,7 +148,7 @@ def test_ranges_in_an_empty_room_are_those_of_plain_geometry(name, precision, ba
         case.poses, scanner.bearings
     )
     bound = TOLERANCES["float32 ranges to float64"].value if precision == "float32" else 1e-11
-    # World coordinates of 5e6 m are rounded before they come here.
+    # World coordinates of 5e6 m are already rounded in float64.
     bound += 64 * np.spacing(np.abs(case.grid.origin).max()) / cell
     np.testing.assert_allclose(found / cell, known, rtol=0, atol=bound)
 
@@ -216,7 +216,7 @@ def test_any_stiff_question(backend, question, precision):
     log_p, parts = model.log_likelihood(poses, z, per_beam=True)
     truth = log_mixture(z.astype(float), expected.astype(float), range_max=top, **p.to_dict())
     errors = stiff.error_in_eps(parts, truth, precision)
-    # Where large logarithms cancel, errors are measured by them.
+    # Where large logarithms cancel, errors are relative to them.
     peak = abs(math.log(sigma)) if weights[0] else 0.0
     allowed = BOUND[precision] * (1 + 2 * peak / (1 + np.abs(np.where(np.isinf(truth), 0, truth))))
     assert (errors <= allowed).all(), (parts, truth, expected, z)

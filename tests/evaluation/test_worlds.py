@@ -13,7 +13,7 @@ from gpusense.evaluation import worlds
 from gpusense.world.parameters import BeamParameters
 
 # A stochastic assertion draws SAMPLES readings from a fixed seed. 1.95 / sqrt(n) is the Kolmogorov-Smirnov bound that a
-# right sampler exceeds once in a thousand seeds, and five standard errors bound a mean or a share.
+# correct sampler exceeds once in a thousand seeds; five standard errors bound a mean or a share.
 SAMPLES = 200_000
 KS_BOUND = 1.95
 STANDARD_ERRORS = 5.0

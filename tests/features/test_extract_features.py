@@ -61,7 +61,7 @@ def scores():
 
 
 def test_lines_are_those_of_the_line_model():
-    """Angle, distance, ends and covariance in normal form, of a scanner beside the robot's centre."""
+    """Compare angle, distance, ends and covariance in normal form, for a scanner off the robot's centre."""
     scanner = ring(720, mount=(0.2, -0.1, 0.4))
     walls = gs.LineMap([(3, -2, 3, 2), (3, 2, -1, 2), (-1, 2, -1, -2), (-1, -2, 3, -2)], two_sided=False)
     place = gs.compose_poses(np.zeros(3), np.array(scanner.mount))
@@ -104,7 +104,7 @@ def test_most_features_exist(scores):
 
 
 def test_covariances_are_those_of_errors(scores):
-    """The median of chi squared over its degrees of freedom is 0.69 for 2, 0.79 for 3; the mean of lines is 1."""
+    """The median of chi squared over its degrees of freedom is 0.69 for 2 and 0.79 for 3; the mean of lines is 1."""
     for (beams, noise), by_kind in scores.items():
         if noise == 0:
             assert all(np.median(by_kind[kind].squares) < 0.5 for kind in KINDS)
@@ -130,7 +130,7 @@ def test_lines_are_those_of_least_squares_on_the_true_points():
             guess = [middle, z.min()]
             fit = least_squares(lambda p, b=b, z=z: p[1] / np.cos(b - p[0]) - z, guess, x_scale=(0.1, 1.0))
             angle, distance = fit.x
-            # The line's error across, at its midpoint, and its turn.
+            # The line's error across it, at its midpoint, and the error of its angle.
             off = np.cos(angle) * mine.pose[:, 0] + np.sin(angle) * mine.pose[:, 1] - distance
             turn = np.mod(mine.pose[:, 2] - angle, math.pi) - math.pi / 2
             place = np.arctan2(mine.pose[:, 1], mine.pose[:, 0])
@@ -172,7 +172,7 @@ def test_float32_finds_nearly_the_same(device, monkeypatch):
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_ties_are_the_same_in_float32(noise, monkeypatch, needs):
-    """Splits between which readings decide by less than float32 rounds: on these floors some once fell otherwise."""
+    """Readings decide between splits by less than float32's rounding; on these floors some splits once differed."""
     device, scanner = get_backend(needs("opencl")), ring(720)
     ranges, _ = floor_scans(1, scanner, 0.0, 20)
     ranges = ranges + noise * np.random.default_rng(1).standard_normal(ranges.shape)
@@ -213,7 +213,7 @@ def test_beams_of_one_bearing_raise_nothing(backend):
 @pytest.mark.parametrize("beams", [180, 720, 1081])
 @pytest.mark.parametrize("turn", [0.0, 0.3, math.pi / 4])
 def test_a_square_room_has_four_walls_and_corners(backend, beams, turn):
-    """Whatever the bearing at which a scan begins: the wall there is one line."""
+    """The wall at which a scan begins is one line, whatever the first bearing."""
     bearings = turn + np.arange(beams) * 2 * math.pi / beams
     scanner = gs.Scanner(np.mod(bearings + math.pi, 2 * math.pi) - math.pi, range_max=9.0)
     found = gs.extract_features(square_room(scanner, x=0.4, y=-0.3), scanner, backend=backend)
@@ -231,7 +231,7 @@ def test_a_square_room_has_four_walls_and_corners(backend, beams, turn):
 
 @pytest.mark.parametrize(("swing", "least"), [(-70, 0.97), (-45, 0.97), (60, 0.6), (90, 0.6)])
 def test_doors_have_leaves(swing, least):
-    """A leaf turns out of the room (-) or into it (+), where it hides a jamb or the wall beside it from many places."""
+    """A leaf opens out of the room (-) or into it (+), where it hides a jamb or the wall beside it from many places."""
     near, far, angle = 1.5, 2.4, math.radians(swing)
     leaf = (0, near, 0.9 * math.sin(angle), near + 0.9 * math.cos(angle))
     room = [(0, 0, 6, 0), (6, 0, 6, 4), (6, 4, 0, 4), (0, 4, 0, far), (0, near, 0, 0), leaf]
@@ -270,7 +270,7 @@ def test_poses_are_in_the_robots_frame():
 
 
 def test_a_turned_scanner_sees_the_same():
-    """Only the bearing at which a scan begins differs."""
+    """Scans differ only in their first bearing."""
     plain, turned = ring(720), ring(720, mount=(0.3, -0.2, 1.1))
     ranges, _ = floor_scans(4, plain, 0.01, count=4)
     one, two = (gs.extract_features(ranges, scanner, kinds=("corner", "pole")) for scanner in (plain, turned))
@@ -334,7 +334,7 @@ def test_features_become_readings_of_landmarks():
     np.testing.assert_array_equal(found.range_bearing("corner"), rows[found.kind == "corner"])
     both = found.range_bearing(("door", "pole"))
     assert len(both) == np.isin(found.kind, ("door", "pole")).sum()
-    # Signatures of two kinds never meet.
+    # No signature belongs to two kinds.
     for number, kind in enumerate(KINDS):
         mine = found[kind].signatures
         assert (mine >= 10 * number).all() and (mine < 10 * number + 9.01).all()

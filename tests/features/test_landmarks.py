@@ -67,7 +67,7 @@ def test_landmarks_are_where_corners_and_doors_are(surveyed):
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("beside", ["alone", "lines", "field"])
 def test_a_filter_localises_by_features(surveyed, beside):
-    """Odometry alone is off by more in the end than the filter ever is in the median."""
+    """The final error of odometry exceeds the median error of every filter."""
     poses = corridor_path(120, aside=0.1)
     ranges = scans_at(poses, 5)
     features = gs.extract_features(ranges, SCANNER)

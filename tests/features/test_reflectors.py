@@ -1,4 +1,4 @@
-"""Reflectors: bright runs of beams in simulated scans, and a recording's against the positions by the sensor."""
+"""Reflectors: bright runs of beams in simulated scans, and those of a recording against the sensor's own positions."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_reflectors_need_light():
     ranges, light = scan()
     for intensities in (None, np.ones(1440), np.zeros(1440), np.full(1440, np.nan), light.clip(max=2.5)):
         assert len(gs.extract_features(ranges, SCANNER, "reflector", backend="numpy", intensities=intensities)) == 0
-    # Without a return nothing shines; a wall that shines all along is no reflector.
+    # Without a return nothing is bright; a wall that is bright along its whole length is no reflector.
     assert len(gs.extract_features(np.full(1440, np.inf), SCANNER, "reflector", intensities=light)) == 0
     wide = np.where(np.abs(SCANNER.bearings) < 0.2, 8.0, 1.0)
     assert len(gs.extract_features(np.full(1440, 5.0), SCANNER, "reflector", intensities=wide)) == 0
@@ -64,7 +64,7 @@ def test_bad_intensities_are_named():
 
 
 def test_reflectors_of_a_recording(data_dir):
-    """The six reflectors by which the AGV of jarvis_lab localises, mapped at its poses, in most scans."""
+    """Most scans show the six reflectors by which the AGV of jarvis_lab localises, at their places on its map."""
     folder = data_dir / "jarvis_lab"
     bag = folder / "jarvis_complex_path_fast.bag"
     scans = list(gs.read_log(bag, topic="/driver_laser_navigation/laser_scan"))[::10]

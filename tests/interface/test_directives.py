@@ -1,4 +1,4 @@
-"""The preprocessor of kernel sources: branches against a generator that knows them, and all that it refuses."""
+"""The preprocessor of kernel sources: branches against those of a generator, and all that it refuses."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_a_chain_takes_its_first_true_branch():
 )
 def test_what_is_not_resolved_is_refused_with_file_and_line(text, line, message):
     text, message = text.format(a=NAMES[0], b=NAMES[1]), message.format(a=NAMES[0], b=NAMES[1])
-    with pytest.raises(ValueError) as caught:  # the whole beginning is compared
+    with pytest.raises(ValueError) as caught:  # The whole beginning is compared.
         resolve(text, frozenset(), "beam.cl")
     assert str(caught.value).startswith(f"beam.cl:{line}: {message}") and "\n" not in str(caught.value)
 

@@ -1,4 +1,4 @@
-"""Launches bind arguments by name, and hold them to the signature table."""
+"""Launches bind arguments by name, and check them against the signature table."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_a_struct_is_no_number_and_no_other_struct():
 
 @pytest.mark.parametrize("name", STRUCTS)
 def test_structs_have_the_memory_of_c(name):
-    """NumPy's aligned record types are laid out as C compilers do."""
+    """NumPy's aligned record types have the layout of C compilers."""
     for real in (np.dtype(np.float32), np.dtype(np.float64)):
         kinds = dtypes(name, real)
         aligned = np.dtype([(field, kind) for field, kind in zip(fields(name), kinds, strict=True)], align=True)

@@ -18,7 +18,7 @@ from gpusense.interface.kernel_files import warp_module
 from gpusense.interface.signatures import KERNELS
 from gpusense.interface.sources import assemble, relevant
 
-# Kernel, the flag, flags beside it, and what only the flag's code has, in OpenCL and in Warp's C++.
+# Kernel, the flag, flags beside it, and patterns of the flag's code in OpenCL and in Warp's C++.
 TRACES = [
     ("cast_ranges", "FLOAT64", (), r"\bdouble\b", r"\bfloat64\b"),
     ("cast_ranges", "ORIGINS_OUTSIDE", (), r"\benter_x\b", r"\bwp::neg\("),
@@ -194,12 +194,12 @@ def test_cuda_code_of_a_block_of_the_field_loads_as_little_as_can_be(
     flags = frozenset({"LOG_TABLE", "TWO_PART_POINTS", "ROUNDED_CELLS", "INSIDE"})
     code = cuda_code("field_blocks", flags, tmp_path)
     operations = cuda_operations_of(code)
-    # Where an end point's place has a bound, products and sums are one operation.
+    # Where places of end points have an error bound, products and sums are fused.
     assert "fma.rn.f32" in operations <= {f"{name}.rn.f32" for name in ("mul", "add", "sub", "fma")}
     blocks = re.split(r"^\$L\w+:|\bbra\b.*", code.partition(".entry")[2], flags=re.MULTILINE)
     whole = max(blocks, key=len)
     loads = re.findall(r"\bld\.global\S*", whole)
-    # 16 readings, a point for two of them and a cell each, by their addresses: no strides, no checks of signs.
+    # Loads of 16 readings, a point for two of them and a cell for each, by address: no strides, no checks of signs.
     assert sorted(loads) == ["ld.global.nc.f32"] * 16 + ["ld.global.nc.v4.f32"] * 8
     assert not re.search(r"\bmul\.lo\.s64\b|\bshr\.s32\b", whole)
 

@@ -1,4 +1,4 @@
-"""Orders of particles for GPUs: permutations whatever the run, in which neighbours are near."""
+"""Orders of particles for GPUs: each run gives a permutation in which neighbours are near."""
 
 from __future__ import annotations
 

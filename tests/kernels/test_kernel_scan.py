@@ -38,7 +38,7 @@ def scans(real: type, count: int) -> list[np.ndarray]:
 def placed(
     device: Backend, flags: frozenset[str], ranges: np.ndarray, vectors: np.ndarray, *numbers: Any, some: bool = False
 ) -> Any:
-    """Return the readings that place_inputs writes, by the reference and by a device; the rest stays 77."""
+    """Return the readings that place_inputs writes, after a comparison of reference and device; the rest stays 77."""
     real = np.float64 if "FLOAT64" in flags else np.float32
     beams, each = vectors.shape[:2]
     places, chosen, kind, possible, nearest, log_max, top = numbers
@@ -68,7 +68,7 @@ def placed(
 def test_readings_are_placed_as_the_host_prepares_them(
     end_points: bool, precision: type, single: bool, device: Backend
 ) -> None:
-    """For all choices of beams and all that max readings may be."""
+    """Try all choices of beams and all treatments of max readings."""
     real = np.dtype(precision)
     for count, (z_max, kind) in itertools.product((1, 53), ((0.0, MAX_LEFT_OUT), (0.1, MAX_FIXED), (0.1, MAX_PLACED))):
         scanner = gs.Scanner(np.linspace(-3, 3, count), RANGE, NEAREST)
@@ -136,7 +136,7 @@ def test_an_even_choice_is_that_of_the_host() -> None:
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_poses_are_placed_along_with_readings(precision: type, device: Backend) -> None:
-    """As place_poses and the reference place them, whatever work-items readings take before."""
+    """Poses are placed like those of place_poses, however many work-items precede them for readings."""
     rng, count, beams, grid = np.random.default_rng(5), 150, 53, gs.OccupancyGrid(np.zeros((9, 12), np.int8), 0.5)
     poses = np.stack([rng.uniform(-1, 7, count), rng.uniform(-1, 5, count), rng.uniform(-4, 4, count)], axis=-1)
     poses[7, 1] = np.nan

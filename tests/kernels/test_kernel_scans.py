@@ -33,7 +33,7 @@ COUNT = PER_SCAN * SCANS
 # Rays or end points of each scan: less than a block, none, several blocks, one block.
 START = np.array([0, 5, 5, 48, 64], np.int32)
 FIXED = (-1.5, 0.25, 3.0, -2.0)
-# Particles of the first scans that another launch has.
+# Particles of the first scans that belong to another launch.
 AHEAD = (0, 1, PER_SCAN, PER_SCAN + 5)
 REAL = np.float32
 
@@ -70,7 +70,7 @@ def test_fields_of_scans(ahead: int, device: Backend) -> None:
         ScanBatch(PER_SCAN, ahead),
     )  # fmt: skip
     assert differing(found["log_p"], reference["log_p"]) == 0
-    # The scan without readings has what is fixed.
+    # The scan without readings has its constant term.
     empty = slice(max(PER_SCAN - ahead, 0), 2 * PER_SCAN - ahead)
     assert (found["log_p"][empty] == REAL(0.75) * REAL(FIXED[1])).all()
 
@@ -86,7 +86,7 @@ def test_blocks_of_fields_of_scans(names: tuple[str, ...], spread: int, device: 
         device, "field_blocks", flags, items(COUNT, spread, 64, 64), *given, guards, START,
         room_for(COUNT, blocks, REAL), window, COUNT, most, spread, ScanBatch(PER_SCAN, 0),
     )  # fmt: skip
-    # Of each particle the blocks of its scan, and no others.
+    # Each particle has the blocks of its scan, and no others.
     assert differing(found["parts"], reference["parts"]) == 0
     written = np.count_nonzero(found["parts"].reshape(-1)[: COUNT * blocks].reshape(blocks, COUNT) != -77, axis=0)
     assert (
@@ -99,7 +99,7 @@ def test_blocks_of_fields_of_scans(names: tuple[str, ...], spread: int, device: 
 def test_sums_of_scans(block: int, names: tuple[str, ...], device: Backend) -> None:
     counts = np.array([5, 0, 48, 16], np.int32)
     parts = np.random.default_rng(4).uniform(0.1, 3, 48 * COUNT).astype(REAL)
-    # Parts beyond the end of a scan count for nothing.
+    # Parts beyond the end of a scan are not counted.
     place_scan = (an_order(COUNT) if "ORDERED" in names else np.arange(COUNT)) // PER_SCAN
     added = strands_in(counts) if "STRANDED" in names else counts
     parts.reshape(48, COUNT)[np.arange(48)[:, None] >= added[place_scan]] = np.nan

@@ -30,8 +30,8 @@ from gpusense.evaluation.tolerances import differing, per_beam, per_scan
 from gpusense.interface.structs import Score, Window
 from gpusense.reference.mixture import log_density
 
-# Each set of flags is compiled. The lines of the components, of the precision and of the rest of the kernel are apart,
-# so each mixture has a plain scene in float32 and a full one in float64, and two mixtures have all four.
+# Each set of flags is compiled. Components, precision and the rest of the kernel have separate lines of code, so each
+# mixture has a plain scene in float32 and a full one in float64, and two mixtures have all four.
 FULL = ("ALL_READINGS", "ORIGINS_OUTSIDE", "SHARED_RAYS")
 BEAMS = [*((name, *case) for name in MIXTURES for case in (((), np.float32), (FULL, np.float64)))]
 BEAMS += [(name, *case) for name in ("book", "hit and short") for case in (((), np.float64), (FULL, np.float32))]
@@ -111,7 +111,7 @@ def test_fields_agree_with_the_reference(name: str, names: tuple[str, ...], real
     if name == "log table":
         assert differing(found["parts"], reference["parts"]) == 0
     truth = reference["parts"].astype(np.float64)
-    # Both may be off by the bound.
+    # Each may be off by the bound.
     assert_near(found["parts"], truth, 2 * per_beam(truth, real))
     total = temperature * (truth.sum(axis=1) + fixed)
     assert_near(found["log_p"], total, 2 * per_scan(truth, real, fixed=fixed, temperature=temperature))

@@ -151,7 +151,7 @@ TILED = [("ORDERED",), ("ORDERED", "ALL_READINGS", "SHARED_RAYS")]
 @pytest.mark.sampled(0.4)
 @pytest.mark.parametrize("names", [(), ("ORDERED", "ALL_READINGS")])
 def test_tiles_that_add_up_strands(names: tuple[str, ...], device: Backend) -> None:
-    """The sums of strands, no more and no fewer, are those of the terms of single readings, to the bit."""
+    """The sums of strands are the sums of the terms of single readings, to the bit."""
     for count, rays, spread in itertools.product((1, 17), (1, 3, 4, 16, 21, 53), SPREADS):
         found, expected = beam_tiles(device, "book", np.float32, count, rays, spread, (*names, "STRANDED"))
         single, _ = beam_tiles(device, "book", np.float32, count, rays, spread, names)

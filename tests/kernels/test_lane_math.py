@@ -1,4 +1,4 @@
-"""Functions of kernels/opencl/lanes/math.cl against float64, in ulps of float32, and where their constants are from."""
+"""Functions of kernels/opencl/lanes/math.cl against float64, in ulps of float32, and the source of their constants."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ COUNT = 1 << 22
 
 
 def spread(low: float, high: float) -> np.ndarray:
-    """Return positive float32 numbers between two, both among them, evenly in their bits and in their values."""
+    """Return positive float32 numbers from low to high, both included, evenly by bits and by value."""
     ends = np.array([low, high], np.float32)
     bits = np.linspace(*ends.view(np.int32).astype(np.float64), COUNT // 2).astype(np.int32).view(np.float32)
     return np.concatenate([bits, np.linspace(*ends, COUNT // 2, dtype=np.float32)])
@@ -78,7 +78,7 @@ def test_errors_in_ulps(function, evaluate):
 
 
 def test_arc_rest_is_below_a_fifth_of_the_last_bit(evaluate):
-    """The rest that is added to t for arctan t, in ulps of arctan t."""
+    """Check the difference arctan t - t, in ulps of arctan t."""
     t = spread(1e-30, 0.41421356)
     exact = np.arctan(t.astype(np.float64))
     off = np.abs(evaluate("arc_rest_lanes", t) - (exact - t)) / np.spacing(exact.astype(np.float32))
@@ -87,7 +87,7 @@ def test_arc_rest_is_below_a_fifth_of_the_last_bit(evaluate):
 
 
 def test_the_log_of_erfc_is_within_two_eps(evaluate):
-    """In eps (1 + |log(erfc(x) / 2)|), the size of the terms of a bumper."""
+    """Errors are in eps (1 + |log(erfc(x) / 2)|), the size of the terms of a bumper."""
     x = spread(1e-30, 4.0)
     exact = np.log(special.erfc(x.astype(np.float64)))
     off = np.abs(evaluate("log_erfc_lanes", x) - exact) / (1 + np.log(2) - exact) / np.finfo(np.float32).eps
@@ -96,7 +96,7 @@ def test_the_log_of_erfc_is_within_two_eps(evaluate):
 
 
 def test_ends(evaluate):
-    """Exact values, far arguments, and none that depends on a neighbour."""
+    """Check exact values, far arguments, and that no value depends on a neighbour."""
 
     def at(function: str, *numbers: float) -> list[float]:
         given = np.resize(np.array(numbers, np.float32), LANES)

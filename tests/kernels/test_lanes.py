@@ -61,7 +61,7 @@ def test_lanes_have_the_bits_of_one(particles, beams, outside, in_lanes, compile
     assert all(compiled_lanes[kernel] == {LANES} for kernel in KINDS)
     for name in ("ranges", "field log p", "field parts"):
         assert differing(found[name], one[name]) == 0, name
-    # Drivers have elementary functions of their own for vectors.
+    # The elementary functions of drivers differ for vectors.
     allowed = beam_tolerance(np.float32).twice()
     for name in ("beam parts", "beam log p", "smooth field parts", "smooth field log p"):
         assert allowed.difference(found[name], one[name]) <= allowed.value, name
@@ -122,7 +122,7 @@ FIELD_OPTIONS = {
 )
 @pytest.mark.parametrize("bearings", ["each once", "some often"])
 def test_every_option_has_a_body_in_lanes(kind, option, precision, bearings, in_lanes, compiled_lanes):
-    """No option leaves the lanes; each has the scalar kernel's values, those of a particle in any lane included."""
+    """Every option runs in lanes, with the scalar kernel's values for a particle in any lane."""
     options = (BEAM_OPTIONS if kind is gs.BeamModel else FIELD_OPTIONS)[option]
     grid, scanner, poses, z = scene(70, 67)
     if bearings == "some often":
@@ -164,7 +164,7 @@ def test_a_particle_does_not_depend_on_its_lane(in_lanes):
 
 @pytest.mark.parametrize("resolution", [1e-4, 1e-3, 0.05, 3.0])
 def test_end_points_next_to_edges_and_far_away(resolution, in_lanes):
-    """Readings of up to 2^20 cells, most of them whole, at headings of quarter turns and nearly so."""
+    """Readings of up to 2^20 cells, mostly whole numbers, at headings of quarter turns and close to them."""
     rng = np.random.default_rng(5)
     grid = gs.OccupancyGrid(rng.choice([0, 100], (90, 70), p=[0.9, 0.1]), resolution)
     scanner = gs.Scanner(np.append(np.arange(32) * math.pi / 4, rng.uniform(-3, 3, 50)), (1 << 20) * resolution)

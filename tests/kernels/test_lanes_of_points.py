@@ -1,4 +1,4 @@
-"""Landmarks, beacons and bumpers in vectors: the scalar kernels' values, and no particle depends on its lane."""
+"""Landmarks, beacons and bumpers in lanes: the scalar kernels' values, and no particle depends on its lane."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_landmarks(name, side, in_lanes, compiled_lanes):
 
 
 def test_unseen_landmarks_have_the_bits_of_one(in_lanes):
-    """With no features that could be landmarks, log p is the count of unseen ones alone."""
+    """Without features that could be landmarks, log p is only the count of unseen ones."""
     p, poses = gs.LandmarkParameters(range_max=12.0, field_of_view=3.0), cloud(30.0)
     found = []
     for lanes in (1, LANES):
@@ -130,7 +130,7 @@ SQUARE = np.array([(0.2, 0.25), (-0.2, 0.25), (-0.2, -0.25), (0.2, -0.25)])
 @pytest.mark.parametrize("outline", ["circle", "square"])
 @pytest.mark.parametrize("changes", [{}, {"sigma": 0.01, "p_contact": 1.0, "p_false": 0.0}, {"sigma": 1e5}])
 def test_bumpers(outline, changes, in_lanes, compiled_lanes):
-    """Poses on edges of cells, off the map, and in walls; contact that is certain either way."""
+    """Poses are on edges of cells, off the map, and in walls; contact is certain in either state."""
     rng = np.random.default_rng(5)
     grid = gs.OccupancyGrid(rng.choice([0, 100], (37, 53), p=[0.97, 0.03]), 0.25, (3.0, -2.0, 0.3))
     local = rng.uniform((-1, -1, -4), (14, 10, 4), (PARTICLES, 3))

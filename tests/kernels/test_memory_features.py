@@ -1,4 +1,4 @@
-"""Kernels of landmarks and of sensors without a scan under the checkers of memory."""
+"""Kernels of landmarks and of sensors without a scan under checkers of memory."""
 
 from __future__ import annotations
 

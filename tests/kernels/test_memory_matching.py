@@ -1,4 +1,4 @@
-"""Kernels of matching, mapping and localisation under the checkers of memory."""
+"""Kernels of matching, mapping and localisation under checkers of memory."""
 
 from __future__ import annotations
 

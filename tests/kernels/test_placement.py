@@ -35,7 +35,7 @@ FAMOUS = 6381956970095103 * 2.0**797  # of all float64 numbers the nearest to a 
 
 
 def errors(theta: np.ndarray) -> np.ndarray:
-    """Return errors of cosines and sines in ulps of float64, against as many digits as are needed."""
+    """Return errors of cosines and sines in ulps of float64, against mpmath with enough digits."""
     found = []
     with mp.workdps(400):
         for angle, *values in zip(theta, *heading.cos_sin(theta), strict=True):
@@ -196,7 +196,7 @@ def test_every_device_gives_the_bits_of_the_reference(name, real, given_as, devi
 @pytest.mark.parametrize("real", PRECISIONS)
 @pytest.mark.parametrize("name", FRAMES)
 def test_the_kernel_does_what_the_host_does(name, real, backend):
-    """The same bits as frames.place_poses, which places poses for devices without float64."""
+    """The kernel has the bits of frames.place_poses, which places poses for devices without float64."""
     poses, grid, mount = poses_of(name), grid_of(name), FRAMES[name][2]
     expected = place_poses(poses, grid, mount, np.dtype(real))
     found = launch(get_backend(backend), poses, grid, mount, real)
@@ -219,7 +219,7 @@ def test_positions_and_headings_against_60_digits(name):
     resolution, origin, mount = FRAMES[name]
     poses = poses_of(name)[500:800]
     found = place_poses(poses, grid_of(name), mount, np.dtype(np.float64))
-    # A sum of world coordinates in cells is rounded to an ulp of them.
+    # A sum of world coordinates in cells is rounded to one of their ulps.
     slack = 1e-12 + 8 * np.finfo(float).eps * (2000 + math.hypot(*origin[:2]) / resolution)
     for pose, cell, high, low in zip(poses, found.cell, found.pose, found.low, strict=True):
         x, y, cos, sin = placed(pose, origin, resolution, mount)
@@ -229,7 +229,7 @@ def test_positions_and_headings_against_60_digits(name):
 
 
 def test_frames_without_yaw_and_mount_change_no_bit(backend):
-    """Without yaw and mount nothing is added: a heading keeps its cosine and sine, a whole cell has no fraction."""
+    """Without yaw and mount no term is added: a heading keeps its cosine and sine, a whole cell has no fraction."""
     poses = np.array([[3.0, 4.0, 0.1], [0.5, 0.25, -2.0], [600.0, 300.0, 1e5], [-0.0, -0.0, -0.0]])
     grid = gs.OccupancyGrid(np.zeros((ROWS, COLS), np.int8), 1.0)
     found = launch(get_backend(backend), poses, grid, (0.0, 0.0, 2.0), "float64")
@@ -299,7 +299,7 @@ def test_poses_that_are_not_finite_are_reported_and_harmless(yaw, real, given_as
 
 
 def test_a_position_that_overflows_is_far_away(backend):
-    """Finite poses whose sums are not: no NaN, and no index that is not one."""
+    """Finite poses with infinite sums give no NaN and no invalid index."""
     grid = gs.OccupancyGrid(np.zeros((3, 3), np.int8), 1e-4, (-1e9, 1e9, 2.0))
     poses = np.array([[1.7e308, -1.7e308, 0.0], [1.7e308, 1.7e308, 1.0], [-1.7e308, -1.7e308, 1.0]])
     found = launch(get_backend(backend), poses, grid, NO_MOUNT, "float32")

@@ -1,4 +1,4 @@
-"""Ranges of many cells: long corridors, far origins and the longest range there may be."""
+"""Ranges of many cells: long corridors, far origins and the longest possible range."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from gpusense.tables.rectangles import Planes
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_long_corridors(backend, precision):
-    """20 000 cells along an axis and aslant: the far wall at its distance, whatever lies beside the ray."""
+    """Rays of 20 000 cells, parallel to an axis or oblique, end at the far wall, whatever lies beside them."""
     length = 20_000
     occupied = np.zeros((9, length), bool)
     occupied[:, -1] = True
@@ -44,7 +44,7 @@ def test_long_corridors(backend, precision):
     assert (error <= (FLOAT32_CELLS if precision == "float32" else FLOAT64_RELATIVE * expected)).all()
 
 
-# The most cells that a range may have.
+# The largest number of cells in a range.
 MOST = 1 << 20
 
 
@@ -53,7 +53,7 @@ def rounded(value: Fraction, real: np.dtype) -> Fraction:
     if value == 0:
         return value
     exponent = math.floor(math.log2(value))
-    # Next to a power of two the logarithm may be off.
+    # Next to a power of two the logarithm may be off by one.
     exponent += (value >= Fraction(2) ** (exponent + 1)) - (value < Fraction(2) ** exponent)
     unit_in_last_place = Fraction(2) ** (exponent - np.finfo(real).nmant)
     return round(value / unit_in_last_place) * unit_in_last_place
@@ -88,7 +88,7 @@ def test_counts_of_boundaries_near_the_longest_range(precision):
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_origins_nearly_as_far_off_as_a_range_may_be_long(precision, backend):
-    """float64 is the rational walk; float32 has the bits of numpy's walk from cell to cell."""
+    """float64 ranges are those of a rational walk; float32 has the bits of NumPy's walk from cell to cell."""
     rng = np.random.default_rng(19)
     occupied = rng.random((50, 60)) < 0.02
     target = rng.uniform((0, 0), (60, 50), (600, 2))
@@ -104,7 +104,7 @@ def test_origins_nearly_as_far_off_as_a_range_may_be_long(precision, backend):
         assert differing(cast(scene, backend, precision, Planes(sectors)), found) == 0
     assert differing(found, cast(scene, "numpy", precision)) == 0
     if precision == "float64" and backend == "numpy":
-        # The walk begins near the map, at a place on the ray that is exact.
+        # The walk begins near the map, at an exact place on the ray.
         for i in range(0, 600, 4):
             ray, skipped = scene.ray(i), int(away[i]) - 100
             near = ray.moved(*(skipped * Fraction(d) for d in ray.direction), 0)
@@ -117,7 +117,7 @@ def test_origins_nearly_as_far_off_as_a_range_may_be_long(precision, backend):
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_the_longest_corridor(precision, backend):
-    """A million cells inside the map: counts of boundaries as they were at its begin."""
+    """After a million cells inside the map, counts of boundaries are as exact as at the beginning."""
     length = MOST - 100 if get_backend(backend).info.backend != "numpy" else 100_000
     occupied = np.zeros((3, length), bool)
     occupied[:, -1] = True

@@ -63,7 +63,7 @@ def test_every_backend_has_the_bits_of_numpy_for_any_number_of_sectors(family, b
     bits = np.dtype(precision).str.replace("f", "u")
     for scene in scenes_of(family):
         expected = cast(scene, "numpy", precision)
-        # Vectors too, where the device has them.
+        # In lanes as well, where the device has them.
         for wide in (False, True) if get_backend(backend).info.lanes > 1 else (False,):
             found = cast(scene, backend, precision, Planes(sectors), wide=wide)
             wrong = np.flatnonzero(expected.view(bits) != found.view(bits))
@@ -73,7 +73,7 @@ def test_every_backend_has_the_bits_of_numpy_for_any_number_of_sectors(family, b
 def unexplained(
     scene: Scene, found: np.ndarray, suspects: np.ndarray, move: float, turn: float, tolerance: float
 ) -> list[int]:
-    """Return the rays whose range is also not a nearby ray's."""
+    """Return the rays whose range is not that of a nearby ray either."""
     cells = scene.occupied.tolist()
     return [
         i
@@ -86,7 +86,7 @@ def unexplained(
 
 
 def test_a_diagonal_pair_of_walls_never_leaks(backend):
-    """Neither pair of diagonal neighbours lets a ray through their common corner, from any side."""
+    """Neither pair of diagonal neighbours lets a ray pass through their common corner, from any side."""
     for pair in (((5, 5), (6, 6)), ((5, 6), (6, 5))):
         occupied = np.zeros((12, 12), bool)
         for row, col in pair:
@@ -103,12 +103,12 @@ def test_a_diagonal_pair_of_walls_never_leaks(backend):
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_no_pair_of_walls_leaks_at_any_slope(precision, backend):
-    """Rays aimed at the common corner of two walls as exactly as floats can: however they round, a wall stops them."""
+    """Rays aim at the common corner of two walls as exactly as floats allow; a wall stops them however they round."""
     rng = np.random.default_rng(13)
     for number in range(40):
         sign = rng.choice([-1, 1], 2)
         occupied = np.zeros((41, 41), bool)
-        # The corner is (20, 20). The cells before and behind it on the way are free, the two beside it are walls.
+        # The corner is (20, 20). Along the ray, the cells before and behind it are free; the two beside it are walls.
         occupied[20 if sign[1] < 0 else 19, 20 if sign[0] > 0 else 19] = True
         occupied[20 if sign[1] > 0 else 19, 20 if sign[0] < 0 else 19] = True
         if number % 2:

@@ -1,4 +1,4 @@
-"""Readings far from all particles: the particles reach them without becoming copies of one, or the estimate says so."""
+"""Readings far from all particles: particles reach them without becoming copies of one, or the estimate reports it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gpusense.localization.filter_cloud import is_starved, summary_of
 
 
 def follow(backend, prior, sigma, far, corrections, **options):
-    """Return estimates of a robot at x = far, y = 0, where a filter was told a normal density around the origin."""
+    """Return estimates of a robot at x = far, y = 0 by a filter that starts with a normal density around the origin."""
     model = gs.PositionModel(gs.PositionParameters(sigma=sigma), backend=backend)
     pf = gs.ParticleFilter(model, particles=2000, seed=1, **options)
     pf.initialize(mean=(0, 0, 0), covariance=np.diag([prior**2, prior**2, 1.0]))
@@ -33,7 +33,7 @@ def test_particles_reach_a_fix_that_is_far_from_all_of_them(backend, prior, sigm
         assert (deviations > sigma / 4).all()
         assert (np.abs(one.pose[:2] - (far, 0.0)) < 4 * deviations + sigma / 2).all(), one
         assert one.effective_sample_size < 1.2 * particles + 5
-    # The first correction cannot use all of such a fix, and says so.
+    # The first correction cannot use the whole fix, and reports it.
     assert found[0].used < 0.7 and found[-1].used == 1.0
     assert np.abs(found[-1].pose[:2] - (far, 0.0)).max() < 4 * sigma
 

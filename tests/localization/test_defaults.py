@@ -41,7 +41,7 @@ def test_library_and_commands_have_its_values():
         command.add_arguments(parsers[-1])
     assert parsers[0].get_default("temperature") == DEFAULTS.temperature
     assert parsers[1].get_default("particles") == DEFAULTS.particles
-    # Options that stand before a file of parameters have no value of their own; the help has the table's.
+    # Options that override a file of parameters have no default; their help has the table's value.
     text = re.sub(r"\s+", " ", parsers[0].format_help())
     alpha = shown(DEFAULTS.alpha).replace(",", "")
     for value in (f"default: {DEFAULTS.particles}", alpha, f"default: {DEFAULTS.reverse})"):

@@ -23,7 +23,7 @@ def gps(backend="numpy", precision="float64"):
 
 
 def posterior(count, seed, backend="numpy"):
-    """Return mean and covariance of a robot that knows its heading, after three steps and fixes."""
+    """Return mean and covariance of a robot with a known heading, after three steps and fixes."""
     motion = gs.OdometryMotion((0, 0, 0.04, 0), reverse=0.0, least=(0.0, 0.0))
     pf = gs.ParticleFilter(gps(backend), motion=motion, particles=count, seed=seed, stages=1)
     pf.initialize(mean=(0, 0, 0), covariance=np.diag([0.5, 0.5, 0.0]))
@@ -160,7 +160,7 @@ def test_a_filter_on_a_wrong_map_says_that_it_is_lost():
 
 
 def test_people_in_the_room_are_no_wrong_map():
-    """Most of the beams may end at people: beams that are too short do not contradict a pose."""
+    """Even if most beams end at people, short beams do not contradict a pose."""
     model = gs.BeamModel(GRID, SCANNER, gs.BeamParameters(sigma_hit=0.1), backend="numpy")
     for share in (0.3, 0.6):
         pf, rng = gs.ParticleFilter(model, particles=200, seed=2), np.random.default_rng(1)
@@ -266,7 +266,7 @@ def test_motion_noise_is_learned():
         sign = -1 if rng.random() < 0.05 else 1
         truth.append(_step(truth[-1], one + noise[0], sign * (trans + noise[1]), two + noise[2]))
     fit = gs.fit_odometry_motion(np.array(odometry), np.array(truth))
-    # Mean squares of 3000 steps have a deviation of 3 %; turns and translations share the noise of a turn.
+    # Mean squares of 3000 steps have a standard deviation of 3 %; turns and translations share the noise of a turn.
     assert (np.array(fit.motion.alpha) / alpha)[[0, 1, 2]] == pytest.approx(np.ones(3), rel=0.35)
     assert fit.inflation < 1.8 and 0.03 < fit.motion.reverse < 0.07 and fit.motion.sideways < 0.002
     np.testing.assert_allclose(fit.motion.systematic, 0, atol=0.02)
@@ -284,7 +284,7 @@ def test_systematic_errors_and_slips_of_the_odometry_are_learned():
         end = gs.compose_poses(truth[-1], (0, 0, one))
         truth.append(gs.compose_poses(end, (ahead, side, two)))
     fit = gs.fit_odometry_motion(np.array(odometry), np.array(truth))
-    # Four deviations of estimates from 800 steps.
+    # Four standard deviations of estimates from 800 steps.
     np.testing.assert_allclose(fit.motion.systematic, missed, atol=0.012)
     assert fit.motion.sideways == pytest.approx(slip, rel=0.3)
     found = fit.motion.sampled(odometry[0], odometry[1])
@@ -296,7 +296,7 @@ def test_systematic_errors_and_slips_of_the_odometry_are_learned():
 
 
 def _drive(motion, steps, rng):
-    """Return the poses of an odometer, and true ones that have the noise of a model."""
+    """Return the poses of an odometer, and true ones with the noise of a model."""
     truth, odometry = [np.zeros(3)], [np.zeros(3)]
     for _ in range(steps):
         odometry.append(_step(odometry[-1], rng.normal(0.1, 0.15), rng.uniform(0, 0.6), rng.normal(0, 0.15)))
@@ -396,7 +396,7 @@ def test_particles_without_a_correction_are_all_effective(backend):
     assert pf.estimate().effective_sample_size == 200
     pf.initialize(mean=TRUTH, covariance=np.eye(3) * 0.01)
     assert pf.estimate().effective_sample_size == 200
-    # Readings of the particles before say nothing of these.
+    # Readings of the earlier particles have no information on these.
     with pytest.raises(RuntimeError, match="needs a correction first"):
         pf.reset()
 
@@ -409,7 +409,7 @@ def test_readings_may_be_overwritten_after_the_correction(backend):
 
 
 def test_a_filter_that_never_draws_keeps_what_it_knows(backend):
-    """With a threshold below 1 / N no weight may round to the integer 0."""
+    """With a threshold below 1 / N, no weight may round to the integer 0."""
     pf = gs.ParticleFilter(gps(backend), particles=1000, seed=2, threshold=1e-15, stages=1)
     pf.initialize(mean=(0, 0, 0), covariance=np.diag([0.09, 0.09, 1e-6]))
     for _ in range(3):

@@ -1,4 +1,4 @@
-"""Each member of the interface between a filter and its particles, for a cloud on one device and for a split one."""
+"""Each member of the interface between a filter and its particles, for a cloud on one device and on several."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def cloud(kind, backend) -> Any:
 
 @pytest.fixture
 def other(kind, backend) -> Any:
-    """The cloud of the other kind, whose bits are the same."""
+    """Return the cloud of the other kind, which must have the same bits."""
     found = made({"one device": "split", "split": "one device"}[kind], backend)
     found.place(POSES)
     return found
@@ -126,7 +126,7 @@ def test_a_pool_is_injected(cloud, other):
         # A second stage would draw none of them.
         numbers = step(recovery="augmented", pool=(5, (0.1, 0.1, 0.1)))._replace(stages=1)
         contents = each.contents(COUNT)
-        # Averages of the likelihood that say that it has fallen.
+        # Averages of a likelihood that has fallen.
         state = contents.state.copy()
         state[SLOW], state[FAST] = 1e6, 1.0
         each.restore(contents._replace(state=state, pool=far))
@@ -155,7 +155,7 @@ def test_seconds_are_those_of_waiting_for_scores(cloud, backend):
     cloud.correct(step())
     first = cloud.scoring_seconds
     cloud.correct(step())
-    # A recorded program has no time of its own.
+    # A recorded program takes no time for itself.
     recorded = get_backend(backend).info.kind == "gpu"
     assert first == cloud.scoring_seconds == 0 if recorded else 0 < first < cloud.scoring_seconds < 60
 

@@ -60,7 +60,7 @@ def test_a_gpu_has_the_particles_of_a_processor(needs, monkeypatch):
     on_gpu = run()
     for one, other in zip((on_processor[0], *on_processor[1]), (on_gpu[0], *on_gpu[1]), strict=True):
         np.testing.assert_array_equal(one, other)
-    # KLD sampling follows the cloud in steps of several stages, too.
+    # KLD sampling also follows the cloud in steps of several stages.
     assert on_gpu[2] == on_processor[2] and on_gpu[2][-1] < 500 < on_gpu[2][0]
 
 
@@ -100,5 +100,5 @@ def test_a_gpu_tracks_as_a_processor_does(warp_as_gpu, monkeypatch):
     on_gpu = tracked(3)[0].mean_and_covariance()
     monkeypatch.undo()
     on_processor = tracked(3)[0].mean_and_covariance()
-    # Log-likelihoods differ by roundings, random numbers not at all.
+    # Log-likelihoods differ by rounding, random numbers do not differ.
     np.testing.assert_allclose(on_gpu[0], on_processor[0], atol=0.02)

@@ -16,7 +16,7 @@ from gpusense.sweeps.executors import ProcessExecutor
 
 
 def continued(pf, first=3, steps=4):
-    """Return everything that a filter shows as it goes on, its state included."""
+    """Return all outputs of a filter as it continues, its state included."""
     shown = []
     for step in range(first, first + steps):
         pf.predict(*odometry(step))
@@ -26,7 +26,7 @@ def continued(pf, first=3, steps=4):
 
 
 def restored(pf, make):
-    """Return a new filter with the state of another, which went through a pickle."""
+    """Return a new filter with the pickled state of another."""
     state = pickle.loads(pickle.dumps(pf.state()))
     made = make()
     made.restore(state)
@@ -44,14 +44,14 @@ COPIES = {
 @pytest.mark.parametrize("name", FILTERS)
 def test_a_copy_continues_with_the_same_bits(name, how, backend):
     pf = begun(FILTERS[name](backend), everywhere=name == "sensors, resetting")
-    # A motion that has not run yet is part of the state.
+    # A pending motion is part of the state.
     pf.predict(*odometry(2))
     made = COPIES[how](pf, lambda: FILTERS[name](backend))
     assert everything(made) == everything(pf) and repr(made) == repr(pf)
     assert (made.models == pf.models) == (how == "copy" and name != "split")
     before = everything(pf)
     expected = continued(made)
-    # The original is as it was, and goes the same way.
+    # The original is unchanged, and continues in the same way.
     assert everything(pf) == before
     assert continued(pf) == expected
 

@@ -1,6 +1,6 @@
 """A call of a filter that was interrupted at any line has changed all of the filter's state or none.
 
-What "interrupted" means to a model or a device is the matter of the tests of models; here it is the filter's own state.
+Tests of models cover interrupts in models and devices; these cover the filter's own state.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from support.split_scene import field
 import gpusense as gs
 from gpusense.localization import journal, starts
 
-# Rooms whose lines are interrupted: those below them know nothing of a filter.
+# Rooms whose lines are interrupted: the rooms below them do not use filters.
 ROOMS = ("localization", "sweeps")
 CALLS: dict[str, Callable[[Filter], Any]] = {
     "predict": lambda pf: pf.predict(*odometry(3)),
@@ -36,7 +36,7 @@ OTHER_STATES: dict[str, Any] = {}
 
 @pytest.fixture(autouse=True)
 def few_tries(monkeypatch):
-    """A reset tries few poses: a state has all or nothing of any number."""
+    """Let a reset try few poses: for any number, a state has all of it or nothing."""
     monkeypatch.setattr(starts, "_LEAST_TRIES", 300)
 
 
@@ -85,13 +85,13 @@ class Interrupted:
 
 
 def interrupt_lines(name: str, backend: str, call: str, most: int | None) -> None:
-    """Interrupt a call at all of its lines, or at most at some of them, others for each filter and call."""
+    """Interrupt a call at all of its lines, or at no more than a number of them, which differ by filter and call."""
     case = Interrupted(name, backend, call)
     lines = case.lines()
     every = 1 if most is None else max(len(lines) // most, 1)
     lines = lines[(3 * list(FILTERS).index(name) + list(CALLS).index(call)) % every :: every]
     reached = sum(case.check(line) for line in lines)
-    # Lines that make and record programs are reached at first only.
+    # Only first calls reach lines that make and record programs.
     assert reached > 0.7 * len(lines) > 0, (reached, len(lines))
 
 
@@ -168,7 +168,7 @@ def test_a_model_that_fails_in_any_call_changes_nothing(backend, monkeypatch):
 
 
 def test_an_interrupt_of_the_way_back_is_made_good_by_the_next_call(monkeypatch):
-    """A second Ctrl-C while the first one is handled."""
+    """A second Ctrl-C comes while the first one is handled."""
     pf = begun(FILTERS["field"]("numpy"))
     pf.predict(*odometry(3))
     before, restore = everything(pf), journal.Journal.restore

@@ -66,7 +66,7 @@ def test_wrong_maps_and_wrong_mounts_are_distinguished(model):
 
 
 def test_a_mount_is_found_beside_sensors_without_scans(model):
-    """Only scans are mirrored: a heading has no beams."""
+    """Only scans can be mirrored: a heading has no beams."""
     compass = gs.HeadingModel(backend="numpy")
     monitor = gs.PoseMonitor([model, compass])
     for pose in POSES:

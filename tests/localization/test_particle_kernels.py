@@ -59,7 +59,7 @@ def test_deviates_are_uniform_and_standard_normal():
     one, two = normal_pair(found[0], found[1])
     assert stats.kstest(one, "norm").pvalue > 1e-3 and stats.kstest(two, "norm").pvalue > 1e-3
     assert abs(np.corrcoef(one, two)[0, 1]) < 0.01
-    # Independent over steps and streams, too.
+    # Steps and streams are independent as well.
     other = normal_pair(*random_words((n, zero + 1, zero, zero), 7, 9)[:2])[0]
     assert abs(np.corrcoef(one, other)[0, 1]) < 0.01
 
@@ -135,7 +135,7 @@ def test_draws_keep_the_expected_copies(stratified):
 def run_step(selection, count, flags=PLAIN, *, lanes=True, draws=c.SYSTEMATIC, lone=False, depth=1.0):
     """Return all buffers after two motions, a correction of two stages and an estimate.
 
-    Where ``lone`` is set, only particles without a weight are possible.
+    With ``lone``, only particles without a weight are possible.
     """
     device, rng = get_backend(selection), np.random.default_rng(0)
     sums, block = Sums(device, count), 8
@@ -192,7 +192,7 @@ def run_step(selection, count, flags=PLAIN, *, lanes=True, draws=c.SYSTEMATIC, l
     return found
 
 
-# The largest one has more blocks than a work-item adds up.
+# The largest one has more blocks than a work-item sums.
 @pytest.mark.parametrize("count", [1, 37, 1500])
 @pytest.mark.parametrize("flags", [PLAIN, frozenset({"FLOAT64"})], ids=["float32", "float64"])
 @pytest.mark.parametrize("lanes", [False, True], ids=["scalars", "lanes"])
@@ -283,7 +283,7 @@ def test_estimates_are_the_moments_of_the_cloud(backend, name):
     assert numbers[c.WIDE_HEADINGS] == (turn > 1)
 
 
-# Deviations of turns: none, of a jump of 100 m, and the largest that a filter asks for.
+# Deviations of turns: none, that of a jump of 100 m, and the largest that a filter uses.
 @pytest.mark.parametrize("deviation", [0.1, 14.2, 1e5])
 @pytest.mark.parametrize("lanes", [False, True], ids=["scalars", "lanes"])
 @pytest.mark.parametrize("kind", [c.STRAIGHT, c.VELOCITY_MODEL])

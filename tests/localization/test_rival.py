@@ -34,7 +34,7 @@ def scans(poses, people=0.0, grid=GRID):
 
 
 def along(start, count, step=0.25):
-    """Return poses of a robot that drives straight on."""
+    """Return poses of a robot that drives straight ahead."""
     x, y, theta = start
     s = step * np.arange(count)
     return np.column_stack([x + s * math.cos(theta), y + s * math.sin(theta), np.full(count, theta)])
@@ -84,7 +84,7 @@ def test_a_turn_that_the_odometry_misses_is_found_again(model):
     odometry[10:] = along((*odometry[9][:2], 0.0), 20, 0.05)
     found = track(poses, scans(poses), begun(model, poses[0]), odometry)
     assert all(error(e, pose) < 0.2 for e, pose in zip(found[:10], poses, strict=False))
-    # A place that was searched for is confirmed by scans of the robot's way.
+    # Scans along the robot's path confirm a place that a search found.
     assert all(error(e, pose) < 0.2 and not e.lost for e, pose in zip(found[-8:], poses[-8:], strict=True))
 
 
@@ -124,7 +124,7 @@ def test_the_temperature_does_not_learn_from_a_doubtful_pose(model):
         pf.predict((0, 0, 0), (0, 0, 0))
         pf.correct(z)
         found.append((pf.estimate().explained, pf.temperatures))
-    # The first scan elsewhere was learned from before it was judged.
+    # The filter learned from the first scan elsewhere before it judged it.
     doubtful = [after for (explained, before), (_, after) in itertools.pairwise(found) if explained < 0.3]
     assert len(doubtful) > 1 and set(doubtful) == {found[0][1]}
 
@@ -145,7 +145,7 @@ def test_poses_are_drawn_by_their_likelihood():
 
 @pytest.mark.parametrize("kind", ["field", "beam"])
 def test_a_carried_robot_is_found_within_a_few_scans(model, kind):
-    """Anywhere in the building, whatever the number of particles: the search is over the whole map."""
+    """The search is over the whole map, so neither the place nor the number of particles matters."""
     if kind == "beam":
         model = gs.BeamModel(GRID, SCANNER, gs.BeamParameters(z_hit=0.8, z_short=0.1, z_max=0.0, z_rand=0.1,
                              sigma_hit=0.05, lambda_short=0.5), backend="opencl")  # fmt: skip
@@ -172,7 +172,7 @@ def test_the_likeliest_poses_of_a_map_hold_the_right_one():
 
 
 def test_a_second_rival_has_nothing_of_the_first(backend, monkeypatch):
-    """A state does not depend on rivals that the filter has given up: a copy made before them goes on alike."""
+    """A state does not depend on rivals that the filter has given up: a copy made before them continues alike."""
     monkeypatch.setattr("gpusense.localization.starts._LEAST_TRIES", 300)
     pf = scene.begun(scene.FILTERS["sensors, resetting"](backend), 4, everywhere=True)
     pf.predict(*scene.odometry(3))

@@ -136,7 +136,7 @@ def test_the_filter_starts_anew_everywhere(load: Any, monkeypatch: pytest.Monkey
     assert node.localizer.estimate is None
     wide = np.ptp(node.localizer.cloud()[0][:, :2], axis=0)
     assert (near < 1.5).all() and (wide > 3.0).all()
-    # A robot that stands is localised anew, and a bad scan before that publishes nothing.
+    # A robot that stands still is localised again; a bad scan before that publishes nothing.
     bad = scan_message(2.0)
     bad.range_max = math.inf
     node.made["scan"].call(bad)

@@ -36,7 +36,7 @@ def test_beams_of_a_person_are_left_out(beams):
     missing = np.isnan(found)
     assert missing[BLOCKED].all() and missing[5]
     assert np.array_equal(found[~missing], ranges[~missing]) and ranges[20] == 0.5
-    # Of thinned scans no other beams come in.
+    # Thinned scans get no other beams.
     assert np.count_nonzero(~missing) == pytest.approx((beams or 60) * (60 - 13) / 60, abs=3)
 
 

@@ -1,4 +1,4 @@
-"""The temperature against the variance of scores that is known from how the errors of scans were drawn."""
+"""The temperature against the variance of scores, which follows from the distribution of drawn errors."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import gpusense as gs
 from gpusense.localization.temperature import BeamCorrelation, axes_of, poses_around
 
 HALF = np.array([3.0, 2.0])
-# Of 40 scans with four blocks, F_4 has a deviation of 0.15, and F_4 / F_16 one of 0.2, which counts up to three times,
-# and only where it is above 1.
+# For 40 scans with four blocks, F_4 has a standard deviation of 0.15, and F_4 / F_16 one of 0.2, which counts up to
+# three times, and only above 1.
 LEAST, MOST = 0.5, 1.3
 
 
@@ -33,7 +33,7 @@ def autoregressive(rng, count, phi):
 
 
 def learned(draw, count, scans=150, sigma=0.05):
-    """Return what is learned of scans with drawn errors, and the temperature at which the mean NEES of fits is 3."""
+    """Return the learned temperature of scans with drawn errors, and the one at which the mean NEES of fits is 3."""
     rng, found, squared = np.random.default_rng(3), BeamCorrelation(), []
     for _ in range(scans):
         gradients, ways = room(rng.uniform(0, 2 * np.pi), count)
@@ -58,7 +58,7 @@ def test_short_correlations_have_the_temperature_of_theory(count, phi):
 @pytest.mark.parametrize(("count", "phi"), [(180, 0.8), (180, 0.95), (60, 0.8)])
 def test_long_correlations_make_normalised_errors_of_fits_right(count, phi):
     found, wanted = learned(lambda rng, n: autoregressive(rng, n, phi), count)
-    # Their variance ends to grow before the whole scan, which no block of it shows: at most 3 times too careful.
+    # Their variance stops growing at the scale of the whole scan, which no block shows: at most 3 times too careful.
     assert wanted / 3 < found.temperature(count) < 1.2 * wanted
     plain = learned(lambda rng, n: rng.normal(size=n), count)[0]
     assert found.temperature(count) < 0.5 * plain.temperature(count)
@@ -110,7 +110,7 @@ def test_scans_that_do_not_follow_and_few_beams_are_not_compared():
 
 
 def test_models_of_scans_are_calibrated():
-    """Beam models of a room, with independent errors and with moving averages of 6 beams, whose inflation is 6."""
+    """Errors of beam models of a room are independent, or moving averages of 6 beams, whose inflation is 6."""
     grid = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
     scanner = gs.Scanner.uniform(angle_min=-np.pi, angle_increment=np.pi / 180, count=360, range_max=10.0)
     model = gs.BeamModel(grid, scanner, gs.BeamParameters(0.97, 0.0, 0.0, 0.03, sigma_hit=0.05), backend="numpy")

@@ -117,10 +117,10 @@ def test_the_ratio_ignores_short_beams_and_has_limits():
 
 
 def test_the_belief_is_the_exact_filter_of_two_states():
-    """Increments of an autoregressive process of Gaussian ratios, against the joint density of all of them."""
+    """Compare increments of an autoregressive process of Gaussian ratios with the joint density of all ratios."""
     rng = np.random.default_rng(0)
     for gap in (0.0, 0.5, 2.0):
-        # Ratios of N(+-m, 2 m) are those of normal data; a way of `gap` between the scans gives their correlation.
+        # Ratios of N(+-m, 2 m) are those of normal data; the distance `gap` between scans gives their correlation.
         rho, mean = STAYS * math.exp(-gap / LENGTH), 1.3
         ratios = rng.normal(mean, math.sqrt(2 * mean), 6)
         covariance = 2 * mean * rho ** np.abs(np.subtract.outer(np.arange(6), np.arange(6)))
@@ -172,7 +172,7 @@ def test_a_short_log_leaves_places_that_look_alike():
     one = Belief(0.0, 0.0, (0.0, 0.0, 0.0)).judged((9.0, 0.0, 0.0), -3.0)
     alike = ALIKE * math.exp(-9.0 / ALIKE_LENGTH)
     assert one.wrong / (1 - one.wrong) == pytest.approx(alike + (1 - alike) * math.exp(one_step(9.0, -3.0)))
-    # A pose that looks alike and is contradicted is found out within a few scans.
+    # A pose that looks alike and is contradicted is detected within a few scans.
     for k in range(1, 4):
         near = near.counted().judged((0.3 + 1.0 * k, 0.0, 0.0), 3.0)
     assert near.wrong > 0.85

@@ -1,4 +1,4 @@
-"""Bags that grow without bound: chunks, messages and files that decompress to more than they may, and YAML."""
+"""Bags that grow without bound: chunks, messages and files that decompress beyond their limits, and YAML."""
 
 from __future__ import annotations
 

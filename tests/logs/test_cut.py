@@ -1,4 +1,4 @@
-"""Logs that are cut off are read up to there, with a warning; broken ones are errors as before."""
+"""Logs that are cut off are read up to the cut, with a warning; broken logs are errors."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_last_line_without_an_end_is_whole_and_others_are_errors(tmp_path, lin
         path.write_text(text)
         with pytest.raises(ValueError, match=r"run\.log:"):
             count(path)
-    # Nothing but the cut line.
+    # The cut line alone.
     path.write_text(lines[0][:30])
     with pytest.raises(ValueError, match=r"run\.log"):
         count(path)
@@ -132,7 +132,7 @@ def test_a_bag_that_is_cut_before_its_first_message_is_an_error(tmp_path, needs_
 
 
 def test_lengths_of_headers_are_not_believed(tmp_path, needs_ros):
-    """A record of 2^60 bytes takes what the file has."""
+    """A record that claims 2^60 bytes takes the bytes of the file."""
     file = tmp_path / "run.mcap"
     header = struct.pack("<BQ", 1, 12) + struct.pack("<I", 4) + b"ros2" + struct.pack("<I", 0)
     file.write_bytes(b"\x89MCAP0\r\n" + header + struct.pack("<BQ", 6, 1 << 60) + bytes(100))

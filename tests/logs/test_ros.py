@@ -1,4 +1,4 @@
-"""Rosbags of ROS 1 and 2 and MCAP files, written here by the library rosbags."""
+"""Bags of ROS 1 and 2 and MCAP files, which the library rosbags writes here."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_scans_with_odometry_and_mount(tmp_path: Path, kind: str) -> None:
     assert (scanner.range_max, scans[0].pose) == (8.0, None) and not scans[0].ranges.flags.writeable
     np.testing.assert_array_equal(scans[0].ranges, [1.0, math.inf, math.nan, math.nan, 9.0, 2.0])
     assert gs.classify(scans[0].ranges, scanner).tolist() == [2, 1, 0, 0, 1, 2]
-    # Halfway between headings pi - 0.1 and pi + 0.1, along the shorter arc; after the last message its own.
+    # Halfway between headings pi - 0.1 and pi + 0.1, along the shorter arc; after the last message, its heading.
     x, y, theta = scans[0].odometry
     assert (x, y) == (0.5, 0.5) and abs(math.remainder(theta - math.pi, 2 * math.pi)) < 1e-12
     assert scans[2].odometry[0] == 2.0

@@ -1,4 +1,4 @@
-"""Logs that gpusense writes are read back: CARMEN logs and bags, whole or not at all."""
+"""Logs that gpusense writes can be read: CARMEN logs and bags, whole or not at all."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_carmen_logs_are_read_back(name, tmp_path):
     assert sum(isinstance(record, gs.Odometry) for record in both) == 5
     raw = path.read_bytes()
     write_carmen(path, scans())
-    assert path.read_bytes() == raw  # compressed logs hold no time of writing
+    assert path.read_bytes() == raw  # Compressed logs hold no time of writing.
     if name.endswith(".gz"):
         assert gzip.decompress(raw).startswith(b"ODOM")
 

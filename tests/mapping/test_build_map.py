@@ -24,7 +24,7 @@ UNIT = 4096
 
 
 def fraction_cells(start, end):
-    """Return the cells of a ray in order: the next boundary by fractions of the ray, x first where they are equal."""
+    """Return the cells of a ray in order, by the fractions of the ray at boundaries, x first where they are equal."""
     x, y = (Fraction(int(v), UNIT) for v in start)
     dx, dy = (Fraction(int(v), UNIT) - w for v, w in zip(end, (x, y), strict=True))
     col, row = math.floor(x), math.floor(y)
@@ -221,7 +221,7 @@ def far_counts():
 
 
 def test_rays_from_far_do_not_bend(backend):
-    """Rays of more than 2^18 cells, which were clamped there, visit the cells of a walk in integers."""
+    """Rays of more than 2^18 cells, an earlier limit, visit the cells of a walk in integers."""
     shape, (hits, misses) = (40, 50), far_counts()
     assert misses.sum() > 150 and hits.sum() == 4
     starts, ends = (np.array([ray[k] for ray in FAR]) for k in (0, 1))
@@ -275,7 +275,7 @@ def test_bands_of_rows_make_the_same_map(backend, yaw):
 
 
 def test_the_counts_of_a_large_map_take_little_memory_beside_it():
-    """41 bytes a cell before; NumPy's counts are memory of this process, so that all of it is measured."""
+    """It was 41 bytes a cell once. NumPy's counts are memory of this process, so all of it is measured."""
     scans, poses, scanner = world_of_scans(count=40, side=150.0)
     options = dict(resolution=0.05, origin=(0, 0, 0), shape=(3000, 3000), backend="numpy")
     gs.build_map(scans[:1], poses[:1], scanner, **options)

@@ -7,14 +7,17 @@ import pytest
 from support.matching_scenes import FRONT, RING, random_pairs
 
 from gpusense.backends import get_backend
+from gpusense.interface.flags import flags_if
+from gpusense.interface.lanes import with_teams_flag
 from gpusense.interface.structs import MatchRules
+from gpusense.matching import icp
 from gpusense.matching.icp import IcpPairs, space_of
 from gpusense.matching.points import scan_points
 from gpusense.reference import icp_pairs as reference
 from gpusense.reference.lines import fit_lines
 
 RULES = MatchRules(40, 2, 3, 1, 0, 0, 1.0, 0.3, 1.0, 0.03, 0.85, 0.06, 0.3, 1e-4)
-# Sums are added in another order than by NumPy: information is compared relative to its largest number.
+# Sums have another order than NumPy's: information is compared relative to its largest number.
 TOLERANCE = {"float32": (2e-5, 2e-4), "float64": (1e-10, 1e-9)}
 
 
@@ -45,6 +48,17 @@ def test_devices_agree_with_the_reference(device, precision, scanner, thin):
         largest = np.abs(expected[..., part]).max(axis=-1, keepdims=True)
         assert (np.abs(found - expected)[..., part] <= sums * largest).all()
     np.testing.assert_allclose(found[..., 18:], expected[..., 18:], rtol=sums, atol=pose)
+
+
+@pytest.mark.sampled(0.4)
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize(("scanner", "thin"), [(RING, 0), (FRONT, 0), (FRONT, 1)], ids=["ring", "front", "thin"])
+def test_a_team_of_work_items_agrees_with_the_reference(device, monkeypatch, precision, scanner, thin):
+    """GPUs match in teams by themselves; here processors do."""
+    scalar = flags_if(FLOAT64=precision == "float64")
+    monkeypatch.setattr(icp, "with_lanes_flag", lambda lanes, kernel, flags: scalar)
+    monkeypatch.setattr(icp, "with_teams_flag", lambda kind, *launched: with_teams_flag("gpu", *launched))
+    test_devices_agree_with_the_reference(device, precision, scanner, thin)
 
 
 def test_the_search_by_bearing_finds_the_nearest_of_all_points(device):

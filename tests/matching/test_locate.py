@@ -102,7 +102,7 @@ def test_the_pose_of_a_bilinear_field_is_that_of_brute_force(seeds):
 
 
 def test_cluttered_scans_are_found_where_they_are_unique():
-    """People hide a quarter of the beams: fewer readings agree than any fixed share would ask for, none is too long."""
+    """People hide a quarter of the beams: fewer readings agree than any fixed share would require, none is too long."""
     grid, pose = house(), np.array([4.0, 2.6, 1.3])
     model = gs.LikelihoodFieldModel(grid, SCANNER, PARAMETERS, backend="opencl")
     ranges = scan_at(grid, pose, 0.01)

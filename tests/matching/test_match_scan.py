@@ -1,4 +1,4 @@
-"""Matches of scans: accuracy, honesty in stiff cases, and arguments."""
+"""Matches of scans: accuracy, honest covariances in stiff cases, and arguments."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ def test_a_temperature_divides_the_covariance():
 
 
 def test_what_the_reference_did_not_see_neither_attracts_nor_repels():
-    """A scan of 181 beams is matched to the part of it that the other one sees."""
+    """A scan of 181 beams is matched to the part of it that the other scan sees."""
     first, second = (segments_scan(ROOM, pose, FRONT) for pose in ((0.0, 0.0, 0.0), (0.1, 0.1, 0.6)))
     match = gs.match_scan(first, second, FRONT, (0.0, 0.0, 0.5), backend="numpy")
     np.testing.assert_allclose(match.pose, (0.1, 0.1, 0.6), atol=5e-3)

@@ -15,7 +15,7 @@ from gpusense.matching.noise import ROOT, scan_noise
 from gpusense.matching.observability import covariance_of, critical_ratio, observed_information
 from gpusense.matching.result import STATUSES
 
-# A corridor longer than the scanners see, and a room of which nothing is like ROOM.
+# A corridor longer than the range of the scanners, and a room that is nowhere like ROOM.
 CORRIDOR = np.array([[-200.0, -1.2, 200.0, -1.2], [-200.0, 1.4, 200.0, 1.4]])
 
 
@@ -44,7 +44,7 @@ def test_corridors_never_converge_and_every_finite_deviation_is_right(beams, noi
     assert match.usable.mean() > 0.95
     seen = match.usable
     off, variance = (match.pose - truth)[seen], np.einsum("sii->si", match.covariance)[seen]
-    # The position along the corridor; across it, too, unless it is an axis.
+    # The position along the corridor; that across it as well, unless the corridor follows an axis.
     assert np.isinf(variance[:, 0]).all()
     assert np.isinf(variance[:, 1]).all() or heading < 0.1
     assert np.isfinite(variance[:, 2]).all()
@@ -179,7 +179,7 @@ def test_few_beams_are_matched_to_a_map(beams):
 
 
 def test_covariances_of_noisy_dense_scans_are_right():
-    """Noise turns short lines: with longer ones for pose and information, NEES / 3 is near 1."""
+    """Noise turns short lines; with longer ones for pose and information, NEES / 3 is near 1."""
     rng, scanner = np.random.default_rng(4), ring(1081, 2.36)
     one, two, truth = random_pairs(100, scanner, seed=5)
     one, two = (z + rng.normal(0, 0.03, z.shape) for z in (one, two))
@@ -191,7 +191,7 @@ def test_covariances_of_noisy_dense_scans_are_right():
 
 
 def test_observability_is_invariant_and_lost_wholly():
-    """A direction that information has no more of than noise makes up is lost in every coordinate of it."""
+    """A direction with no more information than noise alone would give is lost in all its coordinates."""
     lost = np.array([0.3, -1.5, 1.0])
     frame = np.linalg.qr(np.column_stack([lost, np.eye(3)[:, :2]]))[0]
     spurious = 2.0 * np.outer(frame[:, 0], frame[:, 0])[None]

@@ -1,4 +1,4 @@
-"""Matches in maps that leave something open: honest covariances and failures, by every method, anywhere."""
+"""Matches in maps that do not determine the pose: honest covariances and failures, by every method, in any frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Masked arrays of NumPy: a masked reading is a missing one everywhere, a masked pose or cell is an error."""
+"""Masked arrays of NumPy: a masked reading is always missing, a masked pose or cell is an error."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def test_masked_readings_are_missing(needs, name):
     call, values, mask = READINGS[name]
     missing, all_forms = forms(values, mask)
     expected, plain = np.asarray(call(missing)), np.asarray(call(values))
-    # An unmasked scan has another result, so that a mask that is ignored is found.
+    # An unmasked scan has another result, so that an ignored mask is found.
     assert not np.array_equal(expected, plain, equal_nan=True)
     # Lists have another meaning for several models, and none for bound calls.
     for form in [all_forms["array"]] if name in ARRAYS_ONLY else all_forms.values():
@@ -140,7 +140,7 @@ def test_masked_integers_and_booleans_are_missing():
 
 
 def errors():
-    """Yield name, call and argument for masks without a meaning."""
+    """Yield name, call and argument of masks that have no meaning."""
     model = make("field", GRID, "numpy")
     poses = np.ma.array(POSES, mask=np.arange(36).reshape(12, 3) == 4)
     cells = np.ma.array([[0, 100]], mask=[[False, True]])

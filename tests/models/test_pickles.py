@@ -1,4 +1,4 @@
-"""Copies and pickles of models are made by the constructor's arguments: same bits, the map as it is now, no device."""
+"""Copies and pickles of models hold the constructor's arguments: same bits, the current map, no device."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_copies_have_the_bits_and_the_options(name, how, backend):
     assert made is not model and type(made) is type(model) and repr(made) == repr(model)
     assert np.array_equal(call(made), expected)
     assert made.backend is model.backend
-    # Nothing of the device was copied.
+    # No memory of the device was copied.
     assert len(pickle.dumps(model)) < 30_000
 
 
@@ -92,7 +92,7 @@ def test_copies_have_the_bits_and_the_options(name, how, backend):
 def test_every_argument_of_the_constructor_is_kept(name):
     model = CASES[name][0]("numpy")
     names = set(inspect.signature(type(model)).parameters) - {"backend"}
-    # Two names of one argument.
+    # Two names for one argument.
     assert set(model._arguments()) == names - ({"method"} if name == "caster" else set())
 
 

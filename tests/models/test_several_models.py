@@ -1,4 +1,4 @@
-"""Several models of one device in one call: each result has the bits of the model's own, and one wait is for all."""
+"""Several models of one device in one call: each result has the bits of the model's own call, and there is one wait."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def scans(scanner: gs.Scanner, *shape: int) -> np.ndarray:
 
 
 def models_of(backend: str) -> list[gs.BeamModel | gs.LikelihoodFieldModel]:
-    """Return models of two maps, two sensors, two kinds."""
+    """Return models of two maps, two sensors and two kinds."""
     made: list[gs.BeamModel | gs.LikelihoodFieldModel] = [
         gs.BeamModel(grid(1, 40), SCANNERS[0], backend=backend),
         gs.LikelihoodFieldModel(grid(1, 40), SCANNERS[0], backend=backend, temperature=0.5),
@@ -45,7 +45,7 @@ def models_of(backend: str) -> list[gs.BeamModel | gs.LikelihoodFieldModel]:
 
 def test_results_are_those_of_each_model(backend):
     models = models_of(backend)
-    # One scan, several scans, and both; particles of each model's own, or the same.
+    # One scan, several scans, and both; particles for each model, or shared ones.
     for shapes in (((50,), (50,), (50,), (20,)), ((3, 50), (4, 30), (2, 70), (3, 1)), ((50,), (3, 20), (1, 5), (0, 4))):
         given = [poses(i, *shape) for i, shape in enumerate(shapes)]
         z = [scans(model.scanner, *shape[:-1]) for model, shape in zip(models, shapes, strict=True)]
@@ -79,13 +79,13 @@ def test_no_model_and_no_particle(backend):
 
 
 def test_all_is_started_before_the_wait(needs, monkeypatch):
-    """A device whose copies to the host are commands is waited for once all models are started."""
+    """If copies to the host are commands, the call waits for the device after all models have started."""
     device = get_backend(needs("opencl"))
     monkeypatch.setattr(device, "_shared", False)
     models = models_of(needs("opencl"))[:3]
     given, z = poses(1, 50), [scans(model.scanner) for model in models]
     expected = gs.log_likelihoods(models, given, z)
-    # Memory of other models that is given up waits for the device as well.
+    # Released memory of other models waits for the device as well.
     gc.collect()
     done: list[str] = []
     kind = type(device)

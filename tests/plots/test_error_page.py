@@ -56,7 +56,7 @@ def test_the_script_chooses_as_python_does() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_script_has_the_profiles_of_python(seed: int) -> None:
-    """Random times and errors of five methods in six scenes, some not measured: the same steps, best method first."""
+    """Five methods in six scenes have random times and errors, some unmeasured: steps are equal, best method first."""
     draw, limit = random.Random(seed), 0.4
     table = {
         name: [(draw.uniform(1, 9), draw.random()) if draw.random() < 0.8 else None for _ in range(6)]

@@ -61,7 +61,7 @@ def test_points_of_an_arc_see_the_angle_between_two_beacons():
 
 @pytest.mark.parametrize("heading", [None, POSE[2]], ids=["unknown", "known"])
 def test_log_density_is_the_product_of_gaussians(heading):
-    """Against SciPy's densities; an unknown heading takes the best of a fine lattice of headings."""
+    """The truth is by SciPy's densities; an unknown heading takes the best of a fine lattice of headings."""
     points = position_plots.tile_centers(EXTENT, 12)
     rho = np.hypot(*np.moveaxis(XY - points[..., None, :], -1, 0))
     found = position_plots.position_log_density(points, XY, ranges=RANGES, sigma_range=[0.2, 0.3, 0.4])
@@ -75,7 +75,7 @@ def test_log_density_is_the_product_of_gaussians(heading):
         off = np.angle(np.exp(1j * (BEARINGS - seen + theta)))
         best = np.maximum(best, stats.norm.logpdf(off, 0, 0.3).sum(axis=-1))
     bearings = position_plots.position_log_density(points, XY, bearings=BEARINGS, heading=heading, sigma_bearing=0.3)
-    # Where the residuals nearly wrap there are two good headings; the start at the circular mean may take the other.
+    # Where residuals nearly wrap, two headings are good; the start at the circular mean may find the other one.
     near = best > best.max() - 12
     np.testing.assert_allclose(bearings[near], best[near], atol=1e-9 if heading else 1e-4)
     assert (bearings <= best + 1e-4).all()
@@ -97,7 +97,7 @@ def test_ellipse_and_density_agree():
     edge = position_plots.position_log_density(points, XY, ranges=RANGES, sigma_range=1e-3)
     top = position_plots.position_log_density(fix.best, XY, ranges=RANGES, sigma_range=1e-3)
     np.testing.assert_allclose(top - edge, stats.chi2.ppf(0.95, 2) / 2, rtol=2e-2)
-    position_plots.draw_fix(axes(), gs.trilaterate(XY[:2], [1.0, 1.0]))  # no covariance, no ellipse
+    position_plots.draw_fix(axes(), gs.trilaterate(XY[:2], [1.0, 1.0]))  # Without a covariance there is no ellipse.
 
 
 def test_density_is_drawn_below_its_maximum():

@@ -1,4 +1,4 @@
-"""Positions from beacons: truth is found again, covariances keep their promise, and the lowest minimum is found."""
+"""Positions from beacons: truth is recovered, covariances are right, and the lowest minimum is found."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import gpusense as gs
 from gpusense.positions.problem import LOSSES
 
 each_case = pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
-# Without noise least squares ends where residuals are rounding, 1e-15 m here: times the condition numbers, which are
-# below 100 for XY and below 1e7 for the worst of random scenes.
+# Without noise, least squares ends at residuals of the size of rounding, 1e-15 m here, times the condition numbers:
+# below 100 for XY, and below 1e7 for the worst of random scenes.
 NEAR = dict(rtol=0, atol=1e-9)
 FOUND = 1e-7
 
@@ -52,7 +52,7 @@ def test_truth_is_found(case):
 
 @each_case
 def test_covariance_is_that_of_the_derivatives(case):
-    """G S G^T with the derivatives G of the whole solution by central differences, also where weights differ."""
+    """It is G S G^T with derivatives G of the whole solution by central differences, for unequal weights as well."""
     xy, clean = XY[: case.beacons], case.measure(XY[: case.beacons], POSE)
     sigma = case.sigmas(case.beacons)
     options = {} if case.kind == "triangle" else {"weights": 0.5 + np.arange(case.beacons)}
@@ -73,7 +73,7 @@ def test_covariance_is_that_of_the_derivatives(case):
 @pytest.mark.sampled(0.5)
 @each_case
 def test_ellipses_hold_the_truth_as_often_as_they_say(case):
-    """95 % ellipses of noisy fixes; the count lies within 4 sigma of the binomial distribution."""
+    """The number of truths in 95 % ellipses of noisy fixes is within 4 sigma of the binomial distribution."""
     rng = np.random.default_rng(6)
     xy, clean = XY[: case.beacons], case.measure(XY[: case.beacons], POSE)
     sigma, runs = case.sigmas(case.beacons), 150
@@ -89,7 +89,7 @@ def test_ellipses_hold_the_truth_as_often_as_they_say(case):
 
 @each_case
 def test_turn_shift_scale_and_order(case):
-    """A scene that is turned, moved, made larger or given in another order has the same solution, moved alike."""
+    """The solution follows a scene that is turned, shifted, scaled or reordered."""
     rng = np.random.default_rng(7)
     xy, sigma = XY[: case.beacons], case.sigmas(case.beacons)
     noise = sigma * rng.standard_normal(sigma.size)
@@ -121,7 +121,7 @@ def test_turn_shift_scale_and_order(case):
 
 @pytest.mark.parametrize("case", [c for c in CASES if c.kind != "ranges"], ids=lambda case: case.name)
 def test_whole_turns_change_nothing(case):
-    """Bearings and headings of any size; those of a robot that looks along -x lie on both sides of pi."""
+    """Bearings and headings have any size; those of a robot that looks along -x lie on both sides of pi."""
     xy = XY[: case.beacons] - (20.0, 0.0)
     pose = np.array([2.5, 0.5, 0.01])
     values = case.measure(xy, pose)
@@ -137,7 +137,7 @@ def test_whole_turns_change_nothing(case):
 
 
 def lowest(case, xy, values, sigma, theta, loss, scale, centre):
-    """Return the lowest cost that SciPy finds from starts all over the scene: an oracle without closed forms."""
+    """Return the lowest cost that SciPy finds from starts all over the scene, an oracle without closed forms."""
     half = xy.shape[0]
 
     def residuals(state):
@@ -189,7 +189,7 @@ def test_robust_losses_forget_an_outlier(name, loss):
     error = np.abs(apart(case.solve(xy, values, POSE[2], **options).best, POSE)[:2]).max()
     plain = np.abs(apart(case.solve(xy, values, POSE[2], sigma=sigma).best, POSE)[:2]).max()
     assert error < 0.1 * plain
-    # A weight of 0 is the beacon left out, and its residual is not reported.
+    # A weight of 0 leaves the beacon out, and its residual is not reported.
     weights = np.where(np.arange(8) == 3, 0.0, 1.0)
     fix = case.solve(xy, values, POSE[2], sigma=sigma, weights=weights)
     np.testing.assert_allclose(apart(fix.best, POSE), 0, **NEAR)
@@ -212,7 +212,7 @@ def test_losses_are_those_of_scipy(loss):
 
 
 def test_many_beacons():
-    """More pairs and triples than are tried: the same answer whichever are."""
+    """There are more pairs and triples than are tried; the answer does not depend on the choice."""
     rng = np.random.default_rng(9)
     xy = rng.uniform(-50, 50, (200, 2))
     for case in CASES:
@@ -224,7 +224,7 @@ def test_many_beacons():
         assert fix.status == "unique"
         error = apart(fix.best, POSE)
         assert error @ np.linalg.solve(fix.covariance[0], error) < 20
-        # Chi-squared of about as many degrees as there are measurements.
+        # Chi-squared has about as many degrees of freedom as there are measurements.
         assert abs(fix.cost[0] / clean.size - 1) < 0.35
 
 

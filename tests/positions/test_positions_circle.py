@@ -38,5 +38,5 @@ def test_a_robot_off_the_circle_is_found(off):
         xy, pose, bearings = scene(number, off)
         fix = gs.triangulate(xy, bearings)
         assert fix.status == "unique", number
-        # The condition grows as the circle comes near, and with coordinates far from the beacons.
+        # The condition number grows near the circle, and with coordinates far from the beacons.
         np.testing.assert_allclose(fix.best[:2], pose[:2], atol=1e-4)

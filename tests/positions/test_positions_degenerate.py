@@ -1,4 +1,4 @@
-"""Geometry that leaves no position, two, or infinitely many: each is named, with all that is determined."""
+"""Geometry with no position, two, or infinitely many: each is named, with all quantities that it determines."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def near(fix, *points, atol=1e-6):
 )
 @placed
 def test_two_circles_that_do_not_cross(place, ranges, sigma, status, point):
-    """The nearest point on the line of centres: it shares the gap in proportion to the variances."""
+    """The nearest point lies on the line of centres, and divides the gap in proportion to the variances."""
     xy = place(SQUARE[:2])
     factor = np.hypot(*(xy[1] - xy[0])) / 4
     fix = gs.trilaterate(xy, np.array(ranges) * factor, sigma=sigma)
@@ -91,7 +91,7 @@ def test_beacons_at_one_place(place):
         assert (fix.status, fix.degenerate, len(fix)) == ("coincident", True, 0)
         with pytest.raises(ValueError, match="solutions: must hold one, got none: coincident: too few"):
             _ = fix.best
-    # With others elsewhere they are no trouble.
+    # With beacons elsewhere, the fix is not degenerate.
     xy = place(SQUARE[[0, 1, 1, 2]])
     point = place(np.array([(1.0, 2.5)]))[0]
     fix = gs.trilaterate(xy, ranges_to(xy, point))
@@ -107,7 +107,7 @@ def test_beacons_in_line_leave_the_mirror_image(place, beacons):
     assert fix.status == ("two" if len(beacons) == 2 else "mirror") and not fix.degenerate
     first = np.argmin(ranges_to(fix.solutions, point))
     assert near(fix, *[(point, image), (image, point)][first])
-    # The images' covariances are mirrored, too.
+    # The covariances of the images are mirrored as well.
     np.testing.assert_allclose(np.linalg.eigvalsh(fix.covariance[0]), np.linalg.eigvalsh(fix.covariance[1]), rtol=1e-6)
 
 
@@ -118,7 +118,7 @@ def test_a_robot_in_line_with_its_beacons(place, point):
     fix = gs.trilaterate(xy, ranges_to(xy, robot))
     assert fix.status == ("at a beacon" if point in ((0.0, 0.0), (4.0, 2.0)) else "in line")
     assert fix.degenerate and near(fix, robot) and np.isnan(fix.covariance).all()
-    # Ranges that are all too short stretch the robot onto the line as well.
+    # Ranges that are all too short also put the robot onto the line.
     if point == (2.0, 1.0):
         fix = gs.trilaterate(xy, 0.8 * ranges_to(xy, robot))
         assert fix.status == "in line" and fix.degenerate
@@ -157,7 +157,7 @@ def test_lines_of_sight_that_do_not_meet(place):
     ]:
         fix = gs.triangulate(xy, bearings, along)
         assert (fix.status, fix.degenerate, len(fix)) == (status, True, 0), bearings
-    # From between them, the first behind on the left and the second ahead on the left.
+    # The robot is between them: the first is behind on the left, the second ahead on the left.
     assert gs.triangulate(xy, (3.0, 0.5), along).status == "unique"
     assert gs.triangulate(place(SQUARE[:3]), [0.5, 0.5, 0.5], 0.0).status == "parallel"
 
@@ -197,20 +197,20 @@ def test_near_the_circle_the_condition_grows():
 @placed
 def test_three_bearings_in_bad_places(place):
     line = place(LINE[:3])
-    # In line with all beacons: every point of the line sees the same.
+    # In line with all beacons, bearings are equal at every point of the line.
     robot = place(np.array([(-2.0, -1.0)]))[0]
     fix = gs.triangulate_triangle(line, bearings_to(line, (*robot, 0.4)))
     assert (fix.status, len(fix)) == ("in line", 0)
-    # Beacons in line are no trouble from beside it.
+    # Seen from beside their line, beacons are not degenerate.
     robot = place(np.array([(1.0, 3.0)]))[0]
     fix = gs.triangulate_triangle(line, bearings_to(line, (*robot, 0.4)))
     assert fix.status == "unique" and near(fix, (*robot, 0.4), atol=1e-5)
-    # Equal bearings of two beacons: the robot is in line with them, the third fixes where.
+    # With equal bearings of two beacons, the robot is in line with them, and the third determines its place.
     xy = place(SQUARE[:3])
     robot = place(np.array([(-3.0, 0.0)]))[0]
     fix = gs.triangulate_triangle(xy, bearings_to(xy, (*robot, -1.0)))
     assert fix.status == "unique" and near(fix, (*robot, -1.0), atol=1e-5)
-    # Equal bearings of three beacons that are not in line: no pose sees that.
+    # No pose has equal bearings of three beacons that are not in line.
     assert gs.triangulate_triangle(xy, (0.2, 0.2, 0.2)).status == "behind"
     # Beacons in the wrong order around the robot.
     inside = bearings_to(xy, (*place(np.array([(3.0, 1.5)]))[0], 0.0))
@@ -224,7 +224,7 @@ def test_three_bearings_in_bad_places(place):
 
 
 def test_poses_that_see_beacons_behind_their_bearings():
-    """For random bearings, "behind" is reported exactly where no pose of a fine lattice comes near them."""
+    """For random bearings, "behind" is reported exactly if no pose of a fine lattice has similar ones."""
     rng = np.random.default_rng(2)
     places = np.stack(np.meshgrid(*[np.linspace(-30, 34, 257)] * 2), axis=-1).reshape(-1, 2)
     seen = np.arctan2(SQUARE[:3, 1] - places[:, 1:], SQUARE[:3, 0] - places[:, :1])
@@ -249,10 +249,10 @@ def test_poses_that_see_beacons_behind_their_bearings():
 
 @placed
 def test_scenes_on_a_small_lattice(place):
-    """Beacons and robots on few lattice points stand at one place, in line, on circles and on each other all the time.
+    """On few lattice points, beacons and robots often coincide, or lie in line or on circles.
 
-    Whatever the scene, without noise the truth is among the solutions, or the fix says that it is degenerate, or the
-    robot stands at a beacon, whose bearing is made up here.
+    In every scene without noise, the truth is among the solutions, or the fix is reported as degenerate, or the robot
+    stands at a beacon, whose bearing is made up.
     """
     rng = np.random.default_rng(3)
     seen = set()
@@ -267,7 +267,7 @@ def test_scenes_on_a_small_lattice(place):
         assert fix.degenerate or np.isfinite(fix.covariance[0]).all()
         if fix.degenerate or ranges_to(xy, robot).min() < 1e-6:
             continue
-        # UTM coordinates are rounded to 1e-9 m, which the condition number stretches.
+        # UTM coordinates are rounded to 1e-9 m, which the condition number magnifies.
         assert ranges_to(fix.solutions[:, :2], robot).min() < 1e-7 * max(1.0, fix.condition[0]), (
             case.name,
             xy,

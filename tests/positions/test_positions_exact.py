@@ -28,7 +28,7 @@ def exact_circles(xy, ranges):
 
 @pytest.mark.parametrize("origin", FAR, ids=["near", "UTM"])
 def test_two_circles(origin):
-    """The error is that of a few roundings of the three lengths, which flat triangles stretch by 1 / sin(angle)."""
+    """The error is a few roundings of the three lengths, which flat triangles magnify by 1 / sin(angle)."""
     rng = np.random.default_rng(1)
     sines, tested = [], 0
     for _ in range(400):
@@ -51,7 +51,7 @@ def test_two_circles(origin):
         points, height = exact_circles(xy, ranges)
         a = mp.hypot(*(mp.mpf(float(xy[1, k])) - mp.mpf(float(xy[0, k])) for k in (0, 1)))
         sine = float(a * height / (mp.mpf(float(ranges[0])) * mp.mpf(float(ranges[1]))))
-        # To first order; near the tangent point the second order is as large.
+        # This holds to first order; near the tangent point the second order is as large.
         if sine < 1e-7:
             continue
         bound = 6 * EPS * (length / sine + np.abs(origin).max() + length)
@@ -64,7 +64,7 @@ def test_two_circles(origin):
 
 
 def test_flat_triangles_keep_their_digits():
-    """A needle of 1 m at 1e6 m: the plain formula for y is off in its first digits, ours by a few eps."""
+    """For a triangle of 1 m at 1e6 m, the plain formula for y is off in its first digits, ours by a few eps."""
     xy, ranges = np.array([(0.0, 0.0), (1e6, 0.0)]), np.array([5e5, 5e5 + 2.0**-20])
     plain = math.sqrt(ranges[0] ** 2 - ((1e12 + ranges[0] ** 2 - ranges[1] ** 2) / 2e6) ** 2)
     points, height = exact_circles(xy, ranges)
@@ -93,7 +93,7 @@ def exact_pose(xy, bearings, start):
 @pytest.mark.parametrize("origin", FAR, ids=["near", "UTM"])
 @pytest.mark.parametrize("shape", ["any", "in line", "near the circle", "on a side"])
 def test_three_bearings(origin, shape):
-    """The error is that of a few roundings of bearings and coordinates, stretched by the inverse of the Jacobian."""
+    """The error is a few roundings of bearings and coordinates, times the inverse of the Jacobian."""
     rng = np.random.default_rng(2)
     worst = 0.0
     for _ in range(60):

@@ -46,10 +46,10 @@ def quantiles(values):
 
 
 def test_two_fiducials(sightings):
-    """Fixes lie as near to the reference as single sightings do: some cm, and cm per 0.01 rad across a few metres.
+    """Fixes are as near the reference as single sightings: some cm, and cm for 0.01 rad over a few metres.
 
-    The map's and the reference's errors are within the bounds: the sightings' ranges are off by 5 cm in the median and
-    13 cm at 90 %, their bearings by 0.008 and 0.03 rad.
+    The bounds include the errors of map and reference: ranges of sightings are off by 5 cm in the median and 13 cm at
+    90 %, their bearings by 0.008 and 0.03 rad.
     """
     truths = [pose for pose, *_ in sightings]
     assert len(truths) > 200
@@ -65,7 +65,7 @@ def test_two_fiducials(sightings):
         assert found[0] < median and found[1] < most, (found, median, most)
     turns = np.array([np.angle(np.exp(1j * (f.best[2] - t[2]))) for f, t in zip(poses, truths, strict=True)])
     assert quantiles(np.abs(turns))[0] < 0.08 and quantiles(np.abs(turns))[1] < 0.12
-    # The covariance says how far off a pose is: chi-squared's median is 2.4 for three degrees of freedom.
+    # Errors fit the covariance: the median of chi-squared is 2.4 for three degrees of freedom.
     away = [f.best - t for f, t in zip(poses, truths, strict=True)]
     for error, turn in zip(away, turns, strict=True):
         error[2] = turn
@@ -74,7 +74,7 @@ def test_two_fiducials(sightings):
 
 
 def cylinders(ranges):
-    """Return bearings and ranges of cylinders in a scan of the LEGO robot: between a jump nearer and one farther."""
+    """Return bearings and ranges of cylinders in a scan of the LEGO robot: between a fall and a rise of the range."""
     bearings = (np.arange(ranges.size) - 330) * 0.006135923 - 0.0698
     seen = ranges > 0.02
     found, inside = [], []
@@ -93,10 +93,10 @@ def cylinders(ranges):
 
 
 def test_cylinders_of_the_lego_robot(data_dir):
-    """Three and more cylinders in a lidar's scan, against the overhead camera's position.
+    """Compare fixes by three and more cylinders in a lidar's scan with the overhead camera's position.
 
-    Which cylinder is which is taken from the camera: ranges within 12 cm and bearings, at the one heading that explains
-    most of them, within 0.06 rad. The axis lies 9 cm behind the mean of the points that are found.
+    The camera identifies the cylinders: ranges must agree within 12 cm, and bearings, at the heading that explains most
+    of them, within 0.06 rad. The axis lies 9 cm behind the mean of the points that are found.
     """
     folder = data_dir / "brenner_lego"
     landmarks = np.loadtxt(folder / "robot_arena_landmarks.txt", usecols=(2, 3)) / 1000

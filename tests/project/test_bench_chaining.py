@@ -1,4 +1,4 @@
-"""``bench/accuracy/chaining.py`` on the shortest log: trajectories, closures and maps have figures."""
+"""``bench/accuracy/chaining.py`` on the shortest log: figures of trajectories, closures and maps."""
 
 from __future__ import annotations
 

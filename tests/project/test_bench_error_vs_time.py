@@ -74,7 +74,7 @@ def test_a_report_needs_a_commit(tmp_path: Path) -> None:
 
 
 def test_a_later_run_adds_scenes(measure: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Scenes that the report has are kept as they are; other sizes and devices are refused."""
+    """Scenes of the report stay unchanged; other sizes and devices are refused."""
     began = []
 
     def run(plan):
@@ -147,7 +147,7 @@ def test_other_matchers_find_the_motion(
 
 
 def test_filters_of_others_follow_the_robot(measure: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each takes the beams of the setting of every scan; one that cannot be compiled is left out."""
+    """Each uses every scan with the setting's beams; a filter that cannot be compiled is left out."""
     module, taken = importlib.import_module("rival_filters"), []
 
     class Follower:
@@ -178,7 +178,7 @@ def test_filters_of_others_follow_the_robot(measure: ModuleType, monkeypatch: py
 def test_tasks_are_measured(
     measure: ModuleType, needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Landmarks: known correspondences are the truth, the likeliest landmarks are not; and all times are there."""
+    """Known correspondences of landmarks are the truth, the likeliest ones are not; the rows have all times."""
     tasks, selection = importlib.import_module("needs"), needs("opencl")
     monkeypatch.setattr(tasks, "PARTICLES", 300)
     given = argparse.Namespace(need=["landmarks"], rounds=2, seconds=99.0, longest=99.0, commit="abc", no_peers=True)

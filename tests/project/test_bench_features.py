@@ -13,7 +13,7 @@ from support.bench_scripts import BENCH, run_script
 
 @pytest.mark.slow
 def test_features_are_measured(data_dir: Path, needs: Callable[[str], str], tmp_path: Path) -> None:
-    """Simulated floors, one recording's worth of scans, and rates."""
+    """Measure simulated floors, scans of one recording, and rates."""
     report = run_script(
         "accuracy/features.py", "--data", str(data_dir), "--backend", needs("opencl"), "--floors", "1", "--scans", "2",
         "--every", "12", "--limit", "20", "--repeats", "1", "--parts", "simulated", "real", "rates",

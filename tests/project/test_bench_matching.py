@@ -30,7 +30,7 @@ def test_matching_odometry_runs(data_dir: Path, needs: Callable[[str], str], tmp
 
 
 def test_matching_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
-    """Generated buildings alone, which need no data."""
+    """Match in generated buildings alone, which need no data."""
     arguments = ["--matches", "6", "--backend", needs("opencl")]
     report = run_script("accuracy/matching.py", *arguments, output=tmp_path / "matching")
     assert len(report["rows"]) == 6
@@ -39,7 +39,7 @@ def test_matching_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_match_verdicts_are_measured(needs: Callable[[str], str], tmp_path: Path) -> None:
-    """Corridors and scans of few beams, which need no data."""
+    """Match corridors and scans of few beams, which need no data."""
     arguments = ["--count", "6", "--backend", needs("opencl"), "--part", "corridors", "--part", "few"]
     rows = run_script("accuracy/match_verdicts.py", *arguments, output=tmp_path / "verdicts")["rows"]
     assert all(float(row["converged %"]) <= 10 for row in rows["corridors"])

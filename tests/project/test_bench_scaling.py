@@ -40,7 +40,7 @@ def test_scaling_runs(selection: str, needs: Callable[[str], str], tmp_path: Pat
         for name in ("floor_call_s", "floor_launch_s", "scattered_s", "call_s", "launch_s", "median_s"):
             assert 0 < row[name] < math.inf, (name, row)
         assert row["floor_launch_s"] <= row["floor_call_s"] and row["floor_launch_s"] <= row["scattered_s"]
-        # No cleverness makes up for a factor: a floor so far above a time would be a mistake of the floor.
+        # A floor so far above a measured time would be wrong.
         assert row["floor_launch_s"] < 20 * row["launch_s"], row
         assert row["launches"] >= 1 and row["table_bytes"] > 0 and row["steps"] > 0.5 and row["reads"] >= row["steps"]
         assert row["error"] < 1e-2, row

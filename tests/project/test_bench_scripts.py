@@ -87,7 +87,7 @@ def test_sonar_field_runs(tmp_path: Path) -> None:
         assert all(0 <= rank <= 1 for rank in row["rank"] + row["global rank"])
         assert all(-50 < value <= math.log(31) + 1e-9 for value in row["information"])
         assert all(0 <= error < 5 for error in row["error"])
-        # Tuned ways know more than nothing about a pose, one frame at a time.
+        # Tuned methods have some information on a pose from a single frame.
         assert row["window"] == 8 or sum(row["information"]) > 0
     assert sorted(file.name for file in (tmp_path / "drawn").glob("*.png")) == ["sonar-scene.png", "sonar-scores.png"]
 
@@ -113,7 +113,7 @@ def test_small_calls_runs(selection: str, needs: Callable[[str], str], tmp_path:
 
 @pytest.mark.slow
 def test_trees_are_compared(needs: Callable[[str], str], tmp_path: Path) -> None:
-    """A tree has the bits of itself, and rows of both its processes."""
+    """A tree has its own bits, and rows of both processes."""
     arguments = ["--old", str(BENCH.parent), "--new", str(BENCH.parent), "--backend", needs("opencl"), "--limit", "50"]
     arguments += ["--particles", "1000", "--beams", "8", "--size", "20", "--blocks", "2", "--turns", "2", "--bits"]
     words = ["--rows", "field, tracking", "rays, global", "preparation", "scans", "step, field, 500"]
@@ -132,7 +132,7 @@ def test_trees_are_compared(needs: Callable[[str], str], tmp_path: Path) -> None
 def test_bits_of_trees_are_compared(
     needs: Callable[[str], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A tree has the bits of itself; a record in which one result is changed is found."""
+    """A tree has its own bits; a record with one changed result is found."""
     monkeypatch.syspath_prepend(str(BENCH))
     script, backend = importlib.import_module("trees.bits"), needs("numpy")
     cases = ["--rays", "300", "--models", "40", "--filters", "1", "--matches", "2"]
@@ -287,7 +287,7 @@ def test_stretches_of_machine_code_end_at_labels_and_branches(
 
 @pytest.mark.slow
 def test_real_scores_runs(data_dir: Path, tmp_path: Path) -> None:
-    """A recorded map, on every device that is present."""
+    """Score on a recorded map, on every device that is present."""
     arguments = ["--data", str(data_dir), "--map", "columbia", "--log", "none"]
     report = run_script("accuracy/real_scores.py", *arguments, output=tmp_path / "real")
     rows = report["maps"]
@@ -343,7 +343,7 @@ def test_calibration_runs(tmp_path: Path) -> None:
 
 
 def test_rays_per_core_runs(needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rows of both clouds for every caster; a stand-in takes range_libc's place."""
+    """Every caster has rows of both clouds; a stand-in replaces range_libc."""
     monkeypatch.syspath_prepend(str(BENCH))
     script = importlib.import_module("speed.rays_per_core")
 

@@ -6,7 +6,7 @@ import ast
 
 from support.paths import ROOT
 
-# Calls that read without a bound, or execute what they read.
+# Calls that read without a bound, or execute the contents.
 CALLS = {
     "yaml": ("load", "load_all", "safe_load", "safe_load_all", "full_load", "unsafe_load", "compose"),
     "json": ("load", "loads"), "gzip": ("open", "GzipFile", "decompress"), "zlib": ("decompress",),

@@ -21,7 +21,7 @@ def modules_with_examples() -> list[str]:
 
 @pytest.mark.parametrize("name", modules_with_examples())
 def test_examples(name, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # examples write files
+    monkeypatch.chdir(tmp_path)  # Examples write files.
     attempted = 0
     for test in doctest.DocTestFinder(exclude_empty=True).find(importlib.import_module(name), globs={}):
         report: list[str] = []

@@ -1,4 +1,4 @@
-"""docs/error-vs-time.md: made of committed reports of the code as it is; the interactive page in Node and Chromium."""
+"""docs/error-vs-time.md is made of committed reports of current code; the interactive page in Node and Chromium."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def reports(page: ModuleType) -> ModuleType:
 
 
 def test_the_page_is_what_the_reports_give(page: ModuleType) -> None:
-    """Byte for byte, figures as well; nothing else of it is committed."""
+    """Page and figures agree byte for byte; no other output is committed."""
     made = page.files()
     assert {path for path, text in made.items() if (ROOT / path).read_bytes() != text.encode()} == set(), (
         "run python bench/error_vs_time/page.py"
@@ -70,7 +70,7 @@ def test_reports_state_command_and_device(reports: ModuleType) -> None:
 
 @pytest.fixture
 def history(tmp_path: Path) -> Path:
-    """Make a repository of five commits, of which two change kernels, and a branch aside."""
+    """Make a repository of five commits, two of which change kernels, and a side branch."""
 
     def git(*words: str) -> None:
         own = ["-c", "user.name=a", "-c", "user.email=a@example.org", "-c", "commit.gpgsign=false"]
@@ -118,7 +118,7 @@ def task(method: str, setting: str, seconds: float, error: float, **changes: Any
 
 
 def test_the_doubt_of_an_error_by_hand(reports: ModuleType) -> None:
-    """Two standard deviations of the mean: of the runs where there are three, otherwise of a need."""
+    """The doubt is two standard deviations of the mean, by the runs if there are three, otherwise by the need."""
     runs = {"by_run": {"error": [0.9, 1.1, 1.0, 1.0]}, "runs": 4}
     assert reports.doubt(task("beam", "", 1, 1) | runs) == pytest.approx(1 + math.sqrt(0.02 / 3))
     assert reports.doubt(task("beam", "", 1, 1, runs=1)) == pytest.approx(1.3)
@@ -159,14 +159,14 @@ def test_the_answers_by_hand(page: ModuleType, tmp_path: Path) -> None:
     first = f"- **10 000 particles at 100 Hz on a laptop's processor** ({DEVICE}): field, 10000 x 60: 8 ms, 1.8 cm\n\n"
     assert f"{first}```python\nlaptop = make(field)\n```\n" in text and "on a GPU** (" not in text
     assert "| 1000 particles at 100 Hz | **beam, 1000 x 60**: 9 ms, 6 mm |" in text
-    # A temperature of 1 is no default: it is right in simulations alone.
+    # A temperature of 1 is not the default: it is right only in simulations.
     assert "| localisation to 2 cm | **field, 1000 x 60**: 2 ms, 1.7 cm |" in text
     assert "| beam model, at most 1 ms | - |" in text
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_noise_of_times_gives_the_same_answers(page: ModuleType, tmp_path: Path, seed: int) -> None:
-    """Two runs of other days: all times differ by up to a tenth, and each answer has the same method."""
+    """All times of two runs differ by up to a tenth, and each answer has the same method."""
     import random
 
     noise, found = random.Random(seed), []
@@ -192,7 +192,7 @@ def test_answers_of_the_last_page_stand(page: ModuleType, tmp_path: Path) -> Non
 
 
 def test_reports_of_other_days_are_compared(page: ModuleType, tmp_path: Path) -> None:
-    """On the settings that both have: the beam model is slower than the limit now, and 100 000 particles are new."""
+    """Only common settings count: the beam model is now slower than the limit, and 100 000 particles are new."""
     agreement, texts = importlib.import_module("error_vs_time.agreement"), []
     slow = [one | {"processor_s": 2 * one["processor_s"]} if one["method"] == "beam" else one for one in ROWS]
     for rows in (ROWS, [*slow, task("field", "100000 x 8", 0.001, 0.001)]):
@@ -234,7 +234,7 @@ def test_two_reports_of_a_device_are_refused(page: ModuleType, tmp_path: Path) -
 
 
 def test_methods_of_one_kind_of_cloud_are_on_the_interactive_page_alone(page: ModuleType, tmp_path: Path) -> None:
-    """A table that was left out in the tracking clouds has no error there, and so no place in the tables."""
+    """A table that was left out for tracking clouds has no error there, and is in no table of the page."""
     points = [
         made_point(problem="beam", cloud=cloud, method=method, status="left out" if alone else "ok")
         for method, cloud, alone in (("exact", "global", False), ("exact", "tracking", False),
@@ -248,7 +248,7 @@ def test_methods_of_one_kind_of_cloud_are_on_the_interactive_page_alone(page: Mo
 
 
 def test_devices_and_other_matchers_have_their_places(page: ModuleType, tmp_path: Path) -> None:
-    """A GPU by OpenCL, Warp's processor device, and a program that matches on one core."""
+    """The devices are a GPU by OpenCL, Warp's processor, and one core for another program."""
     outside = {"backend": "outside", "device": "csm 1, 1 thread", "outside": "csm 1, 1 thread"}
     rows = [
         task("icp", "180 beams", 0.0003, 0.005, need="matching", backend="warp:cpu", device="CPU"),
@@ -268,7 +268,7 @@ def test_devices_and_other_matchers_have_their_places(page: ModuleType, tmp_path
 
 
 def test_one_processor_with_and_without_its_widest_vectors() -> None:
-    """PoCL's target tells the columns apart."""
+    """PoCL's target distinguishes the columns."""
     titles = {target: titles_of([made_point(backend="opencl:0:0", device="pthread-X", kind="cpu")],
                                      {"processors": 2, "processor": "X"},
                                      [{"selection": "opencl:0:0", "driver": "PoCL", "target": target}])["opencl:0:0"]
@@ -286,7 +286,7 @@ def test_the_interactive_page_fetches_nothing(page: ModuleType) -> None:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 def test_the_interactive_page_works_in_a_browser(page: ModuleType, tmp_path: Path) -> None:
-    """Choose a need, move the budget, hover: answer, marked point, front and tooltip follow."""
+    """Answer, marked point, front and tooltip follow a chosen need, a moved budget and the pointer."""
     write_tasks(tmp_path, ROWS)
     script = """
     const slide = value => { $("budget").value = value; $("budget").dispatchEvent(new Event("input")); };

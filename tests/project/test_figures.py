@@ -1,4 +1,4 @@
-"""The figures that move, as the site's build writes them: their script computes gpusense's numbers."""
+"""Interactive figures as the site's build writes them: their script computes gpusense's numbers."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_a_wrong_script_is_found(written: dict[str, str]) -> None:
     assert in_node("disagreement(data)", data) == pytest.approx(1e-3, rel=0.01)
 
 
-# What a visitor does, and the text that must follow.
+# Actions of a visitor, and the text that must appear.
 VISITS = {
     "beam": (
         """const set = (name, value) => { const one = document.querySelector(`input[name="${name}"]`);

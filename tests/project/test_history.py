@@ -1,4 +1,4 @@
-"""bench/speed/history.py: rows are appended, and a regression of 10 % on quiet runs is seen."""
+"""bench/speed/history.py appends rows, and detects a regression of 10 % in quiet runs."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ BEFORE = [row("a", 10.0), row("b", 10.3), row("c", 9.8)]
         # The processor itself is slower by a fifth today, which the probe shows.
         (row("d", 12.0, probe=2.4), ""),
         (row("d", 13.4, probe=2.4), "1.12 times"),
-        # A busy machine says nothing about times, but errors count.
+        # Times of a busy machine do not count, but errors do.
         (row("d", 30.0, quiet="no"), ""),
         (row("d", 30.0, quiet="no", error=0.1), "error 0.1 nats, before 1e-05"),
         (row("d", 10.0, error=9e-4), ""),
-        # The same commit again, and another device, are compared with nothing.
+        # A repeated commit and another device have no row to compare with.
         (row("c", 99.0), "9.75 times the time of 2 quiet runs"),
         (row("d", 99.0, device="Y"), ""),
     ],

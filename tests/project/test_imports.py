@@ -1,7 +1,7 @@
-"""Imports of the package form no circle, wherever they stand: in functions, under TYPE_CHECKING, in ``importlib``.
+"""Imports of the package form no circle, those in functions, under TYPE_CHECKING and by ``importlib`` included.
 
-The linter holds rooms to their order, but does not see names of modules in strings. Here a string that names a module,
-as in a table of modules that are imported on use, counts as an import of it, and an f-string of all that it fits.
+The linter enforces the order of rooms, but does not see names of modules in strings. Here a string that names a module,
+as in a table of modules that are imported on use, counts as its import, and an f-string as imports of all that it fits.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def pattern_of(node: ast.JoinedStr) -> str:
 
 
 def named(tree: ast.Module, package: str) -> Iterator[tuple[str, bool]]:
-    """Yield what a module imports by dotted names, and whether the last part may be a name in the module before it."""
+    """Yield dotted names that a module imports, and whether the last part may be a name in the module before it."""
     unused = docstrings(tree)
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -114,7 +114,7 @@ def graph() -> Graph:
 
 
 def test_no_module_imports_the_root(graph):
-    """It would import all rooms; the version is in ``_version``."""
+    """The root imports all rooms; the version is in ``_version``."""
     assert [name for name, found in graph.items() if PACKAGE in found] == []
 
 
@@ -127,7 +127,7 @@ def test_rooms_form_no_circle(graph):
 
 
 def test_this_sees_the_imports_of_the_package(graph):
-    """A graph without imports would have no circle either."""
+    """A graph that missed the imports would have no circle either."""
     assert len(graph) > 400 and sum(map(len, graph.values())) > 1500
     # At the top, in a function, in a table of modules.
     assert "gpusense.backends.base" in graph["gpusense.backends.opencl.backend"]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from support.paths import ROOT, TESTS
 
-# Folders of tests that are not of one folder of the package.
+# Folders of tests that mirror no folder of the package.
 OTHERS = {"kernels": "the kernels in all languages", "project": "packaging, scripts, documentation, layout"}
 LONGEST = 450
 
@@ -60,7 +60,7 @@ def test_test_files_are_short():
 
 
 def test_no_file_imports_a_test_or_a_conftest():
-    """Functions and scenes that tests share lie in ``support``."""
+    """Shared functions and scenes are in ``support``."""
     files = {path.stem for path in TEST_FILES} | {"conftest"}
     for path in FILES:
         modules = {part for module, name in imported(tree_of(path)) for part in (*module.split("."), name)}
@@ -73,7 +73,7 @@ def test_helpers_define_no_fixture():
 
 
 def test_this_looks_at_all_there_is():
-    """A rule that reads no file, or finds no fixture and no import, would also hold."""
+    """The rules would also hold if no file, fixture or import was found."""
     assert len(TEST_FILES) > 100 and len(SUPPORT) > 20
     assert {"backend", "needs", "place"} <= set(fixtures(tree_of(TESTS / "conftest.py")))
     assert ("support.paths", "ROOT") in set(imported(tree_of(Path(__file__))))
@@ -81,6 +81,6 @@ def test_this_looks_at_all_there_is():
 
 
 def test_the_quick_subset_has_files_of_today():
-    """A file that moved would leave the subset unseen."""
+    """A file that moves must not drop out of the subset unnoticed."""
     names = ast.literal_eval(re.search(r"^QUICK = (\(.*?^\))", (TESTS / "conftest.py").read_text(), re.M | re.S)[1])
     assert [name for name in names if not (TESTS / name).exists()] == []

@@ -19,7 +19,7 @@ from gpusense.commands import cli
 
 LOCALIZE = ["localize", "--map", "map.yaml", "--log", "run.log", "--range-max", "20", "--backend", "numpy",
             "--particles", "50", "--limit", "2"]  # fmt: skip
-# Library, a call that needs it, and the begin of the message.
+# Library, a call that needs it, and the beginning of the message.
 CALLS = [
     ("rosbags", ["localize", "--map", "map.yaml", "--log", "run.bag"], "run.bag: a ROS bag needs the library rosbags"),
     ("rosbags", ["match", "--log", "run.mcap"], "run.mcap: a ROS bag needs the library rosbags"),
@@ -52,7 +52,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def block(monkeypatch: pytest.MonkeyPatch):
-    """Return a function that makes imports of a library fail, as where it is not installed."""
+    """Return a function that makes imports of a library fail, as if it was not installed."""
 
     def forget(name: str) -> None:
         for module in [each for each in sys.modules if each == name or each.startswith(f"{name}.")]:

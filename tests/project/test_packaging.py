@@ -86,7 +86,7 @@ print(module.double.func.__module__, values.numpy().tolist())
 
 @dataclass(frozen=True)
 class Layout:
-    """Says where the package lies on a disk, and starts Python so that it is the one imported."""
+    """A place of the package on a disk, with a Python that imports it from there."""
 
     package: Path
     kernels: Path
@@ -177,7 +177,7 @@ def editable_python(checkout: Path, tmp_path_factory: pytest.TempPathFactory) ->
     python = scripts / ("python.exe" if os.name == "nt" else "python")
     where = "import sysconfig; print(sysconfig.get_path('purelib'))"
     site = run([python, "-c", where], cwd=environment).strip()
-    # Borrow this environment's libraries; by its name the file is read after that of the editable install.
+    # Use this environment's libraries; by its name, the file is read after that of the editable install.
     paths = dict.fromkeys([sysconfig.get_path("purelib"), sysconfig.get_path("platlib")])
     Path(site, "zz_borrowed.pth").write_text("\n".join(paths), encoding="utf-8")
     pip = [sys.executable, "-m", "pip", "--python", python, "install", "--no-index", "--no-deps"]

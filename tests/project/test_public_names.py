@@ -1,4 +1,4 @@
-"""The public names: one table, from which the stub for type checkers is made."""
+"""Public names: one table, of which the stub for type checkers is made."""
 
 import pytest
 from support import public_names

@@ -1,4 +1,4 @@
-"""Files that comments, docstrings and pages name are there; links of pages and their anchors lead somewhere."""
+"""Files that comments, docstrings and pages name exist, and so do the targets of links and anchors."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 from support.paths import ROOT
 
-# Reports hold the commands of the day on which they were made; folders of tools are no part of the project.
+# Reports hold the commands of their day; folders of tools are no part of the project.
 _LEFT_OUT = ("bench/results/", ".git/", ".venv/", "venv/", "build/", "dist/", "shared/", "site/", "htmlcov/")
 _SOURCES = (".py", ".pyi", ".cl", ".md", ".toml", ".cpp")
-# Scripts whose names of old a page explains.
+# Scripts whose former names a page explains.
 _FORMER = {"bench/RESULTS.md": {"speed.py", "several_scans.py", "work_items.py"}}
 # Folders in which a path may begin, beside that of the file that names it.
 _BASES = ("", "gpusense", "kernels", "kernels/opencl", "kernels/warp", "bench", "tests", "docs")
@@ -46,7 +46,7 @@ PAGES = [name for name in READ if name.endswith(".md")]
 def prose(name: str, text: str) -> Iterator[tuple[int, str]]:
     """Yield the lines of a file that are written for readers: comments, docstrings, pages.
 
-    A command after "Command:" is as it was run.
+    Commands after "Command:" are left out, since they are as they were run.
     """
     if name.endswith((".py", ".pyi")):
         for token in tokenize.generate_tokens(io.StringIO(text).readline):
@@ -140,7 +140,7 @@ _WRITTEN = {
 
 
 def broken_links(name: str, text: str) -> list[str]:
-    """Return the relative links of a page that lead nowhere."""
+    """Return the relative links of a page without a target."""
     broken = []
     for groups in _LINK.findall(without_code(text)):
         target = next(filter(None, groups))

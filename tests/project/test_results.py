@@ -34,7 +34,7 @@ def published() -> str:
 
 
 def test_each_report_is_published(published: str) -> None:
-    """A page links it, or the table of a report links the file beside it."""
+    """A page links to it, or the table of a report links to the file beside it."""
     names = {Path(name).stem for name in re.findall(r"results/([\w.-]+)", published)}
     assert [file.name for file in REPORTS if file.stem not in names] == []
 
@@ -57,7 +57,7 @@ def test_each_report_states_commit_and_command(file: Path) -> None:
 
 @pytest.mark.parametrize("file", REPORTS, ids=lambda file: file.name)
 def test_scripts_of_reports_are_here(file: Path) -> None:
-    """The script of each command exists, by its path or, of older reports, by its name or today's."""
+    """The script of each command exists at its path; for older reports, by its name or its current name."""
     names = {path.stem for path in (ROOT / "bench").rglob("*.py")}
     for script in SCRIPT.findall(file.read_text(encoding="utf-8")):
         stem = Path(script).stem
@@ -117,5 +117,5 @@ def test_families_of_quantities(stiff_density: ModuleType) -> None:
 
 
 def test_reports_stay_few() -> None:
-    """Reports that no figure comes from belong to the history."""
+    """Reports without a published figure belong to the history."""
     assert 20 < len(list(RESULTS.iterdir())) <= MOST

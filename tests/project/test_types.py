@@ -1,4 +1,4 @@
-"""Type checkers see mistakes in names of choices, and accept arrays and lists of any kind."""
+"""Type checkers find wrong names of choices, and accept arrays and lists of any kind."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ def test_the_study_of_the_verdict_counts_alarms_and_misses(monkeypatch: pytest.M
     rows[20:, report.ERROR], rows[[5, *range(50, 60)], report.P_LOST] = 8.0, 0.9
     found = report.figures([(job, rows)])
     assert found["right"] == 20 and found["false"] == 1 / 20
-    # The first 20 scans after the jump are no misses yet.
+    # The first 20 scans after the jump are not counted as misses.
     assert found["late"] == 20 and found["missed"] == 10 / 20 and found["finals_wrong"] == 0
     assert found["auroc"] == pytest.approx((10 * 19.5 + 10 * 9.5) / (20 * 20))
     wrong = report.figures([(job | {"case": "wrong"}, rows)])

@@ -1,4 +1,4 @@
-"""Sweeps on a Dask cluster that gpusense has not started: supervision, reports and TLS."""
+"""Sweeps on a Dask cluster that gpusense did not start: supervision, reports and TLS."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def test_a_job_of_a_client_that_has_gone_does_not_hold_its_worker(cluster, execu
     process = other.submit(os.getpid).result(timeout=60)
     other.submit(time.sleep, 600)
     time.sleep(0.5)
-    # Of a client that is killed, only its connection tells.
+    # Only its connection shows that a client was killed.
     other._client.close()
     awaited(lambda: not alive(process))
     assert executor.submit(abs, -4).result(timeout=60) == 4
@@ -238,7 +238,7 @@ def test_tls_keeps_others_out(tmp_path, capsys):
 
 
 def strictly_verified(ca, certificate):
-    """Tell whether OpenSSL accepts a certificate as Python 3.13 does."""
+    """Return whether OpenSSL accepts a certificate, by the rules of Python 3.13."""
     call = ["openssl", "verify", "-x509_strict", "-CAfile", ca, certificate]
     return subprocess.run(call, capture_output=True, check=False).returncode == 0
 
@@ -278,7 +278,7 @@ def test_a_worker_that_cannot_run_calls_is_left_out(caplog):
     with gs.sweep.DaskExecutor(devices=2, timeout=2) as executor:
         first, second = executor._watched.workers.values()
         first.place = second.place = "/nowhere"
-        # Dask repeats a call on a worker that has taken over an address: it is not begun there.
+        # Dask repeats a call on a worker that took over an address: the call does not begin there.
         with pytest.raises(WorkerDied, match="with its Dask worker at"):
             executor.submit(abs, -1).result(timeout=60)
         first._link = second._link = first._link._replace(limits=None)

@@ -31,7 +31,7 @@ ENGINES = [
         marks=pytest.mark.skipif(find_spec("distributed") is None, reason="needs gpusense[sweep]"),
     ),
 ]
-# Ends of a job, the error of its row, and how often it is started where twice is most.
+# End of a job, the error of its row, and the number of its starts, of at most two.
 ERRORS = {
     "segmentation fault": ("WorkerDied: the worker ended by SIGSEGV, 2 times", 2),
     "exit code 7": ("WorkerDied: the worker ended with exit code 7, 2 times", 2),
@@ -53,7 +53,7 @@ def swept(jobs, path, executor=None, **options):
 
 
 def endings(folder, ends, count):
-    """Return jobs whose first ones end as given, each between sound ones."""
+    """Return jobs whose first ones have these ends, each between sound jobs."""
     options = {"folder": str(folder)} | {f"end{2 * k}": end for k, end in enumerate(ends)}
     return [Job(task="support.sweep_tasks:ending", seed=seed, options=options) for seed in range(count)]
 
@@ -70,7 +70,7 @@ def check(folder, ends, jobs, ended, table, attempts=2):
 
 
 def alive(process):
-    """Tell whether a process runs: one that nothing has waited for is none."""
+    """Return whether a process runs; zombies do not."""
     try:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
@@ -101,7 +101,7 @@ def test_only_jobs_that_end_their_worker_fail(tmp_path, engine):
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_job_that_hangs_is_ended_at_its_limit(tmp_path, engine):
-    # Processes are tested with the harder one: no other thread of the worker runs.
+    # Processes are tested with the harder case, in which no other thread of the worker runs.
     end = "hang in C" if engine is ProcessExecutor else "hang"
     jobs = endings(tmp_path, [end], 3)
     with engine(1, job_timeout=4) as executor:
@@ -227,7 +227,7 @@ def test_a_hanging_worker_ends_with_a_parent_that_is_killed(tmp_path):
 
 
 class Crowded(Executor):
-    """Runs jobs two at a time, and lets one of them die whenever it has a neighbour."""
+    """An executor that runs two jobs at a time, and lets one of them die whenever it has a neighbour."""
 
     slots = 2
 

@@ -1,4 +1,4 @@
-"""Sweeps: equal tables on every executor, failures, workers and schedulers that are killed."""
+"""Sweeps: equal tables on every executor, failures, killed workers and schedulers."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_score_and_fit_are_tasks(folder):
     _, table = swept(jobs, folder / "tasks.csv", root=folder)
     assert table["status"] == ["done"] * 5 + ["failed"] and "absent.log" in table["error"][-1]
     assert table["rank_median"][0] >= 1 and table["error_median"][1] < 0.5 and 0.01 < table["sigma_hit"][2] < 0.1
-    # A bootstrap draws scans anew: close to the fit of all, and never equal.
+    # A bootstrap resamples scans: its fit is close to the fit of all scans, and never equal.
     assert len(set(table["sigma_hit"][2:5])) == 3
 
 
@@ -156,7 +156,7 @@ def test_a_job_that_kills_its_workers_fails_alone(tmp_path, processes):
 
 
 def alive(process):
-    """Tell whether a process runs: one that nothing has waited for is none."""
+    """Return whether a process runs; zombies do not."""
     try:
         os.kill(process, 0)
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"

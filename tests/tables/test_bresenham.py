@@ -1,4 +1,4 @@
-"""Bresenham's line by hand, where it leaks, and its symmetries."""
+"""Bresenham's line: by hand, its leaks, and its symmetries."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gpusense.tables import casters
     ],
 )
 def test_bresenham_by_hand(shape, range_max, line, backend):
-    """From the cell (0, 0) to the cell (4, 2) and (8, 3): sqrt(i^2 + j^2) where an obstacle (i, j) is on the line."""
+    """Lines from (0, 0) to (4, 2) and (8, 3) end with sqrt(i^2 + j^2) at an obstacle (i, j) on the line."""
     end = line[-1]
     for row, col in np.ndindex(shape):
         cells = np.zeros(shape, int)

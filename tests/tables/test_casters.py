@@ -1,4 +1,4 @@
-"""All casters: the bits of NumPy on every backend, origins off the map, models, tables' sizes."""
+"""All casters: the bits of NumPy on every backend, origins off the map, models, sizes of tables."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_every_backend_has_the_bits_of_numpy(kind, backend):
 @pytest.mark.parametrize("kind", CROPPED, ids=by_name)
 @pytest.mark.parametrize("outside", ["free", "occupied"])
 def test_a_cropped_map_has_the_bits_of_the_whole_map(kind, outside, backend, monkeypatch):
-    """The window is the least that these poses need, since an earlier cloud chose it; obstacles beyond it are near."""
+    """An earlier cloud chose the smallest window for these poses, and obstacles are near beyond it."""
     rng = np.random.default_rng(1)
     grid = gs.OccupancyGrid(rng.choice([0, 100], (300, 400), p=[0.998, 0.002]), 1.0)
     poses = np.column_stack([rng.uniform(208, 209.5, 150), rng.uniform(158, 159.5, 150), rng.uniform(-3, 3, 150)])
@@ -76,7 +76,7 @@ def test_a_cropped_map_has_the_bits_of_the_whole_map(kind, outside, backend, mon
 
 @pytest.mark.parametrize("kind", each_caster(36), ids=by_name)
 def test_origins_far_off_the_map(kind, backend):
-    """Up to the limits of places; rays that lead away, or end before the map, are exactly range_max."""
+    """Origins reach the limits of places; rays that lead away, or end before the map, are exactly range_max."""
     cells = np.zeros((20, 30), int)
     cells[5:15, 25] = 100
     grid, limit = gs.OccupancyGrid(cells, 1.0), 1e6
@@ -91,7 +91,7 @@ def test_origins_far_off_the_map(kind, backend):
 
 
 def kernel_cast(scene: Scene, kind: Caster, backend: str, precision: str) -> np.ndarray:
-    """Return ranges in cells of rays that are given to the last bit."""
+    """Return the ranges of rays in cells, from exact inputs."""
     device, real = get_backend(backend), np.dtype(precision)
     rows, cols = scene.occupied.shape
     flags = {kind.entry.flag} - {""} | ({"FLOAT64"} if precision == "float64" else set())
@@ -114,7 +114,7 @@ def kernel_cast(scene: Scene, kind: Caster, backend: str, precision: str) -> np.
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("family", FAMILIES)
 def test_dda_is_the_exact_caster_to_the_bit(family, backend):
-    """Rays through corners, on edges and along axes, walls that touch at corners, tiny maps, walls at the limit."""
+    """Try rays through corners, on edges and along axes, walls that touch at corners, tiny maps, walls at the limit."""
     for scene in scenes_of(family)[:4]:
         for precision in ("float32", "float64"):
             ranges = kernel_cast(scene, Dda(), backend, precision)
@@ -192,7 +192,7 @@ def test_a_table_too_large_for_the_device_is_an_error_that_names_sizes(name, nee
                 call()
         small = gs.RayCaster(grid, RANGE, method=Cddt(8), backend=device).cast(poses, bearings)
     same_bits(small, cast(Cddt(8), "numpy", **case))
-    # Both recover once there is room.
+    # Both recover as soon as memory is free.
     same_bits(caster.cast(poses, bearings), cast(Lookup(108), "numpy", **case))
     assert np.isfinite(model.log_likelihood(poses, bearings)).all()
 

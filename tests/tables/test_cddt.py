@@ -19,8 +19,8 @@ from gpusense.tables.directional import directional_table
 def clipped_begin(col: int, row: int, turn: float, line: int) -> float | None:
     """Return where a cell begins on a line of its bin's direction, in plain Python; None if it is not on the line.
 
-    It is the point of the cell's outline that is farthest back on the middle of the line, or, where the cell does not
-    reach the middle, its corner that is nearest to it.
+    The cell begins at the point of its outline that is farthest back on the middle of the line, or, if it does not
+    reach the middle, at its corner nearest to it.
     """
     cos, sin = math.cos(turn), math.sin(turn)
     corners = [(col, row), (col + 1, row), (col + 1, row + 1), (col, row + 1)]
@@ -40,7 +40,7 @@ def clipped_begin(col: int, row: int, turn: float, line: int) -> float | None:
 def test_directional_table_by_brute_force(bins):
     rng = np.random.default_rng(bins)
     obstacles = rng.random((7, 9)) < 0.3
-    obstacles[2:5, 3:6] = True  # the cell (4, 3) sees no free cell
+    obstacles[2:5, 3:6] = True  # The cell (4, 3) faces no free cell.
     expected: dict[tuple[int, int], list[float]] = {}
     for row, col in np.argwhere(obstacles).tolist():
         if obstacles[max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2].all() and 0 < row < 6 and 0 < col < 8:
@@ -63,7 +63,7 @@ def test_directional_table_by_brute_force(bins):
 
 @pytest.mark.parametrize("pruned", [True, False])
 def test_directional_ranges_on_the_middle_of_a_line_are_exact(pruned, backend):
-    """One obstacle, rays in the directions of the bins: along the axes, at 45 degrees, and between."""
+    """Rays to one obstacle have the directions of bins: along the axes, at 45 degrees, and between."""
     bins, cells = 24, np.zeros((30, 30), int)
     cells[14, 17] = 100
     grid, checked = gs.OccupancyGrid(cells, 1.0), 0
@@ -95,7 +95,7 @@ def floor() -> tuple[gs.OccupancyGrid, np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("bins", [36, 216])
 def test_directional_ranges_end_near_an_obstacle_and_pass_none(bins):
-    """Both ways: across the ray by range * pi / bins + 1 cell, along it by a cell's diagonal."""
+    """Bounds are range * pi / bins + 1 cell across the ray, and a cell's diagonal along it, in both directions."""
     grid, poses, _ = floor()
     limit, bearings = 6.0 / grid.resolution, np.linspace(0, 6, 5)
     cast = functools.partial(gs.RayCaster, grid, 6.0, backend="auto", precision="float64")
@@ -116,7 +116,7 @@ def test_directional_ranges_end_near_an_obstacle_and_pass_none(bins):
 
 
 def test_pruned_ranges_differ_beside_an_obstacle_only(backend):
-    """Only obstacles that begin beside another one of their line are left out: these are also seen from beside it."""
+    """Only obstacles that begin beside another one of their line are left out, so ranges differ only there."""
     grid, poses, clearance = floor()
     for bins in (36, 216):
         every, pruned = (gs.RayCaster(grid, 6.0, method=Cddt(bins, p), backend=backend) for p in (False, True))
@@ -128,7 +128,7 @@ def test_pruned_ranges_differ_beside_an_obstacle_only(backend):
 
 @pytest.mark.parametrize("make", [Cddt, Lookup])
 def test_more_bins_are_more_exact(make):
-    """Medians, and the share of rays that are wrong by more than two cells; on average over three buildings."""
+    """Compare medians and shares of rays off by more than two cells, as averages over three buildings."""
     median, wrong = [], []
     for bins in (16, 64, 256):
         off = []

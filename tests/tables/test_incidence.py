@@ -1,4 +1,4 @@
-"""Angles of incidence: normals against walls of known angle, the cell that a ray hits, and casters."""
+"""Angles of incidence: normals of walls of known angle, the cell that a ray hits, and casters."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_normals_of_straight_walls(thick, record_property):
 @pytest.mark.parametrize("radius", [5, 12, 40])
 @pytest.mark.parametrize("filled", [True, False])
 def test_normals_of_circles(radius, filled):
-    """A disc's point outwards; a thin ring's lie along the radius, in either direction."""
+    """Normals of a disc point outwards; those of a thin ring lie along the radius, in either direction."""
     side = 2 * radius + 11
     x, y = np.meshgrid(*2 * [np.arange(side) + 0.5 - side / 2])
     far = np.hypot(x, y)
@@ -147,7 +147,7 @@ def hit_cells(scene: Scene, real: np.dtype) -> tuple[np.ndarray, list[tuple[int,
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("family", FAMILIES)
 def test_the_cell_is_the_one_where_the_walk_ends(family, backend):
-    """Every wall has another normal, which nothing but the right cell gives; corners, edges and origins in walls."""
+    """Every wall has another normal, which only the right cell has; there are corners, edges and origins in walls."""
     rng, device = np.random.default_rng(8), get_backend(backend)
     hits = 0
     for number, full in enumerate(scenes_of(family)[:4]):
@@ -215,7 +215,7 @@ def test_incidence_is_the_same_everywhere(outside, backend):
 
 
 def test_incidence_on_a_slanted_wall_is_what_geometry_says(backend):
-    """A long wall at 20 degrees, seen from one side: 90 degrees less the angle between beam and wall."""
+    """At a long wall of 20 degrees, the angle is 90 degrees minus the angle between beam and wall."""
     slope = math.radians(20)
     x, y = np.meshgrid(np.arange(400) + 0.5, np.arange(400) + 0.5)
     off = math.cos(slope) * (y - 200) - math.sin(slope) * (x - 200)

@@ -1,4 +1,4 @@
-"""Look-up tables: their contents, and the files in which they are kept."""
+"""Look-up tables: their contents and their files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def saved(path: Path, backend: str = "numpy", bins: int = 12, **options: object)
 def test_a_look_up_table_holds_the_exact_ranges_of_centres(backend, tmp_path, monkeypatch):
     grid, bins = place()[0], 12
     table = saved(tmp_path / "table", backend)
-    # In the grid's own frame, so that headings are the table's to the bit.
+    # The frame is the grid's, so that headings have the bits of the table's.
     level = gs.OccupancyGrid(grid.cells, 1.0)
     poses = np.column_stack([level.cell_centers(*np.indices(grid.shape).reshape(2, -1)), np.zeros(grid.cells.size)])
     limit = RANGE / grid.resolution

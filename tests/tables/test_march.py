@@ -43,7 +43,7 @@ def passages(occupied: np.ndarray, x: float, y: float, angle: float, limit: floa
 
 @pytest.mark.parametrize("tolerance", [1.0, 0.1, 0.01])
 def test_marching_is_too_long_by_the_tolerance_or_clips_less_of_a_corner(tolerance, backend):
-    """Each ray passes obstacles for less than the least step there, and stops less than that before one."""
+    """Each ray passes through obstacles for less than the smallest step, and stops less than that before one."""
     bearings, limit, clipped = np.linspace(0, 6, 7), 40.0, 0
     grid, poses = scattered(2)
     rays = [passages(grid.occupied, x, y, theta + b, limit) for x, y, theta in poses for b in bearings]
@@ -56,7 +56,7 @@ def test_marching_is_too_long_by_the_tolerance_or_clips_less_of_a_corner(toleran
             clipped += len(passed) > 0
             if found < limit:
                 assert ((ranges[:, 0] - rounding <= found) & (found <= ranges[:, 0] + least)).any(), (ranges, found)
-    # So many rays of this map pass that near to a corner.
+    # The number of rays of this map that pass a corner within this distance.
     assert clipped <= 0.3 * tolerance * 2 * len(rays) + 2
 
 
@@ -69,7 +69,7 @@ def room(seed: int) -> tuple[gs.OccupancyGrid, np.ndarray]:
 
 
 class Counting:
-    """Counts how often a table is looked up."""
+    """A table that counts its look-ups."""
 
     def __init__(self, table: np.ndarray) -> None:
         self.table, self.count = table, 0
@@ -124,7 +124,7 @@ def test_the_rule_centre_takes_fewer_steps_and_errs_more():
 
 
 def test_a_march_of_a_million_cells_ends(backend):
-    """There the tolerance is less than the least difference of two float32 numbers, and a step must still advance."""
+    """There the tolerance is below the spacing of float32 numbers, and a step must still advance."""
     cells = np.zeros((3, 60), int)
     cells[[0, 2]] = cells[1, -1] = 100
     caster = gs.RayCaster(gs.OccupancyGrid(cells, 1.0), 1_040_000, method=March(0.001), backend=backend)

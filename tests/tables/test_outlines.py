@@ -1,4 +1,4 @@
-"""Normals near corners, on bends and at the ends of walls; and how many sonars of a room hear nothing."""
+"""Normals near corners, on bends and at the ends of walls, and the share of sonars in a room without a return."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_bends_are_not_taken_for_corners(radius, solid):
 
 @pytest.mark.parametrize("thick", [1, 2, 3])
 def test_the_end_of_a_wall_has_the_direction_of_the_wall(thick):
-    """Up to the last cell but one; the last has sides of both directions."""
+    """This holds up to the last cell but one; the last cell has sides of both directions."""
     cells = np.zeros((40, 60), int)
     cells[20 : 20 + thick, :30] = 100
     normals = gs.surface_normals(gs.OccupancyGrid(cells, 1.0), outside="occupied")[20 : 20 + thick, 5:29]
@@ -131,7 +131,7 @@ def analytic(scanner: gs.Scanner, poses: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("rays", [3, 9, 33])
 @pytest.mark.parametrize("turn", [0.0, 0.1, 0.35, math.pi / 4])
 def test_sonars_in_a_room_hear_as_geometry_says(turn, rays, record_property):
-    """Before outlines 36 % of these cones were without a return, but 28 % in the model, and fewer with more rays."""
+    """Without outlines, 36 % of these cones had no return, but 28 % in the model, and fewer with more rays."""
     rng = np.random.default_rng(3)
     poses = np.column_stack([rng.uniform(-0.45, 0.45, (250, 2)) * SIZE, rng.uniform(-math.pi, math.pi, 250)])
     c, s = math.cos(turn), math.sin(turn)

@@ -1,4 +1,4 @@
-"""The reachable part of a map gives the bits of the whole map, and is kept while the cloud stays."""
+"""The reachable part of a map gives the bits of the whole map, and is reused while the cloud stays."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gpusense.world import windows
 @pytest.mark.parametrize("kind", [*KINDS, "caster"])
 @pytest.mark.parametrize("outside", ["free", "occupied"])
 def test_a_cropped_map_gives_the_same_bits(kind, outside, backend, monkeypatch):
-    """A cloud that stays, one that leaves the window, one at the border, one that jumps, one that returns."""
+    """Clouds stay, leave the window, lie at the border, jump, and return."""
     grid = room((400, 500))
     z = scan()
     rng = np.random.default_rng(5)

@@ -10,7 +10,7 @@ import gpusense as gs
 from gpusense.world.deskew import beam_poses
 
 MOVING = gs.Scanner(RING.bearings[::2], range_max=30.0, mount=(0.2, 0.1, 0.3))
-# The second scans turn the other way.
+# The second scans turn in the other direction.
 BACK = np.array([1.0, 1.0, -1.0])
 # Walls run through the centres of cells.
 ORIGIN = (-5.01, -4.01, 0.0)
@@ -24,7 +24,7 @@ def moved(pose, motion):
 
 
 def measured(pose, motion, scanner):
-    """Return the scan of a robot that moves, beam by beam, from closed forms of its way in 2000 small steps."""
+    """Return the scan of a moving robot, beam by beam, from closed forms of its path in 2000 small steps."""
     steps = 2000
     inverse = np.linalg.inv(arc(motion[2])) @ motion[:2]
     ranges = []
@@ -112,7 +112,7 @@ def room_cells():
 
 
 def test_maps_lose_the_error_of_the_motion(drive):
-    """Walls of a map are sharper: fewer cells are occupied, and more of them near a wall."""
+    """Walls of the map become sharper: fewer cells are occupied, and more of them are near a wall."""
     first, _, motion, scans, _ = drive
     walls = gs.distance_transform(room_cells() > 0, resolution=0.02, backend="numpy")
     errors = []

@@ -36,7 +36,7 @@ def test_the_density_is_that_of_a_normal_and_a_uniform_one():
 
 
 def shown(sigma, interpolation, precision, specialize):
-    """Return all that follows from the density: likelihoods, gradients, a search, a picture."""
+    """Return all results that depend on the density: likelihoods, gradients, a search, a picture."""
     p = parameters(sigma, z_hit=0.8, z_rand=0.2, interpolation=interpolation)
     model = gs.LikelihoodFieldModel(
         GRID, SCANNER, p, backend="numpy", precision=precision, specialize=specialize, outside="free"
@@ -56,7 +56,7 @@ def shown(sigma, interpolation, precision, specialize):
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("interpolation", ["nearest", "bilinear"])
 def test_a_made_up_shape_is_followed_by_all_users(interpolation, precision, specialize, monkeypatch):
-    """Hits of 2.5 times the deviation that the parameters name: every user must see them."""
+    """Hits have 2.5 times the deviation of the parameters: every user must follow."""
     plain = shown(0.1, interpolation, precision, specialize)
     wider = shown(0.25, interpolation, precision, specialize)
     monkeypatch.setattr(FieldDensity, "sigma", property(lambda self: 2.5 * self.parameters.sigma_hit))

@@ -48,7 +48,7 @@ def test_cell_fraction_and_low_part_make_the_position(name, precision):
     assert found.cell.dtype == np.int32 and found.pose.dtype == found.low.dtype == real
     assert found.cell.shape == (200, 2) and found.pose.shape == found.low.shape == (200, 4)
     assert ((found.pose[:, :2] >= 0) & (found.pose[:, :2] < 1)).all()
-    # The pose minus the origin is exact to half an ulp of what float64 can say of 3000 cells.
+    # The pose minus the origin is exact to half an ulp of 3000 cells in float64.
     cells = 3000 + math.hypot(*mount[:2]) / resolution
     position = 1e-12 + 8 * np.finfo(float).eps * cells
     heading = 4 * np.finfo(float).eps + TWO_PARTS[precision]
@@ -63,7 +63,7 @@ def test_cell_fraction_and_low_part_make_the_position(name, precision):
 
 @pytest.mark.parametrize("real", [FLOAT64, FLOAT32], ids=str)
 def test_fractions_that_round_to_one(real):
-    """Just below an edge a pose keeps its cell, and a fraction below 1."""
+    """Just below an edge, a pose keeps its cell and a fraction below 1."""
     grid = gs.OccupancyGrid(np.zeros((4, 4), int), 1.0)
     for x in (np.nextafter(2.0, 0), 2 - 1e-9, 2 - 2.0**-25, 1 - 2.0**-53, 0.0, 2.0, 3 + 2.0**-30):
         found = place_poses(np.array([[x, x, 0.0]]), grid, NO_MOUNT, real)
@@ -76,7 +76,7 @@ def test_fractions_that_round_to_one(real):
 @pytest.mark.parametrize("real", [FLOAT64, FLOAT32], ids=str)
 @pytest.mark.parametrize("x", [-1e-20, -5e-324, -1e-17, -3e-17])
 def test_just_below_zero(real, x):
-    """The cell is -1; the fraction cannot say how near to 1 it is, but high and low part together can."""
+    """The cell is -1; the fraction alone does not resolve its distance from 1, but high and low part do."""
     grid = gs.OccupancyGrid(np.zeros((4, 4), int), 1.0)
     found = place_poses(np.array([[x, 0.5, 0.0]]), grid, NO_MOUNT, real)
     assert found.cell.tolist() == [[-1, 0]]
@@ -87,7 +87,7 @@ def test_just_below_zero(real, x):
 
 
 def test_quarter_turns_of_the_origin():
-    """Poses on the lattice of a turned grid stay in their cells to rounding, and headings to the last place."""
+    """On the lattice of a turned grid, cells are right to rounding, and headings to the last place."""
     for quarter in range(-4, 5):
         yaw = quarter * math.pi / 2
         grid = gs.OccupancyGrid(np.zeros((9, 9), int), 0.5, (10.0, -20.0, yaw))
@@ -101,7 +101,7 @@ def test_quarter_turns_of_the_origin():
 
 
 def test_cells_farther_than_int32():
-    """Poses out of this world keep finite fractions and a cell that no range reaches."""
+    """Poses far outside the map have finite fractions and a cell beyond every range."""
     grid = gs.OccupancyGrid(np.zeros((2, 2), int), 0.001)
     found = place_poses(np.array([[1e300, -1e300, 0.0], [1e9, -3e12, 1e300]]), grid, NO_MOUNT, FLOAT32)
     assert np.isfinite(found.pose).all() and np.isfinite(found.low).all()
@@ -131,7 +131,7 @@ def test_split_keeps_48_bits():
 
 @pytest.mark.parametrize("theta", [1e6, -1e6, 1e15, 1e300])
 def test_heading_of_any_size(theta):
-    """Results depend on theta modulo 2 pi, taken of the number as it is."""
+    """Results depend on theta modulo 2 pi, reduced exactly."""
     grid = gs.OccupancyGrid([[0]], 1.0)
     found = place_poses(np.array([[0.5, 0.5, theta]]), grid, NO_MOUNT, FLOAT64)
     with mp.workdps(400):

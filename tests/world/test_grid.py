@@ -135,7 +135,7 @@ def test_no_turn_means_no_rounding():
 def test_centres_come_back(x, y, yaw, resolution, row, col):
     grid = OccupancyGrid(CELLS, resolution, (x, y, yaw))
     back = grid.world_to_cells(grid.cell_centers([row], [col]))
-    # World coordinates are rounded to 2**-53 of 5e6 m once and turned with an error of a few units of that.
+    # World coordinates are rounded once to 2**-53 of 5e6 m, and turned with an error of a few such units.
     np.testing.assert_allclose(back, [[col + 0.5, row + 0.5]], atol=1e-8 / resolution + 1e-12)
 
 

@@ -1,4 +1,4 @@
-"""Images of maps: formats, depths, transparency, and files that lie."""
+"""Images of maps: formats, depths, transparency, and files with false headers."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_raw_ignores_alpha(place):
 def test_colours_count_by_their_luma(place):
     rgb = np.array([[[255, 255, 255], [0, 0, 255], [0, 255, 0], [255, 0, 0], [0, 0, 0]]], np.uint8)
     grid = read_map(place(Image.fromarray(rgb), "map.png"))
-    assert grid.cells.tolist() == [[0, 100, -1, 100, 100]]  # greys 255, 29, 149, 76, 0
+    assert grid.cells.tolist() == [[0, 100, -1, 100, 100]]  # Greys 255, 29, 149, 76 and 0.
     grid = read_map(place(Image.fromarray(rgb), "map.png", mode="scale", free_thresh=0, occupied_thresh=1))
     assert grid.cells.tolist() == [[0, 89, 42, 70, 100]]
     ppm = b"P6 5 1 255\n" + rgb.tobytes()
@@ -108,7 +108,7 @@ def test_one_bit(place, suffix):
 @pytest.mark.parametrize("depth", [1, 2, 4])
 def test_small_grey_depths(place, depth):
     white = 2**depth - 1
-    packed = white << (8 - depth)  # a white pixel, then a black one
+    packed = white << (8 - depth)  # A white pixel, then a black one.
     assert read_map(place(png(2, 1, bytes([0, packed]), depth), "map.png")).cells.tolist() == [[0, 100]]
 
 
@@ -184,7 +184,7 @@ def test_truncated_images(place, kind, keep):
     greys = np.random.default_rng(2).integers(0, 256, (40, 40), np.uint8)
     if kind == "P2":
         content = b"P2 40 40 255\n" + b" ".join(b"%d" % v for v in greys.ravel())
-        # Half a number is a number: cut off a whole one.
+        # Half a number is still a number, so a whole one is cut off.
         ends = {"magic": 2, "header": 12, "half": len(content) // 2, "all but one": content.rindex(b" ")}
     else:
         if kind == "P5":
@@ -194,7 +194,7 @@ def test_truncated_images(place, kind, keep):
         else:
             path = place(Image.fromarray(greys), f"map.{kind}").with_name(f"map.{kind}")
             content = path.read_bytes()
-        # Of a PNG the last 16 bytes are a checksum and an empty chunk: the pixels would be whole without them.
+        # The last 16 bytes of a PNG are a checksum and an empty chunk; the pixels are whole without them.
         last = len(content) - (17 if kind == "png" else 1)
         ends = {"magic": 3, "header": 20, "half": len(content) // 2, "all but one": last}
     file = place(content[: ends[keep]], f"map.{kind}")
@@ -251,7 +251,7 @@ BOUND = 3000
 
 
 def big_images():
-    """Yield name, content and bytes a cell, beside fixed ones, that reading may take at its peak."""
+    """Yield name, contents and largest number of bytes a cell, besides a fixed number, for reading."""
     side = BOUND
     yield "map.png", png(side, side, bytes(side * (1 + (side + 7) // 8)), depth=1), 1.3
     yield "map.png", png(side, side, bytes(side * (1 + side))), 1.3
@@ -262,7 +262,7 @@ def big_images():
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize(("name", "content", "most"), big_images(), ids=["png-1-bit", "png", "pgm", "pgm-plain"])
 def test_a_map_is_read_at_a_byte_a_cell(tmp_path, name, content, most):
-    """Memory of NumPy and Python; Pillow holds one more byte a pixel of a grey PNG, which it does not report."""
+    """Count the memory of NumPy and Python; Pillow holds one more byte a pixel of a grey PNG without reporting it."""
     (tmp_path / name).write_bytes(content)
     (tmp_path / "map.yaml").write_text(yaml_text(name))
     read_map(tmp_path / "map.yaml")

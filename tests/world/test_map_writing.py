@@ -1,4 +1,4 @@
-"""Maps that are written: round trips, and failures that leave everything as it was."""
+"""Written maps: round trips, and failures that leave all files unchanged."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_a_failure_leaves_everything_as_it_was(tmp_path, monkeypatch, failing_ca
 
     monkeypatch.setattr(os, "replace", failing_replace)
     if not before and failing_call > 2:
-        write_map(OccupancyGrid([[1, 2]]), target)  # there are but two files to replace
+        write_map(OccupancyGrid([[1, 2]]), target)  # Only two files are to be replaced.
         return
     with pytest.raises(OSError, match="no space left"):
         write_map(OccupancyGrid([[1, 2]]), target)

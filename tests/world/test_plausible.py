@@ -1,4 +1,4 @@
-"""Values that are legal but cannot be meant compute as before, and give one warning that names the likely cause."""
+"""Legal but implausible values are used as they are, and give one warning that names the likely cause."""
 
 from __future__ import annotations
 

@@ -110,7 +110,7 @@ def test_range_max_is_recognised_in_the_readings_own_dtype(dtype, range_max):
 
 
 def test_limits_beyond_the_dtype():
-    # 1e6 is infinite in float16, 1e-50 is 0 in float32: the table still holds.
+    # 1e6 is infinite in float16, 1e-50 is 0 in float32: the rules still hold.
     assert classify(np.float16([1.0, 65504.0, np.inf]), scanner_of(3, 1e6)).tolist() == [HIT, HIT, MAX]
     assert classify(np.float32([0.0, 1e-40]), scanner_of(2, 5.0, 1e-50)).tolist() == [MISSING, HIT]
 

@@ -41,6 +41,8 @@ class Launch:
         self._lanes, self._group = (1, row.group)
         if "IN_LANES" in flags:
             self._lanes, self._group = (lanes_of(flags) if row.in_lanes else 1), row.lanes_group
+        elif "IN_TEAMS" in flags:
+            self._group = row.team
         self._lock = threading.Lock()
         real = np.dtype(np.float64 if "FLOAT64" in flags else np.float32)
         # With its types set, pyopencl sets all arguments in 1 us; otherwise a single number takes 6 us.

@@ -261,7 +261,7 @@ class WarpBackend(ProcessBound, Backend):
         Raises:
             RuntimeError: Warp does not compile it.
         """
-        group = row.group if self._device.is_cuda else 1
+        group = (row.team if "IN_TEAMS" in flags else row.group) if self._device.is_cuda else 1
         with settings():
             compiled = warp_module(row.file).make(kernel, flags)
             try:

@@ -26,7 +26,7 @@ KERNELS: dict[str, Kernel] = {
     "match_scans": kernel(
         "icp", "item", *_POINTS, "real4 line [points]", "int2 pair [pairs]", "real4 guess [pairs * starts]",
         f"out real result [{MATCH_RESULT} * pairs * starts]", "int scans", "int points", "int pairs", "int starts",
-        "MatchRules rules", group=4,
+        "MatchRules rules", group=4, team=256,
     ),
     "pool_scores": kernel(
         "search", "col line image", _CELLS,

@@ -60,7 +60,7 @@ class Argument:
         return _evaluate(ast.parse(self.shape, mode="eval").body, values)
 
     def dtype(self, real: np.dtype) -> np.dtype:
-        """Return the Return the NumPy dtype of one number of an array or scalar."""
+        """Return the NumPy dtype of one number of an array or scalar."""
         base = self.type.rstrip("24")
         return real if base == "real" else _SCALARS[base]
 
@@ -71,7 +71,8 @@ class Kernel:
 
     The first axis of a global size is rounded up to whole groups; heavier work-items have smaller groups. Where a
     kernel is compiled with IN_LANES, its groups have ``lanes_group`` work-items, and with ``in_lanes`` each of them
-    takes as many neighbours of the first axis as there are lanes. ``apart`` says that no two of its arrays share
+    takes as many neighbours of the first axis as there are lanes. With IN_TEAMS the ``team`` work-items of a group
+    share an item, so the first axis has as many work-items for each. ``apart`` says that no two of its arrays share
     memory, so a compiler need not reload arguments after a write.
     """
 
@@ -82,6 +83,7 @@ class Kernel:
     in_lanes: bool = False
     lanes_group: int = 1
     apart: bool = False
+    team: int = 1
 
 
 # Particles or beams of a work-item of a kernel in lanes.
@@ -101,6 +103,7 @@ def kernel(
     in_lanes: bool = False,
     lanes_group: int = 1,
     apart: bool = False,
+    team: int = 1,
 ) -> Kernel:
     """Return the kernel whose arguments are rows such as ``"out real parts [particles * features]"``."""
     arguments = []
@@ -108,7 +111,7 @@ def kernel(
         head, _, shape = row.partition("[")
         *output, kind, name = head.split()
         arguments.append(Argument(name, kind, shape.rstrip("]") if shape else None, output == ["out"]))
-    return Kernel(file, tuple(launch.split()), tuple(arguments), group, in_lanes, lanes_group, apart)
+    return Kernel(file, tuple(launch.split()), tuple(arguments), group, in_lanes, lanes_group, apart, team)
 
 
 WINDOW = "Window window"

@@ -6,5 +6,6 @@
 kernel void match_scans(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= pairs * starts) return;
-    match_pair(point, start, line, pair[n / starts], guess[n], result + (long)MATCH_RESULT * n, rules);
+    const Team team = {0};
+    match_pair(point, start, line, pair[n / starts], guess[n], result + (long)MATCH_RESULT * n, rules, team);
 }

@@ -144,7 +144,8 @@ lanes lines_lanes(global const real4 *line, const ilanes which, lanes *lines) {
 
 // Return how well every stride-th point of one scan agrees with every skip-th point of another scan; see icp_pairs.cl.
 real4 agreement(global const real4 *point, global const real4 *line, const int count, global const real4 *other,
-                const int others, const int stride, const int skip, const real4 pose, const real near, const real gap) {
+                const int others, const int stride, const int skip, const real4 pose, const real near, const real gap,
+                const Team team) {
     const real scale = near / 3;
     global const real *numbers = (global const real *)other;
     lanes sum = 0, seen = 0;
@@ -184,7 +185,7 @@ real4 agreement(global const real4 *point, global const real4 *line, const int c
 // Write the sums over the pairs of a scan's points at a pose (x, y, cos, sin), and those of blocks, 0 unless full.
 void sum_pairs(global const real4 *point, global const real4 *line, const int count, global const real4 *other,
                const int others, const int stride, const int skip, const real4 pose, const real capture,
-               const real scale, const int last, const int full, real *sums, real *squares) {
+               const real scale, const int last, const int full, real *sums, real *squares, const Team team) {
     global const real *numbers = (global const real *)other;
     lanes total[MATCH_SUMS];
     int hint = 0;

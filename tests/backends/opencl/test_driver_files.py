@@ -105,7 +105,7 @@ def test_half_a_wheel_is_none(machine, intel, monkeypatch, problem):
 
 @pytest.fixture
 def trials(machine, monkeypatch):
-    """Run children with a list of failures in turn; return the list of drivers that each one has loaded."""
+    """Let child processes fail as listed, in turn; return the list of drivers that each one loaded."""
     failures, loaded = [], []
 
     def run_text(arguments, job, variables):
@@ -138,7 +138,7 @@ def test_a_verdict_on_loading_is_kept_and_made_anew_when_asked(trials, monkeypat
 
 
 def test_a_process_keeps_the_drivers_that_it_has_loaded(trials, monkeypatch):
-    """Its selection strings, and those of its children, count the devices of these drivers."""
+    """Selection strings of the process and of its children number the devices of these drivers."""
     failures, loaded = trials
     monkeypatch.setattr(drivers, "choice", _CHOICE)
     failures.append("")

@@ -43,7 +43,7 @@ def call_of(method: str, backend: Any) -> Any:
 @pytest.mark.parametrize("real", [np.float32, np.float64])
 @pytest.mark.parametrize("method", METHODS)
 def test_poses_on_the_device_stay_there(method, real, queue, there, copies):
-    """Results have the bits of NumPy's poses, and are arrays on the queue; out= is filled in place."""
+    """Results have the bits of those of NumPy's poses, and are arrays on the queue; out= is filled in place."""
     call, poses = call_of(method, queue), cloud(1).astype(real)
     expected, given = call(poses), there(poses)
     call(given)
@@ -60,7 +60,7 @@ def test_poses_on_the_device_stay_there(method, real, queue, there, copies):
 @pytest.mark.parametrize("share", [True, False], ids=["together", "apart"])
 @pytest.mark.parametrize("kind", MODELS)
 def test_several_scans(kind, share, queue, there, monkeypatch):
-    """Also where the device cannot begin with the particles of a scan, or those of a piece."""
+    """Scans and pieces may begin where the device cannot begin a sub-buffer."""
     model = kind(GRID, SCANNER, backend=queue)
     monkeypatch.setattr(
         "gpusense.models.scan.pipeline.TOGETHER", {"gpu": 1 << 22 if share else 0} | {"cpu": 1 << 22 if share else 0}
@@ -79,7 +79,7 @@ def test_several_scans(kind, share, queue, there, monkeypatch):
 
 
 def test_pieces_of_calls(queue, there, monkeypatch):
-    """Pieces of other sizes than the device can begin with become multiples of 256 particles."""
+    """Pieces become multiples of 256 particles where the device could not begin a sub-buffer."""
     monkeypatch.setattr(run, "CHUNK", 300)
     poses = cloud(3, 1000)
     for kind in MODELS:
@@ -90,7 +90,7 @@ def test_pieces_of_calls(queue, there, monkeypatch):
 
 @pytest.mark.parametrize("kind", MODELS)
 def test_pieces_with_which_the_device_cannot_begin(kind, as_gpu, queue, there, monkeypatch):
-    """They are written elsewhere and copied; bound calls, which copy nothing, have larger ones."""
+    """Such pieces are written elsewhere and copied; bound calls, which copy nothing, use larger pieces."""
     monkeypatch.setattr(run, "CHUNK", 49)
     poses = cloud(3, 300).astype(np.float32)
     model, caster = kind(GRID, NEAR, backend=queue, precision="float64"), gs.RayCaster(GRID, 5.0, backend=queue)
@@ -157,12 +157,12 @@ def test_arrays_in_shared_virtual_memory(queue):
 
 
 def test_other_processes_are_refused(as_gpu, queue, there, monkeypatch):
-    """A fork's child has another number, and drivers do not survive in it."""
+    """The child of a fork has another process number, and drivers do not work in it."""
     call = FIELD(GRID, NEAR, backend=queue).bind(there(cloud(1)), there(mixed(1)))
     call()
     call.check()
     monkeypatch.setattr(as_gpu, "_process", -1)
-    # The child looks selection strings up anew.
+    # The child looks up selection strings again.
     monkeypatch.setattr(selection, "_looks", ((), {}))
     for refused in (call, call.check, lambda: get_backend(queue), lambda: get_backend("opencl")):
         with pytest.raises(RuntimeError, match="does not survive a fork"):
@@ -171,7 +171,7 @@ def test_other_processes_are_refused(as_gpu, queue, there, monkeypatch):
 
 @pytest.mark.parametrize("kind", MODELS)
 def test_an_error_leaves_no_verdict_behind(kind, queue, there, monkeypatch):
-    """A pose that is not finite, in a call that ended early, is not the next call's."""
+    """A pose that is not finite, in a call that ended early, does not affect the next call."""
     model, poses = kind(GRID, SCANNER, backend=queue), cloud(1)
     expected = model.log_likelihood(there(poses), scan(1)).get()
     bad = poses.copy()
@@ -197,7 +197,7 @@ def test_a_device_without_float64_places_no_poses(as_gpu, queue, there, monkeypa
 
 
 def test_writes_of_another_queue_are_waited_for(queue, there):
-    """The wait comes before any launch that reads the array."""
+    """The device waits before any launch that reads the array."""
     import pyopencl as cl
 
     model, poses = FIELD(GRID, SCANNER, backend=queue), there(cloud(1))
@@ -211,7 +211,7 @@ def test_writes_of_another_queue_are_waited_for(queue, there):
     expected = model.log_likelihood(cloud(2), scan(1))
     poses.queue = Busy()
     assert differing(model.log_likelihood(poses, scan(1)).get(), expected) == 0
-    # The same of arrays whose queue has events to be waited for.
+    # The same for arrays with events on their queue.
     moved = there(cloud(1)).with_queue(cl.CommandQueue(queue.context))
     moved += 0.25
     assert moved.events

@@ -18,7 +18,7 @@ from gpusense.models.scan import binding
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("case", CASES)
 def test_bound_calls(case, as_gpu, queue, there):
-    """They have the bits of ordinary calls with the arrays' and the map's contents at that time; NumPy's arrays too."""
+    """Each has the bits of an ordinary call with the current contents of arrays and map, NumPy's arrays included."""
     model = CASES[case](backend=queue)
     beams = model.scanner.count
     for real in (np.float32, np.float64):
@@ -69,14 +69,14 @@ def test_bound_calls_on_another_queue(as_gpu, queue, there):
     properties = cl.command_queue_properties.OUT_OF_ORDER_EXEC_MODE_ENABLE
     with pytest.raises(ValueError, match="stream: must be an in-order queue"):
         call(cl.CommandQueue(queue.context, properties=properties))
-    # Nothing that a queue still works on is freed.
+    # No memory that a queue still uses is freed.
     call(other)
     del call
     gc.collect()
 
 
 def test_a_bound_call_binds_no_argument_again(as_gpu, queue, there, monkeypatch):
-    """A call is three launches with kernel objects of its own."""
+    """A call is three launches with kernel objects that it does not share."""
     from gpusense.backends.opencl import replay as _opencl_replay
 
     model = FIELD(GRID, NEAR, backend=queue)
@@ -109,7 +109,7 @@ def test_a_bound_call_whose_device_is_gone(as_gpu, queue, there, monkeypatch):
 
 
 def test_a_bound_call_of_numpy_arrays_copies_once_each_way(as_gpu, queue, copies, monkeypatch):
-    """It makes no buffer, and copies only poses and readings, results and the status of the poses."""
+    """The call makes no buffer, and copies only poses, readings, results and the status of the poses."""
     for kind in MODELS:
         call = kind(GRID, NEAR, backend=queue).bind(cloud(1).astype(np.float32), mixed(1))
         call()

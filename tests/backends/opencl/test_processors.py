@@ -31,7 +31,7 @@ PILEDRIVER = f"{BULLDOZER} f16c fma bmi1 tbm"
 EXCAVATOR = f"{PILEDRIVER} avx2 bmi2 movbe rdrand"
 ZEN = f"{HASWELL} sse4a adx sha_ni clzero"
 
-# Processor, LLVM 14's name for it, its instruction sets, and the processor of the library that fits.
+# Processor, its name in LLVM 14, its instruction sets, and the processor of the library that fits it.
 PROCESSORS = [
     ("Opteron 240", "opteron-sse3", K8, "x86-64"),
     ("Core 2 Duo E6600", "core2", CORE2, "core2"),
@@ -98,7 +98,7 @@ def width_of(flags: str) -> int:
 
 @pytest.fixture
 def of(monkeypatch):
-    """Give this machine the instruction sets of another, and PoCL its libraries for several processors."""
+    """Imitate the instruction sets of another machine, and PoCL's libraries for several processors."""
 
     def give(flags: str, libraries: bool = True) -> None:
         monkeypatch.setattr(pocl, "instruction_sets", lambda: frozenset(flags.split()))
@@ -216,6 +216,6 @@ def test_a_copy_of_the_wheel_hides_avx_512(monkeypatch: pytest.MonkeyPatch, tmp_
         pytest.skip(str(error))
     code = Path(named.read_text().strip()).read_bytes()
     assert script.SET + script.READ not in code
-    # Elsewhere the bytes are left alone.
+    # All other bytes are unchanged.
     assert code.count(script.SET + script.CLAIM) == 2
     assert script.READ in code

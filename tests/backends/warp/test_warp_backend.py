@@ -108,7 +108,7 @@ assert before == {name: getattr(wp.config, name) for name in before}
 
 
 def run_quietly(folder: Path, **variables: str) -> None:
-    """Run a kernel in a new process with its caches in a folder; it must print nothing at all."""
+    """Run a kernel in a new process with its caches in a folder, and check that it prints nothing."""
     environment = os.environ | {"WARP_CACHE_PATH": str(folder / "warp"), "GPUSENSE_CACHE_DIR": str(folder)} | variables
     done = subprocess.run([sys.executable, "-c", _QUIET], capture_output=True, text=True, env=environment, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
@@ -129,7 +129,7 @@ def test_the_cache_can_be_switched_off(needs: Callable[[str], str], tmp_path: Pa
 
 @pytest.fixture
 def field_launch(warp_backend: Backend, monkeypatch: pytest.MonkeyPatch):
-    """Return a launcher of the field's scores that three threads share, and a function that runs one on particles."""
+    """Return a launcher of the field's scores for three threads, and a function that runs a launcher on particles."""
     from gpusense.backends import helpers
     from gpusense.backends.warp import backend as _warp
     from gpusense.backends.warp import pieces as _warp_pieces

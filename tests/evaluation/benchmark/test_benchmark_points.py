@@ -1,4 +1,4 @@
-"""Measurements of ``gpusense bench``: costs, failures that show, outside candidates."""
+"""Measurements of ``gpusense bench``: costs, reported failures, outside candidates."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_costs_of_a_caster():
     assert cost.build_s > 0 and cost.first_s > 0 and cost.compile_s is not None
     assert 0 < cost.launch_min_s <= cost.launch_median_s
     rows, cols = scene.grid.shape
-    # The table of the map, and poses, bearings and ranges beside it.
+    # Memory holds the table of the map, poses, bearings and ranges.
     assert cost.table_bytes == 8 * (rows + 2) * (cols + 2)
     assert cost.table_bytes + 4 * 20 * 9 < cost.device_bytes <= cost.peak_bytes
     assert cost.device_bytes < cost.table_bytes + 20_000
@@ -57,7 +57,7 @@ def test_a_table_that_is_slow_to_make_is_made_once(monkeypatch):
     monkeypatch.setattr(measure, "SLOW_TO_MAKE", -1.0)
     assert measure.measure(make, None, poses, 1)[0].compile_s is None
     assert len(made) == 3
-    # The next cloud of a scene takes the runner.
+    # The next cloud of a scene reuses the runner.
     earlier = []
     first, second = (measure.measure(make, None, poses, 1, earlier=earlier) for _ in range(2))
     assert len(made) == 4 and second[1] is first[1]
@@ -209,6 +209,6 @@ def test_numba_computes_the_stated_scores(baselines):
         found[one.label] = accuracy.errors(truth, one.problem, ranges=ranges, log_p=log_p)
     assert found["numba field, log grid"]["log_p"]["max"] < 1e-3
     assert found["numba field, log of products"]["log_p"]["max"] < 1e-3
-    # Another package's weight is no likelihood.
+    # The weight of another package is not a likelihood.
     assert found["numba field, sum of cubes"]["log_p"]["max"] > 1
     assert found["numba march, headings = 2000"]["ranges"]["median"] < 2

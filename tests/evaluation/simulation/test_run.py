@@ -62,10 +62,10 @@ def test_people_change_readings_and_nothing_else():
 def test_people_hide_the_share_of_beams_that_is_asked_for(share):
     run = gs.worlds.simulate_run(OFFICE, SCANNER, scans=200, hidden=share, seed=3)
     assert abs(run.hidden.mean() - share) < 0.06
-    # In whole sectors: a beam beside a hidden one is mostly hidden, too.
+    # People hide whole sectors: the neighbour of a hidden beam is mostly hidden as well.
     pairs = run.hidden[:, 1:] & run.hidden[:, :-1]
     assert pairs.sum() > 0.5 * run.hidden.sum()
-    # Discs are where their beams end.
+    # Beams that discs hide end on them.
     lasers = gs.compose_poses(run.poses, SCANNER.mount)
     t = int(run.hidden.sum(axis=1).argmax())
     for k in np.flatnonzero(run.hidden[t])[:20]:

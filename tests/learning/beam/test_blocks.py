@@ -32,7 +32,7 @@ def test_gradients_of_blocks_add_up_to_the_gradient(bias: float, backend: str) -
 
 
 def test_independent_readings_have_the_same_errors_in_blocks(needs) -> None:
-    """Errors over 2000 blocks are a share of 1 / sqrt(2 * 2000) = 1.6 % of themselves, or more for long tails."""
+    """Errors over 2000 blocks have a relative error of 1 / sqrt(2 * 2000) = 1.6 %, or more for long tails."""
     z, expected = draw(TYPICAL, 20_000, 3)
     fit = gs.fit_beam_parameters(z, expected, RANGE_MAX, backend=needs("opencl"), blocks=np.arange(20_000) // 10)
     independent = np.array([fit.independent_errors[name] for name in fit.standard_errors])
@@ -41,7 +41,7 @@ def test_independent_readings_have_the_same_errors_in_blocks(needs) -> None:
 
 
 def test_repeated_readings_know_no_more_than_one(needs) -> None:
-    """Each reading 9 times in a block: the errors of a single reading each, 3 times as large as independent ones."""
+    """Each block has a reading 9 times: errors are those of single readings, 3 times those of independent ones."""
     backend = needs("opencl")
     z, expected = draw(TYPICAL, 3000, 4)
     once = gs.fit_beam_parameters(z, expected, RANGE_MAX, backend=backend, blocks=np.arange(3000))
@@ -56,7 +56,7 @@ def test_repeated_readings_know_no_more_than_one(needs) -> None:
 
 @pytest.mark.slow
 def test_errors_over_blocks_are_those_of_repeated_experiments(needs) -> None:
-    """60 scans whose 20 readings share an error: the spread of sigma_hit and z_hit over 60 experiments."""
+    """The 20 readings of each of 60 scans share an error; sigma_hit and z_hit scatter so over 60 experiments."""
     backend = needs("opencl")
     values, claimed, independent = [], [], []
     for seed in range(60):

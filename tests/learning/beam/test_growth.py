@@ -1,4 +1,4 @@
-"""Fits of the deviation's growth with range."""
+"""Fits of a deviation that grows with range."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_all_parameters_are_found(needs) -> None:
 def test_without_growth_the_fit_is_the_plain_one() -> None:
     rng = np.random.default_rng(3)
     expected = rng.uniform(1, 9, 3000)
-    # A deviation that falls with range: growth ends at its bound, 0.
+    # If the deviation falls with range, growth is at its bound, 0.
     z = expected + rng.normal(0, 0.3 - 0.03 * expected)
     plain = gs.fit_beam_parameters(z, expected, 10.0, backend="numpy")
     fit = gs.fit_beam_parameters(z, expected, 10.0, sigma_growth=True, backend="numpy")

@@ -56,7 +56,7 @@ def test_the_likelihood_never_falls_and_is_that_of_the_mixture() -> None:
 
 
 def test_the_fit_is_that_of_scipy(backend: str) -> None:
-    """The likelihood by SciPy's t distribution, maximised by SciPy's simplex from the truth."""
+    """SciPy's simplex maximises the likelihood by SciPy's t distribution, from the truth."""
     z, expected = (each[:1500] for each in drawn(STUDENT))
     blocks = np.arange(1500) // 5
     fit = gs.fit_beam_parameters(z, expected, RANGE, backend=backend, hit="student", blocks=blocks)
@@ -77,7 +77,7 @@ def test_the_fit_is_that_of_scipy(backend: str) -> None:
     assert fit.converged and -best.fun - 1e-6 <= fit.log_likelihood <= -best.fun + 1e-4
     for name, value in zip(("sigma_hit", "lambda_short", "hit_dof"), np.exp(best.x[3:]), strict=True):
         assert getattr(fit.parameters, name) == pytest.approx(value, rel=0.01 * fit.independent_errors[name] / value)
-    # Standard errors: of the parameters that SciPy's second derivatives see, and of blocks of independent readings.
+    # Standard errors are those of SciPy's second derivatives, and those over blocks of independent readings.
     assert fit.standard_errors["hit_dof"] == pytest.approx(fit.independent_errors["hit_dof"], rel=0.3)
 
 

@@ -17,7 +17,7 @@ EDGE = np.pi / 4
 
 
 def scene(counts: tuple[int, int], seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw readings, expected ranges and angles: numbers below and above 45 degrees, each with parameters."""
+    """Draw readings, expected ranges and angles below and above 45 degrees, each with its own parameters."""
     rng = np.random.default_rng(seed)
     expected = rng.uniform(1, 9, sum(counts))
     angles = np.concatenate([rng.uniform(0, EDGE, counts[0]), rng.uniform(EDGE, np.pi / 2, counts[1])])
@@ -50,7 +50,7 @@ def test_thin_bins_lean_on_the_pooled_fit() -> None:
         pooled, thin = fit.pooled.parameters, fit.parameters.parameters[1]
         distance.append(abs(thin.z_max - pooled.z_max))
         assert all((np.diff(own.trace) >= -1e-9 * abs(own.trace[-1])).all() for own in fit.fits)
-        # The thick bin hardly notices 30 pseudo-readings.
+        # 30 pseudo-readings hardly change the full bin.
         if strength == 30.0:
             alone = gs.fit_beam_parameters(z[:4000], expected[:4000], RANGE_MAX, backend="numpy")
             for name, value in fit.parameters.parameters[0].to_dict().items():
@@ -107,7 +107,7 @@ def test_beams_that_hit_nothing_have_parameters_of_their_own() -> None:
     assert (
         with_nothing.parameters.parameters == fit.parameters.parameters and with_nothing.pooled.hits == fit.pooled.hits
     )
-    # 30 pseudo-readings beside 50 without return; without readings these are all there is.
+    # A bin has 30 pseudo-readings beside 50 without return; one without readings has only the former.
     found, pooled = with_nothing.parameters.no_surface, fit.pooled.parameters
     assert found.z_max == pytest.approx((50 + 30 * pooled.z_max) / 80, rel=1e-6)
     assert found.sigma_hit == pytest.approx(pooled.sigma_hit, rel=1e-6)
@@ -152,7 +152,7 @@ def test_a_model_gives_readings_the_likelihood_of_their_fit(backend: str) -> Non
     model = gs.BeamModel(grid, scanner, incidence=fit.parameters, backend=backend)
     parts = [model.log_likelihood(pose[None], scan, per_beam=True)[1] for pose, scan in zip(poses, z, strict=True)]
     total = np.sum(parts, dtype=np.float64)
-    # float32 densities of float32 ranges that the fit took for float64: sigma is 0.05 m, eps of 4 m is 5e-7 m.
+    # Densities and ranges are float32, and the fit takes them for float64: sigma is 0.05 m, eps of 4 m is 5e-7 m.
     assert total == pytest.approx(fit.log_likelihood, rel=1e-5)
     without = gs.IncidenceParameters(fit.parameters.edges, fit.parameters.parameters)
     blind = gs.BeamModel(grid, scanner, incidence=without, backend=backend)

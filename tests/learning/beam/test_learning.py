@@ -15,7 +15,7 @@ from gpusense.models.scan.densities import log_mixture
 
 FAR = gs.BeamParameters(0.7, 0.1, 0.15, 0.05, 1.0, 0.3)
 EQUAL = gs.BeamParameters(0.25, 0.25, 0.25, 0.25, 1.0, 1.0)
-# A parameter whose standard error is below this part of it is identified: its likelihood is near a normal density.
+# A parameter is identified if its relative standard error is below this: its likelihood is then nearly normal.
 IDENTIFIED = 0.3
 
 
@@ -32,7 +32,7 @@ def identified(fit: gs.BeamFit) -> np.ndarray:
 
 
 def worst_fall(fit: gs.BeamFit) -> float:
-    """Return the largest fall of the log-likelihood in an iteration, over its size."""
+    """Return the largest relative fall of the log-likelihood in an iteration."""
     return float(np.max(-np.diff(fit.trace), initial=0.0)) / abs(fit.log_likelihood)
 
 
@@ -48,7 +48,7 @@ def test_fifty_scenes_from_mild_to_stiff(needs) -> None:
         truth = np.array(list(scene.parameters.to_dict().values()))
         known = identified(fit)
         off += list((values(fit) - truth)[known] / errors(fit)[known])
-        # The truth is a point like any other, and never better.
+        # The truth is a point like any other, and is never better than the fit.
         at_truth = log_mixture(
             np.minimum(z, scene.range_max), expected, range_max=scene.range_max, **scene.parameters.to_dict()
         ).sum()
@@ -56,7 +56,7 @@ def test_fifty_scenes_from_mild_to_stiff(needs) -> None:
     off = np.array(off)
     assert len(off) > 200
     assert np.mean(np.abs(off) <= 3) >= 0.95
-    # Standard errors are neither too small nor too large: 240 squares have a mean of 1 +- 0.1, scenes are not alike.
+    # Standard errors are neither too small nor too large: 240 squares of unlike scenes have a mean of 1 +- 0.1.
     assert 0.75 < np.sqrt(np.mean(off**2)) < 1.25
 
 
@@ -97,7 +97,7 @@ def test_the_log_likelihood_is_the_sum_of_the_mixture(backend: str) -> None:
 
 
 def test_a_fit_of_the_model_scores_highest(needs) -> None:
-    """BeamModel itself finds the fitted parameters likelier than any near them."""
+    """BeamModel itself scores the fitted parameters higher than any near them."""
     grid = gs.OccupancyGrid(np.pad(np.zeros((80, 120), np.int8), 1, constant_values=100), 0.1)
     scanner = gs.Scanner(np.linspace(-np.pi, np.pi, 1500, endpoint=False), 9.0)
     pose = [[4.0, 3.0, 0.3]]
@@ -149,7 +149,7 @@ def test_hill_climbing_leaves_a_ridge_that_no_coordinate_climbs(needs) -> None:
     best = gs.fit_beam_parameters(z, expected, scene.range_max, backend=backend)
     fit = gs.fit_beam_parameters(z, expected, scene.range_max, method="hill_climb", initial=start, backend=backend)
     assert fit.converged and abs(fit.log_likelihood - best.log_likelihood) < 1e-6
-    # Cut short, it does not claim to have arrived.
+    # A fit that was cut short does not claim to have converged.
     fit = gs.fit_beam_parameters(
         z, expected, scene.range_max, method="hill_climb", initial=start, max_iterations=8, backend=backend
     )
@@ -197,7 +197,7 @@ def test_the_books_m_step_falls_where_components_are_cut_off(truth: gs.BeamParam
 
 
 def test_the_book_is_right_where_nothing_is_cut_off() -> None:
-    """Far from both ends, with steep short readings, both M-steps are the same."""
+    """Far from both ends, with steep short readings, both M-steps are equal."""
     z, expected = draw(gs.BeamParameters(0.6, 0.2, 0.1, 0.1, 0.05, 10.0), 2000, 1, 0.5, 0.7)
     book = gs.fit_beam_parameters(
         z, expected, RANGE_MAX, method="em-book", backend="numpy", max_iterations=500, tolerance=1e-11
@@ -216,7 +216,7 @@ def test_an_offset_of_correct_ranges(backend: str) -> None:
     assert abs(fit.range_bias - 0.05) < 4 * fit.range_bias_error < 0.03
     assert fit.log_likelihood > plain.log_likelihood + 50
     assert fit.parameters.sigma_hit < plain.parameters.sigma_hit
-    # To first order the plain fit knows of it.
+    # To first order, the plain fit reports the offset.
     assert abs(plain.range_bias - fit.range_bias) < 0.02
     assert worst_fall(fit) <= TOLERANCES["exact EM falls"].value
     # Readings without the offset give the same fit.

@@ -1,4 +1,4 @@
-"""The sums that learning rests on: against mpmath, against the densities, and alike on every backend."""
+"""The sums that learning uses: against mpmath, against the densities, and alike on every backend."""
 
 from __future__ import annotations
 
@@ -119,14 +119,14 @@ def test_derivatives_are_those_of_the_log_likelihood(name: str, prior: Prior | N
     scaled = np.outer(unit, unit)
     bent = np.abs((value.hessian - hessian) / scaled)
     assert bent[:FORM, :FORM].max() < 1e-11 * (1 + np.abs(hessian / scaled).max())
-    # Derivatives by the shape are differences.
+    # Derivatives by the shape are finite differences.
     assert off[FORM:].max(initial=0) < 1e-5 * (1 + np.abs(gradient / unit).max())
     assert bent[FORM:].max(initial=0) < 1e-5 * (1 + np.abs(hessian / scaled).max())
 
 
 def alike(found: np.ndarray, truth: np.ndarray, precision: type) -> bool:
     """Return whether sums are those of the reference, within the tolerance."""
-    # Terms of either sign: their magnitudes are at most some 30 times those of r u^2.
+    # Terms have either sign; their magnitudes are at most some 30 times those of r u^2.
     scale = np.maximum(np.abs(truth), np.abs(truth[7]))[: len(found)]
     tolerance = TOLERANCES[f"{np.dtype(precision).name} sums to learn from"]
     return bool((np.abs(found - truth[: len(found)]) <= tolerance.value * scale).all())
@@ -155,7 +155,7 @@ def test_pseudo_readings_of_a_student_are_distributed_as_its_density() -> None:
         assert first[place] * unit == pytest.approx((after - before) / (2 * step), rel=1e-4)
         bend = (after - 2 * value(0.2, 0.05) + before) / step**2
         assert second[place, place] * unit**2 == pytest.approx(bend, rel=1e-2)
-    # The density is highest where it is that of the pseudo-readings.
+    # The prior is highest where the density is that of the pseudo-readings.
     same = point(1.0, 0.0, 0.0, 0.0, sigma=0.3, rate=1.0, bias=0.01, shape=StudentHit(2.5))
     np.testing.assert_allclose(prior.derivatives(same)[0], 0, atol=1e-7)
     assert prior.of_hits(same) == (3.0, pytest.approx(3.0))
@@ -231,7 +231,7 @@ def test_sums_do_not_depend_on_how_pairs_are_cut(as_gpu, monkeypatch: pytest.Mon
 
 
 def test_a_held_mean_does_not_move_with_the_bias() -> None:
-    # z* + b beyond range_max is held there, so only the second pair says anything about b.
+    # z* + b is clamped to range_max, so only the second pair depends on b.
     problem = problem_of(np.array([9.0, 5.0]), np.array([9.8, 5.0]))
     alone = problem_of(np.array([5.0]), np.array([5.0]))
     at = point(0.9, 0.0, 0.0, 0.1, sigma=0.5, rate=1.0, bias=0.4)

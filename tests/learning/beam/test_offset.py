@@ -13,7 +13,7 @@ import gpusense as gs
 
 
 def long_tails(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Draw readings with an offset of 5 cm, four deviations, and a fifth at random."""
+    """Draw readings with an offset of 5 cm and four standard deviations; a fifth of them are random."""
     rng = np.random.default_rng(seed)
     expected = rng.uniform(1, 30, 5000)
     z = expected + 0.05 + rng.normal(0, 0.04, 5000) * rng.choice([0.5, 1, 2, 3], 5000)
@@ -35,7 +35,7 @@ def test_the_reported_offset_is_that_of_the_joint_fit(seed: int, needs) -> None:
 
 
 def test_the_reported_offset_is_the_maximum_of_the_profile(needs) -> None:
-    """Fits of readings moved by b, without an offset, have the profile's log-likelihood away from both ends."""
+    """Away from both ends, fits without an offset of readings moved by b have the profile's log-likelihood."""
     rng = np.random.default_rng(5)
     expected = rng.uniform(3, 7, 3000)
     z = expected + 0.05 + rng.normal(0, 0.1, 3000)

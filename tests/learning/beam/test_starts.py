@@ -17,7 +17,7 @@ from gpusense.models.scan.densities import log_mixture
 
 
 def two_modes() -> tuple[np.ndarray, np.ndarray]:
-    """Draw 25 readings of a wall at 2 m and 25 of something at 4 m, both within a centimetre."""
+    """Draw 25 readings of a wall at 2 m and 25 of another object at 4 m, both within a centimetre."""
     rng = np.random.default_rng(0)
     return np.r_[rng.normal(2, 0.01, 25), rng.normal(4, 0.01, 25)], np.full(50, 2.0)
 
@@ -43,7 +43,7 @@ def brute_force(z: np.ndarray, expected: np.ndarray, range_max: float, count: in
 
 @pytest.fixture(scope="module")
 def highest() -> float:
-    """The highest log-likelihood of two modes."""
+    """Return the highest log-likelihood of two modes."""
     return brute_force(*two_modes(), 8.0, 20)
 
 

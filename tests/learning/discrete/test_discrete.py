@@ -47,16 +47,16 @@ def exact(number) -> Fraction:
 
 @functools.cache
 def spread_exactly(d: int, s: float):
-    """Return the share of readings d steps from the obstacle's: the integral of a triangle times a normal density."""
+    """Return the share of readings d steps from the obstacle: the integral of a triangle times a normal density."""
     if s == math.inf:
         return mp.mpf(d == 0)
-    # A narrow peak is cut up, so that nodes see it.
+    # The integral is split at a narrow peak, so that nodes lie in it.
     points = sorted({d - 1, d, d + 1, *(mp.mpf(u) / s for u in (-40, -6, 6, 40) if d - 1 < u / s < d + 1)})
     return mp.quad(lambda v: s * (1 - abs(v - d)) * mp.npdf(v * s), points)
 
 
 def walk(causes: list[list[Fraction]]) -> list[Fraction]:
-    """Return P of each step and of no return, from each cause's probability of triggering at a step it reaches."""
+    """Return P of each step and of no return, from each cause's probability to trigger at a step that it reaches."""
     reached, row = Fraction(1), []
     for probabilities in zip(*causes, strict=True):
         none = math.prod((1 - p for p in probabilities), start=Fraction(1))
@@ -83,7 +83,7 @@ def separate_exactly(c: gs.DiscreteCauses, bins: int, j: int) -> list[Fraction]:
 def shared_exactly(p: gs.BeamParameters, bins: int, j: int) -> list[Fraction]:
     w, last = mp.mpf(RANGE) / bins, min(j + 1, bins)
     mass = [spread_exactly(abs(i - j), float(w) / p.sigma_hit) for i in range(bins)]
-    if sum(mass) == 0:  # all of it beyond, infinitely far for 60 digits: the nearest step has it
+    if sum(mass) == 0:  # All of it is beyond, infinitely far for 60 digits: the nearest step has it.
         mass[-1] = mp.mpf(1)
     hit = [exact(m / sum(mass)) for m in mass]
     decay = [mp.exp(-mp.mpf(p.lambda_short) * w * i) if i < last else mp.mpf(0) for i in range(bins)]
@@ -98,9 +98,9 @@ def shared_exactly(p: gs.BeamParameters, bins: int, j: int) -> list[Fraction]:
 
 
 def assert_close(log_p: np.ndarray, truth: list[Fraction]) -> None:
-    """Check a sum of logarithms, each good to some eps of itself: 64 eps for a dozen of them."""
+    """Check a sum of a dozen logarithms, each exact to some eps of itself, within 64 eps."""
     for found, wanted in zip(log_p, truth, strict=True):
-        if wanted < Fraction(10) ** -50:  # 60 digits do not distinguish it from 0
+        if wanted < Fraction(10) ** -50:  # 60 digits do not distinguish it from 0.
             assert found < -110
             continue
         log = float(mp.log(mp.mpf(wanted.numerator) / wanted.denominator))
@@ -129,7 +129,7 @@ def test_shared_causes_are_those_of_exact_arithmetic(name, bins):
 
 @pytest.mark.parametrize("s", [1e-8, 1e-3, 0.1, 0.49, 0.5, 0.51, 2.0, 40.0, 1e6])
 def test_the_spread_of_a_detection_keeps_its_digits_everywhere(s):
-    """Against second differences with as many digits as they lose."""
+    """The truth is second differences, with as many more digits as they lose."""
 
     def tail(x):
         return mp.npdf(x) - x * mp.erfc(x / mp.sqrt(2)) / 2
@@ -161,7 +161,7 @@ def simulate(c: gs.DiscreteCauses, bins: int, j: int, count: int, random: np.ran
 
 @pytest.mark.parametrize("name", ["laser", "sonar", "crowd"])
 def test_simulated_causes_have_the_frequencies_of_the_table(name):
-    """Binomial: of 100 counts none is 6 deviations off but once in 5 million times; 6 more for rare steps."""
+    """Counts are binomial: one of 100 is 6 deviations off once in 5 million tests; rare steps are allowed 6 more."""
     bins, count, random = 12, 200_000, np.random.default_rng(3)
     table = gs.DiscreteBeamModel(CAUSES[name], RANGE, bins).probabilities
     for j in (0, 3, 8, 11, 12):
@@ -188,10 +188,10 @@ def test_rows_sum_to_1_and_no_logarithm_is_nan(bins):
 
 
 def test_a_reading_is_impossible_only_where_it_is():
-    """Logarithms do not underflow: without random triggers a reading 300 deviations away is improbable."""
+    """Logarithms do not underflow: without random triggers, a reading 300 deviations away is still possible."""
     far = gs.DiscreteBeamModel(gs.DiscreteCauses(0.0, 0.0, 0.9, 0.01), RANGE, 100).log_probabilities
     assert np.isfinite(far[:-1]).all() and far.min() < -1e4
-    # No obstacle, nothing else: no return.
+    # Without an obstacle or another cause, there is no return.
     assert (far[-1] == [*[-math.inf] * 100, 0]).all()
 
 
@@ -205,7 +205,7 @@ def test_without_noise_and_other_causes_one_step_has_it_all():
 
 
 def test_causes_that_trigger_earlier_hide_later_ones():
-    """The share of beams that go on falls along the beam, and everywhere with more unknown obstacles."""
+    """The share of beams that continue falls along the beam, and falls everywhere with more unknown obstacles."""
 
     def survival(rate: float) -> np.ndarray:
         p = gs.DiscreteBeamModel(gs.DiscreteCauses(rate, 0.02, 0.9, 0.2), RANGE, 60).probabilities
@@ -216,7 +216,7 @@ def test_causes_that_trigger_earlier_hide_later_ones():
         assert (np.diff(each, axis=1) <= 0).all()
     for fewer, more in itertools.pairwise(rates):
         assert (more <= fewer + 1e-14).all() and (more[:, 1] < fewer[:, 1]).all()
-    # Independent causes would detect far obstacles as often as near ones.
+    # With independent causes, far obstacles would be detected as often as near ones.
     p = gs.DiscreteBeamModel(gs.DiscreteCauses(0.5, 0.0, 1.0, 0.0), RANGE, 60).probabilities
     np.testing.assert_allclose(np.diagonal(p)[:-1], np.exp(-0.5 * 0.1 * np.arange(60)), rtol=1e-13)
 
@@ -253,7 +253,7 @@ def test_the_mixture_is_the_limit_of_shared_causes(name):
     assert_first_order(errors)
     if name == "all":
         assert_first_order(atoms)
-    if name == "hit":  # one cause never meets another
+    if name == "hit":  # One cause never meets another.
         assert max(atoms) < 1e-12
 
 

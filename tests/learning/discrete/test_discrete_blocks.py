@@ -40,7 +40,7 @@ def test_errors_over_blocks() -> None:
     repeated = learn(np.repeat(z, 9), np.repeat(expected, 9), nine)
     single = learn(z, expected, np.arange(4000))
     for name, error in single.standard_errors.items():
-        # Each reading nine times knows no more than once, to the precision of differences.
+        # Nine copies of a reading have the information of one, to the precision of differences.
         assert repeated.standard_errors[name] == pytest.approx(error, rel=2e-3), name
         assert repeated.independent_errors[name] == pytest.approx(single.independent_errors[name] / 3, rel=2e-3), name
 

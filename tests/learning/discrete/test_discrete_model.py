@@ -26,7 +26,7 @@ TABLES = {
 
 @functools.cache
 def scene() -> tuple[gs.OccupancyGrid, gs.Scanner, np.ndarray]:
-    """Return a corridor with a wall at its end: ahead 0 to 3.9 m, behind always range_max."""
+    """Return a corridor with a wall at its end: expected ranges are 0 to 3.9 m ahead, and range_max behind."""
     cells = np.zeros((1, 400), int)
     cells[0, -1] = 100
     poses = np.zeros((60, 3))
@@ -79,7 +79,7 @@ def test_tiles_and_orders_change_nothing(gpu, as_gpu):
 
 
 def test_max_readings_depend_on_what_is_expected(backend):
-    """A wall ahead makes no return unlikely: seen or not, the probability comes from the table."""
+    """A wall ahead makes no return unlikely; with and without a wall, the probability is the table's."""
     _, scanner, poses = scene()
     table = TABLES["separate"]
     one = model(table, backend)
@@ -103,7 +103,7 @@ def test_cones_are_looked_up_too(selection, needs):
 
 
 def test_impossible_readings_are_minus_infinity(backend):
-    """Without noise and random triggers nothing is measured behind the wall, and no return is impossible."""
+    """Without noise and random triggers, no reading lies behind the wall, and no return is impossible."""
     _, scanner, poses = scene()
     one = model(TABLES["certain"], backend)
     log_p, parts = one.log_likelihood(poses, [INF] + [NAN] * (scanner.count - 1), per_beam=True)
@@ -121,7 +121,7 @@ def test_the_plan_says_so():
 
 
 def simulated(causes: gs.DiscreteCauses, count: int, bins: int = BINS, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Draw readings from the table's rows, anywhere in their step."""
+    """Draw readings from the table's rows, at random places in their steps."""
     random = np.random.default_rng(seed)
     expected = random.uniform(0.2, 1.1 * RANGE, count)
     cumulative = np.cumsum(gs.DiscreteBeamModel(causes, RANGE, bins).probabilities, axis=1)
@@ -136,7 +136,7 @@ def simulated(causes: gs.DiscreteCauses, count: int, bins: int = BINS, seed: int
     gs.DiscreteCauses(1.0, 0.2, 0.4, 0.2),
 ])  # fmt: skip
 def test_learning_finds_the_causes(truth):
-    """Within 4 standard errors, which 12 normal numbers exceed once in 1300 times; and no cause can be bettered."""
+    """Causes are within 4 standard errors, which 12 normal numbers exceed once in 1300 times, and none can improve."""
     z, expected = simulated(truth, 30_000)
     table = gs.DiscreteBeamModel.learn(z, expected, RANGE, BINS)
     fit = table.fit
@@ -160,7 +160,7 @@ def test_learning_finds_the_causes(truth):
 
 @pytest.mark.slow
 def test_standard_errors_are_the_scatter_of_repetitions():
-    """Of 16 repetitions the deviation is known to 18 %: within a factor of 2 is 3.9 of those."""
+    """16 repetitions give the deviation to 18 %; a factor of 2 is 3.9 times as much."""
     truth, found, told = gs.DiscreteCauses(0.3, 0.05, 0.85, 0.3), [], []
     for seed in range(16):
         table = gs.DiscreteBeamModel.learn(*simulated(truth, 3000, 12, seed), RANGE, 12)

@@ -58,7 +58,7 @@ def test_detections_are_counted():
 
 @pytest.mark.parametrize("view", VIEWS)
 def test_likelihood_is_the_models(view):
-    """Known landmarks: the number of LandmarkModel; unknown ones: its sum over a map entirely in view."""
+    """The likelihood is LandmarkModel's for known landmarks, and its sum over a map in full view for unknown ones."""
     seen = world.simulate(5, field_of_view=view, scans=8)
     found = fit(seen, field_of_view=view)
     lm = gs.LandmarkMap(seen.xy)
@@ -80,7 +80,7 @@ def test_likelihood_is_the_models(view):
 @pytest.mark.parametrize("view", VIEWS)
 @pytest.mark.parametrize("known", [True, False])
 def test_gradient_is_the_slope(view, known):
-    """Central differences of the log-likelihood, whose error at steps of 1e-5 is 1e-10 of the third derivative."""
+    """Central differences with steps of 1e-5 have an error of 1e-10 times the third derivative."""
     seen = world.simulate(2, field_of_view=view, scans=10)
     features = np.column_stack([seen.features, seen.ids + 0.3 * np.sin(np.arange(len(seen.ids)))])
     features[::7, 0] = features[1::7, 1] = np.nan
@@ -88,7 +88,7 @@ def test_gradient_is_the_slope(view, known):
     pairs = inner.make_pairs(
         seen.poses[seen.scan], features, seen.xy, np.arange(12.0), seen.ids if known else None, limits
     )
-    # Deviations as large as the limits, so that what is cut off counts.
+    # Deviations are as large as the limits, so that truncation matters.
     for point in (inner.Point((3.0, 0.9, 2.0), 0.8, (0.2, -0.1)), inner.Point((0.1, 0.04, 0.3), 0.9, (0.0, 0.0))):
         value = inner.evaluate(pairs, point)
         for k in range(6):

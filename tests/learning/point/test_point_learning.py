@@ -31,7 +31,7 @@ def beacon_ranges(seed: int = 1, scale: float = 0.15) -> np.ndarray:
 
 
 def problems() -> list[tuple[str, Problem, list[float]]]:
-    """Return a problem of each kind and a point where nothing vanishes."""
+    """Return a problem of each kind, and a point at which no term vanishes."""
     rng = np.random.default_rng(0)
     d, ids = rng.uniform(0, 20, 100), rng.integers(0, 3, 100)
     z = np.clip(d + rng.normal(0.3, 1, 100), 0, 20)
@@ -61,7 +61,7 @@ def test_gradients_are_those_of_differences(name: str, problem: Problem, at: lis
 
 
 def no_better(problem: Problem, theta: np.ndarray, value: float) -> None:
-    """Check an optimum against another optimiser, which starts there and at disturbed places."""
+    """Check an optimum with another optimiser, which starts there and at disturbed places."""
     low, high = problem.bounds()
     scales = problem.scales(theta)
     for seed in range(3):

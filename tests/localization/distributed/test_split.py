@@ -78,7 +78,7 @@ def test_moments_follow_a_prediction():
 
 
 def test_a_fix_at_particles_without_weight_has_the_bits_of_one_device(backend):
-    """The weights stay, and draws that change the number of particles take them."""
+    """The weights stay, and draws that change the number of particles use them."""
     found = []
     for make in (gs.ParticleFilter(gps(backend), **FEW), SplitParticleFilter(gps, devices=[backend] * 3, **FEW)):
         make.initialize_from(TwoPlaces())
@@ -113,7 +113,7 @@ def test_few_particles_leave_a_device_idle():
     assert equal(states(pf), expected) and pf.explain() == "split: 0 on numpy, 16 on numpy, 0 on numpy, 4 on numpy"
 
 
-# At a low temperature some steps draw nothing.
+# At a low temperature some steps do not resample.
 @pytest.mark.parametrize(
     "options",
     [dict(stages=1), dict(stages=3), dict(stages=3, temperature=0.05), dict(stages=2, resampling="residual")],

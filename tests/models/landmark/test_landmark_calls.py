@@ -26,7 +26,7 @@ IMPOSSIBLE = {
 @pytest.mark.parametrize("name", IMPOSSIBLE)
 @pytest.mark.parametrize("how", ["nearest", "joint", "negative"])
 def test_features_that_the_sensor_cannot_measure_are_left_out(name, how):
-    """Such a feature counts as missing: live data must not stop a filter. ``explain`` counts it."""
+    """Such a feature is missing, since live data must not stop a filter, and ``explain`` counts it."""
     options = {"negative": True} if how == "negative" else {"association": how}
     model, poses, features = scenes.model("everything", "numpy", **options)
     with_it = np.insert(features, 2, IMPOSSIBLE[name], axis=0)
@@ -56,7 +56,7 @@ FEATURES = np.array([[3.0, 0.1], [6.0, np.nan], [2.0, -2.0]])
 
 
 def calls(backend: Any) -> dict[str, Any]:
-    """Return the calls that take poses and ``out=``, by sensor; each also with a reading without information."""
+    """Return the calls that take poses and ``out=``, by sensor, each also with a reading without information."""
     xy = [(5e6, 0.0), (5e6 + 9, 3.0), (5e6 - 4, -2.0)]
     found = {name: (model, measured) for name, (model, measured) in models(backend).items()}
     landmarks = gs.LandmarkMap(xy)
@@ -79,7 +79,7 @@ SENSORS = ("position", "heading", "beacons", "bumper", "nearest", "known", "join
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("name", SENSORS)
 def test_poses_on_the_device_stay_there(name, warp_as_gpu, warp_copies, monkeypatch):
-    """Float32 and float64 poses, results and ``out=`` of the same library, in pieces, not finite, and none at all."""
+    """Try float32 and float64 poses, results and ``out=`` of the same library, pieces, infinite poses, and none."""
     call = calls(warp_as_gpu)[name]
     expected = call(POSES)
     for real in (np.float64, np.float32):
@@ -91,7 +91,7 @@ def test_poses_on_the_device_stay_there(name, warp_as_gpu, warp_copies, monkeypa
             found = call(given)
             assert type(found) is type(given)
             assert differing((found.held if wrap is Array else found).numpy(), truth) == 0
-            # Measurements go there, and the two numbers of the status of poses come back.
+            # Measurements go to the device, and the two numbers of the pose status come back.
             assert [size for way, size in warp_copies if way == "down"] == [8]
             assert all(size <= 400 for _, size in warp_copies)
             assert call(given, out=out) is out

@@ -97,7 +97,7 @@ def test_joint_association_tries_all(backend, name, precision):
 
 @on_every_backend(on_warp=lambda precision: precision == "float32", precision=PRECISIONS)
 def test_features_as_the_caller_gave_them(backend, precision):
-    """Rounding of positions, directions and readings included: float32 keeps them in two numbers."""
+    """The bound includes rounding of positions, directions and readings: float32 keeps them in two numbers."""
     model, poses, features = scenes.model("everything", backend, precision=precision)
     expected = oracle.likelihoods(
         model, oracle.table(model, oracle.exact_inputs(model, poses, features, rounded=False))
@@ -111,11 +111,11 @@ def test_features_as_the_caller_gave_them(backend, precision):
 @pytest.mark.parametrize("name", ["ordinary", "everything", "wide field", "narrow field", "flat", "ranges", "bearings"])
 @pytest.mark.parametrize("place", [(0.0, 0.0), (2.9, 0.9), (3.0, 1.0)])
 def test_the_mixture_integrates_to_1(name, place):
-    """Over all that a feature can be, for a known landmark: also at zero range and near the limits of the sensor."""
+    """The integral is over all features of a known landmark, at zero range and near the sensor's limits as well."""
     landmarks, p, _, _, options = scenes.make(name)
     model = gs.LandmarkModel(landmarks, p, backend="numpy", precision="float64", **{**options, "mount": (0, 0, 0)})
     half, (low, high), j = p.field_of_view / 2, model._sensor.span, 0 if place == (3.0, 1.0) else 2
-    # The landmark is a little to the left; at zero range it is nowhere.
+    # The landmark is a little to the left; at zero range it has no direction.
     away = scenes.XY[j] - place
     d, b = np.hypot(*away), 0.1
     pose = [[*place, np.arctan2(away[1], away[0]) - b]]
@@ -135,14 +135,14 @@ def test_the_mixture_integrates_to_1(name, place):
     if p.sigma_range is not None:
         axes[0] = pieces(0.0, p.range_max, d, p.sigma_range)
     if p.sigma_bearing is not None:
-        # The wrapped difference breaks half a turn away from the landmark.
+        # The wrapped difference jumps half a turn away from the landmark.
         back = (b + 2 * np.pi) % (2 * np.pi) - np.pi
         cut = min(max(back, -half), half)
         first, second = (pieces(*ends, b, p.sigma_bearing) for ends in ((-half, cut), (cut, half)))
         axes[1] = np.append(first[0], second[0]), np.append(first[1], second[1])
     if p.sigma_signature is not None:
         axes[2] = pieces(low, high, scenes.SIGNATURES[j], p.sigma_signature)
-    # The components are independent, so an axis at a time: the others stay where they are.
+    # The components are independent, so one axis is integrated at a time, with the others fixed.
     for axis in range(3):
         if len(axes[axis][0]) > 1:
             grid = np.full((len(axes[axis][0]), 3), NAN)
@@ -156,7 +156,7 @@ def test_the_sum_over_landmarks_integrates_to_1():
     landmarks, _, poses, _, _ = scenes.make("ordinary")
     p = gs.LandmarkParameters(sigma_range=2.0, sigma_bearing=0.8)
     model = gs.LandmarkModel(landmarks, p, backend="numpy", precision="float64", association="sum")
-    # Bearings are wrapped where the landmarks are behind: a periodic function, by the midpoint rule.
+    # Bearings of landmarks behind the robot wrap: the midpoint rule integrates a periodic function.
     z, weights = np.polynomial.legendre.leggauss(24)
     z, weights = (z + 1) * p.range_max / 2, weights * p.range_max / 2
     b = (np.arange(120) + 0.5) / 120 * 2 * np.pi - np.pi

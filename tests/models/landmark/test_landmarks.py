@@ -1,4 +1,4 @@
-"""The landmark model: semantics, gate, association, negative information, laws, batches, plan, bad input aside."""
+"""The landmark model, except for bad input: semantics, gate, association, negative information, laws, batches, plan."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_the_gate_leaves_out_nothing_that_matters(backend, case):
     for precision in ("float32", "float64") if not backend.startswith("warp") else ("float32",):
         gated = gs.LandmarkModel(landmarks, p, backend=backend, association=association, precision=precision)
         found = gated.log_likelihood(poses, features)
-        # 16 eps (1 + |log p_k|) of each feature, and eps for what is left out.
+        # 16 eps (1 + |log p_k|) for each feature, and eps for omitted terms.
         size = (1 + np.abs(whole.associate(poses, features)[1])).sum(axis=1)
         assert (np.abs(found - truth) <= 17 * np.finfo(precision).eps * size).all()
     if precision == "float64":
@@ -145,7 +145,7 @@ def test_negative_information_by_counting(backend):
         assert seen.sum(axis=1).max() > 3
         expected = plain.log_likelihood(poses, features) + seen.sum(axis=1) * np.log(0.3)
         np.testing.assert_allclose(model.log_likelihood(poses, features), expected, rtol=1e-5, atol=1e-5)
-    # Known ones, a sensor that misses nothing, and nothing seen at all.
+    # Known landmarks, a sensor that misses nothing, and no features.
     sure = gs.LandmarkModel(
         gs.LandmarkMap([[3.0, 0.0], [0.0, 3.0]]), p.replace(p_detect=1.0), backend=backend, negative=True
     )
@@ -156,7 +156,7 @@ def test_negative_information_by_counting(backend):
 
 @on_every_backend(on_warp=lambda precision: precision == "float32", precision=("float32", "float64"))
 def test_laws(backend, precision):
-    """Permuted landmarks and features, a turned and shifted world, whole turns, a mount for a pose, batches."""
+    """Try permuted landmarks and features, a turned and shifted world, whole turns, a mount as a pose, and batches."""
     model, poses, features = scenes.model("ordinary", backend, precision=precision)
     found = model.log_likelihood(poses, features)
     rng = np.random.default_rng(1)
@@ -176,7 +176,7 @@ def test_laws(backend, precision):
         turn = np.array([[c, s], [-s, c]])
         moved = np.concatenate([poses[:, :2] @ turn + shift, poses[:, 2:] + angle], axis=1)
         other = gs.LandmarkModel(gs.LandmarkMap(scenes.XY @ turn + shift), **own)
-        near = np.arange(len(poses)) != 1  # the one on a landmark, of which the turned one may not be
+        near = np.arange(len(poses)) != 1  # The pose on a landmark; the turned one may lie beside it.
         apart = np.abs(other.log_likelihood(moved, features) - found)
         assert (apart <= eps + lost * (1 + np.abs(found)))[near].all()
     around = features + np.array([0, 2 * np.pi])
@@ -246,7 +246,7 @@ def test_wrong_signatures_are_other_landmarks(backend):
 
 @on_every_backend(on_warp=lambda false: False, false=(0.05, 0.0))
 def test_a_particle_has_the_same_bits_among_any_others(backend, false):
-    """Particles that are computed together look at landmarks together only where they are near to each other."""
+    """Particles that are computed together visit the same landmarks only where they are near each other."""
     landmarks, _, features = forest(800, 110.0)
     rng = np.random.default_rng(3)
     near, far = rng.normal(0, (0.3, 0.3, 0.1), (40, 3)), rng.uniform(-50, 50, (60, 3))
@@ -264,7 +264,7 @@ def test_a_particle_has_the_same_bits_among_any_others(backend, false):
 
 @pytest.mark.parametrize("association", ["nearest", "sum"])
 def test_100_000_landmarks_by_brute_force(needs, association):
-    """The landmarks left out of a large map matter to no feature: plain NumPy over all of them, from the definition."""
+    """The omitted landmarks of a large map affect no feature: plain NumPy computes the definition over all of them."""
     landmarks, poses, features = forest(100_000, 1265.0)
     poses, features = poses[::4], features[:, :2]
     p = gs.LandmarkParameters()
@@ -279,7 +279,7 @@ def test_100_000_landmarks_by_brute_force(needs, association):
         for z, bearing in features:
             turn = (bearing - b + np.pi) % (2 * np.pi) - np.pi
             density = np.exp(-0.5 * ((z - d) / p.sigma_range) ** 2 - 0.5 * (turn / p.sigma_bearing) ** 2)
-            # Mass of a range on [0, range_max], for landmarks beyond it that of one there; of a bearing nearly 1.
+            # Mass of a range on [0, range_max], for farther landmarks that of one there; a bearing's is nearly 1.
             near = np.minimum(d, p.range_max) / p.sigma_range
             mass = ndtr(near) - ndtr(near - p.range_max / p.sigma_range)
             density /= 2 * np.pi * p.sigma_range * p.sigma_bearing * mass

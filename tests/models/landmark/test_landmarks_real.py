@@ -16,7 +16,7 @@ EVERY = 12
 
 
 def recorded(folder: Path, robot: int) -> tuple[gs.LandmarkMap, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the map, and of some readings the true pose, range and bearing, and the landmark."""
+    """Return the map, and true pose, range and bearing, and landmark of some readings."""
     places = np.loadtxt(folder / "Landmark_Groundtruth.dat")
     swap = dict(zip(SWAPPED, SWAPPED[::-1], strict=True))
     index = {swap.get(int(row[0]), int(row[0])): i for i, row in enumerate(places)}
@@ -46,6 +46,6 @@ def test_the_likeliest_landmark_is_the_one_of_the_barcode(data_dir, needs, robot
     alone = np.array([
         model.log_likelihood(poses[keep][[n]], features[keep][[n]], known[[n]])[0] for n in range(0, len(known), 40)
     ])  # fmt: skip
-    # Where the barcode's landmark is the likeliest one, to know it adds nothing.
+    # Where the barcode's landmark is the likeliest one, the barcode adds no information.
     agree = (which == known)[::40]
     np.testing.assert_allclose(alone[agree], parts[::40][agree], rtol=1e-5, atol=1e-5)

@@ -1,4 +1,4 @@
-"""The line model: mpmath on every backend, precision and association; sides, pieces, angles that wrap, and limits."""
+"""The line model against mpmath, by backend, precision and association; sides, pieces, angles that wrap, limits."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_lines_against_mpmath(backend, name, precision, how):
 
 @pytest.mark.parametrize("name", ["ordinary", "mounted", "far origin"])
 def test_lines_as_the_caller_gave_them(name):
-    """Rounding of places, directions and features included: float32 keeps them in two numbers."""
+    """The bound includes rounding of places, directions and features: float32 keeps them in two numbers."""
     model, poses, features = oracle.make(name, "numpy", precision="float32")
     expected = oracle.likelihoods(model, oracle.table(model, oracle.as_given(model, poses, features), features))
     assert_within(model.associate(poses, features)[1], expected, "float32")
@@ -89,7 +89,7 @@ def test_overlapping_lines_by_way_of_others_have_one_group():
 @pytest.mark.parametrize("far", [(0.0, 3.0), (0.05, 3.0), (4.0, 8.0)])
 @pytest.mark.parametrize(("lever", "two_sided"), [(0.0, True), (6.0, True), (6.0, False)])
 def test_the_mixture_integrates_to_1(far, lever, two_sided):
-    """Over all angles and distances, for a known wall: near the sensor, far from it, and beside its foot."""
+    """The integral is over all angles and distances to a known wall: near the sensor, far from it, beside its foot."""
     distance, range_max = far
     p = gs.LineParameters(sigma_angle=0.15, sigma_distance=0.4, range_max=range_max)
     model = gs.LineModel(gs.LineMap([(9, distance, -9, distance)], two_sided), p, backend="numpy", precision="float64")
@@ -106,7 +106,7 @@ def test_the_mixture_integrates_to_1(far, lever, two_sided):
 def test_angles_wrap_and_sides_count():
     """Headings of many turns and angles beyond pi are the same; a wall with one side is not seen from behind."""
     model = gs.LineModel(gs.LineMap([(-5, 2, 5, 2), (-5, -2, 5, -2)], [False, True]), backend="numpy")
-    # The upper wall is seen from above only, so from (0, 4) looking down; the lower one from both sides.
+    # The upper wall is visible only from above, here from (0, 4); the lower one from both sides.
     poses = [(0, 4, 0), (0, 4, 200 * np.pi), (0, 0, 0), (0, -4, 0), (0, 0, np.pi)]
     below, above = (-np.pi / 2, 2.0, -1, 1), (np.pi / 2, 2.0, -1, 1)
     which = model.associate(poses, [below, above, (1.5 * np.pi, 2.0, -1, 1), (-1.5 * np.pi, 2.0, -1, 1)])[0]
@@ -169,7 +169,7 @@ def test_an_empty_map_has_false_positives_only():
 
 
 def test_drawn_lines_have_the_covariance_of_the_density():
-    """Far beside the foot of the normal angle and distance go together; the ends are those of what is in view."""
+    """Far beside the foot of the normal, angle and distance are correlated; the ends are those of the visible part."""
     p = gs.LineParameters(sigma_angle=0.02, sigma_distance=0.05, z_detect=1.0, z_false=0.0, p_detect=1.0, range_max=10)
     model = gs.LineModel(gs.LineMap([(4, 3, 20, 3), (-2, -1, 2, -1), (2, -2, -2, -2)], False), p, backend="numpy")
     z = model.sample(np.tile([(0, 0, 0.5)], (20000, 1)), seed=3)

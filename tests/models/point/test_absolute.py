@@ -1,4 +1,4 @@
-"""Bumpers by brute force; of all sensors without a scan: missing readings, laws, batches, extreme poses, bad input."""
+"""Bumpers by brute force; for all sensors without a scan: missing readings, laws, batches, extreme poses, bad input."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from gpusense.models.point.bumper import sample_outline
 
 
 def brute_force(pose, points, radius, pressed, p, *, unknown="free", outside="free"):
-    """Return log P of one segment; nan where a point is too near to a cell's edge to say which cell it is in."""
+    """Return log P of one segment; nan if a point is too near an edge to belong to one cell for certain."""
     pad = 30
     occupied = (CELLS >= 65) | ((CELLS == -1) if unknown == "occupied" else False)
     squared = squared_distances(np.pad(occupied, pad, constant_values=outside == "occupied"))
@@ -198,13 +198,13 @@ def test_extreme_poses_are_never_nan(backend: str, precision: str) -> None:
     for name, (model, measured) in given.items():
         found = model.log_likelihood(poses, *measured)
         assert not np.isnan(found).any() and not np.isposinf(found).any(), name
-        # Exponents are held where they would overflow.
+        # Exponents are clamped before they overflow.
         assert np.isfinite(found).all(), name
 
 
 @each_precision
 def test_the_frame_does_not_matter(backend: str, precision: str) -> None:
-    """A world that is moved and turned by half a turn; numbers that are multiples of 2^-10 move exactly."""
+    """The world is shifted and turned by half a turn; multiples of 2^-10 move exactly."""
     rng = np.random.default_rng(8)
     poses = np.concatenate([np.round(rng.uniform(-8, 8, (40, 2)) * 1024) / 1024, rng.uniform(-3, 3, (40, 1))], axis=1)
     shift = np.array([4194304.0, -1048576.0, 0.0])

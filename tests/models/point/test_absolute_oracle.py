@@ -1,4 +1,4 @@
-"""Position fixes, headings, beacons and bumpers against mpmath and SciPy, stiff cases, and integrals that are 1."""
+"""Position fixes, headings, beacons and bumpers against mpmath and SciPy; stiff cases; integrals of 1."""
 
 from __future__ import annotations
 

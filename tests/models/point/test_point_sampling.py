@@ -158,7 +158,7 @@ def test_bearings_have_the_density_of_the_model(field, sigma):
     p = gs.LandmarkParameters(sigma_range=None, sigma_bearing=sigma, z_detect=1.0, z_false=0.0, field_of_view=field)
     landmarks = gs.LandmarkMap([(-1.0, 0.7)])
     model = gs.LandmarkModel(landmarks, p, backend="numpy", precision="float64")
-    for heading in (2.4, 0.0):  # in the field of view or, of narrow ones, outside
+    for heading in (2.4, 0.0):  # In the field of view, or outside a narrow one.
         z = model.sample(np.tile((0.0, 0.0, heading), (20_000, 1)), seed=1, correspondence=[0])[:, 0, 1]
         fine = (np.arange(4000) + 0.5) / 4000 * field - field / 2
         density = np.exp([model.log_likelihood([(0, 0, heading)], [(np.nan, b)], [0])[0] for b in fine[::20]])

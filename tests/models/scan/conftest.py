@@ -27,7 +27,7 @@ def batching(needs, monkeypatch):
     monkeypatch.setattr(device, "_graphs", GraphCache(device._device))
     started, launch = [], wp.capture_launch
     monkeypatch.setattr(wp, "capture_launch", lambda *given: started.append(launch(*given)))
-    # Libraries that other tests of this process have used may have left threads.
+    # Libraries of earlier tests in this process may have left threads.
     earlier, everything = {*threading.enumerate()} - {threading.current_thread()}, threading.enumerate
     monkeypatch.setattr(threading, "enumerate", lambda: [one for one in everything() if one not in earlier])
     return device, started

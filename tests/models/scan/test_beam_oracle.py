@@ -56,7 +56,7 @@ def error_in_eps(found: float, mixture: Mixture, z: float, expected: float, eps:
 @on_every_backend(weights=WEIGHTS, on_warp=lambda weights: weights in ("all", "hit and short", "hardly any rand"))
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_mixture_on_a_stiff_grid(weights, precision, backend):
-    """Through the model: a corridor with poses at chosen distances from its wall, all rays along it."""
+    """The model scores poses in a corridor at chosen distances from its end, with all rays along it."""
     real = np.dtype(precision)
     cells = np.zeros((1, 64), int)
     cells[0, -1] = 100
@@ -89,7 +89,7 @@ def test_mixture_on_a_stiff_grid(weights, precision, backend):
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("weights", WEIGHTS)
 def test_reference_mixture_on_a_dense_grid(weights, precision):
-    """The NumPy density itself, any expected range from 0 to range_max."""
+    """The reference's density is right for every expected range from 0 to range_max."""
     real = np.dtype(precision)
     eps, grid = np.finfo(real).eps, gs.OccupancyGrid([[0]], 1.0)
     for range_max, sigma, rate in itertools.product((10.0,), SIGMAS, RATES):
@@ -110,7 +110,7 @@ def test_reference_mixture_on_a_dense_grid(weights, precision):
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_where_the_logarithm_cancels(precision):
-    """Readings whose log density is near 0 as the difference of large terms are held to the size of those terms."""
+    """Where a log density near 0 is a difference of large terms, the bound is relative to these terms."""
     real, rng = np.dtype(precision), np.random.default_rng(3)
     eps, grid = np.finfo(real).eps, gs.OccupancyGrid([[0]], 1.0)
     for _ in range(100):

@@ -121,7 +121,7 @@ def used_beams(beams: object, parts: np.ndarray, scan: list[float], range_min: f
 
 
 def test_thinning_counts_informative_beams_only(backend):
-    """A scan with two informative readings: beams=2 must find them, wherever they are."""
+    """In a scan with two informative readings, beams=2 must find both, wherever they are."""
     _, poses = room()
     scan = [NAN] * 10
     scan[3], scan[8] = 1.5, 2.5
@@ -174,7 +174,7 @@ def test_no_scans_beam_by_beam(backend):
 @pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize(("count", "nats"), [(1000, 2e-3), (10_000, 1e-2), (100_000, 1e-1)])
 def test_sums_of_many_beams(count, nats, shared, precision, backend):
-    """On the same rounded readings and ranges. Beyond 10 000 beams float32 promises nothing in nats; 0.1 is kept."""
+    """Readings and ranges are the same rounded ones. Beyond 10 000 beams float32 has no stated error; it keeps 0.1."""
     rng = np.random.default_rng(count)
     grid, poses = room()
     bearings = rng.choice(BEARINGS, count) if shared else rng.uniform(-np.pi, np.pi, count)
@@ -192,7 +192,7 @@ def test_sums_of_many_beams(count, nats, shared, precision, backend):
 
 
 def test_classes_of_readings():
-    """The table of readings, here and in the library."""
+    """The classes of readings are those of the table above."""
     last = np.nextafter(RANGE, 0)
     for range_min in (0.0, 0.5):
         scan = [NAN, -INF, INF, -1.0, -0.0, 0.0, 0.2, np.nextafter(0.5, 0), 0.5, 3.0, last, RANGE, 7.0]

@@ -22,7 +22,7 @@ from gpusense.models.scan import tiles
 @pytest.mark.sampled(0.25)
 @pytest.mark.parametrize("case", CASES)
 def test_a_bound_call_has_the_bits_of_an_ordinary_one(case, batching):
-    """With poses and readings on the device, whose contents change; half of them float32."""
+    """Poses and readings are on the device, half of them float32, and their contents change."""
     device, started = batching
     model = CASES[case](backend=device)
     beams = model.scanner.count
@@ -41,12 +41,12 @@ def test_a_bound_call_has_the_bits_of_an_ordinary_one(case, batching):
                 assert np.allclose(found.numpy(), expected.numpy(), rtol=2e-7)
             else:
                 assert differing(found.numpy(), expected.numpy()) == 0, (seed, real)
-    # The first call starts its launches one by one, the others a graph.
+    # The first call starts its launches one by one, later calls a graph.
     assert len(started) >= 2 * len(SCANS) - 2
 
 
 def test_bound_calls_that_add_up_strands(batching, monkeypatch):
-    """Where particles fill the device, work-items add up strands; the bits are the same."""
+    """Where particles fill the device, work-items sum strands; the bits are the same."""
     poses, ranges = to_device(cloud(1)), to_device(mixed(1))
     found = []
     for enough in (1 << 21, 1):
@@ -69,7 +69,7 @@ def test_bearings_that_repeat_are_cast_one_by_one(kind, batching):
 
 @pytest.mark.parametrize("kind", MODELS)
 def test_a_map_that_changes(kind, batching):
-    """The table is updated or made anew, and the host's poses need only a part of it."""
+    """The table is updated or rebuilt, and the host's poses need only a part of it."""
     device, _ = batching
     model = kind(GRID, NEAR, backend=device)
     poses, ranges = to_device(cloud(1)), to_device(mixed(1))
@@ -84,7 +84,7 @@ def test_a_map_that_changes(kind, batching):
 
 
 def test_other_calls_of_a_model_come_between(batching):
-    """Bound calls have buffers of their own."""
+    """Bound calls share no buffers with other calls."""
     model = FIELD(GRID, NEAR, backend=batching[0])
     arrays = [(to_device(cloud(i, 100 + 50 * i)), to_device(mixed(i))) for i in range(3)]
     expected = [model.log_likelihood(poses, ranges.numpy()).numpy() for poses, ranges in arrays]
@@ -130,7 +130,7 @@ def test_a_pose_that_is_not_finite_is_reported_by_check(value, batching):
     poses.assign(bad)
     call()
     poses.assign(cloud(1))
-    # It is reported once, though the last call had none.
+    # It is reported once, although the last call had no such pose.
     found = call().numpy()
     with pytest.raises(ValueError, match=r"^poses: must be finite, got a pose on the device that is not$"):
         call.check()
@@ -153,7 +153,7 @@ def test_nothing_is_allocated_compiled_or_copied(batching, monkeypatch):
 
 
 def test_without_graphs_launches_are_started_one_by_one(batching, monkeypatch):
-    """Where a driver refuses, and beside other threads, which Warp cannot wait for while it records."""
+    """Graphs are absent if a driver refuses them, and beside other threads, since Warp cannot wait while it records."""
     import warp as wp
 
     device, started = batching
@@ -275,7 +275,7 @@ def test_on_a_gpu(case, library):
 
 
 def test_streams_of_a_gpu(library):
-    """Work of the caller's stream before and after a call keeps its place."""
+    """Work on the caller's stream before and after a call stays in order."""
     cuda, there, _, back, module = library
     model = FIELD(GRID, NEAR, backend=cuda)
     poses, ranges = there(cloud(0)), there(mixed(0))

@@ -46,7 +46,7 @@ def test_a_graph_is_captured_at_the_second_call(batching):
 
 
 def test_numpy_arrays_are_copied_within_the_graph(batching):
-    """Poses and readings are one copy, log-likelihoods and the status of poses another."""
+    """Poses and readings are one copy, log-likelihoods and the pose status another."""
     call = FIELD(GRID, NEAR, backend=batching[0]).bind(cloud(1), mixed(1))
     call()
     assert call.explain().startswith("NumPy arrays are copied with each call: 3 launches")
@@ -72,7 +72,7 @@ def test_another_thread_is_named(there, batching):
 
 
 def test_a_program_that_the_driver_refuses_is_not_tried_again(batching, monkeypatch, caplog):
-    """Other programs still have graphs, and a success ends a row of failures."""
+    """Other programs still have graphs, and a success resets the count of failures."""
     device, started = batching
     first, second, third = (bound(device, poses) for poses in (1, 2, 3))
     for number, call in enumerate((first, second)):
@@ -122,7 +122,7 @@ def test_a_refusal_shows_in_calls_of_numpy_arrays(batching, monkeypatch):
 
 
 def test_a_call_in_many_pieces(batching, monkeypatch):
-    """A recording of any length is a graph; with copies around it, it counts as one of their steps."""
+    """A recording of any length is one graph; with copies around it, it counts as one step."""
     from gpusense.models import run
 
     monkeypatch.setattr(run, "CHUNK", 7)

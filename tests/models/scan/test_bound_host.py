@@ -17,7 +17,7 @@ from gpusense.models.scan import binding, packed_call
 @pytest.mark.sampled(0.25)
 @pytest.mark.parametrize("case", CASES)
 def test_short_calls_of_the_host_are_one_graph(case, batching, monkeypatch):
-    """Copies there and back and all launches; the bits are those of the ordinary call."""
+    """Copies in both directions and all launches are one graph; the bits are those of the ordinary call."""
     device, started = batching
     model = CASES[case](backend=device)
     # Ordinary calls of any size.
@@ -51,7 +51,7 @@ def test_short_calls_of_the_host_are_one_graph(case, batching, monkeypatch):
 @pytest.mark.sampled(0.5)
 @pytest.mark.parametrize("case", CASES)
 def test_ordinary_calls_that_repeat_a_size(case, batching):
-    """They become one graph without another bit, error or report; maps, tables, sizes and types may change."""
+    """They become one graph with the same bits, errors and reports; maps, tables, sizes and types may change."""
     device, started = batching
     model, plain = (CASES[case](backend=device) for _ in range(2))
     plain._short = None
@@ -91,7 +91,7 @@ BESIDE = np.array(
 @pytest.mark.parametrize("real", [np.float32, np.float64])
 @pytest.mark.parametrize("kind", MODELS)
 def test_limits_are_rounded_as_readings_are(kind, real, batching):
-    """A driver's largest float32 reading is a max reading, however it gets to the device."""
+    """A driver's largest float32 reading is a max reading, however it reaches the device."""
     parameters = {BEAM: gs.BeamParameters(), FIELD: gs.LikelihoodFieldParameters(0.7, 0.2, 0.1)}[kind]
     model = kind(GRID, ROUNDED, parameters, backend=batching[0])
     poses, ranges = cloud(1), np.resize(BESIDE, BEAMS).astype(real)
@@ -140,7 +140,7 @@ def test_arrays_of_the_host_on_every_backend(kind, backend):
 
 @pytest.mark.parametrize("compat", [None, "amcl"])
 def test_calls_that_take_the_ordinary_path_on_a_device(compat, batching):
-    """Poses or readings of the host, and weights for which the host makes the readings."""
+    """Calls have poses or readings on the host, or weights for which the host prepares the readings."""
     model = FIELD(GRID, NEAR, backend=batching[0], compat=compat)
     poses, ranges = to_device(cloud(1)), to_device(mixed(1))
     pairs = [(poses, mixed(1)), (cloud(1), ranges), *([(poses, ranges)] if compat else [])]

@@ -1,4 +1,4 @@
-"""Python calls on the way of a steady call to a device: each costs time, and their number has no noise."""
+"""Number of Python calls in a steady call of a device: each costs time, and the number has no noise."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ import gpusense as gs
 SCANNER = gs.Scanner(np.linspace(-np.pi / 2, np.pi / 2, 60), range_max=9.0)
 POSE = np.array([4.0, 3.0, 0.3])
 RANGES = gs.RayCaster(GRID, 9.0, backend="numpy").cast(POSE[None], SCANNER.bearings)[0]
-# Most calls of Python functions, those of NumPy's included, with Python 3.11.
+# Largest number of calls of Python functions, NumPy's included, with Python 3.11.
 MOST_FIELD, MOST_BEAMS, MOST_STEP, MOST_BOUND = 80, 90, 230, 90
 
 
 def calls_of(run: Callable[[], object]) -> int:
-    """Return the number of Python functions that are called while a function runs, without itself.
+    """Return the number of Python functions that a function calls.
 
-    Finalizers of other tests' objects do not count: nothing is collected meanwhile.
+    Finalizers of other tests' objects do not count, since garbage collection is off.
     """
     called = []
     gc.collect()
@@ -61,7 +61,7 @@ def test_a_bound_call(needs):
 
 @pytest.mark.parametrize("recovery", [None, "sensor"])
 def test_a_step_of_a_filter(recovery, needs):
-    """The median: some steps find out whether the particles lie together, learn the temperature, or judge."""
+    """The bound is for the median: some steps check whether particles lie together, learn the temperature, or judge."""
     needs("opencl")
     model = gs.LikelihoodFieldModel(GRID, SCANNER, backend="opencl:pocl")
     pf = gs.ParticleFilter(model, particles=500, seed=1, recovery=recovery)

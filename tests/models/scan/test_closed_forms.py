@@ -1,4 +1,4 @@
-"""Ranges and fields that geometry gives in closed form: in a rectangular room, and in a disc made of pixels."""
+"""Ranges and fields with a closed form: in a rectangular room, and in a disc of pixels."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def test_ranges_in_a_rectangle(frame, precision, backend):
         along_y = np.where(np.sin(angle) > 0, top - local[:, 1:2], bottom - local[:, 1:2]) / np.sin(angle)
     expected = np.minimum(along_x, along_y) * resolution
     found = caster.cast(poses, BEARINGS)
-    # float64: the world's coordinates have an absolute error of 1e-11 m at 5e4 m, and a grazing ray stretches it.
+    # In float64, world coordinates of 5e4 m have an absolute error of 1e-11 m, which a grazing ray magnifies.
     off = {"float32": 1e-3, "float64": 1e-7 if origin[2] else 1e-11}[precision] * resolution
     np.testing.assert_allclose(found, expected, rtol=1e-6 if precision == "float32" else 1e-12, atol=off)
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_ranges_in_a_disc_of_pixels(precision, backend):
-    """A cell is occupied where its centre is radius cells or more away; so its entry is half a diagonal off at most."""
+    """Cells with centres at least radius cells away are occupied, so entries are half a diagonal off at most."""
     radius, size = 150.0, 320
     centre = size / 2
     row, col = np.indices((size, size)) + 0.5
@@ -52,7 +52,7 @@ def test_ranges_in_a_disc_of_pixels(precision, backend):
     grid = gs.OccupancyGrid(cells, 0.1)
     caster = gs.RayCaster(grid, 40.0, backend=backend, precision=precision)
     rng = np.random.default_rng(4)
-    # The middle sees the same range all around; from elsewhere it is the secant's.
+    # From the middle all ranges are equal; from elsewhere they are those of secants.
     distance, turn = np.append(0.0, rng.uniform(0, 140, 40)), rng.uniform(-4, 4, 41)
     x, y = distance * np.cos(turn), distance * np.sin(turn)
     poses = np.stack([(centre + x) * 0.1, (centre + y) * 0.1, rng.uniform(-4, 4, 41)], axis=1)
@@ -68,7 +68,7 @@ def test_ranges_in_a_disc_of_pixels(precision, backend):
 
 @pytest.mark.parametrize("interpolation", ["nearest", "bilinear"])
 def test_the_field_beside_a_straight_wall(interpolation, backend):
-    """d is the distance of the end point's cell to the wall's, or of the end point where it is interpolated."""
+    """d is the distance of the end point's cell from the wall's, or of the end point itself if it is interpolated."""
     cells = np.zeros((40, 60), int)
     cells[:, 50] = 100
     grid = gs.OccupancyGrid(cells, 0.1)

@@ -1,4 +1,4 @@
-"""compat="amcl" and "beluga": their weights on scenes small enough to compute by hand, readings and edges included."""
+"""compat="amcl" and "beluga": their weights in scenes computed by hand, with special readings and edges of the map."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def close(precision: str) -> dict[str, float]:
         ("amcl", (12.5, INF, 13.0, 3.2), (12.5, None, 13.0, 3.2)),
         ("amcl", (-INF, TOP, 6.0, 6.0), (TOP, TOP, 6.0, 6.0)),
         ("beluga", (5.5, 3.0, 2.9, 1.0), (5.5, 3.0, 2.9, 1.0)),
-        # Only what is in [range_min, range_max] is looked at.
+        # Only readings in [range_min, range_max] count.
         ("beluga", (0.5, INF, 13.0, NAN), (0.5, None, None, None)),
         ("beluga", (0.4, TOP, -INF, 6.0), (None, TOP, None, 6.0)),
     ],

@@ -1,4 +1,4 @@
-"""The densities on their own against mpmath at 60 digits and against quadrature, for any expected range."""
+"""Single densities against mpmath at 60 digits and against quadrature, for any expected range."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def eps_off(found: float, truth: mp.mpf, precision: str) -> float:
 
 
 def worst_of(cases, ours, naive, exact, precision):
-    """Return our worst error, and the shares of cases that the textbook's formula loses and gets wrong."""
+    """Return our worst error, and the shares of cases in which the textbook's formula is not finite or wrong."""
     real, worst, lost, wrong = np.dtype(precision).type, (0.0, ()), 0, 0
     for case in cases:
         case = tuple(real(v) for v in case)
@@ -163,7 +163,7 @@ def test_mixture_of_one_component_is_that_component_and_nothing_is_nan():
 
 
 def test_mixture_is_the_mixture_of_the_kernels():
-    """Same numbers as the reference kernel where that is defined, for z* in [0, range_max]."""
+    """The numbers are the reference kernel's where that is defined, for z* in [0, range_max]."""
     from gpusense.reference.mixture import log_density
 
     p = gs.BeamParameters()

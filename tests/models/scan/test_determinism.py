@@ -1,4 +1,4 @@
-"""The same call gives the same bits: again, in another process, in any batches, in any order and on a full device."""
+"""A call gives the same bits when repeated, in another process, in any batches, in any order and on a full device."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def make(kind: str, precision: str, backend: str) -> tuple[object, Call]:
     return scored, score
 
 
-# Models are shared by the tests: what was asked of one before must not matter either.
+# Tests share models, so earlier calls must not matter either.
 shared = functools.cache(make)
 
 
@@ -108,7 +108,7 @@ def hashes(backend: str) -> str:
 
 
 def test_in_a_fresh_process(needs):
-    """Sets of flags are ordered otherwise there, and there is one thread."""
+    """Another process orders sets of flags differently, and has a single thread."""
     from support.selection import BACKENDS
 
     backends = [needs(backend) for backend in BACKENDS]
@@ -128,7 +128,7 @@ def test_any_batches(call):
 
 
 def test_any_batches_of_a_cropped_map(kind, call, backend, monkeypatch):
-    """Each batch of neighbouring particles sees a window of the map of its own."""
+    """Each batch of neighbouring particles uses another window of the map."""
     whole, along = call(cloud()), np.argsort(cloud()[:, 0])
     monkeypatch.setattr(windows, "SMALLEST_CELLS", 1)
     owner, cropped = make(kind, whole.dtype.name, backend)
@@ -189,7 +189,7 @@ def test_float32_ranges_of_every_device_have_the_same_bits():
 
 @pytest.mark.parametrize("kind", KINDS[1:])
 def test_log_likelihoods_of_every_device_are_within_tolerance(kind):
-    """Functions such as exp differ, sums do not: both sides keep the tolerance against the truth."""
+    """Functions such as exp differ, but sums do not: both sides are within the tolerance of the truth."""
     scores = {name: shared(kind, "float32", name)[1](cloud()) for name in real_devices()}
     truth, total, each = scores["numpy"], scan_tolerance("float32", len(BEARINGS)), beam_tolerance("float32")
     for name, found in scores.items():

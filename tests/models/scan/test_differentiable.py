@@ -1,4 +1,4 @@
-"""Log-likelihoods that PyTorch and JAX differentiate; the rule itself is held without these libraries."""
+"""Log-likelihoods that PyTorch and JAX differentiate; the rule itself is tested without these libraries."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Tensor:
 
 
 def test_the_rule_multiplies_the_gradient_by_what_comes_from_above(monkeypatch):
-    """A made-up PyTorch, whose operations are their ``forward`` and ``backward``."""
+    """A stand-in for PyTorch calls ``forward`` and ``backward`` of operations."""
     made = []
 
     class Function:
@@ -106,7 +106,7 @@ def test_jax_differentiates():
     log_p, expected, _ = model.gradient(POSES.astype(np.float32), RANGES)
     assert float(value) == pytest.approx(2 * log_p.sum(), rel=1e-6)
     np.testing.assert_allclose(np.asarray(gradient), 2 * expected, rtol=1e-6)
-    # JAX may add up in another order.
+    # JAX may sum in another order.
     np.testing.assert_allclose(loss(POSES.astype(np.float32)), value, rtol=1e-6)
 
 

@@ -55,7 +55,7 @@ def test_no_bit_changes(name, precision, backend, monkeypatch):
 @pytest.mark.parametrize("precision", [np.float32, np.float64])
 @pytest.mark.parametrize("name", PARAMETERS)
 def test_nothing_beyond_the_end_changes_the_density(name, precision):
-    """By the density in float64: beyond the end it is constant to a quarter of the precision's last bit."""
+    """Beyond the end, the density in float64 is constant to a quarter of the precision's last bit."""
     from gpusense.models.scan.densities import log_mixture
 
     p = PARAMETERS[name]
@@ -67,7 +67,7 @@ def test_nothing_beyond_the_end_changes_the_density(name, precision):
         if end < RANGE:
             log_p = log_mixture(z, np.linspace(end, RANGE, 400), range_max=RANGE, **p.to_dict())
             assert np.ptp(log_p) <= 0.25 * np.finfo(precision).eps + 4 * np.finfo(float).eps * abs(log_p).max()
-    # And it is not far too late: half an offset nearer an obstacle counts, unless p_hit is 0.
+    # The end is not much too far: half an offset nearer, an obstacle matters, unless p_hit is 0.
     if p.z_hit and not p.z_short and slope < 1.01:
         near = log_mixture(2.0, 2.0 + 0.5 * offset - p.range_bias, range_max=RANGE, **p.to_dict())
         far = log_mixture(2.0, RANGE, range_max=RANGE, **p.to_dict())
@@ -76,7 +76,7 @@ def test_nothing_beyond_the_end_changes_the_density(name, precision):
 
 @pytest.mark.sampled(1, without="warp:cpu")
 def test_scenes_in_which_rays_do_not_end(backend):
-    """The default parameters, repeated bearings, tables, bins of incidence, weights of others, casters by table."""
+    """Try default parameters, repeated bearings, tables, bins of incidence, peers' weights, and casters by table."""
     grid, scanner, poses, z = scene(5)
     ends = PARAMETERS["no short"]
     twice = gs.Scanner(np.repeat(scanner.bearings, 2), RANGE)

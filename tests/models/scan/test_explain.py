@@ -1,4 +1,4 @@
-"""``explain()`` lists all that a scene does not need, the reason and the saving, and nothing that it needs."""
+"""``explain()`` lists all parts that a scene does not need, with reason and saving, and none that it needs."""
 
 from __future__ import annotations
 
@@ -23,8 +23,7 @@ def left_out(model: Any) -> dict[str, str]:
 
 
 def test_explain_names_what_is_left_out(monkeypatch):
-    """Each omission is listed with the number that decides it and its saving; scans are not mentioned before the first
-    one."""
+    """Each omission has the number that decides it and its saving; scans are not mentioned before the first one."""
     monkeypatch.setattr(windows, "SMALLEST_CELLS", 1)
     grid = room((400, 500))
     z = scan(REPEATED)
@@ -57,7 +56,7 @@ def test_explain_of_a_model_that_leaves_nothing_out(kind):
 
 
 def test_explain_of_a_full_beam_model(backend):
-    """Needed parts are not called unnecessary; the other tests look at host code, the same everywhere."""
+    """Needed parts are not listed; the other tests check host code, which is the same for every backend."""
     grid = room()
     model = make("beam", grid, backend, precision="float64")
     model.log_likelihood(cloud(grid, 100), scan())
@@ -122,7 +121,7 @@ PARTS = {
 
 @pytest.mark.parametrize("part", PARTS)
 def test_the_text_of_the_kernel_lacks_what_is_left_out(part, needs):
-    """And it has it in a scene that needs it, which says that it is kept."""
+    """In a scene that needs the part, the text has it, and ``explain`` says that it is kept."""
     words, without, with_part = PARTS[part]
     grid = room()
     backend = get_backend(needs("opencl"))
@@ -161,7 +160,7 @@ def test_measured_savings(backend):
             line.startswith("- ") and (rest == "; not timed" or ("; measured " in rest and rest.endswith(" ms")))
         )
     assert sum("; measured " in line for line in timed) >= 2
-    # The model is as it was.
+    # The model is unchanged.
     assert "EXACT_EXPONENT" not in model.explain().splitlines()[1]
     np.testing.assert_array_equal(model.log_likelihood(poses, z), before)
 
@@ -181,7 +180,7 @@ def test_sources_are_those_of_every_backend(backend):
 
 @pytest.fixture
 def pretend(monkeypatch) -> Callable[[str], Backend]:
-    """Return the reference as a processor or a GPU: the host decides the list."""
+    """Let the reference pretend to be a processor or a GPU, since the host makes the list."""
 
     def as_kind(kind: str) -> Backend:
         device = get_backend("numpy")
@@ -213,7 +212,7 @@ def test_huge_headings_are_left_out_where_there_are_none(kind):
 
 
 def test_a_gpu_looks_for_doubtful_end_points_by_blocks(pretend):
-    """Cells are rounded to in float32 look-ups only."""
+    """Only float32 look-ups round to cells."""
     grid, inside = room((200, 80)), placed(room((200, 80)), 100)
     for kind, device, options, listed in (
         ("field", "gpu", {}, True),

@@ -15,7 +15,7 @@ from gpusense.interface.structs import Caster, RangeScale, Window
 from gpusense.tables.rectangles import Planes, empty_rectangles
 
 PRECISIONS = ("float32", "float64")
-# Denormal in float32, denormal in float64 too, and on either side of what a ray takes for 0.
+# Denormal in float32, denormal in both precisions, and on either side of the limit below which a ray takes 0.
 TINY = (5e-324, 1e-310, 1e-45, 1e-40, 1.1e-38, 1e-37, 0.99e-30)
 MODELS = {
     "beam": (gs.BeamModel, gs.BeamParameters()),
@@ -48,7 +48,7 @@ def test_weights_of_long_scans_and_of_many_particles(backend, name, beams, parti
     assert not made.degenerate
     assert math.fsum(made.weights) == pytest.approx(1, abs=1e-6)
     assert 1 <= made.effective_sample_size <= particles
-    # The same beams added exactly.
+    # The exact sum of the same beams.
     again, parts = model.log_likelihood(poses[:3], ranges, per_beam=True)
     assert differing(again, log_p[:3]) == 0
     exact = np.array([math.fsum(row) for row in parts.tolist()])
@@ -79,11 +79,11 @@ def test_a_map_of_20_000_x_20_000_cells(needs):
     side, cell, reach, range_max = 20_000, 0.125, 100, 10.0
     cells = np.zeros((side, side), np.int8)
     cells[::60], cells[:, ::70] = 100, 100
-    cells[30::60, ::70] = 0  # doors
+    cells[30::60, ::70] = 0  # Doors.
     grid, scanner = gs.OccupancyGrid(cells, cell), look_around(24, range_max)
     del cells
     poses = np.random.default_rng(5).uniform((1500, 800, -4), (1503, 803, 4), (50, 3))
-    # The part that the poses can see, as a map; its origin is exact.
+    # A map of the part that the poses can see, with an exact origin.
     row, col = int(800 / cell) - reach, int(1500 / cell) - reach
     part = gs.OccupancyGrid(
         grid.cells[row : row + 2 * reach + 24, col : col + 2 * reach + 24], cell, (col * cell, row * cell, 0)
@@ -103,7 +103,7 @@ def test_a_map_of_20_000_x_20_000_cells(needs):
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_denormal_direction_components_are_zero(backend, precision):
-    """In the kernel itself: a direction's component below 1e-30 is 0 whatever its sign, on either axis."""
+    """The kernel takes a component of a direction below 1e-30 as 0, for either sign and axis."""
     real, obstacles = np.dtype(precision), np.pad(np.zeros((6, 9), bool), 1, constant_values=True)
     obstacles[4, 5] = True
     turns = [(1.0, t) for t in (0.0, *TINY)] + [(1.0, -t) for t in TINY]
@@ -161,6 +161,6 @@ def test_tiny_headings_bearings_and_places(backend, precision):
     assert differing(field_parts, same_field_parts) == 0
     assert differing(field_p, same_field_p) == 0
     np.testing.assert_allclose(beam_p, same_beam_p, rtol=0, atol=4e-3 if precision == "float32" else 1e-9)
-    # Along the axes all tiny headings see what the heading 0 sees.
+    # Along the axes, all tiny headings have the ranges of the heading 0.
     tiny_rows = ranges.reshape(len(places), len(headings), -1)[:, : 2 * (1 + len(TINY)), : len(tiny)]
     assert (tiny_rows[0] == tiny_rows[0, 0, 0]).all()

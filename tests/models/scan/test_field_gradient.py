@@ -51,7 +51,7 @@ def test_gradients_are_finite_differences(kind, origin):
 
 
 def test_information_is_the_curvature_at_a_perfect_fit():
-    """Where all distances vanish, second derivatives of log p are those of Gauss-Newton: here of one wall."""
+    """Where all distances vanish, second derivatives of log p are those of Gauss-Newton, here for one wall."""
     cells = np.zeros((40, 40), int)
     cells[:, 30] = 100
     grid = gs.OccupancyGrid(cells, resolution=0.1)
@@ -73,7 +73,7 @@ def test_devices_agree_with_the_reference(device, precision, specialize):
     for kind in ("linear", "log", "max"):
         expected = field(grid, "numpy", precision, kind).gradient(poses, ranges)
         found = field(grid, device, precision, kind, specialize=specialize).gradient(poses, ranges)
-        # Sums of 80 readings in another order.
+        # The sums of 80 readings have another order.
         bound = 1e-4 if precision == "float32" else 1e-12
         for one, other in zip(found, expected, strict=True):
             np.testing.assert_allclose(one, other, rtol=bound, atol=bound * np.abs(other).max())

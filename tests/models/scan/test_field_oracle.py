@@ -1,4 +1,4 @@
-"""The likelihood field against an implementation of its own, and float32 look-ups against float64 ones."""
+"""The likelihood field against an independent implementation, and float32 look-ups against float64 ones."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def scene(resolution: float, origin: tuple[float, float, float], density: float 
 
 
 def scaled(names: dict[str, float], resolution: float, interpolation: str) -> gs.LikelihoodFieldParameters:
-    """Return parameters whose lengths are in units of 4 cells too."""
+    """Return parameters with lengths in units of 4 cells as well."""
     p = gs.LikelihoodFieldParameters(**names, interpolation=interpolation)
     unit = 4 * resolution
     return p.replace(sigma_hit=p.sigma_hit * unit, max_distance=p.max_distance * unit)
@@ -170,7 +170,7 @@ def differing_cells(grid, poses, ranges, bearings, left: tuple[str, str], right:
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (-3.7, 2.2, 0.3), (4e5, 5e6, 1.0)])
 @pytest.mark.parametrize("longest", [5.0, 900.0])
 def test_float32_look_ups_hit_the_cells_of_float64(origin, longest, backend):
-    """40 000 end points anywhere, some hundreds of them nearer to an edge than float32 resolves."""
+    """Of 40 000 random end points, some hundreds are nearer to an edge than float32 resolves."""
     rng = np.random.default_rng(6)
     grid = gs.OccupancyGrid((rng.random((200, 200)) < 0.1) * 100, 0.05, origin)
     inside = rng.uniform(1, 9, (200, 2))
@@ -179,7 +179,7 @@ def test_float32_look_ups_hit_the_cells_of_float64(origin, longest, backend):
     poses = np.column_stack([xy, rng.uniform(-1e3, 1e3, 200)])
     ranges, bearings = rng.uniform(0, 5, 200), rng.uniform(-4, 4, 200)
     if longest > 5:
-        # Far readings that come back into the map: the poses are as far away as the readings are long.
+        # Far readings that end in the map: the poses are as far away as the readings are long.
         poses[:, 0] -= longest * np.cos(poses[:, 2])
         poses[:, 1] -= longest * np.sin(poses[:, 2])
         ranges, bearings = longest + rng.uniform(-4, 4, 200), rng.uniform(-0.004, 0.004, 200)
@@ -238,7 +238,7 @@ def test_a_cloud_in_a_map_longer_than_distances_reach(backend):
 
 
 def test_a_window_that_fits_is_not_refused_for_its_room_to_move(backend):
-    """24 000 cells are within reach; half as much again, to spare a refresh, would be too long."""
+    """24 000 cells are within reach; a margin of half as much, which saves refreshes, would be too long."""
     cells = np.zeros((1, 60_001), int)
     cells[0, 30_000] = 100
     grid = gs.OccupancyGrid(cells, 0.001)
@@ -249,7 +249,7 @@ def test_a_window_that_fits_is_not_refused_for_its_room_to_move(backend):
 
 @pytest.mark.parametrize("shape", [(1, 32_767), (32_767, 1), (3, 20_000)])
 def test_distances_of_long_maps(shape, backend):
-    """Exact integers as far as int32 reaches."""
+    """Distances are exact integers up to the limit of int32."""
     obstacles = np.zeros(shape, bool)
     obstacles[0, 0] = True
     rows, cols = np.indices(shape)

@@ -1,4 +1,4 @@
-"""A device whose memory is full: pieces are halved, and the model goes on."""
+"""A device whose memory is full: pieces are halved, and the model continues to work."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gpusense.tables.reachable import ReachableMap
 
 
 class FullDevice(Proxy):
-    """Fails some allocations of a backend: those numbered in ``failing``, and those of too many numbers."""
+    """A proxy that fails the allocations numbered in ``failing``, and those of too many numbers."""
 
     def __init__(self, backend: str) -> None:
         super().__init__(get_backend(backend))
@@ -34,7 +34,7 @@ class FullDevice(Proxy):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_launch_that_does_not_fit_is_halved(kind, backend):
-    """A failure in the middle of a call costs a second try; the call after it needs none."""
+    """A failure in the middle of a call costs a second try; the next call needs none."""
     grid, z = room(), scan()
     poses = cloud(grid, 3000)
     expected = make(kind, grid, backend).log_likelihood(poses, z)
@@ -49,7 +49,7 @@ def test_a_launch_that_does_not_fit_is_halved(kind, backend):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_whichever_allocation_fails_the_model_goes_on(kind, backend):
-    """A call gives the right answer or says MemoryError; the next call gives the right answer."""
+    """A call gives the right answer or raises MemoryError; the next call gives the right answer."""
     grid, z = room(), scan()
     poses = cloud(grid, 600)
     expected = make(kind, grid, backend).log_likelihood(poses, z)
@@ -66,7 +66,7 @@ def test_whichever_allocation_fails_the_model_goes_on(kind, backend):
 
 @pytest.mark.parametrize("kind", [*KINDS, "caster"])
 def test_a_table_that_does_not_fit_is_reported_at_once(kind, backend, monkeypatch):
-    """The table is the same for fewer particles: it is tried once, and the message is the device's."""
+    """Fewer particles need the same table, so it is tried once, and the message is the device's."""
     grid, z = room(), scan()
     poses = cloud(grid, 3000)
     monkeypatch.setattr(run, "SMALLEST_CHUNK", 1)
@@ -97,7 +97,7 @@ def test_a_table_that_does_not_fit_is_reported_at_once(kind, backend, monkeypatc
 
 
 def test_a_device_that_holds_nothing(backend):
-    """MemoryError, and the same model works once there is room."""
+    """A model raises MemoryError, and works as soon as memory is free."""
     grid, z = room(), scan()
     poses = cloud(grid, 3000)
     device = FullDevice(backend)

@@ -1,4 +1,4 @@
-"""Shapes of hits: Student's t against mpmath and SciPy, on every backend; a made-up shape, which all users see."""
+"""Shapes of hits: Student's t against mpmath and SciPy, on every backend; a made-up shape, which all users follow."""
 
 from __future__ import annotations
 
@@ -200,7 +200,7 @@ def test_readings_are_drawn_from_the_density_with_equal_bits(backend):
                 assert stats.kstest(share, "uniform").pvalue > 1e-5
 
 
-# ---- a made-up shape: every user of densities must see it
+# ---- a made-up shape: every user of densities must follow it
 
 
 def users(parameters, field, backend, real):
@@ -239,7 +239,7 @@ def users(parameters, field, backend, real):
 
 
 def users_on_the_host(parameters, field):
-    """Return numbers of users that have no kernel of their own."""
+    """Return numbers of users without a kernel."""
     expected = np.linspace(0.5, 7.5, 40)
     data = RangeData(Z, expected, None, np.zeros(40, int), RANGE)
     surface = fits.surface_figure(data, parameters)

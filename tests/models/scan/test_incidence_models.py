@@ -1,4 +1,4 @@
-"""Beam models whose parameters go by the angle of incidence."""
+"""Beam models whose parameters depend on the angle of incidence."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def brute_force(model: gs.BeamModel, poses: np.ndarray, z: np.ndarray) -> np.nda
     parameters = model.incidence_parameters
     expected, angle = model.expected_ranges(poses).astype(float), model.incidence(poses).astype(float)
     which = np.searchsorted(parameters.edges[1:-1], np.nan_to_num(angle), side="right")
-    # Next to an edge rounding may choose either side.
+    # Next to an edge, rounding may choose either side.
     assert not np.isclose(np.nan_to_num(angle)[..., None], parameters.edges[1:-1], rtol=0, atol=2e-6).any()
     real = np.dtype(model.precision)
     found = np.zeros(expected.shape)
@@ -82,7 +82,7 @@ def test_equal_bins_are_the_plain_model(weights, backend):
         found, parts = model.log_likelihood(poses, z, per_beam=True)
         expected, plain_parts = plain.log_likelihood(poses, z, per_beam=True)
         if "IN_LANES" in plain._last.flags:
-            # Functions of vectors may round otherwise.
+            # Functions of vectors may round differently.
             assert (np.abs(parts - plain_parts) <= 2 * per_beam(plain_parts, precision)).all()
             assert (np.abs(found - expected) <= 2 * per_scan(plain_parts, precision)).all()
         else:

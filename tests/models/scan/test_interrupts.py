@@ -1,4 +1,4 @@
-"""An interrupt at any line leaves a model that gives the results of a new one, of the old map or of the changed one."""
+"""After an interrupt at any line, a model gives the results of a new one, of the old map or of the changed one."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class Interrupted:
 @pytest.mark.parametrize("every", [4, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("call", CALLS)
 def test_a_call_that_was_interrupted_can_be_repeated(call, every):
-    """Every line, or every fourth one, of every model; lines outside the folder of tables once for all models."""
+    """Interrupt every line, or every fourth, of every model; lines outside the room ``tables`` once for all models."""
     interrupt_lines(call, "numpy", everything=True, every=every)
 
 

@@ -1,4 +1,4 @@
-"""Programs of earlier calls are repeated with the numbers of the call."""
+"""Stored programs of earlier calls are repeated with the numbers of the current call."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ GUARD = [argument.name for argument in KERNELS["score_field"].arguments].index("
 
 
 class Guards(Proxy):
-    """A backend that lists the bounds of rounding errors with which likelihood fields are read."""
+    """A backend that lists the bounds of rounding errors in launches of likelihood fields."""
 
     def __init__(self, backend: Backend) -> None:
         super().__init__(backend)
@@ -34,7 +34,7 @@ class Guards(Proxy):
 
 @pytest.mark.parametrize("gpu", [False, True])
 def test_the_bound_of_rounding_errors_follows_the_longest_reading(backend, gpu, as_gpu):
-    """End points of longer readings have larger errors: a kept program is started with the bound of the scan."""
+    """End points of longer readings have larger errors: a stored program starts with the bound of the scan."""
     as_gpu(gpu)
     device = Guards(get_backend(backend))
     model = FIELD(GRID, NEAR, backend=device)

@@ -1,8 +1,8 @@
-"""Laws that a range model keeps whatever its numbers are: no oracle, only two scenes whose results must fit.
+"""Laws that range models satisfy: there is no oracle, only two scenes whose results must agree.
 
 Most laws are exact to the bit, because the second scene equals the first one in the grid's frame: poses lie at odd
-multiples of 1/256 cell, resolutions are powers of two, and free cells around the walls are wider than any distance
-counts.
+multiples of 1/256 cell, resolutions are powers of two, and free cells around the walls extend beyond the largest
+distance that counts.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ PARAMETERS: dict[str, dict[str, Any]] = {
 # The sum over beams: BLOCK_TERMS - 1 plain additions in a block, the constant of the max readings, the compensated
 # total, the final sum and the temperature; each takes at most half an eps of the sum of the magnitudes.
 SUM_ROUNDINGS = BLOCK_TERMS + 3
-# A coordinate of 1e6 m is rounded to 1e-10 m, four times on its way; rays nearly along a wall make 1e-5 m of it.
+# A coordinate of 1e6 m is rounded to 1e-10 m four times; rays nearly parallel to a wall magnify it to 1e-5 m.
 FAR_FLOAT64 = 1e-5
 
 SEEDS, NAMES = st.integers(0, 2**32 - 1), st.sampled_from(list(FIELD))
@@ -152,7 +152,7 @@ def plain_sum(log_p: np.ndarray, parts: np.ndarray) -> None:
 
 
 def turned_and_mirrored_scores(after: Scene, before: Scene, parameters: Any, on: dict[str, str]) -> None:
-    """Check to the bit; a distance that is interpolated from the other side keeps the tolerance of both sides."""
+    """Check bits; distances interpolated from the other side must be within the tolerance of both sides."""
     if getattr(parameters, "interpolation", "nearest") == "nearest":
         same_scores(after, before, parameters, on)
     found, expected = after.score(parameters, **on)[1], before.score(parameters, **on)[1]
@@ -163,7 +163,7 @@ def turned_and_mirrored_scores(after: Scene, before: Scene, parameters: Any, on:
 @LAWS
 @given(SEEDS, SMOOTH, st.sampled_from([-1, 1, 2]))
 def test_turn(kind, on, seed, name, quarters):
-    """Headings are those whose turned cosine and sine are just the turned ones; in float32 nearly all are."""
+    """Headings are those whose cosine and sine turn exactly; in float32 nearly all do."""
     made = scene(kind, seed)
     theta = np.random.default_rng(seed).uniform(-4, 4, 4000)
     turned = theta + quarters * (np.pi / 2)
@@ -192,7 +192,7 @@ def test_mirror(kind, on, seed, name):
 @LAWS
 @given(SEEDS, NAMES, st.integers(-10, 10), st.floats(-7, 7), st.integers(0, 40))
 def test_shift(kind, on, seed, name, far, yaw, cells):
-    """By up to a million metres with an origin of any yaw, and by whole cells in a wider map."""
+    """Shift the world by up to a million metres with an origin of any yaw, and by whole cells in a wider map."""
     turned, plain, p = scene(kind, seed, origin=(0.0, 0.0, yaw), mount=MOUNT), scene(kind, seed), PARAMETERS[kind][name]
     x, y, side = 1e5 * far, -1e5 * far, CELL * cells
     wide = replace(plain, cells=np.pad(plain.cells, ((cells, 3), (cells, 5))))
@@ -253,7 +253,7 @@ def cut_in_four(coarse: Scene) -> Scene:
 @LAWS
 @given(SEEDS, NAMES)
 def test_cells_cut_in_four_change_no_range(on, seed, name):
-    """To the bit where places are exact; elsewhere both casts keep their tolerance."""
+    """Ranges have the same bits where places are exact; elsewhere both casts are within their tolerance."""
     coarse = scene("beam", seed)
     same_scores(cut_in_four(coarse), coarse, PARAMETERS["beam"][name], on)
     other = replace(coarse, poses=coarse.poses + np.random.default_rng(seed).uniform(-0.1, 0.1, (12, 3)))
@@ -284,7 +284,7 @@ def test_cells_cut_in_four_change_distances_by_a_diagonal(interpolation, longer,
 @LAWS
 @given(SEEDS, NAMES)
 def test_permuting_beams_and_particles(kind, on, seed, name):
-    """Particles and parts to the bit, and the sum of the parts but for its roundings; four beams repeat a bearing."""
+    """Particles and parts have the same bits, sums differ by rounding alone; four beams repeat a bearing."""
     before, p, rng = scene(kind, seed, mount=MOUNT), PARAMETERS[kind][name], np.random.default_rng(seed)
     before = replace(before, bearings=np.concatenate([before.bearings[:20], before.bearings[:4]]))
     beams, particles = rng.permutation(24), rng.permutation(12)
@@ -302,7 +302,7 @@ def test_permuting_beams_and_particles(kind, on, seed, name):
 @LAWS
 @given(SEEDS, NAMES, st.integers(0, 24))
 def test_splitting_a_scan(kind, on, seed, name, count):
-    """Beams left out are beams that are not there, and the halves' log p add up; a half may have no beam."""
+    """Beams that are left out do not matter, and log p of both halves add up; a half may have no beam."""
     whole, p = scene(kind, seed, mount=MOUNT), PARAMETERS[kind][name]
     log_p, parts = whole.score(p, **on)
     total = np.zeros(len(log_p))
@@ -321,7 +321,7 @@ def test_splitting_a_scan(kind, on, seed, name, count):
 @LAWS
 @given(SEEDS, NAMES, st.floats(2**-10, 1, width=32))
 def test_temperature(kind, on, seed, name, temperature):
-    """1 is the plain sum; any other multiplies it, rounding once, and leaves the parts alone."""
+    """1 gives the plain sum; any other factor multiplies it with one rounding, and leaves the parts unchanged."""
     made, p = scene(kind, seed), PARAMETERS[kind][name]
     plain, parts = made.score(p, **on)
     same_bits(made.score(p, **on, temperature=1.0)[0], plain)
@@ -344,7 +344,7 @@ def test_no_information_is_exactly_0(kind, on, name):
 
 @pytest.mark.sampled(1, without="warp:cpu")
 def test_laws_can_be_broken(on):
-    """By poses that are moved by the least that counts, and by a beam too many in the sum."""
+    """Poses that move by the smallest distance that counts break them, and so does an additional beam in the sum."""
     before, p = scene("beam", 0), PARAMETERS["beam"]["ordinary"]
     least = np.maximum(CELL * np.finfo(on["precision"]).eps / 2, np.spacing(before.poses[:, 0]))
     moved = replace(before, poses=before.poses + np.outer(least, [1, 0, 0]))

@@ -46,7 +46,7 @@ def test_order_and_repetition_do_not_matter(kind, precision, backend):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_buffers_are_used_again(kind, backend):
-    """The second call of a size, and smaller ones, allocate nothing."""
+    """The second call of a size, and smaller calls, allocate no memory."""
     grid, z = room(), scan()
     poses = cloud(grid, 200)
     model = make(kind, grid, backend)

@@ -90,7 +90,7 @@ def test_models_have_the_densities_on_every_backend(shape, real, backend):
         names = ["book" if real == "float32" else "sharp without rand"]
     cases = list(itertools.product(names, (False, True)))
     if backend != "numpy":
-        # With and without code for causes of weight 0, in turns.
+        # With and without code for causes of weight 0, in turn.
         cases = [(name, (number + (real == "float64")) % 2 == 0) for number, name in enumerate(names)]
     for name, wide in cases:
         p = MIXTURES[name].replace(**SHAPES[shape])
@@ -127,7 +127,7 @@ def test_the_code_for_them_changes_nothing_where_they_are_0(name, real):
     z = np.roll(expected, 1, axis=1)
     plain = log_density(flags, z, expected, terms)
     found = log_density(flags | {"BIAS", "GROWTH"}, z, expected, terms)
-    # Exponents in two parts are normalised once more.
+    # Exponents in two parts are normalised once again.
     eps = np.finfo(real).eps if "EXACT_EXPONENT" in flags else 0
     same = plain == found
     assert (same | (np.abs(np.where(same, 0, plain) - np.where(same, 0, found)) <= 2 * eps * np.abs(plain))).all()

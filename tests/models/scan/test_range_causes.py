@@ -66,7 +66,7 @@ def test_densities_are_those_of_scipy():
 
 
 def models(p):
-    """Return log-likelihoods of each beam, one row for each model, and the readings that they are of."""
+    """Return log-likelihoods of each beam, one row for each model, and their readings."""
     # Without random readings a kernel sums logarithms.
     logs = p.replace(z_hit=p.z_hit + p.z_rand, z_rand=0.0)
     bins = gs.IncidenceParameters((0, 0.7, np.pi / 2), (p, p.replace(z_hit=p.z_hit + p.z_max, z_max=0.0)))
@@ -81,8 +81,7 @@ def models(p):
 
 
 def learned(at):
-    """Return the quantities that fits compute from parameters: numbers of kernels, terms of starts, growth and
-    blocks."""
+    """Return the quantities that fits compute of parameters: numbers of kernels, terms of starts, growth and blocks."""
     pairs = make_pairs(WITH_MAX, EXPECTED, RANGE)
     device = DeviceSums(get_backend("numpy"), np.dtype(np.float64), pairs)
     sample = starts.Sample.of(pairs)
@@ -106,7 +105,7 @@ def learned(at):
 
 
 def numbers(p, real=np.float32):
-    """Return the numbers of kernels that depend on the density, log ones of a random density far below the peak."""
+    """Return the numbers of kernels that depend on the density; logarithms if it is far below the peak."""
     settings = dict(specialize=True, max_depends=False)
     # The other densities' peak decides whether a kernel sums densities; a steep one has a last range.
     far = p.replace(z_hit=p.z_hit + p.z_rand - 1e-7, z_rand=1e-7, lambda_short=1e23 * p.lambda_short)
@@ -216,7 +215,7 @@ def radio():
 
 
 def log_floor():
-    """Return the log of the lower end of the density's axis in the picture of a fit, half of a random density."""
+    """Return the log of the lower end of the density's axis in the picture of a fit, half the random density."""
     data = RangeData(np.full(20, 3.0), np.full(20, 3.0), None, np.zeros(20, int), RANGE)
     rare = gs.BeamParameters(0.99, 0.0, 0.0, 0.01, 0.3)
     return math.log(fits.density_figure(data, rare, [3.0]).axes[0].get_ylim()[0])

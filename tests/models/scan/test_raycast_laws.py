@@ -1,4 +1,4 @@
-"""The exact caster under laws that need no oracle: turned, mirrored and shifted maps, and more walls."""
+"""Laws of the exact caster that need no oracle: turned, mirrored and shifted maps, and more walls."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_shift(backend, seed, dx, dy):
 @LAWS
 @given(MAPS, st.sampled_from(PRECISIONS), st.booleans())
 def test_a_wall_lengthens_no_range(backend, seed, precision, on_lattice):
-    """Exactly, wherever the ray starts: the same ray in a map with one more wall."""
+    """A ray in a map with one more wall is exactly as long or shorter, wherever it starts."""
     cells, poses, bearings = drawn(seed)
     if on_lattice:
         poses, bearings = np.round(poses * 4) / 4, np.arange(8) * (np.pi / 4)

@@ -30,7 +30,7 @@ CELLS_FAR = 30.5
 
 @dataclass(frozen=True)
 class World:
-    """Holds a grid with unknown cells, poses all around it, and the exact casts."""
+    """A grid with unknown cells, poses all around it, and the exact casts."""
 
     grid: gs.OccupancyGrid
     poses: np.ndarray
@@ -81,7 +81,7 @@ def test_casts_of_a_world(name, unknown, outside, precision, backend):
 
 
 def forward_error(ray: Ray, exact: Hit) -> float:
-    """Return float64's bound: 1e-12 of the range, and the effect of rounded poses on a ray that meets a wall aslant."""
+    """Return float64's bound: 1e-12 of the range, and the effect of rounded poses on rays at oblique walls."""
     normal = {"x": ray.direction[0], "y": ray.direction[1]}.get(exact.face[2] if exact.face else "", 1)
     size = 2e-15 * (1 + max(abs(ray.cell[0]), abs(ray.cell[1])))
     return 1e-12 * exact.t + (size + 1e-15 * exact.t) / max(abs(float(normal)), 1e-12)
@@ -120,7 +120,7 @@ def test_all_unknown_map(backend):
 
 @pytest.mark.parametrize("heading", [0.0, math.pi / 2, -math.pi / 2, math.pi, 2 * math.pi])
 def test_a_ray_along_an_edge_stays_in_its_row(backend, heading):
-    """From the lower edge of a cell along that edge: the walls of the rows above and below are distinguished."""
+    """A ray along the lower edge of a cell distinguishes the walls of the rows above and below."""
     cells = np.zeros((9, 9), int)
     cells[4, 7] = cells[7, 4] = cells[4, 1] = cells[1, 4] = 100
     grid = gs.OccupancyGrid(cells, 1.0)

@@ -105,7 +105,7 @@ def test_shares_of_bins_are_those_of_the_log_likelihood(kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_readings_have_the_same_bits_on_every_backend(kind, precision, needs):
     poses = gs.worlds.cloud_uniform(ROOM, 120, np.random.default_rng(1))
-    poses[:3] = [(0.05, 0.05, 0.0), (-1.0, 2.0, 0.1), (2.0, 2.0, 1e6)]  # in a wall, off the map, a huge heading
+    poses[:3] = [(0.05, 0.05, 0.0), (-1.0, 2.0, 0.1), (2.0, 2.0, 1e6)]  # In a wall, off the map, with a huge heading.
     expected = model_of(kind, precision=precision).sample(poses, seed=2**40 + 5, step=7)
     assert expected.dtype == precision and expected.shape == (120, KINDS[kind][0].count)
     for name in ("opencl", "warp"):
@@ -153,7 +153,7 @@ def test_random_numbers_of_beams_poses_and_steps_are_independent():
 def test_stiff_deviations_fail_nowhere(sigma, precision):
     p = gs.BeamParameters(z_hit=1.0, z_short=0.0, z_max=0.0, z_rand=0.0, sigma_hit=sigma * LIMIT)
     model = gs.BeamModel(ROOM, SCANNER, p, backend="numpy", precision=np.dtype(precision).name)
-    poses = [(0.05, 0.05, 0.0), (-50.0, -50.0, 2.0), POSE]  # z* = 0, z* = range_max, and between
+    poses = [(0.05, 0.05, 0.0), (-50.0, -50.0, 2.0), POSE]  # z* = 0, z* = range_max, and between.
     z = model.sample(np.tile(poses, (3000, 1)), seed=5).reshape(3000, 3, -1)
     assert np.isfinite(z).all() and (z >= 0).all() and (z < np.dtype(precision).type(LIMIT)).all()
     expected = model.expected_ranges(poses)
@@ -167,7 +167,7 @@ def test_stiff_deviations_fail_nowhere(sigma, precision):
 
 
 def test_every_reading_has_a_density():
-    # What is drawn is possible: also hits next to range_max, weights of exactly 0 and 1, and rates of 0 and 1e6.
+    # Drawn readings are possible, even with hits next to range_max, weights of exactly 0 and 1, and rates of 0 and 1e6.
     rng = np.random.default_rng(1)
     poses = [gs.worlds.free_pose(ROOM, rng) for _ in range(20)]
     for changes in (dict(z_hit=1.0), dict(z_short=1.0), dict(z_max=1.0), dict(z_rand=1.0),

@@ -19,7 +19,7 @@ WEIGHTS = {"all": (0.7, 0.1, 0.1, 0.1), "no short": (0.8, 0.0, 0.1, 0.1), "no ra
 
 @functools.cache
 def scene() -> tuple[gs.OccupancyGrid, gs.Scanner, np.ndarray]:
-    """Return a corridor with a wall at its end: ahead 0 to 3.9 m, behind always range_max; four beams each way."""
+    """Return a corridor with expected ranges of 0 to 3.9 m ahead and range_max behind; four beams in each direction."""
     cells = np.zeros((1, 400), int)
     cells[0, -1] = 100
     poses = np.zeros((80, 3))
@@ -44,7 +44,7 @@ def bits(array: np.ndarray) -> np.ndarray:
 
 @pytest.mark.sampled(1, without="warp:cpu")
 def test_one_reading_by_hand(backend):
-    """1.3 m where 2 m are expected, in bins of 0.5 m: the mixture at 1.25 m and 2.25 m; range_max stays range_max."""
+    """A reading of 1.3 m for 2 m has, in bins of 0.5 m, the mixture at 1.25 m and 2.25 m; range_max stays range_max."""
     _, scanner, _ = scene()
     for precision in PRECISIONS:
         tabulated = model(0.5, backend=backend, precision=precision)
@@ -56,7 +56,7 @@ def test_one_reading_by_hand(backend):
 @pytest.mark.parametrize("width", [1.0, 0.3, 0.01])
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_a_table_holds_the_mixture_at_the_centres_of_bins(width, precision):
-    """0.3 m do not divide 4 m: 13 bins of 4/13 m."""
+    """4 m is no multiple of 0.3 m: the table has 13 bins of 4/13 m."""
     _, _, poses = scene()
     tabulated = model(width, precision=precision)
     cells, mixture = round(RANGE / width), Mixture.of(tabulated.parameters, RANGE)
@@ -68,7 +68,7 @@ def test_a_table_holds_the_mixture_at_the_centres_of_bins(width, precision):
     for z in (*readings(1), 0.0, float(last), *(np.arange(1, 4) + 0.001)):
         _, parts = tabulated.log_likelihood(poses, [z] * 8, per_beam=True)
         wanted = mixture.log_densities(middle[min(int(z / RANGE * cells), cells - 1)], centre)
-        # Where a range is within rounding of a bin's edge either bin will do.
+        # If a range is within rounding of a bin's edge, either bin is right.
         place = expected.astype(float) / RANGE * cells
         sure = (np.abs(place - np.round(place)) > 1e-4) | (expected >= RANGE)
         eps = np.finfo(precision).eps
@@ -77,7 +77,7 @@ def test_a_table_holds_the_mixture_at_the_centres_of_bins(width, precision):
 
 @pytest.mark.parametrize("weights", WEIGHTS)
 def test_narrower_bins_are_more_exact(weights):
-    """Mean error over readings and poses at least of first order; the largest too where the mixture is continuous."""
+    """The mean error is at least of first order, and so is the largest one where the mixture is continuous."""
     (grid, _, poses), p = scene(), model(None, weights).parameters
     z, parts = readings(count=200), []
     for width in (None, 0.4, 0.2, 0.1, 0.05):
@@ -115,7 +115,7 @@ def test_missing_and_max_readings_are_treated_as_the_formula_treats_them(special
 
 @pytest.mark.sampled(1, without="warp:cpu")
 def test_impossible_scans_are_minus_infinity_and_no_others(backend):
-    """Unexpected obstacles only, so a reading in a bin beyond the expected range's is impossible."""
+    """With unexpected obstacles alone, a reading in a bin beyond the expected range's is impossible."""
     grid, scanner, poses = scene()
     p = gs.BeamParameters(0.0, 0.9, 0.1, 0.0, lambda_short=0.2)
     for precision in PRECISIONS:
@@ -136,7 +136,7 @@ def test_impossible_scans_are_minus_infinity_and_no_others(backend):
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("weights", WEIGHTS)
 def test_every_backend_has_the_bits_of_numpy_with_and_without_specialisation(weights, precision, backend):
-    """Expected ranges are the same bits everywhere, and the rest is look-ups and sums in a fixed order."""
+    """Expected ranges have the same bits on every backend, and all else is look-ups and sums in a fixed order."""
     _, _, poses = scene()
     for seed, options in ((0, {}), (1, {"temperature": 0.3}), (2, {"beams": 3})):
         z = readings(seed)
@@ -153,7 +153,7 @@ def test_any_caster_may_feed_the_table(backend):
     lines, alone = model(0.01, backend=backend, caster="bresenham"), model(0.01, backend=backend)
     _, parts = lines.log_likelihood(poses, readings(), per_beam=True)
     _, exact = alone.log_likelihood(poses, readings(), per_beam=True)
-    # Where the line's range is in the exact one's bin, so is the density.
+    # Where the line's range is in the exact one's bin, densities are equal.
     bins = [(one.expected_ranges(poses) * np.float32(100)).astype(int) for one in (lines, alone)]
     same = bins[0] == bins[1]
     assert 0.5 < same.mean() < 1

@@ -59,7 +59,7 @@ def field(scanner: gs.Scanner = SCANNER, **options: Any) -> Any:
     return functools.partial(gs.LikelihoodFieldModel, GRID, scanner, **{"temperature": 0.7} | options)
 
 
-# Arguments of models, and whether Warp, which compiles each set of flags for seconds, has its turn.
+# Arguments of models, and whether they run on Warp, which compiles each set of flags for seconds.
 MODELS: dict[str, tuple[Any, bool]] = {
     "beam": (beam(), True),
     "beam, float64": (beam(precision="float64"), True),
@@ -87,7 +87,7 @@ MODELS: dict[str, tuple[Any, bool]] = {
 
 
 class Counting(Proxy):
-    """Counts the launches of a backend by kernel."""
+    """A backend that counts launches by kernel."""
 
     def __init__(self, backend: Any) -> None:
         super().__init__(backend)
@@ -117,7 +117,7 @@ def assert_as_one_by_one(model: Any, poses: np.ndarray, z: np.ndarray) -> None:
 @on_every_backend(name=MODELS, gpu=(False, True), on_warp=lambda name, gpu: MODELS[name][1])
 def test_bits_are_those_of_single_calls(name, gpu, as_gpu, monkeypatch):
     device = as_gpu(gpu)
-    # Particles in an order as well, which GPUs would make of many.
+    # Particles in an order as well, as GPUs sort large clouds.
     monkeypatch.setattr("gpusense.models.scan.tiles.LEAST_ORDERED", (1, 1))
     model = MODELS[name][0](backend=device)
     z = scans_of(model.scanner)
@@ -153,13 +153,13 @@ def test_scans_with_readings_share_one_set_of_launches(kind, gpu, as_gpu, monkey
     device.launches.clear()
     model.log_likelihood(poses[5:], z[5:])
     launches(1)
-    # Launches of at most 150 particles, which are three scans.
+    # Launches of at most 150 particles, those of three scans.
     monkeypatch.setattr(run, "CHUNK", 150)
     assert_as_one_by_one(model, poses, z)
     device.launches.clear()
     model.log_likelihood(poses[5:], z[5:])
     launches(2)
-    # Scans that fill a launch by themselves.
+    # Each scan fills a launch.
     before = pipeline.TOGETHER
     monkeypatch.setattr(pipeline, "TOGETHER", {"cpu": 50 * BEAMS - 1, "gpu": 50 * BEAMS - 1})
     device.launches.clear()
@@ -196,7 +196,7 @@ def test_scans_that_do_not_fit_together_are_scored_one_by_one(kind, backend, mon
 
     def refuse(self, name, count, dtype, *, zero=False):
         if name in ("pose", "log_p") and count > 4 * 100:
-            raise MemoryError("so many do not fit")
+            raise MemoryError("more than 400 do not fit")
         return empty(self, name, count, dtype, zero=zero)
 
     monkeypatch.setattr(Workspace, "empty", refuse)

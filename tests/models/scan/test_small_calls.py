@@ -1,4 +1,4 @@
-"""Paths of calls of few particles against the plain one: memory that is shared, batches of launches."""
+"""Paths of calls of few particles against the plain one: shared memory, batches of launches."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gpusense.models.scan.packed_call import ShortCalls
 
 @pytest.fixture(autouse=True)
 def no_short_calls(monkeypatch):
-    """Calls that repeat a size stay ordinary ones; test_bound_host.py has the others."""
+    """Let calls that repeat a size stay ordinary; test_bound_host.py tests the others."""
     monkeypatch.setattr(ShortCalls, "of", staticmethod(lambda pipeline: None))
 
 
@@ -52,7 +52,7 @@ def test_shared_memory_changes_no_bit(kind, two_ways):
 
 
 def test_launches_see_the_contents_of_their_time(two_ways):
-    """Copies keep their place among launches, and memory that is given up lives until these have ended."""
+    """Copies stay in order with launches, and released memory lives until these have ended."""
     device, numpy = two_ways[0], get_backend("numpy")
     size, int32 = (200_000,), np.dtype(np.int32)
     results = []
@@ -72,7 +72,7 @@ def test_launches_see_the_contents_of_their_time(two_ways):
 
 
 def test_shared_memory_that_cannot_be_allocated(two_ways):
-    """It is a MemoryError, without any other message."""
+    """The result is a MemoryError, without any other message."""
     from gpusense.backends.opencl.memory import SharedBuffer, driver_errors
 
     with pytest.raises(MemoryError, match="out of memory"), driver_errors():
@@ -93,7 +93,7 @@ def plainly(device, monkeypatch, call):
 def test_graphs_change_no_bit(kind, batching, monkeypatch):
     device, started = batching
     model = kind(GRID, SCANNER, backend=device)
-    # Sizes that come and go, other readings, and poses with huge headings, which are other code.
+    # Sizes that alternate, other readings, and poses with huge headings, which need other code.
     calls = [
         (seed, count, readings) for seed in range(4) for count, readings in ((COUNT, BEAMS), (50, BEAMS), (50, 20))
     ]
@@ -103,14 +103,14 @@ def test_graphs_change_no_bit(kind, batching, monkeypatch):
         expected = plainly(device, monkeypatch, lambda p=poses, z=ranges: model.log_likelihood(p, z))
         assert differing(model.log_likelihood(poses, ranges), expected) == 0
         if kind is gs.BeamModel:
-            # Code of calls that are kept shows as well.
+            # Code of stored calls counts as well.
             inside = np.full((50, 3), 3.0)
             assert "ORIGINS_OUTSIDE" in model._last.flags
             model.log_likelihood(inside, ranges)
             assert "ORIGINS_OUTSIDE" not in model._last.flags
     # Of each of three sizes the first calls are plain, and so are those of other code.
     assert len(started) >= 3
-    # A changed map updates the table or makes it anew.
+    # A changed map updates the table or rebuilds it.
     for place in ((5, 6), (30, 30)):
         model.update_map(np.full((2, 3), 100), place)
         anew = kind(model.grid, SCANNER, backend=device)
@@ -145,7 +145,7 @@ def test_graphs_with_arrays_on_the_device(kind, batching, monkeypatch):
 
 
 def test_scans_and_pieces_are_batched_in_their_order(batching, monkeypatch):
-    """Buffers serve one piece after the other, so that an order lost would show."""
+    """Pieces reuse buffers, so that a wrong order would change results."""
     device, started = batching
     monkeypatch.setattr(run, "CHUNK", 77)
     model = gs.LikelihoodFieldModel(GRID, SCANNER, backend=device)
@@ -162,7 +162,7 @@ def test_scans_and_pieces_are_batched_in_their_order(batching, monkeypatch):
 
 @pytest.mark.parametrize("kind", MODELS)
 def test_scans_that_share_launches_are_batched(kind, batching, monkeypatch):
-    """Calls of other scans, and of one scan with as many particles and readings, are not taken for one another."""
+    """Calls of several scans are not confused with calls of one scan with as many particles and readings."""
     device, started = batching
     model = kind(GRID, SCANNER, backend=device, temperature=0.5)
     poses = np.stack([cloud(1, 100), cloud(2, 100), cloud(3, 100)])
@@ -223,7 +223,7 @@ def test_arrays_that_are_too_large_are_copied_at_once(batching, monkeypatch):
 
 
 def test_a_call_that_fails_leaves_nothing_behind(batching, monkeypatch):
-    """The table that it made is whole, and its arrays are not written later."""
+    """Its table is whole, and its arrays are not written later."""
     device, _ = batching
     model = gs.BeamModel(GRID, SCANNER, backend=device)
     other = gs.BeamModel(GRID, SCANNER, backend=device)
@@ -273,7 +273,7 @@ def test_graphs_are_bounded_and_a_driver_without_them_is_used_plainly(batching, 
     for count in (300, 200, 100, 50):
         for _ in range(3):
             model.log_likelihood(cloud(count, count), scan(1))
-    # Two that are in use are not given up for others, which they would be given up for in turn.
+    # Two that are in use are not evicted for others, which would be evicted for them in turn.
     assert len(device._graphs._graphs) == 2 and len(device._graphs._seen) <= 2 and len(started) == 4
     monkeypatch.setattr(_warp_graphs, "_STALE", 2)
     for _ in range(4):
@@ -291,7 +291,7 @@ def test_graphs_are_bounded_and_a_driver_without_them_is_used_plainly(batching, 
 
 
 def test_an_error_forgets_no_memory_that_launches_still_need(batching, monkeypatch):
-    """Launches of the batch are started first."""
+    """Launches of the batch start first."""
     device, int32, seen = batching[0], np.dtype(np.int32), []
     space, end_batch = Workspace(device), device.end_batch
     monkeypatch.setattr(

@@ -1,4 +1,4 @@
-"""Sonar: cones of rays, and surfaces that return nothing beyond an angle of incidence, against plain rays."""
+"""Sonar against single rays: cones, and surfaces that return nothing beyond an angle of incidence."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def rays_alone(scanner: gs.Scanner) -> gs.Scanner:
 
 
 def brute_force(scanner: gs.Scanner, backend, poses: np.ndarray, **options) -> tuple[np.ndarray, np.ndarray]:
-    """Return ranges of the nearest rays that return, and their angles of incidence, from rays one by one."""
+    """Return the range of the nearest ray that returns, and its angle of incidence, from single rays."""
     model = gs.BeamModel(place()[0], rays_alone(scanner), backend=backend, **options)
     shape = (len(poses), *scanner.ray_bearings.shape)
     ranges = model.expected_ranges(poses).reshape(shape)
@@ -184,7 +184,7 @@ def test_nothing_is_nearer_than_the_nearest_obstacle():
     distance = distance_transform_edt(~grid.obstacles("free"))[row, col] * grid.resolution
     diagonal = grid.resolution * math.sqrt(2)
     assert (found >= distance[:, None] - diagonal).all()
-    # Rays all around find it, but for what slips between them.
+    # Rays in all directions find it, except where it fits between two rays.
     assert np.median(found[:, 0] - distance) < diagonal
 
 
@@ -204,7 +204,7 @@ def test_sensors_may_come_in_any_order():
 
 
 def test_a_mirror_in_a_corner_and_a_wall_aslant():
-    """A sonar that looks at a wall aslant hears nothing from it once the angle is critical."""
+    """A sonar hears nothing from a wall beyond the critical angle."""
     cells = np.zeros((200, 200), int)
     cells[150:153] = 100
     grid = gs.OccupancyGrid(cells, 0.05)

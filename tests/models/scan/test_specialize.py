@@ -1,4 +1,4 @@
-"""Omissions for a scene change no number."""
+"""Code that a scene leaves out changes no number."""
 
 from __future__ import annotations
 

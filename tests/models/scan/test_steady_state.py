@@ -17,7 +17,7 @@ BLOCKS = -(-BEAMS // BLOCK_TERMS)
 RNG = np.random.default_rng(12)
 GRID = gs.OccupancyGrid(np.where(RNG.random((60, 70)) < 0.04, 100, 0).astype(np.int8), 0.1)
 SCANNER = gs.Scanner(np.linspace(-3, 3, BEAMS), RANGE, mount=(0.1, 0.0, 0.2))
-# A box that the clouds of all calls lie in.
+# A box around the clouds of all calls.
 CORNERS = np.array([[0.5, 0.5, 0.0], [6.5, 5.5, 0.0], [0.5, 5.5, 0.0], [6.5, 0.5, 0.0]])
 
 WHATS = ("beam", "field", "smooth field", "caster")
@@ -33,7 +33,7 @@ def scan(seed: int) -> np.ndarray:
 
 
 class Watch:
-    """Counts a backend's allocations, compilations and copied bytes."""
+    """A counter of a backend's allocations, compilations and copied bytes."""
 
     def __init__(self, device, monkeypatch) -> None:
         kind = type(device)
@@ -69,7 +69,7 @@ class Watch:
         self._count_buffers(device, monkeypatch)
 
     def _count_buffers(self, device, monkeypatch) -> None:
-        """Count all requests for buffers of the driver."""
+        """Count all requests to the driver for buffers."""
         if device.info.backend == "opencl":
             from gpusense.backends.opencl import backend as _opencl
 
@@ -122,7 +122,7 @@ def call_of(what: str, device, precision: str):
     else:
         how = gs.LikelihoodFieldParameters(interpolation="bilinear" if what == "smooth field" else "nearest")
         model = gs.LikelihoodFieldModel(GRID, SCANNER, how, backend=device, precision=precision)
-        # On GPUs also how near to an edge an end point of each block of readings may be.
+        # On GPUs also the bound of rounding errors for each block of readings.
         counts = (2 * BEAMS, 2 * BEAMS, *([BLOCKS] if device.info.kind == "gpu" else []))
         copied = (lambda n: [24 * n, *scan_uploads(device, size, *counts)], lambda n: [size * n])
     # Calls that repeat a size stay ordinary ones.
@@ -145,7 +145,7 @@ def test_the_second_call(what, precision, path, as_gpu, monkeypatch):
     first = call(poses(COUNT, 1), scan(1))
     assert watch.allocated and watch.up
     more = [28] if order and what in ("beam", "caster") else []
-    # Fewer particles need no more of anything.
+    # Fewer particles need no additional resources.
     for count, seed in ((COUNT, 2), (COUNT, 3), (COUNT - 100, 4), (COUNT, 1)):
         watch.clear()
         found = call(poses(count, seed), scan(seed))
@@ -195,7 +195,7 @@ def test_several_scans_share_their_copies(what, gpu, as_gpu, monkeypatch):
     model = (gs.BeamModel if what == "beam" else gs.LikelihoodFieldModel)(GRID, SCANNER, backend=device)
 
     def call(count: int, seed: int) -> np.ndarray:
-        # Each scan has as many readings as another of any call, but another time.
+        # The scans of each call have the same numbers of readings, in another order.
         z = np.stack([scan(seed + s) for s in range(scans)])
         for s in range(scans):
             z[s, BEAMS - (seed + s) % scans :] = np.nan

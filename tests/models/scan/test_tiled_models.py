@@ -35,7 +35,7 @@ FIELD = {
 OPTIONS = [*itertools.product(("free", "occupied"), ("float32", "float64"), (True, False))]
 # Kernels are compiled for each set of flags.
 FEW = [("free", "float32", True), ("occupied", "float64", False)]
-# With every option; other tests hold tiles of the other kinds to the reference in float64.
+# Kinds with every option; other tests compare tiles of the other kinds with the reference in float64.
 APART = ("book", "hit", "bilinear")
 
 
@@ -60,7 +60,7 @@ Pretend = Callable[..., object]
 
 @pytest.fixture(params=[False, True], ids=["as given", "ordered"])
 def ordered(request, monkeypatch) -> bool:
-    """Return whether every cloud is put in an order."""
+    """Return whether every cloud is sorted."""
     if request.param:
         monkeypatch.setattr(tiles, "LEAST_ORDERED", (1, 1))
     return request.param
@@ -70,10 +70,14 @@ def code_of(model) -> frozenset[str]:
     return model._last.flags
 
 
-def same_as_one_by_one(make: Callable[[object], object], as_gpu: Pretend, poses: np.ndarray, z: np.ndarray) -> None:
+def same_as_one_by_one(
+    make: Callable[[object], object], as_gpu: Pretend, poses: np.ndarray, z: np.ndarray
+) -> frozenset[str]:
+    """Compare a model on a GPU with one on a processor; return the flags of the GPU's kernel."""
     model = make(as_gpu())
     found = model.log_likelihood(poses, z)
-    assert "PER_BEAM" not in code_of(model)
+    code = code_of(model)
+    assert "PER_BEAM" not in code
     together, parts = model.log_likelihood(poses, z, per_beam=True)
     assert differing(found, together) == 0
     device = as_gpu(False)
@@ -81,12 +85,34 @@ def same_as_one_by_one(make: Callable[[object], object], as_gpu: Pretend, poses:
     if device.info.lanes == 1:
         assert differing(parts, plain_parts) == 0
         assert differing(found, plain) == 0
-        return
+        return code
     # Functions of vectors may round otherwise.
     if model.compat is None:
         assert_near(parts, plain_parts.astype(np.float64), 2 * per_beam(plain_parts, model.precision))
         assert_near(found, plain.astype(np.float64), 2 * per_scan(plain_parts, model.precision))
     np.testing.assert_allclose(found, plain, rtol=1e-4, atol=1e-4)
+    return code
+
+
+# Parts of a beam model's tiles that the other tests leave to a sample: options, and the flags of the code.
+PARTS = [
+    (
+        dict(parameters=gs.BeamParameters(range_bias=0.02, sigma_growth=0.01), outside="occupied"),
+        {"BIAS", "GROWTH", "OUTSIDE_OCCUPIED"},
+    ),
+    (dict(parameters=gs.BeamParameters(0.8, 0.0, 0.1, 0.1, sigma_hit=0.01), caster="dda"), {"DDA", "STOPS"}),
+    (dict(compat="amcl"), {"CUBES"}),
+]
+
+
+@pytest.mark.parametrize(("options", "flags"), PARTS, ids=["offset", "dda", "cubes"])
+def test_parts_of_beam_models(options, flags, as_gpu):
+    grid, _, z = world()
+    scanner = gs.Scanner(np.linspace(-3, 3, BEAMS), RANGE)
+    code = same_as_one_by_one(
+        lambda device: gs.BeamModel(grid, scanner, backend=device, **options), as_gpu, poses_of("inside"), z
+    )
+    assert flags <= code
 
 
 @pytest.mark.sampled(0.25, without="warp:cpu")
@@ -107,7 +133,7 @@ def test_models(kind, ordered, as_gpu, backend):
             )  # fmt: skip
 
 
-@pytest.mark.sampled(0.25)
+@pytest.mark.sampled(0.17)
 @pytest.mark.parametrize("compat", ["amcl", "beluga"])
 @pytest.mark.parametrize("model", [gs.BeamModel, gs.LikelihoodFieldModel])
 def test_weights_of_other_programs(model, compat, ordered, as_gpu):
@@ -159,7 +185,7 @@ def test_any_number_of_particles(count, ordered, as_gpu):
 
 @pytest.mark.parametrize("chunk", ["CHUNK", "CHUNK_BYTES"])
 def test_in_pieces(chunk, ordered, as_gpu, monkeypatch):
-    """Each piece has a window, a place in the result and an order of its own."""
+    """Each piece has its own window, place in the result and order."""
     grid, scanner, z = world()
     poses = np.concatenate([poses_of("inside", 40), poses_of("all over", 77)])
     models = gs.BeamModel(grid, scanner, backend=as_gpu()), gs.LikelihoodFieldModel(grid, scanner, backend=as_gpu())
@@ -180,7 +206,7 @@ def test_in_pieces(chunk, ordered, as_gpu, monkeypatch):
 @pytest.mark.sampled(0.3)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_work_items_that_add_up_strands_change_nothing(precision, ordered, as_gpu, monkeypatch):
-    """Many particles, and few enough rays: alone, in scans of other lengths together, and with impossible readings."""
+    """Many particles and few rays: single scans, scans of several lengths, and scans with impossible readings."""
     grid, scanner, z = world()
     several = np.stack([poses_of("all over"), poses_of("inside"), poses_of("inside") + 0.1])
     scans = np.stack([z, np.where(np.arange(BEAMS) % 3 == 0, z, np.nan), np.full(BEAMS, np.nan)])
@@ -220,7 +246,7 @@ def test_batches(kind, ordered, as_gpu):
 
 
 def lattice(resolution: float, quarter_turns: bool) -> np.ndarray:
-    """Return poses on edges and corners of cells, whose end points lie on edges and corners too."""
+    """Return poses on edges and corners of cells, with end points on edges and corners."""
     at = np.arange(16, 80, 8) * resolution
     x, y = np.meshgrid(at, at)
     turns = np.arange(x.size) % 8 * (math.pi / 2 if quarter_turns else math.pi / 4)
@@ -283,7 +309,7 @@ def test_origins_at_the_border(as_gpu):
 
 
 def test_a_window_that_grows(as_gpu):
-    """Clouds far from each other, each of which sees a part of the map."""
+    """Clouds are far from each other, and each sees a part of the map."""
     cells = np.where(np.random.default_rng(6).random((400, 400)) < 0.01, 100, 0).astype(np.int8)
     grid, scanner = gs.OccupancyGrid(cells, 0.1), gs.Scanner(np.linspace(-3, 3, 21), 2.0)
     z = np.random.default_rng(9).uniform(0, 2, 21)

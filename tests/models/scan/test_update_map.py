@@ -1,4 +1,4 @@
-"""Maps that change: after ``update_map`` every result has the bits of a model made anew from the changed grid."""
+"""Maps that change: after ``update_map`` every result has the bits of a new model of the changed grid."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FIELDS = {
     "bilinear": {"max_distance": 0.72, "interpolation": "bilinear"},
     "uncapped": {"max_distance": 1e3},
 }
-# Contents of patches: nothing, much unknown, some obstacles, only obstacles.
+# Contents of patches: free, mostly unknown, some obstacles, only obstacles.
 KINDS = ([0], [-1, 0], [0] * 9 + [100], [100])
 
 
@@ -121,7 +121,7 @@ def test_the_field_follows(field, outside, precision, device):
 
 @pytest.mark.parametrize("outside", ["free", "occupied"])
 def test_every_cell_of_an_updated_field_is_that_of_a_new_one(outside, device):
-    """A cap of 7.2 cells: distances of 7 cells, just within reach of an edit, still count."""
+    """With a cap of 7.2 cells, distances of 7 cells count, just within reach of an edit."""
     rng, shape = np.random.default_rng(14), (90, 80)
     parameters = gs.LikelihoodFieldParameters(max_distance=0.72)
 
@@ -182,7 +182,7 @@ RANGES = np.linspace(0.3, 3.5, len(BEARINGS))
 
 
 def test_windows_of_the_map_follow(make, monkeypatch):
-    """Edits in, across and beyond the window, and a cloud that moves on and comes back."""
+    """Edit cells in, across and beyond the window, with a cloud that moves away and back."""
     monkeypatch.setattr(windows, "SMALLEST_CELLS", 1)
     rng = np.random.default_rng(6)
     shape = (400, 500)
@@ -274,7 +274,7 @@ def test_a_device_without_room_for_an_update_makes_the_table_anew(make, monkeypa
 
 
 def test_only_cells_that_can_change_are_computed_again(monkeypatch):
-    """An edit of 5 x 5 cells in 2000 x 2000: the bytes that reach the device."""
+    """Count the bytes that reach the device after an edit of 5 x 5 cells of 2000 x 2000."""
     grid = gs.OccupancyGrid(cells_of(np.random.default_rng(12), (2000, 2000)), RESOLUTION)
     device = get_backend("numpy")
     parameters, sizes = gs.LikelihoodFieldParameters(max_distance=0.72), []

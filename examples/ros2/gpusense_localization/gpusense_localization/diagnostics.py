@@ -13,7 +13,7 @@ def status_fields(name: str, level: int, message: str, values: Mapping[str, str]
     """Return the fields of diagnostic_msgs/DiagnosticStatus.
 
     Args:
-        name: What the status is of, behind "gpusense: ".
+        name: Subject of the status, after "gpusense: ".
         level: OK, WARN, ERROR or STALE.
         message: One line for people.
         values: Values by their names.

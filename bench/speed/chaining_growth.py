@@ -9,6 +9,9 @@ scans.
 "searched" counts the pairs of key scans that were matched to close loops, "links" the links of the pose graph,
 "launches" the launches of kernels. Each row has its own process; "memory" is the growth of its peak resident set during
 the chain, "processor" the time of all threads, "main" the time of the calling thread, both without compilation.
+
+The second table has the stages of the longest chain of each log. "device" is the time in calls of the backend, which
+copy, launch and wait; "host" is the remaining time of the stage, which no device shortens.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ import multiprocessing
 import resource
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +28,11 @@ import numpy as np
 
 import gpusense as gs
 from gpusense.backends import get_backend
+from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.proxy import Proxy
+from gpusense.chaining import chain as chains
+from gpusense.chaining import closing
+from gpusense.chaining.front import Front
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "accuracy"))
@@ -37,12 +45,23 @@ SCANS = 5000
 PASSES = {"intel": (0.25, 0.5, 1.0), "fr079": (0.25, 0.5, SCANS / 4791), "seattle": (1.0, 2.0, 4.0, 8.0)}
 # Noise of ranges [m], and relative noise of the odometry of a pass.
 NOISE, STRETCH = 0.01, 0.02
+# Functions of the stages.
+STAGES: tuple[tuple[str, Any, str], ...] = (
+    ("matches to the scan before", Front, "_follow"), ("bridges", Front, "_bridge"),
+    ("choice of key scans", Front, "_choose_keys"), ("matches to key scans", Front, "_match_locally"),
+    ("links", chains.Chainer, "_all_links"), ("places", closing, "overlaps"), ("drift", closing, "Drift"),
+    ("matches of places", closing.Loops, "_matched"), ("agreement", closing, "agreeing"),
+    ("solutions of closures", closing, "solve"), ("last solution", chains, "solve"),
+    ("covariances", chains, "pose_covariances"),
+)  # fmt: skip
 
 
-class Counter(Proxy):
-    """A backend that counts launches."""
+class Clock(Proxy):
+    """A backend that counts launches, and times its calls [s]."""
 
-    launches = 0
+    def __init__(self, backend: Backend) -> None:
+        super().__init__(backend)
+        self.launches, self.seconds = 0, 0.0
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Any:
         """See Backend.compile."""
@@ -50,9 +69,82 @@ class Counter(Proxy):
 
         def launch(*arguments: Any) -> None:
             self.launches += 1
-            launcher(*arguments)
+            self._timed(launcher, *arguments)
 
         return launch
+
+    def upload(self, array: np.ndarray, out: Buffer | None = None, *, wait: bool = True) -> Buffer:
+        """See Backend.upload."""
+        return self._timed(super().upload, array, out, wait=wait)
+
+    def download(self, buffer: Buffer, out: np.ndarray, *, wait: bool = True) -> np.ndarray:
+        """See Backend.download."""
+        return self._timed(super().download, buffer, out, wait=wait)
+
+    def synchronize(self) -> None:
+        """See Backend.synchronize."""
+        self._timed(super().synchronize)
+
+    def submit(self) -> None:
+        """See Backend.submit."""
+        self._timed(super().submit)
+
+    def end_batch(self) -> None:
+        """See Backend.end_batch."""
+        self._timed(super().end_batch)
+
+    def _timed(self, call: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+        begun = time.perf_counter()
+        try:
+            return call(*arguments, **named)
+        finally:
+            self.seconds += time.perf_counter() - begun
+
+
+class Stages:
+    """Times [s] and launches of the stages of a chain, without those of further stages within a stage."""
+
+    def __init__(self, device: Clock) -> None:
+        self.of: dict[str, np.ndarray] = {}
+        self._device, self._open, self._last = device, ["rest"], np.zeros(3)
+        for stage, owner, name in STAGES:
+            self._watch(stage, owner, name)
+
+    def begin(self) -> None:
+        """Forget all times so far."""
+        self._last, self.of = self._now(), {}
+
+    def end(self) -> list[dict[str, Any]]:
+        """Return a row of each stage."""
+        self._switch()
+        return [
+            {"stage": stage, "host_s": total - device, "device_s": device, "launches": int(launches)}
+            for stage, (total, device, launches) in self.of.items()
+        ]
+
+    def _now(self) -> np.ndarray:
+        return np.array([time.perf_counter(), self._device.seconds, self._device.launches])
+
+    def _switch(self) -> None:
+        """Add the time since the last change to the stage that is open."""
+        now = self._now()
+        self.of[self._open[-1]] = self.of.get(self._open[-1], np.zeros(3)) + now - self._last
+        self._last = now
+
+    def _watch(self, stage: str, owner: Any, name: str) -> None:
+        """Replace a function by one that is a stage."""
+        inner = getattr(owner, name)
+
+        def watched(*arguments: Any, **named: Any) -> Any:
+            self._switch()
+            self._open.append(stage)
+            try:
+                return inner(*arguments, **named)
+            finally:
+                self._switch()
+                self._open.pop()
+
+        setattr(owner, name, watched)
 
 
 def driven(data: Path, name: str, passes: float) -> tuple[np.ndarray, gs.Scanner, np.ndarray]:
@@ -78,13 +170,16 @@ def driven(data: Path, name: str, passes: float) -> tuple[np.ndarray, gs.Scanner
 def measured(data: Path, name: str, passes: float, backend: str) -> dict[str, Any]:
     """Return the figures of a chain."""
     ranges, scanner, odometry = driven(data, name, passes)
-    device = Counter(get_backend(backend))
+    device = Clock(get_backend(backend))
+    stages = Stages(device)
     gs.chain_scans(ranges[:40], scanner, odometry[:40], backend=device)
     device.launches = 0
+    stages.begin()
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     begun = time.perf_counter(), time.process_time(), time.thread_time()
     chain = gs.chain_scans(ranges, scanner, odometry, backend=device)
     ended = time.perf_counter(), time.process_time(), time.thread_time()
+    rows = stages.end()
     seconds, processor, main = (b - a for a, b in zip(begun, ended, strict=True))
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory) / 1024
     path = float(np.hypot(*np.diff(chain.poses[:, :2], axis=0).T).sum())
@@ -92,8 +187,23 @@ def measured(data: Path, name: str, passes: float, backend: str) -> dict[str, An
         "log": name, "passes": passes, "scans": len(ranges), "beams": scanner.count, "path_m": path,
         "key_scans": len(chain.keys), "searched": chain.searched, "links": len(chain.links),
         "closures": len(chain.closures), "launches": device.launches, "memory_mb": grown,
-        "processor_s": processor, "main_s": main, "seconds": seconds,
+        "processor_s": processor, "main_s": main, "seconds": seconds, "stages": rows,
     }  # fmt: skip
+
+
+def stages_table(rows: list[dict[str, Any]]) -> str:
+    """Return the table of the stages of the longest chain of each log."""
+    lines, longest = [], {row["log"]: row for row in rows}
+    for name, row in longest.items():
+        total = {"stage": "all"} | {
+            key: sum(stage[key] for stage in row["stages"]) for key in ("host_s", "device_s", "launches")
+        }
+        for stage in [*row["stages"], total]:
+            lines.append([
+                f"{name}, {row['scans']} scans", stage["stage"], f"{stage['host_s']:.2f}", f"{stage['device_s']:.2f}",
+                stage["launches"],
+            ])  # fmt: skip
+    return table(["log", "stage", "host s", "device s", "launches"], lines)
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -123,7 +233,8 @@ def main(argv: list[str] | None = None) -> None:
         ]
         for row in rows
     ]  # fmt: skip
-    publish(__file__, arguments, table(columns, lines), {"rows": rows})
+    text = table(columns, lines) + "\n\n" + stages_table(rows)
+    publish(__file__, arguments, text, {"rows": rows})
 
 
 if __name__ == "__main__":

@@ -69,7 +69,7 @@ def shared_odometry(
 def fitted_odometry(front: Front, links: Links, reported: Floats) -> OdometryMotion:
     """Return the noise of the odometry, fitted to the matches."""
     keys = np.array(front.keys)
-    poses = solve(front.poses, links).poses
+    poses = solve(front.poses, links, settle=True).poses
     whole = np.append(0, np.cumsum(front.lost > 0))[keys]
     return fitted_motion(reported[keys], poses[keys], np.diff(whole) == 0)
 

@@ -219,7 +219,7 @@ class Chainer:
             loops = self._loops[1]
             closures = loops.closures.renumbered(joint.keys)
             poses = _carried(poses, joint.keys, loops.solution.poses)
-        solution = solve(poses, Links.joined([links, closures]))
+        solution = solve(poses, Links.joined([links, closures]), settle=True)
         spread = INFLATION * pose_covariances(solution)
         found = solution.links.kind == CLOSURE
         moved = relative(joint.poses, solution.links.first[found], solution.links.second[found])

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense.chaining.graph import Solution, factored, normal_equations, pose_jacobians
+from gpusense.chaining.equations import factored
+from gpusense.chaining.graph import Solution, normal_equations, pose_jacobians
 from gpusense.chaining.links import CLOSURE, Links
 
 Floats = NDArray[np.float64]
@@ -106,7 +107,7 @@ def _reduced(matrix: Any, rows: Integers) -> Floats:
     others = np.setdiff1d(np.arange(matrix.shape[0]), rows)
     left: Floats = damped[rows][:, rows].toarray()
     if len(others):
-        side, factor = damped[others][:, rows].tocsc(), factored(matrix[others][:, others].tocsc(), DAMPING)
+        side, factor = damped[others][:, rows].tocsc(), factored(damped[others][:, others].tocsc())
         for begin in range(0, len(rows), _COLUMNS):
             part = slice(begin, begin + _COLUMNS)
             left[:, part] -= side.T @ factor.solve(side[:, part].toarray())

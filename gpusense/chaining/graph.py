@@ -4,6 +4,11 @@ The cost is the sum over links of c^2 log(1 + s / c^2), Cauchy's kernel of the s
 residual r in deviations (I is its information). Reweighted Gauss-Newton steps, damped as by Levenberg, minimise it; the
 normal equations are sparse and are factored by SuperLU. Poses are relative to a fixed pose. Information may be 0 in
 some directions of some or even all links: an undetermined direction keeps its initial value.
+
+A step changes the poses in the world. Where asked for, it changes these or the motions from pose to pose, whichever
+costs less: both are equal at first, but one is right for a loose pose among firm ones, the second one for a long chain
+that turns. Each pose then has damping of its own [1/m^2, 1/rad^2], so a few loose poses, which lie in curved valleys of
+the cost, do not hold up all others.
 """
 
 from __future__ import annotations
@@ -14,20 +19,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense.chaining.links import Links
-from gpusense.localization.pose_algebra import wrap_angle
+from gpusense.chaining.equations import Equations
+from gpusense.chaining.links import Links, chained
+from gpusense.localization.pose_algebra import compose_poses, pose_difference, wrap_angle
 
 Floats = NDArray[np.float64]
+Flags = NDArray[np.bool]
 
 # Scale of Cauchy's kernel [deviations of a link].
 KERNEL = 3.0
 # Most iterations, the step that ends them [m, rad], and the first, least and largest damping.
 _ITERATIONS, _SMALL = 50, 1e-6
 _DAMPING, _LEAST, _MOST = 1e-6, 1e-9, 1e6
-# Columns that are factored at once: fewer than SuperLU's default, since few columns of a pose graph are alike.
-_PANEL = 4
-# Information that damping multiplies, of 1 m and 1 rad.
-_UNIT = 1.0
+# After a step that is taken, damping falls by this factor, and where poses have damping of their own by the second one.
+_RELAXED, _RELAXED_APART = 10.0, 3.0
+# After a step that fails, damping rises at links whose cost rises by this share of the largest rise, after a second one
+# by its square, and after this many everywhere.
+_RISE, _FAILS = 0.1, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +55,9 @@ class Solution:
     iterations: int
 
 
-def solve(poses: Floats, links: Links, *, fixed: int = 0, kernel: float = KERNEL, least: float = 1e-7) -> Solution:
+def solve(
+    poses: Floats, links: Links, *, fixed: int = 0, kernel: float = KERNEL, least: float = 1e-7, settle: bool = False
+) -> Solution:
     """Return the poses near initial ones that agree best with links.
 
     Args:
@@ -56,58 +66,83 @@ def solve(poses: Floats, links: Links, *, fixed: int = 0, kernel: float = KERNEL
         fixed: Index of the pose that is kept.
         kernel: Scale of Cauchy's kernel [deviations]; infinity for plain least squares.
         least: Relative gain of the cost below which the iterations end.
+        settle: Whether steps may also change motions, and each pose has damping of its own: more work for each step,
+            for fewer steps.
     """
-    at, damping = np.array(poses, np.float64), _DAMPING
-    squared = links.squared_distances(at)
+    at, damping, fails = np.array(poses, np.float64), np.full(len(poses), _DAMPING), 0
+    residual = links.residuals(at)
+    squared = _squared(links, residual)
     cost, count = _cost(squared, kernel), 0
     if len(at) < 2 or not len(links):
         return Solution(at, replace(links, weight=_weights(squared, kernel)), cost, 0)
+    equations = Equations(len(at), links.first, links.second, fixed, ordered=True)
     while count < _ITERATIONS:
         count += 1
-        matrix, gradient = normal_equations(at, links, _weights(squared, kernel), fixed)
-        step = factored(matrix, damping).solve(-gradient)
-        trial = moved(at, step, fixed)
-        squared_there = links.squared_distances(trial)
-        cost_there = _cost(squared_there, kernel)
-        if not cost_there <= cost * (1 + 1e-12):
-            damping = min(10 * max(damping, 1e-4), _MOST)
-            if damping >= _MOST:
+        information = links.information * _weights(squared, kernel)[:, None, None]
+        matrix, gradient = equations.at(at, information, residual, damping[equations.rows])
+        step = np.insert(equations.step(matrix, gradient), fixed, 0.0, axis=0)
+        tried = [_moved(at, step)] + ([_moved_along(at, step, fixed)] if settle else [])
+        trials = [(trial, links.residuals(trial)) for trial in tried]
+        distances = [_squared(links, off) for _, off in trials]
+        costs = [_cost(there, kernel) for there in distances]
+        best = int(np.argmin(costs))
+        if not costs[best] <= cost * (1 + 1e-12):
+            fails += 1
+            rise = _costs(distances[best], kernel) - _costs(squared, kernel)
+            some = _raised(rise, links, len(at), fails if settle else _FAILS)
+            damping[some] = np.minimum(10 * np.maximum(damping[some], 1e-4), _MOST)
+            if damping.min() >= _MOST:
                 break
             continue
-        gain = cost - cost_there
-        at, squared, cost, damping = trial, squared_there, cost_there, max(damping / 10, _LEAST)
+        gain, fails = cost - costs[best], 0
+        (at, residual), squared, cost = trials[best], distances[best], costs[best]
+        damping = np.maximum(damping / (_RELAXED_APART if settle else _RELAXED), _LEAST)
         if np.abs(step).max() < _SMALL or gain <= least * cost:
             break
     return Solution(at, replace(links, weight=_weights(squared, kernel)), cost, count)
 
 
-def normal_equations(poses: Floats, links: Links, weight: Floats, fixed: int) -> tuple[Any, Floats]:
-    """Return the sparse matrix of the normal equations of the free poses, and the gradient."""
-    from scipy import sparse
+def _raised(rise: Floats, links: Links, count: int, fails: int) -> Flags:
+    """Return the poses (N,) whose damping rises after a step that failed.
 
-    one, two = pose_jacobians(poses, links.first, links.second)
+    These are the poses of the links whose cost rises most, and their neighbours; after further failures more of them.
+
+    Args:
+        rise: (L,) rises of the links' costs.
+        links: The links.
+        count: Number of poses.
+        fails: Number of steps that failed in a row.
+    """
+    near = np.full(count, fails >= _FAILS)
+    some = rise > _RISE**fails * rise.max()
+    for _ in range(2):
+        near[links.first[some]] = near[links.second[some]] = True
+        some = near[links.first] | near[links.second]
+    return near
+
+
+def _moved(poses: Floats, step: Floats) -> Floats:
+    """Return poses (N, 3) after a step (N, 3) in the world."""
+    result = poses + step
+    result[:, 2] = wrap_angle(result[:, 2])
+    return result
+
+
+def _moved_along(poses: Floats, step: Floats, fixed: int) -> Floats:
+    """Return poses (N, 3) whose motions from pose to pose change as a step (N, 3) in the world changes them at first.
+
+    The ends of a long chain turn about its beginning, on circles that a step in the world leaves.
+    """
+    before, after = pose_jacobians(poses, np.arange(len(poses) - 1), np.arange(1, len(poses)))
+    change = np.einsum("lij,lj->li", before, step[:-1]) + np.einsum("lij,lj->li", after, step[1:])
+    result = chained(poses[0], pose_difference(poses[:-1], poses[1:]) + change)
+    return compose_poses(poses[fixed], pose_difference(result[fixed], result)) if fixed else result
+
+
+def normal_equations(poses: Floats, links: Links, weight: Floats, fixed: int) -> tuple[Any, Floats]:
+    """Return the sparse matrix of the normal equations of the free poses, in their order, and the gradient."""
     information = links.information * weight[:, None, None]
-    residual = links.residuals(poses)
-    size = len(poses)
-    gradient = np.zeros((size, 3))
-    side = np.einsum("lij,lj->li", information, residual)
-    rows, cols, blocks = [], [], []
-    ends = ((links.first, one), (links.second, two))
-    for node, jacobian in ends:
-        np.add.at(gradient, node, np.einsum("lij,li->lj", jacobian, side))
-        for other, across in ends:
-            rows.append(node)
-            cols.append(other)
-            blocks.append(jacobian.transpose(0, 2, 1) @ information @ across)
-    row, col, block = (np.concatenate(part) for part in (rows, cols, blocks))
-    free = (row != fixed) & (col != fixed)
-    row, col, block = row[free], col[free], block[free]
-    row, col = row - (row > fixed), col - (col > fixed)
-    k = np.arange(3)
-    i = np.broadcast_to((3 * row)[:, None, None] + k[:, None], block.shape)
-    j = np.broadcast_to((3 * col)[:, None, None] + k, block.shape)
-    matrix = sparse.csc_matrix((block.ravel(), (i.ravel(), j.ravel())), shape=(3 * (size - 1), 3 * (size - 1)))
-    return matrix, np.delete(gradient, fixed, axis=0).ravel()
+    return Equations(len(poses), links.first, links.second, fixed).at(poses, information, links.residuals(poses))
 
 
 def pose_jacobians(poses: Floats, first: NDArray[np.int64], second: NDArray[np.int64]) -> tuple[Floats, Floats]:
@@ -121,24 +156,10 @@ def pose_jacobians(poses: Floats, first: NDArray[np.int64], second: NDArray[np.i
     return one_side, other_side
 
 
-def moved(poses: Floats, step: Floats, fixed: int) -> Floats:
-    """Return poses after a step (3 N - 3,) of the free ones."""
-    result = poses.copy()
-    free = np.arange(len(poses)) != fixed
-    result[free] += step.reshape(-1, 3)
-    result[:, 2] = wrap_angle(result[:, 2])
-    return result
-
-
-def factored(matrix: Any, damping: float) -> Any:
-    """Return the factors of a matrix with damping."""
-    from scipy.sparse import identity
-    from scipy.sparse.linalg import splu
-
-    # Symmetric and positive definite: a symmetric order without pivots.
-    damped = (matrix + damping * _UNIT * identity(matrix.shape[0], format="csc")).tocsc()
-    options = {"SymmetricMode": True}
-    return splu(damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, relax=1, panel_size=_PANEL, options=options)
+def _squared(links: Links, residual: Floats) -> Floats:
+    """Return (L,) squared distances of residuals in deviations."""
+    squared: Floats = np.maximum(np.einsum("li,lij,lj->l", residual, links.information, residual), 0.0)
+    return squared
 
 
 def _weights(squared: Floats, kernel: float) -> Floats:
@@ -147,6 +168,12 @@ def _weights(squared: Floats, kernel: float) -> Floats:
     return weights
 
 
+def _costs(squared: Floats, kernel: float) -> Floats:
+    """Return Cauchy's kernels (L,) of squared distances."""
+    costs: Floats = kernel**2 * np.log1p(squared / kernel**2) if np.isfinite(kernel) else squared
+    return costs
+
+
 def _cost(squared: Floats, kernel: float) -> float:
     """Return the sum of Cauchy's kernels."""
-    return float(np.sum(kernel**2 * np.log1p(squared / kernel**2) if np.isfinite(kernel) else squared))
+    return float(np.sum(_costs(squared, kernel)))

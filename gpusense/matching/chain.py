@@ -23,7 +23,8 @@ from gpusense.matching.verdicts import PairSums, concluded, tested
 DOUBTFUL, _SURE, _FAR, _FAR_TURN = 0.86, 0.97, 0.2, 0.1
 # Guesses farther from the result than this distance [capture radii] or turn [rad] are poor.
 _NEAR, _NEAR_TURN = 0.1, 0.05
-# Starts of a search that are refined, and their least distances [capture radii, rad].
+# Starts of a search that are refined, and their least distances [capture radii, rad]: the turn with which the published
+# accuracy of verdicts and of chains was measured.
 _REFINED, _APART, _APART_TURN = 6, 0.1, 0.11
 # Penalties of a score: per capture radius of distance from the guess, and for a last step that was not small.
 _FARTHER, _UNSETTLED = 0.03, 0.05
@@ -194,21 +195,32 @@ def distinct(poses: np.ndarray, score: np.ndarray, known: np.ndarray, capture: f
     Returns:
         (C,) numbers of rows, ascending, and (C, 3) poses.
     """
-    left, rows = score.copy(), np.arange(len(score))
+    # Only starts that may be refined, row by row; each choice drops those that are near it.
     least = score.max(axis=1) - _PROMISING
-    which, chosen, last = [], [], known
-    for _ in range(min(_REFINED, score.shape[1]) + 1):
-        offset = poses - last[:, None]
-        same = np.hypot(offset[..., 0], offset[..., 1]) < _APART * capture
-        left[same & (np.abs(wrapped(offset[..., 2])) < _APART_TURN)] = -np.inf
-        best = left.argmax(axis=1)
-        last = poses[rows, best]
-        good = np.flatnonzero(left[rows, best] > least)
-        which.append(good)
-        chosen.append(last[good])
-    numbers = np.concatenate(which[:-1])
+    row, start = np.nonzero(score > least[:, None])
+    left, pose, last = score[row, start], poses[row, start], known
+    which, chosen = [], []
+    for _ in range(min(_REFINED, score.shape[1])):
+        offset = pose - last[row]
+        same = np.hypot(offset[:, 0], offset[:, 1]) < _APART * capture
+        near = np.flatnonzero(same)
+        same[near] = np.abs(wrapped(offset[near, 2])) < _APART_TURN
+        row, left, pose = row[~same], left[~same], pose[~same]
+        if not len(row):
+            break
+        begins = np.flatnonzero(np.append(True, row[1:] != row[:-1]))
+        most = np.maximum.reduceat(left, begins)
+        group = np.cumsum(np.append(False, row[1:] != row[:-1]))
+        # The first of several equal ones.
+        best = np.flatnonzero(left == most[group])
+        best = best[np.append(True, np.diff(group[best]) != 0)]
+        which.append(row[best])
+        chosen.append(pose[best])
+        last = last.copy()
+        last[row[best]] = pose[best]
+    numbers = np.concatenate([*which, np.zeros(0, np.intp)])
     order = np.argsort(numbers, kind="stable")
-    return numbers[order], np.concatenate(chosen[:-1])[order]
+    return numbers[order], np.concatenate([*chosen, np.zeros((0, 3))])[order]
 
 
 def to_sensor(pose: np.ndarray, mount: tuple[float, float]) -> np.ndarray:

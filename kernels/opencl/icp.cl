@@ -6,7 +6,7 @@
 // score.
 kernel void match_scans(ARGUMENTS) {
 #if IN_TEAMS
-    local real shared[TEAM * MATCH_SUMS];
+    local real shared[TEAM * AT_ONCE];
     const int n = get_group_id(0);
     const Team team = {get_local_id(0), shared};
 #else

@@ -11,11 +11,13 @@
 // With IN_TEAMS the work-items of a group share the points of a match, each with the same pose and sums.
 #if IN_TEAMS
 #define TEAM 256
+// Numbers that are summed at once: in float64 they take 18 of the 32 KiB that every device shares at least.
+#define AT_ONCE 9
 #else
 #define TEAM 1
 #endif
 
-// A work-item's number in its team, and memory of the team for MATCH_SUMS numbers of each.
+// A work-item's number in its team, and memory of the team for AT_ONCE numbers of each.
 typedef struct {
     int member;
 #if IN_TEAMS
@@ -90,18 +92,21 @@ void close_blocks(real *squares, const real *open, const int levels, const int c
 void add_over_team(real *numbers, const int count, const Team team) {
 #if IN_TEAMS
     local real *mine = team.shared + team.member;
-    barrier(CLK_LOCAL_MEM_FENCE);
-    for (int i = 0; i < count; ++i) mine[TEAM * i] = numbers[i];
-    for (int apart = TEAM / 2; apart > 0; apart /= 2) {
+    for (int first = 0; first < count; first += AT_ONCE) {
+        const int some = min(count - first, AT_ONCE);
         barrier(CLK_LOCAL_MEM_FENCE);
-        if (team.member >= apart) continue;
-        // All loads come first, so that none waits for a store.
-        real part[MATCH_SUMS];
-        for (int i = 0; i < count; ++i) part[i] = mine[TEAM * i + apart];
-        for (int i = 0; i < count; ++i) mine[TEAM * i] = numbers[i] += part[i];
+        for (int i = 0; i < some; ++i) mine[TEAM * i] = numbers[first + i];
+        for (int apart = TEAM / 2; apart > 0; apart /= 2) {
+            barrier(CLK_LOCAL_MEM_FENCE);
+            if (team.member >= apart) continue;
+            // All loads come first, so that none waits for a store.
+            real part[AT_ONCE];
+            for (int i = 0; i < some; ++i) part[i] = mine[TEAM * i + apart];
+            for (int i = 0; i < some; ++i) mine[TEAM * i] = numbers[first + i] += part[i];
+        }
+        barrier(CLK_LOCAL_MEM_FENCE);
+        for (int i = 0; i < some; ++i) numbers[first + i] = team.shared[TEAM * i];
     }
-    barrier(CLK_LOCAL_MEM_FENCE);
-    for (int i = 0; i < count; ++i) numbers[i] = team.shared[TEAM * i];
 #endif
 }
 

@@ -18,6 +18,8 @@ MATCH_BLOCKS = 8
 # Work-items of a team. With IN_TEAMS the work-items of a group share the points of a match, each with the same pose and
 # sums.
 TEAM = 256
+# Numbers that are summed at once: in float64 they take 18 of the 32 KiB that every device shares at least.
+AT_ONCE = 9
 # Bodies of functions of a team. Work-items of processors share nothing: the first member takes all points.
 _COOPERATES = """
 #if defined(__CUDA_ARCH__)
@@ -28,21 +30,23 @@ return false;
 """
 _ADD_OVER_TEAM = """
 #if defined(__CUDA_ARCH__)
-__shared__ {real} shared[{sums} * {team}];
+__shared__ {real} shared[{some} * {team}];
 {real} *mine = shared + threadIdx.x;
 wp::vec_t<{sums}, {real}> total = numbers;
-__syncthreads();
-for (int i = 0; i < {sums}; ++i) mine[{team} * i] = numbers.c[i];
-for (int apart = {team} / 2; apart > 0; apart /= 2) {{
+for (int first = 0; first < {sums}; first += {some}) {{
     __syncthreads();
-    if (threadIdx.x >= apart) continue;
-    // All loads come first, so that none waits for a store.
-    {real} part[{sums}];
-    for (int i = 0; i < {sums}; ++i) part[i] = mine[{team} * i + apart];
-    for (int i = 0; i < {sums}; ++i) mine[{team} * i] = total.c[i] += part[i];
+    for (int i = 0; i < {some}; ++i) mine[{team} * i] = total.c[first + i];
+    for (int apart = {team} / 2; apart > 0; apart /= 2) {{
+        __syncthreads();
+        if (threadIdx.x >= apart) continue;
+        // All loads come first, so that none waits for a store.
+        {real} part[{some}];
+        for (int i = 0; i < {some}; ++i) part[i] = mine[{team} * i + apart];
+        for (int i = 0; i < {some}; ++i) mine[{team} * i] = total.c[first + i] += part[i];
+    }}
+    __syncthreads();
+    for (int i = 0; i < {some}; ++i) total.c[first + i] = shared[{team} * i];
 }}
-__syncthreads();
-for (int i = 0; i < {sums}; ++i) total.c[i] = shared[{team} * i];
 return total;
 #else
 return numbers;
@@ -177,7 +181,7 @@ def functions(flags):
 
     numbers = {
         "real": "double" if real == wp.float64 else "float", "sums": MATCH_SUMS, "blocks": 2 * MATCH_BLOCKS,
-        "levels": MATCH_BLOCKS, "team": TEAM,
+        "levels": MATCH_BLOCKS, "team": TEAM, "some": AT_ONCE,
     }  # fmt: skip
 
     # Return the sums of numbers over the team.

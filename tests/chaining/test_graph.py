@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from gpusense.chaining.drift import Drift
+from gpusense.chaining.equations import Equations
 from gpusense.chaining.graph import KERNEL, normal_equations, pose_jacobians, solve
 from gpusense.chaining.links import CLOSURE, MATCH, Links, chained
 from gpusense.chaining.selected import inverse_blocks, pose_covariances
-from gpusense.localization.pose_algebra import pose_difference, wrap_angle
+from gpusense.localization.pose_algebra import compose_poses, pose_difference, wrap_angle
 
 
 def scene(seed: int, count: int = 12, outlier: bool = False) -> tuple[np.ndarray, Links]:
@@ -93,6 +94,28 @@ def test_jacobians_are_those_of_differences() -> None:
             assert np.abs(analytic[:, :, k] - numeric).max() < 1e-7
 
 
+@pytest.mark.parametrize("fixed", [0, 5])
+def test_normal_equations_are_those_of_the_dense_jacobian(fixed: int) -> None:
+    start, links = scene(1)
+    # Two links between the same poses, and a pose without any.
+    start = np.concatenate([start, [(9.0, 8.0, 0.3)]])
+    links = Links.joined([links, links[3:5]])
+    one, two = pose_jacobians(start, links.first, links.second)
+    whole = np.zeros((len(links), 3, len(start), 3))
+    whole[np.arange(len(links)), :, links.first], whole[np.arange(len(links)), :, links.second] = one, two
+    whole = np.delete(whole, fixed, axis=2).reshape(len(links), 3, -1)
+    weight = np.linspace(0.2, 1.0, len(links))
+    side = np.einsum("lij,lik,l->ljk", whole, links.information, weight)
+    matrix, gradient = normal_equations(start, links, weight, fixed)
+    assert matrix.toarray() == pytest.approx(np.einsum("ljk,lkm->jm", side, whole), abs=1e-9)
+    assert gradient == pytest.approx(np.einsum("ljk,lk->j", side, links.residuals(start)), abs=1e-9)
+    ordered = Equations(len(start), links.first, links.second, fixed, ordered=True)
+    again, turned = ordered.at(start, links.information * weight[:, None, None], links.residuals(start), 0.5)
+    place = (3 * (ordered.rows - (ordered.rows > fixed))[:, None] + np.arange(3)).ravel()
+    assert again.toarray() == pytest.approx((matrix.toarray() + 0.5 * np.eye(len(place)))[np.ix_(place, place)])
+    assert turned == pytest.approx(gradient[place])
+
+
 def test_a_direction_that_no_link_observes_stays_where_it_was() -> None:
     information = np.diag([0.0, 100.0, 400.0])
     links = Links.of(MATCH, [0, 1], [1, 2], np.array([(5.0, 0.1, 0.0), (7.0, -0.1, 0.0)]), np.stack([information] * 2))
@@ -113,12 +136,31 @@ def test_a_graph_without_links_stays(poses: np.ndarray) -> None:
     assert pose_covariances(found).shape == (*poses.shape, 3)
 
 
-def test_the_cost_never_rises() -> None:
+@pytest.mark.parametrize("settle", [False, True])
+def test_the_cost_never_rises(settle: bool) -> None:
     for seed in range(5):
         start, links = scene(seed, outlier=True)
         squared = links.squared_distances(start)
         before = float(np.sum(KERNEL**2 * np.log1p(squared / KERNEL**2)))
-        assert solve(start, links).cost <= before
+        assert solve(start, links, settle=settle).cost <= before
+
+
+@pytest.mark.parametrize("fixed", [0, 40])
+def test_a_long_chain_that_turns_settles_in_a_few_steps(fixed: int) -> None:
+    # Firm links over one and two steps, whose headings disagree: the ends of the chain turn far.
+    rng, count = np.random.default_rng(2), 400
+    steps = np.tile([0.5, 0.0, 0.02], (count - 1, 1))
+    truth = chained(np.zeros(3), steps)
+    first = np.concatenate([np.arange(count - 1), np.arange(count - 2)])
+    second = np.concatenate([np.arange(1, count), np.arange(2, count)])
+    links = Links.of(MATCH, first, second, pose_difference(truth[first], truth[second]),
+                     np.tile(np.diag([1e4, 1e4, 1e5]), (len(first), 1, 1)))  # fmt: skip
+    start = chained(np.zeros(3), steps + rng.normal(0, 1, steps.shape) * (0.005, 0.005, 0.1))
+    start = compose_poses(truth[fixed], pose_difference(start[fixed], start))
+    plain, found = (solve(start, links, fixed=fixed, kernel=np.inf, settle=one) for one in (False, True))
+    assert plain.iterations == 50 and plain.cost > 100
+    assert found.iterations < 8
+    assert found.poses == pytest.approx(truth, abs=1e-6)
 
 
 @pytest.mark.parametrize("count", [2, 3, 40])

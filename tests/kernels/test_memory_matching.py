@@ -27,7 +27,7 @@ lanes = (before.lanes, 8, 16) if BACKEND.startswith("opencl") else (before.lanes
 
 
 def noted(kernel, flags):
-    launched.update({kernel, kernel + " IN_LANES"} if "IN_LANES" in flags else {kernel})
+    launched.update({kernel, *(f"{kernel} {flag}" for flag in ("IN_LANES", "IN_TEAMS") if flag in flags)})
     return compiled(kernel, flags)
 
 
@@ -69,6 +69,11 @@ for width in sorted(set(lanes)):
         agree(lambda one: gs.LikelihoodFieldModel(grid, scanner, field, backend=one).gradient(many, ranges[0])[part],
               rtol=1e-3, atol=1e-2)
     agree(lambda one: gs.match_map(grid, grid, guess=(0.0, 0.0, 0.05), window=(0.2, 0.2, 0.1), backend=one).pose)
+# In teams, which only GPUs ask for; guesses that differ, and scans of three points.
+both[0].info = dataclasses.replace(before, lanes=1, kind="gpu")
+few = np.where(np.arange(41) % 14, np.inf, ranges[2])
+agree(lambda one: gs.match_scan(ranges, second, scanner, 0.01 * poses, "icp", one).pose)
+agree(lambda one: gs.match_scan(few, second[2], scanner, np.zeros(3), "icp", one).score)
 both[0].info = before
 agree(lambda one: gs.match_scan(ranges[:1], second[2:], scanner, np.zeros((1, 3)), "auto", one).score, atol=0.05)
 agree(lambda one: gs.match_scan(grid, ranges, scanner, moved, "gauss_newton", one).pose, atol=0.01)
@@ -100,6 +105,7 @@ both[0].info = before
 tried = {**matching_kernels.KERNELS, **particle_kernels.KERNELS, "count_rays": map_kernels.KERNELS["count_rays"]}
 for name, row in tried.items():
     needed = {name, name + " IN_LANES"} if row.in_lanes and BACKEND.startswith("opencl") else {name}
+    needed |= {name + " IN_TEAMS"} if row.team > 1 else set()
     if needed - launched:
         sys.exit(f"never launched: {needed - launched}")
 print("wrong", wrong, "worst", worst)

@@ -5,6 +5,9 @@ Where a step is one recorded program, replays in a row show its time on the devi
 The scene is a generated building with the cloud of a tracked robot. One stage is the plain filter; the default is up to
 four stages, of which a step on a processor takes those that the cloud needs. Steps of three filters run in turns:
 without recovery and verdict, with the verdict of ``estimate``, and with recovery as well, which is the default.
+
+``--peers`` measures instead, in turns on one simulated run, the default filter with its estimate and those filters of
+nav2_amcl and Beluga that filters.py can compile. Their field has the same parameters, its densities multiplied.
 """
 
 from __future__ import annotations
@@ -19,14 +22,18 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import json
 
 import numpy as np
+from accuracy.compiled_peers import Follower, Weigher
 from common import command_line, make_parser
 from common import machine as described
+from speed.filters import PEERS, load
 
 import gpusense as gs
 from gpusense.evaluation.machine import machine, machine_line
 from gpusense.evaluation.worlds import building
 
 SIZES = ((2000, 60), (4000, 60), (100_000, 60))
+# Scans in which a filter still learns the temperature; they are not timed.
+SETTLING = 60
 
 
 def measure(backend: str, particles: int, beams: int, stages: int, steps: int) -> dict[str, object]:
@@ -88,6 +95,45 @@ def _in_a_row(pf: gs.ParticleFilter, steps: int, recordings: list[Any]) -> float
     return min(times)
 
 
+def measure_peers(backend: str, particles: int, beams: int, scans: int) -> list[dict[str, object]]:
+    """Return the median and least milliseconds of a step of each filter: motion, weights, resampling, and a pose."""
+    scanner = gs.Scanner.uniform(angle_min=-np.pi / 2, angle_increment=np.pi / (beams - 1), count=beams, range_max=20.0)
+    grid = building()
+    run = gs.worlds.simulate_run(grid, scanner, scans=SETTLING + scans, seed=1)
+    field = gs.LikelihoodFieldParameters(sigma_hit=0.1)
+    deviations, alpha = (0.1, 0.1, 0.05), (0.1,) * 4
+    pf = gs.ParticleFilter(gs.LikelihoodFieldModel(grid, scanner, field, backend=backend), particles=particles, seed=1)
+    pf.initialize(mean=run.poses[0], covariance=np.diag(deviations) ** 2)
+    followers = {}
+    for name, (_, package, _) in PEERS.items():
+        compiled, version, missing = load(name)
+        if compiled is None:
+            print(f"left out: {package}: {missing}", flush=True)
+            continue
+        numbers = (field.z_hit, 0.0, 0.0, field.z_rand, field.sigma_hit, 0.1, field.max_distance)
+        weigher = Weigher(compiled, grid, scanner, numbers, "field, prob")
+        followers[f"{version}, product, 1 thread"] = Follower(weigher, particles, run.poses[0], deviations, alpha, 1)
+    clocks: dict[str, list[tuple[float, float]]] = {name: [] for name in ("gpusense", *followers)}
+    for before, odometry, ranges in zip(run.odometry, run.odometry[1:], run.scans[1:], strict=False):
+        for name, kept in clocks.items():
+            begin, processor = time.perf_counter(), time.process_time()
+            if name == "gpusense":
+                pf.predict(before, odometry)
+                pf.correct(ranges)
+                pf.estimate()
+            else:
+                followers[name].step(odometry, ranges)
+            kept.append((time.perf_counter() - begin, time.process_time() - processor))
+    rows = []
+    for name, kept in clocks.items():
+        elapsed, used = (1000 * np.array(kept[SETTLING:])).T
+        rows.append(dict(
+            filter=name, backend=backend if name == "gpusense" else "", particles=particles, beams=beams,
+            median_ms=float(np.median(elapsed)), least_ms=float(elapsed.min()), processor_ms=float(np.median(used)),
+        ))  # fmt: skip
+    return rows
+
+
 def _text(value: Any) -> str:
     return "-" if value is None else f"{value:.3f}"
 
@@ -96,8 +142,21 @@ def main() -> None:
     parser = make_parser(__doc__, backend="auto")
     parser.add_argument("--steps", type=int, default=100, help="steps of 2000 particles; larger clouds take fewer")
     parser.add_argument("--size", type=int, nargs=2, action="append", metavar=("PARTICLES", "BEAMS"), help="repeatable")
+    parser.add_argument("--peers", action="store_true", help="compare with nav2_amcl's and Beluga's filters")
     args = parser.parse_args()
-    rows = []
+    rows: list[dict[str, object]] = []
+    if args.peers:
+        names = ("filter", "particles x beams", "median ms", "least ms", "of all cores, median ms")
+        print(f"| {' | '.join(names)} |\n|{' --- |' * len(names)}")
+        for particles, beams in args.size or ((500, 60), (2000, 60)):
+            for one in measure_peers(args.backend, particles, beams, args.steps):
+                rows.append(one)
+                print(
+                    f"| {one['filter']} | {particles} x {beams} | {one['median_ms']:.2f} | {one['least_ms']:.2f} | "
+                    f"{one['processor_ms']:.2f} |",
+                    flush=True,
+                )
+        return _write(args, rows)
     print(
         "| particles x beams | stages | median ms | least ms | verdict, more ms | and recovery, more ms | "
         "recorded ones in a row ms | with estimate | start |\n"
@@ -114,6 +173,11 @@ def main() -> None:
                 f"{one['start']} |",
                 flush=True,
             )
+    _write(args, rows)
+
+
+def _write(args: Any, rows: list[dict[str, object]]) -> None:
+    """Write the report."""
     print(f"\n{machine_line()}")
     if args.output is not None:
         stated = {"command": command_line("bench/speed/filter_step.py"), "commit": described(args.commit)["commit"]}

@@ -34,10 +34,7 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
     "weigh_particles": (set(),),
 }
 # By kernel: flags with which its body in lanes computes in float64 where real numbers are float32.
-_DOUBLE: dict[str, frozenset[str]] = {
-    "score_beams": frozenset({"EXACT_EXPONENT", "GROWTH"}),
-    "score_field": frozenset({"BILINEAR"}),
-}
+_DOUBLE: dict[str, frozenset[str]] = {"score_field": frozenset({"BILINEAR"})}
 
 
 def with_lanes_flag(

@@ -175,11 +175,7 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str |
         >>> gs.compat.from_nav2({"amcl": {"ros__parameters": {"update_min_d": 0.1}}}).update_min
         (0.1, 0.2)
     """
-    if isinstance(source, Mapping):
-        content, name = source, "source"
-    else:
-        file = checks.existing_file(checks.path("source", source))
-        content, name = read_mapping(file), str(file)
+    content, name = _content(source)
     found = parameters_of(content, name, node, (*_DEFAULTS, *nav2_start.NAMES))
     robot = _ROBOTS[
         checks.choice("robot_model_type", found.get("robot_model_type", _DEFAULTS["robot_model_type"]), tuple(_ROBOTS))
@@ -190,23 +186,16 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str |
     values = {key: _value(name, key, found.get(key, default), default) for key, default in _DEFAULTS.items()}
     model = checks.choice("laser_model_type", values["laser_model_type"], _MODELS)
     weights = _weights(model, values)
-    fitted = content.get("beam_model")
-    if model == "beam" and fitted is not None:
-        parameters: BeamParameters | LikelihoodFieldParameters = BeamParameters.from_dict(fitted)
-    else:
-        parameters = _normalized(weights)
-    least, most = (checks.integer(key, values[key], low=1) for key in ("min_particles", "max_particles"))
-    if least > most:
-        raise ValueError(f"min_particles: must be <= max_particles = {most}, got {least}")
+    fitted = content.get("beam_model") if model == "beam" else None
     near, far = values["laser_min_range"], values["laser_max_range"]
     return Nav2Options(
         model=cast(LaserModel, model),
         weights=weights,
-        parameters=parameters,
+        parameters=_normalized(weights) if fitted is None else BeamParameters.from_dict(fitted),
         alpha=cast(Any, tuple(checks.real(f"alpha{k}", values[f"alpha{k}"], low=0) for k in range(1, 6))),
         odometry=odometry,
         motion=cast(Any, robot),
-        particles=(least, most),
+        particles=_particles(values),
         pf_err=checks.real("pf_err", values["pf_err"], above=0),
         pf_z=checks.real("pf_z", values["pf_z"], above=0),
         resample_interval=checks.integer("resample_interval", values["resample_interval"], low=1),
@@ -228,6 +217,14 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str |
 def has_parameters(content: Mapping[Any, Any]) -> bool:
     """Return whether a file holds parameters by ROS nodes, or amcl's parameters without a node."""
     return any(key in content for key in _DEFAULTS) or any(True for _ in nodes_of(content))
+
+
+def _content(source: str | os.PathLike[str] | Mapping[str, Any]) -> tuple[Mapping[str, Any], str]:
+    """Return the mapping of a file or of a user, and its name in messages."""
+    if isinstance(source, Mapping):
+        return source, "source"
+    file = checks.existing_file(checks.path("source", source))
+    return read_mapping(file), str(file)
 
 
 def _value(name: str, key: str, value: object, default: object) -> Any:
@@ -256,6 +253,14 @@ def _odometry(content: Mapping[str, Any], name: str) -> OdometryMotion | None:
         return OdometryMotion.from_dict(content["odometry_motion"])
     except (TypeError, ValueError) as error:
         raise type(error)(f"{name}: odometry_motion: {error}") from None
+
+
+def _particles(values: Mapping[str, Any]) -> tuple[int, int]:
+    """Return the least and the largest number of particles."""
+    least, most = (checks.integer(key, values[key], low=1) for key in ("min_particles", "max_particles"))
+    if least > most:
+        raise ValueError(f"min_particles: must be <= max_particles = {most}, got {least}")
+    return least, most
 
 
 def _beam_skip(values: Mapping[str, Any]) -> float | None:

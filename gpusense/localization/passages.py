@@ -93,10 +93,11 @@ class Counts(NamedTuple):
 
 def counts_of(scans: Sequence[Passages]) -> Counts:
     """Return the counts of several scans."""
-    agree, through, short, nothing = (
-        sum(one.count(kind) for one in scans) for kind in (AGREES, THROUGH, SHORT, NOTHING)
-    )
-    return Counts(agree, sum(int(np.count_nonzero(one.close)) for one in scans), through, short, nothing)
+    of_kind, close = [0] * (VANISHED + 1), 0
+    for one in scans:
+        of_kind = [a + b for a, b in zip(of_kind, np.bincount(one.kind, minlength=len(of_kind)).tolist(), strict=True)]
+        close += int(np.count_nonzero(one.close))
+    return Counts(of_kind[AGREES], close, of_kind[THROUGH], of_kind[SHORT], of_kind[NOTHING])
 
 
 def passages(

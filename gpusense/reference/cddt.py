@@ -27,15 +27,7 @@ def cast_ray(
 ) -> np.ndarray:  # fmt: skip
     """Return the distance in cells to the first obstacle of the line, limit where none is nearer.
 
-    Args:
-        flags: Flags of the signature table.
-        map_table: The table above.
-        window: Size of the grid.
-        cell: (M, 2) integer column and row of each origin.
-        pose: (M, 4) fraction of the cell in x and y, cosine and sine of the heading.
-        ray: (M, 2) cosine and sine of each bearing.
-        limit: Longest distance in cells.
-        caster: Its angle bins of a full turn.
+    The arguments are those of ``dda.cast_ray``, with the table above and the angle bins of a full turn in ``caster``.
     """
     real = pose.dtype.type
     origin = cell.T.astype(np.int64)

@@ -18,15 +18,8 @@ def cast_ray(
 ) -> np.ndarray:  # fmt: skip
     """Return the distance in cells from the table, limit where no obstacle is nearer.
 
-    Args:
-        flags: Flags of the signature table.
-        map_table: (rows * cols * bins) ranges.
-        window: Size of the grid.
-        cell: (M, 2) integer column and row of each origin.
-        pose: (M, 4) fraction of the cell in x and y, cosine and sine of the heading.
-        ray: (M, 2) cosine and sine of each bearing.
-        limit: Longest distance in cells.
-        caster: Its angle bins of a full turn.
+    The arguments are those of ``dda.cast_ray``, with (rows * cols * bins) ranges as ``map_table`` and the angle bins of
+    a full turn in ``caster``.
     """
     r = make_ray(pose, ray)
     origin, k, t, ranges, active = start_casts(flags, r, cell, window, limit)

@@ -22,15 +22,8 @@ def cast_ray(
 ) -> np.ndarray:  # fmt: skip
     """Return the distance in cells to a point in an occupied cell, limit where none is nearer.
 
-    Args:
-        flags: Flags of the signature table.
-        map_table: Distances between cell centres, in cells.
-        window: Size of the grid.
-        cell: (M, 2) integer column and row of each origin.
-        pose: (M, 4) fraction of the cell in x and y, cosine and sine of the heading.
-        ray: (M, 2) cosine and sine of each bearing.
-        limit: Longest distance in cells.
-        caster: The difference between the distance and a step, and the least step [cells].
+    The arguments are those of ``dda.cast_ray``, with distances between cell centres [cells] as ``map_table``. The
+    caster has the difference between the distance and a step, and the least step [cells].
     """
     real = pose.dtype.type
     r = make_ray(pose, ray)

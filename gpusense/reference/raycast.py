@@ -36,15 +36,7 @@ def cast_ray(
 ) -> np.ndarray:  # fmt: skip
     """Return the distance in cells to the first occupied cell, limit where none is nearer.
 
-    Args:
-        flags: Flags of the signature table.
-        map_table: Padded planes of empty rectangles, flat.
-        window: Size of the grid.
-        cell: (M, 2) integer column and row of each origin.
-        pose: (M, 4) fraction of the cell in x and y, cosine and sine of the heading.
-        ray: (M, 2) cosine and sine of each bearing.
-        limit: Longest distance in cells.
-        caster: Not used.
+    The arguments are those of ``dda.cast_ray``, with padded planes of empty rectangles, flat, as ``map_table``.
     """
     r = make_ray(pose, ray)
     origin, k, t, ranges, active = start_casts(flags, r, cell, window, limit)

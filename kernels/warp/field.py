@@ -41,33 +41,6 @@ def make(name, flags):
     two_at = reader(vec2, 2)
     block_cells = wp.types.vector(length=BLOCK_TERMS, dtype=wp.int32)
 
-    # Return the cells of the end points of width readings from first on, as indices of the table. On processors the
-    # loop that rounds becomes vector code and takes a third of the time; with points read as vec2, or a maximum in
-    # place of a count, it would not.
-    @wp.func
-    def cells_of_block(
-        origin: wp.vec2i, sensor_pose: vec4, sensor_low: vec4, point: wp.array(dtype=vec2),
-        point_low: wp.array(dtype=vec2), first: wp.int32, width: wp.int32, window: types.Window, guard: real,
-    ):  # fmt: skip
-        cells = block_cells()
-        lowered = sensor_pose - vec4(HALF, HALF, ZERO, ZERO)
-        start_cell = table_origin(origin, window.cols)
-        sure = rounding_margin(guard)
-        doubtful = int(0)
-        i = int(0)
-        while i < width:
-            near, off = rounded_cell(lowered, point_at(point, first + i))
-            doubtful += int(off > sure)
-            cells[i] = table_cell(near, start_cell, window)
-            i += 1
-        if doubtful > 0:
-            i = int(0)
-            while i < width:
-                exact = end_point(sensor_pose, sensor_low, point[first + i], point_low[first + i], ZERO, guard)
-                cells[i] = field_cell(origin.x + exact.cell.x, origin.y + exact.cell.y, window)
-                i += 1
-        return cells
-
     # Return the sum of the readings from begin to end by rounded cells, again with more digits where an end point is
     # too near to an edge.
     @wp.func
@@ -152,12 +125,29 @@ def make(name, flags):
         # While loops show the compiler that indices are not negative; range would cost a tenth on processors.
         k = int(0)
         if ROUNDED_CELLS:
-            # First all cells of a block, then all look-ups.
+            # First all cells of a block, then all look-ups. On processors the first loop becomes vector code and takes
+            # a third of the time. It would not in a function, with points read as vec2, or a maximum in place of a
+            # count.
+            lowered = sensor_pose - vec4(HALF, HALF, ZERO, ZERO)
+            start_cell = table_origin(origin, window.cols)
+            sure = rounding_margin(guard)
+            cells = block_cells()
             while k < size:
+                first = begin + k
                 width = wp.min(size - k, BLOCK_TERMS)
-                cells = cells_of_block(
-                    origin, sensor_pose, sensor_low, point, point_low, begin + k, width, window, guard
-                )
+                doubtful = int(0)
+                i = int(0)
+                while i < width:
+                    near, off = rounded_cell(lowered, point_at(point, first + i))
+                    doubtful += int(off > sure)
+                    cells[i] = table_cell(near, start_cell, window)
+                    i += 1
+                if doubtful > 0:
+                    i = int(0)
+                    while i < width:
+                        exact = end_point(sensor_pose, sensor_low, point[first + i], point_low[first + i], ZERO, guard)
+                        cells[i] = field_cell(origin.x + exact.cell.x, origin.y + exact.cell.y, window)
+                        i += 1
                 block = ZERO
                 i = int(0)
                 while i < width:

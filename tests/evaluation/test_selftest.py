@@ -199,8 +199,11 @@ def test_all_backends_present_agree(capsys):
         assert (device.selection if device.available else device.reason) in out or device.kind == "simulator"
 
 
+# The command's own scenes are no reason for a warning.
+@pytest.mark.filterwarnings("error::gpusense.world.plausible.PlausibilityWarning")
 def test_json_lists_every_comparison(capsys):
-    code, out, _ = run(capsys, "--json", "--backend", "numpy")
+    code, out, err = run(capsys, "--json", "--backend", "numpy")
+    assert err == ""
     document = json.loads(out)
     assert code == 0
     assert document["passed"] is True

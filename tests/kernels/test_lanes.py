@@ -217,9 +217,8 @@ def test_only_scenes_that_have_such_kernels_get_them():
     for flag in ("FLOAT64", "EXACT_EXPONENT"):
         assert with_lanes_flag(wide.lanes, "field_gradient", {"LINEAR", flag}) == {"LINEAR", flag}
     assert with_lanes_flag(wide.lanes, "beam_tiles", {"LINEAR"}) == {"LINEAR"}
-    for kernel, flags in (("score_field", {"BILINEAR"}), ("score_beams", {"EXACT_EXPONENT", "GROWTH"})):
-        assert with_lanes_flag(wide.lanes, kernel, flags, float64=False) == flags
-        assert with_lanes_flag(wide.lanes, kernel, {"HIT"}, float64=False) == {"HIT", "IN_LANES"}
+    assert with_lanes_flag(wide.lanes, "score_field", {"BILINEAR"}, float64=False) == {"BILINEAR"}
+    assert with_lanes_flag(wide.lanes, "score_field", {"LOG_TABLE"}, float64=False) == {"LOG_TABLE", "IN_LANES"}
 
 
 def test_programs_in_lanes_begin_in_their_folder():

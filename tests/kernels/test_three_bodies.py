@@ -64,7 +64,6 @@ ON_PURPOSE = [
     Purpose("error_free", "floor_int", (OPENCL,), FLOOR),
     Purpose("error_free", "add_strands", KERNELS_ONLY, "the reference adds the terms of strand_sums"),
     Purpose("error_free", "where_pair strands_in block_sums strand_sums _sums", REFERENCE_ONLY, ARRAYS),
-    Purpose("field", "cells_of_block", (WARP,), "in Warp processors round the end points of a block first"),
     Purpose("field", "rounded_block", KERNELS_ONLY, QUICK),
     Purpose("field", "field_log", KERNELS_ONLY, "sum_terms of beam.py does it for both models"),
     Purpose("field_gradient", "add_slope", KERNELS_ONLY, "readings come one after another"),

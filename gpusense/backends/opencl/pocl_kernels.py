@@ -49,6 +49,16 @@ def _hash(key: str) -> str:
     return hashlib.sha256(key.encode()).hexdigest()[:24]
 
 
+def _has_kernel(file: Path, kernels: Sequence[str]) -> bool:
+    """Return whether bitcode has one of these kernels: another thread may have compiled a program meanwhile.
+
+    Raises:
+        OSError: The file cannot be read.
+    """
+    bitcode = file.read_bytes()
+    return any(name.encode() in bitcode for name in kernels)
+
+
 class PoclKernels:
     """The compiled kernels of this process.
 
@@ -94,11 +104,13 @@ class PoclKernels:
             if not file.is_file():
                 before = self._listed()
                 program = compiled()
-                written = self._listed() - before
+                # There is no folder where a program has loaded PoCL before, with a folder of its own.
+                written = (self.folder / name for name in self._listed() - before)
                 try:
-                    # There is none where a program has loaded PoCL before, with a folder of its own.
-                    os.rename(self.folder / written.pop(), file.parent)
-                except (KeyError, OSError):
+                    os.rename(
+                        next(folder for folder in written if _has_kernel(folder / _BITCODE, kernels)), file.parent
+                    )
+                except (StopIteration, OSError):
                     return program
             return loaded(file.read_bytes())
 

@@ -5,7 +5,7 @@ Every caster has a candidate with its default knobs; ``_VARIED`` lists the metho
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -122,46 +122,51 @@ def candidates(problems: Sequence[str], *, quick: bool = False) -> list[Candidat
         problems: Problems, out of ``PROBLEMS``.
         quick: Whether only a few values of each knob are listed.
     """
-    listed = []
+    listed = (*_of_casters(quick), *_of_models(quick))
+    return [candidate for candidate in listed if candidate.problem in problems]
+
+
+def _of_casters(quick: bool) -> Iterator[Candidate]:
+    """Yield the casters of all curves, alone and in the beam model."""
     for curve in CURVES:
         values: tuple[float | None, ...] = curve.values or (None,)
         few = tuple(curve.values[i] for i in curve.quick) if curve.values else values
         for value in few if quick else values:
-            caster = caster_of(curve, value)
+            caster, code = caster_of(curve, value), code_of(curve, value)
             rays = _table_rays(value) if curve.method == "lookup" and value else None
-            code = code_of(curve, value)
-            listed += [
-                Candidate(
-                    problem, curve.method, make(caster), curve.variant, curve.knob, value, exact=caster.exact,
-                    code=f"gs.{made}, caster={code})", whole=caster.whole, table_rays=rays,
-                )
-                for problem, make, made in (
-                    ("ranges", _ranges, "RayCaster(grid, range_max"), ("beam", _beam, "BeamModel(grid, scanner"),
-                )
+            for problem, make, made in (
+                ("ranges", _ranges, "RayCaster(grid, range_max"), ("beam", _beam, "BeamModel(grid, scanner"),
+            ):  # fmt: skip
                 # The problem "ranges" shows a caster's cost and error; the model is measured with a few values only.
-                if problem == "ranges" or value in few
-            ]  # fmt: skip
+                if problem == "ranges" or value in few:
+                    yield Candidate(
+                        problem, curve.method, make(caster), curve.variant, curve.knob, value, exact=caster.exact,
+                        code=f"gs.{made}, caster={code})", whole=caster.whole, table_rays=rays,
+                    )  # fmt: skip
+
+
+def _of_models(quick: bool) -> Iterator[Candidate]:
+    """Yield the field, and both models with fewer beams, with tables of the sensor, and with weights of peers."""
     exact = CASTERS["exact"]()
     beam, field_model = "gs.BeamModel(grid, scanner", "gs.LikelihoodFieldModel(grid, scanner"
-    listed.append(Candidate("field", "field", _field(), exact=True, code=f"{field_model})"))
+    yield Candidate("field", "field", _field(), exact=True, code=f"{field_model})")
     for share in SHARES[2:3] if quick else SHARES:
         for problem, method, make, model in (
             ("beam", "exact", _beam(exact, share), beam), ("field", "field", _field(share), field_model),
         ):  # fmt: skip
             code = f"{model}, beams=range(0, scanner.count, {share})), temperature {share} times"
-            listed.append(Candidate(problem, method, make, "fewer beams", "every", share, temperature=share, code=code))
+            yield Candidate(problem, method, make, "fewer beams", "every", share, temperature=share, code=code)
     for width in BIN_WIDTHS[2:3] if quick else BIN_WIDTHS:
         made = _beam(exact, sensor_table=width)
         code = f"{beam}, sensor_table={width})"
-        listed.append(Candidate("beam", "exact", made, "sensor table", "bin width", width, code=code))
+        yield Candidate("beam", "exact", made, "sensor table", "bin width", width, code=code)
     for name in COMPAT:
         if _reproduces(BeamModel, name):
             made, code = _beam(exact, compat=name), f'{beam}, compat="{name}")'
-            listed.append(Candidate("beam", f"compat {name}", made, code=code))
+            yield Candidate("beam", f"compat {name}", made, code=code)
         if _reproduces(LikelihoodFieldModel, name):
             made, code = _field(compat=name), f'{field_model}, compat="{name}")'
-            listed.append(Candidate("field", f"compat {name}", made, code=code))
-    return [candidate for candidate in listed if candidate.problem in problems]
+            yield Candidate("field", f"compat {name}", made, code=code)
 
 
 def caster_of(curve: Curve, value: float | None) -> Caster:

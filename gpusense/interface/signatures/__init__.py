@@ -11,12 +11,10 @@ from gpusense.interface.signatures import (
     feature_kernels,
     learning_kernels,
     map_kernels,
-    mapping_kernels,
     matching_kernels,
     particle_kernels,
     point_kernels,
     scan_kernels,
-    search_kernels,
 )
 from gpusense.interface.signatures.rows import LANES, Argument, Kernel, lanes_of
 
@@ -25,12 +23,10 @@ __all__ = ["KERNELS", "LANES", "Argument", "Kernel", "lanes_of"]
 # All kernels; each subject has a file in this folder.
 KERNELS: dict[str, Kernel] = {
     **map_kernels.KERNELS,
-    **mapping_kernels.KERNELS,
     **scan_kernels.KERNELS,
     **point_kernels.KERNELS,
     **learning_kernels.KERNELS,
     **matching_kernels.KERNELS,
-    **search_kernels.KERNELS,
     **feature_kernels.KERNELS,
     **particle_kernels.KERNELS,
 }

@@ -1,4 +1,4 @@
-"""Kernels that make tables of a map."""
+"""Kernels that make tables of a map, and build maps from scans."""
 
 from __future__ import annotations
 
@@ -55,5 +55,10 @@ KERNELS: dict[str, Kernel] = {
         "distance", "col row", "int squared [rows * cols]", "real density [cap + 1]",
         "out real table [begin + height * stride]", *_MAP, "int cap", "real beyond", "int from_col", "int from_row",
         "int width", "int height", "int begin", "int stride",
+    ),
+    "count_rays": kernel(
+        "ray_counts", "ray", "int2 start_cell [rays]", "int2 start_inside [rays]", "int2 end_cell [rays]",
+        "int2 end_inside [rays]", "int hit [rays]", "out int hits [rows * cols]", "out int misses [rows * cols]",
+        *_MAP, "int rays",
     ),
 }  # fmt: skip

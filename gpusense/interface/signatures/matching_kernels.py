@@ -1,4 +1,4 @@
-"""Kernels that match scans to scans and to maps."""
+"""Kernels that match scans to scans and to maps, by steps from a guess or by exhaustive search."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from gpusense.interface.signatures.rows import PLACED, WINDOW, Kernel, kernel
 
 # Points of all scans, sorted by bearing in each scan: x, y [m], bearing in [0, 2 pi), range [m].
 _POINTS = ("real4 point [points]", "int start [scans + 1]")
+_CELLS = "uchar table [scores.tables * (scores.rows + 2 * scores.margin) * (scores.cols + 2 * scores.margin)]"
+_CELL_POINTS = ("int2 point [points]", "int image [points]", "int first [items + 1]")
 
 KERNELS: dict[str, Kernel] = {
     "field_gradient": kernel(
@@ -25,5 +27,23 @@ KERNELS: dict[str, Kernel] = {
         "icp", "item", *_POINTS, "real4 line [points]", "int2 pair [pairs]", "real4 guess [pairs * starts]",
         f"out real result [{MATCH_RESULT} * pairs * starts]", "int scans", "int points", "int pairs", "int starts",
         "MatchRules rules", group=4, team=256,
+    ),
+    "pool_scores": kernel(
+        "search", "col line image", _CELLS,
+        "out uchar pooled [scores.tables * (scores.rows + 2 * scores.margin) * (scores.cols + 2 * scores.margin)]",
+        "ScoreTable scores", "int reach",
+    ),
+    "fold_scores": kernel(
+        "search", "col line image", _CELLS,
+        "out uchar out [folded.tables * (folded.rows + 2 * folded.margin) * (folded.cols + 2 * folded.margin)]",
+        "ScoreTable scores", "ScoreTable folded", "int period", "int beyond",
+    ),
+    "shift_scores": kernel(
+        "search", "col row item", _CELLS, *_CELL_POINTS, "out int score [items * height * width]", "ScoreTable scores",
+        "int items", "int height", "int width", in_lanes=True,
+    ),
+    "candidate_scores": kernel(
+        "search", "candidate", _CELLS, *_CELL_POINTS, "int candidate [3 * candidates]", "out int score [candidates]",
+        "ScoreTable scores", "int candidates",
     ),
 }  # fmt: skip

@@ -15,8 +15,8 @@ from gpusense.interface.plan import Omission
 from gpusense.models.landmark.base import JOINT_FEATURES, FeatureModel
 from gpusense.models.landmark.features import PreparedFeatures
 from gpusense.models.landmark.line_features import possible_lines, prepare_lines
-from gpusense.models.landmark.line_sampling import draw_lines
 from gpusense.models.landmark.plan import common_omissions
+from gpusense.models.landmark.sampling import draw_lines
 from gpusense.models.landmark.tables import uploaded
 from gpusense.models.point.sampling import draws_at
 from gpusense.world.frames import split

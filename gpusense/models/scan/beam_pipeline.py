@@ -126,8 +126,7 @@ class BeamPipeline(ScanPipeline):
             flags -= {"STOPS"}
         if tiled:
             return flags
-        info, flags = self.backend.info, flags | flags_if(PER_BEAM=per_beam)
-        return with_lanes_flag(info.lanes, "score_beams", flags, float64=info.float64)
+        return with_lanes_flag(self.backend.info.lanes, "score_beams", flags | flags_if(PER_BEAM=per_beam))
 
     def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
         if "STRANDED" in flags:

@@ -15,22 +15,33 @@ lanes ray_limit_lanes(const lanes z, global const real *terms, const RangeScale 
 #endif
 }
 
-// Return the terms of readings in the sum.
-lanes reading_term_lanes(const lanes z, const EchoLanes echo, global const real *terms, global const real *edges,
-                         global const real *sensor, const MixtureTables tables, const RangeScale scale) {
+// Return the components of the terms of readings in the sum; bin_at becomes where the terms of their bins begin.
+DensityParts reading_parts_lanes(const lanes z, const EchoLanes echo, global const real *terms, global const real *edges,
+                                 global const real *sensor, const MixtureTables tables, const RangeScale scale,
+                                 ilanes *bin_at) {
     const lanes expected = range_lanes(echo.t, scale);
-    ilanes bin_at = 0;
+    *bin_at = 0;
 #if INCIDENCE
     for (int bin = 0; bin + 1 < tables.incidence_bins; ++bin)
-        bin_at += echo.cosine <= edges[bin] ? (ilanes)MIXTURE_TERMS : (ilanes)0;
+        *bin_at += echo.cosine <= edges[bin] ? (ilanes)MIXTURE_TERMS : (ilanes)0;
 #endif
 #if SENSOR_TABLE
-    lanes term = tabulated_density_lanes(z, expected, sensor, tables, scale.range_max);
+    return (DensityParts){tabulated_density_lanes(z, expected, sensor, tables, scale.range_max), 0};
 #elif CUBES
-    const lanes p = compat_density_lanes(z, expected, terms);
-    lanes term = p * p * p;
+    return (DensityParts){compat_density_lanes(z, expected, terms), 0};
 #else
-    lanes term = log_density_lanes(z, expected, terms, bin_at);
+    return density_parts_lanes(z, expected, terms, *bin_at);
+#endif
+}
+
+// Return the terms of readings in the sum.
+lanes reading_term_lanes(const lanes z, const DensityParts parts, global const real *terms, const ilanes bin_at) {
+#if SENSOR_TABLE
+    lanes term = parts.hit;
+#elif CUBES
+    lanes term = parts.hit * parts.hit * parts.hit;
+#else
+    lanes term = log_of_parts_lanes(parts, terms, bin_at);
 #endif
 #if ALL_READINGS
 #if !SENSOR_TABLE
@@ -108,10 +119,14 @@ kernel void score_beams(ARGUMENTS) {
                                          caster);
 #endif
         }
+        DensityParts parts_of[VECTORS];
+        ilanes bin_at[VECTORS];
+        for (int k = from, v = 0; k < until; k += LANES, ++v)
+            parts_of[v] = reading_parts_lanes(load_some(reading + k, count - k), echo[v], terms, edges, sensor, tables,
+                                              scale, &bin_at[v]);
         for (int k = from, v = 0; k < until; k += LANES, ++v) {
             const int left = count - k;
-            const lanes z = load_some(reading + k, left);
-            lanes term = reading_term_lanes(z, echo[v], terms, edges, sensor, tables, scale);
+            lanes term = reading_term_lanes(load_some(reading + k, left), parts_of[v], terms, bin_at[v]);
             real values[LANES];
             if (left < LANES) {
                 store_lanes(term, 0, values);

@@ -33,6 +33,13 @@ LanePair two_product_lanes(const lanes a, const lanes b) {
     return (LanePair){product, ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low};
 }
 
+// Return c - a b, where c is a b rounded or nearly so.
+lanes rest_lanes(const lanes a, const lanes b, const lanes c) {
+    if (FUSES) return fma(-a, b, c);
+    const LanePair product = two_product_lanes(a, b);
+    return (c - product.hi) - product.lo;
+}
+
 // Add two numbers of two parts each, to about twice the working precision. Where the first parts cancel, their sum is
 // at least the last bit of either, so its exponent is at least that of the second parts.
 LanePair pair_sum_lanes(const LanePair a, const LanePair b) {
@@ -44,10 +51,4 @@ LanePair pair_sum_lanes(const LanePair a, const LanePair b) {
 LanePair pair_product_lanes(const LanePair a, const LanePair b) {
     const LanePair product = two_product_lanes(a.hi, b.hi);
     return ordered_sum_lanes(product.hi, product.lo + (a.hi * b.lo + a.lo * b.hi));
-}
-
-// Multiply a number of two parts by one of one part, as pair_product_lanes.
-LanePair pair_times_lanes(const LanePair a, const lanes b) {
-    const LanePair product = two_product_lanes(a.hi, b);
-    return ordered_sum_lanes(product.hi, product.lo + a.lo * b);
 }

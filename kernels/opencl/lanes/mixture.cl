@@ -31,97 +31,47 @@ lanes mean_range_lanes(const lanes expected, global const real *terms, const ila
 #endif
 }
 
-// Return sigma_hit / sigma at ranges, as sums of two numbers; where exponents are computed in float64, only the first.
+// Return sigma_hit / sigma at ranges: the first number times (1 + the second).
 LanePair hit_scale_lanes(const lanes expected, global const real *terms, const ilanes bin_at) {
 #if GROWTH
-#if FLOAT64
+    const lanes growth = TERM(12), sum = 1 + growth * expected, scale = 1 / sum;
 #if EXACT_EXPONENT
-    const LanePair growth = pair_times_lanes((LanePair){TERM(12), TERM(13)}, expected);
-    const LanePair x = pair_sum_lanes((LanePair){1, 0}, growth);
-    const lanes y = 1 / x.hi;
-    const LanePair back = two_product_lanes(y, x.hi);
-    return (LanePair){y, (((1 - back.hi) - back.lo) - y * x.lo) * y};
+    // By how much the sum is too large; below 2^24 the sum less 1 is exact.
+    const lanes excess = rest_lanes(growth, expected, sum - 1) - TERM(13) * expected;
+    return (LanePair){scale, rest_lanes(sum, scale, (lanes)1) + excess * scale};
+#else
+    return (LanePair){scale, 0};
 #endif
-#endif
-    return (LanePair){1 / (1 + TERM(12) * expected), 0};
 #else
     return (LanePair){1, 0};
 #endif
 }
 
-#if GROWTH
-#if EXACT_EXPONENT
-#if !FLOAT64
-// Half of the readings of a vector. Sums of two numbers of float32 take twice as many operations as float64.
-typedef double8 half_lanes;
-
-// Return sums of two numbers.
-half_lanes sum_of_parts(const float8 high, const float8 low) { return convert_double8(high) + convert_double8(low); }
-
-// Return (z - mean)^2 / (2 sigma^2) of half of the readings; scale is sigma_hit / sigma, rounded to float32.
-half_lanes half_exponent(const float8 z, const float8 expected, const float8 scale, const half_lanes bias,
-                         const half_lanes growth, const half_lanes factor, const double range_max) {
-    const half_lanes at = convert_double8(expected), rough = convert_double8(scale);
-#if BIAS
-    const half_lanes wanted = at + bias, raised = wanted < 0 ? (half_lanes)0 : wanted;
-    const half_lanes off = convert_double8(z) - (raised > range_max ? (half_lanes)range_max : raised);
-#else
-    const half_lanes off = convert_double8(z) - at;
-#endif
-    // A step of Newton's method for the reciprocal of 1 + growth z*.
-    const half_lanes scaled = off * (rough * (2 - (1 + growth * at) * rough));
-    return scaled * scaled * factor;
-}
-
-// Return (z - mean)^2 / (2 sigma^2) as sums of two numbers, computed in float64.
-LanePair exponent_of_halves(const lanes z, const lanes expected, const lanes scale, global const real *terms,
-                            const ilanes bin_at) {
-    const lanes bias = TERM(10), bias_low = TERM(11), growth = TERM(12), growth_low = TERM(13);
-    const lanes factor = TERM(1), factor_low = TERM(9);
-    const half_lanes first = half_exponent(z.lo, expected.lo, scale.lo, sum_of_parts(bias.lo, bias_low.lo),
-                                           sum_of_parts(growth.lo, growth_low.lo),
-                                           sum_of_parts(factor.lo, factor_low.lo), terms[6]);
-    const half_lanes second = half_exponent(z.hi, expected.hi, scale.hi, sum_of_parts(bias.hi, bias_low.hi),
-                                            sum_of_parts(growth.hi, growth_low.hi),
-                                            sum_of_parts(factor.hi, factor_low.hi), terms[6]);
-    const float8 high = convert_float8(first), other = convert_float8(second);
-    return (LanePair){(lanes)(high, other), (lanes)(convert_float8(first - convert_double8(high)),
-                                                    convert_float8(second - convert_double8(other)))};
-}
-#endif
-#endif
-#endif
-
 // Return (z - mean)^2 / (2 sigma^2) as sums of two numbers.
 LanePair normal_exponent_lanes(const lanes z, const lanes expected, const lanes mean, const ilanes clamped,
                                const LanePair scale, global const real *terms, const ilanes bin_at) {
-#if GROWTH
-#if EXACT_EXPONENT
-#if !FLOAT64
-    return exponent_of_halves(z, expected, scale.hi, terms, bin_at);
-#endif
-#endif
-#endif
     LanePair off = {z - expected, 0};
 #if BIAS
-    // z, z* and the bias nearly cancel.
-    const LanePair bias = {-TERM(10), -TERM(11)};
-    off = pair_sum_lanes(two_sum_lanes(z, -expected), bias);
+    // z, z* and the bias nearly cancel. Where z and z* nearly do, their difference is exact.
+    const LanePair shifted = two_sum_lanes(off.hi, -TERM(10));
+    off = ordered_sum_lanes(shifted.hi, shifted.lo - TERM(11));
     off.hi = clamped ? z - mean : off.hi;
     off.lo = clamped ? (lanes)0 : off.lo;
 #endif
 #if EXACT_EXPONENT
+#if GROWTH
+    const lanes scaled = off.hi * scale.hi;
+    off.lo = (off.lo * scale.hi + scaled * scale.lo) - rest_lanes(off.hi, scale.hi, scaled);
+    off.hi = scaled;
+#endif
     LanePair square = two_product_lanes(off.hi, off.hi);
 #if BIAS
     square.lo += 2 * off.hi * off.lo;
+#elif GROWTH
+    square.lo += 2 * off.hi * off.lo;
 #endif
     const LanePair product = two_product_lanes(square.hi, TERM(1));
-    const LanePair exponent = {product.hi, product.lo + (square.lo * TERM(1) + square.hi * TERM(9))};
-#if GROWTH
-    return pair_product_lanes(exponent, pair_product_lanes(scale, scale));
-#else
-    return exponent;
-#endif
+    return (LanePair){product.hi, product.lo + (square.lo * TERM(1) + square.hi * TERM(9))};
 #else
 #if GROWTH
     const lanes scaled = off.hi * scale.hi;
@@ -175,9 +125,14 @@ lanes short_length_lanes(const lanes expected, global const real *terms, const i
 }
 #endif
 
+// Densities of components, or their logarithms. A sum of densities is in the first number.
+typedef struct {
+    lanes hit, shorter;
+} DensityParts;
+
 #if LINEAR
-// Return log p(z | z*). p_rand > 0 bounds the sum from below, so components may underflow, and one logarithm suffices.
-lanes log_density_lanes(const lanes z, const lanes expected, global const real *terms, const ilanes bin_at) {
+// Return p(z | z*). p_rand > 0 bounds the sum from below, so components may underflow, and one logarithm suffices.
+DensityParts density_parts_lanes(const lanes z, const lanes expected, global const real *terms, const ilanes bin_at) {
     lanes p = TERM(5);
 #if HIT
     ilanes clamped;
@@ -202,12 +157,17 @@ lanes log_density_lanes(const lanes z, const lanes expected, global const real *
     const lanes shorter = TERM(3) * exp_lanes(-TERM(4) * z) / short_length_lanes(expected, terms, bin_at);
     p += ((z <= expected) & (expected > 0)) ? shorter : (lanes)0;
 #endif
-    return log_lanes(p);
+    return (DensityParts){p, 0};
+}
+
+// Return log p(z | z*).
+lanes log_of_parts_lanes(const DensityParts parts, global const real *terms, const ilanes bin_at) {
+    return log_lanes(parts.hit);
 }
 #else
-// Return log p(z | z*). Every component stays a logarithm; -inf only where the mixture is 0.
-lanes log_density_lanes(const lanes z, const lanes expected, global const real *terms, const ilanes bin_at) {
-    lanes largest = -INFINITY;
+// Return the logarithms of components of p(z | z*).
+DensityParts density_parts_lanes(const lanes z, const lanes expected, global const real *terms, const ilanes bin_at) {
+    DensityParts parts = {-INFINITY, -INFINITY};
 #if HIT
     ilanes clamped;
     int within;
@@ -222,13 +182,19 @@ lanes log_density_lanes(const lanes z, const lanes expected, global const real *
     const lanes mass = mass_within_lanes(mean, TERM(2), terms, bin_at, &within);
 #endif
     if (!within) hit = mass == 1 ? hit : hit - log_lanes(mass);
-    largest = hit;
+    parts.hit = hit;
 #endif
 #if SHORT
     const lanes decayed = (TERM(3) - log_lanes(short_length_lanes(expected, terms, bin_at))) - TERM(4) * z;
-    const lanes shorter = ((z <= expected) & (expected > 0)) ? decayed : (lanes)-INFINITY;
-    largest = larger_lanes(shorter, largest);
+    parts.shorter = ((z <= expected) & (expected > 0)) ? decayed : (lanes)-INFINITY;
 #endif
+    return parts;
+}
+
+// Return log p(z | z*). Every component stays a logarithm; -inf only where the mixture is 0.
+lanes log_of_parts_lanes(const DensityParts parts, global const real *terms, const ilanes bin_at) {
+    const lanes hit = parts.hit, shorter = parts.shorter;
+    lanes largest = larger_lanes(shorter, hit);
 #if RAND
     const lanes random = TERM(5);
     largest = larger_lanes(random, largest);

@@ -26,18 +26,19 @@ def test_only_the_first_process_compiles_a_program(kernels):
     first = kernels("first")
 
     def compiled():
-        folder = first.folder / "AB" / "CDE"
-        folder.mkdir(parents=True)
-        (folder / "program.bc").write_bytes(b"BC 1")
+        for name, kernel in (("AB", b"cast_2"), ("CD", b"score_1"), ("EF", b"cast_3")):
+            folder = first.folder / name / "folder"
+            folder.mkdir(parents=True)
+            (folder / "program.bc").write_bytes(b"BC " + kernel)
         return "of source"
 
-    assert first.built("key", ["score_1"], compiled, lambda bitcode: bitcode) == b"BC 1"
+    assert first.built("key", ["score_1"], compiled, lambda bitcode: bitcode) == b"BC score_1"
     # PoCL has compiled the kernel for groups of 8.
     (first.folder / "score_1" / "8-1-1").mkdir(parents=True)
     (first.folder / "score_1" / "8-1-1" / "score_1.so").write_bytes(b"code")
     first.save()
     second = kernels("second")
-    assert second.built("key", ["score_1"], pytest.fail, lambda bitcode: bitcode) == b"BC 1"
+    assert second.built("key", ["score_1"], pytest.fail, lambda bitcode: bitcode) == b"BC score_1"
     assert (second.folder / "score_1" / "8-1-1" / "score_1.so").read_bytes() == b"code"
 
 

@@ -124,31 +124,33 @@ def test_joint_association_is_exclusive_where_the_nearest_is_not(backend):
     assert nearest.tolist() == [[0, 0]] and joint.tolist() == [[0, 1]]
 
 
-@pytest.mark.sampled(1, without="warp:cpu")
-def test_negative_information_by_counting(backend):
+@pytest.mark.parametrize(("association", "precision"), [("nearest", "float32"), ("joint", "float64")])
+def test_negative_information_by_counting(association, precision, backend):
     rng = np.random.default_rng(2)
     landmarks, poses, features = forest(60, 40.0)
     p = gs.LandmarkParameters(field_of_view=2.5, range_max=9.0, p_detect=0.7, z_detect=0.9, z_false=0.1)
     features = check_features(features[np.abs(features[:, 1]) < 1.2][:, :2].clip(-1.2, 9), p, (0, 1))[:, :2]
     poses, mount = np.concatenate([poses, rng.uniform(-3, 3, (50, 3))]), (0.2, 0.1, 0.4)
-    for association in ("nearest", "joint"):
-        plain = gs.LandmarkModel(landmarks, p, backend=backend, association=association, mount=mount)
-        model = gs.LandmarkModel(landmarks, p, backend=backend, association=association, mount=mount, negative=True)
-        which = model.associate(poses, features)[0]
-        c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-        sensor = poses[:, :2] + np.stack([c * 0.2 - s * 0.1, s * 0.2 + c * 0.1], axis=1)
-        away = landmarks.xy - sensor[:, None]
-        angle = np.arctan2(away[..., 1], away[..., 0]) - poses[:, 2:] - 0.4
-        seen = (np.hypot(*np.moveaxis(away, 2, 0)) <= 9) & (np.abs((angle + np.pi) % (2 * np.pi) - np.pi) <= 1.25)
-        for n, own in enumerate(which):
-            seen[n, own[own >= 0]] = False
-        assert seen.sum(axis=1).max() > 3
-        expected = plain.log_likelihood(poses, features) + seen.sum(axis=1) * np.log(0.3)
-        np.testing.assert_allclose(model.log_likelihood(poses, features), expected, rtol=1e-5, atol=1e-5)
-    # Known landmarks, a sensor that misses nothing, and no features.
-    sure = gs.LandmarkModel(
-        gs.LandmarkMap([[3.0, 0.0], [0.0, 3.0]]), p.replace(p_detect=1.0), backend=backend, negative=True
-    )
+    options = dict(backend=backend, association=association, precision=precision, mount=mount)
+    plain = gs.LandmarkModel(landmarks, p, **options)
+    model = gs.LandmarkModel(landmarks, p, negative=True, **options)
+    which = model.associate(poses, features)[0]
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    sensor = poses[:, :2] + np.stack([c * 0.2 - s * 0.1, s * 0.2 + c * 0.1], axis=1)
+    away = landmarks.xy - sensor[:, None]
+    angle = np.arctan2(away[..., 1], away[..., 0]) - poses[:, 2:] - 0.4
+    seen = (np.hypot(*np.moveaxis(away, 2, 0)) <= 9) & (np.abs((angle + np.pi) % (2 * np.pi) - np.pi) <= 1.25)
+    for n, own in enumerate(which):
+        seen[n, own[own >= 0]] = False
+    assert seen.sum(axis=1).max() > 3
+    expected = plain.log_likelihood(poses, features) + seen.sum(axis=1) * np.log(0.3)
+    np.testing.assert_allclose(model.log_likelihood(poses, features), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_a_sensor_that_misses_nothing(backend):
+    """With known landmarks, and without features."""
+    p = gs.LandmarkParameters(field_of_view=2.5, range_max=9.0, p_detect=1.0, z_detect=0.9, z_false=0.1)
+    sure = gs.LandmarkModel(gs.LandmarkMap([[3.0, 0.0], [0.0, 3.0]]), p, backend=backend, negative=True)
     assert np.isfinite(sure.log_likelihood([[0, 0, 0.0]], [[3.0, 0.0]], [0])).all()
     assert np.isneginf(sure.log_likelihood([[0, 0, 0.0]], [[3.0, 0.0]], [1])).all()
     np.testing.assert_array_equal(sure.log_likelihood([[0, 0, 0.0], [0, 0, 3.0]], []), [-np.inf, 0])

@@ -203,7 +203,7 @@ def test_in_pieces(chunk, ordered, as_gpu, monkeypatch):
             assert differing(found, right) == 0
 
 
-@pytest.mark.sampled(0.3)
+@pytest.mark.sampled(0.15)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_work_items_that_add_up_strands_change_nothing(precision, ordered, as_gpu, monkeypatch):
     """Many particles and few rays: single scans, scans of several lengths, and scans with impossible readings."""

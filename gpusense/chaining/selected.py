@@ -185,13 +185,13 @@ def _eliminated(blocks: Any, order: Integers, tree: Tree, damping: float) -> tup
     waiting: list[list[tuple[Integers, Integers, Floats]]] = [[] for _ in tree.groups]
     for k, which in enumerate(tree.groups):
         size, below = int(tree.size[which[0]]), int(tree.below[which[0]])
-        front = np.zeros((len(which), size + below, 3, size + below, 3))
+        split = np.zeros((len(which), size + below, 3, size + below, 3))
         each = (start[1:] - start[:-1])[which]
         one = np.repeat(np.arange(len(which)), each)
         some = np.arange(len(one)) + np.repeat(start[which] - np.cumsum(each) + each, each)
         column = step[entry[some]] - tree.begin[which[one]]
-        front[one, at[some], :, column, :] = blocks.data[entry[some]].transpose(0, 2, 1)
-        front = front.reshape(len(which), 3 * (size + below), -1)
+        split[one, at[some], :, column, :] = blocks.data[entry[some]].transpose(0, 2, 1)
+        front = split.reshape(len(which), 3 * (size + below), -1)
         for number, rows, update in waiting[k]:
             np.add.at(front, (number[:, None, None], rows[:, :, None], rows[:, None, :]), update)
         waiting[k], size = [], 3 * size

@@ -111,7 +111,7 @@ def measure(backend: str, particles: int, beams: int, turns: int, tries: int, st
             q1, median, q3 = np.quantile(times[name], (0.25, 0.5, 0.75))
             values = (
                 time.strftime("%Y-%m-%d"), stated, f"{where}, {device.info.backend}", name, f"{median:.4g}",
-                f"{q1:.4g}", f"{q3:.4g}", f"{np.quantile(times['probe'], 0.25):.4g}", f"{error():.3g}", unit,
+                f"{q1:.4g}", f"{q3:.4g}", f"{statistics.median(times['probe']):.4g}", f"{error():.3g}", unit,
                 "yes" if median <= (1 + QUIET) * q1 else "no",
             )  # fmt: skip
             rows[name] = dict(zip(COLUMNS, values, strict=True))
@@ -188,13 +188,14 @@ def main() -> int:
     parser.add_argument("--limit", type=float, default=LIMIT, help="growth of a time (default: %(default)s)")
     parser.add_argument("--window", type=int, default=5, help="rows to compare with (default: %(default)s)")
     parser.add_argument("--turns", type=int, default=60, help="timed calls (default: %(default)s)")
+    parser.add_argument("--tries", type=int, default=4, help="most measurements of a call (default: %(default)s)")
     parser.add_argument("--size", type=int, nargs=2, default=(10_000, 60), metavar=("PARTICLES", "BEAMS"))
     arguments: argparse.Namespace = parse(parser)
     if not arguments.compare:
         stated = arguments.commit or commit() or ""
         if not stated or stated.endswith("+"):
             parser.error(f"--commit: the checkout must have no uncommitted changes, got {stated or 'no repository'}")
-        append(arguments.file, measure(arguments.backend, *arguments.size, arguments.turns, stated))
+        append(arguments.file, measure(arguments.backend, *arguments.size, arguments.turns, arguments.tries, stated))
     try:
         found = regressions(read(arguments.file), limit=arguments.limit, window=arguments.window)
     except ValueError as error:

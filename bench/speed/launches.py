@@ -94,11 +94,15 @@ def by_events(device: Any, launches: list[Callable[[], None]]) -> list[tuple[str
         return [(result.name, result.elapsed * 1e-3) for result in wp.timing_end(synchronize=True)]
     import pyopencl as cl
 
+    from gpusense.backends.opencl.pocl_kernels import source_name
+
     before, found = device._queue, []
     device._queue = cl.CommandQueue(device._context, properties=cl.command_queue_properties.PROFILING_ENABLE)
 
     def enqueue(kernel: Any, size: tuple[int, ...], group: tuple[int, ...]) -> None:
-        found.append((kernel.function_name, cl.enqueue_nd_range_kernel(device._queue, kernel, size, group)))
+        found.append(
+            (source_name(kernel.function_name), cl.enqueue_nd_range_kernel(device._queue, kernel, size, group))
+        )
 
     device.enqueue = enqueue
     try:

@@ -18,6 +18,7 @@ import functools
 import hashlib
 import logging
 import os
+import re
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -31,6 +32,8 @@ from gpusense.backends.scratch import scratch_folder
 # Files that PoCL reads again: programs, and kernels for a group size.
 _ENDINGS = (".bc", ".so")
 _BITCODE = "program.bc"
+# The end of an own name.
+_OWN = re.compile(r"_[0-9a-f]{24}$")
 
 _Program = TypeVar("_Program")
 
@@ -43,6 +46,11 @@ def own_name(kernel: str, key: str) -> str:
         key: Key of the program's entry.
     """
     return f"{kernel}_{_hash(key)}"
+
+
+def source_name(name: str) -> str:
+    """Return the name that a kernel has in its source."""
+    return _OWN.sub("", name)
 
 
 def _hash(key: str) -> str:

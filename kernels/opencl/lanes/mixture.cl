@@ -52,9 +52,9 @@ LanePair normal_exponent_lanes(const lanes z, const lanes expected, const lanes 
                                const LanePair scale, global const real *terms, const ilanes bin_at) {
     LanePair off = {z - expected, 0};
 #if BIAS
-    // z, z* and the bias nearly cancel. Where z and z* nearly do, their difference is exact.
-    const LanePair shifted = two_sum_lanes(off.hi, -TERM(10));
-    off = ordered_sum_lanes(shifted.hi, shifted.lo - TERM(11));
+    // z, z* and the bias nearly cancel.
+    const LanePair bias = {-TERM(10), -TERM(11)};
+    off = pair_sum_lanes(two_sum_lanes(z, -expected), bias);
     off.hi = clamped ? z - mean : off.hi;
     off.lo = clamped ? (lanes)0 : off.lo;
 #endif

@@ -58,7 +58,7 @@ def test_the_probe_counts_for_processors_alone(history: ModuleType) -> None:
 
 def test_rows_are_appended_and_compared(needs, tmp_path: Path) -> None:
     table = tmp_path / "history.csv"
-    words = ["--backend", needs("numpy"), "--size", "40", "8", "--turns", "3", "--file", str(table)]
+    words = ["--backend", needs("numpy"), "--size", "40", "8", "--turns", "3", "--tries", "1", "--file", str(table)]
 
     def run(*more: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run([sys.executable, str(SCRIPT), *words, *more], capture_output=True, text=True, check=False)

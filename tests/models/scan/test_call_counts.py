@@ -25,7 +25,6 @@ def calls_of(run: Callable[[], object]) -> int:
     Finalizers of other tests' objects do not count, since garbage collection is off.
     """
     called = []
-    gc.collect()
     gc.disable()
     sys.setprofile(lambda frame, event, argument: called.append(frame.f_code) if event == "call" else None)
     try:

@@ -184,6 +184,17 @@ return false;
 def fuses() -> bool: ...
 
 
+# Return whether the device is a GPU, which multiplies and adds at once.
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return true;
+#else
+return false;
+#endif
+""")
+def fuses_on_gpu() -> bool: ...
+
+
 @functools.cache
 def exact_fma(real):
     """Make a function of (a, b, c) that returns a b + c with one rounding; on some processors a slow call."""

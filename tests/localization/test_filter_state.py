@@ -26,7 +26,7 @@ def continued(pf, first=3, steps=4):
 
 
 def restored(pf, make):
-    """Return a new filter with the pickled state of another."""
+    """Return a new filter that restores the state of a filter ``pf`` from a pickle."""
     state = pickle.loads(pickle.dumps(pf.state()))
     made = make()
     made.restore(state)

@@ -1,4 +1,4 @@
-"""Copies and pickles of models hold the constructor's arguments: same bits, the current map, no device."""
+"""Copies and pickles of models keep the arguments and the current map, hold no device, and score alike."""
 
 from __future__ import annotations
 

@@ -110,7 +110,7 @@ def test_reference_mixture_on_a_dense_grid(weights, precision):
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_where_the_logarithm_cancels(precision):
-    """Where a log density near 0 is a difference of large terms, the bound is relative to these terms."""
+    """Bound the error of a log density near 0 relative to the large terms of which it is the difference."""
     real, rng = np.dtype(precision), np.random.default_rng(3)
     eps, grid = np.finfo(real).eps, gs.OccupancyGrid([[0]], 1.0)
     for _ in range(100):

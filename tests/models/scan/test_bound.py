@@ -46,7 +46,7 @@ def test_a_bound_call_has_the_bits_of_an_ordinary_one(case, batching):
 
 
 def test_bound_calls_that_add_up_strands(batching, monkeypatch):
-    """Where particles fill the device, work-items sum strands; the bits are the same."""
+    """Sum strands of beams where ``ENOUGH`` work-items fill the device: log p has the same bits."""
     poses, ranges = to_device(cloud(1)), to_device(mixed(1))
     found = []
     for enough in (1 << 21, 1):

@@ -51,7 +51,7 @@ def test_gradients_are_finite_differences(kind, origin):
 
 
 def test_information_is_the_curvature_at_a_perfect_fit():
-    """Compare ``information`` with second derivatives of log p where all distances are 0: Gauss-Newton is exact there."""
+    """Compare ``information`` with second derivatives of log p where all distances are 0: Gauss-Newton is exact."""
     cells = np.zeros((40, 40), int)
     cells[:, 30] = 100
     grid = gs.OccupancyGrid(cells, resolution=0.1)

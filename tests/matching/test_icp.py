@@ -53,9 +53,7 @@ def test_devices_agree_with_the_reference(device, precision, scanner, thin):
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize(("scanner", "thin"), [(RING, 0), (FRONT, 0), (FRONT, 1)], ids=["ring", "front", "thin"])
 @pytest.mark.parametrize(("limit", "team"), [(1024, 256), (255, 64), (63, 1)], ids=["large", "small", "none"])
-def test_a_team_of_work_items_agrees_with_the_reference(
-    device, monkeypatch, precision, scanner, thin, limit, team
-):
+def test_a_team_of_work_items_agrees_with_the_reference(device, monkeypatch, precision, scanner, thin, limit, team):
     """GPUs match in teams that their groups hold; here processors do."""
     monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu", lanes=1))
     monkeypatch.setattr(device, "largest_group", lambda kernel, flags: limit)

@@ -66,7 +66,7 @@ def test_scripts_of_reports_are_here(file: Path) -> None:
 
 
 def test_the_age_of_a_report_counts_commits_of_the_code(tmp_path: Path, report_ages: ModuleType) -> None:
-    """Sections and elements are reports of their own, other commits do not count, and an unknown commit is the oldest."""
+    """Sections and elements are reports of their own, other commits do not count, an unknown one is the oldest."""
 
     def git(*words: str) -> str:
         command = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b", *words]

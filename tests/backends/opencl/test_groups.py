@@ -11,7 +11,7 @@ import gpusense as gs
 
 @pytest.mark.parametrize("limit", [1, 24])
 def test_groups_shrink_to_the_limit_of_a_kernel(as_gpu, monkeypatch, limit):
-    """A kernel may need so many registers that a device holds few work-items of it; results are the same."""
+    """A kernel that needs many registers has smaller groups, with the same results."""
     import pyopencl as cl
 
     expected = gs.BeamModel(GRID, SCANNER, backend=as_gpu).log_likelihood(cloud(1, 100), scan(1))

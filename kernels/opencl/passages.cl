@@ -14,9 +14,16 @@
 #define BEAM_THROUGH 3
 #define BEAM_VANISHED 4
 
+// Return the floor of a coordinate; some drivers call floor as a function.
+int floor_of(const double position) {
+    const int whole = (int)position;
+    return whole - (whole > position);
+}
+
 // Return the value of a cell.
 int value_at(global const uchar *cells, const int col, const int row, const int rows, const int cols) {
-    return col < 0 || row < 0 || col >= cols || row >= rows ? OFF : cells[(long)row * cols + col];
+    // As unsigned numbers, negative indices exceed every limit.
+    return (uint)col < (uint)cols && (uint)row < (uint)rows ? cells[(long)row * cols + col] : OFF;
 }
 
 // Return whether a value is that of a wall.
@@ -32,7 +39,9 @@ double2 walk_ray(const double2 start, const double2 slope, const int steps, glob
     int col_before = 0, row_before = 0, value_before = OFF;
     for (int k = 0; k < steps; ++k) {
         const double distance = STEP * k;
-        const int col = (int)floor(slope.x * distance + start.x), row = (int)floor(slope.y * distance + start.y);
+        const int col = floor_of(slope.x * distance + start.x), row = floor_of(slope.y * distance + start.y);
+        // Nothing is new in the same cell.
+        if (col == col_before && row == row_before && k > 0) continue;
         const int value = value_at(cells, col, row, rows, cols);
         int stops = is_wall(value, occupied);
         if (col != col_before && row != row_before && value != OFF && value_before != OFF)

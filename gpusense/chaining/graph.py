@@ -56,8 +56,9 @@ class Solution:
 
 
 def solve(
-    poses: Floats, links: Links, *, fixed: int = 0, kernel: float = KERNEL, least: float = 1e-7, settle: bool = False
-) -> Solution:
+    poses: Floats, links: Links, *, fixed: int = 0, kernel: float = KERNEL, least: float = 1e-7, settle: bool = False,
+    equations: Equations | None = None,
+) -> Solution:  # fmt: skip
     """Return the poses near initial ones that agree best with links.
 
     Args:
@@ -68,6 +69,7 @@ def solve(
         least: Relative gain of the cost below which the iterations end.
         settle: Whether steps may also change motions, and each pose has damping of its own: more work for each step,
             for fewer steps.
+        equations: Ordered equations of these poses and links, if there are any from an earlier call.
     """
     at, damping, fails = np.array(poses, np.float64), np.full(len(poses), _DAMPING), 0
     residual = links.residuals(at)
@@ -75,11 +77,12 @@ def solve(
     cost, count = _cost(squared, kernel), 0
     if len(at) < 2 or not len(links):
         return Solution(at, replace(links, weight=_weights(squared, kernel)), cost, 0)
-    equations = Equations(len(at), links.first, links.second, fixed, ordered=True)
+    equations = equations or Equations(len(at), links.first, links.second, fixed, ordered=True)
     while count < _ITERATIONS:
         count += 1
         information = links.information * _weights(squared, kernel)[:, None, None]
-        matrix, gradient = equations.at(at, information, residual, damping[equations.rows])
+        pull = np.einsum("lij,lj->li", information, residual)
+        matrix, gradient = equations.at(at, information, pull, damping[equations.rows])
         step = np.insert(equations.step(matrix, gradient), fixed, 0.0, axis=0)
         tried = [_moved(at, step)] + ([_moved_along(at, step, fixed)] if settle else [])
         trials = [(trial, links.residuals(trial)) for trial in tried]
@@ -142,7 +145,8 @@ def _moved_along(poses: Floats, step: Floats, fixed: int) -> Floats:
 def normal_equations(poses: Floats, links: Links, weight: Floats, fixed: int) -> tuple[Any, Floats]:
     """Return the sparse matrix of the normal equations of the free poses, in their order, and the gradient."""
     information = links.information * weight[:, None, None]
-    return Equations(len(poses), links.first, links.second, fixed).at(poses, information, links.residuals(poses))
+    pull = np.einsum("lij,lj->li", information, links.residuals(poses))
+    return Equations(len(poses), links.first, links.second, fixed).at(poses, information, pull)
 
 
 def pose_jacobians(poses: Floats, first: NDArray[np.int64], second: NDArray[np.int64]) -> tuple[Floats, Floats]:

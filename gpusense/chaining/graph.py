@@ -33,9 +33,10 @@ _ITERATIONS, _SMALL = 50, 1e-6
 _DAMPING, _LEAST, _MOST = 1e-6, 1e-9, 1e6
 # After a step that is taken, damping falls by this factor, and where poses have damping of their own by the second one.
 _RELAXED, _RELAXED_APART = 10.0, 3.0
-# After a step that fails, damping rises at links whose cost rises by this share of the largest rise, after a second one
-# by its square, and after this many everywhere.
-_RISE, _FAILS = 0.1, 3
+# After a step that fails, damping rises from at least this value, and where poses have damping of their own from at
+# least the second one, at links whose cost rises by this share of the largest rise, after a second one by its square, and
+# after this many everywhere.
+_FAILED, _FAILED_APART, _RISE, _FAILS = 1e-4, 1e-2, 0.01, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +94,8 @@ def solve(
             fails += 1
             rise = _costs(distances[best], kernel) - _costs(squared, kernel)
             some = _raised(rise, links, len(at), fails if settle else _FAILS)
-            damping[some] = np.minimum(10 * np.maximum(damping[some], 1e-4), _MOST)
+            lowest = _FAILED_APART if settle else _FAILED
+            damping[some] = np.minimum(10 * np.maximum(damping[some], lowest), _MOST)
             if damping.min() >= _MOST:
                 break
             continue

@@ -29,6 +29,8 @@ _NEAR, _NEAR_TURN = 0.1, 0.05
 _REFINED, _APART, _APART_TURN = 6, 0.1, 0.11
 # Penalties of a score: per capture radius of distance from the guess, and for a last step that was not small.
 _FARTHER, _UNSETTLED = 0.03, 0.05
+# Most starts whose results are kept at once, unless a launch has more.
+_KEPT = 1 << 16
 # Starts that score lower than the best one by more than this are not refined.
 _PROMISING = 0.15
 # Lines turn with noise by this in the mean square [rad^2] where longer ones give the pose.
@@ -131,9 +133,10 @@ def _search(
     levels: Levels,
 ) -> None:
     """Search around the guesses of some pairs, and replace results by better ones."""
-    rules, parts, step = levels.search_rules(), [], device.pairs_of_launch(len(offsets))
+    rules, parts = levels.search_rules(), []
+    # The results of all starts of wide windows take much memory.
+    step = max(device.pairs_of_launch(len(offsets)), _KEPT // len(offsets))
     for _, some in device.of_levels(poor):
-        # The results of all starts of wide windows take much memory: as many pairs at a time as a launch has.
         for begin in range(0, len(some), step):
             part = some[begin : begin + step]
             coarse = device.run(poor[part], guess[part, None] + offsets, rules, columns=4)

@@ -34,8 +34,8 @@ _DAMPING, _LEAST, _MOST = 1e-6, 1e-9, 1e6
 # After a step that is taken, damping falls by this factor, and where poses have damping of their own by the second one.
 _RELAXED, _RELAXED_APART = 10.0, 3.0
 # After a step that fails, damping rises from at least this value, and where poses have damping of their own from at
-# least the second one, at links whose cost rises by this share of the largest rise, after a second one by its square, and
-# after this many everywhere.
+# least the second one. It rises at links whose cost rises by this share of the largest rise, after a second failure by
+# its square, and after this many everywhere.
 _FAILED, _FAILED_APART, _RISE, _FAILS = 1e-4, 1e-2, 0.01, 3
 
 

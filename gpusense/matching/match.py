@@ -28,6 +28,8 @@ from gpusense.world.scanner import Reading, Scanner, classes
 
 # Side of a map's cell in capture radii, and most cells along a side; larger scans have larger cells.
 _CELL, _MOST_CELLS = 0.05, 1500
+# Half widths of a search [m, rad].
+WINDOW = (1.2, 1.05)
 METHODS = ("auto", "icp", "gauss_newton", "correlative")
 
 Method = Literal["auto", "icp", "gauss_newton", "correlative"]
@@ -44,7 +46,7 @@ def match_scan(
     precision: Precision = "float32",
     noise: float | Literal["auto"] = "auto",
     capture: float = 1.0,
-    window: ArrayLike = (1.2, 1.05),
+    window: ArrayLike = WINDOW,
     temperature: float = 1.0,
     motion: ArrayLike | None = None,
     reference_motion: ArrayLike | None = None,
@@ -196,6 +198,29 @@ def _to_scans(
     pairs = np.stack([reference, np.arange(len(first), len(first) + len(second))], axis=1)
     match = match_pairs(device, real, points, pairs, poses, method, options, scanner.mount[:2], noise)
     return judged(match, poses, options)
+
+
+def match_readings(
+    first: np.ndarray, second: np.ndarray, scanner: Scanner, guess: np.ndarray, own: tuple[np.ndarray, np.ndarray],
+    backend: Backend, precision: Precision, window: ArrayLike,
+    motions: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
+) -> ScanMatch:  # fmt: skip
+    """Match S pairs of checked scans as ``match_scan`` does, with known noise of each scan.
+
+    Args:
+        first: (S, K) readings of the reference scans [m].
+        second: (S, K) readings of the second scans.
+        scanner: The scanner of both.
+        guess: (S, 3) poses of the second robot frames in the first ones [m, m, rad].
+        own: (S,) and (S,) noise of the reference scans and of the second scans from ``scan_noise`` [m].
+        backend: The device.
+        precision: Precision.
+        window: Half widths of the search [m, rad].
+        motions: (S, 3) and (S, 3) motions during the reference scans and the second scans, or None.
+    """
+    options, poses = check_options(ASSUMED_NOISE, 1.0, window), check_guess(guess, len(second))
+    noise = match_noise(*own)
+    return _to_scans(first, second, scanner, poses, "auto", backend, precision, options, motions, noise)
 
 
 def _still(ranges: np.ndarray, scanner: Scanner, motion: np.ndarray | None) -> np.ndarray:

@@ -30,8 +30,10 @@ DEFAULTS: dict[str, Any] = {"particles": None, "checked": 512, "beams": 360, "re
 QUICK: dict[str, Any] = {"particles": 128, "checked": 128, "beams": 60, "repeats": 10, "seed": 0}
 # Measuring time after which a quick run begins no further point, and its longest time to build a table [s].
 _QUICK_DEADLINE, _QUICK_BUILD = 40.0, 3.0
+# Longest time of a point's calls in a quick run, and of its launches alone [s].
+_QUICK_SECONDS = 0.02
 # Tables that take longer [s] are built once in a quick run; their times then include compiling.
-_QUICK_TWICE = 0.1
+_QUICK_TWICE = 0.03
 
 EPILOG = """\
 Every method with every value of its knob computes the same ranges and scores the same scan, for particles over the
@@ -53,7 +55,7 @@ The report ends with a recommendation for each device and problem: the fastest m
 lengths the shift of its mean, both at a comparable temperature; per cent are rays wrong by more than a cell, cells the
 range error that 95 % of the rays keep. Times are those of calls of --particles times --beams.
 
---quick builds a table that takes more than 0.1 s once, and its time to build then includes compiling; a look-up table
+--quick builds a table that takes more than 0.03 s once, and its time to build then includes compiling; a look-up table
 or CDDT serves both clouds of a scene.
 
 --compare OLD repeats the measurements of the old report, with its particles, beams and seed unless options change
@@ -94,8 +96,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--checked", type=whole_number(low=2), metavar="M", help="particles whose errors are computed (default: 512)")
     add("--beams", type=whole_number(low=1, high=100_000), metavar="K", help="beams of the scanner (default: 360)")
     add("--repeats", type=whole_number(low=1), metavar="R", help="timed calls per point (default: 20; with --quick 10)")
-    add("--seconds", type=positive_number, default=5.0, metavar="S",
-        help="longest time of a point's timed calls, at least three of them [s] (default: %(default)s)")  # fmt: skip
+    add(
+        "--seconds",
+        type=positive_number,
+        metavar="S",
+        help="longest time of a point's timed calls, at least three [s] (default: 5; with --quick 0.02)",
+    )
     add("--build-limit", type=positive_number, metavar="S",
         help="leave out tables that take longer to build [s] (default: 60)")  # fmt: skip
     add("--peers", type=Path, metavar="FILE", help="a Python file with outside candidates; it is executed")
@@ -216,7 +222,8 @@ def make_plan(args: argparse.Namespace, old: Mapping[str, Any] | None) -> tuple[
         sources(args.scene or _names(old, args), args.map, quick=quick), backends, chosen,
         args.precision or (PRECISIONS[:1] if quick else PRECISIONS),
         build_limit=args.build_limit or (_QUICK_BUILD if quick else 60.0),
-        seconds=args.seconds, deadline=_QUICK_DEADLINE if quick else float("inf"),
+        seconds=args.seconds or before.get("seconds") or (_QUICK_SECONDS if quick else 5.0),
+        deadline=_QUICK_DEADLINE if quick else float("inf"),
         slow_to_make=_QUICK_TWICE if quick else None, **numbers,
     )  # fmt: skip
     return plan, [*_absent_devices(args.backend), *failures, *absent]

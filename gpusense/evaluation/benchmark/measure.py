@@ -196,7 +196,7 @@ def measure(
         backend: The device; None for a candidate without a backend.
         poses: (N, 3) particles of a call.
         repeats: Most timed calls.
-        seconds: Longest time of the timed calls, of which there are at least three [s].
+        seconds: Longest time of the timed calls, of which there are at least three, and of the launches alone [s].
         slow_to_make: Duration of a first call above which no second runner is made [s]; None: ``SLOW_TO_MAKE``.
         earlier: A runner of another cloud, if there is one, is measured instead of a new one. Otherwise it receives a
             runner that took longer than ``slow_to_make``. None: every cloud has runners of its own.
@@ -218,7 +218,7 @@ def measure(
     quick = min(calls) <= LONG
     if meter is not None:
         on_device = {"device_bytes": meter.live, "peak_bytes": meter.peak}
-        on_device |= _apart(meter, runner, poses, repeats) if quick else {}
+        on_device |= _apart(meter, runner, poses, repeats, seconds) if quick else {}
         meter.launches.clear()
     table = getattr(runner, "table_bytes", None)
     compiling = None
@@ -296,7 +296,7 @@ def _seconds(run: Callable[[], object], used: list[float]) -> float:
     return time.perf_counter() - begin
 
 
-def _apart(meter: Meter, runner: Runner, poses: np.ndarray, repeats: int) -> dict[str, Any]:
+def _apart(meter: Meter, runner: Runner, poses: np.ndarray, repeats: int, seconds: float) -> dict[str, Any]:
     """Time the transfers of one call, and its launches alone with all arrays on the device."""
     meter.begin()
     runner.run(poses)
@@ -310,6 +310,6 @@ def _apart(meter: Meter, runner: Runner, poses: np.ndarray, repeats: int) -> dic
 
     times: dict[str, Any] = {"upload_s": meter.seconds["upload"], "download_s": meter.seconds["download"]}
     if launches:
-        each = series(launch, repeats, FEWEST, _LAUNCH_SECONDS[backend.info.kind])
+        each = series(launch, repeats, FEWEST, min(_LAUNCH_SECONDS[backend.info.kind], seconds))
         times |= {**quartiles("launch", each), "launches": len(each)}
     return times

@@ -108,6 +108,10 @@ class Backend(ABC):
     def compile(self, kernel: str, flags: frozenset[str]) -> Launcher:
         """Return a kernel by its name, specialised by flags; it is compiled once and cached."""
 
+    def largest_group(self, kernel: str, flags: frozenset[str]) -> int:
+        """Return the most work-items of a group of a compiled kernel that share memory; 1 where none do."""
+        return 1
+
     @abstractmethod
     def source(self, kernel: str, flags: frozenset[str]) -> str:
         """Return the text from which ``compile`` makes a kernel."""

@@ -44,6 +44,7 @@ class Proxy(Backend):
     upload, empty, download, part = map(_forwarded, ("upload", "empty", "download", "part"))
     empty_result, blank, copy, copies_from = map(_forwarded, ("empty_result", "blank", "copy", "copies_from"))
     compile, source, synchronize = map(_forwarded, ("compile", "source", "synchronize"))
+    largest_group = _forwarded("largest_group")
     begin_batch, submit, end_batch = map(_forwarded, ("begin_batch", "submit", "end_batch"))
     address, reads, adopt, view, lend = map(_forwarded, ("address", "reads", "adopt", "view", "lend"))
     check_process = _forwarded("check_process")

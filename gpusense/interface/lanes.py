@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from gpusense.interface.signatures import KERNELS
+from collections.abc import Callable
+
+from gpusense.interface.signatures import KERNELS, team_of
 
 # By kernel: flags with which it has no body in lanes, and sets of flags of which it requires at least one.
 _SCALAR = frozenset({"FLOAT64", "ALL_READINGS", "EXACT_EXPONENT", "CUBES"})
@@ -35,6 +37,8 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
 }
 # By kernel: flags with which its body in lanes computes in float64 where real numbers are float32.
 _DOUBLE: dict[str, frozenset[str]] = {"score_field": frozenset({"BILINEAR"})}
+# Flags of teams, the largest first.
+_TEAMS = (frozenset({"IN_TEAMS"}), frozenset({"IN_TEAMS", "SMALL_TEAMS"}))
 
 
 def with_lanes_flag(
@@ -56,6 +60,19 @@ def with_lanes_flag(
     return frozenset(flags) | {"IN_LANES"}
 
 
-def with_teams_flag(kind: str, kernel: str, flags: frozenset[str]) -> tuple[frozenset[str], int]:
-    """Return the flags of a launch, with IN_TEAMS on a GPU, and the work-items that share an item."""
-    return (flags | {"IN_TEAMS"}, KERNELS[kernel].team) if kind == "gpu" else (flags, 1)
+def with_teams_flags(
+    kind: str, kernel: str, flags: frozenset[str], largest_group: Callable[[str, frozenset[str]], int]
+) -> tuple[frozenset[str], int]:
+    """Return the flags of a launch, on a GPU those of the largest teams that it holds, and the work-items of an item.
+
+    Args:
+        kind: Kind of the device.
+        kernel: The kernel.
+        flags: Its other flags.
+        largest_group: ``Backend.largest_group`` of the device.
+    """
+    for more in _TEAMS if kind == "gpu" else ():
+        shared = flags | more
+        if (team := team_of(KERNELS[kernel], shared)) <= largest_group(kernel, shared):
+            return shared, team
+    return flags, 1

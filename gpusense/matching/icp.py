@@ -11,7 +11,7 @@ from gpusense.backends import Backend
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import MATCH_RESULT
 from gpusense.interface.flags import flags_if
-from gpusense.interface.lanes import with_lanes_flag, with_teams_flag
+from gpusense.interface.lanes import with_lanes_flag, with_teams_flags
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.structs import MatchRules
 from gpusense.matching.points import GAP, ScanPoints
@@ -132,7 +132,7 @@ class IcpPairs:
         buffer = space.empty("match result", result.size, self._real)
         info = self._backend.info
         flags = with_lanes_flag(info.lanes, "match_scans", self._flags)
-        flags, team = with_teams_flag(info.kind, "match_scans", flags)
+        flags, team = with_teams_flags(info.kind, "match_scans", flags, self._backend.largest_group)
         matching = launch(
             "match_scans", flags, (count * starts * team,), point=self._point, start=self._start, line=self._line,
             pair=space.upload("match pairs", self._pairs[pairs]), guess=space.upload("match guesses", padded),

@@ -29,13 +29,15 @@ def likely_poses(model: LikelihoodFieldModel, ranges: NDArray[np.float64], count
         count: Most poses.
 
     Returns:
-        (M, 3) poses, 0.5 m or 15 degrees apart; none for a scan without hits, or on a map without free cells.
+        (M, 3) poses, 0.5 m or 15 degrees apart; none for a scan without hits, on a map without free cells, or on one
+        whose cells are larger than the scan.
     """
     grid = model.grid
     stride = max(round(_RESOLUTION / grid.resolution), 1)
     allowed = grid.free[::stride, ::stride]
     points = end_points_of(model, ranges)[1]
-    if not len(points) or not allowed.any():
+    # Within a single cell no end point depends on the heading, and all free cells far from walls are alike.
+    if not len(points) or not allowed.any() or grid.resolution > np.hypot(*points.T).max():
         return np.empty((0, 3))
     turns = 4 * math.ceil(math.pi / 2 / _ANGLE)
     rows, columns = (-(-size // stride) for size in grid.shape)

@@ -56,7 +56,8 @@ class Search:
         Args:
             points: (K_s, 2) end points of each of S scans in the robot's frame [cells of the tables].
             grid: The poses.
-            slack: Largest difference from the best score of the scan. At most 262 144 poses are kept.
+            slack: Largest difference from the best score of the scan. At most 262 144 poses are kept; of equal ones,
+                the first by row, column and heading.
             level: Blocks of ``2^level`` x ``2^level`` positions are bounded first; 0 is brute force. None: all levels
                 of the tables.
             allowed: (height, width) bool: positions that may be found. None: all.
@@ -92,6 +93,8 @@ class _Run:
         self._least = floor
         self._floor = np.full(scans, floor, np.int64)
         self._complete = np.ones(scans, bool)
+        # Whether as many poses as are kept of a scan have the best score.
+        self._full = np.zeros(scans, bool)
         self._kept: list[tuple[np.ndarray, np.ndarray]] = []
         self._evaluated = 0
         self._allowed = None if allowed is None else _pooled_masks(allowed, level)
@@ -154,7 +157,7 @@ class _Run:
 
     def above(self, bounds: np.ndarray, floor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return (M, 3) candidates (item, row, col) with bounds of at least ``floor`` of their scan, and the bounds."""
-        least = np.maximum(np.repeat(floor, self._turns), 0).astype(np.int32)
+        least = np.maximum(np.repeat(floor, len(bounds) // len(floor)), 0).astype(np.int32)
         flat = np.flatnonzero(bounds >= least[:, None, None])
         item, rest = np.divmod(flat, bounds[0].size)
         row, col = np.divmod(rest, bounds.shape[2])
@@ -235,7 +238,16 @@ class _Run:
         """Keep the best of all poses of each scan."""
         self._best = scores.reshape(len(self._best), -1).max(axis=1, initial=-1).astype(np.int64)
         self._floor = np.maximum(np.where(self._best >= 0, self._best - self._slack, -1), self._least)
-        self.keep(*self.above(scores, self._floor))
+        # In the order of equal poses: where most poses score alike, a few rows have enough of them.
+        height, width = scores.shape[1:]
+        rows = max(_MOST_KEPT // (self._turns * width), 1)
+        for scan in range(len(self._best)):
+            part = scores[scan * self._turns : (scan + 1) * self._turns]
+            for row in range(0, height, rows):
+                candidates, score = self.above(part[:, row : row + rows], self._floor[scan : scan + 1])
+                self.keep(candidates + np.array([scan * self._turns, row, 0], np.int32), score)
+                if self._full[scan]:
+                    break
 
     def keep(self, candidates: np.ndarray, score: np.ndarray) -> None:
         """Keep poses that reach the floor; with too many of them, raise the floor."""
@@ -245,15 +257,24 @@ class _Run:
             self._compact()
 
     def _compact(self) -> None:
-        """Drop poses below the floor, and raise it for scans with too many poses."""
+        """Drop poses below the floor, raise it for scans with too many poses, and keep the first of equal poses."""
         candidates, score = (np.concatenate(parts) for parts in zip(*self._kept, strict=True))
         scan = candidates[:, 0] // self._turns
         share = max(_MOST_KEPT // len(self._best), 1)
         crowded = (_ranks(scan, score) == share) & (score >= self._floor[scan])
         np.maximum.at(self._floor, scan[crowded], np.minimum(score[crowded] + 1, self._best[scan[crowded]]))
         self._complete[scan[crowded]] = False
-        reached = score >= self._floor[scan]
+        self._full[scan[crowded]] = score[crowded] == self._best[scan[crowded]]
+        order = self._order(candidates, score)
+        candidates, score, scan = candidates[order], score[order], scan[order]
+        reached = (score >= self._floor[scan]) & (_ranks(scan, score) < share)
         self._kept = [(candidates[reached], score[reached])]
+
+    def _order(self, candidates: np.ndarray, score: np.ndarray) -> np.ndarray:
+        """Return the order of scans, falling scores, rows, columns and headings."""
+        scan, heading = np.divmod(candidates[:, 0], self._turns)
+        order: np.ndarray = np.lexsort((heading, candidates[:, 2], candidates[:, 1], -score, scan))
+        return order
 
     def found(self) -> Found:
         """Return the poses in falling order of score."""
@@ -261,9 +282,9 @@ class _Run:
         candidates, score = (np.concatenate(parts) for parts in zip(*self._kept, strict=True))
         reached = score >= self._floor[candidates[:, 0] // self._turns]
         candidates, score = candidates[reached], score[reached]
+        order = self._order(candidates, score)
         scan, heading = np.divmod(candidates[:, 0], self._turns)
         row, col = candidates[:, 1], candidates[:, 2]
-        order = np.lexsort((heading, col, row, -score, scan))
         return Found(
             scan[order], row[order], col[order], heading[order], score[order], self._evaluated, self._complete
         )  # fmt: skip

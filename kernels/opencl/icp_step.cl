@@ -10,7 +10,11 @@
 
 // With IN_TEAMS the work-items of a group share the points of a match, each with the same pose and sums.
 #if IN_TEAMS
+#if SMALL_TEAMS
+#define TEAM 64
+#else
 #define TEAM 256
+#endif
 // Numbers that are summed at once: in float64 they take 18 of the 32 KiB that every device shares at least.
 #define AT_ONCE 9
 #else

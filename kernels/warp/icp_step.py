@@ -15,9 +15,6 @@ from .prelude import precision
 MATCH_SUMS = 18
 # Blocks have 1, 2, 4 to 2^(MATCH_BLOCKS - 1) points.
 MATCH_BLOCKS = 8
-# Work-items of a team. With IN_TEAMS the work-items of a group share the points of a match, each with the same pose and
-# sums.
-TEAM = 256
 # Numbers that are summed at once: in float64 they take 18 of the 32 KiB that every device shares at least.
 AT_ONCE = 9
 # Bodies of functions of a team. Work-items of processors share nothing: the first member takes all points.
@@ -77,6 +74,10 @@ def functions(flags):
     types = precision(flags)
     real, vec2, vec4 = types.real, types.vec2, types.vec4
     IN_TEAMS = "IN_TEAMS" in flags
+    # With IN_TEAMS the work-items of a group share the points of a match, each with the same pose and sums.
+    TEAM = 1
+    if IN_TEAMS:
+        TEAM = 64 if "SMALL_TEAMS" in flags else 256
     Sums = wp.types.vector(length=MATCH_SUMS, dtype=real)
     # Squares, and sums of blocks that wait for the second half of their pair.
     Blocks = wp.types.vector(length=2 * MATCH_BLOCKS, dtype=real)

@@ -1,4 +1,4 @@
-"""Readings that a model draws have the density by which it scores them: ranks in posteriors are uniform."""
+"""Readings drawn from a model follow the density that scores them: ranks in posteriors are uniform."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_every_model_of_a_density_has_a_scene():
 
 
 def test_poses_of_a_narrow_view_see_all_landmarks():
-    # Otherwise the absence of a feature would be information as well.
+    # Otherwise a feature's absence would also be information.
     scene = make_scene("landmarks, narrow view")
     model = scene.draw.__closure__[0].cell_contents
     at = gs.compose_poses(scene.poses, model.mount)

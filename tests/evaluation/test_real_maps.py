@@ -70,7 +70,7 @@ def gigantic(data_dir):
     return gs.read_map(data_dir / GIGANTIC)
 
 
-def test_no_map_is_forgotten(data_dir):
+def test_every_recorded_map_is_listed(data_dir):
     found = {p.relative_to(data_dir).as_posix() for p in data_dir.rglob("*.yaml") if p.name != "metadata.yaml"}
     assert found == {*SMALL, GIGANTIC}
 
@@ -147,13 +147,13 @@ def test_yaw_of_a_map_turns_its_poses(data_dir):
     ])  # fmt: skip
     ranges = [gs.RayCaster(g, 20.0, backend="numpy", precision="float64").cast(p, bearings)
               for g, p in ((plain, poses), (grid, turned))]  # fmt: skip
-    # Rounding moves rays by some 1e-14, which matters to one that grazes a corner.
+    # Rounding moves rays by some 1e-14, which changes the range of a ray that grazes a corner.
     assert np.quantile(np.abs(ranges[0] - ranges[1]), 0.999) < 1e-9
 
 
 @pytest.mark.slow
 def test_distance_transform_of_120_million_cells(gigantic, opencl):
-    """Distances at 100 000 places of the map and at its corners are those of a search; memory allows no more places."""
+    """Compare distances at the corners and other places, 100 000 as memory allows, with a nearest-neighbour search."""
     obstacles = gigantic.obstacles()
     found = gs.distance_transform(obstacles, squared=True, backend=opencl)
     rows, cols = obstacles.shape
@@ -169,7 +169,7 @@ def test_distance_transform_of_120_million_cells(gigantic, opencl):
 
 @pytest.mark.slow
 def test_models_on_120_million_cells(gigantic, opencl):
-    """Particles are all over the map, so that no part is left out: compare log-likelihoods with the float64 truth."""
+    """Compare log-likelihoods of particles all over the map with the float64 truth."""
     scanner = gs.Scanner.uniform(angle_min=-2.0, angle_increment=0.08, count=51, range_max=30.0)
     random = np.random.default_rng(9)
     poses = cloud_uniform(gigantic, 300, random)

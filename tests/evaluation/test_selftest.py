@@ -115,7 +115,7 @@ def scene():
     return selftest.built_in_scene()
 
 
-def test_scene_has_what_is_awkward(scene):
+def test_scene_has_the_hard_cases(scene):
     kinds = gs.classify(scene.ranges, scene.scanner)
     assert set(kinds.tolist()) == set(gs.Reading)
     cells = scene.grid.world_to_cells(scene.poses[:, :2])
@@ -199,7 +199,7 @@ def test_all_backends_present_agree(capsys):
         assert (device.selection if device.available else device.reason) in out or device.kind == "simulator"
 
 
-# The command's own scenes are no reason for a warning.
+# The command's scenes cause no warning.
 @pytest.mark.filterwarnings("error::gpusense.world.plausible.PlausibilityWarning")
 def test_json_lists_every_comparison(capsys):
     code, out, err = run(capsys, "--json", "--backend", "numpy")

@@ -171,6 +171,15 @@ def test_the_likeliest_poses_of_a_map_hold_the_right_one():
     assert likely_poses(field, np.full(90, np.inf), 20).shape == (0, 3)
 
 
+@pytest.mark.filterwarnings("ignore::gpusense.PlausibilityWarning")
+def test_no_pose_is_likelier_than_others_where_a_cell_holds_the_whole_scan():
+    """All headings and nearly all cells are alike, so a search would only list millions of poses."""
+    coarse = gs.OccupancyGrid(GRID.cells, 1000.0)
+    field = gs.LikelihoodFieldModel(coarse, SCANNER, backend="opencl")
+    (ranges,) = scans([(3.0, 9.5, 0.3)])
+    assert likely_poses(field, ranges, 20).shape == (0, 3)
+
+
 def test_a_second_rival_has_nothing_of_the_first(backend, monkeypatch):
     """A state does not depend on rivals that the filter has given up: a copy made before them continues alike."""
     monkeypatch.setattr("gpusense.localization.starts._LEAST_TRIES", 300)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from support.matching_scenes import FRONT, RING, random_pairs
 
 from gpusense.backends import get_backend
-from gpusense.interface.flags import flags_if
-from gpusense.interface.lanes import with_teams_flag
 from gpusense.interface.structs import MatchRules
-from gpusense.matching import icp
 from gpusense.matching.icp import IcpPairs, space_of
 from gpusense.matching.points import scan_points
 from gpusense.reference import icp_pairs as reference
@@ -53,12 +52,16 @@ def test_devices_agree_with_the_reference(device, precision, scanner, thin):
 @pytest.mark.sampled(0.4)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize(("scanner", "thin"), [(RING, 0), (FRONT, 0), (FRONT, 1)], ids=["ring", "front", "thin"])
-def test_a_team_of_work_items_agrees_with_the_reference(device, monkeypatch, precision, scanner, thin):
-    """GPUs match in teams by themselves; here processors do."""
-    scalar = flags_if(FLOAT64=precision == "float64")
-    monkeypatch.setattr(icp, "with_lanes_flag", lambda lanes, kernel, flags: scalar)
-    monkeypatch.setattr(icp, "with_teams_flag", lambda kind, *launched: with_teams_flag("gpu", *launched))
+@pytest.mark.parametrize(("limit", "team"), [(1024, 256), (255, 64), (63, 1)], ids=["large", "small", "none"])
+def test_a_team_of_work_items_agrees_with_the_reference(device, monkeypatch, precision, scanner, thin, limit, team):
+    """GPUs match in teams that their groups hold; here processors do."""
+    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu", lanes=1))
+    monkeypatch.setattr(device, "largest_group", lambda kernel, flags: limit)
+    sizes = []
+    starts = device.run
+    monkeypatch.setattr(device, "run", lambda program: (sizes.append(program[-1].size), starts(program)))
     test_devices_agree_with_the_reference(device, precision, scanner, thin)
+    assert sizes == [(4 * 3 * team,)]
 
 
 def test_the_search_by_bearing_finds_the_nearest_of_all_points(device):

@@ -124,6 +124,20 @@ def test_poses_beyond_the_memory_are_dropped_and_reported(monkeypatch):
     assert not found.complete[0] and len(found.scan) <= 50
 
 
+@pytest.mark.parametrize("level", [0, 2])
+def test_of_equal_poses_beyond_the_memory_the_first_are_kept(monkeypatch, level):
+    monkeypatch.setattr("gpusense.matching.search._MOST_KEPT", 50)
+    scores = np.zeros((20, 20), np.uint8)
+    scores[4:] = 7
+    search = Search(ScoreTables(get_backend("numpy"), scores, levels=2))
+    found = search.find(
+        [np.zeros((1, 2))], PoseGrid(np.array([[0.5, 0.5]]), np.zeros((1, 2)), 20, 20), slack=3, level=level
+    )
+    assert not found.complete[0]
+    ties = [(row, col, heading) for row in (4, 5) for col in range(20) for heading in (0, 1)][:50]
+    assert list(zip(found.row, found.col, found.heading, strict=True)) == ties
+
+
 def test_bounds_are_the_same_in_several_launches(monkeypatch):
     scores, points, grid = scene(3)
     search = Search(ScoreTables(get_backend("numpy"), scores, levels=2))

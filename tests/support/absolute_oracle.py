@@ -11,7 +11,7 @@ mp.mp.dps = 60
 
 
 def number(value: Any) -> Any:
-    """Return a float as it is."""
+    """Return the exact value of a float."""
     return mp.mpf(float(value))
 
 
@@ -72,7 +72,7 @@ def normal_density(r: Any, near: Any, far: Any, sigma: Any) -> Any:
 
 
 def t_density(r: Any, near: Any, far: Any, sigma: Any, nu: int) -> Any:
-    """Return the same of a Student t, by the incomplete beta function."""
+    """Return the density of a truncated Student's t, by the incomplete beta function."""
     half = mp.mpf(nu) / 2
     peak = mp.gamma(half + 0.5) / mp.gamma(half) / mp.sqrt(nu * mp.pi) / sigma
 

@@ -67,7 +67,7 @@ class OldArray(Array):
 
 
 class Recorded(Array):
-    """Records gradients like PyTorch's arrays: it can neither be exported nor converted to NumPy."""
+    """Records gradients like PyTorch's arrays, so it can neither be exported nor converted to NumPy."""
 
     requires_grad = True
 

@@ -58,6 +58,6 @@ def uniformity(ranks: Floats) -> dict[str, tuple[float, float]]:
 
 
 def assert_uniform(ranks: np.ndarray) -> None:
-    """Check that ranks are uniform, by two tests of each of four functions, which share the false alarms."""
+    """Check that ranks are uniform by two tests of four functions each, with a joint probability of a false alarm."""
     for name, p_values in uniformity(ranks).items():
         assert min(p_values) > FALSE_ALARM / 8, f"{name}: p = {p_values[0]:.2g} and {p_values[1]:.2g}"

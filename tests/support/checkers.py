@@ -20,7 +20,7 @@ def run(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
         pytest.skip("Oclgrind has no wheel for this platform")
     environment = os.environ | {
         "OCLGRIND_DATA_RACES": "1",
-        # It is wrong about vectors of truth values from LLVM's optimizer; unoptimized, it also sees every access.
+        # Oclgrind misreads vectors of booleans from LLVM's optimizer; in unoptimized code it also sees every access.
         "OCLGRIND_BUILD_OPTIONS": "-cl-opt-disable",
         "GPUSENSE_CACHE": "off",
         # With the cache off, every process would prove its device.

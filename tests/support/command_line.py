@@ -1,4 +1,4 @@
-"""The command line for tests: calls in this process and in other ones."""
+"""The command line for tests: calls in this process and in child processes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Dask clusters on the loopback in separate processes, which gpusense has not started."""
+"""Dask clusters on the loopback in processes that gpusense did not start."""
 
 from __future__ import annotations
 

@@ -116,7 +116,7 @@ def build(folder: Path, mode: str, word: str = "distance", instead: str = "") ->
     Args:
         folder: The folder for the library and ``vendors``.
         mode: ``"abort"``, ``"hang"`` or ``"refuse"`` when it builds a program, ``"wrong"`` to change what a program
-            computes, ``"load"`` to abort when it is loaded, ``"exit"`` to end the process then as if all were well,
+            computes, ``"load"`` to abort when it is loaded, ``"exit"`` to end the process then with status 0,
             ``""`` for none of these.
         word: A text of the programs that it spoils.
         instead: The text of the same length that replaces it in a wrong program.

@@ -113,7 +113,7 @@ def corner_between(p: Floats, q: Floats) -> list[float]:
 
 @dataclass
 class _Plan:
-    """Surfaces that are being put together."""
+    """Surfaces of a floor under construction."""
 
     walls: list[tuple[float, float, float, float]] = field(default_factory=list)
     circles: list[tuple[float, float, float]] = field(default_factory=list)

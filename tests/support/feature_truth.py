@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from support.feature_scenes import Floats, Floor, corner_between
 
-# A run of beams on a wall is seen well from this number and length on [m].
+# Least number of beams and least length [m] of a run on a wall that counts as clearly visible.
 WELL_POINTS, WELL_LENGTH = 10, 0.5
 # Least turn of a corner; share of a door's beams that pass through it by at least _DEEP [m].
 _TURN, _SHARE, _DEEP = math.radians(30), 0.5, 0.5
-# Hallways in which the robot sees this many widths of both walls.
+# Least visible length of both walls of a hallway, in widths.
 _WIDTHS, _WIDEST = 2.3, 3.0
 
 

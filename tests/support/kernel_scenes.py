@@ -134,7 +134,7 @@ def row_after_row(planes: np.ndarray, form: Planes, rows: int) -> np.ndarray:
 
 @functools.lru_cache(maxsize=32)
 def _planes(cells: bytes, shape: tuple[int, int], form: Planes, kind: str) -> np.ndarray:
-    # A separate backend, since the tests' one may pretend to be a GPU.
+    # A separate backend, since the backend under test may pretend to be a GPU.
     backend = NumpyBackend()
     backend.info = dataclasses.replace(backend.info, kind=kind)
     planes = np.empty((4, form.sectors, form.lines(shape[0]), shape[1] + 2), np.uint16)

@@ -47,11 +47,11 @@ def mass(low: Any, high: Any, sigma: Any) -> Any:
 
 
 def bearing_mass(expected: Any, half: Any, sigma: Any) -> Any:
-    """Return the mass of the wrapped difference to a bearing on [-half, half]; at the nearer end for one beyond."""
+    """Return the mass of the wrapped difference to a bearing, clamped to [-half, half], over that interval."""
     expected = min(max(expected, -half), half)
     low, high, found = -half - expected, half - expected, mp.mpf(0)
     for turn in (-1, 0, 1):
-        # The part of the field whose wrapped difference is turned by so much.
+        # The part of the field whose wrapped difference is off by this many turns.
         a, b = max(low + 2 * mp.pi * turn, -mp.pi), min(high + 2 * mp.pi * turn, mp.pi)
         found += mass(a, b, sigma) if b > a else 0
     return found

@@ -21,7 +21,7 @@ def room(shape: tuple[int, int] = (60, 80), seed: int = 0) -> gs.OccupancyGrid:
 
 
 def cloud(grid: gs.OccupancyGrid, count: int, seed: int = 1) -> np.ndarray:
-    """Return poses in the map and somewhat around it."""
+    """Return poses in the map and around it."""
     rng = np.random.default_rng(seed)
     rows, cols = grid.shape
     xy = grid.cell_centers(rng.integers(-5, rows + 5, count), rng.integers(-5, cols + 5, count))
@@ -44,7 +44,7 @@ def make(kind: str, grid: gs.OccupancyGrid, backend: Any, bearings: np.ndarray =
 
 
 def parts_of_kind(model: object, kind: type) -> list[Any]:
-    """Return all objects of a class that a model owns, itself or through its caster."""
+    """Return all objects of a class that a model or its caster owns."""
     owners = [model, *(getattr(model, name) for name in ("_caster", "_pipeline") if hasattr(model, name))]
     owned = {id(value): value for owner in owners for value in vars(owner).values()}
     return [value for value in owned.values() if isinstance(value, kind)]

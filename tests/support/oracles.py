@@ -87,12 +87,12 @@ class Mixture:
         return total
 
     def log_density(self, z: float, expected: float) -> Any:
-        """Return its logarithm, -inf where it is 0."""
+        """Return the logarithm of the density, -inf where the density is 0."""
         p = self.density(z, expected)
         return mp.log(p) if p else -mp.inf
 
     def log_densities(self, z: np.ndarray, expected: np.ndarray) -> np.ndarray:
-        """Return the same in float64 for ordinary parameters: rate > 0, and a sigma that is neither tiny nor huge."""
+        """Return log densities in float64 for ordinary parameters: rate > 0, and neither a tiny nor a huge sigma."""
         hit = norm.pdf(z, expected, self.sigma) / (
             norm.cdf(self.range_max, expected, self.sigma) - norm.cdf(0, expected, self.sigma)
         )

@@ -1,7 +1,7 @@
 """Run the blocks of a documentation page, in their order, in a folder of their own.
 
-Python blocks share a namespace. Shell blocks with a command of gpusense run in this process; other ones, which install
-or start other programs, do not. A YAML block whose first line is ``# name.yaml`` is written as that file. Comments of
+Python blocks share a namespace. Shell blocks with a command of gpusense run in this process; blocks that install
+or start other programs do not. A YAML block whose first line is ``# name.yaml`` is written as that file. Comments of
 Markdown hold hidden blocks, ``<!-- invisible-code-block: python`` or ``sh``, and ``<!-- skip: next "reason" -->``, as
 Sybil has them.
 """
@@ -82,7 +82,7 @@ def run_page(page: Path, folder: Path) -> PageRun:
     """Run a page's blocks in a folder, and count them."""
     run = PageRun()
     document = parsed(page)
-    document.namespace["__name__"] = "__main__"  # as a program that is started
+    document.namespace["__name__"] = "__main__"  # as for a program
     with contextlib.chdir(folder), mock.patch.dict(os.environ):
         for example in document.examples():
             try:

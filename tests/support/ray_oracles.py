@@ -82,7 +82,7 @@ class Hit:
 
 
 def walk(occupied: Sequence[Sequence[bool]], ray: Ray, outside_occupied: bool = False) -> Hit:
-    """Return the end of an equally exact walk in integers, ten times as fast; a test compares it with
+    """Return the end of an equally exact walk in integers, ten times as fast; a test compares both with
     ``fraction_walk``.
 
     With fractions a / one and directions d / unit, the boundary k lies at (k * one + a) * unit / (one * d).
@@ -135,7 +135,7 @@ def backward_error_is_small(
 ) -> bool:
     """Return whether a range is that of a ray with its origin moved by at most ``move`` and turned by ``turn``.
 
-    Rays on both sides of the given one are walked. On one face the range varies continuously with the ray, so any value
+    Walk the rays on both sides of the ray. On one face the range varies continuously with the ray, so any value
     between two rays that end on the same face belongs to a ray between them.
     """
     dx, dy = float(ray.direction[0]), float(ray.direction[1])

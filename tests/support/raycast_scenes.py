@@ -17,7 +17,7 @@ from gpusense.tables.rectangles import Planes, empty_rectangles
 LAST_FLOAT32 = 1 - 2.0**-24
 FRACTIONS = (0.0, 0.25, 0.5, 0.75, LAST_FLOAT32)
 PRECISIONS = ("float64", "float32")
-# The rules of float32: cells, cells and radians. In float64 the same rule, near its own rounding.
+# Tolerances of float32 in cells, cells and radians; those of float64 are near its rounding.
 FLOAT32_CELLS, FLOAT32_MOVE, FLOAT32_TURN = 1e-3, 1e-4, 1e-6
 FLOAT64_RELATIVE, FLOAT64_MOVE, FLOAT64_TURN = 1e-12, 1e-13, 1e-15
 
@@ -133,7 +133,7 @@ def lattice_scenes(rng: np.random.Generator) -> list[Scene]:
 
 
 def axis_scenes(rng: np.random.Generator) -> list[Scene]:
-    """Yield rays along the axes, on edges as well as off them; -0 is a direction component too."""
+    """Yield rays along the axes, on edges and off them, also with a direction component of -0."""
     scenes = []
     for number in range(6):
         occupied = some_map(rng)

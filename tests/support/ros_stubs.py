@@ -55,7 +55,7 @@ def message_class(kind: str) -> type:
 
 
 class Time:
-    """rclpy.time.Time."""
+    """Stand-in for rclpy.time.Time."""
 
     def __init__(self, seconds: float = 0.0) -> None:
         self.seconds = seconds
@@ -74,11 +74,11 @@ class Time:
 
 
 class TransformError(Exception):
-    """tf2_ros.TransformException."""
+    """Stand-in for tf2_ros.TransformException."""
 
 
 class Buffer:
-    """tf2_ros.Buffer with a fixed mount, and odometry at some times."""
+    """Stand-in for tf2_ros.Buffer, with a fixed mount and odometry at some times."""
 
     mount: ClassVar[tuple[float, float, float]] = (0.1, 0.0, 0.0)
 
@@ -118,7 +118,7 @@ class Publisher:
 
 
 class Node:
-    """rclpy.node.Node; ``made`` holds the created objects by topic, service or period."""
+    """Stand-in for rclpy.node.Node; ``made`` holds the created objects by topic, service or period."""
 
     given: ClassVar[dict[str, Any]] = {}
 
@@ -163,7 +163,7 @@ class Node:
 
 
 class LifecycleNode(Node):
-    """rclpy.lifecycle.LifecycleNode, but exceptions in a transition are raised."""
+    """Stand-in for rclpy.lifecycle.LifecycleNode that raises exceptions of a transition."""
 
     state = "unconfigured"
 
@@ -203,7 +203,7 @@ class LifecycleNode(Node):
 
 
 class Recorded:
-    """An object of a launch file, which only holds its arguments."""
+    """An object of a launch file that only holds its arguments."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         self.arguments, self.options = arguments, options

@@ -1,4 +1,4 @@
-"""Which backends tests run on, and what happens where one is absent."""
+"""Selection of the backends that tests run on; an absent one skips the test or fails it."""
 
 from __future__ import annotations
 

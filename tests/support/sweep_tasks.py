@@ -59,13 +59,13 @@ def ended_from_above(job, store):
 
 
 def started(job):
-    """Note that a job has started."""
+    """Record that a job has started."""
     with open(Path(job.option("folder")) / "starts", "a") as file:
         file.write(f"{job.seed}\n")
 
 
 def starts(folder, count):
-    """Return how often each of the first jobs has started."""
+    """Return the number of starts of each of the first jobs."""
     lines = (Path(folder) / "starts").read_text().split()
     return [lines.count(str(seed)) for seed in range(count)]
 

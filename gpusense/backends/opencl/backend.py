@@ -203,6 +203,9 @@ class OpenCLBackend(ProcessBound, Backend):
             launcher = self._launchers[kernel, flags] = self._launcher(kernel, flags)
         return launcher
 
+    def largest_group(self, kernel: str, flags: frozenset[str]) -> int:
+        return self.compile(kernel, flags).limit
+
     def source(self, kernel: str, flags: frozenset[str]) -> str:
         file = KERNELS[kernel].file
         return assemble(file, relevant(file, flags))
@@ -248,7 +251,9 @@ class OpenCLBackend(ProcessBound, Backend):
         program, key = self._programs[row.file, flags]
         first = None if self._pocl is None else functools.partial(self._pocl.mark, key)
         name = pocl_kernels.own_name(kernel, key) if self._of_bitcode else kernel
-        return Launch(self, new_kernel(program, name), row, flags, first)
+        compiled = new_kernel(program, name)
+        limit = compiled.get_work_group_info(cl.kernel_work_group_info.WORK_GROUP_SIZE, self._device)
+        return Launch(self, compiled, row, flags, limit, first)
 
     def _build(self, file: str, flags: frozenset[str]) -> tuple[cl.Program, str]:
         """Build the program of a kernel file; return it with its key in the cache.

@@ -14,7 +14,7 @@ from gpusense.backends.opencl.caches import new_kernel, without_caches
 from gpusense.backends.opencl.memory import raise_clearly
 from gpusense.backends.opencl.replay import BoundLaunch
 from gpusense.interface import structs
-from gpusense.interface.signatures import Argument, Kernel, lanes_of
+from gpusense.interface.signatures import Argument, Kernel, lanes_of, team_of
 
 
 class Enqueuer(Protocol):
@@ -33,16 +33,21 @@ class Launch:
         kernel: cl.Kernel,
         row: Kernel,
         flags: frozenset[str],
+        limit: int,
         first: Callable[[], None] | None = None,
     ) -> None:
         self._backend, self._kernel = backend, kernel
+        # Most work-items of a group of the kernel on the device.
+        self.limit = limit
         # Function that is called once, before the kernel's first launch.
         self._first = first
         self._lanes, self._group = (1, row.group)
         if "IN_LANES" in flags:
             self._lanes, self._group = (lanes_of(flags) if row.in_lanes else 1), row.lanes_group
         elif "IN_TEAMS" in flags:
-            self._group = row.team
+            self._group = team_of(row, flags)
+        if "IN_TEAMS" not in flags:
+            self._group = min(self._group, limit)
         self._lock = threading.Lock()
         real = np.dtype(np.float64 if "FLOAT64" in flags else np.float32)
         # With its types set, pyopencl sets all arguments in 1 us; otherwise a single number takes 6 us.

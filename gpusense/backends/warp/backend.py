@@ -29,7 +29,7 @@ from gpusense.backends.warp.settings import LOCK, initialize, load, settings
 from gpusense.backends.warp.slots import slots_of
 from gpusense.interface.kernel_files import warp_module
 from gpusense.interface.launches import Program
-from gpusense.interface.signatures import KERNELS, Kernel
+from gpusense.interface.signatures import KERNELS, Kernel, team_of
 from gpusense.interface.sources import relevant
 
 _MOST_NUMBERS = (1 << 31) - 1
@@ -182,6 +182,10 @@ class WarpBackend(ProcessBound, Backend):
             self._asked[kernel, flags] = launcher
         return launcher
 
+    def largest_group(self, kernel: str, flags: frozenset[str]) -> int:
+        """See Backend.largest_group; every CUDA device has registers for 256 work-items of any kernel."""
+        return 256
+
     def source(self, kernel: str, flags: frozenset[str]) -> str:
         """See Backend.source; flags are constants of the file's factory, which Warp resolves."""
         return inspect.getsource(warp_module(KERNELS[kernel].file))
@@ -261,7 +265,7 @@ class WarpBackend(ProcessBound, Backend):
         Raises:
             RuntimeError: Warp does not compile it.
         """
-        group = (row.team if "IN_TEAMS" in flags else row.group) if self._device.is_cuda else 1
+        group = (team_of(row, flags) if "IN_TEAMS" in flags else row.group) if self._device.is_cuda else 1
         with settings():
             compiled = warp_module(row.file).make(kernel, flags)
             try:

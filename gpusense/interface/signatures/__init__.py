@@ -16,9 +16,9 @@ from gpusense.interface.signatures import (
     point_kernels,
     scan_kernels,
 )
-from gpusense.interface.signatures.rows import LANES, Argument, Kernel, lanes_of
+from gpusense.interface.signatures.rows import LANES, Argument, Kernel, lanes_of, team_of
 
-__all__ = ["KERNELS", "LANES", "Argument", "Kernel", "lanes_of"]
+__all__ = ["KERNELS", "LANES", "Argument", "Kernel", "lanes_of", "team_of"]
 
 # All kernels; each subject has a file in this folder.
 KERNELS: dict[str, Kernel] = {

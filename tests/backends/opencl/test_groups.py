@@ -1,0 +1,24 @@
+"""Work-groups on OpenCL devices that hold few work-items of a kernel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.scan_calls import GRID, SCANNER, cloud, scan
+
+import gpusense as gs
+
+
+@pytest.mark.parametrize("limit", [1, 24])
+def test_groups_shrink_to_the_limit_of_a_kernel(as_gpu, monkeypatch, limit):
+    """A kernel that needs many registers has smaller groups, with the same results."""
+    import pyopencl as cl
+
+    expected = gs.BeamModel(GRID, SCANNER, backend=as_gpu).log_likelihood(cloud(1, 100), scan(1))
+    as_gpu._launchers.clear()
+    groups, enqueue = set(), cl.enqueue_nd_range_kernel
+    monkeypatch.setattr(cl.Kernel, "get_work_group_info", lambda kernel, name, device: limit)
+    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", lambda *launch: (groups.add(launch[3][0]), enqueue(*launch))[1])
+    found = gs.BeamModel(GRID, SCANNER, backend=as_gpu).log_likelihood(cloud(1, 100), scan(1))
+    assert max(groups) == limit
+    np.testing.assert_array_equal(found, expected)

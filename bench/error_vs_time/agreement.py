@@ -169,7 +169,7 @@ def summary(reports: Sequence[Report]) -> list[str]:
 
 
 def counts(reports: Sequence[Report]) -> str:
-    """Return the numbers of pairs and answers, the same ones, and those afresh: of each device and kind of pair, as CSV."""
+    """Return how many pairs and answers each device has, how many are the same, and how many afresh, as CSV."""
     found: dict[tuple[str, str], list[int]] = {}
     for old, new, answers in pairs(reports):
         dates = {str(one.document["date"]) for one in (old, new)}

@@ -66,10 +66,10 @@ def measure(backend: str, particles: int, beams: int, stages: int, steps: int) -
     means = [float(np.minimum(kept, 4 * np.median(kept)).mean()) for kept in (late, verdict, default)]
     pf = filters[0]
     in_a_row = with_estimate = None
-    if len(pf._cloud._recordings):
-        step = pf._cloud._recordings.items()[-1][1].recording
-        estimate = pf._cloud._estimates.last
-        in_a_row, with_estimate = _in_a_row(pf, steps, [step]), _in_a_row(pf, steps, [step, estimate])
+    # First stages, without and with the estimate, which the first steps launch by themselves.
+    recorded = {key[-1]: kept.recording for key, kept in pf._cloud._recordings.items() if key[1].number == 0}
+    if recorded:
+        in_a_row, with_estimate = (_in_a_row(pf, steps, recorded[estimates]) for estimates in (False, True))
     return dict(
         backend=backend, particles=particles, beams=beams, stages=stages, median_ms=float(np.median(late)),
         least_ms=min(late), verdict_ms=means[1] - means[0], recovery_ms=means[2] - means[0], in_a_row_ms=in_a_row,
@@ -77,8 +77,8 @@ def measure(backend: str, particles: int, beams: int, stages: int, steps: int) -
     )  # fmt: skip
 
 
-def _in_a_row(pf: gs.ParticleFilter, steps: int, recordings: list[Any]) -> float:
-    """Return the device's milliseconds for recordings that are replayed one after the other."""
+def _in_a_row(pf: gs.ParticleFilter, steps: int, recording: Any) -> float:
+    """Return the device's milliseconds for a recording that is replayed again and again."""
     cloud, times = pf._cloud, []
     poses = cloud.host_poses(cloud.places.shown, cloud.count)
     for _ in range(5):
@@ -88,9 +88,8 @@ def _in_a_row(pf: gs.ParticleFilter, steps: int, recordings: list[Any]) -> float
         cloud.wait()
         begin = time.perf_counter()
         for _ in range(steps):
-            for recording in recordings:
-                recording()
-        recordings[0].wait()
+            recording()
+        recording.wait()
         times.append((time.perf_counter() - begin) * 1000 / steps)
     return min(times)
 

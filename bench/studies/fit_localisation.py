@@ -30,7 +30,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common import LOGS, make_parser, note, odd_scans, parse, publish, table
 
 TEMPERATURES = (1.0, 0.1)
-# Published results call these "gpusense score's", whose defaults they were.
 HAND_TUNED = gs.BeamParameters(z_hit=0.75, z_short=0.1, z_max=0.05, z_rand=0.1, sigma_hit=0.1)
 
 

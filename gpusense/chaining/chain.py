@@ -144,6 +144,7 @@ class Chainer:
         )  # fmt: skip
         self._fronts = [self._new_front(one) for one in range(len(data.scanners))]
         self._loops: tuple[Joint, Loops] | None = None
+        self._links_of: tuple[Joint, Links] | None = None
         self._motion, self._fitted_to = motion, 0
 
     @property
@@ -246,7 +247,13 @@ class Chainer:
         )  # fmt: skip
 
     def _all_links(self, joint: Joint) -> Links:
-        """Return the links of matches and of odometry or constant motion; the odometry's noise is fitted once."""
+        """Return the links of matches and of odometry or constant motion; those of the last trajectory are kept."""
+        if self._links_of is None or self._links_of[0] is not joint:
+            self._links_of = joint, self._made_links(joint)
+        return self._links_of[1]
+
+    def _made_links(self, joint: Joint) -> Links:
+        """Make the links of matches and of odometry or constant motion; the odometry's noise is fitted once."""
         parts = [joint.renumbered(weighed(front), one) for one, front in enumerate(joint.fronts)]
         if self._odometry is None:
             links = Links.joined([*parts, joint.couplings(None, None)])

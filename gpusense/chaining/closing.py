@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from gpusense.chaining.agreement import EVIDENCE, EVIDENCE_OVER_WEAK, agreeing
 from gpusense.chaining.drift import Drift
+from gpusense.chaining.equations import Equations
 from gpusense.chaining.graph import KERNEL, Solution, solve
 from gpusense.chaining.links import CLOSURE, Links
 from gpusense.chaining.matcher import BATCH, TeamMatcher
@@ -92,6 +93,7 @@ class Loops:
     matches: Links = field(default_factory=lambda: Links.joined([]))
     searched: int = 0
     _drift_of: tuple[Solution, Drift] | None = None
+    _overlaps_of: tuple[Solution, float, tuple[Integers, Integers, Floats]] | None = None
     # Matched pairs in ascending order of their numbers, the levels of their last searches, and their guesses.
     _tried: tuple[Integers, Integers, Integers, Floats] = field(
         default_factory=lambda: (_NONE, _NONE, _NONE, np.zeros((0, 3)))
@@ -113,7 +115,7 @@ class Loops:
     def _search(self, level: int) -> bool:
         """Match candidates of a level and of all lower levels, and return whether there were any."""
         _, cell, most = _LEVELS[level]
-        first, second, share = overlaps(self.places, self.solution.poses, cell, self.apart, self.sequence)
+        first, second, share = self._overlaps(cell)
         drift = _deviations(self._drift().relative(first, second))
         needed = _level_of(drift)
         # Repeat with the next window, since deviations are estimates. The last window is for large drifts only.
@@ -133,6 +135,13 @@ class Loops:
         self._keep_tried(first, second, needed)
         self.searched += len(first)
         return bool(len(first))
+
+    def _overlaps(self, cell: float) -> tuple[Integers, Integers, Floats]:
+        """Return the pairs of key scans that share cells of a size by the solution so far."""
+        if self._overlaps_of is None or self._overlaps_of[0] is not self.solution or self._overlaps_of[1] != cell:
+            found = overlaps(self.places, self.solution.poses, cell, self.apart, self.sequence)
+            self._overlaps_of = self.solution, cell, found
+        return self._overlaps_of[2]
 
     def _drift(self) -> Drift:
         """Return the drift of the solution so far."""
@@ -204,9 +213,10 @@ class Loops:
         for _ in range(3):
             taken = left[agree]
             links, poses = Links.joined([self.links, taken]), self.solution.poses
+            equations = Equations(len(poses), links.first, links.second, 0, ordered=True)
             if (taken.squared_distances(poses) > KERNEL**2 / _WEIGHT).any():
-                poses = solve(poses, links, kernel=_WIDE * KERNEL, least=_GAIN).poses
-            self.solution = solve(poses, links, least=_GAIN)
+                poses = solve(poses, links, kernel=_WIDE * KERNEL, least=_GAIN, equations=equations).poses
+            self.solution = solve(poses, links, least=_GAIN, equations=equations)
             weight = self.solution.links.weight[len(self.links) :]
             if (weight >= _WEIGHT).all():
                 break

@@ -73,20 +73,18 @@ class Equations:
         self._starts = np.append((9 * begin[:-1, None] + 3 * each[:, None] * k).ravel(), 9 * len(row)).astype(np.int32)
         self._diagonal = np.flatnonzero(row == column)
 
-    def at(
-        self, poses: Floats, information: Floats, residual: Floats, damping: float | Floats = 0.0
-    ) -> tuple[Any, Floats]:
+    def at(self, poses: Floats, information: Floats, pull: Floats, damping: float | Floats = 0.0) -> tuple[Any, Floats]:
         """Return the sparse matrix (3 N - 3, 3 N - 3) and the gradient (3 N - 3,) at poses.
 
         Args:
             poses: (N, 3) poses.
             information: (L, 3, 3) information of the links times their weights.
-            residual: (L, 3) residuals of the links.
+            pull: (L, 3) its product with the residuals of the links.
             damping: Added to the diagonal; a number, or one for each free pose.
         """
         from scipy import sparse
 
-        turned, pull, lever = _turned(poses, self.first, self.second, information, residual)
+        turned, pull, lever = _turned(poses, self.first, self.second, information, pull)
         blocks = _sums(self._slot, _blocks_of(turned, lever), len(self._indices) // 9 + 1)[:, :-1]
         blocks[::4, self._diagonal] += damping
         ends = np.stack([-pull[0], -pull[1], lever[1] * pull[0] - lever[0] * pull[1] - pull[2]])
@@ -102,7 +100,7 @@ class Equations:
 
 
 def _turned(
-    poses: Floats, first: Integers, second: Integers, information: Floats, residual: Floats
+    poses: Floats, first: Integers, second: Integers, information: Floats, pull: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Return for L links, turned into the world: information (6, L) by rows, its product with residuals, and the way.
 
@@ -111,16 +109,16 @@ def _turned(
         first: (L,) first poses.
         second: (L,) second poses.
         information: (L, 3, 3) information in the frames of the first poses.
-        residual: (L, 3) residuals in these frames.
+        pull: (L, 3) its product with the residuals in these frames.
     """
-    c, s = np.cos(poses[first, 2]), np.sin(poses[first, 2])
+    c, s = np.cos(poses[:, 2])[first], np.sin(poses[:, 2])[first]
     lever = (poses[second, :2] - poses[first, :2]).T
     a, b, e, d, f, h = information.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]].T
     cc, cs, ss = c * c, c * s, s * s
     along, across, twice = a - d, cs * b, cc - ss
     world = np.stack([cc * a - 2 * across + ss * d, cs * along + twice * b, c * e - s * f,
                       ss * a + 2 * across + cc * d, s * e + c * f, h])  # fmt: skip
-    x, y, turn = np.einsum("lij,lj->il", information, residual)
+    x, y, turn = pull.T
     return world, np.stack([c * x - s * y, s * x + c * y, turn]), lever
 
 

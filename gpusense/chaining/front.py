@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gpusense._util.angles import wrapped
 from gpusense.chaining.following import matched_again, matched_by_motion, motions_around, weakened
 from gpusense.chaining.links import MATCH, Links, chained
-from gpusense.chaining.matcher import GROUP, NEAR, SURE, Matcher
+from gpusense.chaining.matcher import GROUP, GUIDED_GROUP, NEAR, SURE, Matcher
 from gpusense.chaining.motion import filled_motion, partial_motion, relative, scan_motions
 from gpusense.chaining.options import ChainOptions, jumps_of
 from gpusense.localization.pose_algebra import compose_poses, invert_poses, pose_difference, wrap_angle
@@ -151,7 +151,8 @@ class Front:
 
     def _match_group(self) -> bool:
         """Match the next group; return whether there was one."""
-        begin, end = self.done, min(self.done + GROUP, len(self.nodes))
+        group = GROUP if self._odometry is None else GUIDED_GROUP
+        begin, end = self.done, min(self.done + group, len(self.nodes))
         if begin >= end:
             return False
         self._follow(np.arange(begin, end))

@@ -33,9 +33,10 @@ _ITERATIONS, _SMALL = 50, 1e-6
 _DAMPING, _LEAST, _MOST = 1e-6, 1e-9, 1e6
 # After a step that is taken, damping falls by this factor, and where poses have damping of their own by the second one.
 _RELAXED, _RELAXED_APART = 10.0, 3.0
-# After a step that fails, damping rises at links whose cost rises by this share of the largest rise, after a second one
-# by its square, and after this many everywhere.
-_RISE, _FAILS = 0.1, 3
+# After a step that fails, damping rises from at least this value, and where poses have damping of their own from at
+# least the second one. It rises at links whose cost rises by this share of the largest rise, after a second failure by
+# its square, and after this many everywhere.
+_FAILED, _FAILED_APART, _RISE, _FAILS = 1e-4, 1e-2, 0.01, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +57,9 @@ class Solution:
 
 
 def solve(
-    poses: Floats, links: Links, *, fixed: int = 0, kernel: float = KERNEL, least: float = 1e-7, settle: bool = False
-) -> Solution:
+    poses: Floats, links: Links, *, fixed: int = 0, kernel: float = KERNEL, least: float = 1e-7, settle: bool = False,
+    equations: Equations | None = None,
+) -> Solution:  # fmt: skip
     """Return the poses near initial ones that agree best with links.
 
     Args:
@@ -68,6 +70,7 @@ def solve(
         least: Relative gain of the cost below which the iterations end.
         settle: Whether steps may also change motions, and each pose has damping of its own: more work for each step,
             for fewer steps.
+        equations: Ordered equations of these poses and links, if there are any from an earlier call.
     """
     at, damping, fails = np.array(poses, np.float64), np.full(len(poses), _DAMPING), 0
     residual = links.residuals(at)
@@ -75,11 +78,12 @@ def solve(
     cost, count = _cost(squared, kernel), 0
     if len(at) < 2 or not len(links):
         return Solution(at, replace(links, weight=_weights(squared, kernel)), cost, 0)
-    equations = Equations(len(at), links.first, links.second, fixed, ordered=True)
+    equations = equations or Equations(len(at), links.first, links.second, fixed, ordered=True)
     while count < _ITERATIONS:
         count += 1
         information = links.information * _weights(squared, kernel)[:, None, None]
-        matrix, gradient = equations.at(at, information, residual, damping[equations.rows])
+        pull = np.einsum("lij,lj->li", information, residual)
+        matrix, gradient = equations.at(at, information, pull, damping[equations.rows])
         step = np.insert(equations.step(matrix, gradient), fixed, 0.0, axis=0)
         tried = [_moved(at, step)] + ([_moved_along(at, step, fixed)] if settle else [])
         trials = [(trial, links.residuals(trial)) for trial in tried]
@@ -90,7 +94,8 @@ def solve(
             fails += 1
             rise = _costs(distances[best], kernel) - _costs(squared, kernel)
             some = _raised(rise, links, len(at), fails if settle else _FAILS)
-            damping[some] = np.minimum(10 * np.maximum(damping[some], 1e-4), _MOST)
+            lowest = _FAILED_APART if settle else _FAILED
+            damping[some] = np.minimum(10 * np.maximum(damping[some], lowest), _MOST)
             if damping.min() >= _MOST:
                 break
             continue
@@ -142,7 +147,8 @@ def _moved_along(poses: Floats, step: Floats, fixed: int) -> Floats:
 def normal_equations(poses: Floats, links: Links, weight: Floats, fixed: int) -> tuple[Any, Floats]:
     """Return the sparse matrix of the normal equations of the free poses, in their order, and the gradient."""
     information = links.information * weight[:, None, None]
-    return Equations(len(poses), links.first, links.second, fixed).at(poses, information, links.residuals(poses))
+    pull = np.einsum("lij,lj->li", information, links.residuals(poses))
+    return Equations(len(poses), links.first, links.second, fixed).at(poses, information, pull)
 
 
 def pose_jacobians(poses: Floats, first: NDArray[np.int64], second: NDArray[np.int64]) -> tuple[Floats, Floats]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense.localization.pose_algebra import pose_difference, wrap_angle
+from gpusense._util.angles import wrapped
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -85,8 +85,10 @@ class Links:
 
     def residuals(self, poses: Floats) -> Floats:
         """Return (L, 3) differences between the relative poses of (N, 3) poses and those of the links."""
-        off = pose_difference(poses[self.first], poses[self.second]) - self.pose
-        off[:, 2] = wrap_angle(off[:, 2])
+        cos, sin = np.cos(poses[:, 2])[self.first], np.sin(poses[:, 2])[self.first]
+        x, y, turn = (poses[self.second] - poses[self.first]).T
+        off = np.stack([cos * x + sin * y, cos * y - sin * x, turn], axis=1) - self.pose
+        off[:, 2] = wrapped(off[:, 2])
         return off
 
     def squared_distances(self, poses: Floats) -> Floats:
@@ -107,4 +109,4 @@ def chained(first: Floats, steps: Floats) -> Floats:
     c, s = np.cos(heading[:-1]), np.sin(heading[:-1])
     x = np.cumsum(np.append(first[0], c * steps[:, 0] - s * steps[:, 1]))
     y = np.cumsum(np.append(first[1], s * steps[:, 0] + c * steps[:, 1]))
-    return np.stack([x, y, wrap_angle(heading)], axis=1)
+    return np.stack([x, y, wrapped(heading)], axis=1)

@@ -8,18 +8,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense.backends import get_backend
 from gpusense.chaining.links import Links
 from gpusense.chaining.options import ChainOptions
 from gpusense.localization.pose_algebra import compose_poses, invert_poses
-from gpusense.matching.match import match_scan
+from gpusense.matching.match import WINDOW, match_readings, match_scan
+from gpusense.matching.noise import scan_noise
 from gpusense.matching.result import ScanMatch
 from gpusense.world.scanner import Scanner
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-GROUP = 256
-"""Scans of a group; an interrupt keeps the matches of finished groups."""
+GROUP, GUIDED_GROUP = 256, 1024
+"""Scans of a group without and with odometry; an interrupt keeps the matches of finished groups."""
 BATCH = 1024
 """Most pairs of one call."""
 # Least p_right of a match that is used.
@@ -53,6 +55,7 @@ class Matcher:
 
     def __init__(self, readings: Floats, scanner: Scanner, options: ChainOptions) -> None:
         self.readings, self.scanner, self._options = readings, scanner, options
+        self._device, self._noise = get_backend(options.backend), scan_noise(readings, scanner)
         self.motion: Floats | None = np.zeros((len(readings), 3)) if options.duration else None
 
     def match(
@@ -67,7 +70,10 @@ class Matcher:
             window: Half widths of the search [m, rad]; None for the default of ``match_scan``.
         """
         moved = (None, None) if self.motion is None else (self.motion[first], self.motion[second])
-        return self._matched(self.scanner, self.readings[first], self.readings[second], guess, window, moved)
+        return match_readings(
+            self.readings[first], self.readings[second], self.scanner, guess, (self._noise[first], self._noise[second]),
+            self._device, self._options.precision, WINDOW if window is None else window, moved,
+        )  # fmt: skip
 
     def across(
         self, first: Integers, other: Matcher, second: Integers, guess: Floats, window: tuple[float, float] | None

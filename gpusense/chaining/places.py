@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense.localization.pose_algebra import compose_poses, wrap_angle
+from gpusense.localization.pose_algebra import wrap_angle
 from gpusense.matching.points import ScanPoints, scan_points
 from gpusense.world.sensor_scans import SensorScans
 
@@ -89,11 +89,14 @@ def overlaps(
 
 def _cells_of(places: list[Floats], poses: Floats, cell: float) -> tuple[Integers, Integers]:
     """Return the key scans (C,) and the numbers (C,) of the cells that contain their points, each pair once."""
-    owner = np.repeat(np.arange(len(places)), [len(points) for points in places])
-    at = np.zeros((len(owner), 3))
-    at[:, :2] = np.concatenate(places)
-    cells = np.floor(compose_poses(poses[owner], at)[:, :2] / cell).astype(np.int64)
-    number = _numbered(cells)
+    sizes = [len(points) for points in places]
+    owner = np.repeat(np.arange(len(places)), sizes)
+    px, py, c, s = np.repeat([poses[:, 0], poses[:, 1], np.cos(poses[:, 2]), np.sin(poses[:, 2])], sizes, axis=1)
+    x, y = np.concatenate(places).T
+    cells = np.floor(np.stack([px + c * x - s * y, py + s * x + c * y]) / cell).astype(np.int64)
+    # Neighbouring points mostly share a cell, so little is left to sort.
+    new = np.append(True, (np.diff(owner) != 0) | (np.diff(cells) != 0).any(axis=0))[: len(owner)]
+    owner, number = owner[new], _numbered(cells[:, new].T)
     count = int(number.max(initial=0)) + 1
     both = np.unique(owner * count + number)
     return both // count, both % count
@@ -123,16 +126,20 @@ def _first_passages(table: Any, poses: Floats, sequence: tuple[Integers, Integer
     scanners, ranks = sequence
     ways = scanners * _WAYS + np.floor(poses[:, 2] / (2 * np.pi) * _WAYS + 0.5).astype(np.int64) % _WAYS
     early = []
-    passed = np.zeros((int(ways.max(initial=0)) + 1, table.shape[1]), np.int64)
-    last, begun = np.full(passed.shape, -_AWAY - 1, np.int64), np.full(passed.shape, -_LONG - 1, np.int64)
-    for k, (way, rank) in enumerate(zip(ways.tolist(), ranks.tolist(), strict=True)):
-        seen = table.indices[table.indptr[k] : table.indptr[k + 1]]
-        new = (rank - last[way, seen] > _AWAY) | (rank - begun[way, seen] > _LONG)
-        number = passed[way, seen] + new
+    cells = table.shape[1]
+    each = np.diff(table.indptr)
+    # A number for each cell and way of passing it.
+    whole = table.indices + np.repeat(ways * cells, each)
+    size = (int(ways.max(initial=0)) + 1) * cells
+    passed, begun, until = np.zeros(size, np.int64), np.full(size, -_LONG - 1, np.int64), np.full(size, -1, np.int64)
+    for k, (seen, rank) in enumerate(zip(np.split(whole, table.indptr[1:-1]), ranks.tolist(), strict=True)):
+        new = until[seen] < rank
+        number = passed[seen] + new
         if np.count_nonzero(number <= _PASSAGES) >= _SHARE * len(seen):
             early.append(k)
-            passed[way, seen], last[way, seen] = number, rank
-            begun[way, seen[new]] = rank
+            passed[seen] = number
+            begun[seen[new]] = rank
+            until[seen] = np.minimum(rank + _AWAY, begun[seen] + _LONG)
     return np.array(early, np.int64)
 
 

@@ -69,6 +69,8 @@ MOTION_STREAM, DRAW_STREAM, DRAW_STREAMS = 0, 16, 4
 # settings by place. DRAW_SEED takes 2 places.
 READING_STREAM, DRAW_TERMS = 1 << 30, 9
 DRAW_SEED, DRAW_STEP, DRAW_FIRST, DRAW_PER_SCAN, DRAW_RANGE_MAX, DRAW_TOP, DRAW_MARGIN, DRAW_SETTINGS = 0, *range(2, 9)
+# Classes of a beam: no evidence, it agrees, is short, passes through a wall, has no return where there is a wall.
+NOTHING, AGREES, SHORT, THROUGH, VANISHED = range(5)
 # Kinds of motion: a straight translation, or an arc.
 STRAIGHT, VELOCITY_MODEL = 0, 1
 # Rungs of the ladder of temperatures; columns of a block's sums: weights, their squares, and the weights before.

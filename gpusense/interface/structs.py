@@ -145,11 +145,31 @@ class MatchRules(NamedTuple):
     tolerance: real
 
 
+class BeamRules(NamedTuple):
+    """Origin and companions of a scan's rays in the map, and rules for its readings; see the kernel file ``passages``.
+
+    The origin is relative to the map's corner, along its axes [m]; ``cell`` is the side of a cell. Companions start
+    ``beside`` the beam [m] and diverge by ``apart`` [rad]. Tolerances of readings are ``part`` of them, at least
+    ``least``; rays are walked up to ``limit`` [m]. Walls have the value ``occupied`` or more.
+    """
+
+    origin_x: double
+    origin_y: double
+    cell: double
+    beside: double
+    apart: double
+    least: double
+    part: double
+    limit: double
+    range_max: double
+    occupied: int
+
+
 STRUCTS: dict[str, type[tuple[Any, ...]]] = {
     struct.__name__: struct
     for struct in (
         Window, Frame, Caster, RangeScale, Cone, MixtureTables, Score, ScanBatch, ReadingRules, Buckets, SensorView,
-        ScoreTable, MatchRules,
+        ScoreTable, MatchRules, BeamRules,
     )
 }  # fmt: skip
 

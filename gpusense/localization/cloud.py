@@ -17,11 +17,13 @@ from gpusense.backends.programs import ProgramCache, RecordedProgram, RepeatedPr
 from gpusense.interface.constants import ESTIMATE, LEFT, MOMENTS, SLOW_RATE, STAGE, STATE, WIDE_HEADINGS
 from gpusense.interface.launches import Program
 from gpusense.localization.filter_cloud import Contents, Summary, deeper, is_starved, meaningful, summary_of
-from gpusense.localization.particles import Particles, Stage
+from gpusense.localization.particles import Particles, Places, Stage
 from gpusense.localization.sums import weight_block
 
 _DOUBLE = np.dtype(np.float64)
-_MOST_RECORDED = 32
+_MOST_RECORDED, _MOST_STAGES = 64, 48
+# Corrections in a row after which the estimate was read, from which on corrections compute it themselves.
+_ASKED = 3
 
 
 class Cloud(Particles):
@@ -40,8 +42,16 @@ class Cloud(Particles):
     ) -> None:
         super().__init__(backend, capacity, sensors, precision, residual=residual)
         self._recordings = ProgramCache[RecordedProgram](_MOST_RECORDED)
-        self._estimates, self._stages = RepeatedPrograms(backend, 8), RepeatedPrograms(backend, 24)
+        self._estimates, self._stages = RepeatedPrograms(backend, 8), RepeatedPrograms(backend, _MOST_STAGES)
         self._uploads: list[np.ndarray] = []
+        # Results on the host while they are those on the device; the buffers and the number of particles of the
+        # estimate on the device, and the final estimate on the host with these.
+        self._results: np.ndarray | None = None
+        self._estimated_of: Hashable = None
+        self._known: tuple[Hashable, np.ndarray] | None = None
+        # Corrections in a row after which the estimate was read; whether it was after the last one, which number the
+        # last one's last stage had, and whether the present stage computes it.
+        self._asked, self._was_asked, self._last_stage, self._estimates_too = 0, False, 0, False
 
     def place(self, poses: np.ndarray, weights: np.ndarray | None = None) -> None:
         """Replace all particles."""
@@ -54,6 +64,7 @@ class Cloud(Particles):
 
     def _fill(self, *arrays: tuple[Buffer, np.ndarray]) -> None:
         """Copy arrays to buffers that earlier steps may still use."""
+        self._begin_change()
         self.backend.synchronize()
         for buffer, array in arrays:
             self.backend.upload(np.ascontiguousarray(array, np.float64), buffer)
@@ -76,10 +87,15 @@ class Cloud(Particles):
         self.backend.synchronize()
         self._uploads.clear()
 
+    def _begin_change(self) -> None:
+        """Forget the results that the host knows."""
+        self._results = self._known = self._estimated_of = None
+
     # ---- steps
 
     def move(self, settings: np.ndarray, kind: int) -> None:
         """Move the particles now."""
+        self._begin_change()
         places = self.places.moved(self.kept)
         self.upload_settings(settings)
         self._move(self.places.next, places.next, kind)
@@ -101,32 +117,51 @@ class Cloud(Particles):
             score: Runs the launches of a stage: its motion if it is the first one, log-likelihoods, and weighing.
         """
         self.use(sensors)
+        self._begin_change()
+        self._asked, self._was_asked = self._asked + 1 if self._was_asked else 0, False
         self.upload_settings(settings)
         if settings[SLOW_RATE] > 0:
             # Averages of the likelihood persist.
             self._copy_state(self.places.state, stages[0].state)
         for stage in stages:
             last, deep = stage.most == 1, settings
+            self._estimates_too = self._asked >= _ASKED and stage.number >= self._last_stage
+            self._results = None
             score(stage)
             if not last:
                 numbers, deep = self._deepen(stage, settings)
                 last = numbers[stage.number * STAGE + LEFT] == 0.0
-                self._draw(stage, drawn if last else self.count)
+                if not stage.drawn:
+                    self._draw(stage, drawn if last else self.count)
             if deep is not settings:
                 self.upload_settings(settings)
             if last:
                 break
+        self._last_stage = stage.number
+        self._estimated_of = (stage.places, self.count) if self._estimates_too else None
         self.set_particles(stage.places, drawn, weight_block(self.backend, drawn))
 
     def _deepen(self, stage: Stage, settings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Weigh a stage again on lower rungs while too few particles have weight; return state and settings."""
-        numbers = self._read(self.states[stage.state], STATE)
+        numbers = self._state_of(stage.state)
         while is_starved(numbers, settings, stage.number, self.count):
             settings = deeper(settings)
             self.upload_settings(settings)
-            self.backend.run(self.weighing(stage))
-            numbers = self._read(self.states[stage.state], STATE)
+            self._results = None
+            self.backend.run(self._weighing(stage))
+            numbers = self._state_of(stage.state)
         return numbers, settings
+
+    def _weighing(self, stage: Stage) -> Program:
+        """Return the launches of a stage after its scores, with the estimate of its particles if it is expected."""
+        if not self._estimates_too:
+            return self.weighing(stage)
+        return self.weighing(stage) + self._estimating(stage.places, self.count, 0)
+
+    def _estimating(self, places: Places, count: int, second_pass: int) -> Program:
+        """Return the launches of a pass of the estimate."""
+        poses, weights = self.poses[places.shown], self.weights[places.weight]
+        return self.sums.estimate(poses, weights, self.estimated, count, second_pass)
 
     def _copy_state(self, source: int, target: int) -> None:
         if self.backend.info.kind == "gpu":
@@ -141,7 +176,8 @@ class Cloud(Particles):
 
     def weigh(self, stage: Stage) -> None:
         """Run the launches of a stage after its scores."""
-        self._stages.run((stage.key, self.count, self._sensors), lambda: self.weighing(stage))
+        key = (stage.key, self.count, self._sensors, self._estimates_too)
+        self._stages.run(key, lambda: self._weighing(stage))
 
     def _draw(self, stage: Stage, drawn: int) -> None:
         """Draw into the other buffer."""
@@ -155,12 +191,12 @@ class Cloud(Particles):
             key: Everything on which the sensors' programs depend.
             scoring: Returns the program that scores the poses of a buffer, and the owners of its memory.
         """
-        whole = (key, stage, self.count)
+        whole = (key, stage, self.count, self._estimates_too)
         recorded = self._recordings.get(whole)
         if recorded is None:
             move = () if stage.kind is None else self.motion(stage.origin, stage.source, stage.kind)
             program, owners = scoring(stage.source)
-            program = move + program + self.weighing(stage)
+            program = move + program + self._weighing(stage)
             recorded = self._recordings.keep(whole, RecordedProgram(self.backend, program, owners))
         recorded.start()
 
@@ -173,7 +209,7 @@ class Cloud(Particles):
 
     def summary(self) -> Summary:
         """Return the state after the last correction."""
-        return summary_of(self._read(self.states[self.places.state], STATE))
+        return summary_of(self._state_of(self.places.state))
 
     def shares(self, count: int) -> Any:
         """Return the weights of the shown particles with sum 1: on a GPU an array of the device's library."""
@@ -209,18 +245,34 @@ class Cloud(Particles):
 
     def estimate(self, count: int) -> np.ndarray:
         """Return the kernels' estimate of the shown particles: mean, covariance, sum of weights."""
-        numbers = self._estimate(count, 0)
-        return self._estimate(count, 1) if numbers[WIDE_HEADINGS] else numbers
+        self._was_asked, key = True, (self.places, count)
+        if self._known is None or self._known[0] != key:
+            numbers = self._estimate(count, 0)
+            self._known = key, self._estimate(count, 1) if numbers[WIDE_HEADINGS] else numbers
+        return self._known[1].copy()
 
     def _estimate(self, count: int, second_pass: int) -> np.ndarray:
-        """Run a pass of the estimate, and return its buffer."""
-        shown, weight = self.places.shown, self.places.weight
-        # Clouds that change their size rarely ask twice for the same size.
-        self._estimates.run(
-            (shown, weight, count, second_pass),
-            lambda: self.sums.estimate(self.poses[shown], self.weights[weight], self.estimated, count, second_pass),
-        )
-        return self._read(self.estimated, ESTIMATE)
+        """Return the result of a pass of the estimate, which runs unless the last correction ran it."""
+        places = self.places
+        if second_pass or self._estimated_of != (places, count):
+            self._results = self._estimated_of = None
+            # Clouds that change their size rarely ask twice for the same size.
+            self._estimates.run(
+                (places.shown, places.weight, count, second_pass), lambda: self._estimating(places, count, second_pass)
+            )
+        begin = self.result_begins[2]
+        return self._read_results()[begin : begin + ESTIMATE]
+
+    def _state_of(self, index: int) -> np.ndarray:
+        """Return a state."""
+        begin = self.result_begins[index]
+        return self._read_results()[begin : begin + STATE]
+
+    def _read_results(self) -> np.ndarray:
+        """Return states and estimate, which are copied once after each change."""
+        if self._results is None:
+            self._results = self._read(self.results, self.result_begins[2] + ESTIMATE)
+        return self._results
 
     def host_poses(self, index: int, count: int) -> np.ndarray:
         """Return a copy of the poses of a buffer."""

@@ -25,7 +25,7 @@ class DeviceCloud(Cloud, FilterCloud):
 
     def correct(self, step: Step) -> None:
         score = self._scoring.of(self, step.readings)
-        stages = self.places.stages(self.kept, step.stages, step.drawn, step.kind)
+        stages = self.places.stages(self.kept, step.stages, step.drawn, step.kind, same=step.drawn == self.count)
         self.run_stages(step.settings, stages, step.drawn, len(step.readings), score)
 
     @property

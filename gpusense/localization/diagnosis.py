@@ -10,7 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense.localization.passages import AGREES, SHORT, THROUGH, Passages
+from gpusense.interface.constants import AGREES, SHORT, THROUGH
+from gpusense.localization.passages import Passages
 from gpusense.localization.ratio import ratio_of_scan
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.verdict import sightings

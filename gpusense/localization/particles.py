@@ -49,7 +49,7 @@ class Places(NamedTuple):
         return self._replace(shown=poses, next=poses, weight=self.before)
 
     @functools.lru_cache(maxsize=64)  # noqa: B019 - plain values
-    def stages(self, kept: Places, most: int, drawn: int, kind: int) -> list[Stage]:
+    def stages(self, kept: Places, most: int, drawn: int, kind: int, *, same: bool = False) -> list[Stage]:
         """Return the stages of a correction.
 
         Args:
@@ -57,11 +57,13 @@ class Places(NamedTuple):
             most: Largest number of stages.
             drawn: Particles of the next step.
             kind: Kind of the motion that begins the first stage.
+            same: Whether the present step has as many particles, so that each stage draws this number.
         """
         (poses, weights), state = kept.free(), 1 - kept.state
-        first = Stage(poses, 0, most, drawn if most == 1 else 0, self.before, weights, state, self.next, kind)
+        known = drawn if same or most == 1 else 0
+        first = Stage(poses, 0, most, known, self.before, weights, state, self.next, kind)
         return [first] + [
-            Stage(poses + number % 2, number, most, 0, weights + 1, weights, state) for number in range(1, most)
+            Stage(poses + number % 2, number, most, known, weights + 1, weights, state) for number in range(1, most)
         ]
 
     def free(self) -> tuple[int, int]:
@@ -130,6 +132,9 @@ class Particles:
         places: Buffers of the particles.
         kept: Buffers that steps do not overwrite: those at the beginning of a call of the filter.
         pool_size: Number of poses from which recovery injects particles.
+        results: Two states of corrections, and the estimate; they begin at ``result_begins``.
+        states: The two states.
+        estimated: The estimate.
     """
 
     MEMORY: ClassVar[tuple[str, ...]] = ("count", "block", "places", "pool", "pool_size")
@@ -147,9 +152,13 @@ class Particles:
         self.weights = [make(capacity, _DOUBLE) for _ in range(4)]
         self.log_p = [make(capacity, precision) for _ in range(sensors)]
         self.score, self.ends = backend.empty(capacity, _DOUBLE), backend.empty(capacity, _DOUBLE)
-        self.sums, self.estimated = Sums(backend, capacity), backend.empty(ESTIMATE, _DOUBLE)
-        self.settings = backend.empty(SETTINGS, _DOUBLE)
-        self.states = [backend.upload(np.zeros(STATE)) for _ in range(2)]
+        self.sums, self.settings = Sums(backend, capacity), backend.empty(SETTINGS, _DOUBLE)
+        # One copy reads them all.
+        align = max(backend.alignment // _DOUBLE.itemsize, 1)
+        self.result_begins = tuple(i * (-(-STATE // align) * align) for i in range(3))
+        self.results = backend.upload(np.zeros(self.result_begins[2] + ESTIMATE))
+        parts = zip(self.result_begins, (STATE, STATE, ESTIMATE), strict=True)
+        *self.states, self.estimated = (backend.part(self.results, begin, size, _DOUBLE) for begin, size in parts)
         self.pool, self.pool_size = backend.upload(np.zeros(3)), 0
         # Cumulative numbers of certain copies.
         self._copies = backend.empty(capacity, _DOUBLE) if residual else None

@@ -9,8 +9,8 @@ wrong pose, the edge of a door or a grazed wall is no evidence. A beam
 - gives **no** evidence where unknown cells or the map's edge come first, where the three rays contradict each other, or
     where the reading is missing.
 
-Only grid and pose are needed, so the walk runs on the host, costs the same for every model and holds no table: a few
-thousand look-ups per scan. A diagonal pair of walls stops a ray, as in the casters.
+Only grid and pose are needed, so the walk costs the same for every model: a few thousand look-ups per scan, on the
+device that holds the map's cells, or on the host. A diagonal pair of walls stops a ray, as in the casters.
 """
 
 from __future__ import annotations
@@ -22,15 +22,21 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gpusense.backends.base import Backend
+from gpusense.backends.workspace import Workspace
+from gpusense.interface.constants import AGREES, NOTHING, SHORT, THROUGH, VANISHED
+from gpusense.interface.launches import Program, launch
+from gpusense.interface.structs import BeamRules
+from gpusense.reference.passages import judge_beams
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.scanner import Reading, Scanner, classify
+from gpusense.world.scanner import Scanner
 
 Floats = NDArray[np.float64]
 
-# Classes of a beam.
-NOTHING, AGREES, SHORT, THROUGH, VANISHED = range(5)
-# Most beams of a scan that are judged; readings beyond are walked up to here only [m].
+# Most beams of a scan that are judged; readings beyond are walked up to here only [m]. Twice the middles of that many
+# parts of a scan.
 _BEAMS, _FARTHEST = 32, 20.0
+_MIDDLES = np.arange(_BEAMS) * 2 + 1
 # Companions start beside the beam [m] and diverge by an angle [rad]; both grow with the deviations of the pose, up to
 # these limits.
 _BESIDE, _APART, _MOST_BESIDE, _MOST_APART = 0.08, 0.025, 0.3, 0.1
@@ -38,10 +44,7 @@ _BESIDE, _APART, _MOST_BESIDE, _MOST_APART = 0.08, 0.025, 0.3, 0.1
 _PART, _LEAST, _LEAST_CELLS = 0.02, 0.2, 2.0
 # Agreeing readings within this of a wall are close [m].
 _CLOSE = 0.1
-# Rays that begin farther off than this are moved here, where no map reaches [cells].
-_AFAR = 1e9
-# Step of the walk [cells].
-_STEP = 0.5
+_DOUBLE, _PLAIN = np.dtype(np.float64), frozenset[str]()
 
 
 class Passages(NamedTuple):
@@ -50,7 +53,9 @@ class Passages(NamedTuple):
     Attributes:
         kind: (B,) class of each beam.
         bearing: (B,) bearing from the scanner [rad].
-        wall: (B, 2) where the beam meets the first mapped wall, NaN where it meets none before its end [m].
+        origin: (2,) origin of the beams [m].
+        direction: (B,) direction of each beam in the world [rad].
+        distance: (B,) range to the first mapped wall that the beam meets before its end, inf without one [m].
         close: (B,) whether an agreeing reading ends within 0.1 m of that wall, or within a cell.
         inside: Whether the pose is inside solid cells.
         off: Whether the pose is in unknown cells or off the map.
@@ -58,10 +63,18 @@ class Passages(NamedTuple):
 
     kind: NDArray[np.int8]
     bearing: Floats
-    wall: Floats
+    origin: Floats
+    direction: Floats
+    distance: Floats
     close: NDArray[np.bool_]
     inside: bool
     off: bool
+
+    @property
+    def wall(self) -> Floats:
+        """(B, 2) where the beam meets the first mapped wall, NaN where it meets none before its end [m]."""
+        distance = np.where(self.distance < np.inf, self.distance, np.nan)[:, None]
+        return self.origin + distance * np.column_stack([np.cos(self.direction), np.sin(self.direction)])
 
     def count(self, kind: int) -> int:
         """Return the number of beams of a class."""
@@ -100,13 +113,48 @@ def counts_of(scans: Sequence[Passages]) -> Counts:
     return Counts(of_kind[AGREES], close, of_kind[THROUGH], of_kind[SHORT], of_kind[NOTHING])
 
 
+class MapJudge:
+    """The cells of a map on a device, which judges beams there.
+
+    Args:
+        backend: The device.
+        grid: The map.
+
+    Attributes:
+        grid: The map.
+    """
+
+    def __init__(self, backend: Backend, grid: OccupancyGrid) -> None:
+        self.grid, self._space = grid, Workspace(backend)
+        self._cells = backend.upload(_bytes_of(grid))
+
+    def __call__(self, rules: BeamRules, scan: Floats) -> Floats:
+        """Return the result of the kernel ``judge_beams``."""
+        space, size, (rows, cols) = self._space, len(scan), self.grid.shape
+        device_scan, judged = space.upload("scan", scan), space.empty("judged", size, _DOUBLE)
+
+        def program() -> Program:
+            arguments = dict(cells=self._cells, scan=device_scan, judged=judged, rules=rules, rows=rows, cols=cols)
+            return (launch("judge_beams", _PLAIN, (size // 2,), beams=size // 2, **arguments),)
+
+        space.run(size, dict(rules=rules), program, version=0)
+        result = np.empty(size)
+        space.read(judged, result)
+        return result
+
+
+def _bytes_of(grid: OccupancyGrid) -> NDArray[np.uint8]:
+    """Return the cells of a map as kernels take them: unknown ones are 255."""
+    return grid.cells.reshape(-1).view(np.uint8)
+
+
 def passages(
     grid: OccupancyGrid,
     scanner: Scanner,
     pose: Floats,
     ranges: Floats,
     deviations: tuple[float, float] = (0.0, 0.0),
-    beams: int = _BEAMS,
+    judge: MapJudge | None = None,
 ) -> Passages:
     """Judge the beams of a scan.
 
@@ -116,126 +164,56 @@ def passages(
         pose: (3,) pose of the robot [m, m, rad].
         ranges: (K,) readings [m].
         deviations: Deviations of the position [m] and the heading [rad].
-        beams: Most beams to judge.
+        judge: The map on a device; None judges on the host.
     """
-    kinds = classify(ranges, scanner)
-    present = np.flatnonzero(kinds != Reading.MISSING)
-    if len(present) > beams:
-        present = present[(np.arange(beams) * 2 + 1) * len(present) // (2 * beams)]
-    bearing, returned = scanner.bearings[present], kinds[present] == Reading.HIT
-    reading = np.where(returned, ranges[present], scanner.range_max)
+    # Missing readings are below the least range, or NaN.
+    present = ranges >= scanner.range_min
+    if scanner.range_min > 0:
+        present &= ranges > 0
+    chosen = np.flatnonzero(present)
+    if len(chosen) > _BEAMS:
+        chosen = chosen[_MIDDLES * len(chosen) // (2 * _BEAMS)]
+    bearing, reading, count = scanner.bearings[chosen], ranges[chosen], len(chosen)
     origin, heading = _origin_of(pose, scanner.mount)
-    walk = _walked(grid, scanner, origin, heading + bearing, reading, deviations)
-    first, unknown, tolerance, limit = walk
-    wall = first < np.inf
-    before, after = reading - tolerance, reading + tolerance
-    # A ray gives no evidence beyond the first unknown cell.
-    blind = unknown < np.minimum(first, np.where(returned, before, reading))
-    within = returned & (reading <= limit)
-    beam_agrees = (first[0] >= before) & (first[0] <= after) & ~blind[0]
-    nearest, farthest, seen = first.min(axis=0), first.max(axis=0), ~blind.any(axis=0)
-    walled = farthest < np.inf
-    agrees = within & (beam_agrees | (walled & (nearest <= after) & (farthest >= before) & seen))
-    # Of several classes of a beam, the last one counts.
-    kind = np.full(len(bearing), NOTHING, np.int8)
-    kind[within & (nearest == np.inf) & seen] = SHORT
-    kind[~returned & walled & seen] = VANISHED
-    kind[returned & (farthest < before) & seen] = THROUGH
-    kind[agrees] = AGREES
-    direction = heading + bearing
-    with np.errstate(invalid="ignore"):
-        distance = np.where(wall[0], first[0], np.nan)
-        close = agrees & (np.abs(reading - distance) < max(_CLOSE, grid.resolution))
-        met = origin[:2] + distance[:, None] * np.column_stack([np.cos(direction), np.sin(direction)])
+    scan = np.empty(2 * count)
+    # Of headings within half a turn nothing is rounded off.
+    np.add(bearing, math.remainder(heading - grid.origin[2], math.tau), out=scan[:count])
+    scan[count:] = reading
+    kind, distance = np.zeros(0), np.zeros(0)
+    if count:
+        rules = _rules_of(grid, scanner, origin, deviations)
+        judged = _judged_on_host(grid, rules, scan) if judge is None else judge(rules, scan)
+        kind, distance = judged[:count], judged[count:]
+    close = kind == AGREES
+    close[close] = np.abs(reading[close] - distance[close]) < max(_CLOSE, grid.resolution)
     inside, off = _place_of(grid, pose)
-    return Passages(kind, bearing, met, close, inside, off)
+    return Passages(kind.astype(np.int8), bearing, origin, heading + bearing, distance, close, inside, off)
+
+
+def _judged_on_host(grid: OccupancyGrid, rules: BeamRules, scan: Floats) -> Floats:
+    """Return the result of the kernel ``judge_beams``, computed on the host."""
+    judged = np.empty(len(scan))
+    judge_beams(_PLAIN, _bytes_of(grid), scan, judged, rules, *grid.shape, len(scan) // 2)
+    return judged
+
+
+def _rules_of(grid: OccupancyGrid, scanner: Scanner, origin: Floats, deviations: tuple[float, float]) -> BeamRules:
+    """Return the rules for a scan from a pose with these deviations."""
+    side, (x0, y0, yaw) = grid.resolution, grid.origin
+    c, s = math.cos(yaw), math.sin(yaw)
+    dx, dy = float(origin[0]) - x0, float(origin[1]) - y0
+    return BeamRules(
+        c * dx + s * dy, -s * dx + c * dy, side, min(max(_BESIDE, deviations[0], side), max(_MOST_BESIDE, side)),
+        min(max(_APART, deviations[1]), _MOST_APART) + scanner.cone / 2,
+        max(_LEAST, _LEAST_CELLS * side, min(deviations[0], _MOST_BESIDE)), _PART, min(_FARTHEST, scanner.range_max),
+        scanner.range_max, grid.occupied_threshold,
+    )  # fmt: skip
 
 
 def _origin_of(pose: Floats, mount: tuple[float, float, float]) -> tuple[Floats, float]:
     """Return the origin of the beams, and the direction of bearing 0."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     return np.array([pose[0] + c * mount[0] - s * mount[1], pose[1] + s * mount[0] + c * mount[1]]), pose[2] + mount[2]
-
-
-def _walked(
-    grid: OccupancyGrid,
-    scanner: Scanner,
-    origin: Floats,
-    direction: Floats,
-    reading: Floats,
-    deviations: tuple[float, float],
-) -> tuple[Floats, Floats, Floats, float]:
-    """Walk three rays of each beam.
-
-    Returns:
-        (3, B) range to the first wall and (3, B) to the first unknown cell, inf for none within the walk; (B,)
-        tolerance of the readings; largest range that is walked.
-    """
-    side, (x0, y0, yaw) = grid.resolution, grid.origin
-    beside = min(max(_BESIDE, deviations[0], side), max(_MOST_BESIDE, side))
-    apart = min(max(_APART, deviations[1]), _MOST_APART) + scanner.cone / 2
-    tolerance = np.maximum(max(_LEAST, _LEAST_CELLS * side, min(deviations[0], _MOST_BESIDE)), _PART * reading)
-    limit = min(_FARTHEST, scanner.range_max)
-    steps = (np.minimum(reading + tolerance, limit) / (side * _STEP)).astype(np.int64) + 1
-    offsets = np.array([0.0, 1.0, -1.0])
-    angle = (direction + offsets[:, None] * apart - yaw).reshape(-1)
-    sideways = np.repeat(offsets * beside, len(direction))
-    across = np.tile(direction - yaw, 3)
-    c, s = math.cos(yaw), math.sin(yaw)
-    dx, dy = origin[0] - x0, origin[1] - y0
-    x = (c * dx + s * dy - sideways * np.sin(across)) / side
-    y = (-s * dx + c * dy + sideways * np.cos(across)) / side
-    first, unknown = _first_cells(grid, x, y, np.cos(angle), np.sin(angle), np.tile(steps, 3))
-    shape = 3, len(direction)
-    return first.reshape(shape) * side, unknown.reshape(shape) * side, tolerance, limit
-
-
-def _first_cells(
-    grid: OccupancyGrid, x: Floats, y: Floats, along: Floats, up: Floats, steps: NDArray[np.int64]
-) -> tuple[Floats, Floats]:
-    """Return distances to the first wall and to the first unknown cell of rays in cells [cells]; inf for none."""
-    rays, (rows, columns) = len(x), grid.shape
-    ray = np.repeat(np.arange(rays), steps)
-    number = np.arange(len(ray))
-    number -= np.repeat(np.cumsum(steps) - steps, steps)
-    distance = _STEP * number
-    column, row = (_cells_along(start, slope, steps, distance) for start, slope in ((x, along), (y, up)))
-    # As unsigned numbers, negative indices exceed every limit.
-    within = (column.view(np.uint32) < columns) & (row.view(np.uint32) < rows)
-    cells, place = grid.cells.reshape(-1), row.astype(np.int64) * columns + column
-    # Cells off the map are unknown, -1.
-    value = np.full(len(ray), -1, np.int8)
-    np.copyto(value, cells.take(place, mode="clip"), where=within)
-    wall = value >= grid.occupied_threshold
-    # If two successive cells share only a corner, both cells beside the corner may be walls.
-    corner = np.flatnonzero((column[1:] != column[:-1]) & (row[1:] != row[:-1]))
-    corner = corner[(number[corner + 1] > 0) & within[corner + 1] & within[corner]]
-    moved = column[corner + 1] - column[corner]
-    one, two = place[corner + 1] - moved, place[corner] + moved
-    wall[corner + 1] |= (cells[one] >= grid.occupied_threshold) & (cells[two] >= grid.occupied_threshold)
-    return _firsts(wall, ray, number, rays), _firsts(value < 0, ray, number, rays)
-
-
-def _cells_along(
-    start: Floats, slope: Floats, steps: NDArray[np.int64], distance: NDArray[np.floating]
-) -> NDArray[np.int32]:
-    """Return the rows or columns of all steps of rays, each of which begins at a coordinate and has a slope [cells].
-
-    Processors convert to 32 bits several times as fast as to 64, and off the map any number of cells will do.
-    """
-    place = np.repeat(slope, steps)
-    place *= distance
-    place += np.repeat(np.minimum(np.maximum(start, -_AFAR), _AFAR), steps)
-    return np.floor(place, out=place).astype(np.int32)
-
-
-def _firsts(marked: NDArray[np.bool_], ray: NDArray[np.int64], number: NDArray[np.int64], rays: int) -> Floats:
-    """Return the distance of the first marked step of each ray [cells]; inf without one."""
-    found = np.flatnonzero(marked)
-    first = np.full(rays, np.inf)
-    # Written from the last to the first, so the first one stays.
-    first[ray[found[::-1]]] = number[found[::-1]] * _STEP
-    return first
 
 
 def _place_of(grid: OccupancyGrid, pose: Floats) -> tuple[bool, bool]:

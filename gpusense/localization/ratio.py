@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from gpusense.localization.passages import Passages, counts_of
+from gpusense.localization.passages import Counts, Passages, counts_of
 
 BIAS, SLOPE, BLUNT, NOTHING, FEW = 3.34, 1.74, 0.48, 0.58, 4.0
 CAUTION, SOLID, UNKNOWN, LIMITS = 0.9, 2.0, 1.0, (-4.0, 5.0)
@@ -36,9 +36,20 @@ def ratio_of_scan(scans: Sequence[Passages]) -> float:
     Args:
         scans: Judged beams of each scanner, at one pose.
     """
+    return evidence_of_scan(scans)[0]
+
+
+def evidence_of_scan(scans: Sequence[Passages]) -> tuple[float, float]:
+    """Return the ratio of simultaneous scans, and the share of agreeing beams; see the functions of each."""
     if not scans:
-        return math.nan
+        return math.nan, math.nan
     counts = counts_of(scans)
+    telling = counts.telling
+    return _ratio_of(counts, scans), counts.agree / telling if telling else math.nan
+
+
+def _ratio_of(counts: Counts, scans: Sequence[Passages]) -> float:
+    """Return the ratio of scans with these counts."""
     place = SOLID * any(one.inside for one in scans) + UNKNOWN * any(one.off for one in scans)
     telling = counts.telling
     if not telling and not place:
@@ -55,8 +66,7 @@ def _odds(one: int, other: int) -> float:
 
 def explained_of_scan(scans: Sequence[Passages]) -> float:
     """Return the share of agreeing beams among those that the map could explain; NaN without any."""
-    counts = counts_of(scans)
-    return counts.agree / counts.telling if counts.telling else math.nan
+    return evidence_of_scan(scans)[1]
 
 
 def ratio_of_features(gain: float, count: int, least: float) -> float:

@@ -15,6 +15,7 @@ from gpusense.backends.base import Backend
 from gpusense.interface.constants import DEPTH, TEMPERATURE
 from gpusense.interface.launches import Program
 from gpusense.localization.defaults import DEFAULTS
+from gpusense.localization.passages import MapJudge
 from gpusense.localization.temperature import BeamCorrelation, axes_of, poses_around
 from gpusense.models.landmark.base import FeatureModel
 from gpusense.models.point.base import PointModel
@@ -64,6 +65,7 @@ class Sensor:
         self._correlation = BeamCorrelation()
         self._seen, self._learned = 0, -1
         self._ranges: Any = None
+        self._judge: MapJudge | None = None
         self.seconds, self._started = 0.0, 0
 
     def temperature(self, chosen: float | str) -> float:
@@ -93,6 +95,12 @@ class Sensor:
         correlation = copy.copy(self._correlation)
         correlation.add(parts, axes, scanner.bearings + pose[2], follows=self._learned == self._seen - 1)
         self._correlation, self._learned = correlation, self._seen
+
+    def judge(self) -> MapJudge:
+        """Return the present map on the device, where beams are judged; it is copied there on first use."""
+        if self._judge is None or self._judge.grid is not self.model.grid:
+            self._judge = MapJudge(self.backend, self.model.grid)
+        return self._judge
 
     def parts(self, poses: np.ndarray, reading: tuple[Any, ...]) -> np.ndarray:
         """Return (N, K) log-likelihoods of the beams of a scan, in float64."""

@@ -29,6 +29,7 @@ f) / (1 - r f) of independent ones. Its inverse is the second factor of the temp
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,6 +51,7 @@ _STEPS, _TURN = (1e-4, 0.1), 0.25
 # Deviations from the pose to the points of a cubature of degree 3 in 3 dimensions (Arasaratnam and Haykin, "Cubature
 # Kalman filters" (2009)): differences are means of derivatives over the normal density of the pose.
 _FAR = 3**0.5
+_IDENTITY, _TWELVE = np.eye(3), np.arange(12)
 # Initial steps without a known covariance: ahead, to the side [m] and in heading [rad].
 _FIRST_STEPS = (0.05, 0.05, 0.0125)
 
@@ -62,7 +64,8 @@ def axes_of(covariance: np.ndarray) -> np.ndarray:
     """
     units = np.array([1.0, 1.0, _TURN])
     values, vectors = np.linalg.eigh(covariance / np.outer(units, units))
-    axes: np.ndarray = units[:, None] * vectors * np.clip(np.sqrt(np.maximum(values, 0.0)), *_STEPS)
+    lengths = np.minimum(np.maximum(np.sqrt(np.maximum(values, 0.0)), _STEPS[0]), _STEPS[1])
+    axes: np.ndarray = units[:, None] * vectors * lengths
     return axes
 
 
@@ -72,20 +75,25 @@ def poses_around(pose: np.ndarray, axes: np.ndarray) -> np.ndarray:
 
 
 class _Scores(NamedTuple):
-    """Scores (3, K) of beams along the axes, their curvature, and the change (3,) of the scores by a fit."""
+    """Scores of beams along the axes.
 
-    each: np.ndarray
+    Attributes:
+        numbers: (12 K,) scores of each beam, and their outer products.
+        curvature: Curvature.
+        fit: (3,) change of the scores by a fit.
+        outer: (3, 3) sum of the outer products.
+    """
+
+    numbers: np.ndarray
     curvature: float
     fit: np.ndarray
     outer: np.ndarray
 
-    def of_blocks(self, block: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return (count, 3) scores of blocks after the fit, and (count, 3, 3) outer products, by blocks of beams."""
-        outer = np.zeros((count, 3, 3))
-        scores = np.zeros((count, 3))
-        np.add.at(scores, block, self.each.T)
-        np.add.at(outer, block, self.each.T[:, :, None] * self.each.T[:, None, :])
-        return scores - outer @ self.fit, outer
+    def of_blocks(self, places: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return (count, 3) scores of blocks after the fit, and (count, 3, 3) outer products, by ``_places_of``."""
+        sums = np.bincount(places, self.numbers, 12 * count).reshape(count, 12)
+        outer = sums[:, 3:].reshape(count, 3, 3)
+        return sums[:, :3] - outer @ self.fit, outer
 
 
 def _scores_of(parts: np.ndarray) -> _Scores:
@@ -93,8 +101,22 @@ def _scores_of(parts: np.ndarray) -> _Scores:
     each = (parts[1:4] - parts[4:7]) / (2 * _FAR)
     curvature = float(np.sum(2 * parts[0] - parts[1:4] - parts[4:7])) / _FAR**2
     outer = each @ each.T
-    regular = outer + 1e-9 * max(float(np.trace(outer)), 1e-30) * np.eye(3)
-    return _Scores(each, curvature, np.linalg.solve(regular, each.sum(axis=1)), regular)
+    regular = outer + 1e-9 * max(float(np.trace(outer)), 1e-30) * _IDENTITY
+    numbers = np.empty((each.shape[1], 12))
+    numbers[:, :3] = each.T
+    np.multiply(each.T[:, :, None], each.T[:, None, :], out=numbers[:, 3:].reshape(-1, 3, 3))
+    return _Scores(numbers.reshape(-1), curvature, np.linalg.solve(regular, each.sum(axis=1)), regular)
+
+
+def _places_of(block: np.ndarray) -> np.ndarray:
+    """Return the places (12 K,) of the numbers of beams among the sums of their blocks (K,)."""
+    return (block[:, None] * 12 + _TWELVE).reshape(-1)
+
+
+@functools.lru_cache(maxsize=64)
+def _places_of_neighbors(beams: int, count: int) -> np.ndarray:
+    """Return the places of the numbers of beams in ``count`` blocks of neighbours."""
+    return _places_of(np.arange(beams) * count // beams)
 
 
 class BeamCorrelation:
@@ -152,11 +174,12 @@ class BeamCorrelation:
     ) -> None:
         """Correlate a scan's blocks with the last scan's blocks in the same directions."""
         # Sectors of the world, an eighth of a scan wide, in a whole number per turn.
-        ahead = np.sort(np.mod(directions, 2 * np.pi))
-        gap = float(np.diff(ahead, append=ahead[0] + 2 * np.pi).max())
+        ahead = np.mod(directions, 2 * np.pi)
+        ordered = np.sort(ahead)
+        gap = max(float(np.max(ordered[1:] - ordered[:-1])), float(ordered[0] + 2 * np.pi - ordered[-1]))
         around = max(round(_SECTORS * 2 * np.pi / max(2 * np.pi - gap, 0.1)), 1)
-        block = (np.mod(directions[used], 2 * np.pi) * (around / (2 * np.pi))).astype(np.int64) % around
-        blocks, _ = scores.of_blocks(block, around)
+        block = (ahead[used] * (around / (2 * np.pi))).astype(np.int64) % around
+        blocks, _ = scores.of_blocks(_places_of(block), around)
         # Gradients in the world, times the covariance's root of this scan.
         world = np.linalg.solve(axes.T, blocks.T).T
         seen = np.bincount(block, minlength=around) > 0
@@ -210,8 +233,7 @@ class BeamCorrelation:
 
 def _variances(scores: _Scores, count: int) -> tuple[float, float]:
     """Return the variance of the scores of ``count`` blocks of beams after a fit, and that of independent beams."""
-    beams = scores.each.shape[1]
-    blocks, outer = scores.of_blocks(np.arange(beams) * count // beams, count)
+    blocks, outer = scores.of_blocks(_places_of_neighbors(len(scores.numbers) // 12, count), count)
     taken = np.einsum("bij,bij->", outer, np.linalg.solve(scores.outer, outer).transpose(0, 2, 1))
     return float(np.sum(blocks**2)), float(np.trace(scores.outer) - taken)
 

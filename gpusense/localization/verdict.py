@@ -22,7 +22,7 @@ from gpusense.backends import arrays
 from gpusense.localization.belief import Belief
 from gpusense.localization.evidence import LEAST_GAIN, Evidence, Gains
 from gpusense.localization.passages import Passages, passages
-from gpusense.localization.ratio import explained_of_scan, ratio_of_features, ratio_of_scan
+from gpusense.localization.ratio import evidence_of_scan, ratio_of_features
 from gpusense.localization.sensors import Sensor
 from gpusense.localization.spread import deviations, is_apart, is_wide
 from gpusense.localization.words import TRACKING
@@ -173,14 +173,15 @@ class Verdict:
         if state.judged == state.corrections or self._adds_nothing(pose, covariance, evidence):
             return state.explained
         scans = sightings(self._sensors, readings, pose, covariance)
-        explained, belief = explained_of_scan(scans), state.belief
+        ratio, explained = evidence_of_scan(scans)
+        belief = state.belief
         x, y, theta = (float(value) for value in pose)
         if is_apart(covariance):
             belief = belief.widened()
         elif is_wide(covariance):
             belief = belief.judged((x, y, theta), math.nan)
         else:
-            ratios = [ratio_of_scan(scans), float(np.mean(state.ratios)) if state.ratios else math.nan]
+            ratios = [ratio, float(np.mean(state.ratios)) if state.ratios else math.nan]
             known = [ratio for ratio in ratios if not math.isnan(ratio)]
             belief = belief.judged((x, y, theta), sum(known) if known else math.nan)
         places = 0 if belief.wrong < TRACKING else state.places
@@ -217,7 +218,7 @@ def sightings(
         sensor = sensors[index]
         if sensor.calibrates:
             ranges = np.asarray(arrays.copied_to_host(reading[0], sensor.backend, "ranges"), np.float64)
-            result.append(passages(sensor.model.grid, sensor.model.scanner, pose, ranges, spread))
+            result.append(passages(sensor.model.grid, sensor.model.scanner, pose, ranges, spread, sensor.judge()))
     return result
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from gpusense._util.angles import wrapped
 from gpusense.backends import Backend
+from gpusense.interface.structs import MatchRules
 from gpusense.matching.evidence import pair_evidence
 from gpusense.matching.icp import STRAIGHT_WIDTH, WIDTH, IcpPairs, space_of
 from gpusense.matching.options import MatchOptions
@@ -28,6 +29,8 @@ _NEAR, _NEAR_TURN = 0.1, 0.05
 _REFINED, _APART, _APART_TURN = 6, 0.1, 0.11
 # Penalties of a score: per capture radius of distance from the guess, and for a last step that was not small.
 _FARTHER, _UNSETTLED = 0.03, 0.05
+# Most starts whose results are kept at once, unless a launch has more.
+_KEPT = 1 << 16
 # Starts that score lower than the best one by more than this are not refined.
 _PROMISING = 0.15
 # Lines turn with noise by this in the mean square [rad^2] where longer ones give the pose.
@@ -36,6 +39,35 @@ _TURNED = 0.11
 _OTHER, _OTHER_TURN, _CLOSE = 0.25, 0.1, 0.012
 
 _IDENTITY = np.eye(3)
+
+
+class Levels(NamedTuple):
+    """Levels of noise of the pairs of a call.
+
+    Attributes:
+        options: The options of each level.
+        most: For each level the number of points of the largest reference and of the largest second scan.
+        gap: Largest step between the bearings of two neighbours that hides nothing [rad].
+    """
+
+    options: list[MatchOptions]
+    most: list[tuple[int, int]]
+    gap: float
+
+    def rules(self) -> list[MatchRules]:
+        """Return the rules of matches from guesses."""
+        return [options.rules(most, self.gap) for options, (_, most) in zip(self.options, self.most, strict=True)]
+
+    def search_rules(self) -> list[MatchRules]:
+        """Return the rules of the starts of a search."""
+        return [
+            options.search_rules(most, self.gap, before)
+            for options, (before, most) in zip(self.options, self.most, strict=True)
+        ]
+
+    def final_rules(self) -> list[MatchRules]:
+        """Return the rules of the refinement of a search's best starts."""
+        return [options.final_rules(most, self.gap) for options, (_, most) in zip(self.options, self.most, strict=True)]
 
 
 class Best(NamedTuple):
@@ -54,6 +86,7 @@ def match_pairs(
     method: str,
     options: MatchOptions,
     mount: tuple[float, float],
+    noise: np.ndarray | None = None,
 ) -> ScanMatch:
     """Match pairs of scans; ``judged`` adds the probability that they are right.
 
@@ -66,27 +99,28 @@ def match_pairs(
         method: ``"icp"`` or ``"auto"``.
         options: Capture radius, noise and window.
         mount: Place of the scanner on the robot [m].
+        noise: (S,) standard deviations of ranges [m]; None for that of the options.
     """
     lock, space = space_of(backend)
     sensor = to_sensor(guess, mount)
+    noise = np.full(len(pairs), options.noise) if noise is None else noise
     with lock, space:
-        device = IcpPairs(backend, real, points, pairs, options.noise, space)
-        counts = points.counts[pairs]
-        before, most = counts.max(axis=0, initial=0).tolist()
-        result = device.run(np.arange(len(pairs)), sensor[:, None], options.rules(most, points.gap))[:, 0]
+        device = IcpPairs(backend, real, points, pairs, noise, space)
+        levels = Levels([replace(options, noise=level) for level in device.levels], device.most_points(), points.gap)
+        result = device.run(np.arange(len(pairs)), sensor[:, None], levels.rules())[:, 0]
         best = Best(result, np.full((len(pairs), 3), np.nan))
         if method == "auto":
-            enough, score = counts.min(axis=1) > 2, result[:, 3]
+            enough, score = points.counts[pairs].min(axis=1) > 2, result[:, 3]
             poor = enough & (score < DOUBTFUL)
             far = _is_moved(result, sensor, _FAR * options.capture, _FAR_TURN) & enough & ~poor & (score < _SURE)
             for some, wide in ((poor, True), (far, False)):
                 if some.any():
                     which, starts = np.flatnonzero(some), (options if wide else nearby(options)).starts()
-                    _search(device, which, sensor[which], starts, best, options, (before, most), points.gap)
-            _repeat(device, sensor, best, options, most, points.gap)
-        noisy = _straighten(device, best.result, points, pairs, options)
-        sums = tested(device, best.result, points, pairs, options, noisy)
-    return _finished(best, sums, pairs, points, options, mount)
+                    _search(device, which, sensor[which], starts, best, options, levels)
+            _repeat(device, sensor, best, options, levels)
+        noisy = _straighten(device, best.result, noise, levels)
+        sums = tested(device, best.result, points, pairs, noise, levels.options, noisy)
+    return _finished(best, sums, pairs, points, options, noise, mount)
 
 
 def _search(
@@ -96,24 +130,24 @@ def _search(
     offsets: np.ndarray,
     best: Best,
     options: MatchOptions,
-    most: tuple[int, int],
-    gap: float,
+    levels: Levels,
 ) -> None:
-    """Search around the guesses of some pairs, and replace results by better ones.
-
-    ``most`` is the number of points of the largest reference and of the largest second scan.
-    """
-    rules, parts = options.search_rules(most[1], gap, most[0]), []
-    # The results of all starts of wide windows take much memory: as many pairs at a time as a launch has.
-    for begin in range(0, len(poor), step := device.pairs_of_launch(len(offsets))):
-        part = slice(begin, begin + step)
-        coarse = device.run(poor[part], guess[part, None] + offsets, rules)
-        rows, poses = distinct(coarse[..., :3], coarse[..., 3], best.result[poor[part], :3], options.capture)
-        parts.append((begin + rows, poses))
+    """Search around the guesses of some pairs, and replace results by better ones."""
+    rules, parts = levels.search_rules(), []
+    # The results of all starts of wide windows take much memory.
+    step = max(device.pairs_of_launch(len(offsets)), _KEPT // len(offsets))
+    for _, some in device.of_levels(poor):
+        for begin in range(0, len(some), step):
+            part = some[begin : begin + step]
+            coarse = device.run(poor[part], guess[part, None] + offsets, rules, columns=4)
+            rows, poses = distinct(coarse[..., :3], coarse[..., 3], best.result[poor[part], :3], options.capture)
+            parts.append((part[rows], poses))
     which, chosen = (np.concatenate(values) for values in zip(*parts, strict=True))
     if not len(which):
         return
-    fine = device.run(poor[which], chosen[:, None], options.final_rules(most[1], gap))[:, 0]
+    order = np.argsort(which, kind="stable")
+    which, chosen = which[order], chosen[order]
+    fine = device.run(poor[which], chosen[:, None], levels.final_rules())[:, 0]
     rows = poor[which]
     order = np.arange(len(rows)) - np.searchsorted(rows, rows)
     # The starts of all pairs in one launch, grouped by pair.
@@ -152,30 +186,27 @@ def _is_moved(result: np.ndarray, guess: np.ndarray, distance: float, turn: floa
     return far
 
 
-def _repeat(device: IcpPairs, guess: np.ndarray, best: Best, options: MatchOptions, most: int, gap: float) -> None:
+def _repeat(device: IcpPairs, guess: np.ndarray, best: Best, options: MatchOptions, levels: Levels) -> None:
     """Match pairs again from their results where the guess was poor: ICP may have stopped short of it."""
     rows = np.flatnonzero(_is_moved(best.result, guess, _NEAR * options.capture, _NEAR_TURN))
     if len(rows):
-        again = device.run(rows, best.result[rows, None, :3], options.rules(most, gap))[:, 0]
+        again = device.run(rows, best.result[rows, None, :3], levels.rules())[:, 0]
         better = (
             again[:, 3] + _UNSETTLED * again[:, 5] > best.result[rows, 3] + _UNSETTLED * best.result[rows, 5] - 1e-3
         )
         best.result[rows[better]] = again[better]
 
 
-def _straighten(
-    device: IcpPairs, result: np.ndarray, points: ScanPoints, pairs: np.ndarray, options: MatchOptions
-) -> np.ndarray:
+def _straighten(device: IcpPairs, result: np.ndarray, noise: np.ndarray, levels: Levels) -> np.ndarray:
     """Match pairs again with longer lines where noise turns the usual ones; return the numbers of these pairs."""
-    turn = (result[:, 12] + result[:, 15]) * options.noise**2 / np.maximum(result[:, 19], 1e-30)
-    rows = np.flatnonzero(turn > _TURNED)
-    if len(rows) and STRAIGHT_WIDTH * options.noise > WIDTH:
-        device.fit_lines(STRAIGHT_WIDTH * options.noise, rows)
-        most = int(points.counts[pairs[:, 1]].max(initial=0))
-        rules = options.final_rules(most, points.gap)
-        rules = rules._replace(capture=rules.least_capture, scale=rules.least_scale)
+    turn = (result[:, 12] + result[:, 15]) * noise**2 / np.maximum(result[:, 19], 1e-30)
+    noisy = np.flatnonzero(turn > _TURNED)
+    rows = noisy[STRAIGHT_WIDTH * noise[noisy] > WIDTH]
+    if len(rows):
+        device.fit_lines(lambda level: STRAIGHT_WIDTH * level, rows)
+        rules = [rule._replace(capture=rule.least_capture, scale=rule.least_scale) for rule in levels.final_rules()]
         result[rows] = device.run(rows, result[rows, None, :3], rules)[:, 0]
-    return rows
+    return noisy
 
 
 def nearby(options: MatchOptions) -> MatchOptions:
@@ -198,26 +229,26 @@ def distinct(poses: np.ndarray, score: np.ndarray, known: np.ndarray, capture: f
     # Only starts that may be refined, row by row; each choice drops those that are near it.
     least = score.max(axis=1) - _PROMISING
     row, start = np.nonzero(score > least[:, None])
-    left, pose, last = score[row, start], poses[row, start], known
+    left, last = score[row, start], known
+    x, y, turn = (poses[row, start, k] for k in range(3))
     which, chosen = [], []
     for _ in range(min(_REFINED, score.shape[1])):
-        offset = pose - last[row]
-        same = np.hypot(offset[:, 0], offset[:, 1]) < _APART * capture
-        near = np.flatnonzero(same)
-        same[near] = np.abs(wrapped(offset[near, 2])) < _APART_TURN
-        row, left, pose = row[~same], left[~same], pose[~same]
+        near = np.flatnonzero(np.hypot(x - last[row, 0], y - last[row, 1]) < _APART * capture)
+        same = np.zeros(len(row), bool)
+        same[near] = np.abs(wrapped(turn[near] - last[row[near], 2])) < _APART_TURN
+        row, left, x, y, turn = (values[~same] for values in (row, left, x, y, turn))
         if not len(row):
             break
-        begins = np.flatnonzero(np.append(True, row[1:] != row[:-1]))
-        most = np.maximum.reduceat(left, begins)
-        group = np.cumsum(np.append(False, row[1:] != row[:-1]))
+        ends = row[1:] != row[:-1]
+        begins = np.flatnonzero(np.append(True, ends))
+        group = np.cumsum(np.append(False, ends))
         # The first of several equal ones.
-        best = np.flatnonzero(left == most[group])
+        best = np.flatnonzero(left == np.maximum.reduceat(left, begins)[group])
         best = best[np.append(True, np.diff(group[best]) != 0)]
         which.append(row[best])
-        chosen.append(pose[best])
+        chosen.append(np.stack([x[best], y[best], turn[best]], axis=1))
         last = last.copy()
-        last[row[best]] = pose[best]
+        last[row[best]] = chosen[-1]
     numbers = np.concatenate([*which, np.zeros(0, np.intp)])
     order = np.argsort(numbers, kind="stable")
     return numbers[order], np.concatenate([*chosen, np.zeros((0, 3))])[order]
@@ -233,7 +264,7 @@ def to_sensor(pose: np.ndarray, mount: tuple[float, float]) -> np.ndarray:
 
 
 def _finished(
-    best: Best, sums: PairSums, pairs: np.ndarray, points: ScanPoints, options: MatchOptions,
+    best: Best, sums: PairSums, pairs: np.ndarray, points: ScanPoints, options: MatchOptions, noise: np.ndarray,
     mount: tuple[float, float],
 ) -> ScanMatch:  # fmt: skip
     """Return the matches in the robot's frame, with information and status."""
@@ -253,8 +284,8 @@ def _finished(
     step[:, :2] -= moved[:, :2, 2] * step[:, 2:]
     length = np.sqrt(np.maximum(np.einsum("si,sij,sj->s", step, final, step), 0))
     status = statuses(result, found.lost, length)
-    evidence = pair_evidence(result, found.lost, best.other, options.noise)
+    evidence = pair_evidence(result, found.lost, best.other, noise)
     return concluded(
         pose, final, factor, result[:, 3], result[:, 4], status, lever, best.other,
-        evidence, result[:, 19], options,
+        evidence, result[:, 19], noise, options.window,
     )  # fmt: skip

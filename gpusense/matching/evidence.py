@@ -32,18 +32,18 @@ _LEAST = np.array([1e-3, 3e-3, 1e-3, 1.0, 0.1, 1e-2])
 _NEAR = 0.04
 
 
-def pair_evidence(result: np.ndarray, lost: np.ndarray, other: np.ndarray, noise: float) -> np.ndarray:
+def pair_evidence(result: np.ndarray, lost: np.ndarray, other: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Return the evidence (S, 9) of results of the kernel ``match_scans``, see :data:`NAMES`; the distance is 0.
 
     Args:
         result: (S, 35) results.
         lost: (S,) number of lost directions.
         other: (S, 3) offsets to poses that agree about as well, NaN without one.
-        noise: Standard deviation of ranges [m].
+        noise: (S,) standard deviations of ranges [m].
     """
     seen, through, unseen = result[:, 21], result[:, 22], result[:, 23]
     pairs, weights = np.maximum(result[:, 18], 1), result[:, 19]
-    rough = np.sqrt(result[:, 20] / np.maximum(weights, 1e-30)) / max(noise, 1e-6)
+    rough = np.sqrt(result[:, 20] / np.maximum(weights, 1e-30)) / np.maximum(noise, 1e-6)
     common = np.maximum(seen + through, 1)
     evidence = np.zeros((len(result), len(NAMES)))
     values = (

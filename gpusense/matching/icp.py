@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import weakref
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import MATCH_RESULT
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag, with_teams_flags
-from gpusense.interface.launches import Program, launch
+from gpusense.interface.launches import Launch, Program, launch
 from gpusense.interface.structs import MatchRules
 from gpusense.matching.points import GAP, ScanPoints
 
@@ -34,10 +35,10 @@ _SPACES: weakref.WeakKeyDictionary[Backend, tuple[threading.RLock, Workspace]] =
 _LOCK = threading.Lock()
 
 
-def points_of_line(gap: float, noise: float, lever: np.ndarray) -> np.ndarray:
+def points_of_line(gap: float, noise: np.ndarray, lever: np.ndarray) -> np.ndarray:
     """Return the number of points (S,) of a long line at half of a scan's rms range ``lever``; see ``IcpPairs``."""
     spacing = 0.5 * lever * gap / GAP
-    width = max(WIDTH, LONG_WIDTH * noise)
+    width = np.maximum(WIDTH, LONG_WIDTH * noise)
     points: np.ndarray = np.clip(2 * width / np.maximum(spacing, 1e-9), 2 * REACH + 1, 2 * _MOST + 1)
     return points
 
@@ -54,18 +55,25 @@ def space_of(backend: Backend) -> tuple[threading.RLock, Workspace]:
 class IcpPairs:
     """Pairs of scans on a device.
 
+    Pairs whose ranges have equal noise form a level; each level has its own launches, with rules of its own.
+
     Args:
         backend: The device.
         real: Precision.
         points: The points of all scans.
         pairs: (S, 2) numbers of the reference and of the second scan.
-        noise: Standard deviation of ranges [m].
+        noise: (S,) standard deviations of ranges [m]; a scan belongs to pairs of one level.
         space: The workspace of the buffers.
+
+    Attributes:
+        levels: Noise of each level [m], ascending.
+        level: (S,) number of the level of each pair.
     """
 
     def __init__(
-        self, backend: Backend, real: np.dtype, points: ScanPoints, pairs: np.ndarray, noise: float, space: Workspace
-    ):
+        self, backend: Backend, real: np.dtype, points: ScanPoints, pairs: np.ndarray, noise: np.ndarray,
+        space: Workspace,
+    ):  # fmt: skip
         self._backend, self._real, self._space = backend, real, space
         self._flags = flags_if(FLOAT64=real == np.float64)
         self._pairs = np.ascontiguousarray(pairs, np.int32)
@@ -73,16 +81,37 @@ class IcpPairs:
         point = points.point if len(points.point) else np.zeros((1, 4), real)
         self._point, self._start = space.upload("match points", point), space.upload("match start", points.start)
         self._line = space.empty("match lines", point.size, real)
-        self._most, self._gap, self._noise = int(points.counts.max(initial=0)), points.gap, noise
+        self._points, self._most, self._gap = points, int(points.counts.max(initial=0)), points.gap
+        levels = np.unique(noise) if len(noise) > 1 else noise
+        self.levels: list[float] = levels.tolist()
+        self.level = np.searchsorted(levels, noise)
         # Launches that start with the next match, so that its copies need not wait for them.
         self._fits: Program = ()
-        self.fit_lines(WIDTH)
+        self.fit_lines(lambda noise: WIDTH)
 
-    def fit_lines(self, width: float, pairs: np.ndarray | None = None) -> None:
+    def of_levels(self, pairs: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+        """Yield the levels of some pairs (P,), each with the places of its pairs among these."""
+        if len(self.levels) == 1:
+            yield 0, np.arange(len(pairs))
+            return
+        of = self.level[pairs]
+        for level in np.unique(of).tolist():
+            yield level, np.flatnonzero(of == level)
+
+    def most_points(self, pairs: np.ndarray | None = None) -> list[tuple[int, int]]:
+        """Return for each level the most points of a reference, and of a second scan, of all or of some pairs (P,)."""
+        rows = np.arange(len(self._pairs)) if pairs is None else pairs
+        most = [(0, 0)] * len(self.levels)
+        for level, some in self.of_levels(rows):
+            before, second = self._points.counts[self._pairs[rows[some]]].max(axis=0, initial=0).tolist()
+            most[level] = before, second
+        return most
+
+    def fit_lines(self, width: Callable[[float], float], pairs: np.ndarray | None = None) -> None:
         """Fit lines to the points of all scans, or of the scans of some pairs, from the next match on.
 
         Args:
-            width: Half their length [m]; shorter where points are missing.
+            width: Half their length by the noise of ranges [m]; shorter where points are missing.
             pairs: (P,) indices of pairs; lines of other pairs are kept.
         """
         if not self._most:
@@ -90,42 +119,58 @@ class IcpPairs:
         # A fit to all scans replaces an earlier one.
         if pairs is not None and self._fits:
             self._backend.run(self._fits)
-        scans = np.arange(self._counts[0], dtype=np.int32) if pairs is None else np.unique(self._pairs[pairs])
+        rows = np.arange(len(self._pairs)) if pairs is None else pairs
+        whole = pairs is None and len(self.levels) == 1
+        self._fits = tuple(
+            self._lines(
+                level, np.arange(self._counts[0], dtype=np.int32) if whole else np.unique(self._pairs[rows[some]]),
+                width(self.levels[level]),
+            )
+            for level, some in self.of_levels(rows)
+        )  # fmt: skip
+
+    def _lines(self, level: int, scans: np.ndarray, width: float) -> Launch:
+        """Return the launch that fits lines to the points of some scans of a level."""
         flags = with_lanes_flag(self._backend.info.lanes, "fit_lines", self._flags)
-        lines = launch(
+        return launch(
             "fit_lines", flags, (self._most, len(scans)), point=self._point, start=self._start,
-            which=self._space.upload("match which", scans), line=self._line, chosen=len(scans),
+            which=self._space.upload(f"match which {level}", scans), line=self._line, chosen=len(scans),
             scans=self._counts[0], points=self._counts[1], reach=1 if self._gap > GAP * _SPARSE else REACH,
             most=_MOST if width > WIDTH else _FEWER,
-            ratio=max(_RATIO, _STEPS * self._gap / GAP), slack=max(_SLACK, _SLACK_DEVIATIONS * self._noise),
+            ratio=max(_RATIO, _STEPS * self._gap / GAP), slack=max(_SLACK, _SLACK_DEVIATIONS * self.levels[level]),
             width=width, gap=self._gap,
         )  # fmt: skip
-        self._fits = (lines,)
 
-    def run(self, pairs: np.ndarray, guesses: np.ndarray, rules: MatchRules) -> np.ndarray:
+    def run(
+        self, pairs: np.ndarray, guesses: np.ndarray, rules: Sequence[MatchRules], columns: int = MATCH_RESULT
+    ) -> np.ndarray:
         """Match some pairs from several guesses each.
 
         Args:
             pairs: (P,) numbers of pairs.
             guesses: (P, M, 3) poses of the second scan in the reference's frame.
-            rules: See the kernel file ``icp``.
+            rules: Those of each level; see the kernel file ``icp``.
+            columns: Numbers of each result that are returned.
 
         Returns:
-            (P, M, 35) results in float64, as the kernel file describes them.
+            (P, M, columns) results in float64, as the kernel file describes them.
         """
-        starts = guesses.shape[1]
-        result = np.empty((len(pairs), starts, MATCH_RESULT), self._real)
-        for begin in range(0, len(pairs), step := self.pairs_of_launch(starts)):
-            self._run(pairs[begin : begin + step], guesses[begin : begin + step], rules, result[begin : begin + step])
-        return result.astype(np.float64)
+        starts, result = guesses.shape[1], np.empty((len(pairs), guesses.shape[1], columns))
+        step = self.pairs_of_launch(starts)
+        for level, some in self.of_levels(pairs):
+            for begin in range(0, len(some), step):
+                part = some[begin : begin + step]
+                result[part] = self._run(pairs[part], guesses[part], rules[level])[..., :columns]
+        return result
 
     def pairs_of_launch(self, starts: int) -> int:
         """Return the most pairs of a launch of some starts each."""
         return max(_MOST_STARTS[self._backend.info.kind] // max(starts, 1), 1)
 
-    def _run(self, pairs: np.ndarray, guesses: np.ndarray, rules: MatchRules, result: np.ndarray) -> None:
-        """Match the pairs of one launch."""
+    def _run(self, pairs: np.ndarray, guesses: np.ndarray, rules: MatchRules) -> np.ndarray:
+        """Return the results (P, M, 35) of the pairs of one launch."""
         count, starts = guesses.shape[:2]
+        result = np.empty((count, starts, MATCH_RESULT), self._real)
         padded = np.zeros((count, starts, 4), self._real)
         padded[..., :3] = guesses
         space = self._space
@@ -141,3 +186,4 @@ class IcpPairs:
         fits, self._fits = self._fits, ()
         self._backend.run((*fits, matching))
         space.read(buffer, result)
+        return result

@@ -28,6 +28,8 @@ from gpusense.world.scanner import Reading, Scanner, classes
 
 # Side of a map's cell in capture radii, and most cells along a side; larger scans have larger cells.
 _CELL, _MOST_CELLS = 0.05, 1500
+# Half widths of a search [m, rad].
+WINDOW = (1.2, 1.05)
 METHODS = ("auto", "icp", "gauss_newton", "correlative")
 
 Method = Literal["auto", "icp", "gauss_newton", "correlative"]
@@ -44,7 +46,7 @@ def match_scan(
     precision: Precision = "float32",
     noise: float | Literal["auto"] = "auto",
     capture: float = 1.0,
-    window: ArrayLike = (1.2, 1.05),
+    window: ArrayLike = WINDOW,
     temperature: float = 1.0,
     motion: ArrayLike | None = None,
     reference_motion: ArrayLike | None = None,
@@ -146,19 +148,20 @@ def _matches(
         motion = np.repeat(motion, len(second), axis=0)
     before = check_motion("reference_motion", motions[1], len(first))
 
-    def to_scan(rows: np.ndarray, chosen: MatchOptions) -> ScanMatch:
-        shared = len(first) == 1
-        one, moved_before = (first, before) if shared else (first[rows], None if before is None else before[rows])
-        moved = None if motion is None else motion[rows]
-        return _to_scans(
-            one, second[rows], scanner, poses[rows], method, device, precision, chosen, moved_before, moved
-        )
-
     noise = np.full(len(second), options.noise)
     if not given:
         own = scan_noise(np.concatenate([first, second]), scanner)
         noise = match_noise(own[: len(first)], own[len(first) :])
-    return _by_noise(noise, options, to_scan), single
+    if method not in ("gauss_newton", "correlative") or not len(second):
+        moved = before, motion
+        return _to_scans(first, second, scanner, poses, method, device, precision, options, moved, noise), single
+    first, second = _still(first, scanner, before), _still(second, scanner, motion)
+
+    def by_maps(rows: np.ndarray, chosen: MatchOptions) -> ScanMatch:
+        one = first if len(first) == 1 else first[rows]
+        return match_by_maps(one, second[rows], scanner, poses[rows], method, device, precision, chosen)
+
+    return _by_noise(noise, options, by_maps), single
 
 
 def _by_noise(
@@ -175,23 +178,49 @@ def _by_noise(
 
 def _to_scans(
     first: np.ndarray, second: np.ndarray, scanner: Scanner, poses: np.ndarray, method: Method, device: Backend,
-    precision: Precision, options: MatchOptions, before: np.ndarray | None, motion: np.ndarray | None,
+    precision: Precision, options: MatchOptions, motions: tuple[np.ndarray | None, np.ndarray | None],
+    noise: np.ndarray,
 ) -> ScanMatch:  # fmt: skip
-    """Match (S, K) scans to (S, K) or (1, K) reference scans."""
-    if method in ("gauss_newton", "correlative") and len(second):
-        first, second = _still(first, scanner, before), _still(second, scanner, motion)
-        return match_by_maps(first, second, scanner, poses, method, device, precision, options)
+    """Match (S, K) scans to (S, K) or (1, K) reference scans, with noise (S,) of ranges."""
+    before, motion = motions
+    reference = np.arange(len(second)) if len(first) == len(second) else np.zeros(len(second), np.intp)
+    if len(first) != len(second) and len(noise) > 1:
+        # Lines depend on the noise, so each level of it has a reference of its own.
+        levels, reference = np.unique(noise, return_inverse=True)
+        first = np.repeat(first, len(levels), axis=0)
+        before = None if before is None else np.repeat(before, len(levels), axis=0)
     real = np.dtype(precision)
     moved = None
     if before is not None or motion is not None:
         both = (first, before), (second, motion)
         moved = np.concatenate([np.zeros((len(scans), 3)) if m is None else m for scans, m in both])
     points = scan_points(np.concatenate([first, second]), scanner, real, moved)
-    pairs = np.empty((len(second), 2), np.intp)
-    pairs[:, 1] = np.arange(len(first), len(first) + len(second))
-    pairs[:, 0] = pairs[:, 1] - len(first) if len(first) == len(second) else 0
-    match = match_pairs(device, real, points, pairs, poses, method, options, scanner.mount[:2])
+    pairs = np.stack([reference, np.arange(len(first), len(first) + len(second))], axis=1)
+    match = match_pairs(device, real, points, pairs, poses, method, options, scanner.mount[:2], noise)
     return judged(match, poses, options)
+
+
+def match_readings(
+    first: np.ndarray, second: np.ndarray, scanner: Scanner, guess: np.ndarray, own: tuple[np.ndarray, np.ndarray],
+    backend: Backend, precision: Precision, window: ArrayLike,
+    motions: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
+) -> ScanMatch:  # fmt: skip
+    """Match S pairs of checked scans as ``match_scan`` does, with known noise of each scan.
+
+    Args:
+        first: (S, K) readings of the reference scans [m].
+        second: (S, K) readings of the second scans.
+        scanner: The scanner of both.
+        guess: (S, 3) poses of the second robot frames in the first ones [m, m, rad].
+        own: (S,) and (S,) noise of the reference scans and of the second scans from ``scan_noise`` [m].
+        backend: The device.
+        precision: Precision.
+        window: Half widths of the search [m, rad].
+        motions: (S, 3) and (S, 3) motions during the reference scans and the second scans, or None.
+    """
+    options, poses = check_options(ASSUMED_NOISE, 1.0, window), check_guess(guess, len(second))
+    noise = match_noise(*own)
+    return _to_scans(first, second, scanner, poses, "auto", backend, precision, options, motions, noise)
 
 
 def _still(ranges: np.ndarray, scanner: Scanner, motion: np.ndarray | None) -> np.ndarray:

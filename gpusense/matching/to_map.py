@@ -225,14 +225,16 @@ class MapMatcher:
         points, couples = self._expected_points(ranges, pose)
         sums = pair_sums(self._backend, self._real, points, couples, self._options)
         unknown = np.full((len(pose), 3), np.nan)
-        evidence = pair_evidence(sums, lost, unknown, self._options.noise)
+        noise = np.full(len(pose), self._options.noise)
+        evidence = pair_evidence(sums, lost, unknown, noise)
         status = np.full(len(pose), "converged", dtype="<U16")
         status[lost > 0] = "unobservable"
         status[~calm] = "no convergence"
         status[score < _POOR] = "poor"
         status[hits.sum(axis=1) < _FEW] = "few points"
         return concluded(
-            pose, joint, variance, score, iterations, status, lever, unknown, evidence, pairs, self._options
+            pose, joint, variance, score, iterations, status, lever, unknown, evidence, pairs, noise,
+            self._options.window,
         )  # fmt: skip
 
 

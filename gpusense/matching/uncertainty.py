@@ -90,7 +90,7 @@ def inflation_of(squares: np.ndarray) -> np.ndarray:
 
 
 def variance_of(
-    squared: np.ndarray, pairs: np.ndarray, scale: float, noise: float, inflation: np.ndarray
+    squared: np.ndarray, pairs: np.ndarray, scale: np.ndarray, noise: np.ndarray, inflation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the variance of single errors (S,) [m^2], and the factor (S,) of the inverse information.
 
@@ -99,8 +99,8 @@ def variance_of(
     Args:
         squared: (S,) weighted mean squared error [m^2].
         pairs: (S,) sums of weights.
-        noise: Standard deviation of ranges [m].
-        scale: Scale of the weights [m].
+        noise: (S,) standard deviations of ranges [m].
+        scale: (S,) scales of the weights [m].
         inflation: (S,) factor of the covariance because errors of neighbours are correlated.
     """
     square = scale**2
@@ -169,16 +169,17 @@ def observable_directions(
     points = scan_points(ranges, scanner, real)
     everything = np.arange(len(pose))
     lock, space = space_of(backend)
+    noise = np.full(len(pose), options.noise)
     with lock, space:
-        device = IcpPairs(backend, real, points, np.stack([everything, everything], axis=1), options.noise, space)
-        device.fit_lines(max(WIDTH, LONG_WIDTH * options.noise))
+        device = IcpPairs(backend, real, points, np.stack([everything, everything], axis=1), noise, space)
+        device.fit_lines(lambda level: max(WIDTH, LONG_WIDTH * level))
         rules = options.rules(int(points.counts.max(initial=0)), points.gap)
-        result = device.run(everything, np.zeros((len(pose), 1, 3)), rules)[:, 0].astype(np.float64)
+        result = device.run(everything, np.zeros((len(pose), 1, 3)), [rules])[:, 0]
     turned = _turned(pose[:, 2], scanner.mount[:2])
     information, doubt = (turned @ symmetric(result[:, at : at + 6]) @ turned.transpose(0, 2, 1) for at in (6, 12))
     lever = points.rms_range(everything)
-    lines = result[:, 19] / points_of_line(points.gap, options.noise, lever)
-    found = observed_pairs(information, doubt, np.full(len(pose), options.noise**2), lever, lines)
+    lines = result[:, 19] / points_of_line(points.gap, noise, lever)
+    found = observed_pairs(information, doubt, noise**2, lever, lines)
     return found.information / np.maximum(variance, 1e-12)[:, None, None]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -31,36 +32,48 @@ class PairSums(NamedTuple):
 
 
 def tested(
-    device: IcpPairs, result: np.ndarray, points: ScanPoints, pairs: np.ndarray, options: MatchOptions,
-    noisy: np.ndarray,
+    device: IcpPairs, result: np.ndarray, points: ScanPoints, pairs: np.ndarray, noise: np.ndarray,
+    levels: Sequence[MatchOptions], noisy: np.ndarray,
 ) -> PairSums:  # fmt: skip
     """Return the directions that pairs observe, by the matches' lines or, where noise may turn these, by longer lines.
 
-    ``noisy`` are numbers of pairs whose lines noise turns.
+    Args:
+        device: The pairs.
+        result: (S, 35) results of the matches.
+        points: The points of all scans.
+        pairs: (S, 2) numbers of the reference and of the second scan.
+        noise: (S,) standard deviations of ranges [m].
+        levels: The options of each level of noise.
+        noisy: (N,) numbers of pairs whose lines noise turns.
     """
     lever, weights = points.rms_range(pairs[:, 1]), np.maximum(result[:, 19], 1e-30)
-    variance, factor = variance_of(
-        result[:, 20] / weights, result[:, 19], options.least_scale, options.noise, inflation_of(result[:, 24:32])
-    )
-    noise = np.maximum(variance, options.noise**2)
+    scale = np.array([options.least_scale for options in levels])[device.level]
+    variance, factor = variance_of(result[:, 20] / weights, result[:, 19], scale, noise, inflation_of(result[:, 24:32]))
+    largest = np.maximum(variance, noise**2)
 
     def observed(sums: np.ndarray, rows: np.ndarray | slice, independent: np.ndarray) -> Observed:
         information, doubt = symmetric(sums[:, 6:12]), symmetric(sums[:, 12:18])
-        return observed_pairs(information, doubt, noise[rows], lever[rows], independent)
+        return observed_pairs(information, doubt, largest[rows], lever[rows], independent)
 
     # Short lines decide only where the result is beyond doubt.
     found = observed(result, slice(None), np.zeros(len(result)))
-    turned = (result[:, 12] + result[:, 15]) * noise > _TURNED_LINES * weights
+    turned = (result[:, 12] + result[:, 15]) * largest > _TURNED_LINES * weights
     turned[noisy] = True
-    rows = np.flatnonzero((found.lost > 0) | turned)
-    if len(rows) and LONG_WIDTH * options.noise > WIDTH:
-        device.fit_lines(LONG_WIDTH * options.noise, rows)
-        rules = options.last_rules(points.gap)
-        stride = options.rules(int(points.counts[pairs[rows, 1]].max(initial=0)), points.gap).stride
-        longer = device.run(rows, result[rows, None, :3], rules._replace(stride=stride, thin=1))[:, 0]
+    rows = np.flatnonzero(((found.lost > 0) | turned) & (LONG_WIDTH * noise > WIDTH))
+    if len(rows):
+        device.fit_lines(lambda level: LONG_WIDTH * level, rows)
+        strides = [
+            options.rules(most, points.gap).stride
+            for options, (_, most) in zip(levels, device.most_points(rows), strict=True)
+        ]
+        rules = [
+            options.last_rules(points.gap)._replace(stride=stride, thin=1)
+            for options, stride in zip(levels, strides, strict=True)
+        ]
+        longer = device.run(rows, result[rows, None, :3], rules)[:, 0]
         # A subset represents all points.
-        longer[:, 6:18] *= stride
-        lines = result[:, 19] / points_of_line(points.gap, options.noise, lever)
+        longer[:, 6:18] *= np.array(strides)[device.level[rows], None]
+        lines = result[:, 19] / points_of_line(points.gap, noise, lever)
         for values, others in zip(found, observed(longer, rows, lines[rows]), strict=True):
             values[rows] = others
     return PairSums(found, variance, factor)
@@ -69,7 +82,7 @@ def tested(
 def concluded(
     pose: np.ndarray, information: np.ndarray, factor: np.ndarray, score: np.ndarray, iterations: np.ndarray,
     status: np.ndarray, lever: np.ndarray, other: np.ndarray, evidence: np.ndarray, pairs: np.ndarray,
-    options: MatchOptions,
+    noise: np.ndarray, window: tuple[float, float],
 ) -> ScanMatch:  # fmt: skip
     """Return matches whose information is 0 where they failed, and spans both poses where there are two.
 
@@ -84,7 +97,8 @@ def concluded(
         other: (S, 3) offsets to poses that agree about as well, NaN without one.
         evidence: (S, E) numbers of ``evidence.NAMES``.
         pairs: (S,) sums of weights.
-        options: The window and the noise.
+        noise: (S,) standard deviations of ranges [m].
+        window: Half widths of the search [m, rad].
     """
     usable = is_usable(status)
     two = usable & np.isfinite(other).all(axis=1)
@@ -100,9 +114,9 @@ def concluded(
         # These are not the axes of the information that is kept.
         information = np.where(usable[:, None, None], information, 0.0)
     return ScanMatch(
-        pose, covariance_of(information, lever, options.window, kept), information, np.zeros(len(pose)), score,
+        pose, covariance_of(information, lever, window, kept), information, np.zeros(len(pose)), score,
         iterations.astype(np.int64), values * (factor / np.maximum(pairs, 1))[:, None], vectors.transpose(0, 2, 1),
-        lever, np.full(len(pose), options.noise), evidence, status,
+        lever, noise, evidence, status,
     )  # fmt: skip
 
 
@@ -141,6 +155,6 @@ def pair_sums(
     stride = options.rules(int(points.counts[pairs[:, 1]].max(initial=0)), points.gap).score_stride
     rules = options.last_rules(points.gap)._replace(score_stride=stride)
     with lock, space:
-        device = IcpPairs(backend, real, points, pairs, options.noise, space)
-        result = device.run(np.arange(len(pairs)), np.zeros((len(pairs), 1, 3)), rules)[:, 0]
+        device = IcpPairs(backend, real, points, pairs, np.full(len(pairs), options.noise), space)
+        result = device.run(np.arange(len(pairs)), np.zeros((len(pairs), 1, 3)), [rules])[:, 0]
     return result

@@ -304,7 +304,7 @@ def test_motion_during_scans_is_taken_out(needs) -> None:
 
 def test_a_run_that_is_interrupted_keeps_what_it_has(lap: tuple[np.ndarray, ...], needs, monkeypatch) -> None:
     truth, scans, odometry = lap
-    monkeypatch.setattr("gpusense.chaining.front.GROUP", 40)
+    monkeypatch.setattr("gpusense.chaining.front.GUIDED_GROUP", 40)
     chainer = Chainer(scans, FRONT, odometry, backend=needs("opencl"))
     steps = chainer.steps()
     assert len(chainer.chain().poses) == 1

@@ -110,7 +110,8 @@ def test_normal_equations_are_those_of_the_dense_jacobian(fixed: int) -> None:
     assert matrix.toarray() == pytest.approx(np.einsum("ljk,lkm->jm", side, whole), abs=1e-9)
     assert gradient == pytest.approx(np.einsum("ljk,lk->j", side, links.residuals(start)), abs=1e-9)
     ordered = Equations(len(start), links.first, links.second, fixed, ordered=True)
-    again, turned = ordered.at(start, links.information * weight[:, None, None], links.residuals(start), 0.5)
+    information = links.information * weight[:, None, None]
+    again, turned = ordered.at(start, information, np.einsum("lij,lj->li", information, links.residuals(start)), 0.5)
     place = (3 * (ordered.rows - (ordered.rows > fixed))[:, None] + np.arange(3)).ravel()
     assert again.toarray() == pytest.approx((matrix.toarray() + 0.5 * np.eye(len(place)))[np.ix_(place, place)])
     assert turned == pytest.approx(gradient[place])

@@ -184,7 +184,7 @@ def test_motion_is_taken_out_of_scans_of_each_laser(needs) -> None:
 
 def test_an_interrupt_keeps_the_scans_of_all_lasers_so_far(lap: tuple, needs, monkeypatch) -> None:
     truth, scans, sensor, odometry = lap
-    monkeypatch.setattr("gpusense.chaining.front.GROUP", 20)
+    monkeypatch.setattr("gpusense.chaining.front.GUIDED_GROUP", 20)
     chainer = Chainer(scans, [AHEAD, BACK], odometry, sensor=sensor, backend=needs("opencl"))
     steps = chainer.steps()
     assert len(chainer.chain().poses) == 1

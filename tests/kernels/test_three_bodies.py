@@ -79,6 +79,8 @@ ON_PURPOSE = [
     ),
     Purpose("landmark_grid", "candidates", REFERENCE_ONLY, ARRAYS),
     Purpose("landmarks", "negative_where at_places", REFERENCE_ONLY, ARRAYS),
+    Purpose("passages", "floor_of", (OPENCL,), FLOOR),
+    Purpose("passages", "_cells_along", REFERENCE_ONLY, ARRAYS),
     Purpose("placement", "floor_cells", (OPENCL,), FLOOR),
     Purpose("ranges", "caster_of", (WARP, NUMPY), "OpenCL requires the file caster, which sources.py resolves"),
     Purpose("raycast", "track_of rectangle_at", KERNELS_ONLY, COUNTS),

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 import gpusense as gs
+from gpusense.backends import get_backend
+from gpusense.interface.constants import AGREES, NOTHING, SHORT, THROUGH, VANISHED
 from gpusense.localization.belief import ALIKE, ALIKE_LENGTH, FOUND, LENGTH, PER_METRE, PER_SCAN, STAYS, Belief
-from gpusense.localization.passages import AGREES, NOTHING, SHORT, THROUGH, VANISHED, passages
+from gpusense.localization.passages import MapJudge, passages
 from gpusense.localization.ratio import LIMITS, explained_of_scan, ratio_of_scan
 from gpusense.localization.spread import share_off, share_off_of
 from gpusense.localization.words import word_of
@@ -93,6 +95,23 @@ def test_the_map_may_lie_anywhere_and_be_turned(origin):
     grid = gs.OccupancyGrid(house().cells, 0.1, origin)
     place = gs.compose_poses(np.array(origin), POSE + np.array([0.6, 0.6, 0.0]))
     assert kinds(place, scan_at(POSE), grid) == kinds(POSE, scan_at(POSE))
+
+
+def test_every_device_judges_beams_alike(backend):
+    rng = np.random.default_rng(3)
+    for share, side in ((0.003, 0.05), (0.05, 0.3), (0.3, 0.1)):
+        cells = np.where(rng.random((70, 50)) < share, 100, 0)
+        cells[rng.random(cells.shape) < share / 4] = -1
+        grid = gs.OccupancyGrid(cells, side, (-1.0, 2.0, 0.8))
+        judge = MapJudge(get_backend(backend), grid)
+        low, high = np.array(grid.bounds()).reshape(2, 2)
+        for k in range(12):
+            pose = np.append(rng.uniform(low - 1, high + 1), rng.uniform(-9, 9)) * (1e12 if k == 5 else 1)
+            ranges = rng.choice([np.nan, np.inf, 0.0, *rng.uniform(0.0, 11.0, 9)], 64)
+            spread = (0.1 * (k % 4), 0.05 * (k % 3))
+            host = passages(grid, SCANNER, pose, ranges, spread)
+            device = passages(grid, SCANNER, pose, ranges, spread, judge)
+            assert all(np.array_equal(*pair) for pair in zip(host, device, strict=True))
 
 
 def test_a_scanner_has_its_mount():

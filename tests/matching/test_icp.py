@@ -27,8 +27,8 @@ def run(backend: str, precision: str, scanner, rules, guesses):
     points = scan_points(np.concatenate([first, second]), scanner, real)
     lock, space = space_of(device)
     with lock, space:
-        pairs = IcpPairs(device, real, points, np.arange(8).reshape(2, 4).T, 0.01, space)
-        return pairs.run(np.arange(4), guesses, rules)
+        pairs = IcpPairs(device, real, points, np.arange(8).reshape(2, 4).T, np.full(4, 0.01), space)
+        return pairs.run(np.arange(4), guesses, [rules])
 
 
 @pytest.mark.sampled(0.4)

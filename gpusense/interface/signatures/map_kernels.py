@@ -1,4 +1,4 @@
-"""Kernels that make tables of a map, and build maps from scans."""
+"""Kernels that make tables of a map, build maps from scans, and compare scans with maps."""
 
 from __future__ import annotations
 
@@ -60,5 +60,9 @@ KERNELS: dict[str, Kernel] = {
         "ray_counts", "ray", "int2 start_cell [rays]", "int2 start_inside [rays]", "int2 end_cell [rays]",
         "int2 end_inside [rays]", "int hit [rays]", "out int hits [rows * cols]", "out int misses [rows * cols]",
         *_MAP, "int rays",
+    ),
+    "judge_beams": kernel(
+        "passages", "beam", "uchar cells [rows * cols]", "double scan [2 * beams]", "out double judged [2 * beams]",
+        "BeamRules rules", *_MAP, "int beams", group=4,
     ),
 }  # fmt: skip

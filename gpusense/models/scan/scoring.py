@@ -81,14 +81,17 @@ class _Scorer:
         value = self._pipeline.value(scans)
         if value is None and (self._uploaded is None or self._uploaded[0] != piece.scans):
             self._uploaded = piece.scans, self._pipeline.upload(scans, self._space)
-        # Only once, even if a piece is retried.
-        before, self._before = self._before, None
-        if before is not None:
-            before()
         if value is not None:
+            self._begin()
             self._fill(piece, scans, value)
         elif self._uploaded is not None:
             self._score(piece, scans, self._uploaded[1])
+
+    def _begin(self) -> None:
+        """Start the launches that write the poses, only once, even if a piece is retried."""
+        before, self._before = self._before, None
+        if before is not None:
+            before()
 
     def _score(self, piece: Piece, scans: ClassedScans, readings: Readings) -> None:
         """Score a piece; log-likelihoods of readings are complete on return."""
@@ -97,6 +100,8 @@ class _Scorer:
         with space.result("log_p", request.result.flat, piece.begin, piece.count, pipeline.real) as log_p:
             scoring = pipeline.scoring(readings, placed, table, log_p, space, per_beam=request.per_beam)
             key = (scoring.flags, placed.key, readings.key)
+            # As late as possible: a processor's threads are then awake for the launches that follow.
+            self._begin()
             flags = space.run(
                 key, dict(pipeline.numbers(scoring), poses=placed.source, log_p=log_p),
                 lambda: pipeline.program(scoring), version=pipeline.map.version,

@@ -1,0 +1,137 @@
+"""Classes of the beams of a scan at one pose: each beam is walked through the map with two companions.
+
+These start beside it and diverge. :mod:`gpusense.localization.passages` describes the classes. Steps are half a cell.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpusense.interface import structs
+from gpusense.interface.constants import AGREES, NOTHING, SHORT, THROUGH, VANISHED
+from gpusense.reference.heading import cos_sin
+
+# Values of cells that are unknown, and of places off the map, which are unknown as well.
+UNKNOWN, OFF = 255, 256
+# Step of a walk, and farthest start of one, where no map reaches [cells].
+STEP, AFAR = 0.5, 1e9
+# Sides of a beam and of its companions.
+SIDES = np.array([[0.0], [1.0], [-1.0]])
+
+
+def value_at(cells: np.ndarray, col: np.ndarray, row: np.ndarray, rows: int, cols: int) -> np.ndarray:
+    """Return the values of cells."""
+    # As unsigned numbers, negative indices exceed every limit.
+    within = (col.view(np.uint32) < cols) & (row.view(np.uint32) < rows)
+    index = row.astype(np.int64)
+    index *= cols
+    index += col
+    value = np.full(col.shape, OFF, np.int16)
+    np.copyto(value, cells.take(index, mode="clip"), where=within)
+    return value
+
+
+def is_wall(value: np.ndarray, occupied: int) -> np.ndarray:
+    """Return whether values are those of walls."""
+    return (value >= occupied) & (value < UNKNOWN)
+
+
+def walk_ray(
+    start: np.ndarray, slope: np.ndarray, steps: np.ndarray, cells: np.ndarray, rows: int, cols: int, occupied: int
+) -> np.ndarray:
+    """Return the distances (2, R) along rays to the first wall, and to the first unknown cell before it [cells].
+
+    They are infinite for none. A pair of walls that share a corner stops a ray.
+
+    Args:
+        start: (2, R) columns and rows where rays begin [cells].
+        slope: (2, R) directions.
+        steps: (R,) numbers of steps.
+        cells: Values of the map's cells.
+        rows: Rows of the map.
+        cols: Columns of the map.
+        occupied: Least value of a wall.
+    """
+    # All steps of all rays in sequence.
+    ray = np.repeat(np.arange(len(steps)), steps)
+    number = np.arange(len(ray))
+    number -= np.repeat(np.cumsum(steps) - steps, steps)
+    distance = STEP * number
+    col, row = (_cells_along(start[axis], slope[axis], steps, distance) for axis in (0, 1))
+    value = value_at(cells, col, row, rows, cols)
+    stops = is_wall(value, occupied)
+    corner = np.flatnonzero((col[1:] != col[:-1]) & (row[1:] != row[:-1])) + 1
+    corner = corner[(number[corner] > 0) & (value[corner] != OFF) & (value[corner - 1] != OFF)]
+    beside = (col[corner - 1], row[corner]), (col[corner], row[corner - 1])
+    one, other = (is_wall(value_at(cells, *at, rows, cols), occupied) for at in beside)
+    stops[corner] |= one & other
+    first = np.full((2, len(steps)), np.inf)
+    for result, marked in zip(first, (stops, value >= UNKNOWN), strict=True):
+        # From the last to the first, so that the first one is written last.
+        found = np.flatnonzero(marked)[::-1]
+        result[ray[found]] = distance[found]
+    first[1, first[1] > first[0]] = np.inf
+    return first
+
+
+def _cells_along(start: np.ndarray, slope: np.ndarray, steps: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Return the columns or rows of all steps of rays, from their coordinates and slopes (R,) along one axis."""
+    place = np.repeat(slope, steps)
+    place *= distance
+    place += np.repeat(start, steps)
+    # Processors convert to 32 bits several times as fast as to 64.
+    return np.floor(place, out=place).astype(np.int32)
+
+
+def walk_beside(
+    side: np.ndarray, direction: np.ndarray, steps: np.ndarray, cells: np.ndarray, rows: int, cols: int,
+    rules: structs.BeamRules,
+) -> np.ndarray:  # fmt: skip
+    """Return the distances (2, M, B) [m] along beams (side 0) and their companions on both sides (1 and -1).
+
+    Args:
+        side: (M, 1) sides.
+        direction: (B,) directions of the beams in the map's frame [rad].
+        steps: (B,) numbers of steps.
+        cells: Values of the map's cells.
+        rows: Rows of the map.
+        cols: Columns of the map.
+        rules: Origin and companions.
+    """
+    (cos, sin), slope = cos_sin(direction), np.stack(cos_sin(direction + side * rules.apart))
+    shift = side * rules.beside
+    start = np.stack([(rules.origin_x - shift * sin) / rules.cell, (rules.origin_y + shift * cos) / rules.cell])
+    start = np.minimum(np.maximum(start, -AFAR), AFAR).reshape(2, -1)
+    first = walk_ray(start, slope.reshape(2, -1), np.tile(steps, len(side)), cells, rows, cols, rules.occupied)
+    return first.reshape(2, len(side), -1) * rules.cell
+
+
+def judge_beams(
+    flags: frozenset[str], cells: np.ndarray, scan: np.ndarray, judged: np.ndarray, rules: structs.BeamRules,
+    rows: int, cols: int, beams: int,
+) -> None:  # fmt: skip
+    """Judge beams.
+
+    The scan has their directions in the map's frame, then their readings; the result has their classes, then the
+    distances to the first wall on the beam itself.
+    """
+    direction, measured = scan[: 2 * beams].reshape(2, beams)
+    returned = measured < rules.range_max
+    reading = np.where(returned, measured, rules.range_max)
+    tolerance = np.maximum(rules.least, rules.part * reading)
+    before, after = reading - tolerance, reading + tolerance
+    within = returned & (reading <= rules.limit)
+    steps = (np.minimum(after, rules.limit) / (rules.cell * STEP)).astype(np.int64) + 1
+    # A ray gives no evidence beyond the first unknown cell.
+    end = np.where(returned, before, reading)
+    first, unknown = walk_beside(SIDES, direction, steps, cells, rows, cols, rules)
+    seen, own = unknown >= np.minimum(first, end), first[0]
+    alone = within & (own >= before) & (own <= after) & seen[0]
+    nearest, farthest, seen = first.min(axis=0), first.max(axis=0), seen.all(axis=0)
+    walled = farthest < np.inf
+    kind = np.full(beams, NOTHING)
+    kind[seen & within & (nearest == np.inf)] = SHORT
+    kind[seen & ~returned & walled] = VANISHED
+    kind[seen & returned & (farthest < before)] = THROUGH
+    kind[alone | (seen & within & walled & (nearest <= after) & (farthest >= before))] = AGREES
+    judged[:beams], judged[beams : 2 * beams] = kind, own

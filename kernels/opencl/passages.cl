@@ -1,0 +1,99 @@
+// Classes of the beams of a scan at one pose: each beam is walked through the map with two companions that start beside
+// it and diverge. gpusense.localization.passages describes the classes. Steps are half a cell.
+// requires: heading
+
+// Values of cells that are unknown, and of places off the map, which are unknown as well.
+#define UNKNOWN 255
+#define OFF 256
+// Step of a walk, and farthest start of one, where no map reaches [cells].
+#define STEP 0.5
+#define AFAR 1e9
+#define BEAM_NOTHING 0
+#define BEAM_AGREES 1
+#define BEAM_SHORT 2
+#define BEAM_THROUGH 3
+#define BEAM_VANISHED 4
+
+// Return the floor of a coordinate; some drivers call floor as a function.
+int floor_of(const double position) {
+    const int whole = (int)position;
+    return whole - (whole > position);
+}
+
+// Return the value of a cell.
+int value_at(global const uchar *cells, const int col, const int row, const int rows, const int cols) {
+    // As unsigned numbers, negative indices exceed every limit.
+    return (uint)col < (uint)cols && (uint)row < (uint)rows ? cells[(long)row * cols + col] : OFF;
+}
+
+// Return whether a value is that of a wall.
+int is_wall(const int value, const int occupied) {
+    return value >= occupied && value < UNKNOWN;
+}
+
+// Return the distances along a ray to the first wall, and to the first unknown cell before it [cells]; infinite for none.
+// A pair of walls that share a corner stops a ray.
+double2 walk_ray(const double2 start, const double2 slope, const int steps, global const uchar *cells, const int rows,
+                 const int cols, const int occupied) {
+    double2 first = (double2)(INFINITY, INFINITY);
+    int col_before = 0, row_before = 0, value_before = OFF;
+    for (int k = 0; k < steps; ++k) {
+        const double distance = STEP * k;
+        const int col = floor_of(slope.x * distance + start.x), row = floor_of(slope.y * distance + start.y);
+        // Nothing is new in the same cell.
+        if (col == col_before && row == row_before && k > 0) continue;
+        const int value = value_at(cells, col, row, rows, cols);
+        int stops = is_wall(value, occupied);
+        if (col != col_before && row != row_before && value != OFF && value_before != OFF)
+            stops |= is_wall(value_at(cells, col_before, row, rows, cols), occupied) &&
+                     is_wall(value_at(cells, col, row_before, rows, cols), occupied);
+        if (value >= UNKNOWN && isinf(first.y)) first.y = distance;
+        if (stops) {
+            first.x = distance;
+            break;
+        }
+        col_before = col, row_before = row, value_before = value;
+    }
+    return first;
+}
+
+// Return the distances [m] along a beam (side 0) or its companion on one side (1 or -1).
+double2 walk_beside(const double side, const double direction, const int steps, global const uchar *cells,
+                    const int rows, const int cols, const BeamRules rules) {
+    const double2 along = cos_sin(direction), slope = cos_sin(direction + side * rules.apart);
+    const double shift = side * rules.beside;
+    const double x = (rules.origin_x - shift * along.y) / rules.cell, y = (rules.origin_y + shift * along.x) / rules.cell;
+    const double2 start = (double2)(fmin(fmax(x, -AFAR), AFAR), fmin(fmax(y, -AFAR), AFAR));
+    return walk_ray(start, slope, steps, cells, rows, cols, rules.occupied) * rules.cell;
+}
+
+// Judge beams: one work-item takes a beam. The scan has their directions in the map's frame, then their readings; the
+// result has their classes, then the distances to the first wall on the beam itself.
+kernel void judge_beams(ARGUMENTS) {
+    const int b = get_global_id(0);
+    if (b >= beams) return;
+    const double direction = scan[b];
+    const int returned = scan[beams + b] < rules.range_max;
+    const double reading = returned ? scan[beams + b] : rules.range_max;
+    const double tolerance = fmax(rules.least, rules.part * reading);
+    const double before = reading - tolerance, after = reading + tolerance;
+    const int within = returned && reading <= rules.limit, steps = (int)(fmin(after, rules.limit) / (rules.cell * STEP)) + 1;
+    // A ray gives no evidence beyond the first unknown cell.
+    const double end = returned ? before : reading;
+    const double2 own = walk_beside(0, direction, steps, cells, rows, cols, rules);
+    int kind = BEAM_NOTHING;
+    if (within && own.x >= before && own.x <= after && own.y >= fmin(own.x, end)) {
+        kind = BEAM_AGREES;
+    } else {
+        const double2 left = walk_beside(1, direction, steps, cells, rows, cols, rules);
+        const double2 right = walk_beside(-1, direction, steps, cells, rows, cols, rules);
+        const double nearest = fmin(own.x, fmin(left.x, right.x)), farthest = fmax(own.x, fmax(left.x, right.x));
+        const int seen = own.y >= fmin(own.x, end) && left.y >= fmin(left.x, end) && right.y >= fmin(right.x, end);
+        if (seen && within && isinf(nearest)) kind = BEAM_SHORT;
+        if (seen && !returned && !isinf(farthest)) kind = BEAM_VANISHED;
+        if (seen && returned && farthest < before) kind = BEAM_THROUGH;
+        if (seen && within && nearest <= after && farthest >= before && !isinf(farthest)) kind = BEAM_AGREES;
+    }
+    judged[b] = kind;
+    judged[beams + b] = own.x;
+}

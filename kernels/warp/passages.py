@@ -1,0 +1,138 @@
+"""Classes of the beams of a scan at one pose: each beam is walked through the map with two companions.
+
+These start beside it and diverge. gpusense.localization.passages describes the classes. Steps are half a cell.
+"""
+
+import functools
+import math
+
+import warp as wp
+
+from gpusense.interface import constants
+
+from . import heading
+from .prelude import kernel, precision
+
+# Values of cells that are unknown, and of places off the map, which are unknown as well.
+UNKNOWN, OFF = wp.constant(255), wp.constant(256)
+# Step of a walk, and farthest start of one, where no map reaches [cells].
+STEP, AFAR, MINUS_AFAR = wp.constant(wp.float64(0.5)), wp.constant(wp.float64(1e9)), wp.constant(wp.float64(-1e9))
+ZERO, ONE, MINUS_ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0)), wp.constant(wp.float64(-1.0))
+FOREVER = wp.constant(wp.float64(math.inf))
+NOTHING, AGREES = wp.constant(constants.NOTHING), wp.constant(constants.AGREES)
+SHORT, THROUGH = wp.constant(constants.SHORT), wp.constant(constants.THROUGH)
+VANISHED = wp.constant(constants.VANISHED)
+
+
+# Return the value of a cell.
+@wp.func
+def value_at(cells: wp.array(dtype=wp.uint8), col: wp.int32, row: wp.int32, rows: wp.int32, cols: wp.int32):
+    value = OFF
+    if col >= 0 and row >= 0 and col < cols and row < rows:
+        value = wp.int32(cells[row * cols + col])
+    return value
+
+
+# Return whether a value is that of a wall.
+@wp.func
+def is_wall(value: wp.int32, occupied: wp.int32):
+    return value >= occupied and value < UNKNOWN
+
+
+# Return the distances along a ray to the first wall, and to the first unknown cell before it [cells]; infinite for
+# none. A pair of walls that share a corner stops a ray.
+@wp.func
+def walk_ray(
+    start: wp.vec2d, slope: wp.vec2d, steps: wp.int32, cells: wp.array(dtype=wp.uint8), rows: wp.int32, cols: wp.int32,
+    occupied: wp.int32,
+):  # fmt: skip
+    wall = wp.float64(FOREVER)
+    unknown = wp.float64(FOREVER)
+    col_before = int(0)
+    row_before = int(0)
+    value_before = int(OFF)
+    k = int(0)
+    while k < steps:
+        distance = STEP * wp.float64(k)
+        col = wp.int32(wp.floor(slope.x * distance + start.x))
+        row = wp.int32(wp.floor(slope.y * distance + start.y))
+        value = value_at(cells, col, row, rows, cols)
+        stops = is_wall(value, occupied)
+        if col != col_before and row != row_before and value != OFF and value_before != OFF:
+            if is_wall(value_at(cells, col_before, row, rows, cols), occupied):
+                if is_wall(value_at(cells, col, row_before, rows, cols), occupied):
+                    stops = True
+        if value >= UNKNOWN and wp.isinf(unknown):
+            unknown = distance
+        k += 1
+        if stops:
+            wall = distance
+            k = steps
+        col_before = col
+        row_before = row
+        value_before = value
+    return wp.vec2d(wall, unknown)
+
+
+@functools.cache
+def make(name, flags):
+    """Make a kernel of the file for a set of flags."""
+    BeamRules = precision(flags).BeamRules
+    cos_sin = heading.functions(flags & {"HUGE_HEADINGS"}).cos_sin
+
+    # Return the distances [m] along a beam (side 0) or its companion on one side (1 or -1).
+    @wp.func
+    def walk_beside(
+        side: wp.float64, direction: wp.float64, steps: wp.int32, cells: wp.array(dtype=wp.uint8), rows: wp.int32,
+        cols: wp.int32, rules: BeamRules,
+    ):  # fmt: skip
+        along = cos_sin(direction)
+        slope = cos_sin(direction + side * rules.apart)
+        shift = side * rules.beside
+        x = (rules.origin_x - shift * along.y) / rules.cell
+        y = (rules.origin_y + shift * along.x) / rules.cell
+        start = wp.vec2d(wp.min(wp.max(x, MINUS_AFAR), AFAR), wp.min(wp.max(y, MINUS_AFAR), AFAR))
+        return walk_ray(start, slope, steps, cells, rows, cols, rules.occupied) * rules.cell
+
+    # Judge beams: one work-item takes a beam. The scan has their directions in the map's frame, then their readings;
+    # the result has their classes, then the distances to the first wall on the beam itself.
+    @kernel(flags)
+    def judge_beams(cells, scan, judged, rules, rows, cols, beams):
+        b = wp.tid()
+        if b >= beams:
+            return
+        direction = scan[b]
+        reading = scan[beams + b]
+        returned = reading < rules.range_max
+        if not returned:
+            reading = rules.range_max
+        tolerance = wp.max(rules.least, rules.part * reading)
+        before = reading - tolerance
+        after = reading + tolerance
+        within = returned and reading <= rules.limit
+        steps = wp.int32(wp.min(after, rules.limit) / (rules.cell * STEP)) + 1
+        # A ray gives no evidence beyond the first unknown cell.
+        end = wp.where(returned, before, reading)
+        own = walk_beside(ZERO, direction, steps, cells, rows, cols, rules)
+        seen = own.y >= wp.min(own.x, end)
+        kind = NOTHING
+        if within and own.x >= before and own.x <= after and seen:
+            kind = AGREES
+        else:
+            left = walk_beside(ONE, direction, steps, cells, rows, cols, rules)
+            right = walk_beside(MINUS_ONE, direction, steps, cells, rows, cols, rules)
+            nearest = wp.min(own.x, wp.min(left.x, right.x))
+            farthest = wp.max(own.x, wp.max(left.x, right.x))
+            seen = seen and left.y >= wp.min(left.x, end) and right.y >= wp.min(right.x, end)
+            if seen and within and wp.isinf(nearest):
+                kind = SHORT
+            if seen and not returned and not wp.isinf(farthest):
+                kind = VANISHED
+            if seen and returned and farthest < before:
+                kind = THROUGH
+            if seen and within and nearest <= after and farthest >= before and not wp.isinf(farthest):
+                kind = AGREES
+        judged[b] = wp.float64(kind)
+        judged[beams + b] = own.x
+
+    return locals()[name]

@@ -3,6 +3,7 @@
     python bench/error_vs_time/agreement.py                      # all pairs of reports of a device in the history
     python bench/error_vs_time/agreement.py ONE.json TWO.json    # all pairs of these reports
     python bench/error_vs_time/agreement.py --history ONE.json   # of both
+    python bench/error_vs_time/agreement.py --write              # the counts that page.py publishes, into agreement.csv
 
 Two reports of a device are compared on the points or settings that both have, so a map or a setting that one of them
 lacks makes no difference. The older answer stands until another one is clearly better, as on the page; "afresh" counts
@@ -14,6 +15,8 @@ different commits, so that some differences are due to the code.
 from __future__ import annotations
 
 import argparse
+import csv
+import io
 import itertools
 import json
 import subprocess
@@ -28,7 +31,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from error_vs_time.choices import SHOWN, WISHES, answer, chosen
 from error_vs_time.reports import ROWS, git
 
+from gpusense._util.files import write_whole
 from gpusense.evaluation.benchmark.report import SCHEMA, table
+
+COUNTS = Path(__file__).with_name("agreement.csv")
 
 KEYS = {
     "models": ("scene", "cloud", "problem", "method", "variant", "knob", "value", "precision", "particles", "beams"),
@@ -162,18 +168,37 @@ def summary(reports: Sequence[Report]) -> list[str]:
     return [*lines, "", *table(("device", "to do", "older", "answer", "newer", "answer"), differences, 6)]
 
 
+def counts(reports: Sequence[Report]) -> str:
+    """Return how many pairs and answers each device has, how many are the same, and how many afresh, as CSV."""
+    found: dict[tuple[str, str], list[int]] = {}
+    for old, new, answers in pairs(reports):
+        dates = {str(one.document["date"]) for one in (old, new)}
+        row = found.setdefault((answers[0].device, "different dates" if len(dates) > 1 else "one date"), [0, 0, 0, 0])
+        numbers = 1, len(answers), sum(one.same for one in answers), sum(one.afresh for one in answers)
+        row[:] = [total + number for total, number in zip(row, numbers, strict=True)]
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(("device", "reports of", "pairs", "answers", "same", "afresh"))
+    writer.writerows([*key, *numbers] for key, numbers in sorted(found.items()))
+    return stream.getvalue()
+
+
 def main() -> int:
     """Print the tables; return 1 if answers differ."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("reports", nargs="*", type=Path, help="reports of measure.py; default: those of the history")
     parser.add_argument("--history", action="store_true", help="the history's reports beside the others")
+    parser.add_argument("--write", action="store_true", help=f"write {COUNTS.name} as well")
     arguments = parser.parse_args()
     try:
         reports = [report_of(file.name, file.read_text(encoding="utf-8")) for file in arguments.reports]
         reports += list(history()) if arguments.history or not reports else []
     except (OSError, ValueError, KeyError, subprocess.SubprocessError) as error:
         parser.error(f"{type(error).__name__}: {error}")
-    lines = summary([report for report in reports if report is not None])
+    read = [report for report in reports if report is not None]
+    if arguments.write:
+        write_whole(COUNTS, lambda stream: stream.write(counts(read).encode()))
+    lines = summary(read)
     print("\n".join(lines))
     return int(lines[0].split()[0] != lines[0].split()[2])
 

@@ -72,7 +72,9 @@ class FitnessOfLog:
 
     def __init__(self, model: Model, *, seed: int = 0) -> None:
         self._model, self._seed = model, seed
-        self._belief, self._judge = Belief(), MapJudge(model.backend, model.grid)
+        # The host judges beams for devices without float64.
+        device = model.backend if model.backend.info.float64 else None
+        self._belief, self._judge = Belief(), None if device is None else MapJudge(device, model.grid)
         self._scans: list[Passages] = []
         self._shares: list[float] = []
         self._better: list[float] = []

@@ -1,10 +1,15 @@
 // Negative information: landmarks that the sensor should see from a pose, but that match no feature.
 // requires: error_free landmarks landmark_grid
 
-// Return whether a landmark is within range, and the cosine of its angle to the sensor's axis is at least ``least``.
+// Return whether a landmark is within range and, with a FIELD, the cosine of its angle to the sensor's axis is at least
+// ``least``.
 int in_view(const real4 off, const real cosine, const real sine, const real range_max, const real least) {
     const real d = sqrt(off.x * off.x + off.z * off.z);
+#if FIELD
     return d <= range_max && cosine * off.x + sine * off.z >= least * d;
+#else
+    return d <= range_max;
+#endif
 }
 
 // Add log_missed to log_p for every landmark in view that belongs to no feature. One work-item takes a particle.

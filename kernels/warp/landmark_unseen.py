@@ -17,11 +17,17 @@ def make(name, flags):
     sensor_place, offset = density.sensor_place, density.offset
     bucket_at = landmark_grid.functions(flags & {"FLOAT64"}).bucket_at
 
-    # Return whether a landmark is within range, and the cosine of its angle to the sensor's axis is at least ``least``.
+    FIELD = "FIELD" in flags
+
+    # Return whether a landmark is within range and, with a FIELD, the cosine of its angle to the sensor's axis is at
+    # least ``least``.
     @wp.func
     def in_view(off: vec4, cosine: real, sine: real, range_max: real, least: real):
         d = wp.sqrt(off[0] * off[0] + off[2] * off[2])
-        return d <= range_max and cosine * off[0] + sine * off[2] >= least * d
+        seen = d <= range_max
+        if FIELD:
+            seen = seen and cosine * off[0] + sine * off[2] >= least * d
+        return seen
 
     # Add log_missed to log_p for every landmark in view that belongs to no feature. One work-item takes a particle.
     @kernel(flags)

@@ -206,6 +206,7 @@ def test_reports_of_other_days_are_compared(page: ModuleType, tmp_path: Path) ->
         f"| {DEVICE} | 1000 particles at 100 Hz | a, 2026-01-01 | **beam, 1000 x 60**: 9 ms, 6 mm | b, 2026-01-01 |"
     )
     assert device in lines[-1]
+    assert agreement.counts([new, old]).splitlines()[1:] == [f'"{DEVICE}",one date,1,3,2,2']
     assert agreement.summary([old])[0] == "0 of 0 answers of 0 pairs of reports are the same, 0 afresh."
 
 

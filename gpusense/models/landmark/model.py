@@ -203,7 +203,8 @@ class LandmarkModel(FeatureModel):
         if not self.negative:
             return ()
         p = self.parameters
-        flags = with_lanes_flag(self._backend.info.lanes, "count_unseen", self._flags)
+        flags = self._flags | flags_if(FIELD=not full_circle(p))
+        flags = with_lanes_flag(self._backend.info.lanes, "count_unseen", flags)
         return (launch(
             "count_unseen", flags, (placed.count,), landmark=self._tables.landmark, start=self._tables.start,
             pose_cell=placed.cell, pose=placed.pose, pose_low=placed.low, which=which, log_p=log_p,

@@ -1,16 +1,15 @@
 // Search for the landmarks near the end points of a feature for LANES particles at once: landmark_grid.cl in lanes.
-// requires: landmark_grid lanes/landmarks
+// requires: landmark_grid lanes/buckets lanes/landmarks
 
 // Particles search together unless that visits more than TOGETHER times the buckets of a single search.
 #define TOGETHER 16
 
 // Return the smallest and the largest of the lanes.
 real2 ends_of_lanes(const lanes a) {
-    real each[LANES];
-    store_lanes(a, 0, each);
-    real2 ends = (real2)(each[0], each[0]);
-    for (int i = 1; i < LANES; ++i) ends = (real2)(fmin(ends.x, each[i]), fmax(ends.y, each[i]));
-    return ends;
+    const float8 low = a.lo < a.hi ? a.lo : a.hi, high = a.lo < a.hi ? a.hi : a.lo;
+    const float4 less = low.lo < low.hi ? low.lo : low.hi, more = high.lo < high.hi ? high.hi : high.lo;
+    const float2 least = less.lo < less.hi ? less.lo : less.hi, most = more.lo < more.hi ? more.hi : more.lo;
+    return (real2)(least.x < least.y ? least.x : least.y, most.x < most.y ? most.y : most.x);
 }
 
 // Results of a search: the log densities, of the likeliest landmarks or with MARGINAL of all of them; the log densities
@@ -42,6 +41,22 @@ void with_density_lanes(MatchLanes *match, const ilanes seen, const lanes log_p,
 #endif
 }
 
+#if !MARGINAL
+// Return the lanes in which a landmark at an offset may be likelier than the best so far. The exponent is at least that of
+// the error of the range and the sine of the bearing's; margins cover rounding errors, and landmarks without a bearing
+// at zero range.
+ilanes may_be_likelier(const LanePlace off, const lanes d, const LanePlace turned, const lanes best,
+                       global const real *feature) {
+    const float at = feature[RANGE_AT];
+    const lanes rest = feature[MOST] - best, beyond = d - at;
+    const lanes side = turned.x.hi * off.y.hi - turned.y.hi * off.x.hi;
+    const lanes away = (beyond < 0 ? -beyond : beyond) - 1e-6f * (d + at), across = (side < 0 ? -side : side) - 1e-6f * d;
+    const lanes r = (away > 0 ? away : (lanes)0) * feature[RANGE_SCALE];
+    const lanes b = (across > 0 ? across : (lanes)0) * feature[BEARING_SCALE] / d;
+    return ~(r * r + b * b > 1.01f * (rest > 0 ? rest : (lanes)0) + 0.01f) | (d <= (float)ZERO_RANGE);
+}
+#endif
+
 // Update the matches by landmark j, where it lies in a feature's disc, within the limits of the sensor that the feature
 // does not measure, and may be likelier than the best so far.
 void with_landmark_lanes(MatchLanes *match, global const real4 *landmark, global const real4 *signature, const int j,
@@ -56,8 +71,12 @@ void with_landmark_lanes(MatchLanes *match, global const real4 *landmark, global
     const LanePlace off = offset_lanes(here, place);
     const lanes squared = off.x.hi * off.x.hi + off.y.hi * off.y.hi;
     ilanes seen = (apart <= match->most) & (squared >= hole) & (squared <= farthest);
+    const lanes d = sqrt(squared);
 #if FIELD
-    seen &= turned.x.hi * off.x.hi + turned.y.hi * off.y.hi >= feature[AXIS] * sqrt(squared);
+    seen &= turned.x.hi * off.x.hi + turned.y.hi * off.y.hi >= feature[AXIS] * d;
+#endif
+#if !MARGINAL
+    seen &= may_be_likelier(off, d, turned, match->best, feature);
 #endif
     if (!any_lane(seen)) return;
 #if SIGNATURE
@@ -77,20 +96,31 @@ void with_landmark_lanes(MatchLanes *match, global const real4 *landmark, global
 #endif
 }
 
-// Search the landmarks of some buckets. The landmark nearest to (x, y), the middle of the end points, comes first:
-// after it most others are too far to be likelier. Sums have the order of the landmarks, which does not depend on the
-// other lanes.
+// Return whether a landmark lies beyond a radius around each end point: none is outside of the intervals x and y. Rounded
+// differences and squares grow with exact ones, so no end point's squared distance is smaller.
+int is_beyond(const real4 here, const real2 x, const real2 y, const float squared_radius) {
+    const float left = x.x - here.x, right = here.x - x.y, below = y.x - here.y, above = here.y - y.y;
+    const float across = left > right ? left : right, along = below > above ? below : above;
+    return (across > 0 ? across * across : 0) + (along > 0 ? along * along : 0) > squared_radius;
+}
+
+// Search the landmarks of some buckets. The landmark nearest to the middle of the end points, which lie in the intervals
+// x and y, comes first: after it most others are too far to be likelier. Sums have the order of the landmarks, which
+// does not depend on the other lanes.
 void search_buckets_lanes(MatchLanes *match, global const real4 *landmark, global const real4 *signature,
-                          global const int *start, const int4 buckets, const int cols, const float x, const float y,
+                          global const int *start, const int4 buckets, const int cols, const real2 x, const real2 y,
                           const LanePlace place, const LanePlace turned, const lanes end_x, const lanes end_y,
                           global const real *feature, global const real *terms) {
+    const float squared_radius = feature[RADIUS] * feature[RADIUS];
     int nearest = -1;
 #if !MARGINAL
+    const float middle_x = 0.5f * (x.x + x.y), middle_y = 0.5f * (y.x + y.y);
     float least = INFINITY;
     for (int row = buckets.z; row <= buckets.w; ++row) {
         const int last = start[row * cols + buckets.y + 1];
         for (int j = start[row * cols + buckets.x]; j < last; ++j) {
-            const float off_x = landmark[j].x - x, off_y = landmark[j].y - y, squared = off_x * off_x + off_y * off_y;
+            const float off_x = landmark[j].x - middle_x, off_y = landmark[j].y - middle_y;
+            const float squared = off_x * off_x + off_y * off_y;
             nearest = squared < least ? j : nearest;
             least = squared < least ? squared : least;
         }
@@ -101,17 +131,9 @@ void search_buckets_lanes(MatchLanes *match, global const real4 *landmark, globa
     for (int row = buckets.z; row <= buckets.w; ++row) {
         const int last = start[row * cols + buckets.y + 1];
         for (int j = start[row * cols + buckets.x]; j < last; ++j)
-            if (j != nearest)
+            if (j != nearest && !is_beyond(landmark[j], x, y, squared_radius))
                 with_landmark_lanes(match, landmark, signature, j, place, turned, end_x, end_y, feature, terms);
     }
-}
-
-// Return the first and last column, and the first and last row, of the buckets that discs touch.
-int4 touched_buckets(const real2 x, const real2 y, const float radius, const Buckets buckets) {
-    const int left = bucket_at(x.x - radius, buckets.size, buckets.cols);
-    const int right = bucket_at(x.y + radius, buckets.size, buckets.cols);
-    const int low = bucket_at(y.x - radius, buckets.size, buckets.rows);
-    return (int4)(left, right, low, bucket_at(y.y + radius, buckets.size, buckets.rows));
 }
 
 // Return the matches of a feature. Where the discs of all particles touch few more buckets together than each disc
@@ -129,18 +151,19 @@ MatchLanes search_lanes(global const real4 *landmark, global const real4 *signat
     const int up = min((int)(2 * fmin(radius, buckets.size * buckets.rows) / buckets.size) + 2, buckets.rows);
     if ((long)(all.y - all.x + 1) * (all.w - all.z + 1) <= TOGETHER * (long)across * up) {
         match.most = radius * radius;
-        search_buckets_lanes(&match, landmark, signature, start, all, buckets.cols, 0.5f * (x.x + x.y),
-                             0.5f * (y.x + y.y), place, turned, end_x, end_y, feature, terms);
+        search_buckets_lanes(&match, landmark, signature, start, all, buckets.cols, x, y, place, turned, end_x, end_y,
+                             feature, terms);
     } else {
         real each_x[LANES], each_y[LANES];
         store_lanes(end_x, 0, each_x);
         store_lanes(end_y, 0, each_y);
         for (int i = 0; i < LANES; ++i) {
-            const int4 touched = touched_buckets((real2)each_x[i], (real2)each_y[i], radius, buckets);
+            const real2 x_only = each_x[i], y_only = each_y[i];
+            const int4 touched = touched_buckets(x_only, y_only, radius, buckets);
             const ilanes active = (ilanes)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15) == i;
             // No squared distance is negative, so the other lanes find nothing.
             match.most = active ? (lanes)(radius * radius) : (lanes)-1;
-            search_buckets_lanes(&match, landmark, signature, start, touched, buckets.cols, each_x[i], each_y[i], place,
+            search_buckets_lanes(&match, landmark, signature, start, touched, buckets.cols, x_only, y_only, place,
                                  turned, end_x, end_y, feature, terms);
         }
     }

@@ -1,6 +1,6 @@
 // Negative information: count_unseen of landmark_unseen.cl, for LANES landmarks of a particle at once, with the same
 // bits. Landmarks of neighbouring buckets lie side by side, wherever the particles are.
-// requires: landmark_grid lanes/offsets
+// requires: landmark_grid lanes/buckets lanes/offsets
 
 // Return the high parts of the offsets from a sensor to landmarks.
 lanes offset_to_lanes(const lanes landmark, const lanes landmark_low, const real place, const real place_low) {
@@ -22,10 +22,8 @@ Viewer viewer_of(const int2 cell, const real4 high, const real4 low, const Bucke
     viewer.place = sensor_place(cell, high, low, buckets.size);
     viewer.cosine = high.z * view.axis_cosine - high.w * view.axis_sine;
     viewer.sine = high.w * view.axis_cosine + high.z * view.axis_sine;
-    viewer.buckets = (int4)(bucket_at(viewer.place.x - view.range_max, buckets.size, buckets.cols),
-                            bucket_at(viewer.place.x + view.range_max, buckets.size, buckets.cols),
-                            bucket_at(viewer.place.z - view.range_max, buckets.size, buckets.rows),
-                            bucket_at(viewer.place.z + view.range_max, buckets.size, buckets.rows));
+    const real2 x = viewer.place.x, y = viewer.place.z;
+    viewer.buckets = touched_buckets(x, y, view.range_max, buckets);
     return viewer;
 }
 
@@ -35,7 +33,10 @@ ilanes unseen_lanes(const Viewer *viewer, const LanePlace at, const ilanes index
     const lanes x = offset_to_lanes(at.x.hi, at.y.hi, viewer->place.x, viewer->place.y);
     const lanes y = offset_to_lanes(at.x.lo, at.y.lo, viewer->place.z, viewer->place.w);
     const lanes d = sqrt(x * x + y * y);
-    ilanes missed = (d <= view.range_max) & (viewer->cosine * x + viewer->sine * y >= view.least * d);
+    ilanes missed = d <= view.range_max;
+#if FIELD
+    missed &= viewer->cosine * x + viewer->sine * y >= view.least * d;
+#endif
     for (int k = 0; k < features; ++k) missed &= index != which[k];
     return missed;
 }

@@ -255,6 +255,8 @@ def _place_of(grid: OccupancyGrid, pose: Floats) -> tuple[bool, bool]:
     rows, columns = grid.shape
     if not (-reach <= row < rows + reach and -reach <= column < columns + reach):
         return False, True
+    if 0 <= row < rows and 0 <= column < columns and 0 <= grid.cells[row, column] < grid.occupied_threshold:
+        return False, False
     cells = grid.cells[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
     if not cells.size:
         return False, True

@@ -99,8 +99,8 @@ def functions(flags):
         def log_of_exponent(exponent: vec2, terms: wp.array(dtype=real)):
             hit = (terms[0] - exponent.x) + (terms[4] - exponent.y)
             if RAND:
-                largest = wp.max(hit, terms[2])
-                return largest + wp.log(wp.exp(hit - largest) + wp.exp(terms[2] - largest))
+                # The larger of two exponentials is 1.
+                return wp.max(hit, terms[2]) + wp.log(ONE + wp.exp(-wp.abs(hit - terms[2])))
             else:
                 return hit
 

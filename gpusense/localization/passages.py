@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense.backends.base import Backend
+from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import AGREES, NOTHING, SHORT, THROUGH, VANISHED
 from gpusense.interface.launches import Program, launch
@@ -114,7 +114,7 @@ def counts_of(scans: Sequence[Passages]) -> Counts:
 
 
 class MapJudge:
-    """The cells of a map on a device, which judges beams there.
+    """The cells of a map around the last pose on a device, which judges beams there.
 
     Args:
         backend: The device.
@@ -126,21 +126,49 @@ class MapJudge:
 
     def __init__(self, backend: Backend, grid: OccupancyGrid) -> None:
         self.grid, self._space = grid, Workspace(backend)
-        self._cells = backend.upload(_bytes_of(grid))
+        # First and last row and column of the cells on the device.
+        self._part = (0, 0), (0, 0)
+        self._cells: Buffer = None
 
     def __call__(self, rules: BeamRules, scan: Floats) -> Floats:
         """Return the result of the kernel ``judge_beams``."""
-        space, size, (rows, cols) = self._space, len(scan), self.grid.shape
+        space, size = self._space, len(scan)
+        (top, bottom), (left, right) = self._part_around(rules)
+        side = rules.cell
+        rules = rules._replace(origin_x=rules.origin_x - left * side, origin_y=rules.origin_y - top * side)
         device_scan, judged = space.upload("scan", scan), space.empty("judged", size, _DOUBLE)
+        changing = dict(cells=self._cells, rules=rules, rows=bottom - top, cols=right - left)
 
         def program() -> Program:
-            arguments = dict(cells=self._cells, scan=device_scan, judged=judged, rules=rules, rows=rows, cols=cols)
-            return (launch("judge_beams", _PLAIN, (size // 2,), beams=size // 2, **arguments),)
+            beams = size // 2
+            return (launch("judge_beams", _PLAIN, (beams,), scan=device_scan, judged=judged, beams=beams, **changing),)
 
-        space.run(size, dict(rules=rules), program, version=0)
+        space.run(size, changing, program, version=0)
         result = np.empty(size)
         space.read(judged, result)
         return result
+
+    def _part_around(self, rules: BeamRules) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Return rows and columns on the device, after a copy if some are missing that a ray may reach."""
+        reach = (rules.limit + rules.beside) / rules.cell + 2
+        places = (rules.origin_y / rules.cell, rules.origin_x / rules.cell)
+        if self._cells is None or not all(
+            begin <= low and high <= end
+            for (begin, end), (low, high) in zip(self._part, self._around(places, reach), strict=True)
+        ):
+            # With a margin, so that a robot that moves on seldom needs another part.
+            self._part = (top, bottom), (left, right) = self._around(places, 1.5 * reach)
+            part = np.ascontiguousarray(self.grid.cells[top:bottom, left:right])
+            self._cells = self._space.upload("cells", part.reshape(-1).view(np.uint8))
+        return self._part
+
+    def _around(self, places: tuple[float, float], reach: float) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Return rows and columns within a distance of a place [cells], at least one of each."""
+        spans = []
+        for place, size in zip(places, self.grid.shape, strict=True):
+            low = int(min(max(place - reach, 0.0), size - 1.0))
+            spans.append((low, int(min(max(place + reach, low), size - 1.0)) + 1))
+        return spans[0], spans[1]
 
 
 def _bytes_of(grid: OccupancyGrid) -> NDArray[np.uint8]:
@@ -227,6 +255,8 @@ def _place_of(grid: OccupancyGrid, pose: Floats) -> tuple[bool, bool]:
     rows, columns = grid.shape
     if not (-reach <= row < rows + reach and -reach <= column < columns + reach):
         return False, True
+    if 0 <= row < rows and 0 <= column < columns and 0 <= grid.cells[row, column] < grid.occupied_threshold:
+        return False, False
     cells = grid.cells[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
     if not cells.size:
         return False, True

@@ -155,8 +155,11 @@ class IcpPairs:
         Returns:
             (P, M, columns) results in float64, as the kernel file describes them.
         """
-        starts, result = guesses.shape[1], np.empty((len(pairs), guesses.shape[1], columns))
+        starts = guesses.shape[1]
         step = self.pairs_of_launch(starts)
+        if len(self.levels) == 1 and len(pairs) <= step:
+            return self._run(pairs, guesses, rules[0])[..., :columns].astype(np.float64)
+        result = np.empty((len(pairs), starts, columns))
         for level, some in self.of_levels(pairs):
             for begin in range(0, len(some), step):
                 part = some[begin : begin + step]

@@ -64,19 +64,15 @@ def functions(flags):
         past = vec2((offset.x - nearest) + offset.y, ZERO)
         if EXACT_EXPONENT:
             past = two_sum(offset.x - nearest, offset.y)
-        size = past
-        if past.x < ZERO:
-            size = -past
+        below = past.x < ZERO
+        size = vec2(wp.where(below, -past.x, past.x), wp.where(below, -past.y, past.y))
         other = vec2(ONE - size.x, ZERO)
         if EXACT_EXPONENT:
             other = pair_sum(vec2(ONE, ZERO), -size)
-        rest = past
-        to_next = other
-        if past.x + EDGE < ZERO:
-            nearest -= ONE
-            rest = other
-            to_next = -past
-        return int(nearest), rest, to_next
+        under = past.x + EDGE < ZERO
+        rest = vec2(wp.where(under, other.x, past.x), wp.where(under, other.y, past.y))
+        to_next = vec2(wp.where(under, -past.x, other.x), wp.where(under, -past.y, other.y))
+        return int(wp.where(under, nearest - ONE, nearest)), rest, to_next
 
     # An end point: its cell as an offset from the pose's cell, and its place between the edges of that cell.
     @wp.struct

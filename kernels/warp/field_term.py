@@ -45,16 +45,27 @@ def functions(flags):
         else:
             return vec2(weight_a.x * a.x + weight_b.x * b.x, ZERO)
 
+    # Return the distances of the four cell centres around an end point.
+    @wp.func
+    def four_distances(table: wp.array(dtype=real), cell: wp.vec2i, window: types.Window):
+        return vec4(
+            number_at(table, field_cell(cell.x, cell.y, window)),
+            number_at(table, field_cell(cell.x + 1, cell.y, window)),
+            number_at(table, field_cell(cell.x, cell.y + 1, window)),
+            number_at(table, field_cell(cell.x + 1, cell.y + 1, window)),
+        )
+
+    # Interpolate between four distances, in two parts.
+    @wp.func
+    def interpolated(four: vec4, end: EndPoint):
+        low = between(end.to_next_x, vec2(four.x, ZERO), end.rest_x, vec2(four.y, ZERO))
+        high = between(end.to_next_x, vec2(four.z, ZERO), end.rest_x, vec2(four.w, ZERO))
+        return between(end.to_next_y, low, end.rest_y, high)
+
     # Interpolate the distance between the four cell centres around an end point, in two parts.
     @wp.func
     def bilinear(table: wp.array(dtype=real), cell: wp.vec2i, end: EndPoint, window: types.Window):
-        a = vec2(number_at(table, field_cell(cell.x, cell.y, window)), ZERO)
-        b = vec2(number_at(table, field_cell(cell.x + 1, cell.y, window)), ZERO)
-        c = vec2(number_at(table, field_cell(cell.x, cell.y + 1, window)), ZERO)
-        d = vec2(number_at(table, field_cell(cell.x + 1, cell.y + 1, window)), ZERO)
-        low = between(end.to_next_x, a, end.rest_x, b)
-        high = between(end.to_next_x, c, end.rest_x, d)
-        return between(end.to_next_y, low, end.rest_y, high)
+        return interpolated(four_distances(table, cell, window), end)
 
     # Return the exponent of a normal in two parts, since for a high peak exponent and log peak nearly cancel.
     # terms[8] = {hit, 1 / (2 sigma^2), rand, log z_max, the low parts of terms 0 and 1, two numbers of the shape of a
@@ -72,28 +83,31 @@ def functions(flags):
     def field_exponent(distance: vec2, terms: wp.array(dtype=real)):
         return shape_exponent(field_square(distance, terms), terms[6], terms[7])
 
-    # Return log p of the distance from an end point to the nearest obstacle.
+    # Return log p of the exponent of the density of a hit.
     if LINEAR:
 
         @wp.func
-        def log_field(distance: vec2, terms: wp.array(dtype=real)):
+        def log_of_exponent(exponent: vec2, terms: wp.array(dtype=real)):
             p = terms[2]
             if HIT:
-                exponent = field_exponent(distance, terms)
                 p += terms[0] * wp.exp(-exponent.x) * (ONE - exponent.y)
             return wp.log(p)
 
     else:
 
         @wp.func
-        def log_field(distance: vec2, terms: wp.array(dtype=real)):
-            exponent = field_exponent(distance, terms)
+        def log_of_exponent(exponent: vec2, terms: wp.array(dtype=real)):
             hit = (terms[0] - exponent.x) + (terms[4] - exponent.y)
             if RAND:
-                largest = wp.max(hit, terms[2])
-                return largest + wp.log(wp.exp(hit - largest) + wp.exp(terms[2] - largest))
+                # The larger of two exponentials is 1.
+                return wp.max(hit, terms[2]) + wp.log(ONE + wp.exp(-wp.abs(hit - terms[2])))
             else:
                 return hit
+
+    # Return log p of the distance from an end point to the nearest obstacle.
+    @wp.func
+    def log_field(distance: vec2, terms: wp.array(dtype=real)):
+        return log_of_exponent(field_exponent(distance, terms), terms)
 
     # Return the term of one reading. The table holds log densities, or cubes of densities (CUBES), or, where it is
     # interpolated, capped distances in metres.

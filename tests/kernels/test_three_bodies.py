@@ -48,6 +48,7 @@ BLOCKS = "a work-item reads blocks of 16 readings as sets of bits; the reference
 TILES = "a work-item of a GPU finds its particle and rays; the reference takes all of them at once"
 TEAMS = "work-items of a GPU share the points of a scan; the reference takes all points at once"
 QUICK = "kernels round end points first and repeat the doubtful ones with twice the digits; the reference repeats all"
+STAGES = "on Warp's processor device each stage of a block is a loop; OpenCL has lanes for it"
 KERNELS_ONLY, REFERENCE_ONLY = (OPENCL, WARP), (NUMPY,)
 
 ON_PURPOSE = [
@@ -66,8 +67,10 @@ ON_PURPOSE = [
     Purpose("error_free", "where_pair strands_in block_sums strand_sums _sums", REFERENCE_ONLY, ARRAYS),
     Purpose("field", "rounded_block", KERNELS_ONLY, QUICK),
     Purpose("field", "field_log", KERNELS_ONLY, "sum_terms of beam.py does it for both models"),
+    Purpose("field", "staged_sum", (WARP,), STAGES),
     Purpose("field_gradient", "add_slope", KERNELS_ONLY, "readings come one after another"),
     Purpose("field_term", "quick_value careful_value", KERNELS_ONLY, QUICK),
+    Purpose("field_term", "four_distances interpolated log_of_exponent", (WARP,), STAGES),
     Purpose("heading", "two_sum_float64 high_half_float64 pair_product_float64", (OPENCL,), FLOAT64),
     Purpose("icp_step", "add_to_blocks close_blocks", KERNELS_ONLY, "points come one after another"),
     Purpose("icp_step", "cooperates", (WARP,), "OpenCL's processors have teams as well"),

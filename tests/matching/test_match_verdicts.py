@@ -131,10 +131,16 @@ def test_noise_of_a_call_does_not_depend_on_its_other_scans():
     match = gs.match_scan(one, two, RING, truth, backend="numpy")
     assert len(np.unique(match.noise)) > 1
     assert (np.abs(np.log(match.noise / noise[:, 0])) < 2 * math.log(ROOT)).all()
-    for i in (0, 5):
-        alone = gs.match_scan(one[i], two[i], RING, truth[i], backend="numpy")
-        assert alone.pose.tolist() == match.pose[i].tolist()
-        assert float(alone.noise) == match.noise[i]
+    # Several scans with one reference, from guesses of which some need a search.
+    guess = truth + [[0.0, 0.0, 0.0], [0.9, 0.3, 0.5]] * 3
+    shared = gs.match_scan(one[0], two, RING, guess, backend="numpy")
+    assert len(np.unique(shared.noise)) > 1
+    for i in (0, 1, 4, 5):
+        for k, (whole, start) in ((i, (match, truth)), (0, (shared, guess))):
+            alone = gs.match_scan(one[k], two[i], RING, start[i], backend="numpy")
+            assert alone.pose.tolist() == whole.pose[i].tolist()
+            assert alone.information.tolist() == whole.information[i].tolist()
+            assert float(alone.noise) == whole.noise[i] and alone.status == whole.status[i]
     fixed = gs.match_scan(one, two, RING, truth, backend="numpy", noise=0.02)
     assert (fixed.noise == 0.02).all()
     with pytest.raises((TypeError, ValueError), match=r"^noise"):

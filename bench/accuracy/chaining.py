@@ -64,17 +64,23 @@ def aligned_error(poses: np.ndarray, truth: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.abs(p * turn / abs(turn) - q) ** 2)))
 
 
+def ends_of_paths(poses: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return indices of the first and last pose of each path of at least a length [m], and the paths' lengths."""
+    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+    last = np.searchsorted(path, path + length)
+    first = np.flatnonzero(last < len(path))
+    last = last[first]
+    return first, last, path[last] - path[first]
+
+
 def drifts(poses: np.ndarray, truth: np.ndarray, length: float) -> tuple[float, float]:
     """Return the mean error of relative poses over paths of a length: per cent, and degrees a metre."""
     rows = np.flatnonzero(np.isfinite(truth).all(axis=1))
-    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(truth[rows, :2], axis=0).T)))
-    first = np.arange(len(rows))
-    second = np.searchsorted(path, path + length)
-    first, second = first[second < len(rows)], second[second < len(rows)]
+    first, second, long = ends_of_paths(truth[rows], length)
     if not len(first):
         return np.nan, np.nan
     moved = [gs.pose_difference(p[rows[first]], p[rows[second]]) for p in (truth, poses)]
-    off, long = gs.pose_difference(*moved), path[second] - path[first]
+    off = gs.pose_difference(*moved)
     return float(100 * np.mean(np.hypot(off[:, 0], off[:, 1]) / long)), float(
         np.degrees(np.mean(np.abs(off[:, 2]) / long))
     )

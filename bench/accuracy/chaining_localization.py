@@ -32,7 +32,7 @@ from gpusense.localization.defaults import DEFAULTS
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from chaining import LIMIT, figures
+from chaining import LIMIT, ends_of_paths, figures
 from chaining_logs import Log, load, references
 from common import make_parser, note, parse, publish, table
 
@@ -83,9 +83,7 @@ def aligned(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 def over_length(poses: np.ndarray, truth: np.ndarray, length: float) -> np.ndarray:
     """Return errors (P,) of relative poses over a path of a length [m]; none where the track is shorter."""
-    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T)))
-    first, second = np.arange(len(path)), np.searchsorted(path, path + length)
-    first, second = first[second < len(path)], second[second < len(path)]
+    first, second, _ = ends_of_paths(truth, length)
     moved = [gs.pose_difference(p[first], p[second]) for p in (truth, poses)]
     return np.hypot(*(gs.pose_difference(*moved))[:, :2].T)
 

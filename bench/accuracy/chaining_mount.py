@@ -26,7 +26,7 @@ import gpusense as gs
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from chaining import drifts, figures
+from chaining import drifts, ends_of_paths, figures
 from chaining_logs import Log, load, references
 from common import make_parser, parse, publish, table
 
@@ -82,9 +82,7 @@ def measured(log: Log, backend: str) -> list[dict[str, Any]]:
 
 def heading_of_mount(poses: np.ndarray, others: np.ndarray) -> float:
     """Return the offset of the mount's heading [rad] with which poses (S, 3) best follow the motions of others."""
-    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(others[:, :2], axis=0).T)))
-    first, second = np.arange(len(path)), np.searchsorted(path, path + MOTION)
-    first, second = first[second < len(path)], second[second < len(path)]
+    first, second, _ = ends_of_paths(others, MOTION)
     moved, wanted = (gs.pose_difference(p[first], p[second]) for p in (poses, others))
 
     def errors(values: np.ndarray) -> np.ndarray:

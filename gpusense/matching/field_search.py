@@ -22,7 +22,7 @@ import numpy as np
 from gpusense._util.angles import wrapped
 from gpusense._util.typing import Space
 from gpusense.backends import get_backend
-from gpusense.matching.pose_grid import Found, PoseGrid
+from gpusense.matching.pose_grid import Found, PoseGrid, end_places
 from gpusense.matching.score_tables import TOP, ScoreTables, quantized
 from gpusense.matching.search import Search
 from gpusense.models.scan.caster import RayCaster
@@ -221,10 +221,8 @@ def _first_of_largest(log_p: np.ndarray, found: Found, rows: np.ndarray) -> int:
 
 
 def _tile_numbers(points: np.ndarray, headings: np.ndarray, start: np.ndarray, tiles: int) -> np.ndarray:
-    """Return the numbers (A, K) of the tiles in which end points lie at each heading; see ``end_cells``."""
-    cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
-    x, y = points[:, 0], points[:, 1]
-    place = np.stack([start[0] + (cos * x - sin * y), start[1] + (sin * x + cos * y)], axis=-1)
+    """Return the numbers (A, K) of the tiles in which end points lie at each heading; see ``end_places``."""
+    place = end_places(points, headings, start)
     tile = np.minimum(np.floor((place - np.floor(place)) * tiles), tiles - 1).astype(np.int32)
     number: np.ndarray = tile[..., 1] * tiles + tile[..., 0]
     return number

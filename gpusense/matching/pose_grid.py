@@ -83,8 +83,8 @@ class Found:
         return np.searchsorted(self.scan, np.arange(len(self.complete)))
 
 
-def end_cells(points: np.ndarray, headings: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return (A, K, 2) int32 columns and rows of the end points at each heading, at the position ``start``.
+def end_places(points: np.ndarray, headings: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return (A, K, 2) places [cells] of the end points at each heading, at the position ``start``.
 
     Args:
         points: (K, 2) end points in the robot's frame [cells].
@@ -93,8 +93,12 @@ def end_cells(points: np.ndarray, headings: np.ndarray, start: np.ndarray) -> np
     """
     cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
     x, y = points[:, 0], points[:, 1]
-    cells = np.stack([start[0] + (cos * x - sin * y), start[1] + (sin * x + cos * y)], axis=-1)
-    return np.floor(cells).astype(np.int32)
+    return np.stack([start[0] + (cos * x - sin * y), start[1] + (sin * x + cos * y)], axis=-1)
+
+
+def end_cells(points: np.ndarray, headings: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return (A, K, 2) int32 columns and rows of the end points; see :func:`end_places`."""
+    return np.floor(end_places(points, headings, start)).astype(np.int32)
 
 
 def distinct_poses(poses: np.ndarray, count: int, radius: float, angle: float, first: int = 0) -> list[int]:

@@ -32,7 +32,10 @@ evidence: it counts as repeated from the previous scan. A contradiction counts i
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
+
+import numpy as np
 
 # Prior probability of "wrong" after a start at a pose. Rates of becoming wrong per scan and per metre, of becoming
 # right again, and of both while the distribution is wide.
@@ -46,6 +49,18 @@ ALIKE, ALIKE_LENGTH, ALIKE_TURN = 0.12, 8.0, 2.0
 MISSES, MOST_PLACES = 8, 2
 # Longest motion from one scan to the next that counts [m]; a longer one is a jump of the localiser.
 _FASTEST = 1.0
+
+
+def correlation(pose: Sequence[float] | np.ndarray, before: Sequence[float] | np.ndarray) -> float:
+    """Return the correlation of the log-likelihood ratios of two scans that were taken at two poses."""
+    way, turn = _motion(pose, before)
+    return STAYS * math.exp(-way / LENGTH - turn / TURN)
+
+
+def _motion(pose: Sequence[float] | np.ndarray, before: Sequence[float] | np.ndarray) -> tuple[float, float]:
+    """Return distance [m] and turn [rad] between two poses."""
+    way = math.hypot(pose[0] - before[0], pose[1] - before[1])
+    return way, abs(math.remainder(float(pose[2] - before[2]), math.tau))
 
 
 class Belief(NamedTuple):
@@ -100,9 +115,8 @@ class Belief(NamedTuple):
         if self.chosen and ratio < 0:
             rho, before = STAYS, ratio
         elif self.pose is not None:
-            way = math.hypot(pose[0] - self.pose[0], pose[1] - self.pose[1])
-            turn = abs(math.remainder(pose[2] - self.pose[2], math.tau))
-            rho = STAYS * math.exp(-way / LENGTH - turn / TURN)
+            way, turn = _motion(pose, self.pose)
+            rho = correlation(pose, self.pose)
         lost = 1 - math.exp(-PER_SCAN * self.scans - PER_METRE * min(way, _FASTEST * self.scans))
         log_odds, alike = self._moved(lost, 1 - (1 - FOUND) ** self.scans, 1)
         if math.isnan(ratio):

@@ -103,8 +103,9 @@ class Recovery:
     def _compare(self, rival: Rival, readings: list[SensorReadings]) -> None:
         """Correct the rival, and let it replace the particles if it has won."""
         tracker = self._tracker
-        rival.correct(readings, evidence_of(tracker.cloud.summary()))
-        won = rival.judge(*tracker.mean_and_covariance(), readings)
+        pose, covariance = tracker.mean_and_covariance()
+        rival.correct(readings, evidence_of(tracker.cloud.summary()), pose)
+        won = rival.judge(pose, covariance, readings)
         if won is not None:
             poses, weights = won
             # The next scans have to confirm them.

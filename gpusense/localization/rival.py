@@ -8,11 +8,13 @@ each cloud, the mean likelihood of its predicted particles, the logarithm of the
 
     B = sum over later scans t of log p_rival(z_t | ...) - log p_filter(z_t | ...)
 
-is evidence for the rival (Kass and Raftery, "Bayes factors" (1995)); the scan by which the rival was chosen is not. The
-rival replaces the particles once B exceeds ``WIN``, after ``SCANS`` scans if it lies together, and after ``APART``
-scans if several places are equally likely, provided that the beams that meet walls support it. Until then the particles
-give the estimate, and the probability that the rival is right adds to the probability of being lost. A rival is given
-up if it ends at the pose of the particles, falls behind, or has not won after ``LONGEST`` scans.
+is evidence for the rival (Kass and Raftery, "Bayes factors" (1995)); the scan by which the rival was chosen is not.
+Terms of scans that lie close together repeat one another, since the same furniture is wrong in all of them, so each
+counts as far as it is new (:mod:`gpusense.localization.belief`). The rival replaces the particles once B exceeds
+``WIN``, after ``SCANS`` scans if it lies together, and after ``APART`` scans if several places are equally likely,
+provided that the beams that meet walls support it. Until then the particles give the estimate, and the probability that
+the rival is right adds to the probability of being lost. A rival is given up if it ends at the pose of the particles,
+falls behind, or has not won after ``LONGEST`` scans.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ import numpy as np
 
 from gpusense.interface.constants import EVIDENCE
 from gpusense.localization import starts
+from gpusense.localization.belief import correlation
 from gpusense.localization.filter_cloud import Contents, SensorReadings, Summary
 from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import SampledMotion
@@ -75,6 +78,8 @@ class Rival:
         self._tracker = tracker
         self.active, self.log_odds = False, PRIOR
         self._scans, self._place = 0, np.zeros(3)
+        # Log ratio of the last scan, and the pose of the particles then.
+        self._last, self._at = 0.0, np.zeros(3)
         self._prior, self._settled = PRIOR, False
         # Weighted sums of the log-likelihood ratios of the rival and of the particles, and the sum of the weights.
         self._ratios = np.zeros(3)
@@ -133,24 +138,28 @@ class Rival:
         self._tracker.place(starts.spread(tries[chosen], _SPREAD, options.most, key, each=True))
         self.active, self.log_odds, self._prior, self._scans, self._settled = True, prior, prior, 0, False
         # No trace of an earlier rival may remain in the state.
-        self._ratios, self._place = np.zeros(3), np.zeros(3)
+        self._ratios, self._place, self._last, self._at = np.zeros(3), np.zeros(3), 0.0, np.zeros(3)
 
     def predict(self, motion: SampledMotion) -> None:
         """Move the rival."""
         if self.active:
             self._tracker.follow(motion)
 
-    def correct(self, readings: list[SensorReadings], evidence: float) -> None:
+    def correct(self, readings: list[SensorReadings], evidence: float, pose: np.ndarray) -> None:
         """Correct the rival, and compare it with the particles.
 
         Args:
             readings: Indices of sensors with their readings.
             evidence: Evidence of the filter, by :func:`evidence_of`.
+            pose: (3,) estimated pose of the particles.
         """
         self._tracker.weigh(readings)
         mine = evidence_of(self._tracker.cloud.summary())
         if math.isfinite(mine) or math.isfinite(evidence):
-            self.log_odds += min(max(mine - evidence, -_MOST), _MOST)
+            ratio = min(max(mine - evidence, -_MOST), _MOST)
+            rho = correlation(pose, self._at) if self._scans else 0.0
+            self.log_odds += (ratio - rho * self._last) / (1 + rho)
+            self._last, self._at = ratio, np.array(pose)
         self._scans += 1
 
     def judge(

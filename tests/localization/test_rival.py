@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from support import filter_scene as scene
 
 import gpusense as gs
+from gpusense.localization import rival
 from gpusense.localization.rival_search import drawn
 from gpusense.matching.likely import likely_poses
 
@@ -192,3 +194,16 @@ def test_a_second_rival_has_nothing_of_the_first(backend, monkeypatch):
             pf.correct(scene.readings(pf, 3))
         found.append(scene.everything(pf))
     assert found[0] == found[2] != found[1]
+
+
+def test_scans_of_a_robot_that_stands_count_once_for_a_rival(monkeypatch):
+    """The same furniture is wrong in all of them; scans far apart count in full."""
+    monkeypatch.setattr(rival, "evidence_of", lambda summary: -1.0)
+    gains = []
+    for step in (0.0, 100.0):
+        cloud = SimpleNamespace(summary=lambda: None)
+        one = rival.Rival(SimpleNamespace(sensors=[], cloud=cloud, weigh=lambda readings: None))
+        for scan in range(20):
+            one.correct([], -4.0, np.array([step * scan, 0.0, 0.0]))
+        gains.append(one.log_odds - rival.PRIOR)
+    assert gains[0] == pytest.approx(3.0 + 19 * 3.0 * 0.05 / 1.95) and gains[1] == pytest.approx(60.0)

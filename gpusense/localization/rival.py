@@ -9,8 +9,8 @@ each cloud, the mean likelihood of its predicted particles, the logarithm of the
     B = sum over later scans t of log p_rival(z_t | ...) - log p_filter(z_t | ...)
 
 is evidence for the rival (Kass and Raftery, "Bayes factors" (1995)); the scan by which the rival was chosen is not.
-Terms of scans that lie close together repeat one another, since the same furniture is wrong in all of them, so each
-counts as far as it is new (:mod:`gpusense.localization.belief`). The rival replaces the particles once B exceeds
+Terms of scans that lie close together repeat one another, since the same furniture is wrong in all of them, so against
+a tracked pose each counts as far as it is new (:mod:`gpusense.localization.belief`). The rival replaces the particles once B exceeds
 ``WIN``, after ``SCANS`` scans if it lies together, and after ``APART`` scans if several places are equally likely,
 provided that the beams that meet walls support it. Until then the particles give the estimate, and the probability that
 the rival is right adds to the probability of being lost. A rival is given up if it ends at the pose of the particles,
@@ -78,8 +78,8 @@ class Rival:
         self._tracker = tracker
         self.active, self.log_odds = False, PRIOR
         self._scans, self._place = 0, np.zeros(3)
-        # Log ratio of the last scan, and the pose of the particles then.
-        self._last, self._at = 0.0, np.zeros(3)
+        # Of each set of sensors: log ratio of its last scan, and the pose of the particles then.
+        self._last: dict[tuple[int, ...], tuple[float, np.ndarray]] = {}
         self._prior, self._settled = PRIOR, False
         # Weighted sums of the log-likelihood ratios of the rival and of the particles, and the sum of the weights.
         self._ratios = np.zeros(3)
@@ -138,7 +138,7 @@ class Rival:
         self._tracker.place(starts.spread(tries[chosen], _SPREAD, options.most, key, each=True))
         self.active, self.log_odds, self._prior, self._scans, self._settled = True, prior, prior, 0, False
         # No trace of an earlier rival may remain in the state.
-        self._ratios, self._place, self._last, self._at = np.zeros(3), np.zeros(3), 0.0, np.zeros(3)
+        self._ratios, self._place, self._last = np.zeros(3), np.zeros(3), {}
 
     def predict(self, motion: SampledMotion) -> None:
         """Move the rival."""
@@ -157,9 +157,12 @@ class Rival:
         mine = evidence_of(self._tracker.cloud.summary())
         if math.isfinite(mine) or math.isfinite(evidence):
             ratio = min(max(mine - evidence, -_MOST), _MOST)
-            rho = correlation(pose, self._at) if self._scans else 0.0
-            self.log_odds += (ratio - rho * self._last) / (1 + rho)
-            self._last, self._at = ratio, np.array(pose)
+            sensors = tuple(index for index, _ in readings)
+            before, at = self._last.get(sensors, (0.0, pose))
+            # A place that was searched on the whole map is no likelier than its rivals, so they are compared at once.
+            rho = correlation(pose, at) if sensors in self._last and self._prior < 0.0 else 0.0
+            self.log_odds += (ratio - rho * before) / (1 + rho)
+            self._last[sensors] = ratio, np.array(pose)
         self._scans += 1
 
     def judge(

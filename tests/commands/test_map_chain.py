@@ -131,7 +131,7 @@ def test_odometry_that_never_changes_is_none(log, tmp_path, capsys, needs):
 
 
 def test_an_interrupt_keeps_the_chain_so_far(log, truth, tmp_path, capsys, monkeypatch, needs):
-    monkeypatch.setattr("gpusense.chaining.front.GROUP", 10)
+    monkeypatch.setattr("gpusense.chaining.front.GUIDED_GROUP", 10)
 
     @contextlib.contextmanager
     def interrupting(total):

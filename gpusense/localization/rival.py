@@ -10,11 +10,11 @@ each cloud, the mean likelihood of its predicted particles, the logarithm of the
 
 is evidence for the rival (Kass and Raftery, "Bayes factors" (1995)); the scan by which the rival was chosen is not.
 Terms of scans that lie close together repeat one another, since the same furniture is wrong in all of them, so against
-a tracked pose each counts as far as it is new (:mod:`gpusense.localization.belief`). The rival replaces the particles once B exceeds
-``WIN``, after ``SCANS`` scans if it lies together, and after ``APART`` scans if several places are equally likely,
-provided that the beams that meet walls support it. Until then the particles give the estimate, and the probability that
-the rival is right adds to the probability of being lost. A rival is given up if it ends at the pose of the particles,
-falls behind, or has not won after ``LONGEST`` scans.
+a tracked pose each counts as far as it is new (:mod:`gpusense.localization.belief`). The rival replaces the particles
+once B exceeds ``WIN``, after ``SCANS`` scans if it lies together, and after ``APART`` scans if several places are
+equally likely, provided that the beams that meet walls support it. Until then the particles give the estimate, and the
+probability that the rival is right adds to the probability of being lost. A rival is given up if it ends at the pose of
+the particles, falls behind, or has not won after ``LONGEST`` scans.
 """
 
 from __future__ import annotations

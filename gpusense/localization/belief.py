@@ -51,16 +51,15 @@ MISSES, MOST_PLACES = 8, 2
 _FASTEST = 1.0
 
 
-def correlation(pose: Sequence[float] | np.ndarray, before: Sequence[float] | np.ndarray) -> float:
-    """Return the correlation of the log-likelihood ratios of two scans that were taken at two poses."""
-    way, turn = _motion(pose, before)
-    return STAYS * math.exp(-way / LENGTH - turn / TURN)
-
-
-def _motion(pose: Sequence[float] | np.ndarray, before: Sequence[float] | np.ndarray) -> tuple[float, float]:
+def motion_between(pose: Sequence[float] | np.ndarray, before: Sequence[float] | np.ndarray) -> tuple[float, float]:
     """Return distance [m] and turn [rad] between two poses."""
     way = math.hypot(pose[0] - before[0], pose[1] - before[1])
     return way, abs(math.remainder(float(pose[2] - before[2]), math.tau))
+
+
+def correlation(way: float, turn: float) -> float:
+    """Return the correlation of the log-likelihood ratios of two scans with this motion between them."""
+    return STAYS * math.exp(-way / LENGTH - turn / TURN)
 
 
 class Belief(NamedTuple):
@@ -115,8 +114,8 @@ class Belief(NamedTuple):
         if self.chosen and ratio < 0:
             rho, before = STAYS, ratio
         elif self.pose is not None:
-            way, turn = _motion(pose, self.pose)
-            rho = correlation(pose, self.pose)
+            way, turn = motion_between(pose, self.pose)
+            rho = correlation(way, turn)
         lost = 1 - math.exp(-PER_SCAN * self.scans - PER_METRE * min(way, _FASTEST * self.scans))
         log_odds, alike = self._moved(lost, 1 - (1 - FOUND) ** self.scans, 1)
         if math.isnan(ratio):

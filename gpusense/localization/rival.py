@@ -27,7 +27,7 @@ import numpy as np
 
 from gpusense.interface.constants import EVIDENCE
 from gpusense.localization import starts
-from gpusense.localization.belief import correlation
+from gpusense.localization.belief import correlation, motion_between
 from gpusense.localization.filter_cloud import Contents, SensorReadings, Summary
 from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import SampledMotion
@@ -160,7 +160,7 @@ class Rival:
             sensors = tuple(index for index, _ in readings)
             before, at = self._last.get(sensors, (0.0, pose))
             # A place that was searched on the whole map is no likelier than its rivals, so they are compared at once.
-            rho = correlation(pose, at) if sensors in self._last and self._prior < 0.0 else 0.0
+            rho = correlation(*motion_between(pose, at)) if sensors in self._last and self._prior < 0.0 else 0.0
             self.log_odds += (ratio - rho * before) / (1 + rho)
             self._last[sensors] = ratio, np.array(pose)
         self._scans += 1

@@ -74,7 +74,7 @@ def test_rows_are_appended_and_compared(
     assert [line.split(",")[1] for line in lines[1:]] == ["a"] * 3 + ["b"] * 3
     table.write_text("x,y\n1,2\n")
     monkeypatch.setattr(sys, "argv", [str(SCRIPT), *words, "--compare"])
-    with pytest.raises(SystemExit, match="^2$"):
+    with pytest.raises(SystemExit, match=r"^2$"):
         history.main()
     assert "history.csv: must have the columns date, commit" in capsys.readouterr().err
 

@@ -159,7 +159,7 @@ class IcpPairs:
         """
         starts = guesses.shape[1]
         step = self.pairs_of_launch(starts)
-        if len(pairs) <= step:
+        if 0 < len(pairs) <= step:
             return self._run(pairs, guesses, rules)[..., :columns].astype(np.float64)
         result = np.empty((len(pairs), starts, columns))
         for begin in range(0, len(pairs), step):

@@ -65,7 +65,7 @@ def with_teams_flags(
 ) -> tuple[frozenset[str], int]:
     """Return the flags of a launch with those of teams on a GPU, and the work-items of an item.
 
-    Teams are the smallest ones with a work-item for each point, or the largest ones that the device holds.
+    Teams are the smallest ones with a work-item for each two points, or the largest ones that the device holds.
 
     Args:
         kind: Kind of the device.
@@ -77,7 +77,7 @@ def with_teams_flags(
     if kind != "gpu":
         return flags, 1
     teams = [(team_of(KERNELS[kernel], flags | more), flags | more) for more in _TEAMS]
-    enough = sum(team >= points for team, _ in teams)
+    enough = sum(2 * team >= points for team, _ in teams)
     for team, shared in teams[max(enough - 1, 0) :]:
         if team <= largest_group(kernel, shared):
             return shared, team

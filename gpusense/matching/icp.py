@@ -171,6 +171,12 @@ class IcpPairs:
         """Return the most pairs of a launch of some starts each."""
         return max(_MOST_STARTS[self._backend.info.kind] // max(starts, 1), 1)
 
+    def _points_used(self, pairs: np.ndarray, rules: Sequence[MatchRules]) -> int:
+        """Return the most points of a scan that a start of some pairs uses."""
+        strides = np.array([rule.stride if rule.thin else 1 for rule in rules])
+        points = self._points.counts[self._pairs[pairs, :2]].max(axis=1)
+        return int((-(-points // strides[self.level[pairs]])).max())
+
     def _run(self, pairs: np.ndarray, guesses: np.ndarray, rules: Sequence[MatchRules]) -> np.ndarray:
         """Return the results (P, M, 35) of the pairs of one launch."""
         count, starts = guesses.shape[:2]
@@ -181,8 +187,8 @@ class IcpPairs:
         buffer = space.empty("match result", result.size, self._real)
         info = self._backend.info
         flags = with_lanes_flag(info.lanes, "match_scans", self._flags)
-        most = max(-(-self._most // rule.stride) if rule.thin else self._most for rule in rules)
-        flags, team = with_teams_flags(info.kind, "match_scans", flags, most, self._backend.largest_group)
+        used = self._points_used(pairs, rules) if info.kind == "gpu" else 0
+        flags, team = with_teams_flags(info.kind, "match_scans", flags, used, self._backend.largest_group)
         matching = launch(
             "match_scans", flags, (count * starts * team,), point=self._point, start=self._start, line=self._line,
             pair=space.upload("match pairs", self._pairs[pairs]), guess=space.upload("match guesses", padded),

@@ -76,8 +76,12 @@ def odometry_turns(before: object, after: object) -> tuple[float, float, float]:
         >>> gs.odometry_turns((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
         (0.0, -1.0, 0.0)
     """
-    one, two = checks.array("before", before, (3,)), checks.array("after", after, (3,))
-    x, y, turn = _difference(one, two)
+    return turns_between(checks.array("before", before, (3,)), checks.array("after", after, (3,)))
+
+
+def turns_between(before: np.ndarray, after: np.ndarray) -> tuple[float, float, float]:
+    """Return the motion between checked poses of an odometer; see :func:`odometry_turns`."""
+    x, y, turn = _difference(before, after)
     trans = math.hypot(x, y)
     first = math.atan2(y, x) if trans >= SHORTEST else 0.0
     if abs(first) > math.pi / 2:
@@ -161,7 +165,10 @@ class OdometryMotion:
         """Return the numbers of a step from the odometer's poses before and after it."""
         if len(arguments) != 2:
             raise TypeError(f"predict: must have the odometry before and after the step, got {len(arguments)} values")
-        first, trans, second = odometry_turns(*arguments)
+        return self.sampled_turns(*odometry_turns(*arguments))
+
+    def sampled_turns(self, first: float, trans: float, second: float) -> SampledMotion:
+        """Return the numbers of a step from its motion; see :func:`odometry_turns`."""
         stretch, gain, drift = self.systematic
         first, second = (turn * (1 + gain) + drift * trans / 2 for turn in (first, second))
         trans *= 1 + stretch

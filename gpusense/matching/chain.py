@@ -145,17 +145,14 @@ def _search(
     rules, parts = levels.search_rules(), []
     # The results of all starts of wide windows take much memory.
     step = max(device.pairs_of_launch(len(offsets)), _KEPT // len(offsets))
-    for _, some in device.of_levels(poor):
-        for begin in range(0, len(some), step):
-            part = some[begin : begin + step]
-            coarse = device.run(poor[part], guess[part, None] + offsets, rules, columns=4)
-            rows, poses = distinct(coarse[..., :3], coarse[..., 3], best.result[poor[part], :3], options.capture)
-            parts.append((part[rows], poses))
+    for begin in range(0, len(poor), step):
+        part = slice(begin, begin + step)
+        coarse = device.run(poor[part], guess[part, None] + offsets, rules, columns=4)
+        rows, poses = distinct(coarse[..., :3], coarse[..., 3], best.result[poor[part], :3], options.capture)
+        parts.append((begin + rows, poses))
     which, chosen = (np.concatenate(values) for values in zip(*parts, strict=True))
     if not len(which):
         return
-    order = np.argsort(which, kind="stable")
-    which, chosen = which[order], chosen[order]
     fine = device.run(poor[which], chosen[:, None], levels.final_rules())[:, 0]
     rows = poor[which]
     order = np.arange(len(rows)) - np.searchsorted(rows, rows)

@@ -271,9 +271,9 @@ class VelocityMotion:
         return SampledMotion((w * seconds / 2, v * seconds, 0.0, back), (half, length, 0.0, last), VELOCITY_MODEL)
 
 
-def settings_of(motion: SampledMotion) -> tuple[np.ndarray, float]:
-    """Return means and deviations as an (8,) array, and the probability of a reverse."""
+def settings_of(motion: SampledMotion) -> tuple[list[float], float]:
+    """Return the eight means and deviations, and the probability of a reverse."""
     first, ahead, left, second = motion.deviation
     # A heading with a deviation of many turns is uniform, so a limit changes only the size of the numbers.
     turns = min(first, _MOST_TURNED), min(second, _MOST_TURNED)
-    return np.array([*motion.mean, turns[0], ahead, left, turns[1]]), motion.reverse
+    return [*motion.mean, turns[0], ahead, left, turns[1]], motion.reverse

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 from gpusense.interface.signatures import KERNELS, team_of
@@ -52,12 +53,18 @@ def with_lanes_flag(
         flags: Its other flags.
         float64: Whether the device has float64, which some bodies in lanes need.
     """
+    return _flagged(lanes, kernel, frozenset(flags), float64)
+
+
+@functools.lru_cache(maxsize=256)
+def _flagged(lanes: int, kernel: str, flags: frozenset[str], float64: bool) -> frozenset[str]:
+    """See ``with_lanes_flag``; calls repeat the flags of earlier ones."""
     never = _NEVER.get(kernel, _SCALAR)
     if not float64 and kernel in _DOUBLE and _DOUBLE[kernel] <= flags:
-        return frozenset(flags)
+        return flags
     if lanes == 1 or flags & never or not any(needed <= flags for needed in _NEEDED.get(kernel, ())):
-        return frozenset(flags)
-    return frozenset(flags) | {"IN_LANES"}
+        return flags
+    return flags | {"IN_LANES"}
 
 
 def with_teams_flags(

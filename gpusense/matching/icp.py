@@ -80,10 +80,10 @@ class IcpPairs:
         point = points.point if len(points.point) else np.zeros((1, 4), real)
         self._point, self._start = space.upload("match points", point), space.upload("match start", points.start)
         self._line = space.empty("match lines", point.size, real)
-        self._points, self._most, self._gap = points, int(points.counts.max(initial=0)), points.gap
+        self._points, self._most, self._gap = points, max(points.counts.tolist(), default=0), points.gap
         levels = np.unique(noise) if len(noise) > 1 else noise
         self.levels: list[float] = levels.tolist()
-        self.level = np.searchsorted(levels, noise)
+        self.level = np.searchsorted(levels, noise) if len(levels) > 1 else np.zeros(len(noise), np.intp)
         # (S, 3) reference, second scan and level.
         self._pairs = np.empty((len(pairs), 3), np.int32)
         self._pairs[:, :2], self._pairs[:, 2] = pairs, self.level
@@ -102,6 +102,9 @@ class IcpPairs:
 
     def most_points(self, pairs: np.ndarray | None = None) -> list[tuple[int, int]]:
         """Return for each level the most points of a reference, and of a second scan, of all or of some pairs (P,)."""
+        if len(self._pairs) == 1:
+            first, second = self._points.counts[self._pairs[0, :2]].tolist()
+            return [(first, second)]
         rows = np.arange(len(self._pairs)) if pairs is None else pairs
         most = [(0, 0)] * len(self.levels)
         for level, some in self.of_levels(rows):

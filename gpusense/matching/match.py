@@ -103,14 +103,15 @@ def match_scan(
     checks.choice("method", method, METHODS)
     given = not (isinstance(noise, str) and noise == "auto")
     options = check_options(noise if given else ASSUMED_NOISE, capture, window)
-    checks.real("temperature", temperature, above=0, high=1)
+    if temperature != 1.0 or isinstance(temperature, bool):
+        checks.real("temperature", temperature, above=0, high=1)
     device = get_backend(backend)
     real_dtype(precision, device)
     moved = motion, reference_motion
     matches, single = _matches(reference, ranges, scanner, guess, method, device, precision, options, moved, given)
     if temperature != 1:
         covariance, information = matches.covariance / temperature, matches.information * temperature
-        matches = replace(matches, covariance=covariance, information=information)
+        matches = matches.changed(covariance=covariance, information=information)
     return matches[0] if single else matches
 
 
@@ -195,7 +196,8 @@ def _to_scans(
         both = (first, before), (second, motion)
         moved = np.concatenate([np.zeros((len(scans), 3)) if m is None else m for scans, m in both])
     points = scan_points(np.concatenate([first, second]), scanner, real, moved)
-    pairs = np.stack([reference, np.arange(len(first), len(first) + len(second))], axis=1)
+    pairs = np.empty((len(second), 2), np.intp)
+    pairs[:, 0], pairs[:, 1] = reference, np.arange(len(first), len(first) + len(second))
     match = match_pairs(device, real, points, pairs, poses, method, options, scanner.mount[:2], noise)
     return judged(match, poses, options)
 

@@ -14,7 +14,7 @@ from gpusense.chaining.links import Links
 from gpusense.chaining.options import ChainOptions
 from gpusense.localization.pose_algebra import compose_poses, invert_poses
 from gpusense.matching.basin import is_held
-from gpusense.matching.match import WINDOW, match_readings, match_scan
+from gpusense.matching.match import WINDOW, match_log, match_scan
 from gpusense.matching.noise import scan_noise
 from gpusense.matching.result import ScanMatch
 from gpusense.world.scanner import Scanner
@@ -75,10 +75,9 @@ class Matcher:
             guess: (L, 3) poses [m, m, rad].
             window: Half widths of the search [m, rad]; None for the default of ``match_scan``.
         """
-        moved = (None, None) if self.motion is None else (self.motion[first], self.motion[second])
-        return match_readings(
-            self.readings[first], self.readings[second], self.scanner, guess, (self._noise[first], self._noise[second]),
-            self._device, self._options.precision, WINDOW if window is None else window, moved,
+        return match_log(
+            self.readings, self.scanner, first, second, guess, self._noise, self._device, self._options.precision,
+            WINDOW if window is None else window, self.motion,
         )  # fmt: skip
 
     def observed(self, first: Integers, second: Integers, found: ScanMatch) -> ScanMatch:

@@ -44,7 +44,8 @@ def is_held(
         motions: (S, 3) and (S, 3) motions during the reference scans and the second scans, or None.
     """
     count, real = len(second), np.dtype(precision)
-    moved = None if motions[0] is None else np.concatenate(motions)
+    before, during = motions
+    moved = None if before is None or during is None else np.concatenate([before, during])
     points = scan_points(np.concatenate([first, second]), scanner, real, moved)
     one, two = np.arange(count), np.arange(count, 2 * count)
     pairs = np.concatenate([np.stack([one, two], axis=1), np.stack([two, one], axis=1)])

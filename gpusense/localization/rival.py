@@ -129,12 +129,13 @@ class Rival:
         """
         self._tracker.step = step
         key, options = self._tracker.key(), self._tracker.options
-        tries, score, effective, ratio = self._search.found(pose, covariance, readings, key, options.temperature)
+        found = self._search.found(pose, covariance, readings, key, options.temperature)
+        tries, score, ratio = found.poses, found.score, found.ratio
         if prior == 0.0:
             far = np.hypot(*(tries[:, :2] - pose[:2]).T) > FAR
             far |= np.abs(wrap_angle(tries[:, 2] - pose[2])) > 2 * FAR_TURN
             tries, score = tries[far], score[far]
-        chosen = drawn(score, options.most, effective)
+        chosen = drawn(score, options.most, found.effective)
         if chosen is None:
             return ratio
         self._tracker.pending = None

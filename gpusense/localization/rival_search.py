@@ -42,19 +42,29 @@ _NEARBY, _MARGIN = 2.0, 1.0
 
 
 class Candidates(NamedTuple):
-    """Poses at which a rival may begin.
+    """Poses at which a rival may begin, and how the estimate compares with them.
 
     Attributes:
         poses: (M, 3) poses.
         score: (M,) log-likelihood of each, less the ratio of its beams that meet walls.
         effective: Effective number of them that begins a rival.
-        ratio: Log-likelihood ratio of other places against the estimate; NaN without a search of the whole map.
+        lead: Log-likelihood, times the temperature, of the likeliest candidate beyond 1 m or 0.5 rad of the estimate
+            less that at the estimate [nats]; NaN without a search of the whole map.
+        beams: Number of independent beams, the temperature times the number of beams.
+        is_found: Whether a candidate is at the estimate.
     """
 
     poses: np.ndarray
     score: np.ndarray
     effective: int
-    ratio: float
+    lead: float = math.nan
+    beams: float = 0.0
+    is_found: bool = False
+
+    @property
+    def ratio(self) -> float:
+        """Log-likelihood ratio of other places against the estimate; NaN without a search of the whole map."""
+        return ratio_of_places(self.lead, self.beams, is_found=self.is_found)
 
 
 class RivalSearch:
@@ -99,11 +109,11 @@ class RivalSearch:
             beams += share * sensor.beams
         score, reached = score[:-1], float(score[-1])
         if not on_map:
-            return Candidates(tries, score, effective, math.nan)
+            return Candidates(tries, score, effective)
         apart = are_apart(tries, pose)
         lead = float(score[apart].max(initial=-math.inf)) - reached
-        ratio = ratio_of_places(lead, beams, is_found=not apart.all())
-        return Candidates(tries, score - self._ratios(tries, readings), effective, ratio)
+        score -= self._ratios(tries, readings)
+        return Candidates(tries, score, effective, lead, beams, is_found=not apart.all())
 
     def _ratios(self, poses: np.ndarray, readings: Sequence[SensorReadings]) -> np.ndarray:
         """Return the log-likelihood ratios (M,) of "wrong" against "right" for poses; 0 without evidence from scans."""

@@ -12,7 +12,7 @@ from support import filter_scene as scene
 
 import gpusense as gs
 from gpusense.localization import rival
-from gpusense.localization.ratio import BY_CHANCE, FARTHEST, HALF, IS_FOUND, OF_LEAD, ratio_of_places
+from gpusense.localization.ratio import IS_FOUND, ratio_of_places
 from gpusense.localization.rival_search import RivalSearch, are_apart, drawn
 from gpusense.localization.sensors import Sensor
 from gpusense.matching.likely import likely_poses
@@ -243,18 +243,17 @@ def test_a_robot_that_is_carried_away_on_a_wrong_map_is_lost_and_found():
 def test_the_comparison_has_the_likeliest_other_place(model):
     """Compare with poses all over the map: none beyond the search's resolution is likelier, and the robot's own is."""
     here, there = np.array([4.0, 3.5, 0.3]), np.array([9.0, 9.0, 2.0])
-    ranges, spread = scans([here])[0], np.diag([0.01, 0.01, 0.001])
+    ranges, spread = scans([here], people=0.6)[0], np.diag([0.01, 0.01, 0.001])
     anywhere = np.random.default_rng(0).uniform((0, 0, -3), (20, 12, 3), (4000, 3))
     log_p = model.log_likelihood(np.vstack([here, there, anywhere]), ranges)
     search, temperature = RivalSearch([Sensor(model)]), 0.05
-    beams = temperature * SCANNER.count
     for pose, mine, is_found in ((here, log_p[0], True), (there, log_p[1], False)):
-        ratio = search.found(pose, spread, [(0, (ranges,))], (0, 0, 0), temperature).ratio
-        lead = (ratio + beams / (beams + HALF) * (BY_CHANCE + IS_FOUND * is_found)) / OF_LEAD
+        compared = search.found(pose, spread, [(0, (ranges,))], (0, 0, 0), temperature)
         others = log_p[are_apart(np.vstack([here, there, anywhere]), pose)]
         # Poses of the search are 0.1 m and 3 degrees apart, and the nearest one is a little less likely.
-        assert lead > min(temperature * float(others.max() - mine), FARTHEST) - 1.0
-        assert lead < -1.0 if is_found else lead > 4.0
+        assert compared.lead > temperature * float(others.max() - mine) - 1.0
+        assert compared.is_found == is_found and compared.beams == pytest.approx(temperature * SCANNER.count)
+        assert compared.ratio < -1.5 if is_found else compared.ratio > 0.2
 
 
 def test_a_comparison_needs_information_and_has_limits():

@@ -22,6 +22,9 @@ INFLATION = 2.0
 """Factor of the covariances of poses: with it six of eight recorded logs err as stated or less (docs/matching.md)."""
 # Share of the largest eigenvalue below which the information of a scan's links leaves a direction open.
 _OPEN = 1e-6
+# Relative gain of the cost below which the solution for a fit of the odometry's noise ends: the fitted variances change
+# by less than 0.1 %.
+_GAIN = 1e-5
 # Deviations of a pose along an unobserved direction [m, rad].
 _UNKNOWN, _UNKNOWN_TURN = 30.0, 3.0
 
@@ -69,7 +72,7 @@ def shared_odometry(
 def fitted_odometry(front: Front, links: Links, reported: Floats) -> OdometryMotion:
     """Return the noise of the odometry, fitted to the matches."""
     keys = np.array(front.keys)
-    poses = solve(front.poses, links, settle=True).poses
+    poses = solve(front.poses, links, settle=True, least=_GAIN).poses
     whole = np.append(0, np.cumsum(front.lost > 0))[keys]
     return fitted_motion(reported[keys], poses[keys], np.diff(whole) == 0)
 

@@ -7,6 +7,7 @@ key scans before it, and every scan between to the key scans on both sides. Time
 from __future__ import annotations
 
 import copy
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -179,6 +180,7 @@ class Front:
             self.matcher.motion[self.nodes[part[0] - 1 : part[-1] + 1][new]] = moved[new]
             again = self.matcher.match(first, second, found.pose, NEAR)
             found = found.replaced(np.arange(len(part)), again, again.usable)
+        found = self.matcher.observed(first, second, found)
         usable = found.usable & (found.p_right >= SURE)
         information = weakened(found.information, rival)
         links = Links.of(MATCH, part - 1, part, found.pose, information, found.p_right)
@@ -264,13 +266,13 @@ class Front:
 
     def _choose_keys(self, begin: int, end: int) -> None:
         """Choose key scans among nodes: after a motion, and on both sides of a failed match."""
-        poses = self.poses
+        poses, sure = self.poses.tolist(), (self.p_right >= SURE).tolist()
         length, turn = self._options.key_step
         for k in range(begin, end):
-            off = poses[k] - poses[self.keys[-1]]
-            if self.p_right[k - 1] < SURE:
+            (x, y, theta), (last_x, last_y, last_theta) = poses[k], poses[self.keys[-1]]
+            if not sure[k - 1]:
                 self.keys += [n for n in (k - 1, k) if n > self.keys[-1]]
-            elif np.hypot(off[0], off[1]) >= length or abs(wrap_angle(off[2])) >= turn:
+            elif math.hypot(x - last_x, y - last_y) >= length or abs(wrapped(theta - last_theta)) >= turn:
                 self.keys.append(k)
 
     def _match_locally(self, last: bool) -> None:

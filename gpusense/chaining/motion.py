@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gpusense.localization.motion import OdometryMotion
+from gpusense.localization.motion import OdometryMotion, turns_between
 from gpusense.localization.motion_fit import fit_odometry_motion
 from gpusense.localization.pose_algebra import pose_difference, wrap_angle
 from gpusense.world.deskew import part_of_arc
@@ -36,7 +36,7 @@ def odometry_links(motion: OdometryMotion, before: Floats, after: Floats) -> tup
     count = len(before)
     poses, covariances = np.zeros((count, 3)), np.zeros((count, 3, 3))
     for k in range(count):
-        sampled = motion.sampled(before[k], after[k])
+        sampled = motion.sampled_turns(*turns_between(before[k], after[k]))
         first, ahead, left, second = sampled.mean
         c, s = math.cos(first), math.sin(first)
         poses[k] = c * ahead - s * left, s * ahead + c * left, first + second

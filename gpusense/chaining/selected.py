@@ -89,20 +89,20 @@ def _parts_of(blocks: Any, order: Integers) -> list[tuple[int, int, Integers]]:
     count = len(order)
     place = np.empty(count, np.int64)
     place[order] = np.arange(count)
-    below: list[Integers] = []
-    children: list[list[Integers]] = [[] for _ in range(count)]
-    for k in range(count):
-        columns = place[blocks.indices[blocks.indptr[order[k]] : blocks.indptr[order[k] + 1]]]
-        rows = np.unique(np.concatenate([columns[columns > k], *children[k]]))
+    places, starts = place[blocks.indices].tolist(), blocks.indptr.tolist()
+    below: list[list[int]] = []
+    children: list[list[list[int]]] = [[] for _ in range(count)]
+    for k, step in enumerate(order.tolist()):
+        rows = sorted({row for row in places[starts[step] : starts[step + 1]] if row > k}.union(*children[k]))
         children[k] = []
-        if len(rows):
+        if rows:
             children[rows[0]].append(rows[1:])
         below.append(rows)
     parts, begin = [], 0
     for k in range(count):
         rows = below[k]
         if k + 1 == count or not len(rows) or rows[0] != k + 1 or len(rows) != len(below[k + 1]) + 1:
-            parts.append((begin, k + 1, rows))
+            parts.append((begin, k + 1, np.array(rows, np.int64)))
             begin = k + 1
     return parts
 

@@ -37,8 +37,8 @@ NORMAL, STUDENT_T, TWO_NORMALS = 0, 1, 2
 BEACON, BEACON_TERMS = 7, 12
 # Kernel file ray_counts: fraction bits of a coordinate in cells.
 RAY_BITS = 12
-# Kernel file icp: numbers of the result of a match.
-MATCH_RESULT = 35
+# Kernel file icp: numbers of the result of a match, and of the rules of a level.
+MATCH_RESULT, MATCH_RULES = 35, 14
 # Kernel file field_gradient: numbers of a particle, log p, its gradient (3) and the information (9).
 GRADIENT_NUMBERS = 13
 # Kernel files segments and circles: numbers of a line and of a circle.

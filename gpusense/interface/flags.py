@@ -33,7 +33,7 @@ FLAGS = {
     "AMCL": "the densities to be cubed are nav2_amcl's, not Beluga's",
     "IN_LANES": "a work-item computes 16 particles or beams at once in vector types, as on PoCL",
     "IN_TEAMS": "the work-items of a group share one item, as matches of scans do on GPUs",
-    "SMALL_TEAMS": "a quarter of them share it, on GPUs whose groups hold fewer work-items",
+    "SMALL_TEAMS": "an eighth of them share it, where an item has few points or groups hold fewer work-items",
     "SHARED_RAYS": "several readings have the same bearing",
     "ALL_READINGS": "missing (nan) and max (inf) readings are evaluated too, as they are when nothing is left out",
     "HUGE_HEADINGS": "some heading is beyond 2^20 rad",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 from gpusense.interface.signatures import KERNELS, team_of
@@ -52,27 +53,39 @@ def with_lanes_flag(
         flags: Its other flags.
         float64: Whether the device has float64, which some bodies in lanes need.
     """
+    return _flagged(lanes, kernel, frozenset(flags), float64)
+
+
+@functools.lru_cache(maxsize=256)
+def _flagged(lanes: int, kernel: str, flags: frozenset[str], float64: bool) -> frozenset[str]:
+    """See ``with_lanes_flag``; calls repeat the flags of earlier ones."""
     never = _NEVER.get(kernel, _SCALAR)
     if not float64 and kernel in _DOUBLE and _DOUBLE[kernel] <= flags:
-        return frozenset(flags)
+        return flags
     if lanes == 1 or flags & never or not any(needed <= flags for needed in _NEEDED.get(kernel, ())):
-        return frozenset(flags)
-    return frozenset(flags) | {"IN_LANES"}
+        return flags
+    return flags | {"IN_LANES"}
 
 
 def with_teams_flags(
-    kind: str, kernel: str, flags: frozenset[str], largest_group: Callable[[str, frozenset[str]], int]
+    kind: str, kernel: str, flags: frozenset[str], points: int, largest_group: Callable[[str, frozenset[str]], int]
 ) -> tuple[frozenset[str], int]:
-    """Return the flags of a launch, on a GPU those of the largest teams that it holds, and the work-items of an item.
+    """Return the flags of a launch with those of teams on a GPU, and the work-items of an item.
+
+    Teams are the smallest ones with a work-item for each two points, or the largest ones that the device holds.
 
     Args:
         kind: Kind of the device.
         kernel: The kernel.
         flags: Its other flags.
+        points: Points of an item.
         largest_group: ``Backend.largest_group`` of the device.
     """
-    for more in _TEAMS if kind == "gpu" else ():
-        shared = flags | more
-        if (team := team_of(KERNELS[kernel], shared)) <= largest_group(kernel, shared):
+    if kind != "gpu":
+        return flags, 1
+    teams = [(team_of(KERNELS[kernel], flags | more), flags | more) for more in _TEAMS]
+    enough = sum(2 * team >= points for team, _ in teams)
+    for team, shared in teams[max(enough - 1, 0) :]:
+        if team <= largest_group(kernel, shared):
             return shared, team
     return flags, 1

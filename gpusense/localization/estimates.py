@@ -71,8 +71,8 @@ class Estimate:
 
 def covariance_of(numbers: np.ndarray) -> np.ndarray:
     """Return the covariance from the results of kernel ``finish_estimate``; negative variances by rounding are 0."""
-    xx, xy, xt, yy, yt, tt = numbers[3:9]
-    xx, yy, tt = (max(float(variance), 0.0) for variance in (xx, yy, tt))
+    xx, xy, xt, yy, yt, tt = numbers[3:9].tolist()
+    xx, yy, tt = max(xx, 0.0), max(yy, 0.0), max(tt, 0.0)
     return np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
 
 

@@ -76,8 +76,12 @@ def odometry_turns(before: object, after: object) -> tuple[float, float, float]:
         >>> gs.odometry_turns((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
         (0.0, -1.0, 0.0)
     """
-    one, two = checks.array("before", before, (3,)), checks.array("after", after, (3,))
-    x, y, turn = _difference(one, two)
+    return turns_between(checks.array("before", before, (3,)), checks.array("after", after, (3,)))
+
+
+def turns_between(before: np.ndarray, after: np.ndarray) -> tuple[float, float, float]:
+    """Return the motion between checked poses of an odometer; see :func:`odometry_turns`."""
+    x, y, turn = _difference(before, after)
     trans = math.hypot(x, y)
     first = math.atan2(y, x) if trans >= SHORTEST else 0.0
     if abs(first) > math.pi / 2:
@@ -161,7 +165,10 @@ class OdometryMotion:
         """Return the numbers of a step from the odometer's poses before and after it."""
         if len(arguments) != 2:
             raise TypeError(f"predict: must have the odometry before and after the step, got {len(arguments)} values")
-        first, trans, second = odometry_turns(*arguments)
+        return self.sampled_turns(*odometry_turns(*arguments))
+
+    def sampled_turns(self, first: float, trans: float, second: float) -> SampledMotion:
+        """Return the numbers of a step from its motion; see :func:`odometry_turns`."""
         stretch, gain, drift = self.systematic
         first, second = (turn * (1 + gain) + drift * trans / 2 for turn in (first, second))
         trans *= 1 + stretch
@@ -264,9 +271,9 @@ class VelocityMotion:
         return SampledMotion((w * seconds / 2, v * seconds, 0.0, back), (half, length, 0.0, last), VELOCITY_MODEL)
 
 
-def settings_of(motion: SampledMotion) -> tuple[np.ndarray, float]:
-    """Return means and deviations as an (8,) array, and the probability of a reverse."""
+def settings_of(motion: SampledMotion) -> tuple[list[float], float]:
+    """Return the eight means and deviations, and the probability of a reverse."""
     first, ahead, left, second = motion.deviation
     # A heading with a deviation of many turns is uniform, so a limit changes only the size of the numbers.
     turns = min(first, _MOST_TURNED), min(second, _MOST_TURNED)
-    return np.array([*motion.mean, turns[0], ahead, left, turns[1]]), motion.reverse
+    return [*motion.mean, turns[0], ahead, left, turns[1]], motion.reverse

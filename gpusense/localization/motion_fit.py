@@ -32,7 +32,7 @@ from gpusense._util import checks
 from gpusense._util.html import card
 from gpusense._util.typing import AnyArray
 from gpusense.localization.defaults import DEFAULTS
-from gpusense.localization.motion import OdometryMotion, odometry_turns
+from gpusense.localization.motion import OdometryMotion, turns_between
 from gpusense.localization.pose_algebra import pose_difference
 from gpusense.localization.step_errors import NOISES, REST, Errors, corrected, errors_of
 
@@ -50,6 +50,9 @@ _PRIOR, _ROUNDS = 0.1, 3
 # counts as.
 _DEFAULT = np.array([*DEFAULTS.alpha, DEFAULTS.sideways, *(value**2 for value in DEFAULTS.least)])
 _PRIOR_LOG, _PRIOR_STEPS = math.log(10), 25
+# Logarithms of the defaults, and of the limits of variances.
+_LOG_DEFAULT = np.log(_DEFAULT)
+_LOWEST, _HIGHEST = np.log([_LEAST_ALPHA] * 5 + [_LEAST**2] * 2), np.log([_MOST_ALPHA] * 5 + [_MOST**2] * 2)
 # A variance is determined if the deviation of its logarithm is at most this share of the prior deviation.
 _DETERMINED = 0.5
 
@@ -129,7 +132,7 @@ def fit_odometry_motion(odometry: AnyArray, poses: AnyArray, *, systematic: bool
     if len(reported) < 3:
         raise ValueError(f"odometry: must hold at least 3 poses, got {len(reported)}")
     reference, at = _references(poses, len(reported))
-    turns = np.array([odometry_turns(a, b) for a, b in itertools.pairwise(reported[at[0] : at[-1] + 1])])
+    turns = np.array([turns_between(a, b) for a, b in itertools.pairwise(reported[at[0] : at[-1] + 1])])
     at = at - at[0]
     travelled, turned = float(np.abs(turns[:, 1]).sum()), float(np.abs(turns[:, [0, 2]]).sum())
     if travelled < REST[0] and turned < REST[1]:
@@ -205,7 +208,7 @@ def _fitted(errors: Errors, starts: list[np.ndarray]) -> tuple[np.ndarray, float
     from scipy.optimize import minimize
 
     def cost(logs: np.ndarray) -> float:
-        return _cost(_limited(logs), errors) + 0.5 * float(np.sum((logs - np.log(_DEFAULT)) ** 2)) / _PRIOR_LOG**2
+        return _cost(_limited(logs), errors) + 0.5 * float(np.sum((logs - _LOG_DEFAULT) ** 2)) / _PRIOR_LOG**2
 
     options = dict(maxiter=4000, maxfev=4000, adaptive=True, xatol=1e-2, fatol=1e-3)
     best: Any = min(
@@ -218,8 +221,7 @@ def _fitted(errors: Errors, starts: list[np.ndarray]) -> tuple[np.ndarray, float
 
 def _limited(logs: np.ndarray) -> np.ndarray:
     """Return variances within their limits."""
-    low = np.log([_LEAST_ALPHA] * 5 + [_LEAST**2] * 2)
-    return np.exp(np.clip(logs, low, np.log([_MOST_ALPHA] * 5 + [_MOST**2] * 2)))
+    return np.exp(np.clip(logs, _LOWEST, _HIGHEST))
 
 
 def _systematic(noise: np.ndarray, errors: Errors, before: np.ndarray) -> np.ndarray:

@@ -136,7 +136,7 @@ def settings_of_step(
         sensors: Temperature and beams of each sensor that is used.
         one_peak: Whether the particles lie together, and no sensor has several peaks among them.
     """
-    s = np.zeros(SETTINGS)
+    s: list[float] = [0.0] * SETTINGS
     s[SEED], s[SEED + 1], s[STEP] = *options.words, step
     s[MEAN : DEVIATION + 4], s[REVERSE] = settings_of(motion)
     s[JITTER], s[FARTHEST_X], s[FARTHEST_THETA] = DEFAULTS.jitter, DEFAULTS.farthest, DEFAULTS.farthest_turn
@@ -158,4 +158,4 @@ def settings_of_step(
         s[TEMPERATURE + place] = temperature
         total += temperature * max(beams, 1)
     s[PER_BEAM_SCALE] = 1 / total if total > 0 else 0.0
-    return s
+    return np.array(s, np.float64)

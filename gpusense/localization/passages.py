@@ -153,8 +153,8 @@ class MapJudge:
         reach = (rules.limit + rules.beside) / rules.cell + 2
         places = (rules.origin_y / rules.cell, rules.origin_x / rules.cell)
         if self._cells is None or not all(
-            begin <= low and high <= end
-            for (begin, end), (low, high) in zip(self._part, self._around(places, reach), strict=True)
+            (begin == 0 or place - reach >= begin) and (end >= size or place + reach < end)
+            for (begin, end), place, size in zip(self._part, places, self.grid.shape, strict=True)
         ):
             # With a margin, so that a robot that moves on seldom needs another part.
             self._part = (top, bottom), (left, right) = self._around(places, 1.5 * reach)
@@ -198,7 +198,7 @@ def passages(
     present = ranges >= scanner.range_min
     if scanner.range_min > 0:
         present &= ranges > 0
-    chosen = np.flatnonzero(present)
+    chosen = present.nonzero()[0]
     if len(chosen) > _BEAMS:
         chosen = chosen[_MIDDLES * len(chosen) // (2 * _BEAMS)]
     bearing, reading, count = scanner.bearings[chosen], ranges[chosen], len(chosen)
@@ -213,7 +213,8 @@ def passages(
         judged = _judged_on_host(grid, rules, scan) if judge is None else judge(rules, scan)
         kind, distance = judged[:count], judged[count:]
     close = kind == AGREES
-    close[close] = np.abs(reading[close] - distance[close]) < max(_CLOSE, grid.resolution)
+    agreeing = close.nonzero()[0]
+    close[agreeing] = np.abs(reading[agreeing] - distance[agreeing]) < max(_CLOSE, grid.resolution)
     inside, off = _place_of(grid, pose)
     return Passages(kind.astype(np.int8), bearing, origin, heading + bearing, distance, close, inside, off)
 

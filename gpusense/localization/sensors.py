@@ -63,6 +63,8 @@ class Sensor:
         self.precision = np.dtype(model.precision)
         self.beams = model.used_beams if isinstance(model, ScanModel) else 0
         self._correlation = BeamCorrelation()
+        # A temperature, and the correlation that it is of; learning replaces the correlation.
+        self._known: tuple[BeamCorrelation, float] | None = None
         self._seen, self._learned = 0, -1
         self._ranges: Any = None
         self._judge: MapJudge | None = None
@@ -72,7 +74,11 @@ class Sensor:
         """Return the present temperature of the log-likelihood, from the chosen one of scans or "auto"."""
         if not self.calibrates:
             return 1.0
-        return self._correlation.temperature(self.beams) if isinstance(chosen, str) else chosen
+        if not isinstance(chosen, str):
+            return chosen
+        if self._known is None or self._known[0] is not self._correlation:
+            self._known = self._correlation, self._correlation.temperature(self.beams)
+        return self._known[1]
 
     def restart(self) -> None:
         """Reset the count of scans: the next scan is treated as the first."""

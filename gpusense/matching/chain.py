@@ -11,6 +11,7 @@ import numpy as np
 from gpusense._util.angles import wrapped
 from gpusense.backends import Backend
 from gpusense.interface.structs import MatchRules
+from gpusense.matching.columns import Column, any_of, column_of, columns_of, is_not, larger, square_root, upright
 from gpusense.matching.evidence import pair_evidence
 from gpusense.matching.icp import STRAIGHT_WIDTH, WIDTH, IcpPairs, space_of
 from gpusense.matching.options import MatchOptions
@@ -106,21 +107,29 @@ def match_pairs(
     noise = np.full(len(pairs), options.noise) if noise is None else noise
     with lock, space:
         device = IcpPairs(backend, real, points, pairs, noise, space)
-        levels = Levels([replace(options, noise=level) for level in device.levels], device.most_points(), points.gap)
+        levels = Levels([options.at_noise(level) for level in device.levels], device.most_points(), points.gap)
         result = device.run(np.arange(len(pairs)), sensor[:, None], levels.rules())[:, 0]
         best = Best(result, np.full((len(pairs), 3), np.nan))
         if method == "auto":
-            enough, score = points.counts[pairs].min(axis=1) > 2, result[:, 3]
-            poor = enough & (score < DOUBTFUL)
-            far = _is_moved(result, sensor, _FAR * options.capture, _FAR_TURN) & enough & ~poor & (score < _SURE)
-            for some, wide in ((poor, True), (far, False)):
-                if some.any():
-                    which, starts = np.flatnonzero(some), (options if wide else nearby(options)).starts()
-                    _search(device, which, sensor[which], starts, best, options, levels)
+            score = columns_of(result)[3]
+            if any_of(score < _SURE):
+                first, second = columns_of(points.counts[pairs])
+                enough = (first > 2) & (second > 2)
+                poor = enough & (score < DOUBTFUL)
+                far = (
+                    _is_moved(result, sensor, _FAR * options.capture, _FAR_TURN)
+                    & enough
+                    & is_not(poor)
+                    & (score < _SURE)
+                )
+                for some, wide in ((poor, True), (far, False)):
+                    if any_of(some):
+                        which, starts = np.flatnonzero(some), (options if wide else nearby(options)).starts()
+                        _search(device, which, sensor[which], starts, best, options, levels)
             _repeat(device, sensor, best, options, levels)
-        noisy = _straighten(device, best.result, noise, levels)
-        sums = tested(device, best.result, points, pairs, noise, levels.options, noisy)
-    return _finished(best, sums, pairs, points, options, noise, mount)
+        noisy, lever = _straighten(device, best.result, noise, levels), points.rms_range(pairs[:, 1])
+        sums = tested(device, best.result, points.gap, lever, noise, levels.options, noisy)
+    return _finished(best, sums, lever, options, noise, mount)
 
 
 def _search(
@@ -136,17 +145,14 @@ def _search(
     rules, parts = levels.search_rules(), []
     # The results of all starts of wide windows take much memory.
     step = max(device.pairs_of_launch(len(offsets)), _KEPT // len(offsets))
-    for _, some in device.of_levels(poor):
-        for begin in range(0, len(some), step):
-            part = some[begin : begin + step]
-            coarse = device.run(poor[part], guess[part, None] + offsets, rules, columns=4)
-            rows, poses = distinct(coarse[..., :3], coarse[..., 3], best.result[poor[part], :3], options.capture)
-            parts.append((part[rows], poses))
+    for begin in range(0, len(poor), step):
+        part = slice(begin, begin + step)
+        coarse = device.run(poor[part], guess[part, None] + offsets, rules, columns=4)
+        rows, poses = distinct(coarse[..., :3], coarse[..., 3], best.result[poor[part], :3], options.capture)
+        parts.append((begin + rows, poses))
     which, chosen = (np.concatenate(values) for values in zip(*parts, strict=True))
     if not len(which):
         return
-    order = np.argsort(which, kind="stable")
-    which, chosen = which[order], chosen[order]
     fine = device.run(poor[which], chosen[:, None], levels.final_rules())[:, 0]
     rows = poor[which]
     order = np.arange(len(rows)) - np.searchsorted(rows, rows)
@@ -179,17 +185,18 @@ def _prior(result: np.ndarray, guess: np.ndarray, options: MatchOptions) -> np.n
     return lost
 
 
-def _is_moved(result: np.ndarray, guess: np.ndarray, distance: float, turn: float) -> np.ndarray:
+def _is_moved(result: np.ndarray, guess: np.ndarray, distance: float, turn: float) -> Column:
     """Return which results differ from their guesses by more than a distance along an axis [m], or a turn [rad]."""
-    moved = np.abs(result[:, :3] - guess)
-    far: np.ndarray = (np.maximum(moved[:, 0], moved[:, 1]) > distance) | (moved[:, 2] > turn)
-    return far
+    pose = columns_of(result[:, :3])
+    x, y, heading = (abs(one - other) for one, other in zip(pose, columns_of(guess), strict=True))
+    return (x > distance) | (y > distance) | (heading > turn)
 
 
 def _repeat(device: IcpPairs, guess: np.ndarray, best: Best, options: MatchOptions, levels: Levels) -> None:
     """Match pairs again from their results where the guess was poor: ICP may have stopped short of it."""
-    rows = np.flatnonzero(_is_moved(best.result, guess, _NEAR * options.capture, _NEAR_TURN))
-    if len(rows):
+    moved = _is_moved(best.result, guess, _NEAR * options.capture, _NEAR_TURN)
+    if any_of(moved):
+        rows = np.flatnonzero(moved)
         again = device.run(rows, best.result[rows, None, :3], levels.rules())[:, 0]
         better = (
             again[:, 3] + _UNSETTLED * again[:, 5] > best.result[rows, 3] + _UNSETTLED * best.result[rows, 5] - 1e-3
@@ -197,12 +204,13 @@ def _repeat(device: IcpPairs, guess: np.ndarray, best: Best, options: MatchOptio
         best.result[rows[better]] = again[better]
 
 
-def _straighten(device: IcpPairs, result: np.ndarray, noise: np.ndarray, levels: Levels) -> np.ndarray:
-    """Match pairs again with longer lines where noise turns the usual ones; return the numbers of these pairs."""
-    turn = (result[:, 12] + result[:, 15]) * noise**2 / np.maximum(result[:, 19], 1e-30)
-    noisy = np.flatnonzero(turn > _TURNED)
-    rows = noisy[STRAIGHT_WIDTH * noise[noisy] > WIDTH]
-    if len(rows):
+def _straighten(device: IcpPairs, result: np.ndarray, noise: np.ndarray, levels: Levels) -> Column:
+    """Match pairs again with longer lines where noise turns the usual ones; return for which pairs it does."""
+    numbers, deviation = columns_of(result), column_of(noise)
+    noisy = (numbers[12] + numbers[15]) * (deviation * deviation) / larger(numbers[19], 1e-30) > _TURNED
+    straightened = noisy & (STRAIGHT_WIDTH * deviation > WIDTH)
+    if any_of(straightened):
+        rows = np.flatnonzero(straightened)
         device.fit_lines(lambda level: STRAIGHT_WIDTH * level, rows)
         rules = [rule._replace(capture=rule.least_capture, scale=rule.least_scale) for rule in levels.final_rules()]
         result[rows] = device.run(rows, result[rows, None, :3], rules)[:, 0]
@@ -256,33 +264,33 @@ def distinct(poses: np.ndarray, score: np.ndarray, known: np.ndarray, capture: f
 
 def to_sensor(pose: np.ndarray, mount: tuple[float, float]) -> np.ndarray:
     """Convert relative poses of robot frames to poses of frames at the sensors with the robots' axes."""
-    x, y = mount
-    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    (x, y), (ahead, aside, heading) = mount, columns_of(pose)
+    c, s = np.cos(heading), np.sin(heading)
     sensor = np.array(pose)
-    sensor[:, 0], sensor[:, 1] = pose[:, 0] + c * x - s * y - x, pose[:, 1] + s * x + c * y - y
+    sensor[:, 0], sensor[:, 1] = ahead + c * x - s * y - x, aside + s * x + c * y - y
     return sensor
 
 
 def _finished(
-    best: Best, sums: PairSums, pairs: np.ndarray, points: ScanPoints, options: MatchOptions, noise: np.ndarray,
+    best: Best, sums: PairSums, lever: np.ndarray, options: MatchOptions, noise: np.ndarray,
     mount: tuple[float, float],
 ) -> ScanMatch:  # fmt: skip
     """Return the matches in the robot's frame, with information and status."""
-    result, lever = best.result, points.rms_range(pairs[:, 1])
-    x, y = mount
-    theta = wrapped(result[:, 2])
+    result, (x, y) = best.result, mount
+    ahead, aside, heading = columns_of(result)[:3]
+    theta = wrapped(heading)
     c, s = np.cos(theta), np.sin(theta)
     pose = np.empty((len(result), 3))
-    pose[:, 0], pose[:, 1], pose[:, 2] = result[:, 0] - c * x + s * y + x, result[:, 1] - s * x - c * y + y, theta
+    pose[:, 0], pose[:, 1], pose[:, 2] = ahead - c * x + s * y + x, aside - s * x - c * y + y, theta
     # Derivative of the sensor's pose with respect to the robot's.
     moved = np.empty((len(pose), 3, 3))
     moved[:] = _IDENTITY
     moved[:, 0, 2], moved[:, 1, 2] = -s * x - c * y, c * x - s * y
     found, factor = sums.found, sums.factor
-    final = moved.transpose(0, 2, 1) @ found.information @ moved / factor[:, None, None]
+    final = moved.transpose(0, 2, 1) @ found.information @ moved / upright(factor, 2)
     step = np.array(result[:, 32:35])
     step[:, :2] -= moved[:, :2, 2] * step[:, 2:]
-    length = np.sqrt(np.maximum(np.einsum("si,sij,sj->s", step, final, step), 0))
+    length = square_root(larger(column_of(np.einsum("si,sij,sj->s", step, final, step)), 0.0))
     status = statuses(result, found.lost, length)
     evidence = pair_evidence(result, found.lost, best.other, noise)
     return concluded(

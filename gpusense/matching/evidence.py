@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.matching.columns import Column, column_of, columns_of, larger, square_root
+
 NAMES = ("disagreement", "contradiction", "overlap", "pairs", "roughness", "misfit", "lost", "rival", "distance")
 """Evidence for and against a match.
 
@@ -41,26 +43,32 @@ def pair_evidence(result: np.ndarray, lost: np.ndarray, other: np.ndarray, noise
         other: (S, 3) offsets to poses that agree about as well, NaN without one.
         noise: (S,) standard deviations of ranges [m].
     """
-    seen, through, unseen = result[:, 21], result[:, 22], result[:, 23]
-    pairs, weights = np.maximum(result[:, 18], 1), result[:, 19]
-    rough = np.sqrt(result[:, 20] / np.maximum(weights, 1e-30)) / np.maximum(noise, 1e-6)
-    common = np.maximum(seen + through, 1)
+    numbers = columns_of(result)
+    weights, squared, seen, through, unseen = numbers[19:24]
+    pairs, common = larger(numbers[18], 1.0), larger(seen + through, 1.0)
+    rough = square_root(squared / larger(weights, 1e-30)) / larger(column_of(noise), 1e-6)
     evidence = np.zeros((len(result), len(NAMES)))
     values = (
-        1 - result[:, 3], through / common, seen / np.maximum(common + unseen, 1), pairs, np.minimum(rough, 20.0),
-        1 - weights / pairs, lost, np.isfinite(other).all(axis=1),
+        1 - numbers[3], through / common, seen / larger(common + unseen, 1.0), pairs, np.minimum(rough, 20.0),
+        1 - weights / pairs, column_of(lost), has_rival(other),
     )  # fmt: skip
     for column, value in enumerate(values):
         evidence[:, column] = value
     return evidence
 
 
+def has_rival(other: np.ndarray) -> Column:
+    """Return whether there are offsets (S, 3) to other poses: NaN stands for none."""
+    x, y, turn = columns_of(other)
+    return np.isfinite(x + y + turn)
+
+
 def features_of(evidence: np.ndarray) -> np.ndarray:
     """Return the numbers (S, 10) that the weights multiply."""
-    features, lost = np.empty((len(evidence), len(_WEIGHTS))), evidence[:, 6]
+    features, (lost, rival, distance) = np.empty((len(evidence), len(_WEIGHTS))), columns_of(evidence)[6:9]
     features[:, :6] = np.log(np.maximum(evidence[:, :6], _LEAST))
-    features[:, 6], features[:, 7], features[:, 8] = lost > 0, lost > 1, evidence[:, 7]
-    features[:, 9] = np.log(evidence[:, 8] + _NEAR)
+    features[:, 6], features[:, 7], features[:, 8] = lost > 0, lost > 1, rival
+    features[:, 9] = np.log(distance + _NEAR)
     return features
 
 

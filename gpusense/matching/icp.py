@@ -55,7 +55,7 @@ def space_of(backend: Backend) -> tuple[threading.RLock, Workspace]:
 class IcpPairs:
     """Pairs of scans on a device.
 
-    Pairs whose ranges have equal noise form a level; each level has its own launches, with rules of its own.
+    Pairs whose ranges have equal noise form a level, with rules of its own.
 
     Args:
         backend: The device.
@@ -76,15 +76,17 @@ class IcpPairs:
     ):  # fmt: skip
         self._backend, self._real, self._space = backend, real, space
         self._flags = flags_if(FLOAT64=real == np.float64)
-        self._pairs = np.ascontiguousarray(pairs, np.int32)
         self._counts = len(points.start) - 1, len(points.point)
         point = points.point if len(points.point) else np.zeros((1, 4), real)
         self._point, self._start = space.upload("match points", point), space.upload("match start", points.start)
         self._line = space.empty("match lines", point.size, real)
-        self._points, self._most, self._gap = points, int(points.counts.max(initial=0)), points.gap
+        self._points, self._most, self._gap = points, max(points.counts.tolist(), default=0), points.gap
         levels = np.unique(noise) if len(noise) > 1 else noise
         self.levels: list[float] = levels.tolist()
-        self.level = np.searchsorted(levels, noise)
+        self.level = np.searchsorted(levels, noise) if len(levels) > 1 else np.zeros(len(noise), np.intp)
+        # (S, 3) reference, second scan and level.
+        self._pairs = np.empty((len(pairs), 3), np.int32)
+        self._pairs[:, :2], self._pairs[:, 2] = pairs, self.level
         # Launches that start with the next match, so that its copies need not wait for them.
         self._fits: Program = ()
         self.fit_lines(lambda noise: WIDTH)
@@ -100,10 +102,13 @@ class IcpPairs:
 
     def most_points(self, pairs: np.ndarray | None = None) -> list[tuple[int, int]]:
         """Return for each level the most points of a reference, and of a second scan, of all or of some pairs (P,)."""
+        if len(self._pairs) == 1:
+            first, second = self._points.counts[self._pairs[0, :2]].tolist()
+            return [(first, second)]
         rows = np.arange(len(self._pairs)) if pairs is None else pairs
         most = [(0, 0)] * len(self.levels)
         for level, some in self.of_levels(rows):
-            before, second = self._points.counts[self._pairs[rows[some]]].max(axis=0, initial=0).tolist()
+            before, second = self._points.counts[self._pairs[rows[some], :2]].max(axis=0, initial=0).tolist()
             most[level] = before, second
         return most
 
@@ -123,7 +128,7 @@ class IcpPairs:
         whole = pairs is None and len(self.levels) == 1
         self._fits = tuple(
             self._lines(
-                level, np.arange(self._counts[0], dtype=np.int32) if whole else np.unique(self._pairs[rows[some]]),
+                level, np.arange(self._counts[0], dtype=np.int32) if whole else np.unique(self._pairs[rows[some], :2]),
                 width(self.levels[level]),
             )
             for level, some in self.of_levels(rows)
@@ -157,20 +162,25 @@ class IcpPairs:
         """
         starts = guesses.shape[1]
         step = self.pairs_of_launch(starts)
-        if len(self.levels) == 1 and len(pairs) <= step:
-            return self._run(pairs, guesses, rules[0])[..., :columns].astype(np.float64)
+        if 0 < len(pairs) <= step:
+            return self._run(pairs, guesses, rules)[..., :columns].astype(np.float64)
         result = np.empty((len(pairs), starts, columns))
-        for level, some in self.of_levels(pairs):
-            for begin in range(0, len(some), step):
-                part = some[begin : begin + step]
-                result[part] = self._run(pairs[part], guesses[part], rules[level])[..., :columns]
+        for begin in range(0, len(pairs), step):
+            part = slice(begin, begin + step)
+            result[part] = self._run(pairs[part], guesses[part], rules)[..., :columns]
         return result
 
     def pairs_of_launch(self, starts: int) -> int:
         """Return the most pairs of a launch of some starts each."""
         return max(_MOST_STARTS[self._backend.info.kind] // max(starts, 1), 1)
 
-    def _run(self, pairs: np.ndarray, guesses: np.ndarray, rules: MatchRules) -> np.ndarray:
+    def _points_used(self, pairs: np.ndarray, rules: Sequence[MatchRules]) -> int:
+        """Return the most points of a scan that a start of some pairs uses."""
+        strides = np.array([rule.stride if rule.thin else 1 for rule in rules])
+        points = self._points.counts[self._pairs[pairs, :2]].max(axis=1)
+        return int((-(-points // strides[self.level[pairs]])).max())
+
+    def _run(self, pairs: np.ndarray, guesses: np.ndarray, rules: Sequence[MatchRules]) -> np.ndarray:
         """Return the results (P, M, 35) of the pairs of one launch."""
         count, starts = guesses.shape[:2]
         result = np.empty((count, starts, MATCH_RESULT), self._real)
@@ -180,11 +190,13 @@ class IcpPairs:
         buffer = space.empty("match result", result.size, self._real)
         info = self._backend.info
         flags = with_lanes_flag(info.lanes, "match_scans", self._flags)
-        flags, team = with_teams_flags(info.kind, "match_scans", flags, self._backend.largest_group)
+        used = self._points_used(pairs, rules) if info.kind == "gpu" else 0
+        flags, team = with_teams_flags(info.kind, "match_scans", flags, used, self._backend.largest_group)
         matching = launch(
             "match_scans", flags, (count * starts * team,), point=self._point, start=self._start, line=self._line,
             pair=space.upload("match pairs", self._pairs[pairs]), guess=space.upload("match guesses", padded),
-            result=buffer, scans=self._counts[0], points=self._counts[1], pairs=count, starts=starts, rules=rules,
+            rules=space.upload("match rules", np.array(rules, self._real)), result=buffer, scans=self._counts[0],
+            points=self._counts[1], pairs=count, starts=starts, levels=len(rules),
         )  # fmt: skip
         fits, self._fits = self._fits, ()
         self._backend.run((*fits, matching))

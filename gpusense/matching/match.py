@@ -103,14 +103,15 @@ def match_scan(
     checks.choice("method", method, METHODS)
     given = not (isinstance(noise, str) and noise == "auto")
     options = check_options(noise if given else ASSUMED_NOISE, capture, window)
-    checks.real("temperature", temperature, above=0, high=1)
+    if temperature != 1.0 or isinstance(temperature, bool):
+        checks.real("temperature", temperature, above=0, high=1)
     device = get_backend(backend)
     real_dtype(precision, device)
     moved = motion, reference_motion
     matches, single = _matches(reference, ranges, scanner, guess, method, device, precision, options, moved, given)
     if temperature != 1:
         covariance, information = matches.covariance / temperature, matches.information * temperature
-        matches = replace(matches, covariance=covariance, information=information)
+        matches = matches.changed(covariance=covariance, information=information)
     return matches[0] if single else matches
 
 
@@ -195,32 +196,40 @@ def _to_scans(
         both = (first, before), (second, motion)
         moved = np.concatenate([np.zeros((len(scans), 3)) if m is None else m for scans, m in both])
     points = scan_points(np.concatenate([first, second]), scanner, real, moved)
-    pairs = np.stack([reference, np.arange(len(first), len(first) + len(second))], axis=1)
+    pairs = np.empty((len(second), 2), np.intp)
+    pairs[:, 0], pairs[:, 1] = reference, np.arange(len(first), len(first) + len(second))
     match = match_pairs(device, real, points, pairs, poses, method, options, scanner.mount[:2], noise)
     return judged(match, poses, options)
 
 
-def match_readings(
-    first: np.ndarray, second: np.ndarray, scanner: Scanner, guess: np.ndarray, own: tuple[np.ndarray, np.ndarray],
-    backend: Backend, precision: Precision, window: ArrayLike,
-    motions: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
+def match_log(
+    readings: np.ndarray, scanner: Scanner, first: np.ndarray, second: np.ndarray, guess: np.ndarray, own: np.ndarray,
+    backend: Backend, precision: Precision, window: ArrayLike, motion: np.ndarray | None = None,
 ) -> ScanMatch:  # fmt: skip
-    """Match S pairs of checked scans as ``match_scan`` does, with known noise of each scan.
+    """Match L pairs of checked scans of a log as ``match_scan`` does; points and lines of each scan are made once.
 
     Args:
-        first: (S, K) readings of the reference scans [m].
-        second: (S, K) readings of the second scans.
-        scanner: The scanner of both.
-        guess: (S, 3) poses of the second robot frames in the first ones [m, m, rad].
-        own: (S,) and (S,) noise of the reference scans and of the second scans from ``scan_noise`` [m].
+        readings: (S, K) readings [m].
+        scanner: The scanner.
+        first: (L,) indices of the reference scans.
+        second: (L,) indices of the second scans.
+        guess: (L, 3) poses of the second robot frames in the first ones [m, m, rad].
+        own: (S,) noise of the scans from ``scan_noise`` [m].
         backend: The device.
         precision: Precision.
         window: Half widths of the search [m, rad].
-        motions: (S, 3) and (S, 3) motions during the reference scans and the second scans, or None.
+        motion: (S, 3) motions during the scans, or None.
     """
     options, poses = check_options(ASSUMED_NOISE, 1.0, window), check_guess(guess, len(second))
-    noise = match_noise(*own)
-    return _to_scans(first, second, scanner, poses, "auto", backend, precision, options, motions, noise)
+    noise = match_noise(own[first], own[second])
+    # Lines depend on the noise, so a scan has points for each level.
+    level = np.unique(noise, return_inverse=True)[1] * len(readings)
+    used, pairs = np.unique(np.concatenate([level + first, level + second]), return_inverse=True)
+    scans = used % len(readings)
+    real = np.dtype(precision)
+    points = scan_points(readings[scans], scanner, real, None if motion is None else motion[scans])
+    match = match_pairs(backend, real, points, pairs.reshape(2, -1).T, poses, "auto", options, scanner.mount[:2], noise)
+    return judged(match, poses, options)
 
 
 def _still(ranges: np.ndarray, scanner: Scanner, motion: np.ndarray | None) -> np.ndarray:

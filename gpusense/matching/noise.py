@@ -12,6 +12,7 @@ import functools
 
 import numpy as np
 
+from gpusense.matching.columns import chosen, column_of, larger, values_of
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner, hits
 
@@ -93,11 +94,11 @@ def match_noise(first: np.ndarray, second: np.ndarray) -> np.ndarray:
         first: (S,) or (1,) noise of the reference scans [m]; NaN is unknown.
         second: (S,) noise of the second scans.
     """
-    both = np.fmax(first, second)
-    both = np.where(np.isnan(both), ASSUMED_NOISE, both)
-    both = np.minimum(np.maximum(both, LEAST_NOISE), LARGEST_NOISE)
-    noise: np.ndarray = LEAST_NOISE * ROOT ** np.ceil(np.log(both / LEAST_NOISE) / np.log(ROOT) - 0.1)
-    return noise
+    both = np.fmax(column_of(first), column_of(second))
+    both = chosen(np.isnan(both), ASSUMED_NOISE, both)
+    both = np.minimum(larger(both, LEAST_NOISE), LARGEST_NOISE)
+    steps = np.ceil(np.log(both / LEAST_NOISE) / np.log(ROOT) - 0.1)
+    return values_of(LEAST_NOISE * np.power(ROOT, steps))
 
 
 def map_noise(scans: np.ndarray, grid: OccupancyGrid) -> np.ndarray:

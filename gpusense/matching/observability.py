@@ -14,9 +14,12 @@ A lost direction affects all coordinates: the remaining information assumes that
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
+
+from gpusense.matching.columns import Column, all_of, any_of, column_of, upright
 
 # Probability that an unobserved direction counts as observed, and the normal quantile of its complement.
 FALSE_ALARM, _QUANTILE = 1e-4, 3.72
@@ -50,31 +53,38 @@ def critical_ratio(lines: np.ndarray) -> np.ndarray:
     return ratio
 
 
+@functools.cache
+def _ratio_of_few_lines() -> float:
+    """Return the critical ratio of the least number of lines."""
+    return float(critical_ratio(np.array([_LEAST_LINES]))[0])
+
+
 def observed_information(
-    information: np.ndarray, spurious: np.ndarray, lever: np.ndarray, lines: np.ndarray, least: np.ndarray
+    information: np.ndarray, spurious: np.ndarray, lever: Column, lines: np.ndarray | None, least: np.ndarray | float
 ) -> Observed:
     """Remove from the information of pairs the directions that they do not observe.
 
     Args:
         information: (S, 3, 3) sums of w J J'.
         spurious: (S, 3, 3) the expected part of it that is due to the variance of the points.
-        lever: (S,) length by which headings are multiplied [m].
-        lines: (S,) lines of the scan without a common point.
-        least: (S,) least pairs of an observed direction.
+        lever: Lengths by which headings are multiplied [m].
+        lines: (S,) lines of the scan without a common point; None for few.
+        least: (S,) least pairs of an observed direction, or one for all.
     """
     scale = balance_of(lever)
     both = scale[:, :, None] * scale[:, None, :]
     total, made_up = information * both, spurious * both + _SPURIOUS_PART
-    critical = critical_ratio(lines)
+    critical = _ratio_of_few_lines() if lines is None else critical_ratio(lines)
     values, vectors = _generalised(total, made_up)
     lost = _is_lost(values, vectors, critical, least)
-    some = np.flatnonzero(lost[:, 0])
-    count = np.zeros(len(lever), np.intp)
+    some = np.flatnonzero(lost[:, 0]) if any_of(column_of(lost[:, 0])) else ()
+    count = np.zeros(len(lost), np.intp)
     # Noise contributes 1 to each eigenvalue.
     left = np.maximum(values - 1, 1e-3 * values)
     if len(some):
         count = lost.sum(axis=1)
-        basis = _lost_basis(total[some], made_up[some], critical[some], least[some], vectors[some], lost[some])
+        ratio, fewest = (np.broadcast_to(limit, len(lost))[some] for limit in (critical, least))
+        basis = _lost_basis(total[some], made_up[some], ratio, fewest, vectors[some], lost[some])
         result = without(total[some], basis, made_up[some])
         values[some], vectors[some] = _generalised(result, made_up[some])
         left = np.where(np.arange(3) < count[:, None], 0.0, np.maximum(values - 1, 1e-3 * values))
@@ -85,8 +95,10 @@ def observed_information(
     return Observed(result / both, count)
 
 
-def balance_of(lever: np.ndarray) -> np.ndarray:
+def balance_of(lever: Column) -> np.ndarray:
     """Return (S, 3) factors that turn x, y and ``lever`` times the heading into x, y and the heading."""
+    if not isinstance(lever, np.ndarray):
+        return np.array([[1.0, 1.0, 1 / lever]])
     factors = np.ones((len(lever), 3))
     factors[:, 2] = 1 / lever
     return factors
@@ -116,12 +128,13 @@ def _generalised(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return values, turned @ vectors
 
 
-def _is_lost(values: np.ndarray, vectors: np.ndarray, critical: np.ndarray, least: np.ndarray) -> np.ndarray:
+def _is_lost(values: np.ndarray, vectors: np.ndarray, critical: Column, least: Column) -> np.ndarray:
     """Return which directions noise explains or hardly a pair observes, and all directions with smaller ratios."""
     pairs = values / np.maximum(np.add.reduce(np.square(vectors), axis=1), 1e-300)
-    lost = (values < critical[:, None]) | (pairs < least[:, None])
-    result: np.ndarray = np.logical_or.accumulate(lost[:, ::-1], axis=1)[:, ::-1]
-    return result
+    lost = (values < upright(critical)) | (pairs < upright(least))
+    for k in range(lost.shape[1] - 1, 0, -1):
+        lost[:, k - 1] |= lost[:, k]
+    return lost
 
 
 def _lost_basis(
@@ -158,7 +171,7 @@ def orthonormal(vectors: np.ndarray) -> np.ndarray:
     return result
 
 
-def axes_of(information: np.ndarray, lever: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def axes_of(information: np.ndarray, lever: Column) -> tuple[np.ndarray, np.ndarray]:
     """Return ascending eigenvalues (S, 3) of information, exactly 0 where lost, and directions (S, 3, 3) in columns.
 
     Directions are those of x, y and ``lever`` times the heading.
@@ -170,7 +183,7 @@ def axes_of(information: np.ndarray, lever: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def covariance_of(
-    information: np.ndarray, lever: np.ndarray, reach: tuple[float, float],
+    information: np.ndarray, lever: Column, reach: tuple[float, float],
     known_axes: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Return the covariance (S, 3, 3) of an information: its inverse, infinite in every coordinate that is lost.
@@ -180,14 +193,15 @@ def covariance_of(
 
     Args:
         information: (S, 3, 3), 0 along lost directions.
-        lever: (S,) length by which headings are multiplied [m].
+        lever: Lengths by which headings are multiplied [m].
         reach: Farthest distance [m] and angle [rad] from the guess.
         known_axes: The result of ``axes_of``, where it is known.
     """
     scale = balance_of(lever)
     values, vectors = axes_of(information, lever) if known_axes is None else known_axes
     axes = vectors * scale[:, :, None]
-    if values.all():
+    # In ascending order, with lost ones first.
+    if all_of(column_of(values[:, 0])):
         return np.einsum("sik,sk,sjk->sij", axes, 1 / values, axes)
     gone = values == 0
     inverse = np.where(gone, 0, 1 / np.where(gone, 1, values))

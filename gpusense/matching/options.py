@@ -11,6 +11,7 @@ import numpy as np
 from gpusense._util import checks
 from gpusense._util.angles import wrapped
 from gpusense.interface.structs import MatchRules
+from gpusense.matching.columns import Column, any_of, columns_of
 from gpusense.matching.points import GAP
 
 # Points that are used while the scale shrinks, and for each start of a search.
@@ -43,12 +44,15 @@ class MatchOptions:
     window: tuple[float, float]
     one_way: bool = False
 
-    def is_outside(self, offset: np.ndarray) -> np.ndarray:
+    def is_outside(self, offset: np.ndarray) -> Column:
         """Return whether (S, 3) offsets from guesses leave the window, enlarged by the move that a start may make."""
-        turn = np.abs(wrapped(offset[:, 2]))
+        x, y, turn = columns_of(offset)
         reach, half = self.window
-        outside: np.ndarray = (np.hypot(offset[:, 0], offset[:, 1]) > reach + _MARGIN) | (turn > half + _MARGIN)
-        return outside
+        return (np.hypot(x, y) > reach + _MARGIN) | (abs(wrapped(turn)) > half + _MARGIN)
+
+    def at_noise(self, noise: float) -> MatchOptions:
+        """Return the options with another noise."""
+        return MatchOptions(noise, self.capture, self.window, self.one_way)
 
     @property
     def least_scale(self) -> float:
@@ -141,10 +145,12 @@ def check_guess(guess: object, matches: int | None, farthest: float = _FARTHEST)
     values = checks.array("guess", read, shape)
     if values.ndim == 2 and matches is None:
         raise ValueError(f"guess: shape must be (3,) for a single match, got {checks.shape_text(values.shape)}")
-    if np.abs(values[..., :2]).max(initial=0.0) > farthest:
-        raise ValueError(f"guess: x and y must be within {farthest:g} m, got {checks.show(values)}")
     result = np.empty((1 if matches is None else matches, 3))
     result[:] = values
-    turned = np.exp(1j * result[:, 2])
-    result[:, 2] = np.arctan2(turned.imag, turned.real)
+    if len(result):
+        x, y, heading = columns_of(result)
+        if any_of((abs(x) > farthest) | (abs(y) > farthest)):
+            raise ValueError(f"guess: x and y must be within {farthest:g} m, got {checks.show(values)}")
+        turned = np.exp(1j * heading)
+        result[:, 2] = np.arctan2(turned.imag, turned.real)
     return result

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gpusense.matching.columns import column_of, larger, square_root, values_of
 from gpusense.world.deskew import sensor_points
 from gpusense.world.scanner import Scanner, hits
 
@@ -16,6 +17,8 @@ _FULL_TURN = 2 * math.pi
 _NEAREST = 1e-6
 # Beams are dense up to this step [rad].
 _DENSE = math.radians(2.5)
+# Whole points as single items, by the bytes of a number.
+_ITEMS = {size: np.dtype((np.void, 4 * size)) for size in (4, 8)}
 # Largest step between the bearings of neighbours that hides nothing [steps of the scanner].
 GAP = 3.0
 
@@ -49,7 +52,8 @@ class ScanPoints:
 
     def rms_range(self, scan: np.ndarray) -> np.ndarray:
         """Return the root mean square range of some scans, at least 1e-3 m."""
-        return np.maximum(np.sqrt(self.squares / np.maximum(self.counts, 1)), 1e-3)[scan]
+        squares, counts = column_of(self.squares[scan]), column_of(self.counts[scan])
+        return values_of(larger(square_root(squares / larger(counts, 1)), 1e-3))
 
 
 def dense_scanner(scanner: Scanner) -> Scanner:
@@ -81,9 +85,9 @@ def scan_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype, motion: np
     if motion is not None and motion.any():
         return _moved_points(ranges, scanner, real, motion)
     order, bearing, cosine, sine, gap = _beams_by_angle(scanner, real)
-    z = ranges[:, order]
-    # Columns taken in an order lie in memory one after another; sums of squares go along rows.
-    hit = np.ascontiguousarray(hits(z, scanner.range_min, scanner.range_max) & (z > _NEAREST))
+    z = ranges.take(order, axis=1)
+    hit = hits(z, scanner.range_min, scanner.range_max)
+    hit &= z > _NEAREST
     z = np.where(hit, z, 0).astype(np.float64, copy=False)
     everything = np.empty((*z.shape, 4), real)
     np.multiply(z, cosine, out=everything[..., 0], casting="same_kind")
@@ -91,7 +95,7 @@ def scan_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype, motion: np
     everything[..., 2] = bearing
     everything[..., 3] = z
     # View each point as a single item, so that a mask selects whole points.
-    items = everything.view(np.dtype((np.void, 4 * everything.itemsize)))[..., 0]
+    items = everything.view(_ITEMS[everything.itemsize])[..., 0]
     point = items[hit].view(real).reshape(-1, 4)
     return _points(point, hit, gap, np.einsum("sk,sk->s", z, z))
 

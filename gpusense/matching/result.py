@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,8 @@ USABLE = ("converged", "unobservable", "ambiguous")
 
 def is_usable(status: str | NDArray[np.str_]) -> NDArray[np.bool]:
     """Return whether statuses are of poses that may be used along their observed directions."""
+    if isinstance(status, str):
+        return np.bool_(status in USABLE)  # type: ignore[return-value]
     named = np.asarray(status)
     usable = named == USABLE[0]
     for name in USABLE[1:]:
@@ -107,9 +110,19 @@ class ScanMatch:
         """Return one of S matches."""
         if self.pose.ndim == 1:
             raise TypeError("a single match has no items")
-        values = {name: getattr(self, name)[index] for name in _FIELDS}
-        values["status"] = str(values["status"])
-        return ScanMatch(**values)
+        values = {name: value[index] for name, value in self.__dict__.items()}
+        return ScanMatch._of(values | {"status": str(values["status"])})
+
+    @classmethod
+    def _of(cls, values: dict[str, Any]) -> ScanMatch:
+        """Return a match with all fields by name; the constructor of a frozen class sets each of them by a call."""
+        match = object.__new__(cls)
+        match.__dict__.update(values)
+        return match
+
+    def changed(self, **values: Any) -> ScanMatch:
+        """Return matches in which some fields have other values."""
+        return ScanMatch._of(self.__dict__ | values)
 
     @classmethod
     def joined(cls, matches: list[ScanMatch]) -> ScanMatch:
@@ -136,7 +149,7 @@ class ScanMatch:
         information = turned @ self.information @ turned.transpose(0, 2, 1)
         directions = self.directions @ turned.transpose(0, 2, 1)
         covariance = covariance_of(information, self.lever, reach)
-        return replace(self, pose=pose, information=information, covariance=covariance, directions=directions)
+        return self.changed(pose=pose, information=information, covariance=covariance, directions=directions)
 
     def replaced(self, rows: NDArray[np.intp], others: ScanMatch, chosen: NDArray[np.bool]) -> ScanMatch:
         """Return S matches in which the chosen ones of some rows are replaced by other matches."""

@@ -12,10 +12,13 @@ sum of squares of the sums of blocks of b points is 1 + 2 sum (1 - k / b) rho_k 
 from __future__ import annotations
 
 import functools
+import itertools
+from collections.abc import Sequence
 
 import numpy as np
 
 from gpusense.backends import Backend
+from gpusense.matching.columns import Column, chosen, column_of, columns_of, is_not, larger, upright, values_of
 from gpusense.matching.icp import LONG_WIDTH, WIDTH, IcpPairs, points_of_line, space_of
 from gpusense.matching.observability import LEAST_PAIRS, Observed, observed_information
 from gpusense.matching.options import MatchOptions
@@ -40,7 +43,7 @@ def symmetric(upper: np.ndarray) -> np.ndarray:
     return upper[:, _BOTH_TRIANGLES]
 
 
-def noise_of(ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def noise_of(ratio: Column) -> tuple[Column, Column]:
     """Return the deviation of normal errors, and the factor of the covariance, from a weighted mean of squared errors.
 
     Args:
@@ -69,62 +72,61 @@ def _noise_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.append(0, mean_wuu / mean_w), np.append(0, sigma), np.append(0, factor)
 
 
-def inflation_of(squares: np.ndarray) -> np.ndarray:
-    """Return (S,) variances of sums of weighted errors, relative to independent errors; at least 1.
+def inflation_of(squares: Sequence[Column]) -> Column:
+    """Return the variances of sums of weighted errors, relative to independent errors; at least 1.
 
     The ratio to single points rises with the size of blocks, and is less certain for large ones. So its steps are
     summed until the first one that is not positive. The last of them counts twice: once blocks are longer than the
     correlation, each step is half of the one before.
 
     Args:
-        squares: (S, 8) sums of squares of the sums of blocks of 1, 2, 4 to 128 points.
+        squares: 8 columns: sums of squares of the sums of blocks of 1, 2, 4 to 128 points.
     """
-    ratio = squares / np.where(squares[:, :1] > 0, squares[:, :1], 1)
-    step = ratio[:, 1:] - ratio[:, :-1]
-    rises = np.logical_and.accumulate(step > 0, axis=1)
-    steps = np.where(rises, step, 0.0)
-    # Without a rise, all steps are 0.
-    last = steps[np.arange(len(steps)), np.add.reduce(rises, axis=1, dtype=np.intp) - 1]
-    inflation: np.ndarray = 1 + np.add.reduce(steps, axis=1) + last
-    return inflation
+    first = chosen(squares[0] > 0, squares[0], 1.0)
+    rises, total, last = first > 0, 0.0, 0.0
+    for before, after in itertools.pairwise([square / first for square in squares]):
+        step = after - before
+        rises = rises & (step > 0)
+        total, last = total + chosen(rises, step, 0.0), chosen(rises, step, last)
+    return 1 + total + last
 
 
 def variance_of(
-    squared: np.ndarray, pairs: np.ndarray, scale: np.ndarray, noise: np.ndarray, inflation: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the variance of single errors (S,) [m^2], and the factor (S,) of the inverse information.
+    squared: Column, pairs: Column, scale: Column, noise: Column, inflation: Column
+) -> tuple[Column, Column]:
+    """Return the variance of single errors [m^2], and the factor of the inverse information.
 
     The three fitted numbers of a pose reduce the degrees of freedom, and the prior noise adds some.
 
     Args:
-        squared: (S,) weighted mean squared error [m^2].
-        pairs: (S,) sums of weights.
-        noise: (S,) standard deviations of ranges [m].
-        scale: (S,) scales of the weights [m].
-        inflation: (S,) factor of the covariance because errors of neighbours are correlated.
+        squared: Weighted mean squared errors [m^2].
+        pairs: Sums of weights.
+        scale: Scales of the weights [m].
+        noise: Standard deviations of ranges [m].
+        inflation: Factors of the covariance because errors of neighbours are correlated.
     """
-    square = scale**2
-    sigma, factor = noise_of(squared / square)
+    square = scale * scale
+    # Squares of tiny scales are 0.
+    sigma, factor = noise_of(np.divide(squared, square))
     whole = inflation * factor * square
-    whole = (whole * pairs + _PRIOR_PAIRS * noise**2) / (np.maximum(pairs - 3, 0.5) + _PRIOR_PAIRS)
-    return (sigma * scale) ** 2, np.maximum(whole, _LEAST_VARIANCE)
+    whole = (whole * pairs + _PRIOR_PAIRS * (noise * noise)) / (larger(pairs - 3, 0.5) + _PRIOR_PAIRS)
+    deviation = sigma * scale
+    return deviation * deviation, larger(whole, _LEAST_VARIANCE)
 
 
 def observed_pairs(
-    information: np.ndarray, doubt: np.ndarray, variance: np.ndarray, lever: np.ndarray, lines: np.ndarray
+    information: np.ndarray, doubt: np.ndarray, variance: Column, lever: Column, lines: np.ndarray | None
 ) -> Observed:
     """Return the information that pairs of points and lines observe.
 
     Args:
         information: (S, 3, 3) sums of w J J'.
         doubt: (S, 3, 3) the part of it that is due to a unit variance of the points.
-        variance: (S,) variance of the points [m^2].
-        lever: (S,) length by which headings are multiplied [m].
-        lines: (S,) lines without a common point.
+        variance: Variances of the points [m^2].
+        lever: Lengths by which headings are multiplied [m].
+        lines: (S,) lines without a common point; None for few.
     """
-    return observed_information(
-        information, doubt * variance[:, None, None], lever, lines, np.full(len(lever), LEAST_PAIRS)
-    )
+    return observed_information(information, doubt * upright(variance, 2), lever, lines, LEAST_PAIRS)
 
 
 def statuses(result: np.ndarray, lost: np.ndarray, step: np.ndarray) -> np.ndarray:
@@ -135,16 +137,17 @@ def statuses(result: np.ndarray, lost: np.ndarray, step: np.ndarray) -> np.ndarr
         lost: (S,) number of lost directions.
         step: (S,) length of the last step in deviations of the pose, along observed directions.
     """
-    pairs, seen, through, unseen = result[:, 18], result[:, 21], result[:, 22], result[:, 23]
-    code = (lost > 0).astype(np.intp)
+    numbers = columns_of(result)
+    seen, through, unseen = numbers[21:24]
+    code = chosen(column_of(lost) > 0, 1, 0)
     # Of several reasons, the last one counts.
     reasons = (
-        (result[:, 5] == 0) & ~(step < _SHORT), result[:, 3] < _POOR,
-        seen < _OVERLAP * np.maximum(seen + through + unseen, 1), pairs < _FEW,
+        (numbers[5] == 0) & is_not(column_of(step) < _SHORT), numbers[3] < _POOR,
+        seen < _OVERLAP * larger(seen + through + unseen, 1.0), numbers[18] < _FEW,
     )  # fmt: skip
     for number, failed in enumerate(reasons, 2):
-        code[failed] = number
-    status: np.ndarray = _STATUSES[code]
+        code = chosen(failed, number, code)
+    status: np.ndarray = _STATUSES[values_of(code)]
     return status
 
 

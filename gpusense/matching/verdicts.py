@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from gpusense.backends import Backend
-from gpusense.matching.evidence import DOUBTED, DOUBTED_PARTLY, probability_right
+from gpusense.matching.columns import (
+    Column,
+    all_of,
+    any_of,
+    chosen,
+    column_of,
+    columns_of,
+    is_not,
+    larger,
+    upright,
+    values_of,
+)
+from gpusense.matching.evidence import DOUBTED, DOUBTED_PARTLY, has_rival, probability_right
 from gpusense.matching.icp import LONG_WIDTH, WIDTH, IcpPairs, points_of_line, space_of
 from gpusense.matching.observability import Observed, axes_of, covariance_of
 from gpusense.matching.options import MatchOptions
@@ -24,63 +35,61 @@ _TURNED_LINES = 0.05
 
 
 class PairSums(NamedTuple):
-    """Information of pairs in the sensors' frames, variances of points and factors of covariances, for S matches."""
+    """Information of pairs in the sensors' frames, and factors of covariances, for S matches."""
 
     found: Observed
-    variance: np.ndarray
-    factor: np.ndarray
+    factor: Column
 
 
 def tested(
-    device: IcpPairs, result: np.ndarray, points: ScanPoints, pairs: np.ndarray, noise: np.ndarray,
-    levels: Sequence[MatchOptions], noisy: np.ndarray,
+    device: IcpPairs, result: np.ndarray, gap: float, lever: np.ndarray, noise: np.ndarray,
+    levels: Sequence[MatchOptions], noisy: Column,
 ) -> PairSums:  # fmt: skip
     """Return the directions that pairs observe, by the matches' lines or, where noise may turn these, by longer lines.
 
     Args:
         device: The pairs.
         result: (S, 35) results of the matches.
-        points: The points of all scans.
-        pairs: (S, 2) numbers of the reference and of the second scan.
+        gap: Largest step between the bearings of two neighbours that hides nothing [rad].
+        lever: (S,) root mean square ranges of the second scans [m].
         noise: (S,) standard deviations of ranges [m].
         levels: The options of each level of noise.
-        noisy: (N,) numbers of pairs whose lines noise turns.
+        noisy: Whether noise turns the lines of pairs.
     """
-    lever, weights = points.rms_range(pairs[:, 1]), np.maximum(result[:, 19], 1e-30)
+    numbers, deviation = columns_of(result), column_of(noise)
+    weights = larger(numbers[19], 1e-30)
     scale = np.array([options.least_scale for options in levels])[device.level]
-    variance, factor = variance_of(result[:, 20] / weights, result[:, 19], scale, noise, inflation_of(result[:, 24:32]))
-    largest = np.maximum(variance, noise**2)
-
-    def observed(sums: np.ndarray, rows: np.ndarray | slice, independent: np.ndarray) -> Observed:
-        information, doubt = symmetric(sums[:, 6:12]), symmetric(sums[:, 12:18])
-        return observed_pairs(information, doubt, largest[rows], lever[rows], independent)
-
+    variance, factor = variance_of(
+        numbers[20] / weights, numbers[19], column_of(scale), deviation, inflation_of(numbers[24:32])
+    )
+    largest = larger(variance, deviation * deviation)
     # Short lines decide only where the result is beyond doubt.
-    found = observed(result, slice(None), np.zeros(len(result)))
-    turned = (result[:, 12] + result[:, 15]) * largest > _TURNED_LINES * weights
-    turned[noisy] = True
-    rows = np.flatnonzero(((found.lost > 0) | turned) & (LONG_WIDTH * noise > WIDTH))
-    if len(rows):
+    found = observed_pairs(symmetric(result[:, 6:12]), symmetric(result[:, 12:18]), largest, column_of(lever), None)
+    turned = noisy | ((numbers[12] + numbers[15]) * largest > _TURNED_LINES * weights)
+    longer_lines = ((column_of(found.lost) > 0) | turned) & (LONG_WIDTH * deviation > WIDTH)
+    if any_of(longer_lines):
+        rows = np.flatnonzero(longer_lines)
         device.fit_lines(lambda level: LONG_WIDTH * level, rows)
         strides = [
-            options.rules(most, points.gap).stride
-            for options, (_, most) in zip(levels, device.most_points(rows), strict=True)
+            options.rules(most, gap).stride for options, (_, most) in zip(levels, device.most_points(rows), strict=True)
         ]
         rules = [
-            options.last_rules(points.gap)._replace(stride=stride, thin=1)
+            options.last_rules(gap)._replace(stride=stride, thin=1)
             for options, stride in zip(levels, strides, strict=True)
         ]
         longer = device.run(rows, result[rows, None, :3], rules)[:, 0]
         # A subset represents all points.
         longer[:, 6:18] *= np.array(strides)[device.level[rows], None]
-        lines = result[:, 19] / points_of_line(points.gap, noise, lever)
-        for values, others in zip(found, observed(longer, rows, lines[rows]), strict=True):
+        lines = (result[:, 19] / points_of_line(gap, noise, lever))[rows]
+        information, doubt = symmetric(longer[:, 6:12]), symmetric(longer[:, 12:18])
+        by_longer = observed_pairs(information, doubt, values_of(largest)[rows], lever[rows], lines)
+        for values, others in zip(found, by_longer, strict=True):
             values[rows] = others
-    return PairSums(found, variance, factor)
+    return PairSums(found, factor)
 
 
 def concluded(
-    pose: np.ndarray, information: np.ndarray, factor: np.ndarray, score: np.ndarray, iterations: np.ndarray,
+    pose: np.ndarray, information: np.ndarray, factor: Column, score: np.ndarray, iterations: np.ndarray,
     status: np.ndarray, lever: np.ndarray, other: np.ndarray, evidence: np.ndarray, pairs: np.ndarray,
     noise: np.ndarray, window: tuple[float, float],
 ) -> ScanMatch:  # fmt: skip
@@ -89,7 +98,7 @@ def concluded(
     Args:
         pose: (S, 3) poses.
         information: (S, 3, 3) information on the poses.
-        factor: (S,) factor that turns the information into a sum over pairs [m^2].
+        factor: Factors that turns the information into a sum over pairs [m^2].
         score: (S,) scores.
         iterations: (S,) iterations.
         status: (S,) statuses so far.
@@ -100,22 +109,23 @@ def concluded(
         noise: (S,) standard deviations of ranges [m].
         window: Half widths of the search [m, rad].
     """
-    usable = is_usable(status)
-    two = usable & np.isfinite(other).all(axis=1)
-    if two.any():
-        offset = np.where(two[:, None], other, 0.0)
+    usable, lever_column = is_usable(column_of(status)), column_of(lever)
+    two = usable & has_rival(other)
+    if any_of(two):
+        offset = np.where(upright(two), other, 0.0)
         # The covariance plus a quarter of the offset's square, by Woodbury's identity.
         side = np.einsum("sij,sj->si", information, offset)
         information = information - side[:, :, None] * (side / (4 + (side * offset).sum(axis=1))[:, None])[:, None, :]
-        status = np.where(two, "ambiguous", status)
-    values, vectors = axes_of(information, lever)
-    kept = (values, vectors) if usable.all() else None
+        status = np.where(values_of(two), "ambiguous", status)
+    values, vectors = axes_of(information, lever_column)
+    kept = (values, vectors) if all_of(usable) else None
     if kept is None:
         # These are not the axes of the information that is kept.
-        information = np.where(usable[:, None, None], information, 0.0)
+        information = np.where(upright(usable, 2), information, 0.0)
+    shares = values * upright(factor / larger(column_of(pairs), 1.0))
     return ScanMatch(
-        pose, covariance_of(information, lever, window, kept), information, np.zeros(len(pose)), score,
-        iterations.astype(np.int64), values * (factor / np.maximum(pairs, 1))[:, None], vectors.transpose(0, 2, 1),
+        pose, covariance_of(information, lever_column, window, kept), information, np.zeros(len(pose)), score,
+        iterations.astype(np.int64), shares, vectors.transpose(0, 2, 1),
         lever, noise, evidence, status,
     )  # fmt: skip
 
@@ -129,20 +139,21 @@ def judged(match: ScanMatch, guess: np.ndarray, options: MatchOptions) -> ScanMa
         options: The window.
     """
     offset = match.pose - guess
-    evidence = match.evidence.copy()
-    evidence[:, -1] = np.hypot(offset[:, 0], offset[:, 1]) / max(options.window[0], _LEAST_WINDOW)
-    status, outside, usable = np.asarray(match.status), options.is_outside(offset), match.usable
-    p_right = np.where(usable & ~outside, probability_right(evidence), 0.0)
+    evidence, (x, y, _) = match.evidence.copy(), columns_of(offset)
+    evidence[:, -1] = np.hypot(x, y) / max(options.window[0], _LEAST_WINDOW)
+    status, outside = np.asarray(match.status), options.is_outside(offset)
+    usable = is_usable(column_of(status))
+    p_right = chosen(usable & is_not(outside), column_of(probability_right(evidence)), 0.0)
     # Poses outside the window have probability 0.
-    doubtful = p_right < np.where(status == "converged", DOUBTED, DOUBTED_PARTLY)
-    good = usable & ~doubtful
-    if good.all():
-        return replace(match, evidence=evidence, p_right=p_right)
+    doubtful = p_right < chosen(column_of(status) == "converged", DOUBTED, DOUBTED_PARTLY)
+    good, p_right = usable & is_not(doubtful), values_of(p_right)
+    if all_of(good):
+        return match.changed(evidence=evidence, p_right=p_right)
     status = np.where(usable & doubtful, "doubtful", status)
     status = np.where(usable & outside, "outside window", status)
-    failed = ~good[:, None, None]
-    return replace(
-        match, evidence=evidence, p_right=p_right, status=status, information=np.where(failed, 0.0, match.information),
+    failed = upright(is_not(good), 2)
+    return match.changed(
+        evidence=evidence, p_right=p_right, status=status, information=np.where(failed, 0.0, match.information),
         covariance=np.where(failed, np.where(np.eye(3) > 0, np.inf, 0.0), match.covariance),
     )  # fmt: skip
 

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.interface import structs
-from gpusense.interface.constants import MATCH_RESULT
-from gpusense.reference.icp_match import match_pair
+from gpusense.interface.constants import MATCH_RESULT, MATCH_RULES
+from gpusense.reference.icp_match import match_pair, rules_of
 
 
 def match_scans(
     flags: frozenset[str], point: np.ndarray, start: np.ndarray, line: np.ndarray, pair: np.ndarray, guess: np.ndarray,
-    result: np.ndarray, scans: int, points: int, pairs: int, starts: int, rules: structs.MatchRules,
+    rules: np.ndarray, result: np.ndarray, scans: int, points: int, pairs: int, starts: int, levels: int,
 ) -> None:  # fmt: skip
-    """Match pairs of scans (reference, second scan) from guesses (x, y, theta).
+    """Match pairs of scans (reference, second scan, level of its rules) from guesses (x, y, theta).
 
     A guess is the pose of the second scan in the reference's frame. With ``one_way`` the reference's points do not
     count in the score. A result is the pose (3), the score, iterations, whether the last step was below ten tolerances,
@@ -22,5 +21,7 @@ def match_scans(
     blocks of 1, 2, 4 to 128 successive points the sum of squares of the blocks' sums of weighted errors (8), 0 with
     ``thin``; the last step (3).
     """
+    which, of = pair[: 3 * pairs].reshape(-1, 3), rules[: MATCH_RULES * levels].reshape(-1, MATCH_RULES)
     for n, out in enumerate(result[: MATCH_RESULT * pairs * starts].reshape(-1, MATCH_RESULT)):
-        match_pair(point, start, line, pair[n // starts], guess[n, :3], out, rules)
+        first, second, level = which[n // starts]
+        match_pair(point, start, line, (first, second), guess[n, :3], rules_of(of[level]), out)

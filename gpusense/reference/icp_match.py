@@ -28,6 +28,11 @@ class Match:
     calm: bool = False
 
 
+def rules_of(numbers: np.ndarray) -> structs.MatchRules:
+    """Return the rules of a level."""
+    return structs.MatchRules(*map(int, numbers[:6]), *numbers[6:])
+
+
 def limited_step(step: np.ndarray, capture: np.floating) -> tuple[np.ndarray, np.floating]:
     """Return a step of at most half the first capture radius and 0.3 rad, and the length that it had."""
     real = step.dtype.type
@@ -91,11 +96,11 @@ def mutual_agreement(
 
 
 def match_pair(
-    point: np.ndarray, start: np.ndarray, line: np.ndarray, which: np.ndarray, guess: np.ndarray, out: np.ndarray,
-    rules: structs.MatchRules,
+    point: np.ndarray, start: np.ndarray, line: np.ndarray, pair: tuple[int, int], guess: np.ndarray,
+    rules: structs.MatchRules, out: np.ndarray,
 ) -> None:  # fmt: skip
     """Match a pair (reference, second scan) from a guess, and write the result; its numbers are in icp.py."""
-    first, second = (slice(start[scan], start[scan + 1]) for scan in which)
+    first, second = (slice(start[scan], start[scan + 1]) for scan in pair)
     match = refine(point[first], line[first], point[second], guess, rules)
     both = mutual_agreement(point, line, first, second, match.pose, rules)
     everything = both[1] + both[2] + UNSEEN * both[3]

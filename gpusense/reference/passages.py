@@ -11,24 +11,12 @@ from gpusense.interface import structs
 from gpusense.interface.constants import AGREES, NOTHING, SHORT, THROUGH, VANISHED
 from gpusense.reference.heading import cos_sin
 
-# Values of cells that are unknown, and of places off the map, which are unknown as well.
-UNKNOWN, OFF = 255, 256
+# Value of cells that are unknown, as places off the map are.
+UNKNOWN = 255
 # Step of a walk, and farthest start of one, where no map reaches [cells].
 STEP, AFAR = 0.5, 1e9
-# Sides of a beam and of its companions.
+# Sides of a beam and of its companions, of which the first is the beam itself.
 SIDES = np.array([[0.0], [1.0], [-1.0]])
-
-
-def value_at(cells: np.ndarray, col: np.ndarray, row: np.ndarray, rows: int, cols: int) -> np.ndarray:
-    """Return the values of cells."""
-    # As unsigned numbers, negative indices exceed every limit.
-    within = (col.view(np.uint32) < cols) & (row.view(np.uint32) < rows)
-    index = row.astype(np.int64)
-    index *= cols
-    index += col
-    value = np.full(col.shape, OFF, np.int16)
-    np.copyto(value, cells.take(index, mode="clip"), where=within)
-    return value
 
 
 def is_wall(value: np.ndarray, occupied: int) -> np.ndarray:
@@ -53,22 +41,30 @@ def walk_ray(
         occupied: Least value of a wall.
     """
     # All steps of all rays in sequence.
-    ray = np.repeat(np.arange(len(steps)), steps)
+    ray = np.arange(len(steps)).repeat(steps)
     number = np.arange(len(ray))
-    number -= np.repeat(np.cumsum(steps) - steps, steps)
+    number -= (steps.cumsum() - steps).repeat(steps)
     distance = STEP * number
     col, row = (_cells_along(start[axis], slope[axis], steps, distance) for axis in (0, 1))
-    value = value_at(cells, col, row, rows, cols)
+    # As unsigned numbers, negative indices exceed every limit.
+    within = (col.view(np.uint32) < cols) & (row.view(np.uint32) < rows)
+    index = row.astype(np.int64)
+    index *= cols
+    index += col
+    value = np.full(len(ray), UNKNOWN, np.uint8)
+    np.copyto(value, cells.take(index, mode="clip"), where=within)
     stops = is_wall(value, occupied)
-    corner = np.flatnonzero((col[1:] != col[:-1]) & (row[1:] != row[:-1])) + 1
-    corner = corner[(number[corner] > 0) & (value[corner] != OFF) & (value[corner - 1] != OFF)]
-    beside = (col[corner - 1], row[corner]), (col[corner], row[corner - 1])
-    one, other = (is_wall(value_at(cells, *at, rows, cols), occupied) for at in beside)
-    stops[corner] |= one & other
+    corner = ((col[1:] != col[:-1]) & (row[1:] != row[:-1])).nonzero()[0]
+    after = corner + 1
+    inner = (number[after] > 0) & within[after] & within[corner]
+    corner, after = corner[inner], after[inner]
+    # Cells beside two cells of the map are on the map as well.
+    moved = col[after] - col[corner]
+    stops[after] |= is_wall(cells[index[corner] + moved], occupied) & is_wall(cells[index[after] - moved], occupied)
     first = np.full((2, len(steps)), np.inf)
-    for result, marked in zip(first, (stops, value >= UNKNOWN), strict=True):
+    for result, marked in zip(first, (stops, value == UNKNOWN), strict=True):
         # From the last to the first, so that the first one is written last.
-        found = np.flatnonzero(marked)[::-1]
+        found = marked.nonzero()[0][::-1]
         result[ray[found]] = distance[found]
     first[1, first[1] > first[0]] = np.inf
     return first
@@ -76,21 +72,19 @@ def walk_ray(
 
 def _cells_along(start: np.ndarray, slope: np.ndarray, steps: np.ndarray, distance: np.ndarray) -> np.ndarray:
     """Return the columns or rows of all steps of rays, from their coordinates and slopes (R,) along one axis."""
-    place = np.repeat(slope, steps)
+    place = slope.repeat(steps)
     place *= distance
-    place += np.repeat(start, steps)
+    place += start.repeat(steps)
     # Processors convert to 32 bits several times as fast as to 64.
     return np.floor(place, out=place).astype(np.int32)
 
 
 def walk_beside(
-    side: np.ndarray, direction: np.ndarray, steps: np.ndarray, cells: np.ndarray, rows: int, cols: int,
-    rules: structs.BeamRules,
-) -> np.ndarray:  # fmt: skip
-    """Return the distances (2, M, B) [m] along beams (side 0) and their companions on both sides (1 and -1).
+    direction: np.ndarray, steps: np.ndarray, cells: np.ndarray, rows: int, cols: int, rules: structs.BeamRules
+) -> np.ndarray:
+    """Return the distances (2, 3, B) [m] along beams and their companions on both sides.
 
     Args:
-        side: (M, 1) sides.
         direction: (B,) directions of the beams in the map's frame [rad].
         steps: (B,) numbers of steps.
         cells: Values of the map's cells.
@@ -98,12 +92,18 @@ def walk_beside(
         cols: Columns of the map.
         rules: Origin and companions.
     """
-    (cos, sin), slope = cos_sin(direction), np.stack(cos_sin(direction + side * rules.apart))
-    shift = side * rules.beside
-    start = np.stack([(rules.origin_x - shift * sin) / rules.cell, (rules.origin_y + shift * cos) / rules.cell])
-    start = np.minimum(np.maximum(start, -AFAR), AFAR).reshape(2, -1)
-    first = walk_ray(start, slope.reshape(2, -1), np.tile(steps, len(side)), cells, rows, cols, rules.occupied)
-    return first.reshape(2, len(side), -1) * rules.cell
+    slope = np.empty((2, len(SIDES), len(direction)))
+    slope[0], slope[1] = cos_sin(direction + SIDES * rules.apart)
+    # Companions begin at right angles to the beam, whose side is 0.
+    cos, sin = slope[:, 0]
+    shift, start = SIDES * rules.beside, np.empty_like(slope)
+    start[0], start[1] = rules.origin_x - shift * sin, rules.origin_y + shift * cos
+    start /= rules.cell
+    np.minimum(np.maximum(start, -AFAR, out=start), AFAR, out=start)
+    first = walk_ray(
+        start.reshape(2, -1), slope.reshape(2, -1), np.tile(steps, len(SIDES)), cells, rows, cols, rules.occupied
+    )
+    return first.reshape(slope.shape) * rules.cell
 
 
 def judge_beams(
@@ -124,7 +124,7 @@ def judge_beams(
     steps = (np.minimum(after, rules.limit) / (rules.cell * STEP)).astype(np.int64) + 1
     # A ray gives no evidence beyond the first unknown cell.
     end = np.where(returned, before, reading)
-    first, unknown = walk_beside(SIDES, direction, steps, cells, rows, cols, rules)
+    first, unknown = walk_beside(direction, steps, cells, rows, cols, rules)
     seen, own = unknown >= np.minimum(first, end), first[0]
     alone = within & (own >= before) & (own <= after) & seen[0]
     nearest, farthest, seen = first.min(axis=0), first.max(axis=0), seen.all(axis=0)

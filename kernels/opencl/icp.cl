@@ -1,9 +1,9 @@
 // Scan matching by point-to-line ICP with exact nearest points; see icp_pairs.cl and icp_match.cl.
 // requires: icp_pairs icp_match
 
-// Match scans: a work-item, or with IN_TEAMS a team of them, takes a pair (reference, second scan) and a guess (x, y,
-// theta), the pose of the second scan in the reference's frame. With one_way the reference's points do not count in the
-// score.
+// Match scans: a work-item, or with IN_TEAMS a team of them, takes a pair (reference, second scan, level of its rules)
+// and a guess (x, y, theta), the pose of the second scan in the reference's frame. With one_way the reference's points do
+// not count in the score.
 kernel void match_scans(ARGUMENTS) {
 #if IN_TEAMS
     local real shared[TEAM * AT_ONCE];
@@ -14,5 +14,5 @@ kernel void match_scans(ARGUMENTS) {
     const Team team = {0};
 #endif
     if (n >= pairs * starts) return;
-    match_pair(point, start, line, pair[n / starts], guess[n], result + (long)MATCH_RESULT * n, rules, team);
+    match_pair(point, start, line, pair + 3 * (n / starts), guess[n], rules, result + (long)MATCH_RESULT * n, team);
 }

@@ -7,6 +7,8 @@
 // that the other scan should see, points through which it saw, points that it did not see, and for blocks of 1, 2, 4 to
 // 128 successive points the sum of squares of the blocks' sums of weighted errors (8), 0 with thin; the last step (3).
 #define MATCH_RESULT 35
+// Numbers of the rules of a level.
+#define MATCH_RULES 14
 // Weight in the score of a point that the other scan did not see; a point that disagrees has weight 1.
 #define UNSEEN ((real)0.13)
 
@@ -16,6 +18,17 @@ typedef struct {
     real sums[MATCH_SUMS], squares[MATCH_BLOCKS];
     int iteration, calm;
 } Match;
+
+// Return the rules of a level.
+MatchRules rules_of(global const real *rules, const int level) {
+    global const real *numbers = rules + MATCH_RULES * level;
+    MatchRules of;
+    of.iterations = (int)numbers[0], of.stride = (int)numbers[1], of.skip = (int)numbers[2];
+    of.score_stride = (int)numbers[3], of.thin = (int)numbers[4], of.one_way = (int)numbers[5];
+    of.capture = numbers[6], of.least_capture = numbers[7], of.scale = numbers[8], of.least_scale = numbers[9];
+    of.shrink = numbers[10], of.gap = numbers[11], of.near = numbers[12], of.tolerance = numbers[13];
+    return of;
+}
 
 // Return a step of at most half the first capture radius and 0.3 rad, with the length that it had in w.
 real4 limited_step(const real4 step, const real capture) {
@@ -74,13 +87,14 @@ real4 mutual_agreement(global const real4 *point, global const real4 *line, cons
                              inverse, rules.near, rules.gap, team);
 }
 
-// Match a pair (reference, second scan) from a guess, and write the result.
-void match_pair(global const real4 *point, global const int *start, global const real4 *line, const int2 which,
-                const real4 guess, global real *out, const MatchRules rules, const Team team) {
-    const int first = start[which.x], count = start[which.x + 1] - first;
-    const int second = start[which.y], others = start[which.y + 1] - second;
-    const Match match = refine(point + first, line + first, count, point + second, others, guess, rules, team);
-    const real4 both = mutual_agreement(point, line, first, count, second, others, match.pose, rules, team);
+// Match a pair (reference, second scan, level of its rules) from a guess, and write the result.
+void match_pair(global const real4 *point, global const int *start, global const real4 *line, global const int *pair,
+                const real4 guess, global const real *rules, global real *out, const Team team) {
+    const int first = start[pair[0]], count = start[pair[0] + 1] - first;
+    const int second = start[pair[1]], others = start[pair[1] + 1] - second;
+    const MatchRules of = rules_of(rules, pair[2]);
+    const Match match = refine(point + first, line + first, count, point + second, others, guess, of, team);
+    const real4 both = mutual_agreement(point, line, first, count, second, others, match.pose, of, team);
     if (team.member > 0) return;
     const real all = both.y + both.z + UNSEEN * both.w;
     out[0] = match.pose.x, out[1] = match.pose.y, out[2] = match.pose.z;

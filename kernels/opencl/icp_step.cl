@@ -11,7 +11,7 @@
 // With IN_TEAMS the work-items of a group share the points of a match, each with the same pose and sums.
 #if IN_TEAMS
 #if SMALL_TEAMS
-#define TEAM 64
+#define TEAM 32
 #else
 #define TEAM 256
 #endif

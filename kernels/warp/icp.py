@@ -15,16 +15,16 @@ def make(name, flags):
     match_pair = icp_match.functions(flags).match_pair
     TEAM = icp_step.functions(flags).TEAM
 
-    # Match scans: a work-item, or with IN_TEAMS a team of them, takes a pair (reference, second scan) and a guess (x,
-    # y, theta), the pose of the second scan in the reference's frame. With one_way the reference's points do not count
-    # in the score.
+    # Match scans: a work-item, or with IN_TEAMS a team of them, takes a pair (reference, second scan, level of its
+    # rules) and a guess (x, y, theta), the pose of the second scan in the reference's frame. With one_way the
+    # reference's points do not count in the score.
     @kernel(flags)
-    def match_scans(point, start, line, pair, guess, result, scans, points, pairs, starts, rules):
+    def match_scans(point, start, line, pair, guess, rules, result, scans, points, pairs, starts, levels):
         item = work_item(wp.tid())
         n = item // TEAM
         if n < pairs * starts:
             match_pair(
-                point, start, line, pair[n // starts], guess[n], result, n * MATCH_RESULT, rules, item - n * TEAM
+                point, start, line, pair, 3 * (n // starts), guess[n], rules, result, n * MATCH_RESULT, item - n * TEAM
             )
 
     return locals()[name]

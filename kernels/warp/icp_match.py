@@ -14,6 +14,8 @@ from .prelude import precision
 # the other scan should see, points through which it saw, points that it did not see, and for blocks of 1, 2, 4 to 128
 # successive points the sum of squares of the blocks' sums of weighted errors (8), 0 with thin; the last step (3).
 MATCH_RESULT = wp.constant(35)
+# Numbers of the rules of a level.
+MATCH_RULES = wp.constant(14)
 
 
 @functools.cache
@@ -28,6 +30,27 @@ def functions(flags):
     TENTH, TEN, LARGEST_TURN, QUIET_TURN = real(0.1), real(10.0), real(0.3), real(0.03)
     # Weight in the score of a point that the other scan did not see; a point that disagrees has weight 1.
     UNSEEN = real(0.13)
+
+    # Return the rules of a level.
+    @wp.func
+    def rules_of(rules: wp.array(dtype=real), level: wp.int32):
+        first = level * MATCH_RULES
+        of = MatchRules()
+        of.iterations = int(rules[first])
+        of.stride = int(rules[first + 1])
+        of.skip = int(rules[first + 2])
+        of.score_stride = int(rules[first + 3])
+        of.thin = int(rules[first + 4])
+        of.one_way = int(rules[first + 5])
+        of.capture = rules[first + 6]
+        of.least_capture = rules[first + 7]
+        of.scale = rules[first + 8]
+        of.least_scale = rules[first + 9]
+        of.shrink = rules[first + 10]
+        of.gap = rules[first + 11]
+        of.near = rules[first + 12]
+        of.tolerance = rules[first + 13]
+        return of
 
     # Return a step of at most half the first capture radius and 0.3 rad, with the length that it had in w.
     @wp.func
@@ -114,20 +137,23 @@ def functions(flags):
                 )
         return both
 
-    # Match a pair (reference, second scan) from a guess, and write the result from out on.
+    # Match a pair (reference, second scan, level of its rules), which is numbers from which on, from a guess, and write
+    # the result from out on.
     @wp.func
     def match_pair(
-        point: wp.array(dtype=vec4), start: wp.array(dtype=wp.int32), line: wp.array(dtype=vec4), which: wp.vec2i,
-        guess: vec4, result: wp.array(dtype=real), out: wp.int32, rules: MatchRules, member: wp.int32,
+        point: wp.array(dtype=vec4), start: wp.array(dtype=wp.int32), line: wp.array(dtype=vec4),
+        pair: wp.array(dtype=wp.int32), which: wp.int32, guess: vec4, rules: wp.array(dtype=real),
+        result: wp.array(dtype=real), out: wp.int32, member: wp.int32,
     ):  # fmt: skip
-        first = start[which.x]
-        count = start[which.x + 1] - first
-        second = start[which.y]
-        others = start[which.y + 1] - second
+        first = start[pair[which]]
+        count = start[pair[which] + 1] - first
+        second = start[pair[which + 1]]
+        others = start[pair[which + 1] + 1] - second
+        of = rules_of(rules, pair[which + 2])
         pose, moved, sums, blocks, iteration, calm = refine(
-            point, line, first, count, second, others, guess, rules, member
+            point, line, first, count, second, others, guess, of, member
         )
-        both = mutual_agreement(point, line, first, count, second, others, pose, rules, member)
+        both = mutual_agreement(point, line, first, count, second, others, pose, of, member)
         if member > 0:
             return
         everything = both.y + both.z + UNSEEN * both.w

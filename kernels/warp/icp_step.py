@@ -77,7 +77,7 @@ def functions(flags):
     # With IN_TEAMS the work-items of a group share the points of a match, each with the same pose and sums.
     TEAM = 1
     if IN_TEAMS:
-        TEAM = 64 if "SMALL_TEAMS" in flags else 256
+        TEAM = 32 if "SMALL_TEAMS" in flags else 256
     Sums = wp.types.vector(length=MATCH_SUMS, dtype=real)
     # Squares, and sums of blocks that wait for the second half of their pair.
     Blocks = wp.types.vector(length=2 * MATCH_BLOCKS, dtype=real)

@@ -20,15 +20,16 @@ RULES = MatchRules(40, 2, 3, 1, 0, 0, 1.0, 0.3, 1.0, 0.03, 0.85, 0.06, 0.3, 1e-4
 TOLERANCE = {"float32": (2e-5, 2e-4), "float64": (1e-10, 1e-9)}
 
 
-def run(backend: str, precision: str, scanner, rules, guesses):
+def run(backend: str, precision: str, scanner, rules, guesses, noise=(0.01,) * 4):
+    """Match four pairs, with rules of each level of noise."""
     device, real = get_backend(backend), np.dtype(precision)
     first, second, _ = random_pairs(4, scanner, seed=3)
     second[1, 50:90] = np.inf
     points = scan_points(np.concatenate([first, second]), scanner, real)
     lock, space = space_of(device)
     with lock, space:
-        pairs = IcpPairs(device, real, points, np.arange(8).reshape(2, 4).T, np.full(4, 0.01), space)
-        return pairs.run(np.arange(4), guesses, [rules])
+        pairs = IcpPairs(device, real, points, np.arange(8).reshape(2, 4).T, np.array(noise), space)
+        return pairs.run(np.arange(4), guesses, rules if isinstance(rules, list) else [rules])
 
 
 @pytest.mark.sampled(0.4)
@@ -52,16 +53,41 @@ def test_devices_agree_with_the_reference(device, precision, scanner, thin):
 @pytest.mark.sampled(0.4)
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize(("scanner", "thin"), [(RING, 0), (FRONT, 0), (FRONT, 1)], ids=["ring", "front", "thin"])
-@pytest.mark.parametrize(("limit", "team"), [(1024, 256), (255, 64), (63, 1)], ids=["large", "small", "none"])
+@pytest.mark.parametrize(("limit", "team"), [(1024, 256), (255, 32), (31, 1)], ids=["large", "small", "none"])
 def test_a_team_of_work_items_agrees_with_the_reference(device, monkeypatch, precision, scanner, thin, limit, team):
     """GPUs match in teams that their groups hold; here processors do."""
-    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu", lanes=1))
-    monkeypatch.setattr(device, "largest_group", lambda kernel, flags: limit)
-    sizes = []
-    starts = device.run
-    monkeypatch.setattr(device, "run", lambda program: (sizes.append(program[-1].size), starts(program)))
+    sizes = pretend_gpu(device, monkeypatch, limit)
     test_devices_agree_with_the_reference(device, precision, scanner, thin)
     assert sizes == [(4 * 3 * team,)]
+
+
+def pretend_gpu(device, monkeypatch, limit=1024) -> list[tuple[int, ...]]:
+    """Match in teams as GPUs with groups of at most ``limit`` do; return the list of the sizes of launches."""
+    sizes: list[tuple[int, ...]] = []
+    starts = device.run
+    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, kind="gpu", lanes=1))
+    monkeypatch.setattr(device, "largest_group", lambda kernel, flags: limit)
+    monkeypatch.setattr(device, "run", lambda program: (sizes.append(program[-1].size), starts(program)))
+    return sizes
+
+
+def test_items_of_few_points_have_small_teams(device, monkeypatch):
+    sizes = pretend_gpu(device, monkeypatch)
+    guesses = random_pairs(4, RING, seed=3)[2][:, None] + np.zeros((4, 3, 3))
+    rules = RULES._replace(thin=1, iterations=6, stride=12, score_stride=12)
+    expected, found = (run(name, "float32", RING, rules, guesses) for name in ("numpy", device))
+    np.testing.assert_allclose(found[..., :6], expected[..., :6], atol=TOLERANCE["float32"][0])
+    assert sizes == [(4 * 3 * 32,)]
+
+
+def test_pairs_of_different_noise_share_a_launch_and_keep_their_rules(device):
+    guesses = random_pairs(4, RING, seed=3)[2][:, None] + 0.05
+    levels = [RULES, RULES._replace(stride=5, capture=0.6, near=0.2), RULES._replace(iterations=3)]
+    noise = (0.01, 0.02, 0.01, 0.04)
+    alone = np.array([run(device, "float32", RING, [level] * 3, guesses, noise) for level in levels])
+    both = run(device, "float32", RING, levels, guesses, noise)
+    assert (both == alone[[0, 1, 0, 2], np.arange(4)]).all()
+    assert not (both == alone[0]).all(axis=(1, 2)).all()
 
 
 def test_the_search_by_bearing_finds_the_nearest_of_all_points(device):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gpusense.interface.constants import GRADIENT_NUMBERS, MATCH_RESULT
+from gpusense.interface.constants import GRADIENT_NUMBERS, MATCH_RESULT, MATCH_RULES
 from gpusense.interface.signatures.rows import PLACED, WINDOW, Kernel, kernel
 
 # Points of all scans, sorted by bearing in each scan: x, y [m], bearing in [0, 2 pi), range [m].
@@ -24,9 +24,9 @@ KERNELS: dict[str, Kernel] = {
         lanes_group=8,
     ),
     "match_scans": kernel(
-        "icp", "item", *_POINTS, "real4 line [points]", "int2 pair [pairs]", "real4 guess [pairs * starts]",
-        f"out real result [{MATCH_RESULT} * pairs * starts]", "int scans", "int points", "int pairs", "int starts",
-        "MatchRules rules", group=4, team=256,
+        "icp", "item", *_POINTS, "real4 line [points]", "int pair [3 * pairs]", "real4 guess [pairs * starts]",
+        f"real rules [{MATCH_RULES} * levels]", f"out real result [{MATCH_RESULT} * pairs * starts]", "int scans",
+        "int points", "int pairs", "int starts", "int levels", group=4, team=256,
     ),
     "pool_scores": kernel(
         "search", "col line image", _CELLS,

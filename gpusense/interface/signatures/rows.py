@@ -72,7 +72,7 @@ class Kernel:
     The first axis of a global size is rounded up to whole groups; heavier work-items have smaller groups. Where a
     kernel is compiled with IN_LANES, its groups have ``lanes_group`` work-items, and with ``in_lanes`` each of them
     takes as many neighbours of the first axis as there are lanes. With IN_TEAMS the ``team`` work-items of a group
-    share an item, with SMALL_TEAMS a quarter as many, so the first axis has as many work-items for each. ``apart`` says
+    share an item, with SMALL_TEAMS an eighth as many, so the first axis has as many work-items for each. ``apart`` says
     that no two of its arrays share memory, so a compiler need not reload arguments after a write.
     """
 
@@ -99,7 +99,7 @@ def team_of(row: Kernel, flags: frozenset[str]) -> int:
     """Return the number of work-items that share an item of a kernel."""
     if "IN_TEAMS" not in flags:
         return 1
-    return row.team // 4 if "SMALL_TEAMS" in flags else row.team
+    return row.team // 8 if "SMALL_TEAMS" in flags else row.team
 
 
 def kernel(

@@ -168,15 +168,20 @@ def class_scans(ranges: np.ndarray, rules: Rules) -> ClassedScans:
         if len(ranges) > 1:
             columns, vectors = np.tile(columns, len(ranges)), np.tile(vectors, (len(ranges), 1))
     else:
-        columns, counts = evaluated.nonzero()[1], np.count_nonzero(evaluated, axis=1)
+        columns, counts = evaluated.nonzero()[1], _numbers_of(evaluated)
         values, vectors = ranges[evaluated].astype(np.float64), rules.vectors[columns]
         if rules.max_is_constant:
-            constants += np.count_nonzero(constant, axis=1) * rules.log_max
+            constants += _numbers_of(constant) * rules.log_max
     scans = ClassedScans(
         columns, values, vectors, vectors, np.arange(len(columns) + 1, dtype=np.int32), counts, counts, constants,
         LeftOut(hit[-1], far[-1], used[-1], used_max[-1], constant[-1], rules.z_max > 0),
     )  # fmt: skip
     return scans if rules.separate else _join([_grouped(scans.part(i, i + 1)) for i in range(scans.scans)])
+
+
+def _numbers_of(chosen: np.ndarray) -> np.ndarray:
+    """Return the numbers (S,) of chosen readings (S, K); a single scan's takes a tenth of the time of several."""
+    return np.array([np.count_nonzero(chosen)]) if len(chosen) == 1 else np.count_nonzero(chosen, axis=1)
 
 
 def _grouped(scan: ClassedScans) -> ClassedScans:

@@ -1,11 +1,11 @@
 // Scan matching by point-to-line ICP for LANES points of a scan at once: match_scans of icp.cl.
 // requires: lanes/icp_pairs icp_match
 
-// Match scans: one work-item takes a pair (reference, second scan) and a guess (x, y, theta), the pose of the second
-// scan in the reference's frame. With one_way the reference's points do not count in the score.
+// Match scans: one work-item takes a pair (reference, second scan, level of its rules) and a guess (x, y, theta), the
+// pose of the second scan in the reference's frame. With one_way the reference's points do not count in the score.
 kernel void match_scans(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= pairs * starts) return;
     const Team team = {0};
-    match_pair(point, start, line, pair[n / starts], guess[n], result + (long)MATCH_RESULT * n, rules, team);
+    match_pair(point, start, line, pair + 3 * (n / starts), guess[n], rules, result + (long)MATCH_RESULT * n, team);
 }

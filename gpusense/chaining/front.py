@@ -180,6 +180,7 @@ class Front:
             self.matcher.motion[self.nodes[part[0] - 1 : part[-1] + 1][new]] = moved[new]
             again = self.matcher.match(first, second, found.pose, NEAR)
             found = found.replaced(np.arange(len(part)), again, again.usable)
+        found = self.matcher.observed(first, second, found)
         usable = found.usable & (found.p_right >= SURE)
         information = weakened(found.information, rival)
         links = Links.of(MATCH, part - 1, part, found.pose, information, found.p_right)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from gpusense.backends import get_backend
 from gpusense.chaining.links import Links
 from gpusense.chaining.options import ChainOptions
 from gpusense.localization.pose_algebra import compose_poses, invert_poses
+from gpusense.matching.basin import is_held
 from gpusense.matching.match import WINDOW, match_log, match_scan
 from gpusense.matching.noise import scan_noise
 from gpusense.matching.result import ScanMatch
@@ -26,6 +28,10 @@ BATCH = 1024
 """Most pairs of one call."""
 # Least p_right of a match that is used.
 SURE = 0.5
+# Deviation of a match along a direction that only starts on both sides determine [m]: 0.2 m after the temperature.
+_HELD = 0.04
+# Share of pairs that counts as constraining such a direction.
+_LITTLE = 1e-6
 # Half widths of a search where other matches determine the relative pose [m, rad].
 NEAR = (0.5, 0.3)
 
@@ -74,6 +80,31 @@ class Matcher:
             WINDOW if window is None else window, self.motion,
         )  # fmt: skip
 
+    def observed(self, first: Integers, second: Integers, found: ScanMatch) -> ScanMatch:
+        """Return the matches, with information along lost directions where starts on both sides return to them.
+
+        Args:
+            first: (L,) indices.
+            second: (L,) indices.
+            found: L matches.
+        """
+        rows = np.flatnonzero(found.usable & (found.p_right >= SURE) & (found.eigenvalues == 0).any(axis=1))
+        if not len(rows):
+            return found
+        one, two, some = first[rows], second[rows], found.ordered(rows)
+        moved = (None, None) if self.motion is None else (self.motion[one], self.motion[two])
+        held = is_held(
+            self.readings[one], self.readings[two], self.scanner, some, (self._noise[one], self._noise[two]),
+            self._device, self._options.precision, moved,
+        )  # fmt: skip
+        rows, some = rows[held], some.ordered(np.flatnonzero(held))
+        axes = some.directions * (some.eigenvalues == 0)[:, :, None] / _HELD
+        axes[:, :, 2] *= some.lever[:, None]
+        information, values = np.array(found.information), np.array(found.eigenvalues)
+        information[rows] += np.einsum("lki,lkj->lij", axes, axes)
+        values[rows] = np.maximum(values[rows], _LITTLE)
+        return replace(found, information=information, eigenvalues=values)
+
     def across(
         self, first: Integers, other: Matcher, second: Integers, guess: Floats, window: tuple[float, float] | None
     ) -> Found:
@@ -121,6 +152,7 @@ class Matcher:
         for begin in range(0, len(first), BATCH):
             part = slice(begin, begin + BATCH)
             match = self.match(first[part], second[part], guess[part], NEAR)
+            match = self.observed(first[part], second[part], match)
             links = Links.of(kind, first[part], second[part], match.pose, match.information, match.p_right)
             parts.append(links[match.usable & (match.p_right >= SURE)])
         return Links.joined(parts)

@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
+from _pytest.mark import ParameterSet
 from support.kernel_scenes import GROUPED, PLANES, PRECISIONS, adversarial_poses, each_grid, ranges_on_both, scene_flags
 
 from gpusense.backends import Backend
 from gpusense.evaluation.tolerances import differing
 from gpusense.tables.rectangles import Planes
 
+FORMS = [*PLANES, GROUPED]
+NAMES = [(), ("OUTSIDE_OCCUPIED",), ("ORIGINS_OUTSIDE",), ("ORIGINS_OUTSIDE", "OUTSIDE_OCCUPIED")]
 
-@pytest.mark.sampled(0.12)
-@pytest.mark.parametrize("form", [*PLANES, GROUPED], ids=repr)
-@pytest.mark.parametrize("real", PRECISIONS)
-@pytest.mark.parametrize(
-    "names", [(), ("OUTSIDE_OCCUPIED",), ("ORIGINS_OUTSIDE",), ("ORIGINS_OUTSIDE", "OUTSIDE_OCCUPIED")]
-)
+
+def settings() -> Iterator[ParameterSet]:
+    """Yield flags, precisions and forms; all are slow but 8 sets with every pair of a flag, a precision and a form."""
+    for names, real, form in itertools.product(range(4), range(2), range(4)):
+        occupied, outside = names & 1, names >> 1
+        first = occupied ^ outside == form & 1 and occupied ^ real == form >> 1
+        yield pytest.param(
+            NAMES[names], PRECISIONS[real], FORMS[form], marks=[] if first else pytest.mark.slow,
+            id="-".join((*NAMES[names], PRECISIONS[real].__name__, repr(FORMS[form]))),
+        )  # fmt: skip
+
+
+@pytest.mark.sampled(0.5)
+@pytest.mark.parametrize(("names", "real", "form"), list(settings()))
 @each_grid
 def test_ranges_have_the_bits_of_the_reference(
     occupied: np.ndarray, names: tuple[str, ...], real: type, form: Planes, device: Backend

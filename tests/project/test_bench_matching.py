@@ -6,11 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from support.bench_scripts import run_script
+from support.bench_scripts import run_here, run_script
 
 
 def test_global_matching_runs(data_dir: Path, needs: Callable[[str], str], tmp_path: Path) -> None:
-    report = run_script(
+    report = run_here(
         "studies/global_matching.py", "--data", str(data_dir), "--backend", needs("opencl"), "--part", "window",
         "--part", "olin", "--scans", "2", "--repeats", "1", output=tmp_path / "matching",
     )  # fmt: skip
@@ -32,7 +32,7 @@ def test_matching_odometry_runs(data_dir: Path, needs: Callable[[str], str], tmp
 def test_matching_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     """Match in generated buildings alone, which need no data."""
     arguments = ["--matches", "6", "--backend", needs("opencl")]
-    report = run_script("accuracy/matching.py", *arguments, output=tmp_path / "matching")
+    report = run_here("accuracy/matching.py", *arguments, output=tmp_path / "matching")
     assert len(report["rows"]) == 6
     assert all(row["wrong_percent"] == 0 and row["median_mm"] < 20 for row in report["rows"])
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.bench_scripts import BENCH, run_script
+from support.bench_scripts import BENCH, run_here, run_script
 from support.paths import ROOT
 
 from gpusense.backends import get_backend
@@ -26,7 +26,7 @@ def test_limits_runs(selection: str, needs: Callable[[str], str], tmp_path: Path
     assert {"rays, global, 120 x 8", "field, tracking, 120 x 8", "preparation, beam model"} <= set(names)
     assert {"field, tracking, 2000 x 60", "beam model, tracking, 4000 x 60"} <= set(names)
     noisy = ["--rows", "clouds", "bilinear", "--scan", "noisy", "--range-max", "8"]
-    report["rows"] += run_script("speed/limits.py", *arguments, *noisy, output=tmp_path / "noisy")["rows"]
+    report["rows"] += run_here("speed/limits.py", *arguments, *noisy, output=tmp_path / "noisy")["rows"]
     assert sum(row["what"].startswith("field, bilinear") for row in report["rows"]) == 2
     assert all(row["call_s"] > 0 and row["launch_s"] > 0 and row["first_s"] > 0 for row in report["rows"])
     checked = [row for row in report["rows"] if row["checked"]]
@@ -36,7 +36,7 @@ def test_limits_runs(selection: str, needs: Callable[[str], str], tmp_path: Path
 
 def test_launches_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     arguments = ["--particles", "64", "--beams", "8", "--repeats", "2", "--size", "20", "--power", "3", "--power", "9"]
-    report = run_script("speed/launches.py", "--backend", needs("opencl"), *arguments, output=tmp_path / "launches")
+    report = run_here("speed/launches.py", "--backend", needs("opencl"), *arguments, output=tmp_path / "launches")
     whats = [f"{what}, {cloud}" for cloud in ("global", "tracking") for what in ("rays", "beam model", "field")]
     rows = [(row["what"], row["power"]) for row in report["rows"]]
     assert rows == [(f"{what}, 64 x 8", power) for what in whats for power in (None, 3, 9)]
@@ -54,7 +54,7 @@ def test_launches_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
 def test_point_models_run(selection: str, needs: Callable[[str], str], tmp_path: Path) -> None:
     arguments = ["--landmarks", "30", "--particles", "60", "--features", "4", "--beacons", "3", "--repeats", "1"]
     arguments += ["--seconds", "0.01", "--backend", needs(selection)]
-    rows = run_script("speed/point_models.py", *arguments, output=tmp_path / "points")["rows"]
+    rows = run_here("speed/point_models.py", *arguments, output=tmp_path / "points")["rows"]
     landmarks = [row for row in rows if "landmarks" in row["what"]]
     assert {row["what"] for row in landmarks} == {
         f"{kind}, 30 landmarks, {cloud}" for kind in ("known", "nearest") for cloud in ("tracking", "global")
@@ -68,7 +68,7 @@ def test_point_models_run(selection: str, needs: Callable[[str], str], tmp_path:
 def test_all_kinds_of_landmark_calls_run(tmp_path: Path) -> None:
     arguments = ["--landmarks", "30", "--particles", "40", "--features", "4", "--repeats", "1", "--seconds", "0.01"]
     arguments += ["--what", "landmarks", "--cloud", "tracking", "--backend", "numpy"]
-    rows = run_script("speed/point_models.py", *arguments, output=tmp_path / "all")["rows"]
+    rows = run_here("speed/point_models.py", *arguments, output=tmp_path / "all")["rows"]
     assert len({row["what"] for row in rows}) == len(rows) == 10
     assert all(row["what"].endswith("30 landmarks, tracking") and row["readings"] > 0 for row in rows)
 
@@ -96,7 +96,7 @@ def test_sonar_field_runs(tmp_path: Path) -> None:
 def test_small_calls_runs(selection: str, needs: Callable[[str], str], tmp_path: Path) -> None:
     arguments = ["--particles", "50", "--particles", "90", "--beams", "12", "--scans", "3", "--calls", "4"]
     arguments += ["--models", "2", "--seconds", "0.01", "--size", "20", "--backend", needs(selection)]
-    report = run_script("speed/small_calls.py", *arguments, output=tmp_path / "small_calls")
+    report = run_here("speed/small_calls.py", *arguments, output=tmp_path / "small_calls")
     names = [row["what"] for row in report["rows"]]
     assert {"field, 50 x 12, NumPy in and out", "beam model, 90 x 12, NumPy in and out"} <= set(names)
     assert {"field, 50 x 12, bound, a wait each", "beam model, 90 x 12, bound, 20 calls a wait"} <= set(names)
@@ -159,7 +159,7 @@ def test_map_memory_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
 
 def test_fuzz_rays_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
     arguments = ["--backend", needs("opencl"), "--rays", "30000"]
-    report = run_script("accuracy/fuzz_rays.py", *arguments, output=tmp_path / "fuzz")
+    report = run_here("accuracy/fuzz_rays.py", *arguments, output=tmp_path / "fuzz")
     assert report["rays"] >= 30000 and [row["differing_rays"] for row in report["rows"]] == [0]
 
 
@@ -195,7 +195,7 @@ def test_learning_runs(needs: Callable[[str], str], tmp_path: Path) -> None:
         "--pairs 4000 --numpy-pairs 1000 --scenes 1 --count 400 --starts 1 --repeats 2 --seconds 1 --precision float64"
     )
     arguments = ["--backend", "numpy", "--backend", needs("opencl"), *words.split()]
-    report = run_script("speed/learning.py", *arguments, output=tmp_path / "small")
+    report = run_here("speed/learning.py", *arguments, output=tmp_path / "small")
     assert [row["backend"].split(":")[0] for row in report["rows"]] == ["numpy", "opencl"]
     for row in report["rows"]:
         assert row["error"] < 1e-6 and row["converged"] and 0 < row["iteration_s"] < math.inf
@@ -223,7 +223,7 @@ def test_fits_of_real_sensors_run(needs: Callable[[str], str], data_dir: Path, t
 
 def test_localisation_with_fitted_parameters_runs(needs: Callable[[str], str], data_dir: Path, tmp_path: Path) -> None:
     arguments = ["--data", str(data_dir), "--backend", needs("opencl"), "--log", "intel", "--scans", "2"]
-    report = run_script("studies/fit_localisation.py", *arguments, "--particles", "500", output=tmp_path / "fits")
+    report = run_here("studies/fit_localisation.py", *arguments, "--particles", "500", output=tmp_path / "fits")
     (log,) = report["logs"]
     assert [row["parameters_of"] for row in log["rows"]][:2] == ["fitted", "nav2_amcl's defaults"] and len(
         log["rows"]
@@ -314,7 +314,7 @@ def test_scenes_of_the_compiled_peers_are_those_of_the_tests(monkeypatch: pytest
 
 def test_field_gradients_are_measured(needs: Callable[[str], str], tmp_path: Path) -> None:
     small = ["--particles", "60", "--beams", "11", "--repeats", "1", "--backend", needs("opencl")]
-    report = run_script("speed/field_gradient.py", *small, output=tmp_path / "small")
+    report = run_here("speed/field_gradient.py", *small, output=tmp_path / "small")
     assert [(row["poses"], row["scans"]) for row in report["rows"]] == [
         ("all over", 1), ("all over", 20), ("around", 1), ("around", 20),
     ]  # fmt: skip
@@ -323,7 +323,7 @@ def test_field_gradients_are_measured(needs: Callable[[str], str], tmp_path: Pat
 
 def test_split_filters_are_measured(tmp_path: Path) -> None:
     small = ["--device", "numpy", "--device", "numpy", "--size", "200", "15", "--steps", "2", "--stages", "2"]
-    (row,) = run_script("speed/split_filter.py", *small, output=tmp_path / "split")["rows"]
+    (row,) = run_here("speed/split_filter.py", *small, output=tmp_path / "split")["rows"]
     assert row["equal"] and row["difference"] == 0 and row["one_ms"] > 0 and row["split_ms"] > 0
 
 
@@ -336,7 +336,7 @@ def test_sweeps_are_measured(tmp_path: Path) -> None:
 
 def test_calibration_runs(tmp_path: Path) -> None:
     small = ["--runs", "60", "--model", "heading", "--model", "beam"]
-    report = run_script("accuracy/calibration.py", *small, output=tmp_path / "ranks")
+    report = run_here("accuracy/calibration.py", *small, output=tmp_path / "ranks")
     assert [row["model"] for row in report["rows"]] == ["heading", "beam"]
     assert all(sum(counts) == 60 for row in report["rows"] for counts in row["counts"])
     assert all(0 < row["least_p"] <= 1 for row in report["rows"])

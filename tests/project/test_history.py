@@ -56,22 +56,27 @@ def test_the_probe_counts_for_processors_alone(history: ModuleType) -> None:
     assert history.regressions([*rows, row("c", 12.0, probe=2.4, device="NVIDIA X, warp")])
 
 
-def test_rows_are_appended_and_compared(needs, tmp_path: Path) -> None:
+def test_rows_are_appended_and_compared(
+    history: ModuleType, needs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     table = tmp_path / "history.csv"
     words = ["--backend", needs("numpy"), "--size", "40", "8", "--turns", "3", "--tries", "1", "--file", str(table)]
 
     def run(*more: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run([sys.executable, str(SCRIPT), *words, *more], capture_output=True, text=True, check=False)
 
-    for commit in ("a", "b"):
-        done = run("--commit", commit, "--limit", "1e9")
-        assert (done.returncode, done.stdout) == (0, "no regression\n"), done.stderr
+    monkeypatch.setattr(sys, "argv", [str(SCRIPT), *words, "--commit", "a", "--limit", "1e9"])
+    assert history.main() == 0 and capsys.readouterr().out == "no regression\n"
+    done = run("--commit", "b", "--limit", "1e9")
+    assert (done.returncode, done.stdout) == (0, "no regression\n"), done.stderr
     lines = table.read_text().splitlines()
     assert len(lines) == 7 and lines[0].startswith("date,commit,device,row,ms,")
     assert [line.split(",")[1] for line in lines[1:]] == ["a"] * 3 + ["b"] * 3
     table.write_text("x,y\n1,2\n")
-    done = run("--compare")
-    assert done.returncode == 2 and "history.csv: must have the columns date, commit" in done.stderr
+    monkeypatch.setattr(sys, "argv", [str(SCRIPT), *words, "--compare"])
+    with pytest.raises(SystemExit, match=r"^2$"):
+        history.main()
+    assert "history.csv: must have the columns date, commit" in capsys.readouterr().err
 
 
 def test_the_table_of_the_project_is_whole(history: ModuleType) -> None:

@@ -66,12 +66,16 @@ BAD = (
 
 @pytest.fixture(scope="module")
 def errors(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[int, str]]:
-    """Check a file with mypy, and return the lines of errors and their texts."""
+    """Check a file and the package with mypy, and return the file's lines of errors and their texts.
+
+    The type checker of CI then finds the package checked.
+    """
     folder = tmp_path_factory.mktemp("types")
     file = folder / "user.py"
     file.write_text(HEAD + GOOD + "\n".join(BAD) + "\n", encoding="utf-8")
     command = [sys.executable, "-m", "mypy", "--config-file", str(ROOT / "pyproject.toml"), "--no-error-summary",
-               "--cache-dir", os.environ.get("MYPY_CACHE_DIR", str(folder / "cache")), str(file)]  # fmt: skip
+               "--cache-dir", os.environ.get("MYPY_CACHE_DIR", str(folder / "cache")),
+               "gpusense", str(file)]  # fmt: skip
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode in (0, 1), done.stdout + done.stderr
     found = re.findall(r"^(.*?):(\d+): error: (.*)$", done.stdout, re.M)

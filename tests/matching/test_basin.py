@@ -1,0 +1,91 @@
+"""Starts on both sides of a match tell few pairs among furniture from none along a corridor."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.matching_scenes import CORRIDOR, box, segments_scan
+from support.selection import present
+
+import gpusense as gs
+from gpusense.backends import get_backend
+from gpusense.matching.basin import is_held
+from gpusense.matching.noise import scan_noise
+
+FRONT = gs.Scanner.uniform(angle_min=-np.pi / 2, angle_increment=np.pi / 180, count=181, range_max=12.0)
+MOUNTED = gs.Scanner(FRONT.bearings, FRONT.range_max, mount=(0.4, -0.2, 0.3))
+
+
+def legs(seed: int) -> np.ndarray:
+    """Return the walls of 60 table legs of 10 cm around a robot."""
+    place = np.random.default_rng(seed).uniform(-6, 6, (60, 2))
+    place = place[np.hypot(*place.T) > 1.2]
+    return np.array([wall for x, y in place for wall in box(x - 0.05, y - 0.05, x + 0.05, y + 0.05)])
+
+
+def seen(walls: np.ndarray, pose: np.ndarray, scanner: gs.Scanner, during: np.ndarray | None) -> np.ndarray:
+    """Return the readings of a robot at a pose at the first beam, which moves until the last one."""
+    if during is None:
+        return segments_scan(walls, tuple(gs.compose_poses(pose, np.array(scanner.mount))), scanner)
+    shares = np.linspace(0, 1, scanner.count)
+    places = gs.compose_poses(gs.compose_poses(pose, np.outer(shares, during)), np.array(scanner.mount))
+    beams = [gs.Scanner([bearing], scanner.range_max) for bearing in scanner.bearings]
+    return np.concatenate([segments_scan(walls, tuple(p), beam) for p, beam in zip(places, beams, strict=True)])
+
+
+def pairs(
+    scenes: list[np.ndarray], moved: np.ndarray, scanner: gs.Scanner, during: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return noisy scans of each scene before and after a motion of the robot."""
+    rng = np.random.default_rng(0)
+    scans = [np.array([seen(walls, pose, scanner, during) for walls in scenes]) for pose in (np.zeros(3), moved)]
+    one, two = (z + rng.normal(0, 0.01, z.shape) for z in scans)
+    return one, two
+
+
+def lost_and_held(
+    one: np.ndarray, two: np.ndarray, scanner: gs.Scanner, guess: np.ndarray, during: np.ndarray | None = None
+) -> tuple[gs.ScanMatch, np.ndarray]:
+    """Return the matches that lose a direction, and whether each is held."""
+    device = present("opencl")
+    moved = None if during is None else np.tile(during, (len(one), 1))
+    match = gs.match_scan(
+        one, two, scanner, np.tile(guess, (len(one), 1)), backend=device, motion=moved, reference_motion=moved
+    )
+    rows = np.flatnonzero(match.usable & (match.eigenvalues == 0).any(axis=1))
+    some, noise = match.ordered(rows), (scan_noise(one[rows], scanner), scan_noise(two[rows], scanner))
+    motions = (None, None) if moved is None else (moved[rows], moved[rows])
+    return some, is_held(one[rows], two[rows], scanner, some, noise, get_backend(device), "float32", motions)
+
+
+@pytest.mark.parametrize("scanner", [FRONT, MOUNTED], ids=["at the robot", "mounted"])
+def test_matches_among_table_legs_are_held_and_right(scanner):
+    moved = np.array([0.6, 0.1, 0.3])
+    one, two = pairs([legs(seed) for seed in range(12)], moved, scanner)
+    match, held = lost_and_held(one, two, scanner, moved + np.array([0.1, 0.1, 0.05]))
+    assert len(match) >= 10
+    assert held.sum() >= 0.7 * len(match)
+    assert np.abs(match.pose[held] - moved).max() < 0.05
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, 0.8])
+@pytest.mark.parametrize("length", [0.05, 0.8])
+def test_no_match_in_a_corridor_is_held(turn, length):
+    """Turned by 0.8 rad, starts end at one pose that is half a metre off; the exchanged scans contradict it."""
+    moved = np.array([length, 0.0, turn])
+    shifts = np.linspace(-0.3, 0.3, 12)[:, None] * (0, 1, 0, 1)
+    match, held = lost_and_held(*pairs([CORRIDOR + shift for shift in shifts], moved, FRONT), FRONT, moved)
+    assert len(match) >= 8
+    assert not held.any()
+
+
+def test_motion_during_scans_counts():
+    moved, during = np.array([0.6, 0.1, 0.3]), np.array([0.2, 0.0, 0.3])
+    one, two = pairs([legs(seed) for seed in range(12)], moved, FRONT, during)
+    match, held = lost_and_held(one, two, FRONT, moved, during)
+    assert len(match) >= 10
+    assert held.sum() >= 0.7 * len(match)
+    assert np.abs(match.pose[held] - moved).max() < 0.05
+    # Without the motion the scans' shapes are wrong, and so are the poses.
+    other, _ = lost_and_held(one, two, FRONT, moved)
+    assert np.abs(other.pose - moved).max() > 0.05

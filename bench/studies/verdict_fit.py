@@ -5,6 +5,10 @@ beams of each scan are judged at the estimate, unless its covariance is wide. A 
 weight on wrong poses gives the coefficients. The tables compare fitted ratios with the counts in bins, and show the
 correlation of ratios by the distance between their scans. Poses with errors of 0.5 to 1 m are left out.
 
+Each fourth scan is also searched for on the whole map. A second regression, with the ratio of the scan as an offset,
+gives the coefficients of a comparison with other places, from scans whose ratio is above -2; right poses, wrong maps
+and right maps have weights of a half and two quarters.
+
     python bench/studies/verdict_fit.py --runs 200 --output verdict_fit
 """
 
@@ -26,15 +30,21 @@ from scipy.optimize import minimize
 import gpusense as gs
 from gpusense._util.progress import progress
 from gpusense.localization.passages import counts_of, passages
-from gpusense.localization.ratio import FEW
+from gpusense.localization.ratio import FARTHEST, FEW, HALF, NEAREST, ratio_of_scan
+from gpusense.localization.rival_search import RivalSearch
 from gpusense.localization.spread import deviations, is_wide
 
 EDGES = (-math.inf, -5, -4, -3, -2, -1, 0, 1, 2, 3, 4, math.inf)
 WAYS = (0.0, 0.1, 0.3, 0.6, 1.0, 1.5, 2.5, 4.0)
+# Scans from one search to the next; least ratio of a scan in the regression of comparisons.
+SEARCHED, DOUBTFUL = 4, -2.0
 
 
 def follow(seed, args):
-    """Return a row for each scan with a narrow covariance: whether the pose is wrong, ``Counts``, x, y."""
+    """Return rows of scans with a narrow covariance: whether the pose is wrong, ``Counts``, x, y; and of comparisons.
+
+    A comparison has: whether the pose is wrong, whether the map is, ratio of the scan, lead, beams, whether found.
+    """
     rng = np.random.default_rng((5, seed))
     case = ("own", "own", "kidnapped", "wrong")[int(rng.integers(4))]
     people, moved, glass = (
@@ -53,8 +63,8 @@ def follow(seed, args):
     # No place on another map is the true one.
     start = gs.worlds.free_pose(grid, rng, 0.2) if case == "wrong" and not everywhere else events[0].truth
     recordings.start_at(pf, None if everywhere else start)
-    rows = []
-    for event in recordings.play(pf, models, events):
+    rows, compared = [], []
+    for k, event in enumerate(recordings.play(pf, models, events)):
         pose, covariance = pf.mean_and_covariance()
         position, heading = recordings.errors(pose, event.truth)
         wrong = case == "wrong" or position > 1 or heading > 0.5
@@ -62,15 +72,21 @@ def follow(seed, args):
             continue
         found = passages(grid, scanner, pose, event.ranges, deviations(covariance))
         rows.append((wrong, *counts_of([found]), *pose[:2]))
-    return np.array(rows, np.float64).reshape(-1, 8)
+        if k % SEARCHED == SEARCHED - 1:
+            tracker = pf._parts.tracker
+            search, readings = RivalSearch(tracker.sensors), list(pf._parts.last.items())
+            best = search.found(pose, covariance, readings, tracker.key(), pf.options.temperature)
+            compared.append((wrong, case == "wrong", ratio_of_scan([found]), best.lead, best.beams, best.is_found))
+    return np.array(rows, np.float64).reshape(-1, 8), np.array(compared, np.float64).reshape(-1, 6)
 
 
-def regression(design, wrong):
-    """Return the coefficients of a logistic regression with equal weights of both classes."""
-    weight = np.where(wrong, 0.5 / wrong.mean(), 0.5 / (1 - wrong.mean()))
+def regression(design, wrong, weight=None, offset=0.0):
+    """Return the coefficients of a logistic regression, by default with equal weights of both classes."""
+    if weight is None:
+        weight = np.where(wrong, 0.5 / wrong.mean(), 0.5 / (1 - wrong.mean()))
 
     def loss(coefficients):
-        z = design @ coefficients
+        z = design @ coefficients + offset
         p = 1 / (1 + np.exp(-z))
         value = float((weight * np.logaddexp(0, np.where(wrong, -z, z))).mean())
         return value, design.T @ (weight * (p - wrong)) / len(z)
@@ -83,10 +99,12 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=200)
     args = parse(parser)
     with progress(args.runs) as step:
-        each = []
+        each, compared = [], []
         for seed in range(args.runs):
             step(f"run {seed}")
-            each.append(follow(seed, args))
+            scans, searches = follow(seed, args)
+            each.append(scans)
+            compared.append(searches)
     rows = np.concatenate(each)
     wrong, (agree, close, through, short, nothing) = rows[:, 0] > 0, rows[:, 1:6].T
     telling = agree + through + short
@@ -105,16 +123,33 @@ def main() -> None:
         right, off = int((inside & ~wrong).sum()), int((inside & wrong).sum())
         counted = math.log((off + 0.5) / wrong.sum()) - math.log((right + 0.5) / (~wrong).sum())
         counts.append((f"{low} to {high}", right, off, f"{counted:.2f}"))
+    of_places, searched = comparisons(np.concatenate(compared))
     text = "\n\n".join([
         f"BIAS, SLOPE, BLUNT, NOTHING {_listed(chosen)}; SLOPE alone {_listed(through_only)}; with the short beams "
         f"{_listed(with_short)}",
+        f"OF_LEAD, BY_CHANCE, IS_FOUND {_listed(of_places)}, of {searched} searches",
         f"{len(rows)} scans of {args.runs} runs, {100 * wrong.mean():.0f} % at wrong poses",
         table(("fitted ratio", "right", "wrong", "ratio of the counts"), counts),
         table(("way between scans [m]", "pairs", "correlation of ratios at right poses"),
               correlations(each, np.split(ratio, np.cumsum([len(one) for one in each])[:-1]))),
     ])  # fmt: skip
-    results = dict(coefficients=chosen.tolist(), with_short=with_short.tolist(), scans=len(rows))
+    results = dict(coefficients=chosen.tolist(), with_short=with_short.tolist(), scans=len(rows),
+                   comparisons=of_places.tolist(), searches=searched)  # fmt: skip
     publish(__file__, args, text, dict(results=results))
+
+
+def comparisons(rows):
+    """Return weight of the lead, what it gains by chance and the evidence of a pose that is found, by a regression."""
+    rows = rows[np.isfinite(rows[:, 2]) & ~np.isnan(rows[:, 3]) & (rows[:, 4] > 0)]
+    wrong, other, ratio, lead, beams, is_found = rows.T
+    wrong = wrong > 0
+    weight = np.zeros(len(rows))
+    for chosen, share in ((~wrong, 0.5), (wrong & (other > 0), 0.25), (wrong & (other == 0), 0.25)):
+        weight[chosen] = share * len(rows) / max(chosen.sum(), 1)
+    information = beams / (beams + HALF)
+    design = np.column_stack([np.clip(lead, NEAREST, FARTHEST), -information, -information * is_found])
+    doubtful = ratio > DOUBTFUL
+    return regression(design[doubtful], wrong[doubtful], weight[doubtful], ratio[doubtful]), int(doubtful.sum())
 
 
 def _listed(values):

@@ -31,6 +31,8 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
     "score_contact": (set(),),
     "score_features": ({"RANGE"}, {"BEARING"}),
     "score_field": (set(),),
+    "score_heading": (set(),),
+    "score_position": (set(),),
     "set_weights": (set(),),
     "shift_scores": (set(),),
     "sum_poses": (set(),),

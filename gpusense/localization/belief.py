@@ -27,6 +27,10 @@ agree.
 
 A search, as after a start anywhere, chooses a place because the scans agree with it. So this agreement is no new
 evidence: it counts as repeated from the previous scan. A contradiction counts in full.
+
+Comparisons of the pose with other places of the map (:func:`gpusense.localization.ratio.ratio_of_places`) are a second
+series of ratios. Given right or wrong they count as independent of the scans' ratios, whose coefficients they were
+fitted beside, and as dependent on one another by the same correlation.
 """
 
 from __future__ import annotations
@@ -62,6 +66,20 @@ def correlation(way: float, turn: float) -> float:
     return STAYS * math.exp(-way / LENGTH - turn / TURN)
 
 
+class Comparison(NamedTuple):
+    """Last comparison of the pose with other places; immutable.
+
+    Attributes:
+        ratio: Its log-likelihood ratio of "wrong" against "right".
+        pose: Pose that was compared; None before.
+        chosen: Whether the next pose is one that scans choose among many.
+    """
+
+    ratio: float = 0.0
+    pose: tuple[float, float, float] | None = None
+    chosen: bool = False
+
+
 class Belief(NamedTuple):
     """State of the model; immutable.
 
@@ -72,6 +90,7 @@ class Belief(NamedTuple):
         scans: Scans since that one.
         chosen: Whether the next pose is one that scans choose among many.
         alike: Share of "wrong" that looks like the right place.
+        compared: Last comparison of the pose with other places.
     """
 
     log_odds: float = math.log(START / (1 - START))
@@ -80,6 +99,7 @@ class Belief(NamedTuple):
     scans: int = 0
     chosen: bool = False
     alike: float = ALIKE
+    compared: Comparison = Comparison()
 
     @property
     def wrong(self) -> float:
@@ -93,7 +113,7 @@ class Belief(NamedTuple):
         Args:
             after: Wrong places of earlier searches. On a right map one in ``MISSES`` searches fails.
         """
-        return cls(math.log(MISSES) * min(after, MOST_PLACES), chosen=True)
+        return cls(math.log(MISSES) * min(after, MOST_PLACES), chosen=True, compared=Comparison(chosen=True))
 
     def counted(self) -> Belief:
         """Return the belief with one more scan counted."""
@@ -101,7 +121,8 @@ class Belief(NamedTuple):
 
     def widened(self) -> Belief:
         """Return the belief after scans without a common pose: the next pose may be anywhere."""
-        return Belief(self._moved(WIDE, WIDE, min(self.scans, 100))[0], chosen=True)
+        log_odds = self._moved(WIDE, WIDE, min(self.scans, 100))[0]
+        return Belief(log_odds, chosen=True, compared=Comparison(chosen=True))
 
     def judged(self, pose: tuple[float, float, float], ratio: float) -> Belief:
         """Return the belief after a scan.
@@ -110,10 +131,9 @@ class Belief(NamedTuple):
             pose: Pose at which the scan was judged [m, m, rad].
             ratio: Log-likelihood ratio of "wrong" against "right"; NaN for a scan without evidence.
         """
-        way, turn, rho, before = 0.0, 0.0, 0.0, self.ratio
-        if self.chosen and ratio < 0:
-            rho, before = STAYS, ratio
-        elif self.pose is not None:
+        way, turn, rho = 0.0, 0.0, 0.0
+        repeats = self.chosen and ratio < 0
+        if self.pose is not None and not repeats:
             way, turn = motion_between(pose, self.pose)
             rho = correlation(way, turn)
         lost = 1 - math.exp(-PER_SCAN * self.scans - PER_METRE * min(way, _FASTEST * self.scans))
@@ -121,8 +141,29 @@ class Belief(NamedTuple):
         if math.isnan(ratio):
             return self._replace(log_odds=log_odds, scans=0, alike=alike)
         alike *= math.exp(-way / ALIKE_LENGTH - turn / ALIKE_TURN)
-        change = alike + (1 - alike) * math.exp((ratio - rho * before) / (1 + rho))
-        return Belief(log_odds + math.log(change), ratio, pose, 0, alike=alike / change)
+        new = _new_part(ratio, ratio, STAYS) if repeats else _new_part(ratio, self.ratio, rho)
+        moved = self._replace(log_odds=log_odds, ratio=ratio, pose=pose, scans=0, chosen=False, alike=alike)
+        return moved._changed(new)
+
+    def compared_with(self, pose: tuple[float, float, float], ratio: float) -> Belief:
+        """Return the belief after a comparison of the pose of the scan judged last with other places.
+
+        Args:
+            pose: The pose [m, m, rad].
+            ratio: Its ratio (:func:`gpusense.localization.ratio.ratio_of_places`); NaN for none.
+        """
+        if math.isnan(ratio):
+            return self
+        last = self.compared
+        rho, before = (STAYS, ratio) if last.chosen and ratio < 0 else (0.0, 0.0)
+        if not rho and last.pose is not None:
+            rho, before = correlation(*motion_between(pose, last.pose)), last.ratio
+        return self._replace(compared=Comparison(ratio, pose))._changed(_new_part(ratio, before, rho))
+
+    def _changed(self, new: float) -> Belief:
+        """Return the belief after new evidence [nats], which places that look alike do not show."""
+        change = self.alike + (1 - self.alike) * math.exp(new)
+        return self._replace(log_odds=self.log_odds + math.log(change), alike=self.alike / change)
 
     def _moved(self, lost: float, found: float, times: int) -> tuple[float, float]:
         """Return the log odds, and the share that looks alike, after transitions."""
@@ -132,3 +173,8 @@ class Belief(NamedTuple):
             wrong = stays + added
             alike = (stays * alike + added * ALIKE) / wrong
         return math.log(wrong) - math.log1p(-wrong), alike
+
+
+def _new_part(ratio: float, before: float, rho: float) -> float:
+    """Return the increment of the log odds by a ratio after one with which it has the correlation rho."""
+    return (ratio - rho * before) / (1 + rho)

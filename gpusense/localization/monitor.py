@@ -53,7 +53,8 @@ class PoseMonitor:
     """Judge the poses of a localiser by its scans, one after another.
 
     It needs no particle filter: poses may come from AMCL, a pose graph or motion capture. Each call adds a scan to a
-    belief that persists between calls (``docs/localization.md``), so pass the scans in order.
+    belief that persists between calls (``docs/localization.md``), so pass the scans in order. Unlike a filter it
+    does not compare the pose with other places of the map, so on a coarse map it says "lost" more often.
 
     Args:
         models: A model of scans or landmarks with the map, or several of one device.

@@ -98,7 +98,8 @@ class Recovery:
         if self.everywhere or self.is_doubted():
             prior = 0.0 if self.everywhere else PRIOR
             self.everywhere = max(self.everywhere - 1, 0)
-            self._made().start(pose, covariance, list(last.items()), step=tracker.step, prior=prior)
+            ratio = self._made().start(pose, covariance, list(last.items()), step=tracker.step, prior=prior)
+            self._verdict.compared(pose, covariance, ratio)
 
     def _compare(self, rival: Rival, readings: list[SensorReadings]) -> None:
         """Correct the rival, and let it replace the particles if it has won."""

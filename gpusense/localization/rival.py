@@ -114,7 +114,7 @@ class Rival:
         *,
         step: int,
         prior: float = PRIOR,
-    ) -> None:
+    ) -> float:
         """Search for a rival by the last readings.
 
         Args:
@@ -123,22 +123,27 @@ class Rival:
             readings: Indices of sensors with the last readings.
             step: Number of the last step of the filter; equal steps give equal rivals.
             prior: Prior log odds; with 0, places near the estimate are no rivals.
+
+        Returns:
+            Log-likelihood ratio of other places against the estimate; NaN without a search of the whole map.
         """
         self._tracker.step = step
         key, options = self._tracker.key(), self._tracker.options
-        tries, score, effective = self._search.found(pose, covariance, readings, key, options.temperature)
+        found = self._search.found(pose, covariance, readings, key, options.temperature)
+        tries, score, ratio = found.poses, found.score, found.ratio
         if prior == 0.0:
             far = np.hypot(*(tries[:, :2] - pose[:2]).T) > FAR
             far |= np.abs(wrap_angle(tries[:, 2] - pose[2])) > 2 * FAR_TURN
             tries, score = tries[far], score[far]
-        chosen = drawn(score, options.most, effective)
+        chosen = drawn(score, options.most, found.effective)
         if chosen is None:
-            return
+            return ratio
         self._tracker.pending = None
         self._tracker.place(starts.spread(tries[chosen], _SPREAD, options.most, key, each=True))
         self.active, self.log_odds, self._prior, self._scans, self._settled = True, prior, prior, 0, False
         # No trace of an earlier rival may remain in the state.
         self._ratios, self._place, self._last = np.zeros(3), np.zeros(3), {}
+        return ratio
 
     def predict(self, motion: SampledMotion) -> None:
         """Move the rival."""

@@ -3,22 +3,26 @@
 Scans are searched by branch and bound on the whole map (:func:`gpusense.matching.likely.likely_poses`), which misses no
 place: once with all beams, and once with the longer half, since people shorten beams. Among people the likelihood
 prefers places with many walls, so candidates are also weighed by the beams that meet walls
-(:mod:`gpusense.localization.ratio`). For landmarks, and where the search finds nothing, poses are drawn at random.
+(:mod:`gpusense.localization.ratio`). The same search shows whether the scan fits another place better than the
+estimate, which is evidence for the verdict. For landmarks, and where the search finds nothing, poses are drawn at
+random.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from gpusense.backends import arrays
 from gpusense.localization import starts
 from gpusense.localization.filter_cloud import SensorReadings
-from gpusense.localization.ratio import ratio_of_scan
+from gpusense.localization.pose_algebra import wrap_angle
+from gpusense.localization.ratio import ratio_of_places, ratio_of_scan
 from gpusense.localization.sensors import Sensor
-from gpusense.localization.spread import deviations
+from gpusense.localization.spread import FAR, FAR_TURN, deviations
 from gpusense.localization.verdict import sightings
 from gpusense.matching.likely import likely_poses
 from gpusense.models.landmark.base import FeatureModel
@@ -35,6 +39,32 @@ _FIELD = LikelihoodFieldParameters(z_hit=0.7, z_max=0.0, z_rand=0.3, sigma_hit=0
 _TRIES, _CHOSEN = 20_000, 100
 # Least deviation of random poses around the estimate [m], and margin around landmarks [m].
 _NEARBY, _MARGIN = 2.0, 1.0
+
+
+class Candidates(NamedTuple):
+    """Poses at which a rival may begin, and how the estimate compares with them.
+
+    Attributes:
+        poses: (M, 3) poses.
+        score: (M,) log-likelihood of each, less the ratio of its beams that meet walls.
+        effective: Effective number of them that begins a rival.
+        lead: Log-likelihood, times the temperature, of the likeliest candidate beyond 1 m or 0.5 rad of the estimate
+            less that at the estimate [nats]; NaN without a search of the whole map.
+        beams: Number of independent beams, the temperature times the number of beams.
+        is_found: Whether a candidate is at the estimate.
+    """
+
+    poses: np.ndarray
+    score: np.ndarray
+    effective: int
+    lead: float = math.nan
+    beams: float = 0.0
+    is_found: bool = False
+
+    @property
+    def ratio(self) -> float:
+        """Log-likelihood ratio of other places against the estimate; NaN without a search of the whole map."""
+        return ratio_of_places(self.lead, self.beams, is_found=self.is_found)
 
 
 class RivalSearch:
@@ -56,8 +86,8 @@ class RivalSearch:
         readings: Sequence[SensorReadings],
         key: starts.Key,
         temperature: float | str,
-    ) -> tuple[np.ndarray, np.ndarray, int]:
-        """Return candidates (M, 3), their log-likelihoods (M,), and the effective number that begins a rival.
+    ) -> Candidates:
+        """Return candidates for the last readings, and compare the estimate with them.
 
         Args:
             pose: (3,) estimated pose of the particles.
@@ -70,12 +100,20 @@ class RivalSearch:
         on_map = len(tries) > 0
         if not on_map:
             tries, effective = self._at_random(pose, covariance, key), _CHOSEN
-        score = np.zeros(len(tries))
+        judged = np.vstack([tries, pose])
+        score, beams = np.zeros(len(judged)), 0.0
         for index, reading in readings:
             sensor = self._sensors[index]
-            likelihood = np.asarray(sensor.log_likelihood(tries, reading), np.float64)
-            score += sensor.temperature(temperature) * likelihood
-        return tries, score - self._ratios(tries, readings) if on_map else score, effective
+            share = float(sensor.temperature(temperature))
+            score += share * np.asarray(sensor.log_likelihood(judged, reading), np.float64)
+            beams += share * sensor.beams
+        score, reached = score[:-1], float(score[-1])
+        if not on_map:
+            return Candidates(tries, score, effective)
+        apart = are_apart(tries, pose)
+        lead = float(score[apart].max(initial=-math.inf)) - reached
+        score -= self._ratios(tries, readings)
+        return Candidates(tries, score, effective, lead, beams, is_found=not apart.all())
 
     def _ratios(self, poses: np.ndarray, readings: Sequence[SensorReadings]) -> np.ndarray:
         """Return the log-likelihood ratios (M,) of "wrong" against "right" for poses; 0 without evidence from scans."""
@@ -112,6 +150,12 @@ class RivalSearch:
         wide = max(2 * deviations(covariance)[0], _NEARBY)
         around = starts.normal(pose, np.diag([wide**2, wide**2, math.pi**2]), _TRIES // 2, key)
         return np.vstack([anywhere, around])
+
+
+def are_apart(poses: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Return which of poses (N, 3) are beyond 1 m or 0.5 rad of a pose."""
+    way, turn = np.hypot(*(poses[:, :2] - pose[:2]).T), np.abs(wrap_angle(poses[:, 2] - pose[2]))
+    return np.asarray((way > FAR) | (turn > FAR_TURN))
 
 
 def drawn(score: np.ndarray, count: int, effective: int) -> np.ndarray | None:

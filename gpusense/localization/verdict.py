@@ -195,6 +195,19 @@ class Verdict:
         )
         return explained
 
+    def compared(self, pose: np.ndarray, covariance: np.ndarray, ratio: float) -> None:
+        """Add a comparison of the pose judged last with other places of the map, unless the pose is wide.
+
+        Args:
+            pose: (3,) the pose.
+            covariance: (3, 3) its covariance.
+            ratio: Log-likelihood ratio of other places against it; NaN for none.
+        """
+        if is_wide(covariance):
+            return
+        x, y, theta = (float(value) for value in pose)
+        self.state = self.state._replace(belief=self.state.belief.compared_with((x, y, theta), ratio))
+
     def _adds_nothing(self, pose: np.ndarray, covariance: np.ndarray, evidence: float) -> bool:
         """Tell whether a pose is sure and so near the last judged one that its scan adds almost no evidence."""
         state = self.state

@@ -19,6 +19,13 @@ STEP, AFAR = 0.5, 1e9
 SIDES = np.array([[0.0], [1.0], [-1.0]])
 
 
+def value_at(cells: np.ndarray, index: np.ndarray, within: np.ndarray) -> np.ndarray:
+    """Return the values of cells, unknown where they are off the map."""
+    value = np.full(len(index), UNKNOWN, np.uint8)
+    np.copyto(value, cells.take(index, mode="clip"), where=within)
+    return value
+
+
 def is_wall(value: np.ndarray, occupied: int) -> np.ndarray:
     """Return whether values are those of walls."""
     return (value >= occupied) & (value < UNKNOWN)
@@ -51,8 +58,7 @@ def walk_ray(
     index = row.astype(np.int64)
     index *= cols
     index += col
-    value = np.full(len(ray), UNKNOWN, np.uint8)
-    np.copyto(value, cells.take(index, mode="clip"), where=within)
+    value = value_at(cells, index, within)
     stops = is_wall(value, occupied)
     corner = ((col[1:] != col[:-1]) & (row[1:] != row[:-1])).nonzero()[0]
     after = corner + 1

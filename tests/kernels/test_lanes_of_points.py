@@ -1,4 +1,4 @@
-"""Landmarks, beacons and bumpers in lanes: the scalar kernels' values, and no particle depends on its lane."""
+"""Landmarks and point sensors in lanes: the scalar kernels' values, and no particle depends on its lane."""
 
 from __future__ import annotations
 
@@ -123,6 +123,27 @@ def test_beacons(kind, changes, in_lanes, compiled_lanes):
     assert_alike(found[LANES], found[1], len(ranges))
 
 
+@pytest.mark.parametrize(
+    "changes", [{}, {"kind": "von_mises"}, {"sigma": 1.4}, {"sigma": 1.8}, {"z_hit": 1.0, "z_rand": 0.0}]
+)
+def test_headings_and_positions(changes, in_lanes, compiled_lanes):
+    """Sums of turns, Fourier series and von Mises densities, with and without outliers; a position beside each."""
+    p, poses, found = gs.HeadingParameters(**{"sigma": 0.3, "z_hit": 0.9, "z_rand": 0.1, **changes}), cloud(9.0), {}
+    q = gs.PositionParameters(
+        covariance=((0.3, 0.1), (0.1, 0.2)), z_hit=p.z_hit, z_rand=p.z_rand, region=(-10.0, -10.0, 10.0, 10.0)
+    )
+    for lanes in (1, LANES):
+        heading = gs.HeadingModel(p, backend=in_lanes(lanes))
+        fix = gs.PositionModel(q, backend=in_lanes(lanes))
+        compiled_lanes.clear()
+        found[lanes] = heading.log_likelihood(poses, 3.0), fix.log_likelihood(poses, (0.1, 0.2))
+        assert compiled_lanes["score_heading"] == compiled_lanes["score_position"] == {lanes}
+    assert_no_particle_depends_on_its_lane(lambda some: heading.log_likelihood(some, 3.0), poses)
+    assert_no_particle_depends_on_its_lane(lambda some: fix.log_likelihood(some, (0.1, 0.2)), poses)
+    for wide, one in zip(found[LANES], found[1], strict=True):
+        assert_alike(wide, one, 1)
+
+
 SQUARE = np.array([(0.2, 0.25), (-0.2, 0.25), (-0.2, -0.25), (0.2, -0.25)])
 
 
@@ -150,7 +171,8 @@ def test_bumpers(outline, changes, in_lanes, compiled_lanes):
 
 
 def test_float64_and_lines_have_no_vectors():
-    for kernel in ("score_features", "count_unseen", "score_beacons", "score_contact"):
+    points = ("score_beacons", "score_contact", "score_heading", "score_position")
+    for kernel in ("score_features", "count_unseen", *points):
         assert with_lanes_flag(LANES, kernel, {"RANGE", "BEARING"}) == {"RANGE", "BEARING", "IN_LANES"}
         assert with_lanes_flag(LANES, kernel, {"RANGE", "FLOAT64"}) == {"RANGE", "FLOAT64"}
     assert with_lanes_flag(LANES, "score_features", {"RANGE", "LINE"}) == {"RANGE", "LINE"}

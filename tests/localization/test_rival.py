@@ -12,7 +12,9 @@ from support import filter_scene as scene
 
 import gpusense as gs
 from gpusense.localization import rival
-from gpusense.localization.rival_search import drawn
+from gpusense.localization.ratio import IS_FOUND, ratio_of_places
+from gpusense.localization.rival_search import RivalSearch, are_apart, drawn
+from gpusense.localization.sensors import Sensor
 from gpusense.matching.likely import likely_poses
 
 # A building of four rooms of different sizes along a corridor, with doors.
@@ -207,3 +209,59 @@ def test_scans_of_a_robot_that_stands_count_once_for_a_rival(monkeypatch):
             one.correct([], -4.0, np.array([step * scan, 0.0, 0.0]))
         gains.append(one.log_odds - rival.PRIOR)
     assert gains[0] == pytest.approx(3.0 + 19 * 3.0 * 0.05 / 1.95) and gains[1] == pytest.approx(60.0)
+
+
+def crowded_map(path, tables):
+    """Return the building with tables that are not in the scans, none of them on a path."""
+    cells, rng = CELLS.copy(), np.random.default_rng(4)
+    for row, column in rng.integers(4, (112, 190), (tables, 2)):
+        cells[row : row + 4, column : column + 6] = 100
+    for x, y, _ in path:
+        cells[int(10 * y) - 4 : int(10 * y) + 5, int(10 * x) - 4 : int(10 * x) + 5] = CELLS[int(10 * y), int(10 * x)]
+    return gs.OccupancyGrid(cells, resolution=0.1)
+
+
+def test_a_wrong_map_is_no_evidence_where_no_other_place_fits_better():
+    path = along((1.5, 3.0, 0.05), 50, 0.15)
+    model = gs.LikelihoodFieldModel(crowded_map(path, 160), SCANNER, FIELD, backend="opencl")
+    found = track(path, scans(path), begun(model, path[0]))
+    assert max(error(*pair) for pair in zip(found, path, strict=True)) < 0.2
+    # Most beams contradict the map. By them alone the last p_lost was 0.9, and its mean 0.6.
+    assert np.median([one.explained for one in found]) < 0.5
+    assert found[-1].p_lost < 0.1 and np.mean([one.p_lost for one in found]) < 0.1
+
+
+def test_a_robot_that_is_carried_away_on_a_wrong_map_is_lost_and_found():
+    path, elsewhere = along((1.5, 3.0, 0.05), 20, 0.15), along((14.0, 9.0, 0.5), 12, 0.1)
+    model = gs.LikelihoodFieldModel(crowded_map([*path, *elsewhere], 60), SCANNER, FIELD, backend="opencl")
+    pf = begun(model, path[0])
+    assert track(path, scans(path), pf)[-1].verdict == "tracking"
+    carried = track(elsewhere, scans(elsewhere), pf)
+    assert max(one.p_lost for one in carried[:4]) > 0.7 and error(carried[-1], elsewhere[-1]) < 0.2
+
+
+def test_the_comparison_has_the_likeliest_other_place(model):
+    """Compare with poses all over the map: none beyond the search's resolution is likelier, and the robot's own is."""
+    here, there = np.array([4.0, 3.5, 0.3]), np.array([9.0, 9.0, 2.0])
+    ranges, spread = scans([here], people=0.6)[0], np.diag([0.01, 0.01, 0.001])
+    anywhere = np.random.default_rng(0).uniform((0, 0, -3), (20, 12, 3), (4000, 3))
+    log_p = model.log_likelihood(np.vstack([here, there, anywhere]), ranges)
+    search, temperature = RivalSearch([Sensor(model)]), 0.05
+    for pose, mine, is_found in ((here, log_p[0], True), (there, log_p[1], False)):
+        compared = search.found(pose, spread, [(0, (ranges,))], (0, 0, 0), temperature)
+        others = log_p[are_apart(np.vstack([here, there, anywhere]), pose)]
+        # Poses of the search are 0.1 m and 3 degrees apart, and the nearest one is a little less likely.
+        assert compared.lead > temperature * float(others.max() - mine) - 1.0
+        assert compared.is_found == is_found and compared.beams == pytest.approx(temperature * SCANNER.count)
+        assert compared.ratio < -1.5 if is_found else compared.ratio > 0.2
+
+
+def test_a_comparison_needs_information_and_has_limits():
+    def ratio(lead, beams, is_found=False):
+        return ratio_of_places(lead, beams, is_found=is_found)
+
+    assert ratio(-math.inf, 10.0) < -3 and ratio(math.inf, 10.0) == ratio(9.0, 10.0) > 1
+    assert ratio(2.0, 10.0, is_found=True) == pytest.approx(ratio(2.0, 10.0) - IS_FOUND * 10 / 11)
+    # A scan with hardly any information is no evidence.
+    assert abs(ratio(0.0, 0.01, is_found=True)) < 0.05
+    assert math.isnan(ratio(math.nan, 10.0)) and math.isnan(ratio(1.0, 0.0))

@@ -154,6 +154,28 @@ def test_the_belief_is_the_exact_filter_of_two_states():
         assert belief.log_odds - start == pytest.approx(exact, abs=1e-9)
 
 
+def test_comparisons_are_a_second_series_of_the_belief():
+    """The joint density of two series of Gaussian ratios, independent of one another given right or wrong."""
+    rng, mean, gap = np.random.default_rng(1), 0.8, 0.6
+    rho = STAYS * math.exp(-gap / LENGTH)
+    root = np.linalg.cholesky(2 * mean * rho ** np.abs(np.subtract.outer(np.arange(5), np.arange(5))))
+    ratios = mean + root @ rng.normal(size=(5, 2))
+    inverse = np.linalg.inv(root @ root.T)
+    exact = 2 * mean * float((np.ones(5) @ inverse @ ratios).sum())
+    belief = Belief(alike=0.0)
+    start = belief.log_odds
+    for k, (scan, comparison) in enumerate(ratios.tolist()):
+        pose = (gap * k, 0.0, 0.0)
+        belief = belief.judged(pose, scan).compared_with(pose, math.nan).compared_with(pose, comparison)
+    assert belief.log_odds - start == pytest.approx(exact, abs=1e-9)
+    # At a place that scans have chosen, they fit best there; what speaks against it counts.
+    chosen = Belief.anywhere()
+    assert chosen.compared_with((0.0, 0.0, 0.0), -4.0).wrong > 0.45
+    assert chosen.compared_with((0.0, 0.0, 0.0), 1.2).wrong > 0.7
+    # A pose that looks alike beats other places as well.
+    assert Belief(0.0).compared_with((0.0, 0.0, 0.0), -40.0).log_odds == pytest.approx(math.log(ALIKE))
+
+
 def test_transitions_of_the_belief():
     belief = Belief().counted().judged((0.0, 0.0, 0.0), math.nan)
     assert belief.wrong == pytest.approx(0.1 * (1 - FOUND) + 0.9 * (1 - math.exp(-PER_SCAN)))
@@ -293,6 +315,16 @@ def test_a_wide_cloud_is_never_tracked(model):
     assert before.verdict == "uncertain" and before.p_lost > 0.5 and math.isnan(before.explained)
     pf.initialize_uniform()
     assert pf.estimate().verdict == "uncertain" and pf.estimate().p_lost > 0.9
+
+
+def test_a_wide_cloud_is_not_compared_with_other_places(model):
+    verdict = gs.ParticleFilter(model, particles=500, seed=1)._parts.verdict
+    before = verdict.state
+    verdict.compared(POSE, np.diag([1.0, 1.0, 0.01]), 1.0)
+    assert verdict.state == before
+    verdict.compared(POSE, np.diag([0.01, 0.01, 0.001]), 1.0)
+    odds = verdict.wrong / (1 - verdict.wrong)
+    assert odds == pytest.approx((ALIKE + (1 - ALIKE) * math.e) / 9)
 
 
 def test_a_compass_has_only_its_spread():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -50,11 +51,19 @@ def test_devices_agree_with_the_reference(device, precision, scanner, thin):
     np.testing.assert_allclose(found[..., 18:], expected[..., 18:], rtol=sums, atol=pose)
 
 
-@pytest.mark.sampled(0.4)
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-@pytest.mark.parametrize(("scanner", "thin"), [(RING, 0), (FRONT, 0), (FRONT, 1)], ids=["ring", "front", "thin"])
-@pytest.mark.parametrize(("limit", "team"), [(1024, 256), (255, 32), (31, 1)], ids=["large", "small", "none"])
-def test_a_team_of_work_items_agrees_with_the_reference(device, monkeypatch, precision, scanner, thin, limit, team):
+# PoCL takes 6 s to compile a team, and Warp's processor has none: each team, precision and kind of scan is tried once.
+TEAMS = {"large": (1024, 256), "small": (255, 32), "none": (31, 1)}
+KINDS = {"ring": (RING, 0), "front": (FRONT, 0), "thin": (FRONT, 1)}
+ONCE = [("large", "thin", "float32"), ("small", "ring", "float64"), ("none", "front", "float64")]
+EACH = [
+    pytest.param(*TEAMS[case[0]], *KINDS[case[1]], case[2], id="-".join(case),
+                 marks=[] if case in ONCE else pytest.mark.slow)
+    for case in itertools.product(TEAMS, KINDS, ("float32", "float64"))
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("limit", "team", "scanner", "thin", "precision"), EACH)
+def test_a_team_of_work_items_agrees_with_the_reference(device, monkeypatch, limit, team, scanner, thin, precision):
     """GPUs match in teams that their groups hold; here processors do."""
     sizes = pretend_gpu(device, monkeypatch, limit)
     test_devices_agree_with_the_reference(device, precision, scanner, thin)

@@ -40,11 +40,11 @@ KERNELS: dict[str, Kernel] = {
     ),
     "score_position": kernel(
         "absolute", "particle", "real4 place [particles]", "real terms [9]", "out real log_p [particles]",
-        "int particles", "real temperature",
+        "int particles", "real temperature", in_lanes=True,
     ),
     "score_heading": kernel(
         "absolute", "particle", "real2 residual [particles]", "real terms [12]", "out real log_p [particles]",
-        "int particles", "int kind", "real temperature",
+        "int particles", "int kind", "real temperature", in_lanes=True,
     ),
     "score_beacons": kernel(
         "beacons", "particle", "real4 place [particles]", "real beacon [7 * beacons]", "real terms [12]",

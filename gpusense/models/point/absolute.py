@@ -15,6 +15,7 @@ from gpusense.backends import Selection, arrays
 from gpusense.backends.base import Buffer
 from gpusense.interface.constants import NEARBY, NEGLIGIBLE, SERIES, VON_MISES, WAVES, WRAPS
 from gpusense.interface.flags import flags_if
+from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.plan import Omission
 from gpusense.interface.terms import log_weight
@@ -111,9 +112,9 @@ class PositionModel(PointModel):
         def program(some: Poses, part: Part, log_p: Buffer) -> Program:
             fix = dict(origin_x=x, origin_y=y, mount_x=mount_x, mount_y=mount_y)
             place, placing = self._relative(some, part, "place_relative", fix)
-            count = part[1] - part[0]
+            count, in_lanes = part[1] - part[0], with_lanes_flag(self._backend.info.lanes, "score_position", flags)
             score = launch(
-                "score_position", flags, (count,), place=place, terms=self._workspace.upload("terms", terms),
+                "score_position", in_lanes, (count,), place=place, terms=self._workspace.upload("terms", terms),
                 log_p=log_p, particles=count, temperature=self.temperature,
             )  # fmt: skip
             return (*placing, score)
@@ -255,9 +256,10 @@ class HeadingModel(PointModel):
 
         def program(some: Poses, part: Part, log_p: Buffer) -> Program:
             residual, wrapping = self._relative(some, part, "wrap_headings", target)
+            flags = with_lanes_flag(self._backend.info.lanes, "score_heading", self._flags)
             count = part[1] - part[0]
             score = launch(
-                "score_heading", self._flags, (count,), residual=residual, terms=self._terms_buffer, log_p=log_p,
+                "score_heading", flags, (count,), residual=residual, terms=self._terms_buffer, log_p=log_p,
                 particles=count, kind=self._kind, temperature=self.temperature,
             )  # fmt: skip
             return (*wrapping, score)

@@ -15,11 +15,16 @@ LanePair scaled_pair_lanes(const LanePair a, const float scale, const float scal
     return two_sum_lanes(product.hi, product.lo + (a.hi * scale_low + a.lo * scale));
 }
 
+// Return log(1 + x) for x > -1.
+lanes log_one_plus_lanes(const lanes x) {
+    const lanes sum = 1.0f + x;
+    return log_lanes(sum) + (x - (sum - 1.0f)) / sum;
+}
+
 // Return the log of the sum of two probabilities, from their logs; -inf only where both are 0.
 lanes either_lanes(const lanes a, const lanes b) {
     const ilanes larger = a > b;
     const lanes high = larger ? a : b, low = larger ? b : a;
-    const lanes small = exp_lanes(low - high), sum = 1.0f + small;
-    const lanes sum_log = high + (log_lanes(sum) + (small - (sum - 1.0f)) / sum);
+    const lanes sum_log = high + log_one_plus_lanes(exp_lanes(low - high));
     return high > -INFINITY ? sum_log : high;
 }

@@ -25,6 +25,20 @@ LanePair distance_pair_lanes(const LanePlace off) {
     return (LanePair){d, d > 0 ? rest / (2.0f * d) : (lanes)0};
 }
 
+// Read LANES numbers of two parts; the last of count stands in for those beyond it.
+LanePair load_pairs(global const real *numbers, const int count) {
+    if (count >= LANES) {
+        const lanes a = load_lanes(0, numbers), b = load_lanes(1, numbers);
+        return (LanePair){(lanes)(a.even, b.even), (lanes)(a.odd, b.odd)};
+    }
+    LanePair some;
+    for (int i = 0; i < LANES; ++i) {
+        const int at = 2 * min(i, count - 1);
+        ((real *)&some.hi)[i] = numbers[at], ((real *)&some.lo)[i] = numbers[at + 1];
+    }
+    return some;
+}
+
 // Read LANES places from index first on; a lane beyond the last of count repeats it.
 LanePlace load_places(global const real4 *place, const int first, const int count) {
     LanePlace some;

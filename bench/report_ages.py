@@ -14,15 +14,14 @@ import argparse
 import json
 import math
 import re
-import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from functools import cache
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from common import ROOT, table
+from commits import ROOT, commits_since
+from common import table
 
 RESULTS = ROOT / "bench" / "results"
 CODE = ("kernels", "gpusense")
@@ -38,14 +37,6 @@ def parts_of(file: Path) -> list[str]:
     return [part for part in re.split(r"(?m)^(?=# )", text) if part.strip()]
 
 
-@cache
-def commits_since(commit: str, root: Path = ROOT) -> float:
-    """Count the commits since one that touch the measured code; infinite where the clone lacks it."""
-    command = ["git", "-C", str(root), "rev-list", "--count", f"{commit}..HEAD", "--", *CODE]
-    found = subprocess.run(command, capture_output=True, text=True, check=False)
-    return int(found.stdout) if found.returncode == 0 else math.inf
-
-
 def ages(folder: Path = RESULTS, root: Path = ROOT) -> Iterator[tuple[float, str, str]]:
     """Yield age, name and commit of each report in a folder."""
     for file in sorted(file for file in folder.iterdir() if file.suffix in (".md", ".json")):
@@ -54,7 +45,7 @@ def ages(folder: Path = RESULTS, root: Path = ROOT) -> Iterator[tuple[float, str
             heading = re.match(r'# (.+)|\{"title": "([^"]+)"', part)
             title = next(filter(None, heading.groups())) if heading else f"{number + 1}"
             name = file.name if len(parts) == 1 else f"{file.name}, {title}"
-            stated = [(commits_since(commit, root), commit) for commit in sorted(set(COMMIT.findall(part)))]
+            stated = [(commits_since(commit, CODE, root=root), commit) for commit in sorted(set(COMMIT.findall(part)))]
             age, commit = max(stated, default=(math.inf, "none"))
             yield age, name, commit
 

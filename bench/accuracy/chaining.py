@@ -6,7 +6,8 @@ Rows of a log: its raw odometry; "scan to scan", successive matches without key 
 ``gpusense.chain_scans``, with and without odometry, with and without closures; "KISS-ICP" where that library is
 installed, on points with z = 0, with the best of voxels of 0.1, 0.3 and 1 m, with or without its correction of motion
 during scans that have a duration; "CSM", from scan to scan, if its sources are given. "jarvis-both" has the scans of
-both lasers. Times are wall time without the first call's compilation.
+both lasers. Both rows from scan to scan begin each match at the odometry's motion; KISS-ICP knows no odometry. Times
+are wall time without the first call's compilation.
 
 "error" is the root mean square distance from the reference after alignment. "drift" is the mean error of relative
 poses over a path of 5, 20 and 100 m, per length. "contradicted" closures differ from the reference by more than 0.5 m

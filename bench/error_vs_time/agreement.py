@@ -28,8 +28,9 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from commits import git
 from error_vs_time.choices import SHOWN, WISHES, answer, chosen
-from error_vs_time.reports import ROWS, git
+from error_vs_time.reports import ROWS
 
 from gpusense._util.files import write_whole
 from gpusense.evaluation.benchmark.report import SCHEMA, table

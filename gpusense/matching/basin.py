@@ -2,8 +2,8 @@
 
 Information of pairs is tested against noise, and so little of it is left where few pairs constrain a direction that
 this direction counts as not observed, among furniture as in a corridor. Starts on both sides tell them apart: among
-furniture they end at one pose, and the scans exchanged have the inverse pose. Along a corridor they stay apart, or end
-where the edges of one scan's view hold them, and the exchanged scans have other edges.
+furniture they end at one pose, and the scans exchanged have the inverse pose. Along a corridor they stay apart. Where
+doors that look alike hold them at a wrong pose, the exchanged scans, which see others at their edges, mostly do not.
 """
 
 from __future__ import annotations

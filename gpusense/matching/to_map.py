@@ -14,6 +14,7 @@ import numpy as np
 
 from gpusense._util.angles import wrapped
 from gpusense.backends import Backend
+from gpusense.matching.basin import is_held
 from gpusense.matching.chain import DOUBTFUL, match_pairs
 from gpusense.matching.evidence import pair_evidence
 from gpusense.matching.observability import axes_of, balance_of, observed_information, orthonormal
@@ -137,7 +138,29 @@ class MapMatcher:
             self._backend, self._real, points, pairs, np.zeros((len(pose), 3)), method, self._options,
             self._scanner.mount[:2],
         )  # fmt: skip
-        return local.moved(pose, self._options.window)
+        return self._unslid(ranges, pose, local).moved(pose, self._options.window)
+
+    def _unslid(self, ranges: np.ndarray, pose: np.ndarray, found: ScanMatch) -> ScanMatch:
+        """Return matches to expected scans, at their start along lost directions unless starts on both sides return.
+
+        Along a corridor ICP slides on what noise leaves. Scans of few beams are not tested.
+        """
+        rows = np.flatnonzero(found.usable & (found.eigenvalues == 0).any(axis=1))
+        if not len(rows) or self._dense is not self._scanner:
+            return found
+        expected = self._caster.cast(self._sensors(pose[rows]), self._scanner.bearings).astype(np.float64)
+        noise = np.full(len(rows), self._options.noise)
+        held = is_held(
+            expected, ranges[rows], self._scanner, found.ordered(rows), (noise, noise), self._backend,
+            self._real.name,  # type: ignore[arg-type]
+        )  # fmt: skip
+        rows = rows[~held]
+        some = found.ordered(rows)
+        axes = np.where((some.eigenvalues == 0)[:, :, None], some.directions, 0.0)
+        scale = 1 / balance_of(some.lever)
+        off, placed = some.pose * scale, np.array(found.pose)
+        placed[rows] = (off - np.einsum("lki,lkj,lj->li", axes, axes, off)) / scale
+        return replace(found, pose=placed)
 
     def _expected_points(self, ranges: np.ndarray, pose: np.ndarray) -> tuple[ScanPoints, np.ndarray]:
         """Return the points of the expected scans at poses and of the readings, and their pairs."""

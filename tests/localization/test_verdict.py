@@ -317,6 +317,16 @@ def test_a_wide_cloud_is_never_tracked(model):
     assert pf.estimate().verdict == "uncertain" and pf.estimate().p_lost > 0.9
 
 
+def test_a_wide_cloud_is_not_compared_with_other_places(model):
+    verdict = gs.ParticleFilter(model, particles=500, seed=1)._parts.verdict
+    before = verdict.state
+    verdict.compared(POSE, np.diag([1.0, 1.0, 0.01]), 1.0)
+    assert verdict.state == before
+    verdict.compared(POSE, np.diag([0.01, 0.01, 0.001]), 1.0)
+    odds = verdict.wrong / (1 - verdict.wrong)
+    assert odds == pytest.approx((ALIKE + (1 - ALIKE) * math.e) / 9)
+
+
 def test_a_compass_has_only_its_spread():
     fix = gs.PositionModel(gs.PositionParameters(sigma=0.1), backend="numpy")
     pf = gs.ParticleFilter(fix, particles=500, seed=1)

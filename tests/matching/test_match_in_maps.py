@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from support.matching_scenes import FRONT, RING, random_pairs
+from support.selection import present
 
 import gpusense as gs
 from gpusense.backends import get_backend
@@ -103,3 +104,16 @@ def test_a_single_scan_gives_a_single_match(local):
     assert match.pose.shape == (3,)
     with pytest.raises(ValueError, match="method"):
         gs.match_scan(grid, scan, RING, local[0], "icp", backend="numpy")
+
+
+def test_matches_in_corridors_of_a_recorded_map_stay_at_good_guesses(data_dir):
+    """ICP would slide along the corridor for some of these scans, for one of them by 0.95 m."""
+    folder = data_dir / "carmen_logs"
+    grid = gs.read_map(folder / "derived_maps/aces_even_05cm.yaml")
+    scans = list(gs.read_log(folder / "aces-corrected.log.gz"))[1::2][90:150]
+    poses = np.array([scan.pose for scan in scans])
+    match = gs.match_scan(
+        grid, np.array([scan.ranges for scan in scans]), scans[0].scanner, poses + np.array([0.02, 0.0, 0.0]),
+        backend=present("opencl"),
+    )  # fmt: skip
+    assert np.hypot(*(match.pose - poses)[:, :2].T).max() < 0.3

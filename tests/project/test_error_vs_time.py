@@ -37,6 +37,12 @@ def reports(page: ModuleType) -> ModuleType:
     return importlib.import_module("error_vs_time.reports")
 
 
+@pytest.fixture(scope="module")
+def commits(page: ModuleType) -> ModuleType:
+    """Import the module that reads the history."""
+    return importlib.import_module("commits")
+
+
 # ---- the committed page and reports
 
 
@@ -51,8 +57,8 @@ def test_the_page_is_what_the_reports_give(page: ModuleType) -> None:
     assert "{{" not in made[page.PAGE] and f"python {Path(page.__file__).relative_to(ROOT)}" in made[page.PAGE]
 
 
-def test_reports_are_of_this_code(reports: ModuleType) -> None:
-    if not reports.has_history():
+def test_reports_are_of_this_code(reports: ModuleType, commits: ModuleType) -> None:
+    if not commits.has_history():
         pytest.skip("the checkout has no history, or a part of it only")
     found = {source.name: reports.commit_trouble(source.report["commit"]) for source in reports.sources()}
     assert {name: trouble for name, trouble in found.items() if trouble} == {} and found
@@ -91,9 +97,11 @@ def history(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_commits_that_are_old_unknown_or_unclean_are_refused(reports: ModuleType, history: Path) -> None:
-    assert reports.has_history(history) and not reports.has_history(history / "kernels")
-    hashes = {name: reports.git("rev-parse", name, root=history) for name in ("c0", "c2", "c4", "aside")}
+def test_commits_that_are_old_unknown_or_unclean_are_refused(
+    reports: ModuleType, commits: ModuleType, history: Path
+) -> None:
+    assert commits.has_history(history) and not commits.has_history(history / "kernels")
+    hashes = {name: commits.git("rev-parse", name, root=history) for name in ("c0", "c2", "c4", "aside")}
 
     def trouble(commit: str, limit: int) -> str:
         return reports.commit_trouble(commit, root=history, limit=limit, folders=["kernels"])

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 import gpusense as gs
-from gpusense.world.compat import Beluga, Peer
+from gpusense.peers.weights import Beluga, Peer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 

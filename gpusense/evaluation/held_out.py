@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gpusense.evaluation.range_data import RangeData
 from gpusense.learning.beam.incidence import IncidenceFit
-from gpusense.world.compat import Beluga
+from gpusense.peers.weights import Beluga
 from gpusense.world.parameters import BeamParameters, IncidenceParameters
 from gpusense.world.scanner import Reading
 

@@ -14,10 +14,10 @@ from gpusense.localization.motion import MotionModel, OdometryMotion, OmniMotion
 from gpusense.localization.nav2_nodes import nodes_of, parameters_of
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.field import LikelihoodFieldModel
-from gpusense.world.compat import Amcl
+from gpusense.peers.parameters import BeamWeights, FieldWeights
+from gpusense.peers.weights import Amcl
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
-from gpusense.world.peer_weights import BeamWeights, FieldWeights
 from gpusense.world.scanner import Scanner
 
 if TYPE_CHECKING:

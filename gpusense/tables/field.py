@@ -8,9 +8,9 @@ import numpy as np
 
 from gpusense.backends import Backend
 from gpusense.backends.base import Buffer
+from gpusense.peers.weights import OVERLAID, Beluga, Peer
 from gpusense.tables.cells import check_size
 from gpusense.tables.distances import NO_OBSTACLE, squared_distances
-from gpusense.world.compat import OVERLAID, Beluga, Peer
 from gpusense.world.field_density import FieldDensity
 from gpusense.world.likelihood import Likelihood
 from gpusense.world.parameters import LikelihoodFieldParameters

@@ -15,8 +15,8 @@ from support.paths import ROOT
 from gpusense._util import typing as types
 from gpusense.interface.casters import ENTRIES
 from gpusense.learning.beam.options import METHODS
+from gpusense.peers.weights import PEERS
 from gpusense.positions.problem import LOSSES
-from gpusense.world.compat import PEERS
 
 HEAD = """\
 import numpy as np

@@ -23,9 +23,9 @@ from gpusense.models.scan.mixture import mixture_on_device
 from gpusense.models.scan.model import ScanModel
 from gpusense.models.scan.rules import Beams
 from gpusense.models.scan.sampling import drawing_of, poses_to_draw_at
+from gpusense.peers.weights import Peer, check_weights, choose
 from gpusense.tables import casters
 from gpusense.tables.casters import Caster
-from gpusense.world.compat import Peer, check_weights, choose
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.likelihood import Likelihood
 from gpusense.world.parameters import BeamParameters, IncidenceParameters

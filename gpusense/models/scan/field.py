@@ -21,7 +21,7 @@ from gpusense.models.scan.field_pipeline import FieldPipeline
 from gpusense.models.scan.model import ScanModel
 from gpusense.models.scan.request import make_request
 from gpusense.models.scan.rules import Beams
-from gpusense.world.compat import Peer, check_weights, choose
+from gpusense.peers.weights import Peer, check_weights, choose
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import LikelihoodFieldParameters
 from gpusense.world.scanner import Scanner

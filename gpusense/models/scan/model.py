@@ -28,7 +28,7 @@ from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.request import Request, make_request
 from gpusense.models.scan.rules import Beams, ModelContext, Rules, check_beams
 from gpusense.models.scan.scoring import LastCall, run
-from gpusense.world.compat import Peer, choose
+from gpusense.peers.weights import Peer, choose
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner

@@ -47,10 +47,10 @@ from typing import ClassVar
 import numpy as np
 
 from gpusense._util import checks
+from gpusense.peers.parameters import BeamWeights, FieldWeights
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.likelihood import Likelihood
 from gpusense.world.parameters import BeamParameters, LikelihoodFieldParameters
-from gpusense.world.peer_weights import BeamWeights, FieldWeights
 from gpusense.world.range_causes import RandomDensity
 from gpusense.world.scanner import Scanner
 

@@ -1,0 +1,1 @@
+"""The weights that other implementations give a scan, and their parameters."""

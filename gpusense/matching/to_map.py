@@ -149,9 +149,8 @@ class MapMatcher:
         if not len(rows) or self._dense is not self._scanner:
             return found
         expected = self._caster.cast(self._sensors(pose[rows]), self._scanner.bearings).astype(np.float64)
-        noise = np.full(len(rows), self._options.noise)
         held = is_held(
-            expected, ranges[rows], self._scanner, found.ordered(rows), (noise, noise), self._backend,
+            expected, ranges[rows], self._scanner, found.ordered(rows), self._backend,
             self._real.name,  # type: ignore[arg-type]
         )  # fmt: skip
         rows = rows[~held]

@@ -185,6 +185,8 @@ class MapMatcher:
 
     def searched(self, ranges: np.ndarray, guess: np.ndarray) -> np.ndarray:
         """Return the poses with the largest scores in the round windows about guesses, by branch and bound."""
+        if not len(guess):
+            return guess
         grid, (reach, half) = self._grid, self._options.window
         stride = self._stride
         if self._search is None:

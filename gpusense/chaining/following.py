@@ -116,7 +116,7 @@ def weakened(information: Floats, offset: Floats) -> Floats:
 def motions_around(motion: Floats, good: Flags, last: Floats | None) -> tuple[Floats, Floats, Floats]:
     """Return the last good motion before each, the next good motion, and their mean, each (L, 3).
 
-    Without a good motion on one side, that of the opposite side is taken; without any, rest.
+    Without a good motion on one side, that of the opposite side is taken; without another one, rest.
 
     Args:
         motion: (L, 3) motions.
@@ -129,8 +129,11 @@ def motions_around(motion: Floats, good: Flags, last: Floats | None) -> tuple[Fl
         rest = np.zeros((len(rows), 3))
         return rest, rest, rest
     before, after = np.searchsorted(near, rows) - 1, np.searchsorted(near, rows, "right")
+    alone = (before < 0) & (after == len(near))
     before, after = np.where(before < 0, after, before), np.where(after < len(near), after, before)
-    one, two = motion[near[before]], motion[near[after]]
+    one, two = (
+        np.where(alone[:, None], 0.0, motion[near[np.minimum(side, len(near) - 1)]]) for side in (before, after)
+    )
     return one, two, 0.5 * (one + two)
 
 

@@ -94,8 +94,7 @@ class Matcher:
         one, two, some = first[rows], second[rows], found.ordered(rows)
         moved = (None, None) if self.motion is None else (self.motion[one], self.motion[two])
         held = is_held(
-            self.readings[one], self.readings[two], self.scanner, some, (self._noise[one], self._noise[two]),
-            self._device, self._options.precision, moved,
+            self.readings[one], self.readings[two], self.scanner, some, self._device, self._options.precision, moved,
         )  # fmt: skip
         rows, some = rows[held], some.ordered(np.flatnonzero(held))
         axes = some.directions * (some.eigenvalues == 0)[:, :, None] / _HELD

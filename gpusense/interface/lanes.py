@@ -74,7 +74,7 @@ def with_teams_flags(
 ) -> tuple[frozenset[str], int]:
     """Return the flags of a launch with those of teams on a GPU, and the work-items of an item.
 
-    Teams are the smallest ones with a work-item for each two points, or the largest ones that the device holds.
+    Teams are the smallest ones with a work-item for every two points, or the largest ones that the device holds.
 
     Args:
         kind: Kind of the device.

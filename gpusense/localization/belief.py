@@ -29,8 +29,8 @@ A search, as after a start anywhere, chooses a place because the scans agree wit
 evidence: it counts as repeated from the previous scan. A contradiction counts in full.
 
 Comparisons of the pose with other places of the map (:func:`gpusense.localization.ratio.ratio_of_places`) are a second
-series of ratios. Given right or wrong they count as independent of the scans' ratios, whose coefficients they were
-fitted beside, and as dependent on one another by the same correlation.
+series of ratios. Given right or wrong, they count as independent of the scans' ratios, with which as an offset they
+were fitted. Among one another they have the same correlation.
 """
 
 from __future__ import annotations

@@ -15,7 +15,6 @@ from gpusense._util.typing import Precision
 from gpusense.backends.base import Backend
 from gpusense.matching.chain import to_sensor
 from gpusense.matching.icp import IcpPairs, space_of
-from gpusense.matching.noise import match_noise
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import scan_points
 from gpusense.matching.result import ScanMatch
@@ -28,8 +27,8 @@ _SAME = 0.1
 
 
 def is_held(
-    first: np.ndarray, second: np.ndarray, scanner: Scanner, match: ScanMatch, own: tuple[np.ndarray, np.ndarray],
-    backend: Backend, precision: Precision, motions: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
+    first: np.ndarray, second: np.ndarray, scanner: Scanner, match: ScanMatch, backend: Backend, precision: Precision,
+    motions: tuple[np.ndarray | None, np.ndarray | None] = (None, None),
 ) -> np.ndarray:  # fmt: skip
     """Return (S,) whether starts along the lost directions of matches lead back to their poses.
 
@@ -37,8 +36,7 @@ def is_held(
         first: (S, K) readings of the reference scans [m].
         second: (S, K) readings of the second scans.
         scanner: The scanner of both.
-        match: S matches.
-        own: (S,) and (S,) noise of the reference scans and of the second scans from ``scan_noise`` [m].
+        match: S matches; starts are matched with their noise.
         backend: The device.
         precision: Precision.
         motions: (S, 3) and (S, 3) motions during the reference scans and the second scans, or None.
@@ -54,7 +52,7 @@ def is_held(
     shape = each.shape
     seen = to_sensor(each.reshape(-1, 3), scanner.mount[:2])
     guesses = np.concatenate([seen.reshape(shape), _inverse(seen).reshape(shape)])
-    noise = np.tile(match_noise(*own), 2)
+    noise = np.tile(match.noise, 2)
     lock, space = space_of(backend)
     with lock, space:
         device = IcpPairs(backend, real, points, pairs, noise, space)

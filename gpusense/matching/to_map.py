@@ -149,9 +149,8 @@ class MapMatcher:
         if not len(rows) or self._dense is not self._scanner:
             return found
         expected = self._caster.cast(self._sensors(pose[rows]), self._scanner.bearings).astype(np.float64)
-        noise = np.full(len(rows), self._options.noise)
         held = is_held(
-            expected, ranges[rows], self._scanner, found.ordered(rows), (noise, noise), self._backend,
+            expected, ranges[rows], self._scanner, found.ordered(rows), self._backend,
             self._real.name,  # type: ignore[arg-type]
         )  # fmt: skip
         rows = rows[~held]
@@ -186,6 +185,8 @@ class MapMatcher:
 
     def searched(self, ranges: np.ndarray, guess: np.ndarray) -> np.ndarray:
         """Return the poses with the largest scores in the round windows about guesses, by branch and bound."""
+        if not len(guess):
+            return guess
         grid, (reach, half) = self._grid, self._options.window
         stride = self._stride
         if self._search is None:

@@ -98,7 +98,7 @@ def concluded(
     Args:
         pose: (S, 3) poses.
         information: (S, 3, 3) information on the poses.
-        factor: Factors that turns the information into a sum over pairs [m^2].
+        factor: Factors that turn the information into a sum over pairs [m^2].
         score: (S,) scores.
         iterations: (S,) iterations.
         status: (S,) statuses so far.

@@ -12,6 +12,7 @@ from support.selection import present
 
 import gpusense as gs
 from gpusense.chaining.chain import Chainer
+from gpusense.chaining.following import motions_around
 from gpusense.chaining.places import overlaps
 
 
@@ -157,6 +158,26 @@ def test_one_scan_is_a_trajectory_of_one_pose(odometry: np.ndarray | None) -> No
     assert chain.poses == pytest.approx(np.zeros((1, 3)) if odometry is None else odometry)
     assert chain.covariance.tolist() == np.zeros((1, 3, 3)).tolist()
     assert len(chain.links) == 0
+
+
+@pytest.mark.parametrize("with_odometry", [False, True])
+def test_two_scans_are_a_trajectory(with_odometry: bool, needs) -> None:
+    path = np.array([[-1.0, -0.6, 0.0], [-0.7, -0.6, 0.05]])
+    moved = relative(path[:1], path[1:])
+    odometry = np.concatenate([np.zeros((1, 3)), moved]) if with_odometry else None
+    chain = gs.chain_scans(scans_of(ROOM, path, RING), RING, odometry, backend=needs("opencl"))
+    np.testing.assert_allclose(chain.poses[1:], moved, atol=0.01)
+
+
+def test_motions_around_the_only_good_one_are_rest() -> None:
+    motion, last = np.arange(9.0).reshape(3, 3), np.full(3, 20.0)
+    good = np.array([False, True, False])
+    before, after, _ = motions_around(motion, good, None)
+    assert before.tolist() == after.tolist() == [[3, 4, 5], [0, 0, 0], [3, 4, 5]]
+    before, after, mean = motions_around(motion, good, last)
+    assert before.tolist() == [[20] * 3, [20] * 3, [3, 4, 5]]
+    assert after.tolist() == [[3, 4, 5], [20] * 3, [3, 4, 5]]
+    assert mean[0].tolist() == [11.5, 12, 12.5]
 
 
 @pytest.mark.parametrize("with_odometry", [True, False])

@@ -172,6 +172,10 @@ def test_comparisons_are_a_second_series_of_the_belief():
     chosen = Belief.anywhere()
     assert chosen.compared_with((0.0, 0.0, 0.0), -4.0).wrong > 0.45
     assert chosen.compared_with((0.0, 0.0, 0.0), 1.2).wrong > 0.7
+    # So is a place after scans without a common pose, whatever was compared before.
+    wide = Belief().compared_with((0.0, 0.0, 0.0), 1.2).widened()
+    repeated = wide.compared_with((9.0, 9.0, 0.0), -4.0).log_odds
+    assert repeated == pytest.approx(wide._changed(-4.0 * (1 - STAYS) / (1 + STAYS)).log_odds)
     # A pose that looks alike beats other places as well.
     assert Belief(0.0).compared_with((0.0, 0.0, 0.0), -40.0).log_odds == pytest.approx(math.log(ALIKE))
 

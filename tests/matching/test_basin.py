@@ -4,23 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.matching_scenes import CORRIDOR, box, segments_scan
+from support.matching_scenes import CORRIDOR, segments_scan, table_legs
 from support.selection import present
 
 import gpusense as gs
 from gpusense.backends import get_backend
-from gpusense.matching.basin import is_held
-from gpusense.matching.noise import scan_noise
+from gpusense.matching import basin
 
 FRONT = gs.Scanner.uniform(angle_min=-np.pi / 2, angle_increment=np.pi / 180, count=181, range_max=12.0)
 MOUNTED = gs.Scanner(FRONT.bearings, FRONT.range_max, mount=(0.4, -0.2, 0.3))
-
-
-def legs(seed: int) -> np.ndarray:
-    """Return the walls of 60 table legs of 10 cm around a robot."""
-    place = np.random.default_rng(seed).uniform(-6, 6, (60, 2))
-    place = place[np.hypot(*place.T) > 1.2]
-    return np.array([wall for x, y in place for wall in box(x - 0.05, y - 0.05, x + 0.05, y + 0.05)])
 
 
 def seen(walls: np.ndarray, pose: np.ndarray, scanner: gs.Scanner, during: np.ndarray | None) -> np.ndarray:
@@ -53,15 +45,14 @@ def lost_and_held(
         one, two, scanner, np.tile(guess, (len(one), 1)), backend=device, motion=moved, reference_motion=moved
     )
     rows = np.flatnonzero(match.usable & (match.eigenvalues == 0).any(axis=1))
-    some, noise = match.ordered(rows), (scan_noise(one[rows], scanner), scan_noise(two[rows], scanner))
-    motions = (None, None) if moved is None else (moved[rows], moved[rows])
-    return rows, some, is_held(one[rows], two[rows], scanner, some, noise, get_backend(device), "float32", motions)
+    some, motions = match.ordered(rows), (None, None) if moved is None else (moved[rows], moved[rows])
+    return rows, some, basin.is_held(one[rows], two[rows], scanner, some, get_backend(device), "float32", motions)
 
 
 @pytest.mark.parametrize("scanner", [FRONT, MOUNTED], ids=["at the robot", "mounted"])
 def test_matches_among_table_legs_are_held_and_right(scanner):
     moved = np.array([0.6, 0.1, 0.3])
-    one, two = pairs([legs(seed) for seed in range(12)], moved, scanner)
+    one, two = pairs([table_legs(seed) for seed in range(12)], moved, scanner)
     _, match, held = lost_and_held(one, two, scanner, moved + np.array([0.1, 0.1, 0.05]))
     assert len(match) >= 10
     assert held.sum() >= 0.7 * len(match)
@@ -80,7 +71,7 @@ def test_no_match_in_a_corridor_is_held(turn, length):
 
 def test_motion_during_scans_counts():
     moved, during = np.array([0.6, 0.1, 0.3]), np.array([0.2, 0.0, 0.3])
-    one, two = pairs([legs(seed) for seed in range(12)], moved, FRONT, during)
+    one, two = pairs([table_legs(seed) for seed in range(12)], moved, FRONT, during)
     _, match, held = lost_and_held(one, two, FRONT, moved, during)
     assert len(match) >= 10
     assert held.sum() >= 0.7 * len(match)
@@ -100,3 +91,15 @@ def test_recorded_matches_that_are_held_are_right(data_dir):
     assert held.sum() >= 5
     assert np.count_nonzero(off > 0.5) >= 10
     assert off[held].max() < 0.15
+
+
+@pytest.mark.parametrize("noise", [0.002, 0.15])
+def test_starts_have_the_noise_of_the_match(monkeypatch, noise):
+    """A noise that the caller has chosen is neither rounded nor limited."""
+    one, two = pairs([CORRIDOR, CORRIDOR], np.array([0.1, 0.0, 0.0]), FRONT)
+    match = gs.match_scan(one, two, FRONT, backend="numpy", noise=noise)
+    used: list[float] = []
+    made = basin.IcpPairs
+    monkeypatch.setattr(basin, "IcpPairs", lambda *given: (used.extend(given[4]), made(*given))[1])
+    basin.is_held(one, two, FRONT, match, get_backend("numpy"), "float32")
+    assert used == [noise] * 4

@@ -106,6 +106,12 @@ def test_a_single_scan_gives_a_single_match(local):
         gs.match_scan(grid, scan, RING, local[0], "icp", backend="numpy")
 
 
+@pytest.mark.parametrize("method", ["auto", "gauss_newton", "correlative"])
+def test_no_scans_give_no_matches(method):
+    match = gs.match_scan(drawn(), np.zeros((0, RING.count)), RING, np.zeros((0, 3)), method, backend="numpy")
+    assert len(match) == 0 and match.covariance.shape == (0, 3, 3)
+
+
 def test_matches_in_corridors_of_a_recorded_map_stay_at_good_guesses(data_dir):
     """ICP would slide along the corridor for some of these scans, for one of them by 0.95 m."""
     folder = data_dir / "carmen_logs"

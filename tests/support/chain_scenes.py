@@ -40,7 +40,7 @@ def scans_of(
     """Return noisy readings at poses."""
     rng = np.random.default_rng(seed)
     ranges = np.array([segments_scan(walls, tuple(pose), scanner) for pose in poses])
-    return ranges + rng.normal(0, 0.01, ranges.shape)
+    return ranges + rng.normal(0, noise, ranges.shape)
 
 
 def drifting(poses: np.ndarray, stretch: float = 1.03, turn: float = 0.01) -> np.ndarray:

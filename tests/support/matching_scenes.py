@@ -35,6 +35,13 @@ WALL = np.array([[-200.0, 1.5, 200.0, 1.5]])
 SQUARE = np.array(box(-3, -3, 3, 3))
 
 
+def table_legs(seed: int) -> np.ndarray:
+    """Return the walls of 60 table legs of 10 cm around a robot."""
+    place = np.random.default_rng(seed).uniform(-6, 6, (60, 2))
+    place = place[np.hypot(*place.T) > 1.2]
+    return np.array([wall for x, y in place for wall in box(x - 0.05, y - 0.05, x + 0.05, y + 0.05)])
+
+
 def relative(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return (S, 3) poses of second frames in first ones."""
     c, s, d = np.cos(first[:, 2]), np.sin(first[:, 2]), second - first

@@ -161,16 +161,18 @@ def class_scans(ranges: np.ndarray, rules: Rules) -> ClassedScans:
         evaluated, constant = used | used_max | (not rules.specialize), np.zeros(far.shape, bool)
         ranges = np.where(used, ranges, np.where(used_max, np.inf, np.nan))
     constants = np.zeros(len(ranges))
-    if np.logical_and.reduce(evaluated, axis=None):
-        # Scans without gaps need no selection.
+    if 0 not in evaluated.tobytes():
+        # Scans without gaps need no selection. A search among bytes takes a tenth of the time of a reduction.
         counts = np.asarray([ranges.shape[1]] * len(ranges))
         columns, values, vectors = rules.columns, ranges.reshape(-1).astype(np.float64), rules.vectors
         if len(ranges) > 1:
             columns, vectors = np.tile(columns, len(ranges)), np.tile(vectors, (len(ranges), 1))
     else:
-        columns, counts = evaluated.nonzero()[1], _numbers_of(evaluated)
-        values, vectors = ranges[evaluated].astype(np.float64), rules.vectors[columns]
-        if rules.max_is_constant:
+        places, counts = evaluated.reshape(-1).nonzero()[0], _numbers_of(evaluated)
+        columns = places if len(ranges) == 1 else places % ranges.shape[1]
+        values = ranges.reshape(-1).take(places).astype(np.float64)
+        vectors = rules.vectors.take(columns, axis=0)
+        if rules.max_is_constant and rules.log_max:
             constants += _numbers_of(constant) * rules.log_max
     scans = ClassedScans(
         columns, values, vectors, vectors, np.arange(len(columns) + 1, dtype=np.int32), counts, counts, constants,

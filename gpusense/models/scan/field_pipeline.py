@@ -111,12 +111,9 @@ class FieldPipeline(ScanPipeline):
         high, low = split(scans.vectors * lengths[:, None], self.real)
         if not self.specialize:
             high[~finite] = cells[~finite, None]
-        if scans.scans == 1:
-            longest = np.maximum.reduceat(lengths, np.arange(0, len(lengths), BLOCK_TERMS))
-        else:
-            longest = self._longest_of_blocks(lengths, scans)
         arrays = dict(point=high, point_low=low)
         if self.backend.info.kind == "gpu":
+            longest = self._longest_of_blocks(lengths, scans)
             arrays["guard"] = (self.guard * (longest + 2)).astype(self.real)
         several = scans.scans > 1
         if several:
@@ -132,11 +129,13 @@ class FieldPipeline(ScanPipeline):
             dict(point=uploaded["point"], point_low=uploaded["point_low"], guard=uploaded.get("guard"), start=start),
             dict(counts=counts, constant_terms=uploaded.get("constant_terms", self.terms)),
             float(scans.constants[0]) + self.setting.constant_term,
-            (scans.scans, scans.most_readings, len(scans.readings)), max(longest.ravel().tolist()) + 2,
+            (scans.scans, scans.most_readings, len(scans.readings)), float(np.maximum.reduce(lengths)) + 2,
         )  # fmt: skip
 
     def _longest_of_blocks(self, lengths: np.ndarray, scans: ClassedScans) -> np.ndarray:
         """Return the longest reading of each block, in cells; every scan has as many blocks as the longest scan."""
+        if scans.scans == 1:
+            return np.asarray(np.maximum.reduceat(lengths, np.arange(0, len(lengths), BLOCK_TERMS)))
         blocks = -(-scans.most_readings // BLOCK_TERMS)
         padded = np.zeros((scans.scans, blocks * BLOCK_TERMS))
         padded[np.arange(padded.shape[1]) < scans.counts[:, None]] = lengths

@@ -41,18 +41,26 @@ class BeamChoice:
         columns = np.asarray(beams, np.intp)
         return BeamChoice(columns, len(columns), False)
 
+    @functools.cached_property
+    def _steps(self) -> np.ndarray:
+        """(most,) numbers of the readings that are used."""
+        return np.arange(self.most)
+
     def used(self, informative: np.ndarray) -> np.ndarray:
         """Return which of the informative readings of a scan are used."""
-        places = self.columns[informative[self.columns]]
+        places = self.columns.compress(informative.take(self.columns))
         if len(places) > self.most:
-            places = places[(np.arange(self.most) * len(places)) // max(self.most, 1)]
+            places = places.take((self._steps * len(places)) // max(self.most, 1))
         used = np.zeros(len(informative), bool)
         used[places] = True
         return used
 
     def among(self, hit: np.ndarray, far: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return which of the ranges and of the informative max readings of (S, K) scans are used."""
-        used = np.array([self.used(each) for each in hit | far])
+        informative = hit | far
+        used = np.empty_like(informative)
+        for row, each in zip(used, informative, strict=True):
+            row[:] = self.used(each)
         return hit & used, far & used
 
 

@@ -141,7 +141,7 @@ class Belief(NamedTuple):
         if math.isnan(ratio):
             return self._replace(log_odds=log_odds, scans=0, alike=alike)
         alike *= math.exp(-way / ALIKE_LENGTH - turn / ALIKE_TURN)
-        new = _new_part(ratio, ratio, STAYS) if repeats else _new_part(ratio, self.ratio, rho)
+        new = new_part(ratio, ratio, STAYS) if repeats else new_part(ratio, self.ratio, rho)
         moved = self._replace(log_odds=log_odds, ratio=ratio, pose=pose, scans=0, chosen=False, alike=alike)
         return moved._changed(new)
 
@@ -158,7 +158,7 @@ class Belief(NamedTuple):
         rho, before = (STAYS, ratio) if last.chosen and ratio < 0 else (0.0, 0.0)
         if not rho and last.pose is not None:
             rho, before = correlation(*motion_between(pose, last.pose)), last.ratio
-        return self._replace(compared=Comparison(ratio, pose))._changed(_new_part(ratio, before, rho))
+        return self._replace(compared=Comparison(ratio, pose))._changed(new_part(ratio, before, rho))
 
     def _changed(self, new: float) -> Belief:
         """Return the belief after new evidence [nats], which places that look alike do not show."""
@@ -175,6 +175,6 @@ class Belief(NamedTuple):
         return math.log(wrong) - math.log1p(-wrong), alike
 
 
-def _new_part(ratio: float, before: float, rho: float) -> float:
+def new_part(ratio: float, before: float, rho: float) -> float:
     """Return the increment of the log odds by a ratio after one with which it has the correlation rho."""
     return (ratio - rho * before) / (1 + rho)

@@ -27,13 +27,12 @@ import numpy as np
 
 from gpusense.interface.constants import EVIDENCE
 from gpusense.localization import starts
-from gpusense.localization.belief import correlation, motion_between
+from gpusense.localization.belief import correlation, motion_between, new_part
 from gpusense.localization.filter_cloud import Contents, SensorReadings, Summary
 from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import SampledMotion
-from gpusense.localization.pose_algebra import wrap_angle
 from gpusense.localization.ratio import ratio_of_scan
-from gpusense.localization.rival_search import RivalSearch, drawn
+from gpusense.localization.rival_search import RivalSearch, are_apart, drawn
 from gpusense.localization.spread import FAR, FAR_TURN, deviations
 from gpusense.localization.tracker import Tracker
 from gpusense.localization.verdict import sightings
@@ -132,8 +131,7 @@ class Rival:
         found = self._search.found(pose, covariance, readings, key, options.temperature)
         tries, score, ratio = found.poses, found.score, found.ratio
         if prior == 0.0:
-            far = np.hypot(*(tries[:, :2] - pose[:2]).T) > FAR
-            far |= np.abs(wrap_angle(tries[:, 2] - pose[2])) > 2 * FAR_TURN
+            far = are_apart(tries, pose, 2 * FAR_TURN)
             tries, score = tries[far], score[far]
         chosen = drawn(score, options.most, found.effective)
         if chosen is None:
@@ -166,7 +164,7 @@ class Rival:
             before, at = self._last.get(sensors, (0.0, pose))
             # A place that was searched on the whole map is no likelier than its rivals, so they are compared at once.
             rho = correlation(*motion_between(pose, at)) if sensors in self._last and self._prior < 0.0 else 0.0
-            self.log_odds += (ratio - rho * before) / (1 + rho)
+            self.log_odds += new_part(ratio, before, rho)
             self._last[sensors] = ratio, np.array(pose)
         self._scans += 1
 

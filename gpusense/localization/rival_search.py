@@ -152,10 +152,10 @@ class RivalSearch:
         return np.vstack([anywhere, around])
 
 
-def are_apart(poses: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Return which of poses (N, 3) are beyond 1 m or 0.5 rad of a pose."""
-    way, turn = np.hypot(*(poses[:, :2] - pose[:2]).T), np.abs(wrap_angle(poses[:, 2] - pose[2]))
-    return np.asarray((way > FAR) | (turn > FAR_TURN))
+def are_apart(poses: np.ndarray, pose: np.ndarray, turn: float = FAR_TURN) -> np.ndarray:
+    """Return which of poses (N, 3) are beyond 1 m or a turn [rad] of a pose."""
+    way, turned = np.hypot(*(poses[:, :2] - pose[:2]).T), np.abs(wrap_angle(poses[:, 2] - pose[2]))
+    return np.asarray((way > FAR) | (turned > turn))
 
 
 def drawn(score: np.ndarray, count: int, effective: int) -> np.ndarray | None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 # Size of a slot [bytes], number of slots, and number of slots that threads fill or empty while the device works on the
 # rest.
 SLOT, SLOTS, _AHEAD = 4 << 20, 16, 12
-# Least sizes of a copy for which pieces pay, and of a piece [bytes]; number of pieces of a copy that needs no more slots:
+# Least sizes of a copy for which pieces pay, and of a piece [bytes]; pieces of a copy that needs no more slots:
 # each piece costs the calling thread some 0.05 ms.
 LEAST, _LEAST_PIECE, _FEWEST = 8 << 20, 1 << 20, 6
 # Threads below which a driver's own copy is faster.

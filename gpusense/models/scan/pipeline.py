@@ -198,7 +198,7 @@ class ScanPipeline(ABC):
 
     def place(self, poses: Poses, part: Part, space: Workspace) -> tuple[PlacedPoses, Buffer]:
         """Place some poses in a window of the map; also return the map's table for it."""
-        table, window = self.map.ensure(poses.corners(part) or poses.hull)
+        table, window = poses.window(self.map, part, self.backend, space)
         frame = Frame(window, self.map.grid, self._mount)
         return place(poses, part, frame, self.backend, space, self.real, careful=self.careful), table
 

@@ -11,12 +11,13 @@ import numpy as np
 from gpusense._util.angles import wrapped
 from gpusense.backends import Backend
 from gpusense.interface.structs import MatchRules
-from gpusense.matching.columns import Column, any_of, column_of, columns_of, is_not, larger, square_root, upright
+from gpusense.matching.columns import Column, any_of, column_of, columns_of, is_not, larger, square_root
 from gpusense.matching.evidence import pair_evidence
 from gpusense.matching.icp import STRAIGHT_WIDTH, WIDTH, IcpPairs, space_of
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import ScanPoints
 from gpusense.matching.result import ScanMatch
+from gpusense.matching.triangles import moved, squared_length
 from gpusense.matching.uncertainty import statuses
 from gpusense.matching.verdicts import PairSums, concluded, tested
 
@@ -38,8 +39,6 @@ _PROMISING = 0.15
 _TURNED = 0.11
 # A match is ambiguous if two poses differ by more than this distance [m] or turn [rad], and score alike within this.
 _OTHER, _OTHER_TURN, _CLOSE = 0.25, 0.1, 0.012
-
-_IDENTITY = np.eye(3)
 
 
 class Levels(NamedTuple):
@@ -282,15 +281,12 @@ def _finished(
     c, s = np.cos(theta), np.sin(theta)
     pose = np.empty((len(result), 3))
     pose[:, 0], pose[:, 1], pose[:, 2] = ahead - c * x + s * y + x, aside - s * x - c * y + y, theta
-    # Derivative of the sensor's pose with respect to the robot's.
-    moved = np.empty((len(pose), 3, 3))
-    moved[:] = _IDENTITY
-    moved[:, 0, 2], moved[:, 1, 2] = -s * x - c * y, c * x - s * y
+    # Derivatives of the sensor's place with respect to the robot's heading.
+    across, along = -s * x - c * y, c * x - s * y
     found, factor = sums.found, sums.factor
-    final = moved.transpose(0, 2, 1) @ found.information @ moved / upright(factor, 2)
-    step = np.array(result[:, 32:35])
-    step[:, :2] -= moved[:, :2, 2] * step[:, 2:]
-    length = square_root(larger(column_of(np.einsum("si,sij,sj->s", step, final, step)), 0.0))
+    final = [number / factor for number in moved(found.information, across, along)]
+    ahead, aside, turn = columns_of(result)[32:35]
+    length = square_root(larger(squared_length(final, ahead - across * turn, aside - along * turn, turn), 0.0))
     status = statuses(result, found.lost, length)
     evidence = pair_evidence(result, found.lost, best.other, noise)
     return concluded(

@@ -34,12 +34,12 @@ _LEAST = np.array([1e-3, 3e-3, 1e-3, 1.0, 0.1, 1e-2])
 _NEAR = 0.04
 
 
-def pair_evidence(result: np.ndarray, lost: np.ndarray, other: np.ndarray, noise: np.ndarray) -> np.ndarray:
+def pair_evidence(result: np.ndarray, lost: Column, other: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Return the evidence (S, 9) of results of the kernel ``match_scans``, see :data:`NAMES`; the distance is 0.
 
     Args:
         result: (S, 35) results.
-        lost: (S,) number of lost directions.
+        lost: Number of lost directions.
         other: (S, 3) offsets to poses that agree about as well, NaN without one.
         noise: (S,) standard deviations of ranges [m].
     """
@@ -50,7 +50,7 @@ def pair_evidence(result: np.ndarray, lost: np.ndarray, other: np.ndarray, noise
     evidence = np.zeros((len(result), len(NAMES)))
     values = (
         1 - numbers[3], through / common, seen / larger(common + unseen, 1.0), pairs, np.minimum(rough, 20.0),
-        1 - weights / pairs, column_of(lost), has_rival(other),
+        1 - weights / pairs, lost, has_rival(other),
     )  # fmt: skip
     for column, value in enumerate(values):
         evidence[:, column] = value

@@ -19,7 +19,16 @@ from typing import NamedTuple
 import numpy as np
 
 from gpusense.matching.columns import Column, all_of, column_of, is_not, larger, square_root, upright, values_of
-from gpusense.matching.triangles import UPPER, Triangle, balanced, inverse_of, is_definite, matrices_of, triangle_of
+from gpusense.matching.triangles import (
+    UPPER,
+    Triangle,
+    axes_of_one,
+    balanced,
+    inverse_of,
+    is_definite,
+    matrices_of,
+    triangle_of,
+)
 
 # Probability that an unobserved direction counts as observed, and the normal quantile of its complement.
 FALSE_ALARM, _QUANTILE = 1e-4, 3.72
@@ -49,7 +58,7 @@ class Observed(NamedTuple):
         if not isinstance(self.lost, np.ndarray):
             return others
         information, lost = np.array(self.information), np.array(self.lost)
-        information[:, rows], lost[rows] = np.array(others.information), others.lost
+        information[:, rows], lost[rows] = [*map(values_of, others.information)], others.lost
         return Observed([*information], lost)
 
 
@@ -210,11 +219,19 @@ def orthonormal(vectors: np.ndarray) -> np.ndarray:
 def axes_of(information: np.ndarray, lever: Column) -> tuple[np.ndarray, np.ndarray]:
     """Return ascending eigenvalues (S, 3) of information, exactly 0 where lost, and directions (S, 3, 3) in columns.
 
-    Directions are those of x, y and ``lever`` times the heading.
+    Directions are those of x, y and ``lever`` times the heading; their signs are arbitrary.
     """
+    if not isinstance(lever, np.ndarray):
+        # Where nothing is lost, the axes do not depend on rounding.
+        axes = axes_of_one(balanced(triangle_of(information), lever))
+        if axes[0][0] > _NOTHING * axes[2][0]:
+            sizes, rows = zip(*axes, strict=True)
+            return np.array([sizes]), np.array([rows]).transpose(0, 2, 1)
     scale = balance_of(lever)
     values, vectors = np.linalg.eigh(information * (scale[:, :, None] * scale[:, None, :]))
-    values = np.where(values > _NOTHING * np.maximum(values[:, -1:], 0), values, 0.0)
+    least, largest = column_of(values[:, 0]), column_of(values[:, -1])
+    if not all_of(least > _NOTHING * larger(largest, 0.0)):
+        values = np.where(values > _NOTHING * np.maximum(values[:, -1:], 0), values, 0.0)
     return values, vectors
 
 

@@ -140,6 +140,11 @@ def check_guess(guess: object, matches: int | None, farthest: float = _FARTHEST)
         matches: S, or None for a single match.
         farthest: Largest coordinate.
     """
+    if matches is None and type(guess) is np.ndarray and guess.shape == (3,) and guess.dtype == np.float64:
+        # The other checks take longer than the rest.
+        x, y, heading = guess.tolist()
+        if abs(x) <= farthest and abs(y) <= farthest and math.isfinite(heading):
+            return np.array([[x, y, _turned(heading)]])
     read = checks.as_array("guess", guess)
     shape = (3,) if read.ndim != 2 else ("S" if matches is None else matches, 3)
     values = checks.array("guess", read, shape)
@@ -151,6 +156,11 @@ def check_guess(guess: object, matches: int | None, farthest: float = _FARTHEST)
         x, y, heading = columns_of(result)
         if any_of((abs(x) > farthest) | (abs(y) > farthest)):
             raise ValueError(f"guess: x and y must be within {farthest:g} m, got {checks.show(values)}")
-        turned = np.exp(1j * heading)
-        result[:, 2] = np.arctan2(turned.imag, turned.real)
+        result[:, 2] = _turned(heading)
     return result
+
+
+def _turned(heading: Column) -> Column:
+    """Return headings in [-pi, pi]."""
+    direction = np.exp(1j * heading)
+    return np.arctan2(direction.imag, direction.real)

@@ -6,6 +6,7 @@ Python's numbers take a third of a microsecond. See :mod:`gpusense.matching.colu
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,6 +20,10 @@ UPPER = np.array([0, 1, 2, 4, 5, 8])
 _BOTH = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 # Pivots below this are not divisors.
 _LEAST_PIVOT = 1e-30
+# Numbers beside the diagonal end Jacobi's rotations when all are below this share of the trace, or after these sweeps.
+_ROUNDING, _SWEEPS = 1e-16, 12
+
+Vector = tuple[float, float, float]
 
 
 def triangle_of(matrices: np.ndarray) -> Triangle:
@@ -75,3 +80,45 @@ def squared_length(triangle: Triangle, x: Column, y: Column, turn: Column) -> Co
     """Return v' A v for matrices A and vectors v."""
     xx, xy, xt, yy, yt, tt = triangle
     return x * (xx * x + 2 * (xy * y + xt * turn)) + y * (yy * y + 2 * (yt * turn)) + tt * turn * turn
+
+
+def axes_of_one(triangle: Triangle) -> list[tuple[float, Vector]]:
+    """Return the three eigenvalues of a single matrix in ascending order, with unit vectors.
+
+    Jacobi's rotations (Golub and Van Loan, Matrix Computations, section 8.5) make the numbers beside the diagonal 0.
+    """
+    xx, xy, xt, yy, yt, tt = triangle
+    least = _ROUNDING * (abs(xx) + abs(yy) + abs(tt))
+    a, b, c = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+    for _ in range(_SWEEPS):
+        if abs(xy) <= least and abs(xt) <= least and abs(yt) <= least:
+            break
+        if xy:
+            xx, yy, xt, yt, a, b = _rotated(xx, yy, xy, xt, yt, a, b)
+            xy = 0.0
+        if xt:
+            xx, tt, xy, yt, a, c = _rotated(xx, tt, xt, xy, yt, a, c)
+            xt = 0.0
+        if yt:
+            yy, tt, xy, xt, b, c = _rotated(yy, tt, yt, xy, xt, b, c)
+            yt = 0.0
+    return sorted(((xx, a), (yy, b), (tt, c)))
+
+
+def _rotated(
+    one: float, other: float, both: float, beside: float, across: float, first: Vector, second: Vector
+) -> tuple[float, float, float, float, Vector, Vector]:
+    """Rotate two axes so that the number ``both`` of their row and column, which is not 0, becomes 0.
+
+    Returns:
+        Their two numbers on the diagonal, their two numbers in the third row, and the vectors of both axes.
+    """
+    half = (other - one) / (2 * both)
+    tangent = math.copysign(1.0, half) / (abs(half) + math.sqrt(half * half + 1))
+    cosine = 1 / math.sqrt(tangent * tangent + 1)
+    sine, (a, b, c), (d, e, f) = tangent * cosine, first, second
+    return (
+        one - tangent * both, other + tangent * both, cosine * beside - sine * across, sine * beside + cosine * across,
+        (cosine * a - sine * d, cosine * b - sine * e, cosine * c - sine * f),
+        (sine * a + cosine * d, sine * b + cosine * e, sine * c + cosine * f),
+    )  # fmt: skip

@@ -11,6 +11,7 @@ sum of squares of the sums of blocks of b points is 1 + 2 sum (1 - k / b) rho_k 
 
 from __future__ import annotations
 
+import bisect
 import functools
 import itertools
 from collections.abc import Sequence
@@ -47,8 +48,26 @@ def noise_of(ratio: Column) -> tuple[Column, Column]:
         (S,) deviations in scales, at most 2, and E[w] E[w^2 e^2] / E[d(w e)/de]^2, by which the inverse of the sum of
         w J J' is multiplied.
     """
-    known, sigma, factor = _noise_table()
-    return np.interp(ratio, known, sigma), np.interp(ratio, known, factor)
+    if isinstance(ratio, np.ndarray):
+        known, sigma, factor = _noise_table()
+        return np.interp(ratio, known, sigma), np.interp(ratio, known, factor)
+    return _between(float(ratio))
+
+
+def _between(ratio: float) -> tuple[float, float]:
+    """Return the numbers of ``noise_of`` for one ratio, with the bits of ``numpy.interp``."""
+    known, sigma, factor = _noise_lists()
+    if not ratio < known[-1]:
+        return (sigma[-1], factor[-1]) if ratio == ratio else (ratio, ratio)
+    k = max(bisect.bisect_right(known, ratio) - 1, 0)
+    off, step = larger(ratio - known[k], 0.0), known[k + 1] - known[k]
+    return (sigma[k + 1] - sigma[k]) / step * off + sigma[k], (factor[k + 1] - factor[k]) / step * off + factor[k]
+
+
+@functools.cache
+def _noise_lists() -> list[list[float]]:
+    """Return the ratios, deviations and factors as Python's numbers."""
+    return [column.tolist() for column in _noise_table()]
 
 
 @functools.cache
@@ -81,6 +100,8 @@ def inflation_of(squares: Sequence[Column]) -> Column:
     for before, after in itertools.pairwise([square / first for square in squares]):
         step = after - before
         rises = rises & (step > 0)
+        if rises is False:
+            break
         total, last = total + chosen(rises, step, 0.0), chosen(rises, step, last)
     return 1 + total + last
 

@@ -59,10 +59,9 @@ def tested(
     """
     numbers, deviation = columns_of(result), column_of(noise)
     weights = larger(numbers[19], 1e-30)
-    scale = np.array([options.least_scale for options in levels])[device.level]
-    variance, factor = variance_of(
-        numbers[20] / weights, numbers[19], column_of(scale), deviation, inflation_of(numbers[24:32])
-    )
+    scales = [options.least_scale for options in levels]
+    scale = scales[0] if len(scales) == 1 else np.array(scales)[device.level]
+    variance, factor = variance_of(numbers[20] / weights, numbers[19], scale, deviation, inflation_of(numbers[24:32]))
     largest = larger(variance, deviation * deviation)
     # Short lines decide only where the result is beyond doubt.
     found = observed_pairs(numbers[6:12], numbers[12:18], largest, column_of(lever), None)
@@ -122,10 +121,10 @@ def concluded(
         # These are not the axes of the information that is kept.
         matrices = np.where(upright(usable, 2), matrices, 0.0)
     shares = values * upright(factor / larger(column_of(pairs), 1.0))
-    return ScanMatch(
-        pose, covariance_of(matrices, lever_column, window, kept), matrices, np.zeros(len(pose)), score,
-        iterations.astype(np.int64), shares, vectors.transpose(0, 2, 1),
-        lever, noise, evidence, status,
+    return ScanMatch.of(
+        pose=pose, covariance=covariance_of(matrices, lever_column, window, kept), information=matrices,
+        p_right=np.zeros(len(pose)), score=score, iterations=iterations.astype(np.int64), eigenvalues=shares,
+        directions=vectors.transpose(0, 2, 1), lever=lever, noise=noise, evidence=evidence, status=status,
     )  # fmt: skip
 
 

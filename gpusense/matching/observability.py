@@ -73,8 +73,9 @@ _RATIO_OF_FEW_LINES: float = critical_ratio(_LEAST_LINES)
 
 
 def observed_information(
-    information: Triangle, spurious: Triangle, lever: Column, lines: Column | None, least: Column
-) -> Observed:
+    information: Triangle, spurious: Triangle, lever: Column, lines: Column | None, least: Column,
+    unneeded: Column = False,
+) -> Observed:  # fmt: skip
     """Remove from the information of pairs the directions that they do not observe.
 
     Args:
@@ -83,24 +84,26 @@ def observed_information(
         lever: Lengths by which headings are multiplied [m].
         lines: Lines of the scan without a common point; None for few.
         least: Least pairs of an observed direction.
+        unneeded: Which matches need no information if they lose a direction; their number of these may then be 1.
     """
     total = balanced(information, lever)
     made_up = _with_diagonal(balanced(spurious, lever), _SPURIOUS, _SPURIOUS)
     critical = _RATIO_OF_FEW_LINES if lines is None else critical_ratio(lines)
     # All directions are observed where I exceeds S times the critical ratio, and the least number of pairs.
-    beyond = [whole - critical * part for whole, part in zip(total, made_up, strict=True)]
-    clear = is_definite(beyond) & is_definite(_with_diagonal(total, -least, -least))
+    beyond = is_definite([whole - critical * part for whole, part in zip(total, made_up, strict=True)])
+    clear = beyond & is_definite(_with_diagonal(total, -least, -least))
     # Then noise contributes S.
     less = [whole - part for whole, part in zip(information, spurious, strict=True)]
     left = _with_diagonal(less, -_SPURIOUS, -_SPURIOUS * (lever * lever))
     if all_of(clear):
         return Observed(left, np.zeros(len(clear), np.intp) if isinstance(clear, np.ndarray) else 0)
-    count, rows = len(values_of(clear)), np.flatnonzero(is_not(clear))
+    skipped = values_of(unneeded & is_not(beyond))
+    count, rows = len(skipped), np.flatnonzero(is_not(clear | skipped))
     some, noise = (matrices_of([values_of(column)[rows] for column in triangle]) for triangle in (total, made_up))
     found, lost = _partly_observed(some, noise, *(np.broadcast_to(limit, count)[rows] for limit in (critical, least)))
     # The test on pairs is strict, so some matches have no lost direction.
     gone, rows = lost > 0, rows[lost > 0]
-    parts, numbers = np.array([*map(values_of, left)]), np.zeros(count, np.intp)
+    parts, numbers = np.array([*map(values_of, left)]), skipped.astype(np.intp)
     parts[:, rows] = balanced([*found[gone].reshape(-1, 9).T[UPPER]], 1 / values_of(lever)[rows])
     numbers[rows] = lost[gone]
     return Observed([*map(column_of, parts)], column_of(numbers))

@@ -92,16 +92,23 @@ class MatchOptions:
 
     def starts(self) -> np.ndarray:
         """Return (M, 3) offsets of the starts of a search: a hexagonal grid of places times headings."""
-        step, turn = 0.6 * self.capture, math.radians(15.0)
-        reach, half = self.window
-        rings = int(reach / step * 2 / math.sqrt(3)) + 1
-        i, j = np.meshgrid(np.arange(-2 * rings, 2 * rings + 1), np.arange(-rings, rings + 1))
-        x, y = step * (i + 0.5 * j).ravel(), step * (math.sqrt(0.75) * j).ravel()
-        inside = np.hypot(x, y) <= max(reach, 1e-9) * (1 + 1e-9)
-        count = int(half / turn + 1e-9)
-        turns = turn * np.arange(-count, count + 1)
-        places = np.stack([x[inside], y[inside]], axis=1)
-        return np.concatenate([np.column_stack([places, np.full(len(places), angle)]) for angle in turns])
+        return _starts(self.capture, *self.window)
+
+
+@functools.lru_cache(maxsize=16)
+def _starts(capture: float, reach: float, half: float) -> np.ndarray:
+    """Return the offsets of ``MatchOptions.starts`` in a window."""
+    step, turn = 0.6 * capture, math.radians(15.0)
+    rings = int(reach / step * 2 / math.sqrt(3)) + 1
+    i, j = np.meshgrid(np.arange(-2 * rings, 2 * rings + 1), np.arange(-rings, rings + 1))
+    x, y = step * (i + 0.5 * j).ravel(), step * (math.sqrt(0.75) * j).ravel()
+    inside = np.hypot(x, y) <= max(reach, 1e-9) * (1 + 1e-9)
+    count = int(half / turn + 1e-9)
+    turns = turn * np.arange(-count, count + 1)
+    places = np.stack([x[inside], y[inside]], axis=1)
+    starts = np.concatenate([np.column_stack([places, np.full(len(places), angle)]) for angle in turns])
+    starts.flags.writeable = False
+    return starts
 
 
 def check_options(noise: object, capture: object, window: object) -> MatchOptions:

@@ -62,7 +62,7 @@ class ScanMatch:
         iterations: Iterations of the last refinement.
         eigenvalues: (3,) ascending: the share of pairs of points that constrain each direction of the pose; 0 if none.
         directions: (3, 3) rows: the directions of the eigenvalues in x [m], y [m] and theta, where theta is multiplied
-            by ``lever``.
+            by ``lever``; their signs are arbitrary.
         lever: Root mean square range of the second scan [m].
         noise: Standard deviation of ranges that was used [m].
         evidence: (E,) numbers from which ``p_right`` is computed, see :data:`gpusense.matching.evidence.NAMES`.

@@ -130,8 +130,9 @@ def variance_of(
 
 
 def observed_pairs(
-    information: Triangle, doubt: Triangle, variance: Column, lever: Column, lines: Column | None
-) -> Observed:
+    information: Triangle, doubt: Triangle, variance: Column, lever: Column, lines: Column | None,
+    unneeded: Column = False,
+) -> Observed:  # fmt: skip
     """Return the information that pairs of points and lines observe.
 
     Args:
@@ -140,8 +141,10 @@ def observed_pairs(
         variance: Variances of the points [m^2].
         lever: Lengths by which headings are multiplied [m].
         lines: Lines without a common point; None for few.
+        unneeded: Which matches need no information if they lose a direction.
     """
-    return observed_information(information, [part * variance for part in doubt], lever, lines, LEAST_PAIRS)
+    spurious = [part * variance for part in doubt]
+    return observed_information(information, spurious, lever, lines, LEAST_PAIRS, unneeded)
 
 
 def statuses(result: np.ndarray, lost: Column, step: Column) -> np.ndarray:

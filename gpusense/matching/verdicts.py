@@ -64,9 +64,10 @@ def tested(
     variance, factor = variance_of(numbers[20] / weights, numbers[19], scale, deviation, inflation_of(numbers[24:32]))
     largest = larger(variance, deviation * deviation)
     # Short lines decide only where the result is beyond doubt.
-    found = observed_pairs(numbers[6:12], numbers[12:18], largest, column_of(lever), None)
+    are_longer = LONG_WIDTH * deviation > WIDTH
+    found = observed_pairs(numbers[6:12], numbers[12:18], largest, column_of(lever), None, are_longer)
     turned = noisy | ((numbers[12] + numbers[15]) * largest > _TURNED_LINES * weights)
-    longer_lines = ((found.lost > 0) | turned) & (LONG_WIDTH * deviation > WIDTH)
+    longer_lines = ((found.lost > 0) | turned) & are_longer
     if any_of(longer_lines):
         rows = np.flatnonzero(longer_lines)
         device.fit_lines(lambda level: LONG_WIDTH * level, rows)

@@ -206,6 +206,7 @@ def test_observability_is_invariant_and_lost_wholly():
     found = observed_information(triangle_of(total), triangle_of(spurious), 1.0, 30.0, 1.5)
     information = matrices_of(found.information)
     assert found.lost == 1
+    assert observed_information(triangle_of(total), triangle_of(spurious), 1.0, 30.0, 1.5, unneeded=True).lost == 1
     assert np.abs(information[0] @ lost).max() < 1e-9
     assert np.isinf(np.diagonal(covariance_of(information, 1.0, (1.0, 1.0))[0])).all()
     strong = observed_information(triangle_of(10 * total), triangle_of(spurious), 1.0, 30.0, 1.5)

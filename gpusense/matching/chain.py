@@ -119,7 +119,7 @@ def match_pairs(
         device = IcpPairs(backend, real, points, pairs, noise, space)
         levels = Levels([options.at_noise(level) for level in device.levels], device.most_points(), points.gap)
         result = device.run(np.arange(len(pairs)), sensor[:, None], levels.rules())[:, 0]
-        best = Best(result, np.repeat(_NO_OTHER, len(pairs), axis=0))
+        best = Best(result, _NO_OTHER.repeat(len(pairs), axis=0))
         if method == "auto":
             score = columns_of(result)[3]
             if any_of(score < _SURE):
@@ -197,8 +197,7 @@ def _prior(result: np.ndarray, guess: np.ndarray, options: MatchOptions) -> np.n
 
 def _is_moved(result: np.ndarray, guess: np.ndarray, distance: float, turn: float) -> Column:
     """Return which results differ from their guesses by more than a distance along an axis [m], or a turn [rad]."""
-    pose = columns_of(result[:, :3])
-    x, y, heading = (abs(one - other) for one, other in zip(pose, columns_of(guess), strict=True))
+    x, y, heading = map(abs, columns_of(result[:, :3] - guess))
     return (x > distance) | (y > distance) | (heading > turn)
 
 

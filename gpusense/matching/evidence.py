@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from gpusense.matching.columns import Column, column_of, columns_of, larger, rows_of, smaller, square_root
+from gpusense.matching.columns import Column, column_of, columns_of, larger, rows_of, smaller, square_root, values_of
 
 NAMES = ("disagreement", "contradiction", "overlap", "pairs", "roughness", "misfit", "lost", "rival", "distance")
 """Evidence for and against a match.
@@ -30,7 +30,7 @@ DOUBTED, DOUBTED_PARTLY = 0.65, 0.03
 # Constant, then weights: of the logarithms of disagreement, contradiction, overlap, pairs, roughness and misfit, of one
 # lost direction, of a second one, of a rival, and of the logarithm of the distance.
 _CONSTANT = -3.123
-_WEIGHTS = np.array([-1.350, -0.164, 1.574, -0.067, -0.202, -0.692, -1.395, 0.622, -2.158, -1.788])
+_WEIGHTS = (-1.350, -0.164, 1.574, -0.067, -0.202, -0.692, -1.395, 0.622, -2.158, -1.788)
 # Offset of distances, and lower bounds of the arguments of logarithms; of lost and rival there are none.
 _NEAR = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.04])
 _LEAST = np.array([1e-3, 3e-3, 1e-3, 1.0, 0.1, 1e-2, 1.0, 1.0, 0.0])
@@ -65,17 +65,15 @@ def has_rival(other: np.ndarray) -> Column:
     return np.isfinite(total) if isinstance(total, np.ndarray) else math.isfinite(total)
 
 
-def features_of(evidence: np.ndarray) -> np.ndarray:
-    """Return the numbers (S, 10) that the weights multiply."""
-    features, (lost, rival) = np.empty((len(evidence), len(_WEIGHTS))), columns_of(evidence)[6:8]
-    logarithms = np.log(np.maximum(evidence + _NEAR, _LEAST))
-    features[:, :6], features[:, 9] = logarithms[:, :6], logarithms[:, 8]
-    features[:, 6], features[:, 7], features[:, 8] = lost > 0, lost > 1, rival
-    return features
+def features_of(evidence: np.ndarray) -> list[Column]:
+    """Return the ten columns that the weights multiply."""
+    logarithms, (lost, rival) = columns_of(np.log(np.maximum(evidence + _NEAR, _LEAST))), columns_of(evidence)[6:8]
+    return [*logarithms[:6], lost > 0, lost > 1, rival, logarithms[8]]
 
 
 def probability_right(evidence: np.ndarray) -> np.ndarray:
     """Return the probabilities (S,) that poses are right along their observed directions."""
-    against = np.minimum(-(_CONSTANT + features_of(evidence) @ _WEIGHTS), _MOST)
-    p: np.ndarray = 1 / (1 + np.exp(against))
-    return p
+    total: Column = _CONSTANT
+    for weight, feature in zip(_WEIGHTS, features_of(evidence), strict=True):
+        total = total + weight * feature
+    return values_of(1 / (1 + np.exp(smaller(-total, _MOST))))

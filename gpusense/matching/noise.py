@@ -37,11 +37,10 @@ def scan_noise(ranges: np.ndarray, scanner: Scanner) -> np.ndarray:
     if scanner.count < 3 or not len(ranges):
         return np.full(len(ranges), np.nan)
     places, left, right = _neighbors(scanner)
-    readings = ranges.astype(np.float64)
-    hit = hits(readings, scanner.range_min, scanner.range_max)
-    before, here, after = (readings[:, part] for part in places)
-    use = hit[:, places[0]] & hit[:, places[1]]
-    use &= hit[:, places[2]]
+    readings = ranges.astype(np.float64, copy=False)
+    # Comparisons with readings that are no hits are false.
+    known = np.where(hits(readings, scanner.range_min, scanner.range_max), readings, np.nan)
+    before, here, after = (known[:, part] for part in places)
     with np.errstate(all="ignore"):
         expected = 1 / (left / before + right / after)
         # Standard deviation of the difference, with the errors of both neighbours times their derivatives.
@@ -49,13 +48,14 @@ def scan_noise(ranges: np.ndarray, scanner: Scanner) -> np.ndarray:
             1 + np.square(np.square(expected / before) * left) + np.square(np.square(expected / after) * right)
         )
         limit = _STEP * here
-        use &= expected > 0
+        use = expected > 0
         use &= np.abs(before - here) < limit
         use &= np.abs(after - here) < limit
         off = np.where(use, np.abs(here - expected) / share, np.inf)
         number = np.add.reduce(use, axis=1, dtype=np.intp)
         off.sort(axis=1)
-        deviation = off[np.arange(len(off)), np.maximum(number - 1, 0) // 2] / _MEDIAN
+        middle = np.arange(0, off.size, off.shape[1]) + np.maximum(number - 1, 0) // 2
+        deviation = off.take(middle) / _MEDIAN
         rounding = _rounding(np.where(use, here, np.inf), deviation)
         return np.where(number >= _LEAST, np.maximum(deviation, rounding), np.nan)
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gpusense.matching.columns import Column, columns_of, larger
+from gpusense.matching.columns import Column, larger
 
 Triangle = Sequence[Column]
 
@@ -28,8 +28,10 @@ Vector = tuple[float, float, float]
 
 def triangle_of(matrices: np.ndarray) -> Triangle:
     """Return the triangles of symmetric matrices (S, 3, 3)."""
-    triangle: Triangle = columns_of(matrices.reshape(-1, 9)[:, UPPER])
-    return triangle
+    if len(matrices) != 1:
+        return [*matrices.reshape(-1, 9).T[UPPER]]
+    xx, xy, xt, _, yy, yt, _, _, tt = matrices.ravel().tolist()
+    return xx, xy, xt, yy, yt, tt
 
 
 def matrices_of(triangle: Triangle) -> np.ndarray:

@@ -38,9 +38,7 @@ def test_one_call_is_many_calls(pairs):
         alone = gs.match_scan(first[i], second[i], RING, truth[i], backend="numpy")
         assert alone.pose.tolist() == together.pose[i].tolist()
         assert alone.status == together.status[i]
-        # A product of BLAS rounds by the number of its rows.
-        np.testing.assert_allclose(together[i].p_right, alone.p_right, rtol=1e-12)
-        for name in ("covariance", "information", "evidence", "score", "lever", "noise"):
+        for name in ("covariance", "information", "p_right", "evidence", "score", "lever", "noise"):
             np.testing.assert_array_equal(getattr(together[i], name), getattr(alone, name), err_msg=name)
         # Axes of a single match are computed without LAPACK, and their signs are arbitrary.
         np.testing.assert_allclose(together[i].eigenvalues, alone.eigenvalues, rtol=1e-12)

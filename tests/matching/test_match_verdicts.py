@@ -211,7 +211,7 @@ def test_observability_is_invariant_and_lost_wholly():
     assert np.isinf(np.diagonal(covariance_of(information, 1.0, (1.0, 1.0))[0])).all()
     strong = observed_information(triangle_of(10 * total), triangle_of(spurious), 1.0, 30.0, 1.5)
     assert strong.lost == 0
-    # What is left of an observed information is the information less what noise contributes.
+    # An observed information loses the part that noise contributes, and nothing else.
     expected = 10 * total - spurious - 1e-3 * np.eye(3)
     np.testing.assert_allclose(matrices_of(strong.information), expected, rtol=1e-12)
 

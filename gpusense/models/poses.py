@@ -19,7 +19,7 @@ from gpusense.interface.constants import LARGEST_HEADING
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
-from gpusense.tables.reachable import ReachableMap
+from gpusense.tables.reachable import MapState, ReachableMap
 from gpusense.world.frames import Cells, Mount, frame_of, place_poses
 from gpusense.world.windows import Corners, Window
 
@@ -77,9 +77,9 @@ class Poses:
             self._last_corners = part, corners_of(arrays.bounds_of(self.host[slice(*part)]))
         return self._last_corners[1]
 
-    def window(self, table: ReachableMap, part: Part) -> tuple[Buffer, Window]:
-        """Return the map's table for some poses, and its window."""
-        return table.ensure(self.hull if self.host is None else self.corners(part))
+    def ensure_table(self, reachable: ReachableMap, part: Part) -> MapState:
+        """Return the map with a table for some poses."""
+        return reachable.ensure(self.corners(part) or self.hull)
 
     @property
     def flags(self) -> frozenset[str]:
@@ -202,12 +202,13 @@ def place(
         real: Precision of the placed poses.
         careful: Whether low parts are needed.
     """
-    source, count, corners = poses.buffer(backend, space, part), part[1] - part[0], poses.corners(part)
+    count, corners, flags = part[1] - part[0], poses.corners(part), poses.flags
     lows = 4 * count if careful else 4
+    source = poses.buffer(backend, space, part)
     if source is None:
         _place_on_host(poses, part, frame, space, real, careful=careful)
-        return PlacedPoses(count, corners, frame, space, real, lows, poses.flags)
-    flags = poses.flags | _precision_flags(real == _DOUBLE, careful)
+        return PlacedPoses(count, corners, frame, space, real, lows, flags)
+    flags = flags | _precision_flags(real == _DOUBLE, careful)
     return PlacedPoses(count, corners, frame, space, real, lows, flags, source, backend.info.lanes)
 
 

@@ -6,8 +6,9 @@ typedef doubles Total_lanes;
 
 // Return 8 numbers from first on, and missing in place of those from end on.
 doubles eight_at_lanes(global const double *values, const int first, const int end, const double missing) {
+    if (end - first >= DOUBLES) return vload8(0, values + first);
     const choices there = (choices)(0, 1, 2, 3, 4, 5, 6, 7) < (long)(end - first);
-    const doubles found = load_doubles(values, first, min(DOUBLES, end - first));
+    const doubles found = load_doubles(values, first, end - first);
     return there ? found : (doubles)missing;
 }
 

@@ -199,7 +199,7 @@ class DeviceCall(BoundCall):
             # Keep the table, since another call of the model may replace it; free the last one first.
             self._table = None
             self._programs.clear()
-            state = self._poses.ensure_table(pipeline.map, (0, self._poses.count))
+            state = self._poses.ensure_table(pipeline.map, (0, self._poses.count), pipeline.backend)
             self._table, version = state.table, state.version
             program = RecordedProgram(backend, self._program())
         # Other streams may use the buffers of this one first.

@@ -144,7 +144,7 @@ class MapCaster:
         """Make the table for some poses."""
         if poses.count:
             with self._lock:
-                poses.ensure_table(self.map, (0, poses.count))
+                poses.ensure_table(self.map, (0, poses.count), self.backend)
 
     def save(self, path: Path, bins: int) -> None:
         """Write the look-up table."""
@@ -166,7 +166,8 @@ class MapCaster:
         Returns:
             (N, K) expected ranges, or angles of incidence.
         """
-        checked, rays = Poses(poses, self.backend), len(vectors)
+        rays = len(vectors)
+        checked = Poses(poses, self.backend, late=rays > 0)
         result = Result(poses, out, (checked.count, rays), self.real, self.backend, on_device=checked.on_device)
         if checked.count * rays:
             with self._lock, self._workspace:
@@ -202,7 +203,7 @@ class MapCaster:
     ) -> None:
         """Start drawing the readings of a piece."""
         space, count, info = self._workspace, piece.count, self.backend.info
-        state = poses.ensure_table(self.map, piece.part)
+        state = poses.ensure_table(self.map, piece.part, self.backend, space)
         placed = place(poses, piece.part, Frame(state.window, state.grid, self.mount), self.backend, space, self.real)
         cosines = space.empty("cosines", count * rays if "INCIDENCE" in cones.flags else 1, self.real)
         with space.result("ranges", flat, piece.begin * rays, count * rays, self.real) as result:
@@ -219,7 +220,7 @@ class MapCaster:
     def _cast(self, poses: Poses, piece: Piece, ray: Buffer, rays: int, flat: Any, cones: Cones) -> None:
         """Start casting the rays of a piece."""
         space, count = self._workspace, piece.count
-        state = poses.ensure_table(self.map, piece.part)
+        state = poses.ensure_table(self.map, piece.part, self.backend, space)
         placed = place(poses, piece.part, Frame(state.window, state.grid, self.mount), self.backend, space, self.real)
         with space.result("ranges", flat, piece.begin * rays, count * rays, self.real) as result:
             other = space.empty("echoes", count * rays if "INCIDENCE" in cones.flags else 1, self.real)

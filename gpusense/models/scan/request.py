@@ -87,11 +87,11 @@ def make_request(
     known = {} if known is None else known
     shape: tuple[int, ...]
     if readings.ndim == 1:
-        checked = known[None] = known.get(None) or Poses(poses, backend)
+        checked = known[None] = known.get(None) or Poses(poses, backend, late=True)
         readings, shape = readings[None], (checked.count,)
     else:
         scans = len(readings)
-        checked = known[scans] = known.get(scans) or Poses(poses, backend, scans=scans)
+        checked = known[scans] = known.get(scans) or Poses(poses, backend, scans=scans, late=True)
         shape = (scans, checked.count // scans if scans else np.shape(poses)[1])
     result = Result(poses, out, shape, real, backend, on_device=checked.on_device)
     parts = np.zeros((len(readings), shape[-1], beams if per_beam else 0), real)

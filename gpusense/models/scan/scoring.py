@@ -127,6 +127,8 @@ class _Scorer:
             with space.result("log_p", request.result.flat, piece.begin, piece.count, pipeline.real) as log_p:
                 pipeline.backend.upload(np.full(piece.count, value, pipeline.real), log_p)
         else:
+            # Poses that are not finite are refused whatever the readings.
+            request.poses.corners(piece.part, pipeline.backend)
             request.result.flat[piece.begin : piece.end] = value
         if request.per_beam:
             rows, finite = self._rows(piece), np.isfinite(scans.readings)

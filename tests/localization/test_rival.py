@@ -251,17 +251,22 @@ def test_the_comparison_has_the_likeliest_other_place(model):
         compared = search.found(pose, spread, [(0, (ranges,))], (0, 0, 0), temperature)
         others = log_p[are_apart(np.vstack([here, there, anywhere]), pose)]
         # Poses of the search are 0.1 m and 3 degrees apart, and the nearest one is a little less likely.
-        assert compared.lead > temperature * float(others.max() - mine) - 1.0
+        if not is_found:
+            assert compared.lead > temperature * float(others.max() - mine) - 1.0 and compared.walls < 0
         assert compared.is_found == is_found and compared.beams == pytest.approx(temperature * SCANNER.count)
         assert compared.ratio < -1.5 if is_found else compared.ratio > 0.2
 
 
 def test_a_comparison_needs_information_and_has_limits():
-    def ratio(lead, beams, is_found=False):
-        return ratio_of_places(lead, beams, is_found=is_found)
+    def ratio(lead, beams, walls=-20.0, is_found=False):
+        return ratio_of_places(lead, beams, walls, is_found=is_found)
 
-    assert ratio(-math.inf, 10.0) < -3 and ratio(math.inf, 10.0) == ratio(9.0, 10.0) > 1
+    assert ratio(-math.inf, 10.0) < -2.5 and ratio(math.inf, 10.0) == ratio(9.0, 10.0) > 1
     assert ratio(2.0, 10.0, is_found=True) == pytest.approx(ratio(2.0, 10.0) - IS_FOUND * 10 / 11)
     # A scan with hardly any information is no evidence.
     assert abs(ratio(0.0, 0.01, is_found=True)) < 0.05
     assert math.isnan(ratio(math.nan, 10.0)) and math.isnan(ratio(1.0, 0.0))
+    # The lead of a place that its own beams contradict says nothing, and a pose that none leads stays right.
+    even = math.log((math.exp(ratio(9.0, 10.0)) + 1) / 2)
+    assert ratio(9.0, 10.0, walls=0.0) == pytest.approx(even) and 0 < ratio(9.0, 10.0, walls=5.0) < 0.1
+    assert ratio(-2.0, 10.0, walls=5.0) == ratio(-2.0, 10.0)

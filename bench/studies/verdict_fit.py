@@ -37,7 +37,7 @@ from gpusense._util.progress import progress
 from gpusense.localization.passages import counts_of, passages
 from gpusense.localization.ratio import BY_CHANCE, FARTHEST, FEW, HALF, IS_FOUND, NEAREST, OF_LEAD, ratio_of_scan
 from gpusense.localization.rival_search import RivalSearch
-from gpusense.localization.spread import deviations, is_wide
+from gpusense.localization.spread import is_wide
 
 EDGES = (-math.inf, -5, -4, -3, -2, -1, 0, 1, 2, 3, 4, math.inf)
 WAYS = (0.0, 0.1, 0.3, 0.6, 1.0, 1.5, 2.5, 4.0)
@@ -76,7 +76,7 @@ def follow(seed, args):
         wrong = case == "wrong" or position > 1 or heading > 0.5
         if is_wide(covariance) or (not wrong and (position > 0.5 or heading > 0.25)):
             continue
-        found = passages(grid, scanner, pose, event.ranges, deviations(covariance))
+        found = passages(grid, scanner, pose, event.ranges, covariance)
         rows.append((wrong, *counts_of([found]), *pose[:2]))
         if k % SEARCHED == SEARCHED - 1:
             tracker = pf._parts.tracker

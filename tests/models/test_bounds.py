@@ -80,7 +80,8 @@ def test_results_have_the_bits_of_poses_that_the_host_bounds(
     real = poses_module.bounds_on_device
     monkeypatch.setattr(poses_module, "bounds_on_device", lambda *given: used.append(given[-1]) or real(*given))
     for name, call in calls(device):
-        for poses in (cloud, turned, cloud[:3]):
+        # Each number of poses once each way, since GPUs have a shorter path for sizes that repeat.
+        for poses in (cloud, turned[1:], cloud[:3]):
             used.clear()
             found = call(poses)  # type: ignore[operator]
             assert bool(used) == (len(poses) > 3 and not name.startswith("no ")), name

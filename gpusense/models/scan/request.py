@@ -13,7 +13,7 @@ from gpusense.models.poses import Poses
 from gpusense.models.scan.classed import check_ranges
 from gpusense.models.scan.rules import ModelContext
 
-_FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
+FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
 # Poses that several models share, checked once, by the number of scans.
 Known = MutableMapping[int | None, Poses]
 
@@ -80,7 +80,7 @@ def make_request(
     """
     backend, real, scanner = setting.backend, setting.real, setting.rules.scanner
     beams = scanner.count
-    if type(ranges) is np.ndarray and ranges.shape == (beams,) and ranges.dtype in _FLOATS:
+    if type(ranges) is np.ndarray and ranges.shape == (beams,) and ranges.dtype in FLOATS:
         readings: np.ndarray = ranges
     else:
         readings = check_ranges(arrays.copied_to_host(ranges, backend, "ranges"), scanner)

@@ -99,6 +99,14 @@ def parse(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) ->
     return arguments
 
 
+def part_of(text: str) -> tuple[int, int]:
+    """Return i and n of the option "i/n": the i-th of n parts."""
+    first, count = map(int, text.split("/"))
+    if not 1 <= first <= count:
+        raise argparse.ArgumentTypeError(f"must be i/n with 1 <= i <= n, got {text}")
+    return first, count
+
+
 def present(*, numpy: bool = True) -> list[str]:
     """List the selection strings of the machine's devices, without simulators."""
     found = [device for device in gs.devices() if device.available and device.kind != "simulator"]

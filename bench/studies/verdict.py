@@ -15,7 +15,6 @@ runs to a file; ``--join`` makes the page of all shards.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import math
 import sys
@@ -27,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import numpy as np
 import recordings
 import verdict_runs as runs
-from common import command_line, make_parser, parse, publish
+from common import command_line, make_parser, parse, part_of, publish
 from verdict_report import page
 
 import gpusense as gs
@@ -141,13 +140,6 @@ def run_shard(args):
     print(f"{len(kept)} runs, {lengths.sum()} scans in {time.time() - begin:.0f} s: {args.raw}")
 
 
-def _shard(text):
-    first, count = map(int, text.split("/"))
-    if not 1 <= first <= count:
-        raise argparse.ArgumentTypeError(f"must be i/n with 1 <= i <= n, got {text}")
-    return first, count
-
-
 def main() -> None:
     parser = make_parser(__doc__, backend="opencl", seed=False)
     parser.add_argument("--model", default="field", choices=("field", "beam", "discrete"))
@@ -157,7 +149,7 @@ def main() -> None:
     parser.add_argument("--maps", type=int, default=2, help="other maps of each log and setting")
     parser.add_argument("--simulated", type=int, default=300, help="simulated runs")
     parser.add_argument("--groups", nargs="+", default=list(GROUPS), choices=GROUPS)
-    parser.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N")
+    parser.add_argument("--shard", type=part_of, default=(1, 1), metavar="I/N")
     parser.add_argument("--limit", type=int, help="most runs of the shard")
     parser.add_argument("--seconds", type=float, help="begin no more runs of the shard after this time")
     parser.add_argument("--raw", type=Path, default=Path("verdict_shard.npz"), help="file of the shard's runs")

@@ -84,25 +84,29 @@ def _adopt(array: Any, backend: Backend, name: str, *, in_place: bool = False) -
     )
 
 
-def host_poses(array: object, name: str, scans: int | None = None) -> tuple[np.ndarray, Bounds]:
-    """Return (N, 3) poses in host memory, or the poses of S scans in sequence, and their bounds.
-
-    The poses are C-contiguous float64 numbers. The bounds, which calls need anyway, reveal NaN and infinities.
+def host_poses(array: object, name: str, scans: int | None = None) -> np.ndarray:
+    """Return (N, 3) poses in host memory, or the poses of S scans in sequence: C-contiguous float64 numbers.
 
     Raises:
         TypeError: Not numbers.
-        ValueError: Another shape, or a value that is not finite.
+        ValueError: Another shape.
     """
     read = array if type(array) is np.ndarray else to_host(array, name)
     shape = ("N", 3) if scans is None else (scans, "N", 3)
     if scans is None and isinstance(read, np.ndarray) and read.dtype.kind == "f" and read.shape[1:] == (3,):
-        poses = np.ascontiguousarray(read, np.float64)
-    else:
-        poses = np.ascontiguousarray(checks.array(name, read, shape, finite=False)).reshape(-1, 3)
-    bounds = bounds_of(poses)
+        return np.ascontiguousarray(read, np.float64)
+    return np.ascontiguousarray(checks.array(name, read, shape, finite=False)).reshape(-1, 3)
+
+
+def check_bounds(bounds: Bounds, poses: np.ndarray, name: str, scans: int | None = None) -> None:
+    """Refuse poses in host memory whose bounds, which calls need anyway, reveal NaN or infinities.
+
+    Raises:
+        ValueError: A value is not finite.
+    """
     if not all(map(math.isfinite, (*bounds[0], *bounds[1]))):
-        checks.array(name, read, shape)
-    return poses, bounds
+        shape = ("N", 3) if scans is None else (scans, "N", 3)
+        checks.array(name, poses if scans is None else poses.reshape(scans, -1, 3), shape)
 
 
 def bounds_of(poses: np.ndarray) -> Bounds:

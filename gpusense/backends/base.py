@@ -75,6 +75,13 @@ class Backend(ABC):
         Without ``wait`` the array must not change until ``synchronize`` has returned.
         """
 
+    def refill(self, array: np.ndarray, buffer: Buffer) -> None:
+        """Start copying an array into the beginning of a buffer that no unfinished work uses.
+
+        The array must not change until ``synchronize`` has returned.
+        """
+        self.upload(array, buffer, wait=False)
+
     @abstractmethod
     def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
         """Allocate a buffer of ``count`` numbers, cleared with ``zero``.

@@ -42,6 +42,7 @@ class Proxy(Backend):
     in_batch = _forwarded_property("in_batch")
     replays = _forwarded_property("replays")
     upload, empty, download, part = map(_forwarded, ("upload", "empty", "download", "part"))
+    refill = _forwarded("refill")
     empty_result, blank, copy, copies_from = map(_forwarded, ("empty_result", "blank", "copy", "copies_from"))
     compile, source, synchronize = map(_forwarded, ("compile", "source", "synchronize"))
     largest_group = _forwarded("largest_group")

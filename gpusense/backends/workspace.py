@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.programs import ChangingProgram, ProgramCache, RecordedProgram
 from gpusense.interface.launches import Program
+
+T = TypeVar("T")
 
 # Number of programs of earlier calls that are kept.
 _MOST_KEPT = 64
@@ -60,7 +62,7 @@ class Workspace:
         # Host arrays that unfinished copies read or write.
         self._busy: list[np.ndarray] = []
         # Programs of earlier calls, keyed by everything on which they depend.
-        self._programs = ProgramCache[ChangingProgram | RecordedProgram](_MOST_KEPT)
+        self._programs = ProgramCache[Any](_MOST_KEPT)
         self._version = 0
         self._parts: dict[Hashable, list[Buffer]] = {}
         # Keys of arrays that buffers hold, with these buffers.
@@ -124,6 +126,18 @@ class Workspace:
             )
         kept(changing)
         return kept.flags
+
+    def kept(self, key: Hashable, version: int) -> Any:
+        """Return what ``keep`` has stored; None if it has gone with a buffer, or with the table of the map."""
+        return self._programs.get(("kept", key)) if version == self._version else None
+
+    def keep(self, key: Hashable, program: T, version: int) -> T:
+        """Store a program on this workspace's buffers for a version of the map's table, and return it."""
+        if version != self._version:
+            self._programs.clear()
+            self._version = version
+        self._programs.keep(("kept", key), program)
+        return program
 
     def _identity(self, value: Any) -> Hashable:
         """Return a number or struct as it is, and a buffer by its address."""

@@ -12,7 +12,8 @@ from gpusense.evaluation.agreement import Model
 from gpusense.evaluation.worlds import cloud_uniform
 from gpusense.localization.belief import Belief
 from gpusense.localization.diagnosis import Diagnosis, evidence_of
-from gpusense.localization.passages import MapJudge, Passages, passages
+from gpusense.localization.map_judge import MapJudge
+from gpusense.localization.passages import Passages, passages
 from gpusense.localization.ratio import explained_of_scan, ratio_of_scan
 from gpusense.localization.temperature import BeamCorrelation, learn_from_scan
 from gpusense.localization.words import LOST, TRACKING, Word

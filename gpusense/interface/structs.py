@@ -146,18 +146,21 @@ class MatchRules(NamedTuple):
 
 
 class BeamRules(NamedTuple):
-    """Origin and companions of a scan's rays in the map, and rules for its readings; see the kernel file ``passages``.
+    """Companions of a scan's rays in a part of the map, and rules for its readings; see the kernel file ``passages``.
 
-    The origin is relative to the map's corner, along its axes [m]; ``cell`` is the side of a cell. Companions start
-    ``beside`` the beam [m] and diverge by ``apart`` [rad]. Tolerances of readings are ``part`` of them, at least
-    ``least``; rays are walked up to ``limit`` [m]. Walls have the value ``occupied`` or more.
+    The part begins at its corner, relative to the map's and along its axes [m]. Companions start ``beside`` the beam,
+    or by the deviation of the position up to ``most_beside`` [m]. They diverge by ``apart``, or by the deviation of the
+    heading up to ``most_apart``, and by ``cone`` [rad]. Tolerances of readings are ``part`` of them, at least ``least``
+    and the deviation of the position; rays are walked up to ``limit`` [m]. Walls have the value ``occupied`` or more.
     """
 
-    origin_x: double
-    origin_y: double
-    cell: double
+    corner_x: double
+    corner_y: double
     beside: double
+    most_beside: double
     apart: double
+    most_apart: double
+    cone: double
     least: double
     part: double
     limit: double

@@ -10,7 +10,7 @@ import numpy as np
 from gpusense.localization.estimates import Estimate, clustered
 from gpusense.localization.recovery import Recovery
 from gpusense.localization.rival import evidence_of
-from gpusense.localization.spread import is_apart, is_narrow, is_wide, share_off, share_off_of
+from gpusense.localization.spread import Spread, share_off, share_off_of, spread_of
 from gpusense.localization.tracker import Tracker
 from gpusense.localization.verdict import Verdict
 from gpusense.localization.words import word_of
@@ -39,8 +39,9 @@ def estimate_of(
     elif method == "cluster":
         pose, covariance = clustered(tracker.host_particles(), cloud.host_weights(shown))
     explained = verdict.judge(pose, covariance, readings, evidence_of(summary))
-    p_lost = _p_lost(tracker, verdict, recovery, pose, covariance)
-    word = word_of(p_lost, verdict.wrong, wide=is_wide(covariance), apart=is_apart(covariance))
+    spread = spread_of(covariance)
+    p_lost = _p_lost(tracker, verdict, recovery, pose, covariance, spread)
+    word = word_of(p_lost, verdict.wrong, wide=spread.wide, apart=spread.apart)
     size = summary.effective_sample_size
     if not size > 0:
         # The kernels have no sum of squares before a correction, or where no weighted particle was possible.
@@ -53,9 +54,11 @@ def estimate_of(
     )  # fmt: skip
 
 
-def _p_lost(tracker: Tracker, verdict: Verdict, recovery: Recovery, pose: np.ndarray, covariance: np.ndarray) -> float:
+def _p_lost(
+    tracker: Tracker, verdict: Verdict, recovery: Recovery, pose: np.ndarray, covariance: np.ndarray, spread: Spread
+) -> float:
     """Return the probability that a pose is far off, according to scans and particles."""
-    if is_narrow(covariance) or tracker.shown > _MOST_LOOKED_AT:
+    if spread.narrow or tracker.shown > _MOST_LOOKED_AT:
         share = share_off(covariance)
     else:
         share = share_off_of(tracker.host_particles(), tracker.cloud.host_weights(tracker.shown), pose)

@@ -7,7 +7,7 @@ recorded program.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from gpusense.backends.programs import ProgramCache, RecordedProgram, RepeatedPr
 from gpusense.interface.constants import ESTIMATE, LEFT, MOMENTS, SLOW_RATE, STAGE, STATE, WIDE_HEADINGS
 from gpusense.interface.launches import Program
 from gpusense.localization.filter_cloud import Contents, Summary, deeper, is_starved, meaningful, summary_of
+from gpusense.localization.map_judge import JUDGED, MapJudge
 from gpusense.localization.particles import Particles, Places, Stage
 from gpusense.localization.sums import weight_block
 
@@ -52,6 +53,9 @@ class Cloud(Particles):
         # Corrections in a row after which the estimate was read; whether it was after the last one, which number the
         # last one's last stage had, and whether the present stage computes it.
         self._asked, self._was_asked, self._last_stage, self._estimates_too = 0, False, 0, False
+        # Function that prepares judges of scans; those that the last correction uses, until they receive the result.
+        self._prepared: Callable[[], list[MapJudge]] | None = None
+        self._judges: Sequence[MapJudge] = ()
 
     def place(self, poses: np.ndarray, weights: np.ndarray | None = None) -> None:
         """Replace all particles."""
@@ -90,6 +94,7 @@ class Cloud(Particles):
     def _begin_change(self) -> None:
         """Forget the results that the host knows."""
         self._results = self._known = self._estimated_of = None
+        self._judges, self._prepared = (), None
 
     # ---- steps
 
@@ -105,8 +110,9 @@ class Cloud(Particles):
         self._stages.run((origin, target, kind, self.count, "move"), lambda: self.motion(origin, target, kind))
 
     def run_stages(
-        self, settings: np.ndarray, stages: list[Stage], drawn: int, sensors: int, score: Callable[[Stage], None]
-    ) -> None:
+        self, settings: np.ndarray, stages: list[Stage], drawn: int, sensors: int, score: Callable[[Stage], None],
+        judges: Callable[[], list[MapJudge]] | None = None,
+    ) -> None:  # fmt: skip
         """Run a correction: stages until the temperature is used up.
 
         Args:
@@ -115,9 +121,11 @@ class Cloud(Particles):
             drawn: Particles of the next step.
             sensors: Number of sensors that are used, the first ones of ``log_p``.
             score: Runs the launches of a stage: its motion if it is the first one, log-likelihoods, and weighing.
+            judges: Returns the judges of scans at the estimated pose, prepared for them; called if it is estimated.
         """
         self.use(sensors)
         self._begin_change()
+        self._prepared = judges
         self._asked, self._was_asked = self._asked + 1 if self._was_asked else 0, False
         self.upload_settings(settings)
         if settings[SLOW_RATE] > 0:
@@ -148,7 +156,7 @@ class Cloud(Particles):
             settings = deeper(settings)
             self.upload_settings(settings)
             self._results = None
-            self.backend.run(self._weighing(stage))
+            self.backend.run(self._weighing(stage) + self._judging())
             numbers = self._state_of(stage.state)
         return numbers, settings
 
@@ -157,6 +165,19 @@ class Cloud(Particles):
         if not self._estimates_too:
             return self.weighing(stage)
         return self.weighing(stage) + self._estimating(stage.places, self.count, 0)
+
+    def _judging(self) -> Program:
+        """Return the launches that judge scans at the estimate."""
+        pairs = zip(self._judges, self.judged, strict=False)
+        return tuple(one for judge, judged in pairs for one in judge.launches(self.estimated, judged))
+
+    def _prepare_judges(self) -> Hashable:
+        """Prepare the judges of a correction that estimates the pose; return all on which their launches depend."""
+        if not self._estimates_too:
+            return ()
+        if self._prepared is not None:
+            self._judges, self._prepared = self._prepared(), None
+        return tuple([judge.version for judge in self._judges])
 
     def _estimating(self, places: Places, count: int, second_pass: int) -> Program:
         """Return the launches of a pass of the estimate."""
@@ -178,6 +199,10 @@ class Cloud(Particles):
         """Run the launches of a stage after its scores."""
         key = (stage.key, self.count, self._sensors, self._estimates_too)
         self._stages.run(key, lambda: self._weighing(stage))
+        # Scans are prepared while the device works.
+        versions = self._prepare_judges()
+        if versions:
+            self._stages.run((versions, "judge"), self._judging)
 
     def _draw(self, stage: Stage, drawn: int) -> None:
         """Draw into the other buffer."""
@@ -191,12 +216,12 @@ class Cloud(Particles):
             key: Everything on which the sensors' programs depend.
             scoring: Returns the program that scores the poses of a buffer, and the owners of its memory.
         """
-        whole = (key, stage, self.count, self._estimates_too)
+        whole = (key, stage, self.count, self._estimates_too, self._prepare_judges())
         recorded = self._recordings.get(whole)
         if recorded is None:
             move = () if stage.kind is None else self.motion(stage.origin, stage.source, stage.kind)
             program, owners = scoring(stage.source)
-            program = move + program + self._weighing(stage)
+            program = move + program + self._weighing(stage) + self._judging()
             recorded = self._recordings.keep(whole, RecordedProgram(self.backend, program, owners))
         recorded.start()
 
@@ -256,12 +281,17 @@ class Cloud(Particles):
         places = self.places
         if second_pass or self._estimated_of != (places, count):
             self._results = self._estimated_of = None
+            self._judges = ()
             # Clouds that change their size rarely ask twice for the same size.
             self._estimates.run(
                 (places.shown, places.weight, count, second_pass), lambda: self._estimating(places, count, second_pass)
             )
-        begin = self.result_begins[2]
-        return self._read_results()[begin : begin + ESTIMATE]
+        numbers, begins = self._read_results(), self.result_begins[2:]
+        estimate = numbers[begins[0] : begins[0] + ESTIMATE]
+        for judge, begin in zip(self._judges, begins[1:], strict=False):
+            judge.receive(estimate, numbers[begin : begin + JUDGED])
+        self._judges = ()
+        return estimate
 
     def _state_of(self, index: int) -> np.ndarray:
         """Return a state."""
@@ -271,7 +301,7 @@ class Cloud(Particles):
     def _read_results(self) -> np.ndarray:
         """Return states and estimate, which are copied once after each change."""
         if self._results is None:
-            self._results = self._read(self.results, self.result_begins[2] + ESTIMATE)
+            self._results = self._read(self.results, self.result_begins[-1])
         return self._results
 
     def host_poses(self, index: int, count: int) -> np.ndarray:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 
 from gpusense.localization.cloud import Cloud
-from gpusense.localization.filter_cloud import FilterCloud, Step
+from gpusense.localization.filter_cloud import FilterCloud, SensorReadings, Step
+from gpusense.localization.map_judge import MapJudge
 from gpusense.localization.scoring import FilterScoring
 from gpusense.localization.sensors import Sensor
 
@@ -26,7 +28,13 @@ class DeviceCloud(Cloud, FilterCloud):
     def correct(self, step: Step) -> None:
         score = self._scoring.of(self, step.readings)
         stages = self.places.stages(self.kept, step.stages, step.drawn, step.kind, same=step.drawn == self.count)
-        self.run_stages(step.settings, stages, step.drawn, len(step.readings), score)
+        judges = functools.partial(self._judges_of, step.judged) if step.judged else None
+        self.run_stages(step.settings, stages, step.drawn, len(step.readings), score, judges)
+
+    def _judges_of(self, judged: Sequence[SensorReadings]) -> list[MapJudge]:
+        """Return the judges of scans, prepared for them."""
+        sensors = ((self._scored[index], reading[0]) for index, reading in judged)
+        return [judge for sensor, ranges in sensors if (judge := sensor.judge()).expects(sensor.model.scanner, ranges)]
 
     @property
     def scoring_seconds(self) -> float:

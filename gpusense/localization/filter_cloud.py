@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -48,6 +49,8 @@ class Step(NamedTuple):
         stages: Most stages.
         drawn: Particles of the next step.
         readings: Indices of sensors with their readings.
+        judged: The scans that are to be judged at the pose after it, with the indices of their sensors; a cloud may
+            leave that to the verdict.
     """
 
     settings: np.ndarray
@@ -55,6 +58,7 @@ class Step(NamedTuple):
     stages: int
     drawn: int
     readings: list[SensorReadings]
+    judged: Sequence[SensorReadings] = ()
 
 
 class Contents(NamedTuple):

@@ -122,7 +122,8 @@ class FilterParts:
             verdict.predicted(*tracker.moved_particles(), everything)
         if share is not None:
             used = skipping.skipped(self.sensors, used, tracker.moved_particles(), verdict.anywhere, share)
-        tracker.weigh(used, corrected_before=bool(self.last))
+        judged = verdict.expected(everything, tracker.pending)
+        tracker.weigh(used, judged=judged, corrected_before=bool(self.last))
         # The caller may write the next readings to the same arrays.
         self.last = {index: tuple(map(_copied, reading)) for index, reading in everything.items()}
         verdict.corrected()

@@ -14,7 +14,7 @@ from gpusense.localization import starts
 from gpusense.localization.diagnosis import Diagnosis, diagnose
 from gpusense.localization.scoring import readings_of
 from gpusense.localization.sensors import sensors_of
-from gpusense.localization.spread import is_apart, is_wide, share_off
+from gpusense.localization.spread import share_off, spread_of
 from gpusense.localization.verdict import Verdict, VerdictState
 from gpusense.localization.words import LOST, Word, word_of
 
@@ -113,8 +113,8 @@ class PoseMonitor:
         explained = self._verdict.judge(place, spread, readings)
         self._pose, self._last = place, readings
         wrong = self._verdict.wrong
-        p_lost = wrong + (1 - wrong) * share_off(spread)
-        return PoseVerdict(p_lost, word_of(p_lost, wrong, wide=is_wide(spread), apart=is_apart(spread)), explained)
+        p_lost, beyond = wrong + (1 - wrong) * share_off(spread), spread_of(spread)
+        return PoseVerdict(p_lost, word_of(p_lost, wrong, wide=beyond.wide, apart=beyond.apart), explained)
 
     @property
     def state(self) -> VerdictState:

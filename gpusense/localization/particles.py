@@ -8,6 +8,7 @@ the second buffer of its bank.
 from __future__ import annotations
 
 import functools
+import itertools
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from gpusense.backends.base import Backend, Buffer
 from gpusense.interface.constants import ESTIMATE, SETTINGS, STATE
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
+from gpusense.localization.map_judge import JUDGED
 from gpusense.localization.sums import Sums, weight_block
 
 _DOUBLE = np.dtype(np.float64)
@@ -132,9 +134,11 @@ class Particles:
         places: Buffers of the particles.
         kept: Buffers that steps do not overwrite: those at the beginning of a call of the filter.
         pool_size: Number of poses from which recovery injects particles.
-        results: Two states of corrections, and the estimate; they begin at ``result_begins``.
+        results: Two states of corrections, the estimate, and the judged beams of each sensor; they begin at
+            ``result_begins``.
         states: The two states.
         estimated: The estimate.
+        judged: The judged beams of each sensor.
     """
 
     MEMORY: ClassVar[tuple[str, ...]] = ("count", "block", "places", "pool", "pool_size")
@@ -155,10 +159,14 @@ class Particles:
         self.sums, self.settings = Sums(backend, capacity), backend.empty(SETTINGS, _DOUBLE)
         # One copy reads them all.
         align = max(backend.alignment // _DOUBLE.itemsize, 1)
-        self.result_begins = tuple(i * (-(-STATE // align) * align) for i in range(3))
-        self.results = backend.upload(np.zeros(self.result_begins[2] + ESTIMATE))
-        parts = zip(self.result_begins, (STATE, STATE, ESTIMATE), strict=True)
-        *self.states, self.estimated = (backend.part(self.results, begin, size, _DOUBLE) for begin, size in parts)
+        sizes = STATE, STATE, ESTIMATE, *(JUDGED for _ in range(sensors))
+        self.result_begins = (0, *itertools.accumulate(-(-size // align) * align for size in sizes))
+        self.results = backend.upload(np.zeros(self.result_begins[-1]))
+        parts = zip(self.result_begins, sizes, strict=False)
+        first, second, self.estimated, *self.judged = (
+            backend.part(self.results, begin, size, _DOUBLE) for begin, size in parts
+        )
+        self.states = [first, second]
         self.pool, self.pool_size = backend.upload(np.zeros(3)), 0
         # Cumulative numbers of certain copies.
         self._copies = backend.empty(capacity, _DOUBLE) if residual else None

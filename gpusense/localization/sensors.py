@@ -15,7 +15,7 @@ from gpusense.backends.base import Backend
 from gpusense.interface.constants import DEPTH, TEMPERATURE
 from gpusense.interface.launches import Program
 from gpusense.localization.defaults import DEFAULTS
-from gpusense.localization.passages import MapJudge
+from gpusense.localization.map_judge import MapJudge
 from gpusense.localization.temperature import BeamCorrelation, axes_of, poses_around
 from gpusense.models.landmark.base import FeatureModel
 from gpusense.models.point.base import PointModel

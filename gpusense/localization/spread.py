@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,22 +32,32 @@ def deviations(covariance: Floats) -> tuple[float, float]:
     return math.sqrt(max(largest, 0.0)), math.sqrt(max(tt, 0.0))
 
 
+class Spread(NamedTuple):
+    """How widely a distribution is spread, by its largest deviations.
+
+    Attributes:
+        wide: Whether the deviation of the position exceeds half a metre, or that of the heading 0.25 rad.
+        apart: Whether they exceed 1 m or 0.5 rad, so that the distribution may cover several places.
+        narrow: Whether they are so small that a normal density describes the particles well enough.
+    """
+
+    wide: bool
+    apart: bool
+    narrow: bool
+
+
+def spread_of(covariance: Floats) -> Spread:
+    """Return how widely a distribution with a (3, 3) covariance is spread."""
+    position, heading = deviations(covariance)
+    return Spread(
+        position > WIDE or heading > WIDE_TURN, position > FAR or heading > FAR_TURN,
+        position < _NARROW and heading < _NARROW_TURN,
+    )  # fmt: skip
+
+
 def is_wide(covariance: Floats) -> bool:
     """Return whether the deviation of the position exceeds half a metre, or that of the heading 0.25 rad."""
-    position, heading = deviations(covariance)
-    return position > WIDE or heading > WIDE_TURN
-
-
-def is_apart(covariance: Floats) -> bool:
-    """Tell whether deviations exceed 1 m or 0.5 rad, so that the distribution may cover several places."""
-    position, heading = deviations(covariance)
-    return position > FAR or heading > FAR_TURN
-
-
-def is_narrow(covariance: Floats) -> bool:
-    """Tell whether deviations are so small that a normal density describes the particles well enough."""
-    position, heading = deviations(covariance)
-    return position < _NARROW and heading < _NARROW_TURN
+    return spread_of(covariance).wide
 
 
 def share_off(covariance: Floats) -> float:

@@ -143,11 +143,18 @@ class Tracker:
         self.cloud.move(self.settings(motion, []), motion.kind)
         self.shown, self.pending = self.cloud.count, following
 
-    def weigh(self, readings: list[SensorReadings], *, corrected_before: bool = False) -> None:
+    def weigh(
+        self,
+        readings: list[SensorReadings],
+        *,
+        judged: Sequence[SensorReadings] = (),
+        corrected_before: bool = False,
+    ) -> None:
         """Run the motion, and correct the particles by readings of sensors.
 
         Args:
             readings: Indices of sensors with their readings.
+            judged: Scans that will be judged at the pose after the correction.
             corrected_before: Whether the particles were corrected before, so that some may be copies.
         """
         chosen, motion = self.options, STILL if self.pending is None else self.pending
@@ -155,7 +162,7 @@ class Tracker:
         drawn = self.cloud.count if chosen.least == chosen.most else self._wanted()
         settings = self.settings(motion, [index for index, _ in readings])
         self.shown, self.pending = self.cloud.count, None
-        self.cloud.correct(Step(settings, motion.kind, chosen.stages, drawn, readings))
+        self.cloud.correct(Step(settings, motion.kind, chosen.stages, drawn, readings, judged))
         self.wide = max(self.wide - 1, 0)
 
     def _distinct_share(self) -> float:

@@ -21,10 +21,11 @@ from gpusense._util import masks
 from gpusense.backends import arrays
 from gpusense.localization.belief import Belief
 from gpusense.localization.evidence import LEAST_GAIN, Evidence, Gains
+from gpusense.localization.motion import STILL, SampledMotion
 from gpusense.localization.passages import Passages, passages
 from gpusense.localization.ratio import evidence_of_scan, ratio_of_features
 from gpusense.localization.sensors import Sensor
-from gpusense.localization.spread import deviations, is_apart, is_wide
+from gpusense.localization.spread import Spread, is_wide, spread_of
 from gpusense.localization.words import TRACKING
 from gpusense.models.landmark.base import FeatureModel
 
@@ -86,6 +87,8 @@ class Verdict:
             for index, sensor in enumerate(sensors)
             if isinstance(sensor.model, FeatureModel)
         }
+        # Corrections and pose of the last call of ``judge``, which nothing but ``expected`` reads.
+        self._asked: tuple[int, np.ndarray | None] = -1, None
         self.informed = bool(self._evidence) or any(sensor.calibrates for sensor in sensors)
         self.state = VerdictState()
 
@@ -169,16 +172,17 @@ class Verdict:
         Returns:
             Share of the beams that the pose explains; NaN without beams.
         """
-        state = self.state
-        if state.judged == state.corrections or self._adds_nothing(pose, covariance, evidence):
+        state, spread = self.state, spread_of(covariance)
+        self._asked = state.corrections, pose
+        if state.judged == state.corrections or self._adds_nothing(pose, spread, evidence):
             return state.explained
         scans = sightings(self._sensors, readings, pose, covariance)
         ratio, explained = evidence_of_scan(scans)
         belief = state.belief
         x, y, theta = (float(value) for value in pose)
-        if is_apart(covariance):
+        if spread.apart:
             belief = belief.widened()
-        elif is_wide(covariance):
+        elif spread.wide:
             belief = belief.judged((x, y, theta), math.nan)
         else:
             ratios = [ratio, float(np.mean(state.ratios)) if state.ratios else math.nan]
@@ -195,6 +199,38 @@ class Verdict:
         )
         return explained
 
+    def expected(
+        self, readings: Mapping[int, tuple[Any, ...]], motion: SampledMotion | None
+    ) -> list[tuple[int, tuple[Any, ...]]]:
+        """Return the scans that are likely to be judged after the next correction, so that this may judge them already.
+
+        Args:
+            readings: Readings of the next correction by the index of their sensor.
+            motion: The motion before it; None without one.
+        """
+        state, (asked, pose) = self.state, self._asked
+        if asked != state.corrections or pose is None or self._stays(pose, STILL if motion is None else motion):
+            return []
+        scans = []
+        for index, (ranges, *_) in readings.items():
+            sensor = self._sensors[index]
+            if sensor.calibrates and type(ranges) is np.ndarray and ranges.shape == (sensor.model.scanner.count,):
+                scans.append((index, (ranges.astype(np.float64, copy=False),)))
+        return scans
+
+    def _stays(self, pose: np.ndarray, motion: SampledMotion) -> bool:
+        """Tell whether a pose is sure, and will probably be near the last judged one after a motion."""
+        state = self.state
+        before = state.belief.pose
+        if before is None or state.judged < 0 or state.belief.wrong > _SURE or state.ratios:
+            return False
+        first, ahead, left, second = motion.mean
+        x, y, theta = pose.tolist()
+        c, s = math.cos(theta + first), math.sin(theta + first)
+        near = math.hypot(x + c * ahead - s * left - before[0], y + s * ahead + c * left - before[1]) < _WAY
+        turn = abs(math.remainder(theta + first + second - before[2], math.tau))
+        return near and turn < _TURNED and state.corrections + 1 - state.judged < _SELDOM
+
     def compared(self, pose: np.ndarray, covariance: np.ndarray, ratio: float) -> None:
         """Add a comparison of the pose judged last with other places of the map, unless the pose is wide.
 
@@ -208,11 +244,11 @@ class Verdict:
         x, y, theta = (float(value) for value in pose)
         self.state = self.state._replace(belief=self.state.belief.compared_with((x, y, theta), ratio))
 
-    def _adds_nothing(self, pose: np.ndarray, covariance: np.ndarray, evidence: float) -> bool:
+    def _adds_nothing(self, pose: np.ndarray, spread: Spread, evidence: float) -> bool:
         """Tell whether a pose is sure and so near the last judged one that its scan adds almost no evidence."""
         state = self.state
         before = state.belief.pose
-        if before is None or state.judged < 0 or state.belief.wrong > _SURE or state.ratios or is_wide(covariance):
+        if before is None or state.judged < 0 or state.belief.wrong > _SURE or state.ratios or spread.wide:
             return False
         if not evidence >= state.evidence - _DROP:
             return False
@@ -225,13 +261,12 @@ def sightings(
     sensors: Sequence[Sensor], readings: Mapping[int, tuple[Any, ...]], pose: np.ndarray, covariance: np.ndarray
 ) -> list[Passages]:
     """Return the judged beams of all scans among readings."""
-    spread = deviations(covariance)
     result = []
     for index, reading in readings.items():
         sensor = sensors[index]
         if sensor.calibrates:
             ranges = np.asarray(arrays.copied_to_host(reading[0], sensor.backend, "ranges"), np.float64)
-            result.append(passages(sensor.model.grid, sensor.model.scanner, pose, ranges, spread, sensor.judge()))
+            result.append(passages(sensor.model.grid, sensor.model.scanner, pose, ranges, covariance, sensor.judge()))
     return result
 
 

@@ -1,12 +1,11 @@
 """Poses of a request: checks, bounds, and placement in a window of the map.
 
-NumPy arrays are checked and bounded on the host; the values of device poses are not inspected before the launch that
-places them.
+NumPy arrays are checked and bounded on the host, or by a GPU where they are many; the values of device poses are not
+inspected before the launch that places them.
 """
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Hashable
 from typing import NamedTuple
 
@@ -19,7 +18,8 @@ from gpusense.interface.constants import LARGEST_HEADING
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
-from gpusense.tables.reachable import ReachableMap
+from gpusense.models.bounds import LEAST_BOUNDED, bounds_on_device, bounds_poses
+from gpusense.tables.reachable import MapState, ReachableMap
 from gpusense.world.frames import Cells, Mount, frame_of, place_poses
 from gpusense.world.windows import Corners, Window
 
@@ -41,6 +41,8 @@ class Poses:
         name: Their name in messages.
         scans: None, or S of (S, N, 3) poses of S scans, one after the other.
         in_place: An array on the device must be used without a copy, now and later.
+        late: A GPU may bound parts of many host poses, and so reveal values that are not finite, when their corners
+            are asked for first.
 
     Attributes:
         hull: Corners of the box of poses on the device, if their owner knows them; they affect only the table.
@@ -53,10 +55,14 @@ class Poses:
     hull: Corners | None = None
 
     def __init__(
-        self, poses: object, backend: Backend, name: str = "poses", *, scans: int | None = None, in_place: bool = False
-    ) -> None:
+        self, poses: object, backend: Backend, name: str = "poses", *, scans: int | None = None, in_place: bool = False,
+        late: bool = False,
+    ) -> None:  # fmt: skip
         self.host: np.ndarray | None = None
+        self._name, self._scans = name, scans
         self._last_corners: tuple[Part, Corners] | None = None
+        # Poses that a workspace has on the device before they are placed.
+        self._ahead: tuple[Part, Workspace, Buffer] | None = None
         self.on_device = type(poses) is not np.ndarray and arrays.on_device(poses)
         if self.on_device:
             self._buffer, self.count, single, self._owner = arrays.adopt_poses(
@@ -64,35 +70,62 @@ class Poses:
             )
             self._dtype = _SINGLE if single else _DOUBLE
             return
-        self.host, bounds = arrays.host_poses(poses, name, scans)
-        self._corners, self.count = corners_of(bounds), len(self.host)
+        self.host = arrays.host_poses(poses, name, scans)
+        self.count = len(self.host)
+        self._late = late and self.count >= LEAST_BOUNDED and bounds_poses(backend)
+        if not self._late:
+            self._bound((0, self.count), backend, None)
 
-    def corners(self, part: Part) -> Corners | None:
-        """Return four corners of the box of some poses, at 0 for no poses; None on the device."""
+    def corners(self, part: Part, backend: Backend, space: Workspace | None = None) -> Corners | None:
+        """Return four corners of the box of some poses, at 0 for no poses; None on the device.
+
+        Args:
+            part: The first of them and the one after the last.
+            backend: The device, which bounds them where they are many.
+            space: Holds them there; None where no launch follows.
+
+        Raises:
+            ValueError: A value is not finite.
+        """
         if self.host is None:
             return None
-        if part[1] - part[0] == self.count:
-            return self._corners
         if self._last_corners is None or self._last_corners[0] != part:
-            self._last_corners = part, corners_of(arrays.bounds_of(self.host[slice(*part)]))
+            self._bound(part, backend, space)
+        assert self._last_corners is not None
         return self._last_corners[1]
 
-    def window(self, table: ReachableMap, part: Part) -> tuple[Buffer, Window]:
-        """Return the map's table for some poses, and its window."""
-        return table.ensure(self.hull if self.host is None else self.corners(part))
+    def _bound(self, part: Part, backend: Backend, space: Workspace | None) -> None:
+        """Find the corners of the box of some host poses."""
+        assert self.host is not None
+        count, poses = part[1] - part[0], self.host[slice(*part)]
+        if self._late and space is not None and count >= LEAST_BOUNDED:
+            self._ahead = part, space, space.upload("poses", poses)
+            bounds = bounds_on_device(backend, space, self._ahead[2], count)
+        else:
+            bounds = arrays.bounds_of(poses)
+        arrays.check_bounds(bounds, self.host, self._name, self._scans)
+        self._last_corners = part, corners_of(bounds)
 
-    @property
-    def flags(self) -> frozenset[str]:
-        """The flags of kernels that place these poses."""
-        if self.host is None:
+    def ensure_table(
+        self, reachable: ReachableMap, part: Part, backend: Backend, space: Workspace | None = None
+    ) -> MapState:
+        """Return the map with a table for some poses."""
+        return reachable.ensure(self.corners(part, backend, space) or self.hull)
+
+    def flags(self, corners: Corners | None) -> frozenset[str]:
+        """Return the flags of kernels that place poses with these corners."""
+        if corners is None:
             return _HUGE_SINGLE if self._dtype == _SINGLE else _HUGE
-        return _HUGE if max(-self._corners[0][2], self._corners[3][2]) > LARGEST_HEADING else _PLAIN
+        return _HUGE if max(-corners[0][2], corners[3][2]) > LARGEST_HEADING else _PLAIN
 
     def buffer(self, backend: Backend, space: Workspace, part: Part) -> Buffer:
         """Return some poses on the device, uploaded from host memory; None where the host must place them."""
         begin, end = part
         if self.host is None:
             return self._device_part(backend, space, 3 * begin, 3 * (end - begin))
+        ahead, self._ahead = self._ahead, None
+        if ahead is not None and ahead[0] == part and ahead[1] is space:
+            return ahead[2]
         return space.upload("poses", self.host[begin:end]) if backend.info.float64 else None
 
     def _device_part(self, backend: Backend, space: Workspace, first: int, count: int) -> Buffer:
@@ -202,18 +235,14 @@ def place(
         real: Precision of the placed poses.
         careful: Whether low parts are needed.
     """
-    source, count, corners = poses.buffer(backend, space, part), part[1] - part[0], poses.corners(part)
-    lows = 4 * count if careful else 4
+    count, corners = part[1] - part[0], poses.corners(part, backend, space)
+    flags = poses.flags(corners)
+    source, lows = poses.buffer(backend, space, part), 4 * count if careful else 4
     if source is None:
         _place_on_host(poses, part, frame, space, real, careful=careful)
-        return PlacedPoses(count, corners, frame, space, real, lows, poses.flags)
-    flags = poses.flags | _precision_flags(real == _DOUBLE, careful)
+        return PlacedPoses(count, corners, frame, space, real, lows, flags)
+    flags |= flags_if(FLOAT64=real == _DOUBLE, TWO_PART_POINTS=careful)
     return PlacedPoses(count, corners, frame, space, real, lows, flags, source, backend.info.lanes)
-
-
-@functools.cache
-def _precision_flags(double: bool, careful: bool) -> frozenset[str]:
-    return flags_if(FLOAT64=double, TWO_PART_POINTS=careful)
 
 
 def pose_status(space: Workspace) -> Buffer:

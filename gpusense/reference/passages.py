@@ -5,6 +5,8 @@ These start beside it and diverge. :mod:`gpusense.localization.passages` describ
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from gpusense.interface import structs
@@ -86,51 +88,87 @@ def _cells_along(start: np.ndarray, slope: np.ndarray, steps: np.ndarray, distan
 
 
 def walk_beside(
-    direction: np.ndarray, steps: np.ndarray, cells: np.ndarray, rows: int, cols: int, rules: structs.BeamRules
-) -> np.ndarray:
+    direction: np.ndarray, origin: tuple[float, float], companion: tuple[float, float], steps: np.ndarray,
+    cells: np.ndarray, rows: int, cols: int, cell: float, occupied: int,
+) -> np.ndarray:  # fmt: skip
     """Return the distances (2, 3, B) [m] along beams and their companions on both sides.
 
     Args:
         direction: (B,) directions of the beams in the map's frame [rad].
+        origin: Where the beams begin [m].
+        companion: Distance by which companions start beside a beam [m], and angle by which they diverge [rad].
         steps: (B,) numbers of steps.
         cells: Values of the map's cells.
         rows: Rows of the map.
         cols: Columns of the map.
-        rules: Origin and companions.
+        cell: Side of a cell [m].
+        occupied: Least value of a wall.
     """
     slope = np.empty((2, len(SIDES), len(direction)))
-    slope[0], slope[1] = cos_sin(direction + SIDES * rules.apart)
+    slope[0], slope[1] = cos_sin(direction + SIDES * companion[1])
     # Companions begin at right angles to the beam, whose side is 0.
     cos, sin = slope[:, 0]
-    shift, start = SIDES * rules.beside, np.empty_like(slope)
-    start[0], start[1] = rules.origin_x - shift * sin, rules.origin_y + shift * cos
-    start /= rules.cell
+    shift, start = SIDES * companion[0], np.empty_like(slope)
+    start[0], start[1] = origin[0] - shift * sin, origin[1] + shift * cos
+    start /= cell
     np.minimum(np.maximum(start, -AFAR, out=start), AFAR, out=start)
     first = walk_ray(
-        start.reshape(2, -1), slope.reshape(2, -1), np.tile(steps, len(SIDES)), cells, rows, cols, rules.occupied
+        start.reshape(2, -1), slope.reshape(2, -1), np.tile(steps, len(SIDES)), cells, rows, cols, occupied
     )
-    return first.reshape(slope.shape) * rules.cell
+    return first.reshape(slope.shape) * cell
+
+
+def origin_of(estimate: np.ndarray, frame: structs.Frame, rules: structs.BeamRules) -> tuple[float, float]:
+    """Return where the beams of an estimated pose begin, relative to the corner of the cells, along the axes [m]."""
+    x, y = float(estimate[0]) - frame.origin_x, float(estimate[1]) - frame.origin_y
+    if frame.mount_x != 0 or frame.mount_y != 0:
+        cos, sin = (float(part[0]) for part in cos_sin(estimate[2:3]))
+        x += cos * frame.mount_x - sin * frame.mount_y
+        y += sin * frame.mount_x + cos * frame.mount_y
+    return (
+        frame.yaw_cos * x + frame.yaw_sin * y - rules.corner_x,
+        frame.yaw_cos * y - frame.yaw_sin * x - rules.corner_y,
+    )
+
+
+def deviations_of(estimate: np.ndarray) -> tuple[float, float]:
+    """Return the largest deviation of an estimated position over directions [m], and that of the heading [rad].
+
+    Both are infinite if the covariance is not finite; a variance is negative by rounding.
+    """
+    covariance = estimate[3:9].tolist()
+    if not all(map(math.isfinite, covariance)):
+        return math.inf, math.inf
+    xx, xy, _, yy, _, tt = covariance
+    xx, yy, tt = max(xx, 0.0), max(yy, 0.0), max(tt, 0.0)
+    half_apart = (xx - yy) / 2
+    return math.sqrt((xx + yy) / 2 + math.sqrt(half_apart * half_apart + xy * xy)), math.sqrt(tt)
 
 
 def judge_beams(
-    flags: frozenset[str], cells: np.ndarray, scan: np.ndarray, judged: np.ndarray, rules: structs.BeamRules,
-    rows: int, cols: int, beams: int,
+    flags: frozenset[str], cells: np.ndarray, estimate: np.ndarray, scan: np.ndarray, judged: np.ndarray,
+    frame: structs.Frame, rules: structs.BeamRules, rows: int, cols: int, beams: int,
 ) -> None:  # fmt: skip
-    """Judge beams.
+    """Judge the beams of an estimated pose.
 
-    The scan has their directions in the map's frame, then their readings; the result has their classes, then the
-    distances to the first wall on the beam itself.
+    The scan has their directions relative to the heading, in the map's frame, then their readings, which are NaN for no
+    beam. The result has their classes, then the distances to the first wall on the beam itself.
     """
-    direction, measured = scan[: 2 * beams].reshape(2, beams)
+    relative, measured = scan[: 2 * beams].reshape(2, beams)
+    origin, (position, turn) = origin_of(estimate, frame, rules), deviations_of(estimate)
+    beside = min(max(rules.beside, position), rules.most_beside)
+    companion = beside, min(max(rules.apart, turn), rules.most_apart) + rules.cone
+    direction, cell = relative + estimate[2], frame.resolution
     returned = measured < rules.range_max
     reading = np.where(returned, measured, rules.range_max)
-    tolerance = np.maximum(rules.least, rules.part * reading)
+    least = max(rules.least, min(position, rules.most_beside))
+    tolerance = np.maximum(least, rules.part * reading)
     before, after = reading - tolerance, reading + tolerance
     within = returned & (reading <= rules.limit)
-    steps = (np.minimum(after, rules.limit) / (rules.cell * STEP)).astype(np.int64) + 1
+    steps = (np.minimum(after, rules.limit) / (cell * STEP)).astype(np.int64) + 1
     # A ray gives no evidence beyond the first unknown cell.
     end = np.where(returned, before, reading)
-    first, unknown = walk_beside(direction, steps, cells, rows, cols, rules)
+    first, unknown = walk_beside(direction, origin, companion, steps, cells, rows, cols, cell, rules.occupied)
     seen, own = unknown >= np.minimum(first, end), first[0]
     alone = within & (own >= before) & (own <= after) & seen[0]
     nearest, farthest, seen = first.min(axis=0), first.max(axis=0), seen.all(axis=0)
@@ -140,4 +178,6 @@ def judge_beams(
     kind[seen & ~returned & walled] = VANISHED
     kind[seen & returned & (farthest < before)] = THROUGH
     kind[alone | (seen & within & walled & (nearest <= after) & (farthest >= before))] = AGREES
-    judged[:beams], judged[beams : 2 * beams] = kind, own
+    missing = np.isnan(measured)
+    kind[missing] = NOTHING
+    judged[:beams], judged[beams : 2 * beams] = kind, np.where(missing, np.inf, own)

@@ -57,36 +57,70 @@ double2 walk_ray(const double2 start, const double2 slope, const int steps, glob
     return first;
 }
 
-// Return the distances [m] along a beam (side 0) or its companion on one side (1 or -1).
-double2 walk_beside(const double side, const double direction, const int steps, global const uchar *cells,
-                    const int rows, const int cols, const BeamRules rules) {
-    const double2 along = cos_sin(direction), slope = cos_sin(direction + side * rules.apart);
-    const double shift = side * rules.beside;
-    const double x = (rules.origin_x - shift * along.y) / rules.cell, y = (rules.origin_y + shift * along.x) / rules.cell;
+// Return the distances [m] along a beam (side 0) or its companion on one side (1 or -1), which starts beside it and
+// diverges.
+double2 walk_beside(const double side, const double direction, const double2 origin, const double2 companion,
+                    const int steps, global const uchar *cells, const int rows, const int cols, const double cell,
+                    const int occupied) {
+    const double2 along = cos_sin(direction), slope = cos_sin(direction + side * companion.y);
+    const double shift = side * companion.x;
+    const double x = (origin.x - shift * along.y) / cell, y = (origin.y + shift * along.x) / cell;
     const double2 start = (double2)(fmin(fmax(x, -AFAR), AFAR), fmin(fmax(y, -AFAR), AFAR));
-    return walk_ray(start, slope, steps, cells, rows, cols, rules.occupied) * rules.cell;
+    return walk_ray(start, slope, steps, cells, rows, cols, occupied) * cell;
 }
 
-// Judge beams: one work-item takes a beam. The scan has their directions in the map's frame, then their readings; the
-// result has their classes, then the distances to the first wall on the beam itself.
+// Return where the beams of an estimated pose begin, relative to the corner of the cells along the map's axes [m].
+double2 origin_of(global const double *estimate, const Frame frame, const BeamRules rules) {
+    double x = estimate[0] - frame.origin_x, y = estimate[1] - frame.origin_y;
+    if (frame.mount_x != 0 || frame.mount_y != 0) {
+        const double2 heading = cos_sin(estimate[2]);
+        x += heading.x * frame.mount_x - heading.y * frame.mount_y;
+        y += heading.y * frame.mount_x + heading.x * frame.mount_y;
+    }
+    return (double2)(frame.yaw_cos * x + frame.yaw_sin * y - rules.corner_x,
+                     frame.yaw_cos * y - frame.yaw_sin * x - rules.corner_y);
+}
+
+// Return the largest deviation of an estimated position over directions [m], and that of the heading [rad]. Both are
+// infinite if the covariance is not finite; a variance is negative by rounding.
+double2 deviations_of(global const double *estimate) {
+    const double xx = fmax(estimate[3], 0.0), xy = estimate[4], yy = fmax(estimate[6], 0.0), tt = fmax(estimate[8], 0.0);
+    const double all = estimate[3] + estimate[4] + estimate[5] + estimate[6] + estimate[7] + estimate[8];
+    if (!(all - all == 0)) return (double2)(INFINITY, INFINITY);
+    const double half_apart = (xx - yy) / 2;
+    return (double2)(sqrt((xx + yy) / 2 + sqrt(half_apart * half_apart + xy * xy)), sqrt(tt));
+}
+
+// Judge the beams of an estimated pose: one work-item takes a beam. The scan has their directions relative to the
+// heading, in the map's frame, then their readings, which are NaN for no beam. The result has their classes, then the
+// distances to the first wall on the beam itself.
 kernel void judge_beams(ARGUMENTS) {
     const int b = get_global_id(0);
     if (b >= beams) return;
-    const double direction = scan[b];
-    const int returned = scan[beams + b] < rules.range_max;
+    if (isnan(scan[beams + b])) {
+        judged[b] = BEAM_NOTHING;
+        judged[beams + b] = INFINITY;
+        return;
+    }
+    const double2 origin = origin_of(estimate, frame, rules), deviation = deviations_of(estimate);
+    const double near = fmin(deviation.x, rules.most_beside);
+    const double2 companion = (double2)(fmin(fmax(rules.beside, deviation.x), rules.most_beside),
+                                        fmin(fmax(rules.apart, deviation.y), rules.most_apart) + rules.cone);
+    const double direction = scan[b] + estimate[2], cell = frame.resolution;
+    const int returned = scan[beams + b] < rules.range_max, occupied = rules.occupied;
     const double reading = returned ? scan[beams + b] : rules.range_max;
-    const double tolerance = fmax(rules.least, rules.part * reading);
+    const double tolerance = fmax(fmax(rules.least, near), rules.part * reading);
     const double before = reading - tolerance, after = reading + tolerance;
-    const int within = returned && reading <= rules.limit, steps = (int)(fmin(after, rules.limit) / (rules.cell * STEP)) + 1;
+    const int within = returned && reading <= rules.limit, steps = (int)(fmin(after, rules.limit) / (cell * STEP)) + 1;
     // A ray gives no evidence beyond the first unknown cell.
     const double end = returned ? before : reading;
-    const double2 own = walk_beside(0, direction, steps, cells, rows, cols, rules);
+    const double2 own = walk_beside(0, direction, origin, companion, steps, cells, rows, cols, cell, occupied);
     int kind = BEAM_NOTHING;
     if (within && own.x >= before && own.x <= after && own.y >= fmin(own.x, end)) {
         kind = BEAM_AGREES;
     } else {
-        const double2 left = walk_beside(1, direction, steps, cells, rows, cols, rules);
-        const double2 right = walk_beside(-1, direction, steps, cells, rows, cols, rules);
+        const double2 left = walk_beside(1, direction, origin, companion, steps, cells, rows, cols, cell, occupied);
+        const double2 right = walk_beside(-1, direction, origin, companion, steps, cells, rows, cols, cell, occupied);
         const double nearest = fmin(own.x, fmin(left.x, right.x)), farthest = fmax(own.x, fmax(left.x, right.x));
         const int seen = own.y >= fmin(own.x, end) && left.y >= fmin(left.x, end) && right.y >= fmin(right.x, end);
         if (seen && within && isinf(nearest)) kind = BEAM_SHORT;

@@ -18,6 +18,7 @@ UNKNOWN, OFF = wp.constant(255), wp.constant(256)
 # Step of a walk, and farthest start of one, where no map reaches [cells].
 STEP, AFAR, MINUS_AFAR = wp.constant(wp.float64(0.5)), wp.constant(wp.float64(1e9)), wp.constant(wp.float64(-1e9))
 ZERO, ONE, MINUS_ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0)), wp.constant(wp.float64(-1.0))
+TWO = wp.constant(wp.float64(2.0))
 FOREVER = wp.constant(wp.float64(math.inf))
 NOTHING, AGREES = wp.constant(constants.NOTHING), wp.constant(constants.AGREES)
 SHORT, THROUGH = wp.constant(constants.SHORT), wp.constant(constants.THROUGH)
@@ -77,50 +78,95 @@ def walk_ray(
 @functools.cache
 def make(name, flags):
     """Make a kernel of the file for a set of flags."""
-    BeamRules = precision(flags).BeamRules
+    structs = precision(flags)
+    BeamRules, Frame = structs.BeamRules, structs.Frame
     cos_sin = heading.functions(flags & {"HUGE_HEADINGS"}).cos_sin
 
-    # Return the distances [m] along a beam (side 0) or its companion on one side (1 or -1).
+    # Return the distances [m] along a beam (side 0) or its companion on one side (1 or -1), which starts beside it and
+    # diverges.
     @wp.func
     def walk_beside(
-        side: wp.float64, direction: wp.float64, steps: wp.int32, cells: wp.array(dtype=wp.uint8), rows: wp.int32,
-        cols: wp.int32, rules: BeamRules,
+        side: wp.float64, direction: wp.float64, origin: wp.vec2d, companion: wp.vec2d, steps: wp.int32,
+        cells: wp.array(dtype=wp.uint8), rows: wp.int32, cols: wp.int32, cell: wp.float64, occupied: wp.int32,
     ):  # fmt: skip
         along = cos_sin(direction)
-        slope = cos_sin(direction + side * rules.apart)
-        shift = side * rules.beside
-        x = (rules.origin_x - shift * along.y) / rules.cell
-        y = (rules.origin_y + shift * along.x) / rules.cell
+        slope = cos_sin(direction + side * companion.y)
+        shift = side * companion.x
+        x = (origin.x - shift * along.y) / cell
+        y = (origin.y + shift * along.x) / cell
         start = wp.vec2d(wp.min(wp.max(x, MINUS_AFAR), AFAR), wp.min(wp.max(y, MINUS_AFAR), AFAR))
-        return walk_ray(start, slope, steps, cells, rows, cols, rules.occupied) * rules.cell
+        return walk_ray(start, slope, steps, cells, rows, cols, occupied) * cell
 
-    # Judge beams: one work-item takes a beam. The scan has their directions in the map's frame, then their readings;
-    # the result has their classes, then the distances to the first wall on the beam itself.
+    # Return where the beams of an estimated pose begin, relative to the corner of the cells along the map's axes [m].
+    @wp.func
+    def origin_of(estimate: wp.array(dtype=wp.float64), frame: Frame, rules: BeamRules):
+        x = estimate[0] - frame.origin_x
+        y = estimate[1] - frame.origin_y
+        if frame.mount_x != ZERO or frame.mount_y != ZERO:
+            heading = cos_sin(estimate[2])
+            x += heading.x * frame.mount_x - heading.y * frame.mount_y
+            y += heading.y * frame.mount_x + heading.x * frame.mount_y
+        return wp.vec2d(
+            frame.yaw_cos * x + frame.yaw_sin * y - rules.corner_x,
+            frame.yaw_cos * y - frame.yaw_sin * x - rules.corner_y,
+        )
+
+    # Return the largest deviation of an estimated position over directions [m], and that of the heading [rad]. Both are
+    # infinite if the covariance is not finite; a variance is negative by rounding.
+    @wp.func
+    def deviations_of(estimate: wp.array(dtype=wp.float64)):
+        xx = wp.max(estimate[3], ZERO)
+        xy = estimate[4]
+        yy = wp.max(estimate[6], ZERO)
+        tt = wp.max(estimate[8], ZERO)
+        all = estimate[3] + estimate[4] + estimate[5] + estimate[6] + estimate[7] + estimate[8]
+        if not (all - all == ZERO):
+            return wp.vec2d(FOREVER, FOREVER)
+        half_apart = (xx - yy) / TWO
+        return wp.vec2d(wp.sqrt((xx + yy) / TWO + wp.sqrt(half_apart * half_apart + xy * xy)), wp.sqrt(tt))
+
+    # Judge the beams of an estimated pose: one work-item takes a beam. The scan has their directions relative to the
+    # heading, in the map's frame, then their readings, which are NaN for no beam. The result has their classes, then
+    # the distances to the first wall on the beam itself.
     @kernel(flags)
-    def judge_beams(cells, scan, judged, rules, rows, cols, beams):
+    def judge_beams(cells, estimate, scan, judged, frame, rules, rows, cols, beams):
         b = wp.tid()
         if b >= beams:
             return
-        direction = scan[b]
         reading = scan[beams + b]
+        if wp.isnan(reading):
+            # NOTHING, as Warp would take a converted constant for the variable below.
+            judged[b] = ZERO
+            judged[beams + b] = FOREVER
+            return
+        origin = origin_of(estimate, frame, rules)
+        deviation = deviations_of(estimate)
+        near = wp.min(deviation.x, rules.most_beside)
+        companion = wp.vec2d(
+            wp.min(wp.max(rules.beside, deviation.x), rules.most_beside),
+            wp.min(wp.max(rules.apart, deviation.y), rules.most_apart) + rules.cone,
+        )
+        direction = scan[b] + estimate[2]
+        cell = frame.resolution
+        occupied = rules.occupied
         returned = reading < rules.range_max
         if not returned:
             reading = rules.range_max
-        tolerance = wp.max(rules.least, rules.part * reading)
+        tolerance = wp.max(wp.max(rules.least, near), rules.part * reading)
         before = reading - tolerance
         after = reading + tolerance
         within = returned and reading <= rules.limit
-        steps = wp.int32(wp.min(after, rules.limit) / (rules.cell * STEP)) + 1
+        steps = wp.int32(wp.min(after, rules.limit) / (cell * STEP)) + 1
         # A ray gives no evidence beyond the first unknown cell.
         end = wp.where(returned, before, reading)
-        own = walk_beside(ZERO, direction, steps, cells, rows, cols, rules)
+        own = walk_beside(ZERO, direction, origin, companion, steps, cells, rows, cols, cell, occupied)
         seen = own.y >= wp.min(own.x, end)
         kind = NOTHING
         if within and own.x >= before and own.x <= after and seen:
             kind = AGREES
         else:
-            left = walk_beside(ONE, direction, steps, cells, rows, cols, rules)
-            right = walk_beside(MINUS_ONE, direction, steps, cells, rows, cols, rules)
+            left = walk_beside(ONE, direction, origin, companion, steps, cells, rows, cols, cell, occupied)
+            right = walk_beside(MINUS_ONE, direction, origin, companion, steps, cells, rows, cols, cell, occupied)
             nearest = wp.min(own.x, wp.min(left.x, right.x))
             farthest = wp.max(own.x, wp.max(left.x, right.x))
             seen = seen and left.y >= wp.min(left.x, end) and right.y >= wp.min(right.x, end)

@@ -12,6 +12,7 @@ from gpusense.models import run as pieces
 
 GRID = gs.OccupancyGrid(np.pad(np.zeros((60, 80), int), 2, constant_values=100), resolution=0.1)
 SCANNER = gs.Scanner.uniform(angle_min=-3.0, angle_increment=0.1, count=60, range_max=10.0)
+POSE = np.array([3.0, 2.5, 0.4])
 
 
 def tracked(stages):
@@ -64,6 +65,37 @@ def test_corrections_compute_an_estimate_that_each_step_asks_for(backend, monkey
     assert 4 <= launches <= 6
     for pair in zip(always, once, strict=True):
         np.testing.assert_array_equal(*pair)
+
+
+def test_corrections_judge_the_pose_that_each_step_asks_for(backend, monkeypatch):
+    grid = gs.OccupancyGrid(GRID.cells, 0.1, (20.0, -7.0, 0.3))
+    scanner = gs.Scanner(SCANNER.bearings, range_max=10.0, mount=(0.2, -0.1, 0.5))
+    caster, start = gs.RayCaster(grid, range_max=10.0, backend="numpy"), gs.compose_poses((20.0, -7.0, 0.3), POSE)
+
+    def run(expects, readings):
+        model = gs.LikelihoodFieldModel(grid, scanner, backend=backend)
+        pf, pose, turn = gs.ParticleFilter(model, particles=300, seed=5, temperature=0.2), start, (0.2, 0, 0.3)
+        if not expects:
+            monkeypatch.setattr(pf._parts.verdict, "expected", lambda *_: [])
+        alone, estimates, judge = [], [], pf._sensors[0].judge()
+        launch = judge._space.run
+        monkeypatch.setattr(judge._space, "run", lambda *a, **k: (alone.append(a), launch(*a, **k)))
+        pf.initialize(mean=pose, covariance=np.diag([0.01, 0.01, 0.003]))
+        for _ in range(10):
+            pose = gs.compose_poses(pose, turn)
+            pf.predict((0, 0, 0), turn)
+            sensor = gs.compose_poses(pose, scanner.mount)
+            pf.correct(np.where(readings, caster.cast(sensor[None], scanner.bearings)[0], np.nan))
+            one = pf.estimate()
+            estimates.append((*one.pose, one.p_lost, one.explained))
+        return estimates, len(alone)
+
+    # More beams than are judged, and fewer.
+    for readings in (np.ones(60, bool), np.arange(60) % 3 == 0):
+        (together, few), (apart, many) = run(True, readings), run(False, readings)
+        assert together == apart and min(one[-1] for one in together) > 0.8
+        # The first ones of a filter are judged alone.
+        assert many == 10 and few <= 5
 
 
 def test_a_gpu_has_the_particles_of_a_processor(needs, monkeypatch):

@@ -12,7 +12,8 @@ import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.interface.constants import AGREES, NOTHING, SHORT, THROUGH, VANISHED
 from gpusense.localization.belief import ALIKE, ALIKE_LENGTH, FOUND, LENGTH, PER_METRE, PER_SCAN, STAYS, Belief
-from gpusense.localization.passages import MapJudge, passages
+from gpusense.localization.map_judge import MapJudge
+from gpusense.localization.passages import passages
 from gpusense.localization.ratio import LIMITS, explained_of_scan, ratio_of_scan
 from gpusense.localization.spread import share_off, share_off_of
 from gpusense.localization.words import word_of
@@ -110,7 +111,8 @@ def test_every_device_judges_beams_alike(backend):
         for k in range(12):
             pose = np.append(rng.uniform(low - 1, high + 1), rng.uniform(-9, 9)) * (1e12 if k == 5 else 1)
             ranges = rng.choice([np.nan, np.inf, 0.0, *rng.uniform(0.0, 11.0, 9)], 64)
-            spread = (0.1 * (k % 4), 0.05 * (k % 3))
+            spread = np.diag(np.square([0.1 * (k % 4), 0.07 * (k % 3), 0.05 * (k % 3)]))
+            spread[0, 1] = spread[1, 0] = -0.5 * spread[0, 0] ** 0.5 * spread[1, 1] ** 0.5
             host = passages(grid, scanner, pose, ranges * farthest / 12, spread)
             device = passages(grid, scanner, pose, ranges * farthest / 12, spread, judge)
             assert all(np.array_equal(*pair) for pair in zip(host, device, strict=True))

@@ -113,6 +113,13 @@ class OpenCLBackend(ProcessBound, Backend):
                 cl.enqueue_copy(self._queue, buffer, array, is_blocking=blocking)
         return buffer
 
+    def refill(self, array: np.ndarray, buffer: Buffer) -> None:
+        """See Backend.refill; shared memory needs no wait."""
+        if isinstance(buffer, SHARED):
+            buffer.bytes[: array.nbytes] = array.reshape(-1).view(np.uint8)
+        else:
+            self.upload(array, buffer, wait=False)
+
     def empty(self, count: int, dtype: np.dtype, *, zero: bool = False) -> Buffer:
         size = -(-max(count, 1) * np.dtype(dtype).itemsize // 4) * 4
         self._check_size(size)

@@ -152,7 +152,7 @@ class PointModel(Pickled):
             TypeError, ValueError: Poses that are not (N, 3) finite numbers, or an unfit array for the result.
         """
         backend, space, real = self._backend, self._workspace, self._real
-        checked = Poses(poses, backend)
+        checked = Poses(poses, backend, late=program is not None)
         count, on_device = checked.count, checked.on_device
         result = Result(poses, out, (count,), real, backend, on_device=on_device)
 
@@ -189,7 +189,7 @@ class PointModel(Pickled):
         """
         backend, space, count = self._backend, self._workspace, part[1] - part[0]
         name, width = {"place_relative": ("place", 4), "wrap_headings": ("residual", 2)}[kernel]
-        source = poses.buffer(backend, space, part)
+        flags, source = poses.flags(poses.corners(part, backend, space)), poses.buffer(backend, space, part)
         if source is None:
             assert poses.host is not None
             placed = np.empty((count, width), self._real)
@@ -198,4 +198,4 @@ class PointModel(Pickled):
             return space.upload(kernel, placed), ()
         result = space.empty(kernel, width * count, self._real)
         arguments = {"poses": source, name: result, "pose_status": pose_status(space), "particles": count}
-        return result, (launch(kernel, self._flags | poses.flags, (count,), **arguments, **numbers),)
+        return result, (launch(kernel, self._flags | flags, (count,), **arguments, **numbers),)

@@ -25,6 +25,7 @@ from gpusense.models.run import finish
 from gpusense.models.scan.differentiable import Differentiable, is_recorded, log_likelihood_of
 from gpusense.models.scan.explain import plan_of_call
 from gpusense.models.scan.pipeline import ScanPipeline
+from gpusense.models.scan.repeated import RepeatedScoring
 from gpusense.models.scan.request import Request, make_request
 from gpusense.models.scan.rules import Beams, ModelContext, Rules, check_beams
 from gpusense.models.scan.scoring import LastCall, run
@@ -94,6 +95,11 @@ class ScanModel(Pickled):
         from gpusense.models.scan.packed_call import ShortCalls
 
         return ShortCalls.of(self._pipeline)
+
+    @functools.cached_property
+    def _repeated(self) -> RepeatedScoring:
+        """Scans of poses that stay in place."""
+        return RepeatedScoring(self._pipeline, self._workspace, self._last_call)
 
     @property
     def _last(self) -> LastCall:
@@ -257,9 +263,13 @@ class ScanModel(Pickled):
         Raises:
             TypeError, ValueError, MemoryError: See ``log_likelihood``.
         """
+        with self._lock, self._workspace:
+            if self._repeated.start(poses, ranges, out, before):
+                return
         request = make_request(self._setting, poses, ranges, out, before=before)
         with self._lock, self._workspace:
             self._run(request)
+            self._repeated.remember(poses, out, request)
 
     def finish_scoring(self) -> None:
         """Wait for calls that ``start_scoring`` has begun.
@@ -368,7 +378,7 @@ class ScanModel(Pickled):
         checked = Poses(poses, self._setting.backend)
         if checked.count:
             with self._lock:
-                checked.window(self._pipeline.map, (0, checked.count))
+                checked.ensure_table(self._pipeline.map, (0, checked.count), self._setting.backend)
 
     def _weights_note(self) -> str:
         return "" if self.compat is None else f" with the weights of {self._setting.weights.name} (no likelihood)"

@@ -13,7 +13,7 @@ from gpusense.models.poses import Poses
 from gpusense.models.scan.classed import check_ranges
 from gpusense.models.scan.rules import ModelContext
 
-_FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
+FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
 # Poses that several models share, checked once, by the number of scans.
 Known = MutableMapping[int | None, Poses]
 
@@ -80,18 +80,18 @@ def make_request(
     """
     backend, real, scanner = setting.backend, setting.real, setting.rules.scanner
     beams = scanner.count
-    if type(ranges) is np.ndarray and ranges.shape == (beams,) and ranges.dtype in _FLOATS:
+    if type(ranges) is np.ndarray and ranges.shape == (beams,) and ranges.dtype in FLOATS:
         readings: np.ndarray = ranges
     else:
         readings = check_ranges(arrays.copied_to_host(ranges, backend, "ranges"), scanner)
     known = {} if known is None else known
     shape: tuple[int, ...]
     if readings.ndim == 1:
-        checked = known[None] = known.get(None) or Poses(poses, backend)
+        checked = known[None] = known.get(None) or Poses(poses, backend, late=True)
         readings, shape = readings[None], (checked.count,)
     else:
         scans = len(readings)
-        checked = known[scans] = known.get(scans) or Poses(poses, backend, scans=scans)
+        checked = known[scans] = known.get(scans) or Poses(poses, backend, scans=scans, late=True)
         shape = (scans, checked.count // scans if scans else np.shape(poses)[1])
     result = Result(poses, out, shape, real, backend, on_device=checked.on_device)
     parts = np.zeros((len(readings), shape[-1], beams if per_beam else 0), real)

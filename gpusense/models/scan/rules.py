@@ -99,6 +99,13 @@ class Rules:
         return np.arange(self.scanner.count)
 
     @functools.cached_property
+    def of_complete_scan(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Which readings (1, K) of a scan of ranges alone are used, their positions (M,) and vectors (M, 2)."""
+        used = self.choice.used(np.ones(self.scanner.count, bool))
+        columns = used.nonzero()[0]
+        return used[None], columns, self.vectors.take(columns, axis=0)
+
+    @functools.cached_property
     def separate(self) -> bool:
         """Tell whether each reading has a separate ray, because all bearings differ or nothing is left out."""
         return not self.specialize or len(set(map(tuple, self.vectors.tolist()))) == len(self.vectors)

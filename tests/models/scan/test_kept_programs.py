@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.scan_calls import FIELD, GRID, MODELS, NEAR, cloud, mixed
+from support.scan_calls import CASES, COUNT, FIELD, GRID, MODELS, NEAR, SCANS, cloud, mixed
 
 from gpusense.backends import Backend, get_backend
 from gpusense.backends.proxy import Proxy
@@ -52,3 +52,30 @@ def test_scans_in_any_order_have_the_bits_of_first_calls(kind, backend):
         scan = mixed(seed)
         expected = kind(GRID, NEAR, backend=backend).log_likelihood(cloud(seed), scan)
         assert differing(model.log_likelihood(cloud(seed), scan), expected) == 0
+
+
+@pytest.mark.sampled(0.5)
+@pytest.mark.parametrize("case", CASES)
+def test_scans_of_poses_that_stay_in_place_have_the_bits_of_ordinary_calls(case, backend, monkeypatch):
+    """Poses and map change as well, and one scan comes from a list."""
+    device, model, scored, once = get_backend(backend), *(CASES[case](backend=backend) for _ in range(3))
+    poses = device.view(device.upload(np.zeros(3 * COUNT)), (COUNT, 3), np.dtype(np.float64))
+    out = device.view(device.upload(np.zeros(COUNT, model.precision)), (COUNT,), np.dtype(model.precision))
+    moved: list[int] = []
+    ordinary, run = [], model._run
+    monkeypatch.setattr(model, "_run", lambda request: (ordinary.append(request), run(request)))
+    for seed, one in enumerate((*SCANS, *SCANS[:3])):
+        scan = one[: model.scanner.count]
+        if seed == 4:
+            for changed in (model, scored, once):
+                changed.update_map(np.full((3, 3), 100), (20, 30))
+        device.upload(cloud(seed).reshape(-1), poses.buffer)
+        model.start_scoring(poses, scan.tolist() if seed == 5 else scan, out=out, before=lambda: moved.append(1))
+        model.finish_scoring()
+        found = device.download(out.buffer, np.empty(COUNT, model.precision))
+        assert differing(found, scored.log_likelihood(cloud(seed), scan)) == 0
+        assert len(moved) == seed + 1
+    # The first one, the list, and scans whose log-likelihood is the same everywhere.
+    assert 2 <= len(ordinary) <= 5 or not model._setting.possible
+    once.start_scoring(poses, scan, out=out)
+    assert model.explain() == once.explain() and model.sources() == once.sources()

@@ -1,0 +1,286 @@
+"""Beams of a scan judged on a device by the cells of a map: alone, or by a correction at the pose that it estimates.
+
+The kernel ``judge_beams`` takes pose and covariance from the results of ``finish_estimate``. So the launch of a
+correction that estimates the pose may be followed at once by that of the judgement, and one copy reads both. A
+judgement is kept with everything on which it depends, and is returned where the same is asked for.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gpusense.backends.base import Backend, Buffer
+from gpusense.backends.workspace import Workspace
+from gpusense.interface.constants import MOMENTS
+from gpusense.interface.launches import Program, launch
+from gpusense.interface.structs import BeamRules, Frame
+from gpusense.reference.passages import judge_beams
+from gpusense.world.frames import frame_of
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.scanner import Scanner
+
+Floats = NDArray[np.float64]
+
+# Most beams of a scan that are judged; readings beyond are walked up to here only [m]. Twice the middles of that many
+# parts of a scan.
+BEAMS, _FARTHEST = 32, 20.0
+_MIDDLES = np.arange(BEAMS) * 2 + 1
+# Companions start beside the beam [m] and diverge by an angle [rad]; both grow with the deviations of the pose, up to
+# these limits.
+BESIDE, _APART, _MOST_BESIDE, _MOST_APART = 0.08, 0.025, 0.3, 0.1
+# Tolerance of a range: a share of it, and its least values [m] and [cells].
+_PART, _LEAST, _LEAST_CELLS = 0.02, 0.2, 2.0
+# Numbers of a judgement.
+JUDGED = 2 * BEAMS
+_DOUBLE, _PLAIN = np.dtype(np.float64), frozenset[str]()
+# Numbers of parts of maps on devices, which recorded launches name.
+_VERSIONS = itertools.count(1)
+
+
+class Beams(NamedTuple):
+    """The beams of a scan that are judged.
+
+    Attributes:
+        bearing: (B,) bearings [rad].
+        reading: (B,) readings [m].
+    """
+
+    bearing: Floats
+    reading: Floats
+
+
+class _Setting(NamedTuple):
+    """A scanner in a map.
+
+    Attributes:
+        scanner: The scanner.
+        turn: Direction of bearing 0 in the map, less the robot's heading [rad].
+        frame: Frame of the map.
+        rules: Rules for readings, with the corner of the map's part.
+    """
+
+    scanner: Scanner
+    turn: float
+    frame: Frame
+    rules: BeamRules
+
+
+class _Expected(NamedTuple):
+    """A scan that a correction judges.
+
+    Attributes:
+        scanner: The scanner.
+        ranges: The bytes of its (K,) readings.
+        beams: The beams that are judged.
+        version: The part of the map.
+    """
+
+    scanner: Scanner
+    ranges: bytes
+    beams: Beams
+    version: int
+
+
+def chosen_beams(scanner: Scanner, ranges: Floats) -> Beams:
+    """Return the beams of a scan (K,) that are judged."""
+    # Missing readings are below the least range, or NaN.
+    present = ranges >= scanner.range_min
+    if scanner.range_min > 0:
+        present &= ranges > 0
+    chosen = present.nonzero()[0]
+    if len(chosen) > BEAMS:
+        chosen = chosen[_MIDDLES * len(chosen) // JUDGED]
+    return Beams(scanner.bearings[chosen], ranges[chosen])
+
+
+def judged_on_host(grid: OccupancyGrid, scanner: Scanner, pose: Floats, covariance: Floats, beams: Beams) -> Floats:
+    """Return the result of the kernel ``judge_beams``, computed on the host."""
+    setting, count = _setting_of(grid, scanner), len(beams.bearing)
+    scan = np.concatenate([beams.bearing + setting.turn, beams.reading])
+    estimate, judged = np.array(_numbers_of(pose, covariance)), np.empty(2 * count)
+    cells = grid.cells.reshape(-1).view(np.uint8)
+    if count:
+        judge_beams(_PLAIN, cells, estimate, scan, judged, setting.frame, setting.rules, *grid.shape, count)
+    return judged
+
+
+class MapJudge:
+    """The cells of a map around the last pose on a device, which judges beams there.
+
+    Args:
+        backend: The device.
+        grid: The map.
+
+    Attributes:
+        grid: The map.
+        version: Number of the part of the map on the device, different from those of all others; 0 before.
+    """
+
+    def __init__(self, backend: Backend, grid: OccupancyGrid) -> None:
+        self.grid, self.version = grid, 0
+        self._backend, self._space = backend, Workspace(backend)
+        # First and last row and column of the cells on the device.
+        self._part = (0, 0), (0, 0)
+        self._cells: Buffer = None
+        self._setting: _Setting | None = None
+        # The estimate, then the scan.
+        align = max(backend.alignment // _DOUBLE.itemsize, 1)
+        begin = -(-MOMENTS // align) * align
+        self._given, self._begin = backend.upload(np.zeros(begin + JUDGED)), begin
+        self._estimate = backend.part(self._given, 0, MOMENTS, _DOUBLE)
+        self._scan = backend.part(self._given, begin, JUDGED, _DOUBLE)
+        # The scan that a correction judges; with its result, the pose and covariance of that.
+        self._expected: _Expected | None = None
+        self._known: tuple[_Expected, list[float], Floats] | None = None
+        self._uploaded: Floats | None = None
+
+    def __call__(self, scanner: Scanner, pose: Floats, covariance: Floats, ranges: Floats) -> tuple[Beams, Floats]:
+        """Return the judged beams of a scan, and the result of the kernel ``judge_beams``."""
+        numbers = _numbers_of(pose, covariance)
+        self._cover(self._set(scanner), pose)
+        setting, known = self._set(scanner), self._known
+        if known is not None and known[1] == numbers and self._is_of(known[0], scanner, ranges):
+            return known[0].beams, known[2]
+        beams = chosen_beams(scanner, ranges)
+        count, space = len(beams.bearing), self._space
+        result = np.empty(2 * count)
+        if not count:
+            return beams, result
+        given = np.empty(self._begin + 2 * count)
+        given[:MOMENTS] = numbers
+        np.add(beams.bearing, setting.turn, out=given[self._begin : self._begin + count])
+        given[self._begin + count :] = beams.reading
+        self._expected, self._uploaded = None, given
+        self._backend.upload(given, self._given, wait=False)
+        judged = space.empty("judged", 2 * count, _DOUBLE)
+        (top, bottom), (left, right) = self._part
+        changing = dict(
+            cells=self._cells, frame=setting.frame, rules=setting.rules, rows=bottom - top, cols=right - left
+        )
+        space.run(count, changing, lambda: self._launches(setting, self._estimate, judged, count), version=0)
+        space.read(judged, result)
+        return beams, result
+
+    def expects(self, scanner: Scanner, ranges: Floats) -> bool:
+        """Prepare for a scan that a correction judges at the pose that it estimates, after judgements have ended.
+
+        Args:
+            scanner: The scanner.
+            ranges: (K,) readings [m].
+
+        Returns:
+            Whether there are beams, and cells of the map on the device.
+        """
+        self._expected = self._known = None
+        if self._cells is None:
+            return False
+        beams, turn = chosen_beams(scanner, ranges), self._set(scanner).turn
+        count = len(beams.bearing)
+        if not count:
+            return False
+        # Readings that are NaN are no beams.
+        scan = np.full(JUDGED, np.nan)
+        np.add(beams.bearing, turn, out=scan[:count])
+        scan[BEAMS : BEAMS + count] = beams.reading
+        self._uploaded = scan
+        self._backend.refill(scan, self._scan)
+        self._expected = _Expected(scanner, ranges.tobytes(), beams, self.version)
+        return True
+
+    def launches(self, estimate: Buffer, judged: Buffer) -> Program:
+        """Return the launch that judges the expected scan at an estimate, and depends on ``version``."""
+        if self._expected is None:
+            raise RuntimeError("launches: needs a scan that is expected")
+        return self._launches(self._set(self._expected.scanner), estimate, judged, BEAMS)
+
+    def receive(self, estimate: Floats, judged: Floats) -> None:
+        """Keep the judgement of the expected scan.
+
+        Args:
+            estimate: The results of ``finish_estimate``.
+            judged: The result of ``judge_beams``.
+        """
+        expected, self._expected = self._expected, None
+        if expected is not None:
+            count, numbers = len(expected.beams.bearing), _finished(estimate[:MOMENTS].tolist())
+            result = np.concatenate([judged[:count], judged[BEAMS : BEAMS + count]])
+            self._known = expected, numbers, result
+
+    def _is_of(self, expected: _Expected, scanner: Scanner, ranges: Floats) -> bool:
+        """Tell whether a judgement is that of a scan by the present part of the map."""
+        same = expected.scanner is scanner and expected.version == self.version
+        return same and expected.ranges == ranges.tobytes()
+
+    def _launches(self, setting: _Setting, estimate: Buffer, judged: Buffer, beams: int) -> Program:
+        (top, bottom), (left, right) = self._part
+        return (
+            launch(
+                "judge_beams", _PLAIN, (beams,), cells=self._cells, estimate=estimate, scan=self._scan, judged=judged,
+                frame=setting.frame, rules=setting.rules, rows=bottom - top, cols=right - left, beams=beams,
+            ),
+        )  # fmt: skip
+
+    def _set(self, scanner: Scanner) -> _Setting:
+        """Return the setting of a scanner in the present part of the map."""
+        if self._setting is None or self._setting.scanner is not scanner:
+            (top, _), (left, _) = self._part
+            self._setting = _setting_of(self.grid, scanner, (top, left))
+        return self._setting
+
+    def _cover(self, setting: _Setting, pose: Floats) -> None:
+        """Copy another part of the map if some cells are missing that a ray from a pose may reach."""
+        frame, rules = setting.frame, setting.rules
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        x = float(pose[0]) - frame.origin_x + c * frame.mount_x - s * frame.mount_y
+        y = float(pose[1]) - frame.origin_y + s * frame.mount_x + c * frame.mount_y
+        side, reach = frame.resolution, (rules.limit + rules.most_beside) / frame.resolution + 2
+        places = (frame.yaw_cos * y - frame.yaw_sin * x) / side, (frame.yaw_cos * x + frame.yaw_sin * y) / side
+        if self._cells is None or not all(
+            (begin == 0 or place - reach >= begin) and (end >= size or place + reach < end)
+            for (begin, end), place, size in zip(self._part, places, self.grid.shape, strict=True)
+        ):
+            # With a margin, so that a robot that moves on seldom needs another part.
+            self._part = (top, bottom), (left, right) = self._around(places, 1.5 * reach)
+            part = np.ascontiguousarray(self.grid.cells[top:bottom, left:right])
+            self._cells = self._space.upload("cells", part.reshape(-1).view(np.uint8))
+            self.version, self._setting = next(_VERSIONS), None
+
+    def _around(self, places: tuple[float, float], reach: float) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Return rows and columns within a distance of a place [cells], at least one of each."""
+        spans = []
+        for place, size in zip(places, self.grid.shape, strict=True):
+            low = int(min(max(place - reach, 0.0), size - 1.0))
+            spans.append((low, int(min(max(place + reach, low), size - 1.0)) + 1))
+        return spans[0], spans[1]
+
+
+def _numbers_of(pose: Floats, covariance: Floats) -> list[float]:
+    """Return a pose and its covariance in the order of the kernels' estimate."""
+    x, y, theta = (float(value) for value in pose)
+    (xx, xy, xt), (_, yy, yt), (_, _, tt) = covariance.tolist()
+    # Of headings within half a turn nothing is rounded off.
+    return _finished([x, y, math.remainder(theta, math.tau), xx, xy, xt, yy, yt, tt])
+
+
+def _finished(numbers: list[float]) -> list[float]:
+    """Return an estimate whose variances are not negative by rounding."""
+    for place in (3, 6, 8):
+        numbers[place] = max(numbers[place], 0.0)
+    return numbers
+
+
+def _setting_of(grid: OccupancyGrid, scanner: Scanner, corner: tuple[int, int] = (0, 0)) -> _Setting:
+    """Return the setting of a scanner in a map, or in its part from a row and a column on."""
+    side, (top, left) = grid.resolution, corner
+    rules = BeamRules(
+        left * side, top * side, max(BESIDE, side), max(_MOST_BESIDE, side), _APART, _MOST_APART, scanner.cone / 2,
+        max(_LEAST, _LEAST_CELLS * side), _PART, min(_FARTHEST, scanner.range_max), scanner.range_max,
+        grid.occupied_threshold,
+    )  # fmt: skip
+    turn = math.remainder(scanner.mount[2] - grid.origin[2], math.tau)
+    return _Setting(scanner, turn, frame_of(grid, scanner.mount), rules)

@@ -1,0 +1,103 @@
+"""Scans of poses that stay in place on a processor, as those of a filter: only readings change from call to call.
+
+The host classes and uploads the readings of each scan. All other work of a call, from the checks of arguments to the
+arguments of its launches, is done once for each place of the poses and each number of readings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gpusense.backends.base import Buffer
+from gpusense.backends.programs import ChangingProgram
+from gpusense.backends.workspace import Workspace
+from gpusense.models.poses import PlacedPoses, Poses
+from gpusense.models.run import chunk_of
+from gpusense.models.scan.pipeline import ScanPipeline
+from gpusense.models.scan.request import FLOATS, Request
+from gpusense.models.scan.scoring import LastCall
+
+_IN_LANES = frozenset({"IN_LANES"})
+# Most places of poses that are kept.
+_MOST = 16
+
+
+class _Place(NamedTuple):
+    """Poses and log-likelihoods on the device.
+
+    Attributes:
+        number: A number of its own.
+        owners: The user's arrays, whose identities are therefore theirs alone.
+        poses: The poses.
+        log_p: The buffer for log-likelihoods.
+    """
+
+    number: int
+    owners: tuple[Any, Any]
+    poses: Poses
+    log_p: Buffer
+
+
+class RepeatedScoring:
+    """Starts scans of poses that were scored before.
+
+    Args:
+        pipeline: The stages of the model.
+        space: Holds the buffers.
+        last: Receives the facts that ``explain`` reports.
+    """
+
+    def __init__(self, pipeline: ScanPipeline, space: Workspace, last: LastCall) -> None:
+        self._pipeline, self._space, self._last = pipeline, space, last
+        self._places: dict[tuple[int, int], _Place] = {}
+        self._count = 0
+
+    def remember(self, poses: Any, out: Any, request: Request) -> None:
+        """Keep the place of the poses of a request that was started, if it can be repeated."""
+        backend, count = self._pipeline.backend, request.poses.count
+        whole = request.scans == 1 and 0 < count <= chunk_of(backend, self._pipeline.scanner.count)
+        if backend.info.kind != "cpu" or not request.poses.on_device or not whole:
+            return
+        if len(self._places) >= _MOST:
+            del self._places[next(iter(self._places))]
+        self._count += 1
+        log_p = backend.part(request.result.flat, 0, count, self._pipeline.real)
+        self._places[id(poses), id(out)] = _Place(self._count, (poses, out), request.poses, log_p)
+
+    def start(self, poses: Any, ranges: Any, out: Any, before: Callable[[], None] | None) -> bool:
+        """Start a scan, and return whether it could be; the arguments are those of ``ScanModel.start_scoring``."""
+        place, pipeline, space = self._places.get((id(poses), id(out))), self._pipeline, self._space
+        plain = type(ranges) is np.ndarray and ranges.shape == (pipeline.scanner.count,) and ranges.dtype in FLOATS
+        if place is None or not plain or pipeline.trial is not None:
+            return False
+        scans = pipeline.classed(ranges[None])
+        if pipeline.value(scans) is not None:
+            return False
+        readings = pipeline.upload(scans, space)
+        scoring = pipeline.scoring(readings, *self._placed(place), place.log_p, space)
+        key = place.number, scoring.flags, readings.key
+        program = space.kept(key, pipeline.map.version)
+        if program is None:
+            made = ChangingProgram(pipeline.backend, pipeline.program(scoring), pipeline.numbers(scoring))
+            program = space.keep(key, made, pipeline.map.version)
+        if before is not None:
+            before()
+        program(pipeline.numbers(scoring))
+        last = self._last
+        last.flags = (program.flags - _IN_LANES) | (scoring.flags & _IN_LANES)
+        last.scans, last.together, last.kernels = scans, 0, pipeline.kernel_names[False]
+        return True
+
+    def _placed(self, place: _Place) -> tuple[PlacedPoses, Buffer]:
+        """Return the description of a place in the present map, and the map's table."""
+        pipeline, space = self._pipeline, self._space
+        key = place.number, "placed"
+        placed: tuple[PlacedPoses, Buffer] | None = space.kept(key, pipeline.map.version)
+        if placed is None:
+            made = pipeline.place(place.poses, (0, place.poses.count), space)
+            # A table that was just made has another version.
+            placed = space.keep(key, made, pipeline.map.version)
+        return placed

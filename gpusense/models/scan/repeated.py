@@ -19,6 +19,7 @@ from gpusense.models.run import chunk_of
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.request import FLOATS, Request
 from gpusense.models.scan.scoring import LastCall
+from gpusense.tables.reachable import MapState
 
 _IN_LANES = frozenset({"IN_LANES"})
 # Most places of poses that are kept.
@@ -77,12 +78,13 @@ class RepeatedScoring:
         if pipeline.value(scans) is not None:
             return False
         readings = pipeline.upload(scans, space)
-        scoring = pipeline.scoring(readings, *self._placed(place), place.log_p, space)
+        placed, state = self._placed(place)
+        scoring = pipeline.scoring(readings, placed, state.table, place.log_p, space)
         key = place.number, scoring.flags, readings.key
-        program = space.kept(key, pipeline.map.version)
+        program = space.kept(key, state.version)
         if program is None:
             made = ChangingProgram(pipeline.backend, pipeline.program(scoring), pipeline.numbers(scoring))
-            program = space.keep(key, made, pipeline.map.version)
+            program = space.keep(key, made, state.version)
         if before is not None:
             before()
         program(pipeline.numbers(scoring))
@@ -91,13 +93,12 @@ class RepeatedScoring:
         last.scans, last.together, last.kernels = scans, 0, pipeline.kernel_names[False]
         return True
 
-    def _placed(self, place: _Place) -> tuple[PlacedPoses, Buffer]:
-        """Return the description of a place in the present map, and the map's table."""
+    def _placed(self, place: _Place) -> tuple[PlacedPoses, MapState]:
+        """Return the description of a place in the present map, and the map with its table."""
         pipeline, space = self._pipeline, self._space
         key = place.number, "placed"
-        placed: tuple[PlacedPoses, Buffer] | None = space.kept(key, pipeline.map.version)
+        placed: tuple[PlacedPoses, MapState] | None = space.kept(key, pipeline.map.version)
         if placed is None:
             made = pipeline.place(place.poses, (0, place.poses.count), space)
-            # A table that was just made has another version.
-            placed = space.keep(key, made, pipeline.map.version)
+            placed = space.keep(key, made, made[1].version)
         return placed

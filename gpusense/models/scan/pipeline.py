@@ -200,7 +200,7 @@ class ScanPipeline(ABC):
 
     def place(self, poses: Poses, part: Part, space: Workspace) -> tuple[PlacedPoses, MapState]:
         """Place some poses in a window of the map; also return the map with its table."""
-        state = poses.ensure_table(self.map, part, self.backend, space)
+        state = self.map.ensure(poses.corners(part, self.backend, space) or poses.hull)
         frame = Frame(state.window, state.grid, self._mount)
         return place(poses, part, frame, self.backend, space, self.real, careful=self.careful), state
 

@@ -181,7 +181,7 @@ def class_scans(ranges: np.ndarray, rules: Rules) -> ClassedScans:
         columns, values, vectors, vectors, np.arange(len(columns) + 1, dtype=np.int32), counts, counts, constants,
         LeftOut(hit[-1], far[-1], used[-1], used_max[-1], constant[-1], rules.z_max > 0),
     )  # fmt: skip
-    return _separated(scans, rules)
+    return scans if rules.separate else _separated(scans)
 
 
 def _of_complete_scan(ranges: np.ndarray, classes: tuple[np.ndarray, np.ndarray], rules: Rules) -> ClassedScans:
@@ -190,17 +190,15 @@ def _of_complete_scan(ranges: np.ndarray, classes: tuple[np.ndarray, np.ndarray]
     hit, far = classes[0][0], classes[1][0]
     values = ranges[0] if rules.choice.every else ranges[0].take(columns)
     left_out = LeftOut(hit, far, used, far, far, rules.z_max > 0)
-    return _separated(
-        ClassedScans(
-            columns, values.astype(np.float64), vectors, vectors, first, count, count, constants, left_out
-        ),
-        rules,
+    scans = ClassedScans(
+        columns, values.astype(np.float64), vectors, vectors, first, count, count, constants, left_out
     )  # fmt: skip
+    return scans if rules.separate else _separated(scans)
 
 
-def _separated(scans: ClassedScans, rules: Rules) -> ClassedScans:
+def _separated(scans: ClassedScans) -> ClassedScans:
     """Return scans with readings on one bearing beside each other, which share a ray."""
-    return scans if rules.separate else _join([_grouped(scans.part(i, i + 1)) for i in range(scans.scans)])
+    return _join([_grouped(scans.part(i, i + 1)) for i in range(scans.scans)])
 
 
 def _numbers_of(chosen: np.ndarray) -> np.ndarray:

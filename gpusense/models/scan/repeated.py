@@ -20,6 +20,7 @@ from gpusense.models.run import chunk_of
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.request import FLOATS, Request
 from gpusense.models.scan.scoring import LastCall
+from gpusense.tables.reachable import MapState
 
 _IN_LANES = frozenset({"IN_LANES"})
 # Most places of poses that are kept.
@@ -48,13 +49,13 @@ class _Placed(NamedTuple):
     Attributes:
         number: A number of its own.
         poses: The poses.
-        table: The map's table.
+        map: The map with its table.
         flags: Flags of the launch that places them, as ``explain`` reports them.
     """
 
     number: int
     poses: PlacedPoses
-    table: Buffer
+    map: MapState
     flags: frozenset[str]
 
 
@@ -96,12 +97,12 @@ class RepeatedScoring:
             return False
         readings = pipeline.upload(scans, space)
         placed = self._placed(place)
-        scoring = pipeline.scoring(readings, placed.poses, placed.table, place.log_p, space)
+        scoring = pipeline.scoring(readings, placed.poses, placed.map.table, place.log_p, space)
         key = place.number, scoring.flags, readings.key
-        program = space.kept(key, pipeline.map.version)
+        program = space.kept(key, placed.map.version)
         if program is None:
             made = ChangingProgram(pipeline.backend, pipeline.score_launches(scoring), pipeline.numbers(scoring))
-            program = space.keep(key, made, pipeline.map.version)
+            program = space.keep(key, made, placed.map.version)
         if before is not None:
             before()
         self._placing.run(placed.number, placed.poses.launches)
@@ -117,9 +118,8 @@ class RepeatedScoring:
         key = place.number, "placed"
         placed: _Placed | None = space.kept(key, pipeline.map.version)
         if placed is None:
-            poses, table = pipeline.place(place.poses, (0, place.poses.count), space)
+            poses, state = pipeline.place(place.poses, (0, place.poses.count), space)
             self._count += 1
             flags = flags_of(poses.launches()) - _IN_LANES
-            # A table that was just made has another version.
-            placed = space.keep(key, _Placed(self._count, poses, table, flags), pipeline.map.version)
+            placed = space.keep(key, _Placed(self._count, poses, state, flags), state.version)
         return placed

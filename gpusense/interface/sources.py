@@ -75,8 +75,6 @@ def source_text(file: str) -> str:
 
 @functools.lru_cache(maxsize=512)
 def _with_parameters(text: str, file: str) -> str:
-    """Return a source with the parameters of its kernels."""
-
     def head(match: re.Match[str]) -> str:
         name = match.group(1)
         if name not in KERNELS:
@@ -118,7 +116,6 @@ def _requirements(name: str) -> list[str]:
 
 @functools.lru_cache(maxsize=512)
 def _named_files(text: str) -> list[str]:
-    """Return the files that a source requires."""
     match = _REQUIRES.search(text)
     return match.group(1).split() if match else []
 
@@ -150,7 +147,6 @@ def _declarations(text: str) -> str:
 
 @functools.lru_cache(maxsize=512)
 def _words(text: str) -> frozenset[str]:
-    """Return the words of a source."""
     return frozenset(_WORD.findall(text))
 
 

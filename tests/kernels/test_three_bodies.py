@@ -89,6 +89,7 @@ ON_PURPOSE = [
     Purpose("passages", "floor_of", (OPENCL,), FLOOR),
     Purpose("passages", "_cells_along", REFERENCE_ONLY, ARRAYS),
     Purpose("philox", "number_of", (OPENCL,), LANES),
+    Purpose("placement", "move_to_sensor", (OPENCL,), LANES),
     Purpose("placement", "floor_cells", (OPENCL,), FLOOR),
     Purpose("ranges", "caster_of", (WARP, NUMPY), "OpenCL requires the file caster, which sources.py resolves"),
     Purpose("raycast", "track_of rectangle_at", KERNELS_ONLY, COUNTS),

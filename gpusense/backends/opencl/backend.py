@@ -253,7 +253,6 @@ class OpenCLBackend(ProcessBound, Backend):
             self._queued += 1
 
     def _counted(self, launches: int) -> None:
-        """Count queued launches."""
         with self._count:
             self._queued += launches
 

@@ -178,7 +178,6 @@ class DeviceCall(BoundCall):
         )  # fmt: skip
 
     def _wait(self) -> None:
-        """Wait for all starts of the program."""
         for _, program in self._programs.items():
             program.recording.wait()
 

@@ -218,7 +218,6 @@ class MapCaster:
             drawing.on_host(piece.begin, count, rays, flat[piece.begin * rays : piece.end * rays], incidence)
 
     def _cast(self, poses: Poses, piece: Piece, ray: Buffer, rays: int, flat: Any, cones: Cones) -> None:
-        """Start casting the rays of a piece."""
         space, count = self._workspace, piece.count
         state = poses.ensure_table(self.map, piece.part, self.backend, space)
         placed = place(poses, piece.part, Frame(state.window, state.grid, self.mount), self.backend, space, self.real)

@@ -7,7 +7,8 @@ typedef float coordinate;
 typedef double coordinate;
 #endif
 
-#define FARTHEST 1073741824.0
+// in lanes: FARTHEST within_reach move_to_sensor
+
 #define BELOW_ONE 0x1.fffffep-1f
 
 #if POSES_FLOAT32
@@ -22,12 +23,6 @@ void load_coordinates(global const coordinate *poses, const int n, const int cou
 #else
 #define load_coordinates load_poses
 #endif
-
-// Clamp coordinates to +-FARTHEST cells; NaN becomes -FARTHEST.
-doubles within_reach_lanes(const doubles position) {
-    const doubles above = position > -FARTHEST ? position : (doubles)-FARTHEST;
-    return above < FARTHEST ? above : (doubles)FARTHEST;
-}
 
 // Return the floors of coordinates within reach.
 doubles floor_cells_lanes(const doubles position) {
@@ -57,21 +52,7 @@ void place_lanes(global const coordinate *poses, global int2 *pose_cell, global 
     const choices finite = (x - x) + (y - y) + (theta - theta) == 0.0;
     const DoublePair heading = cos_sin_any(theta);
     doubles cosine = heading.x, sine = heading.y;
-    x -= frame.origin_x;
-    y -= frame.origin_y;
-    if (frame.mount_x != 0 || frame.mount_y != 0) {
-        x += cosine * frame.mount_x - sine * frame.mount_y;
-        y += sine * frame.mount_x + cosine * frame.mount_y;
-    }
-    if (frame.yaw_sin != 0) {
-        const doubles x_before = x, cosine_before = cosine;
-        x = frame.yaw_cos * x + frame.yaw_sin * y;
-        y = frame.yaw_cos * y - frame.yaw_sin * x_before;
-        cosine = cosine * frame.yaw_cos + sine * frame.yaw_sin;
-        sine = sine * frame.yaw_cos - cosine_before * frame.yaw_sin;
-    }
-    x = within_reach_lanes(x / frame.resolution);
-    y = within_reach_lanes(y / frame.resolution);
+    move_to_sensor_lanes(frame, &x, &y, &cosine, &sine);
     if (any_of_lanes(~finite)) {
         atomic_or(&pose_status[0], 1);
         x = finite ? x : (doubles)-FARTHEST, y = finite ? y : (doubles)-FARTHEST;

@@ -2,23 +2,9 @@
 // the order of the scalar kernel.
 // requires: lanes/offsets lanes/log_terms
 
-#define STUDENT_T 1
-#define TWO_NORMALS 2
-#define BEACON 7
-// Numbers of a density, as in beacons.cl.
-#define SCALE 0
-#define PEAK 2
-#define RANDOM 4
-#define RANGE_MAX 5
-#define WIDE_SCALE 6
-#define WIDE_PEAK 8
-#define OFFSET 6
-#define OFFSET_LOW 7
-#define POWER 8
-#define T_SCALE 9
-#define ARC 10
-#define ODD 11
-#define STEEPEST 1e18f
+// in lanes: STUDENT_T TWO_NORMALS BEACON SCALE PEAK RANDOM RANGE_MAX WIDE_SCALE WIDE_PEAK OFFSET OFFSET_LOW POWER T_SCALE
+// in lanes: ARC ODD STEEPEST
+
 // tan(pi/8), pi/4 and pi/2.
 #define EIGHTH_SLOPE 0.414213562f
 #define EIGHTH_TURN 0.785398163f

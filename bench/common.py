@@ -107,6 +107,16 @@ def part_of(text: str) -> tuple[int, int]:
     return first, count
 
 
+def stated_commit(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> str:
+    """Return ``--commit``, or the checkout's commit; exit with an error where it has changes that no commit has."""
+    from gpusense.evaluation.benchmark.report import commit
+
+    stated = arguments.commit or commit() or ""
+    if not stated or stated.endswith("+"):
+        parser.error(f"--commit: the checkout must have no uncommitted changes, got {stated or 'no repository'}")
+    return stated
+
+
 def present(*, numpy: bool = True) -> list[str]:
     """List the selection strings of the machine's devices, without simulators."""
     found = [device for device in gs.devices() if device.available and device.kind != "simulator"]
@@ -152,6 +162,13 @@ class Scene:
     def noisy_scan(self, scanner: gs.Scanner, backend: Any = "numpy") -> np.ndarray:
         """Draw a scan at the pose from the beam model with default parameters; some beams have no return."""
         return simulate_scan(self.grid, scanner, self.pose, gs.BeamParameters(), self.rng, backend)
+
+
+def middle_pose(grid: gs.OccupancyGrid) -> np.ndarray:
+    """Return a pose in a free cell in the middle of the map's rows and columns of free cells."""
+    row, column = (int(index[len(index) // 2]) for index in np.nonzero(grid.free))
+    x0, y0, _ = grid.origin
+    return np.array([x0 + (column + 0.5) * grid.resolution, y0 + (row + 0.5) * grid.resolution, 0.3])
 
 
 def odd_scans(data: Path, name: str, limit: int | None = None) -> tuple[gs.OccupancyGrid, list[Any]]:

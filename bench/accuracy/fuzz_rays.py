@@ -21,21 +21,7 @@ from gpusense.backends import get_backend
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from common import differing_bits, make_parser, parse, publish, table
-from trees.cases import draw_grid
-
-
-def draw_poses(rng: np.random.Generator, grid: gs.OccupancyGrid, count: int) -> np.ndarray:
-    """Draw poses in, on the edges of, and around the map."""
-    rows, cols = grid.shape
-    col, row = rng.uniform(-0.3 * cols - 2, 1.3 * cols + 2, count), rng.uniform(-0.3 * rows - 2, 1.3 * rows + 2, count)
-    on_edge = rng.random((2, count)) < 0.25
-    col, row = np.where(on_edge[0], np.rint(col), col), np.where(on_edge[1], np.rint(row), row)
-    cos, sin = np.cos(grid.origin[2]), np.sin(grid.origin[2])
-    x, y = col * grid.resolution, row * grid.resolution
-    theta = rng.uniform(-np.pi, np.pi, count)
-    theta = np.where(rng.random(count) < 0.25, np.rint(theta / (np.pi / 4)) * (np.pi / 4), theta)
-    theta = np.where(rng.random(count) < 0.1, theta + 1e6, theta)
-    return np.stack([grid.origin[0] + cos * x - sin * y, grid.origin[1] + sin * x + cos * y, theta], axis=1)
+from trees.cases import draw_grid, draw_poses
 
 
 def main() -> int:
@@ -49,7 +35,7 @@ def main() -> int:
     differing = dict.fromkeys(backends, 0)
     while cast < arguments.rays:
         grid = draw_grid(rng)
-        poses = draw_poses(rng, grid, 300)
+        poses = draw_poses(rng, grid, 300, huge=0.1, out=1.0)
         bearings = np.concatenate([rng.uniform(-np.pi, np.pi, 36), np.arange(-4, 4) * (np.pi / 4)])
         range_max = grid.resolution * float(10 ** rng.uniform(0, 3.3))
         policy = {"outside": str(rng.choice(["free", "occupied"])), "unknown": str(rng.choice(["free", "occupied"]))}

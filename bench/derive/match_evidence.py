@@ -56,7 +56,7 @@ def main(argv: list[str] | None = None) -> None:
     for pairs in sets:
         match = pairs.match(backend)
         some = np.isin(match.status, AGREE)
-        x.append(features_of(match.evidence[some]))
+        x.append(np.stack(features_of(match.evidence[some]), axis=1))
         y.append(pairs.right(match)[some])
         half.append(np.full(some.sum(), pairs.half))
     numbers, labels, halves = np.concatenate(x), np.concatenate(y), np.concatenate(half)
@@ -67,7 +67,7 @@ def main(argv: list[str] | None = None) -> None:
             weight[some] = 1000 / max(some.sum(), 1)
     constant, weights = logistic(numbers, labels.astype(float), weight)
     print(f"{len(labels)} matches, {labels.mean():.3f} right")
-    print(f"_CONSTANT = {constant:.3f}\n_WEIGHTS = np.array([{', '.join(f'{value:.3f}' for value in weights)}])")
+    print(f"_CONSTANT = {constant:.3f}\n_WEIGHTS = ({', '.join(f'{value:.3f}' for value in weights)})")
 
 
 if __name__ == "__main__":

@@ -24,13 +24,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import needs
-from common import command_line, note
+from common import command_line, note, stated_commit
 from reports import read_tasks
 
 from gpusense._util.files import write_whole
 from gpusense.backends import get_backend
 from gpusense.commands import bench
-from gpusense.evaluation.benchmark.report import commit, document, plain, to_json
+from gpusense.evaluation.benchmark.report import document, plain, to_json
 from gpusense.evaluation.benchmark.runner import Outcome, Plan, run
 from gpusense.evaluation.benchmark.stored import read_report
 from gpusense.evaluation.machine import machine
@@ -170,18 +170,15 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True, help="path without ending of the .json files")
     needs.add_options(parser)
     arguments = parser.parse_args()
-    stated = arguments.commit or commit() or ""
-    if not stated or stated.endswith("+"):
-        parser.error(f"--commit: the checkout must have no uncommitted changes, got {stated or 'no repository'}")
-    arguments.commit, begin = stated, time.perf_counter()
+    arguments.commit, begin = stated_commit(parser, arguments), time.perf_counter()
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     kinds = {"tasks": tasks, "models": models}
     for kind, measure in kinds.items():
         if getattr(arguments, f"no_{kind}"):
             continue
         try:
-            old = earlier(arguments.output, kind, stated) if arguments.extend else None
-            for report in measure(arguments, stated, begin, old):
+            old = earlier(arguments.output, kind, arguments.commit) if arguments.extend else None
+            for report in measure(arguments, arguments.commit, begin, old):
                 write(arguments.output, kind, report)
         except (OSError, ValueError) as error:
             parser.error(str(error))

@@ -23,7 +23,7 @@ import json
 
 import numpy as np
 from accuracy.compiled_peers import Follower, Weigher
-from common import command_line, make_parser
+from common import command_line, make_parser, middle_pose
 from common import machine as described
 from speed.filters import PEERS, load
 
@@ -41,9 +41,7 @@ def measure(backend: str, particles: int, beams: int, stages: int, steps: int) -
     grid = building()
     scanner = gs.Scanner.uniform(angle_min=-np.pi / 2, angle_increment=np.pi / (beams - 1), count=beams, range_max=20.0)
     model = gs.LikelihoodFieldModel(grid, scanner, gs.LikelihoodFieldParameters(sigma_hit=0.1), backend=backend)
-    row, column = (int(index[len(index) // 2]) for index in np.nonzero(grid.free))
-    x0, y0, _ = grid.origin
-    pose = np.array([x0 + (column + 0.5) * grid.resolution, y0 + (row + 0.5) * grid.resolution, 0.3])
+    pose = middle_pose(grid)
     ranges = gs.RayCaster(grid, range_max=20.0, backend=backend).cast(pose[None], scanner.bearings)[0]
     filters = []
     for recovery in (None, None, "sensor"):
@@ -176,7 +174,6 @@ def main() -> None:
 
 
 def _write(args: Any, rows: list[dict[str, object]]) -> None:
-    """Write the report."""
     print(f"\n{machine_line()}")
     if args.output is not None:
         stated = {"command": command_line("bench/speed/filter_step.py"), "commit": described(args.commit)["commit"]}

@@ -28,13 +28,12 @@ import numpy as np
 
 import gpusense as gs
 from gpusense.backends import Backend, get_backend
-from gpusense.evaluation.benchmark.report import commit
 from gpusense.evaluation.machine import processor_name
 from gpusense.evaluation.worlds import cloud_around, simulate_scan
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import ROOT, make_parser, note, parse
+from common import ROOT, make_parser, note, parse, stated_commit
 
 FILE = ROOT / "bench" / "history.csv"
 COLUMNS = ("date", "commit", "device", "row", "ms", "q1_ms", "q3_ms", "probe_ms", "error", "unit", "quiet")
@@ -192,9 +191,7 @@ def main() -> int:
     parser.add_argument("--size", type=int, nargs=2, default=(10_000, 60), metavar=("PARTICLES", "BEAMS"))
     arguments: argparse.Namespace = parse(parser)
     if not arguments.compare:
-        stated = arguments.commit or commit() or ""
-        if not stated or stated.endswith("+"):
-            parser.error(f"--commit: the checkout must have no uncommitted changes, got {stated or 'no repository'}")
+        stated = stated_commit(parser, arguments)
         append(arguments.file, measure(arguments.backend, *arguments.size, arguments.turns, arguments.tries, stated))
     try:
         found = regressions(read(arguments.file), limit=arguments.limit, window=arguments.window)

@@ -18,7 +18,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
-from common import make_parser, note, parse, publish, table
+from common import make_parser, middle_pose, note, parse, publish, table
 
 import gpusense as gs
 from gpusense.evaluation.worlds import building
@@ -47,9 +47,7 @@ def filters(arguments: Any, particles: int, beams: int, stages: int) -> dict[str
 def measure(arguments: Any, particles: int, beams: int, stages: int) -> dict[str, Any]:
     """Return the milliseconds of a step of both filters, and whether their particles are equal."""
     grid = building()
-    row, column = (int(index[len(index) // 2]) for index in np.nonzero(grid.free))
-    x0, y0, _ = grid.origin
-    pose = np.array([x0 + (column + 0.5) * grid.resolution, y0 + (row + 0.5) * grid.resolution, 0.3])
+    pose = middle_pose(grid)
     bearings = np.linspace(-np.pi / 2, np.pi / 2, beams)
     ranges = gs.RayCaster(grid, range_max=20.0, backend=arguments.device[0]).cast(pose[None], bearings)[0]
     both = filters(arguments, particles, beams, stages)

@@ -35,7 +35,7 @@ from scipy.optimize import minimize
 import gpusense as gs
 from gpusense._util.progress import progress
 from gpusense.localization.passages import counts_of, passages
-from gpusense.localization.ratio import FARTHEST, FEW, HALF, NEAREST, ratio_of_scan
+from gpusense.localization.ratio import BY_CHANCE, FARTHEST, FEW, HALF, IS_FOUND, NEAREST, OF_LEAD, ratio_of_scan
 from gpusense.localization.rival_search import RivalSearch
 from gpusense.localization.spread import is_wide
 
@@ -48,7 +48,8 @@ SEARCHED, DOUBTFUL = 4, -2.0
 def follow(seed, args):
     """Return rows of scans with a narrow covariance: whether the pose is wrong, ``Counts``, x, y; and of comparisons.
 
-    A comparison has: whether the pose is wrong, whether the map is, ratio of the scan, lead, beams, whether found.
+    A comparison has: whether the pose is wrong, whether the map is, ratio of the scan, lead, beams, ratio of the beams
+    at the other place, whether found.
     """
     rng = np.random.default_rng((5, seed))
     case = ("own", "own", "kidnapped", "wrong")[int(rng.integers(4))]
@@ -81,17 +82,18 @@ def follow(seed, args):
             tracker = pf._parts.tracker
             search, readings = RivalSearch(tracker.sensors), list(pf._parts.last.items())
             best = search.found(pose, covariance, readings, tracker.key(), pf.options.temperature)
-            compared.append((wrong, case == "wrong", ratio_of_scan([found]), best.lead, best.beams, best.is_found))
-    return np.array(rows, np.float64).reshape(-1, 8), np.array(compared, np.float64).reshape(-1, 6)
+            compared.append(
+                (wrong, case == "wrong", ratio_of_scan([found]), best.lead, best.beams, best.walls, best.is_found)
+            )
+    return np.array(rows, np.float64).reshape(-1, 8), np.array(compared, np.float64).reshape(-1, 7)
 
 
-def regression(design, wrong, weight=None, offset=0.0):
-    """Return the coefficients of a logistic regression, by default with equal weights of both classes."""
-    if weight is None:
-        weight = np.where(wrong, 0.5 / wrong.mean(), 0.5 / (1 - wrong.mean()))
+def regression(design, wrong):
+    """Return the coefficients of a logistic regression with equal weights of both classes."""
+    weight = np.where(wrong, 0.5 / wrong.mean(), 0.5 / (1 - wrong.mean()))
 
     def loss(coefficients):
-        z = design @ coefficients + offset
+        z = design @ coefficients
         p = 1 / (1 + np.exp(-z))
         value = float((weight * np.logaddexp(0, np.where(wrong, -z, z))).mean())
         return value, design.T @ (weight * (p - wrong)) / len(z)
@@ -198,16 +200,22 @@ def fitted(each, compared):
 
 def comparisons(rows):
     """Return weight of the lead, what it gains by chance and the evidence of a pose that is found, by a regression."""
-    rows = rows[np.isfinite(rows[:, 2]) & ~np.isnan(rows[:, 3]) & (rows[:, 4] > 0)]
-    wrong, other, ratio, lead, beams, is_found = rows.T
+    rows = rows[np.isfinite(rows[:, 2]) & ~np.isnan(rows[:, 3]) & (rows[:, 4] > 0) & (rows[:, 2] > DOUBTFUL)]
+    wrong, other, ratio, lead, beams, walls, is_found = rows.T
     wrong = wrong > 0
     weight = np.zeros(len(rows))
     for chosen, share in ((~wrong, 0.5), (wrong & (other > 0), 0.25), (wrong & (other == 0), 0.25)):
-        weight[chosen] = share * len(rows) / max(chosen.sum(), 1)
+        weight[chosen] = share / max(chosen.sum(), 1)
     information = beams / (beams + HALF)
     design = np.column_stack([np.clip(lead, NEAREST, FARTHEST), -information, -information * is_found])
-    doubtful = ratio > DOUBTFUL
-    return regression(design[doubtful], wrong[doubtful], weight[doubtful], ratio[doubtful]), int(doubtful.sum())
+    possible = 1 / (1 + np.exp(walls))
+
+    def loss(coefficients):
+        plain = design @ coefficients
+        z = ratio + np.where(plain > 0, np.log1p(possible * np.expm1(np.maximum(plain, 0))), plain)
+        return float(weight @ np.logaddexp(0, np.where(wrong, -z, z)))
+
+    return minimize(loss, (OF_LEAD, BY_CHANCE, IS_FOUND), method="Nelder-Mead").x, len(rows)
 
 
 def _listed(values):

@@ -65,6 +65,8 @@ class Workspace:
         self._programs = ProgramCache[Any](_MOST_KEPT)
         self._version = 0
         self._parts: dict[Hashable, list[Buffer]] = {}
+        # Keys of arrays that buffers hold, with these buffers.
+        self._held: dict[str, tuple[Hashable, Buffer]] = {}
 
     def __enter__(self) -> Workspace:
         """Begin a call, whose launches and copies are a batch where the device has graphs."""
@@ -82,7 +84,8 @@ class Workspace:
                 self.abandon()
 
     def abandon(self) -> None:
-        """Drop the non-finite flag after an error: the next call has a cleared one."""
+        """Drop the non-finite flag after an error: the next call has a cleared one. Copies may not have begun."""
+        self._held.clear()
         if POSE_STATUS in self._buffers:
             self._forget()
             del self._buffers[POSE_STATUS]
@@ -176,6 +179,19 @@ class Workspace:
             buffer = self.empty(name, array.size, array.dtype)
         return self._backend.upload(array, buffer, wait=False)
 
+    def hold(self, name: str, key: Hashable, make: Callable[[], np.ndarray]) -> Buffer:
+        """Return a buffer with an array that ``make`` returns; it is copied unless the last one had an equal key.
+
+        Buffers of this name must not be used otherwise.
+        """
+        held = self._held.get(name)
+        if held is not None and held[0] == key:
+            return held[1]
+        self._held.pop(name, None)
+        buffer = self.upload(name, make())
+        self._held[name] = key, buffer
+        return buffer
+
     def upload_all(self, name: str, arrays: Sequence[np.ndarray]) -> list[Buffer]:
         """Upload arrays of one dtype, none of them empty; a batch copies them as one."""
         if not (self._backend.info.graphs and self._backend.in_batch):
@@ -228,6 +244,7 @@ class Workspace:
         """Wait, and free all memory except the buffers named ``keep``; the next call allocates anew."""
         self.wait()
         self._forget()
+        self._held.clear()
         self._buffers = {key: kept for key, kept in self._buffers.items() if key[0] == keep}
 
 

@@ -137,7 +137,6 @@ class Matcher:
         self, scanner: Scanner, one: Floats, two: Floats, guess: Floats, window: tuple[float, float] | None,
         moved: tuple[Floats | None, Floats | None],
     ) -> ScanMatch:  # fmt: skip
-        """Return matches of readings."""
         options: dict[str, Any] = {} if window is None else {"window": window}
         if moved[0] is not None:
             options |= {"motion": moved[1], "reference_motion": moved[0]}

@@ -76,7 +76,6 @@ def _with_failures(listed: list[Device]) -> list[Device]:
 
 
 def _status(device: Device) -> str:
-    """Return a device's status in a word."""
     if device.available:
         return "limited" if device.reason else "available"
     return "unusable" if device.selection else "absent"

@@ -40,7 +40,6 @@ def named_world(name: str, seed: int = 0) -> OccupancyGrid:
 
 
 def _unknown(width: float, height: float) -> np.ndarray:
-    """Return unknown cells."""
     return np.full((round(height / _SIDE), round(width / _SIDE)), -1, np.int8)
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Hashable
+
 from gpusense.interface import casters
 
 FLAGS = {
@@ -61,6 +64,10 @@ FLAGS = {
 }
 
 
-def flags_if(**conditions: object) -> frozenset[str]:
-    """Return the flags whose conditions hold: ``flags_if(HIT=z_hit > 0, RAND=z_rand > 0)``."""
+@functools.lru_cache(maxsize=1024)
+def flags_if(**conditions: Hashable) -> frozenset[str]:
+    """Return the flags whose conditions hold: ``flags_if(HIT=z_hit > 0, RAND=z_rand > 0)``.
+
+    Calls of models repeat the conditions of earlier ones.
+    """
     return frozenset([flag for flag, holds in conditions.items() if holds])

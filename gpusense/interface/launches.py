@@ -116,7 +116,6 @@ _ROWS: dict[str, _Row] = {}
 
 
 def _row(kernel: str) -> _Row:
-    """Return the row of a kernel."""
     return _ROWS.setdefault(kernel, _Row(kernel, KERNELS[kernel]))
 
 

@@ -12,6 +12,7 @@ from gpusense.interface import casters, structs
 from gpusense.interface.directives import resolve
 from gpusense.interface.flags import FLAGS
 from gpusense.interface.kernel_files import has_opencl_source, opencl_source
+from gpusense.interface.lane_functions import takes_scalar_text, written_in_lanes
 from gpusense.interface.signatures import KERNELS
 
 _PRELUDE = """\
@@ -74,8 +75,6 @@ def source_text(file: str) -> str:
 
 @functools.lru_cache(maxsize=512)
 def _with_parameters(text: str, file: str) -> str:
-    """Return a source with the parameters of its kernels."""
-
     def head(match: re.Match[str]) -> str:
         name = match.group(1)
         if name not in KERNELS:
@@ -117,9 +116,15 @@ def _requirements(name: str) -> list[str]:
 
 @functools.lru_cache(maxsize=512)
 def _named_files(text: str) -> list[str]:
-    """Return the files that a source requires."""
     match = _REQUIRES.search(text)
     return match.group(1).split() if match else []
+
+
+def _scalar_source(file: str) -> str | None:
+    """Return the scalar file of the name of a file in lanes that takes functions; None for all other files."""
+    scalar = file.removeprefix("lanes/")
+    takes = scalar != file and has_opencl_source(scalar) and takes_scalar_text(opencl_source(file))
+    return scalar if takes else None
 
 
 def uses_double(file: str, flags: frozenset[str] = frozenset()) -> bool:
@@ -143,7 +148,6 @@ def _declarations(text: str) -> str:
 
 @functools.lru_cache(maxsize=512)
 def _words(text: str) -> frozenset[str]:
-    """Return the words of a source."""
     return frozenset(_WORD.findall(text))
 
 
@@ -162,9 +166,12 @@ def _kept(file: str, flags: frozenset[str]) -> str:
 def assemble(file: str, flags: frozenset[str]) -> str:
     """Return the complete OpenCL C source of a kernel file for a set of flags."""
     head = prelude(float64="FLOAT64" in flags, doubles=uses_double(file, flags))
-    body = ""
+    texts: dict[str, str] = {}
     for needed in required_files(file, flags):
-        body += f'#line 1 "{needed}.cl"\n' + _kept(needed, flags)
+        text, scalar = _kept(needed, flags), _scalar_source(needed)
+        sources = texts if scalar is None else {scalar: _kept(scalar, flags)} | texts
+        texts[needed] = written_in_lanes(text, needed, sources)
+    body = "".join(f'#line 1 "{name}.cl"\n{text}' for name, text in texts.items())
     return head + _declarations(body) + body
 
 
@@ -189,6 +196,7 @@ def with_places(log: str, source: str) -> str:
 def relevant(file: str, flags: frozenset[str]) -> frozenset[str]:
     """Return the flags that change a kernel file's code: one program serves all flags that agree on them."""
     files = required_files(file, flags)
+    files += [scalar for scalar in map(_scalar_source, files) if scalar is not None]
     words = set().union(*(_words(source_text(needed)) for needed in files))
     words |= _words("".join(structs.declaration(name) for name in structs.STRUCTS if name in words))
     if any({"caster", "lanes/caster"} & set(_requirements(needed)) for needed in files):

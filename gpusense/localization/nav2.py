@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 from gpusense._util import checks
 from gpusense._util.documents import read_mapping
-from gpusense.localization import nav2_start
 from gpusense.localization.motion import MotionModel, OdometryMotion, OmniMotion
-from gpusense.localization.nav2_nodes import nodes_of, parameters_of
+from gpusense.localization.nav2_file import START_NAMES, Matrix, first_covariance, first_pose, nodes_of, parameters_of
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.peers.parameters import BeamWeights, FieldWeights
@@ -97,7 +96,7 @@ class Nav2Options:
     """Time by which the transform is dated ahead [s]."""
     initial_pose: tuple[float, float, float] | None
     """The robot's first pose (x, y, yaw) [m, m, rad]; None where the file sets none."""
-    initial_covariance: nav2_start.Matrix | None
+    initial_covariance: Matrix | None
     """(3, 3) covariance of the first pose, of Beluga's ``initial_pose.covariance_x`` and so on; None without one."""
     ignored: tuple[str, ...]
     """Names of other parameters in the file, which have no effect here."""
@@ -176,7 +175,7 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str |
         (0.1, 0.2)
     """
     content, name = _content(source)
-    found = parameters_of(content, name, node, (*_DEFAULTS, *nav2_start.NAMES))
+    found = parameters_of(content, name, node, (*_DEFAULTS, *START_NAMES))
     robot = _ROBOTS[
         checks.choice("robot_model_type", found.get("robot_model_type", _DEFAULTS["robot_model_type"]), tuple(_ROBOTS))
     ]
@@ -208,9 +207,9 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str |
         topics=(values["map_topic"], values["scan_topic"]),
         tf_broadcast=values["tf_broadcast"],
         transform_tolerance=values["transform_tolerance"],
-        initial_pose=nav2_start.pose(name, found) if values["set_initial_pose"] else None,
-        initial_covariance=nav2_start.covariance(name, found) if values["set_initial_pose"] else None,
-        ignored=tuple(sorted(key for key in found if key not in _DEFAULTS and key not in nav2_start.NAMES)),
+        initial_pose=first_pose(name, found) if values["set_initial_pose"] else None,
+        initial_covariance=first_covariance(name, found) if values["set_initial_pose"] else None,
+        ignored=tuple(sorted(key for key in found if key not in _DEFAULTS and key not in START_NAMES)),
     )
 
 

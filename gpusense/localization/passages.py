@@ -39,21 +39,23 @@ class Passages(NamedTuple):
 
     Attributes:
         kind: (B,) class of each beam.
-        bearing: (B,) bearing from the scanner [rad].
-        origin: (2,) origin of the beams [m].
-        direction: (B,) direction of each beam in the world [rad].
         distance: (B,) range to the first mapped wall that the beam meets before its end, inf without one [m].
-        close: (B,) whether an agreeing reading ends within 0.1 m of that wall, or within a cell.
+        bearing: (B,) bearing from the scanner [rad].
+        reading: (B,) its reading [m].
+        origin: Origin of the beams [m].
+        heading: Direction of bearing 0 in the world [rad].
+        near: Distance from a wall within which agreeing readings are close to it [m].
         inside: Whether the pose is inside solid cells.
         off: Whether the pose is in unknown cells or off the map.
     """
 
-    kind: NDArray[np.int8]
-    bearing: Floats
-    origin: Floats
-    direction: Floats
+    kind: Floats
     distance: Floats
-    close: NDArray[np.bool_]
+    bearing: Floats
+    reading: Floats
+    origin: tuple[float, float]
+    heading: float
+    near: float
     inside: bool
     off: bool
 
@@ -61,7 +63,15 @@ class Passages(NamedTuple):
     def wall(self) -> Floats:
         """(B, 2) where the beam meets the first mapped wall, NaN where it meets none before its end [m]."""
         distance = np.where(self.distance < np.inf, self.distance, np.nan)[:, None]
-        return self.origin + distance * np.column_stack([np.cos(self.direction), np.sin(self.direction)])
+        direction = self.heading + self.bearing
+        return np.asarray(self.origin + distance * np.column_stack([np.cos(direction), np.sin(direction)]))
+
+    @property
+    def close(self) -> int:
+        """Number of agreeing beams that end close to that wall."""
+        # Python's numbers, since operations on short arrays take longer.
+        beams = zip(self.kind.tolist(), self.reading.tolist(), self.distance.tolist(), strict=True)
+        return sum([abs(reading - distance) < self.near for kind, reading, distance in beams if kind == AGREES])
 
     def count(self, kind: int) -> int:
         """Return the number of beams of a class."""
@@ -94,7 +104,7 @@ class Counts(NamedTuple):
 def counts_of(scans: Sequence[Passages]) -> Counts:
     """Return the counts of several scans."""
     kinds = [kind for one in scans for kind in one.kind.tolist()]
-    close = sum(int(np.count_nonzero(one.close)) for one in scans)
+    close = sum(one.close for one in scans)
     return Counts(kinds.count(AGREES), close, kinds.count(THROUGH), kinds.count(SHORT), kinds.count(NOTHING))
 
 
@@ -122,26 +132,24 @@ def passages(
     else:
         beams, judged = judge(scanner, pose, covariance, ranges)
     count = len(beams.bearing)
-    kind, distance = judged[:count], judged[count:]
-    close = kind == AGREES
-    agreeing = close.nonzero()[0]
-    close[agreeing] = np.abs(beams.reading[agreeing] - distance[agreeing]) < max(_CLOSE, grid.resolution)
-    origin, heading = _origin_of(pose, scanner.mount)
-    inside, off = _place_of(grid, pose)
-    return Passages(kind.astype(np.int8), beams.bearing, origin, heading + beams.bearing, distance, close, inside, off)
+    return Passages(
+        judged[:count], judged[count:], *beams, *_origin_of(pose, scanner.mount), max(_CLOSE, grid.resolution),
+        *_place_of(grid, pose),
+    )  # fmt: skip
 
 
-def _origin_of(pose: Floats, mount: tuple[float, float, float]) -> tuple[Floats, float]:
+def _origin_of(pose: Floats, mount: tuple[float, float, float]) -> tuple[tuple[float, float], float]:
     """Return the origin of the beams, and the direction of bearing 0."""
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    return np.array([pose[0] + c * mount[0] - s * mount[1], pose[1] + s * mount[0] + c * mount[1]]), pose[2] + mount[2]
+    (x, y, theta), (mount_x, mount_y, turn) = pose.tolist(), mount
+    c, s = math.cos(theta), math.sin(theta)
+    return (x + c * mount_x - s * mount_y, y + s * mount_x + c * mount_y), theta + turn
 
 
 def _place_of(grid: OccupancyGrid, pose: Floats) -> tuple[bool, bool]:
     """Tell whether all cells around a pose are solid, and whether all are unknown or off the map."""
-    x0, y0, yaw = grid.origin
+    (x, y, _), (x0, y0, yaw) = pose.tolist(), grid.origin
     c, s = math.cos(yaw), math.sin(yaw)
-    dx, dy = pose[0] - x0, pose[1] - y0
+    dx, dy = x - x0, y - y0
     column = math.floor((c * dx + s * dy) / grid.resolution)
     row = math.floor((-s * dx + c * dy) / grid.resolution)
     reach = max(1, round(BESIDE / grid.resolution))

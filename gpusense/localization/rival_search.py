@@ -48,9 +48,10 @@ class Candidates(NamedTuple):
         poses: (M, 3) poses.
         score: (M,) log-likelihood of each, less the ratio of its beams that meet walls.
         effective: Effective number of them that begins a rival.
-        lead: Log-likelihood, times the temperature, of the likeliest candidate beyond 1 m or 0.5 rad of the estimate
-            less that at the estimate [nats]; NaN without a search of the whole map.
+        lead: Log-likelihood, times the temperature, of the candidate with the largest score beyond 1 m or 0.5 rad of
+            the estimate, less that at the estimate [nats]; NaN without a search of the whole map.
         beams: Number of independent beams, the temperature times the number of beams.
+        walls: Ratio of the beams that meet walls at that candidate.
         is_found: Whether a candidate is at the estimate.
     """
 
@@ -59,12 +60,13 @@ class Candidates(NamedTuple):
     effective: int
     lead: float = math.nan
     beams: float = 0.0
+    walls: float = 0.0
     is_found: bool = False
 
     @property
     def ratio(self) -> float:
         """Log-likelihood ratio of other places against the estimate; NaN without a search of the whole map."""
-        return ratio_of_places(self.lead, self.beams, is_found=self.is_found)
+        return ratio_of_places(self.lead, self.beams, self.walls, is_found=self.is_found)
 
 
 class RivalSearch:
@@ -110,10 +112,12 @@ class RivalSearch:
         score, reached = score[:-1], float(score[-1])
         if not on_map:
             return Candidates(tries, score, effective)
-        apart = are_apart(tries, pose)
-        lead = float(score[apart].max(initial=-math.inf)) - reached
-        score -= self._ratios(tries, readings)
-        return Candidates(tries, score, effective, lead, beams, is_found=not apart.all())
+        ratios, apart = self._ratios(tries, readings), are_apart(tries, pose)
+        if not apart.any():
+            return Candidates(tries, score - ratios, effective, -math.inf - reached, beams, is_found=True)
+        best = np.flatnonzero(apart)[np.argmax((score - ratios)[apart])]
+        lead, walls = float(score[best]) - reached, float(ratios[best])
+        return Candidates(tries, score - ratios, effective, lead, beams, walls, is_found=not apart.all())
 
     def _ratios(self, poses: np.ndarray, readings: Sequence[SensorReadings]) -> np.ndarray:
         """Return the log-likelihood ratios (M,) of "wrong" against "right" for poses; 0 without evidence from scans."""

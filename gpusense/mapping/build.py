@@ -190,7 +190,6 @@ class MapBuilder:
         return self._kept.pop(key) if key in self._kept else self._survey.rays(part)
 
     def _write(self, counts: BandCounts, cells: np.ndarray) -> None:
-        """Write the occupancies of a band."""
         counts.occupancies(cells, self._occupancy)
 
     @property

@@ -11,12 +11,23 @@ import numpy as np
 from gpusense._util.angles import wrapped
 from gpusense.backends import Backend
 from gpusense.interface.structs import MatchRules
-from gpusense.matching.columns import Column, any_of, column_of, columns_of, is_not, larger, square_root, upright
+from gpusense.matching.columns import (
+    Column,
+    any_of,
+    column_of,
+    columns_of,
+    cosine_and_sine,
+    is_not,
+    larger,
+    rows_of,
+    square_root,
+)
 from gpusense.matching.evidence import pair_evidence
 from gpusense.matching.icp import STRAIGHT_WIDTH, WIDTH, IcpPairs, space_of
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import ScanPoints
 from gpusense.matching.result import ScanMatch
+from gpusense.matching.triangles import moved, squared_length
 from gpusense.matching.uncertainty import statuses
 from gpusense.matching.verdicts import PairSums, concluded, tested
 
@@ -38,8 +49,7 @@ _PROMISING = 0.15
 _TURNED = 0.11
 # A match is ambiguous if two poses differ by more than this distance [m] or turn [rad], and score alike within this.
 _OTHER, _OTHER_TURN, _CLOSE = 0.25, 0.1, 0.012
-
-_IDENTITY = np.eye(3)
+_NO_OTHER = np.full((1, 3), np.nan)
 
 
 class Levels(NamedTuple):
@@ -109,11 +119,11 @@ def match_pairs(
         device = IcpPairs(backend, real, points, pairs, noise, space)
         levels = Levels([options.at_noise(level) for level in device.levels], device.most_points(), points.gap)
         result = device.run(np.arange(len(pairs)), sensor[:, None], levels.rules())[:, 0]
-        best = Best(result, np.full((len(pairs), 3), np.nan))
+        best = Best(result, _NO_OTHER.repeat(len(pairs), axis=0))
         if method == "auto":
             score = columns_of(result)[3]
             if any_of(score < _SURE):
-                first, second = columns_of(points.counts[pairs])
+                first, second = levels.most[0] if len(pairs) == 1 else columns_of(points.counts[pairs])
                 enough = (first > 2) & (second > 2)
                 poor = enough & (score < DOUBTFUL)
                 far = (
@@ -187,8 +197,7 @@ def _prior(result: np.ndarray, guess: np.ndarray, options: MatchOptions) -> np.n
 
 def _is_moved(result: np.ndarray, guess: np.ndarray, distance: float, turn: float) -> Column:
     """Return which results differ from their guesses by more than a distance along an axis [m], or a turn [rad]."""
-    pose = columns_of(result[:, :3])
-    x, y, heading = (abs(one - other) for one, other in zip(pose, columns_of(guess), strict=True))
+    x, y, heading = map(abs, columns_of(result[:, :3] - guess))
     return (x > distance) | (y > distance) | (heading > turn)
 
 
@@ -264,11 +273,11 @@ def distinct(poses: np.ndarray, score: np.ndarray, known: np.ndarray, capture: f
 
 def to_sensor(pose: np.ndarray, mount: tuple[float, float]) -> np.ndarray:
     """Convert relative poses of robot frames to poses of frames at the sensors with the robots' axes."""
+    if mount == (0.0, 0.0):
+        return pose
     (x, y), (ahead, aside, heading) = mount, columns_of(pose)
-    c, s = np.cos(heading), np.sin(heading)
-    sensor = np.array(pose)
-    sensor[:, 0], sensor[:, 1] = ahead + c * x - s * y - x, aside + s * x + c * y - y
-    return sensor
+    c, s = cosine_and_sine(heading)
+    return rows_of((ahead + c * x - s * y - x, aside + s * x + c * y - y, heading))
 
 
 def _finished(
@@ -279,18 +288,14 @@ def _finished(
     result, (x, y) = best.result, mount
     ahead, aside, heading = columns_of(result)[:3]
     theta = wrapped(heading)
-    c, s = np.cos(theta), np.sin(theta)
-    pose = np.empty((len(result), 3))
-    pose[:, 0], pose[:, 1], pose[:, 2] = ahead - c * x + s * y + x, aside - s * x - c * y + y, theta
-    # Derivative of the sensor's pose with respect to the robot's.
-    moved = np.empty((len(pose), 3, 3))
-    moved[:] = _IDENTITY
-    moved[:, 0, 2], moved[:, 1, 2] = -s * x - c * y, c * x - s * y
+    c, s = cosine_and_sine(theta)
+    pose = rows_of((ahead - c * x + s * y + x, aside - s * x - c * y + y, theta))
+    # Derivatives of the sensor's place with respect to the robot's heading.
+    across, along = -s * x - c * y, c * x - s * y
     found, factor = sums.found, sums.factor
-    final = moved.transpose(0, 2, 1) @ found.information @ moved / upright(factor, 2)
-    step = np.array(result[:, 32:35])
-    step[:, :2] -= moved[:, :2, 2] * step[:, 2:]
-    length = square_root(larger(column_of(np.einsum("si,sij,sj->s", step, final, step)), 0.0))
+    final = [number / factor for number in moved(found.information, across, along)]
+    ahead, aside, turn = columns_of(result)[32:35]
+    length = square_root(larger(squared_length(final, ahead - across * turn, aside - along * turn, turn), 0.0))
     status = statuses(result, found.lost, length)
     evidence = pair_evidence(result, found.lost, best.other, noise)
     return concluded(

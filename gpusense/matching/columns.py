@@ -2,8 +2,8 @@
 
 An operation on an array of one number takes 20 times as long as on a number. Both round alike: sums, products,
 quotients, remainders and square roots. Other functions are those of arrays, which accept numbers, so from the same
-results of the kernel a single match has the bits that it has among others. Denominators must not be 0, and conditions
-are negated by :func:`is_not`.
+results of the kernel a single match has the bits that it has among others, but for the axes of its information.
+Denominators must not be 0, and conditions are negated by :func:`is_not`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,11 @@ Column = Any
 def columns_of(rows: np.ndarray) -> Any:
     """Return the columns of rows (S, N)."""
     return rows[0].tolist() if len(rows) == 1 else rows.T
+
+
+def rows_of(columns: Any) -> np.ndarray:
+    """Return columns as rows (S, N) of real numbers."""
+    return np.stack(columns, axis=1) if isinstance(columns[0], np.ndarray) else np.array([columns], np.float64)
 
 
 def column_of(values: Column) -> Column:
@@ -38,11 +43,25 @@ def larger(one: Column, other: Column) -> Column:
     return other if one < other else one
 
 
+def smaller(one: Column, other: Column) -> Column:
+    """Return the smaller of two columns."""
+    if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
+        return np.minimum(one, other)
+    return other if other < one else one
+
+
 def chosen(condition: Column, one: Column, other: Column) -> Column:
     """Return one of two columns where a condition holds, and the other one elsewhere."""
     if isinstance(condition, np.ndarray):
         return np.where(condition, one, other)
     return one if condition else other
+
+
+def cosine_and_sine(angle: Column) -> tuple[Column, Column]:
+    """Return the cosines and sines of a column of angles [rad]."""
+    c, s = np.cos(angle), np.sin(angle)
+    # Operations on NumPy's numbers take three times as long as on Python's.
+    return (c, s) if isinstance(c, np.ndarray) else (float(c), float(s))
 
 
 def square_root(column: Column) -> Column:

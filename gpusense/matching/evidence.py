@@ -8,9 +8,11 @@ neighbouring places and of places without anything in common; right and wrong po
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from gpusense.matching.columns import Column, column_of, columns_of, larger, square_root
+from gpusense.matching.columns import Column, column_of, columns_of, larger, rows_of, smaller, square_root, values_of
 
 NAMES = ("disagreement", "contradiction", "overlap", "pairs", "roughness", "misfit", "lost", "rival", "distance")
 """Evidence for and against a match.
@@ -28,18 +30,20 @@ DOUBTED, DOUBTED_PARTLY = 0.65, 0.03
 # Constant, then weights: of the logarithms of disagreement, contradiction, overlap, pairs, roughness and misfit, of one
 # lost direction, of a second one, of a rival, and of the logarithm of the distance.
 _CONSTANT = -3.123
-_WEIGHTS = np.array([-1.350, -0.164, 1.574, -0.067, -0.202, -0.692, -1.395, 0.622, -2.158, -1.788])
-# Lower bounds of the arguments of logarithms, and the offset of distances.
-_LEAST = np.array([1e-3, 3e-3, 1e-3, 1.0, 0.1, 1e-2])
-_NEAR = 0.04
+_WEIGHTS = (-1.350, -0.164, 1.574, -0.067, -0.202, -0.692, -1.395, 0.622, -2.158, -1.788)
+# Offset of distances, and lower bounds of the arguments of logarithms; of lost and rival there are none.
+_NEAR = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.04])
+_LEAST = np.array([1e-3, 3e-3, 1e-3, 1.0, 0.1, 1e-2, 1.0, 1.0, 0.0])
+# Logarithm of the largest odds against a pose: the exponential of larger ones overflows.
+_MOST = 700.0
 
 
-def pair_evidence(result: np.ndarray, lost: np.ndarray, other: np.ndarray, noise: np.ndarray) -> np.ndarray:
+def pair_evidence(result: np.ndarray, lost: Column, other: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Return the evidence (S, 9) of results of the kernel ``match_scans``, see :data:`NAMES`; the distance is 0.
 
     Args:
         result: (S, 35) results.
-        lost: (S,) number of lost directions.
+        lost: Number of lost directions.
         other: (S, 3) offsets to poses that agree about as well, NaN without one.
         noise: (S,) standard deviations of ranges [m].
     """
@@ -47,33 +51,29 @@ def pair_evidence(result: np.ndarray, lost: np.ndarray, other: np.ndarray, noise
     weights, squared, seen, through, unseen = numbers[19:24]
     pairs, common = larger(numbers[18], 1.0), larger(seen + through, 1.0)
     rough = square_root(squared / larger(weights, 1e-30)) / larger(column_of(noise), 1e-6)
-    evidence = np.zeros((len(result), len(NAMES)))
     values = (
-        1 - numbers[3], through / common, seen / larger(common + unseen, 1.0), pairs, np.minimum(rough, 20.0),
-        1 - weights / pairs, column_of(lost), has_rival(other),
+        1 - numbers[3], through / common, seen / larger(common + unseen, 1.0), pairs, smaller(rough, 20.0),
+        1 - weights / pairs, lost, has_rival(other), 0.0 * pairs,
     )  # fmt: skip
-    for column, value in enumerate(values):
-        evidence[:, column] = value
-    return evidence
+    return rows_of(values)
 
 
 def has_rival(other: np.ndarray) -> Column:
     """Return whether there are offsets (S, 3) to other poses: NaN stands for none."""
     x, y, turn = columns_of(other)
-    return np.isfinite(x + y + turn)
+    total = x + y + turn
+    return np.isfinite(total) if isinstance(total, np.ndarray) else math.isfinite(total)
 
 
-def features_of(evidence: np.ndarray) -> np.ndarray:
-    """Return the numbers (S, 10) that the weights multiply."""
-    features, (lost, rival, distance) = np.empty((len(evidence), len(_WEIGHTS))), columns_of(evidence)[6:9]
-    features[:, :6] = np.log(np.maximum(evidence[:, :6], _LEAST))
-    features[:, 6], features[:, 7], features[:, 8] = lost > 0, lost > 1, rival
-    features[:, 9] = np.log(distance + _NEAR)
-    return features
+def features_of(evidence: np.ndarray) -> list[Column]:
+    """Return the ten columns that the weights multiply."""
+    logarithms, (lost, rival) = columns_of(np.log(np.maximum(evidence + _NEAR, _LEAST))), columns_of(evidence)[6:8]
+    return [*logarithms[:6], lost > 0, lost > 1, rival, logarithms[8]]
 
 
 def probability_right(evidence: np.ndarray) -> np.ndarray:
     """Return the probabilities (S,) that poses are right along their observed directions."""
-    with np.errstate(over="ignore"):
-        p: np.ndarray = 1 / (1 + np.exp(-(_CONSTANT + features_of(evidence) @ _WEIGHTS)))
-    return p
+    total: Column = _CONSTANT
+    for weight, feature in zip(_WEIGHTS, features_of(evidence), strict=True):
+        total = total + weight * feature
+    return values_of(1 / (1 + np.exp(smaller(-total, _MOST))))

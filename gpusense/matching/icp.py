@@ -31,6 +31,9 @@ _SPARSE = 0.12
 # Most starts of one launch; a call can be interrupted between launches.
 _MOST_STARTS = {"cpu": 1 << 12, "gpu": 1 << 18}
 
+# Flags by the bytes of a number.
+_FLAGS = {4: flags_if(), 8: flags_if(FLOAT64=True)}
+
 _SPACES: weakref.WeakKeyDictionary[Backend, tuple[threading.RLock, Workspace]] = weakref.WeakKeyDictionary()
 _LOCK = threading.Lock()
 
@@ -75,7 +78,7 @@ class IcpPairs:
         space: Workspace,
     ):  # fmt: skip
         self._backend, self._real, self._space = backend, real, space
-        self._flags = flags_if(FLOAT64=real == np.float64)
+        self._flags = _FLAGS[real.itemsize]
         self._counts = len(points.start) - 1, len(points.point)
         point = points.point if len(points.point) else np.zeros((1, 4), real)
         self._point, self._start = space.upload("match points", point), space.upload("match start", points.start)
@@ -124,22 +127,26 @@ class IcpPairs:
         # A fit to all scans replaces an earlier one.
         if pairs is not None and self._fits:
             self._backend.run(self._fits)
+        if pairs is None and len(self.levels) == 1:
+            self._fits = (self._lines(0, None, width(self.levels[0])),)
+            return
         rows = np.arange(len(self._pairs)) if pairs is None else pairs
-        whole = pairs is None and len(self.levels) == 1
         self._fits = tuple(
-            self._lines(
-                level, np.arange(self._counts[0], dtype=np.int32) if whole else np.unique(self._pairs[rows[some], :2]),
-                width(self.levels[level]),
-            )
+            self._lines(level, np.unique(self._pairs[rows[some], :2]), width(self.levels[level]))
             for level, some in self.of_levels(rows)
-        )  # fmt: skip
+        )
 
-    def _lines(self, level: int, scans: np.ndarray, width: float) -> Launch:
-        """Return the launch that fits lines to the points of some scans of a level."""
+    def _lines(self, level: int, scans: np.ndarray | None, width: float) -> Launch:
+        """Return the launch that fits lines to the points of all or of some scans of a level."""
         flags = with_lanes_flag(self._backend.info.lanes, "fit_lines", self._flags)
+        chosen = self._counts[0] if scans is None else len(scans)
+        key = chosen if scans is None else scans.tobytes()
+        which = self._space.hold(
+            f"match which {level}", key, lambda: np.arange(chosen, dtype=np.int32) if scans is None else scans
+        )
         return launch(
-            "fit_lines", flags, (self._most, len(scans)), point=self._point, start=self._start,
-            which=self._space.upload(f"match which {level}", scans), line=self._line, chosen=len(scans),
+            "fit_lines", flags, (self._most, chosen), point=self._point, start=self._start,
+            which=which, line=self._line, chosen=chosen,
             scans=self._counts[0], points=self._counts[1], reach=1 if self._gap > GAP * _SPARSE else REACH,
             most=_MOST if width > WIDTH else _FEWER,
             ratio=max(_RATIO, _STEPS * self._gap / GAP), slack=max(_SLACK, _SLACK_DEVIATIONS * self.levels[level]),
@@ -186,7 +193,7 @@ class IcpPairs:
         result = np.empty((count, starts, MATCH_RESULT), self._real)
         padded = np.zeros((count, starts, 4), self._real)
         padded[..., :3] = guesses
-        space = self._space
+        space, chosen = self._space, self._pairs[pairs]
         buffer = space.empty("match result", result.size, self._real)
         info = self._backend.info
         flags = with_lanes_flag(info.lanes, "match_scans", self._flags)
@@ -194,9 +201,10 @@ class IcpPairs:
         flags, team = with_teams_flags(info.kind, "match_scans", flags, used, self._backend.largest_group)
         matching = launch(
             "match_scans", flags, (count * starts * team,), point=self._point, start=self._start, line=self._line,
-            pair=space.upload("match pairs", self._pairs[pairs]), guess=space.upload("match guesses", padded),
-            rules=space.upload("match rules", np.array(rules, self._real)), result=buffer, scans=self._counts[0],
-            points=self._counts[1], pairs=count, starts=starts, levels=len(rules),
+            pair=space.hold("match pairs", chosen.tobytes(), lambda: chosen),
+            guess=space.upload("match guesses", padded),
+            rules=space.hold("match rules", (padded.itemsize, *rules), lambda: np.array(rules, self._real)),
+            result=buffer, scans=self._counts[0], points=self._counts[1], pairs=count, starts=starts, levels=len(rules),
         )  # fmt: skip
         fits, self._fits = self._fits, ()
         self._backend.run((*fits, matching))

@@ -140,7 +140,7 @@ def _matches(
         return _by_noise(noise, options, to_map), second.ndim == 1
     first = readings("reference", reference, scanner, device)
     single = first.ndim == 1 and second.ndim == 1
-    first, second = np.atleast_2d(first), np.atleast_2d(second)
+    first, second = (scans[None] if scans.ndim == 1 else scans for scans in (first, second))
     if len(first) not in (1, len(second)):
         rule = f"must be one scan, or as many as ranges has, {len(second)}"
         raise ValueError(f"reference: {rule}, got {len(first)}")
@@ -149,8 +149,9 @@ def _matches(
         motion = np.repeat(motion, len(second), axis=0)
     before = check_motion("reference_motion", motions[1], len(first))
 
-    noise = np.full(len(second), options.noise)
-    if not given:
+    if given:
+        noise = np.full(len(second), options.noise)
+    else:
         own = scan_noise(np.concatenate([first, second]), scanner)
         noise = match_noise(own[: len(first)], own[len(first) :])
     if method not in ("gauss_newton", "correlative") or not len(second):
@@ -239,6 +240,10 @@ def _still(ranges: np.ndarray, scanner: Scanner, motion: np.ndarray | None) -> n
 
 def readings(name: str, ranges: object, scanner: Scanner, backend: Backend) -> np.ndarray:
     """Return readings of one scan (K,) or of several (S, K), checked."""
+    if type(ranges) is np.ndarray and ranges.dtype == np.float64 and ranges.shape == (scanner.count,):
+        # Other checks take longer than the estimate of a match.
+        scanner._first_scans.look_at(name, ranges)
+        return ranges
     values = checks.as_array(name, arrays.copied_to_host(ranges, backend, name), masked=True)
     shape = ("S", scanner.count) if values.ndim == 2 else (scanner.count,)
     read = checks.array(name, values, shape, finite=False, dtype=None)

@@ -14,12 +14,21 @@ A lost direction affects all coordinates: the remaining information assumes that
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple
 
 import numpy as np
 
-from gpusense.matching.columns import Column, all_of, any_of, column_of, upright
+from gpusense.matching.columns import Column, all_of, column_of, is_not, larger, square_root, upright, values_of
+from gpusense.matching.triangles import (
+    UPPER,
+    Triangle,
+    axes_of_one,
+    balanced,
+    inverse_of,
+    is_definite,
+    matrices_of,
+    triangle_of,
+)
 
 # Probability that an unobserved direction counts as observed, and the normal quantile of its complement.
 FALSE_ALARM, _QUANTILE = 1e-4, 3.72
@@ -29,7 +38,6 @@ _LEAST_LINES, _LEAST_RATIO = 4.0, 2.0
 LEAST_PAIRS = 1.5
 # Spurious information attributed to lines without errors [pairs].
 _SPURIOUS = 1e-3
-_SPURIOUS_PART = _SPURIOUS * np.eye(3)
 # Share of the largest eigenvalue below which a direction of an information is lost.
 _NOTHING = 1e-9
 
@@ -38,61 +46,101 @@ class Observed(NamedTuple):
     """Information of pairs.
 
     Attributes:
-        information: (S, 3, 3) sums of w J J' without the part that noise makes up, exactly 0 along lost directions.
-        lost: (S,) number of lost directions.
+        information: Sums of w J J' without the part that noise makes up, 0 along lost directions up to rounding.
+        lost: Number of lost directions.
     """
 
-    information: np.ndarray
-    lost: np.ndarray
+    information: Triangle
+    lost: Column
+
+    def replaced(self, rows: np.ndarray, others: Observed) -> Observed:
+        """Return the information with that of some rows replaced; a single match is replaced as a whole."""
+        if not isinstance(self.lost, np.ndarray):
+            return others
+        information, lost = np.array(self.information), np.array(self.lost)
+        information[:, rows], lost[rows] = [*map(values_of, others.information)], others.lost
+        return Observed([*information], lost)
 
 
-def critical_ratio(lines: np.ndarray) -> np.ndarray:
-    """Return the quantile of a chi-squared variable over its degrees of freedom (S,), by Wilson and Hilferty (1931)."""
-    share = 2 / (9 * np.maximum(lines, _LEAST_LINES))
-    ratio: np.ndarray = np.maximum((1 - share + _QUANTILE * np.sqrt(share)) ** 3, _LEAST_RATIO)
-    return ratio
+def critical_ratio(lines: Column) -> Column:
+    """Return the quantile of a chi-squared variable over its degrees of freedom, by Wilson and Hilferty (1931)."""
+    share = 2 / (9 * larger(lines, _LEAST_LINES))
+    root = 1 - share + _QUANTILE * square_root(share)
+    return larger(root * root * root, _LEAST_RATIO)
 
 
-@functools.cache
-def _ratio_of_few_lines() -> float:
-    """Return the critical ratio of the least number of lines."""
-    return float(critical_ratio(np.array([_LEAST_LINES]))[0])
+_RATIO_OF_FEW_LINES: float = critical_ratio(_LEAST_LINES)
 
 
 def observed_information(
-    information: np.ndarray, spurious: np.ndarray, lever: Column, lines: np.ndarray | None, least: np.ndarray | float
-) -> Observed:
+    information: Triangle, spurious: Triangle, lever: Column, lines: Column | None, least: Column,
+    unneeded: Column = False,
+) -> Observed:  # fmt: skip
     """Remove from the information of pairs the directions that they do not observe.
 
     Args:
-        information: (S, 3, 3) sums of w J J'.
-        spurious: (S, 3, 3) the expected part of it that is due to the variance of the points.
+        information: Sums of w J J'.
+        spurious: The expected part of it that is due to the variance of the points.
         lever: Lengths by which headings are multiplied [m].
-        lines: (S,) lines of the scan without a common point; None for few.
-        least: (S,) least pairs of an observed direction, or one for all.
+        lines: Lines of the scan without a common point; None for few.
+        least: Least pairs of an observed direction.
+        unneeded: Which matches need no information if they lose a direction; their number of these may then be 1.
     """
-    scale = balance_of(lever)
-    both = scale[:, :, None] * scale[:, None, :]
-    total, made_up = information * both, spurious * both + _SPURIOUS_PART
-    critical = _ratio_of_few_lines() if lines is None else critical_ratio(lines)
+    total = balanced(information, lever)
+    made_up = _with_diagonal(balanced(spurious, lever), _SPURIOUS, _SPURIOUS)
+    critical = _RATIO_OF_FEW_LINES if lines is None else critical_ratio(lines)
+    # All directions are observed where I exceeds S times the critical ratio, and the least number of pairs.
+    beyond = is_definite([whole - critical * part for whole, part in zip(total, made_up, strict=True)])
+    clear = beyond & is_definite(_with_diagonal(total, -least, -least))
+    # Then noise contributes S.
+    less = [whole - part for whole, part in zip(information, spurious, strict=True)]
+    left = _with_diagonal(less, -_SPURIOUS, -_SPURIOUS * (lever * lever))
+    if all_of(clear):
+        return Observed(left, np.zeros(len(clear), np.intp) if isinstance(clear, np.ndarray) else 0)
+    skipped = values_of(unneeded & is_not(beyond))
+    count, rows = len(skipped), np.flatnonzero(is_not(clear | skipped))
+    some, noise = (matrices_of([values_of(column)[rows] for column in triangle]) for triangle in (total, made_up))
+    found, lost = _partly_observed(some, noise, *(np.broadcast_to(limit, count)[rows] for limit in (critical, least)))
+    # The test on pairs is strict, so some matches have no lost direction.
+    gone, rows = lost > 0, rows[lost > 0]
+    parts, numbers = np.array([*map(values_of, left)]), skipped.astype(np.intp)
+    parts[:, rows] = balanced([*found[gone].reshape(-1, 9).T[UPPER]], 1 / values_of(lever)[rows])
+    numbers[rows] = lost[gone]
+    return Observed([*map(column_of, parts)], column_of(numbers))
+
+
+def _with_diagonal(triangle: Triangle, place: Column, heading: Column) -> Triangle:
+    """Return matrices with numbers added to the diagonal: one for x and y, and one for the heading."""
+    xx, xy, xt, yy, yt, tt = triangle
+    return xx + place, xy, xt, yy + place, yt, tt + heading
+
+
+def _partly_observed(
+    total: np.ndarray, made_up: np.ndarray, critical: np.ndarray, least: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the observed part (L, 3, 3) of an information, and the number of lost directions (L,).
+
+    Args:
+        total: (L, 3, 3) information of x, y and ``lever`` times the heading.
+        made_up: (L, 3, 3) its part that is due to noise.
+        critical: (L,) least generalised eigenvalue of an observed direction.
+        least: (L,) least pairs of an observed direction.
+    """
     values, vectors = _generalised(total, made_up)
     lost = _is_lost(values, vectors, critical, least)
-    some = np.flatnonzero(lost[:, 0]) if any_of(column_of(lost[:, 0])) else ()
-    count = np.zeros(len(lost), np.intp)
-    # Noise contributes 1 to each eigenvalue.
-    left = np.maximum(values - 1, 1e-3 * values)
+    count = lost.sum(axis=1)
+    some = np.flatnonzero(lost[:, 0])
     if len(some):
-        count = lost.sum(axis=1)
-        ratio, fewest = (np.broadcast_to(limit, len(lost))[some] for limit in (critical, least))
-        basis = _lost_basis(total[some], made_up[some], ratio, fewest, vectors[some], lost[some])
-        result = without(total[some], basis, made_up[some])
-        values[some], vectors[some] = _generalised(result, made_up[some])
-        left = np.where(np.arange(3) < count[:, None], 0.0, np.maximum(values - 1, 1e-3 * values))
+        basis = _lost_basis(total[some], made_up[some], critical[some], least[some], vectors[some], lost[some])
+        rest = without(total[some], basis, made_up[some])
+        values[some], vectors[some] = _generalised(rest, made_up[some])
+    # Noise contributes 1 to each eigenvalue.
+    left = np.where(np.arange(3) < count[:, None], 0.0, np.maximum(values - 1, 1e-3 * values))
     sides = made_up @ vectors
     result = np.einsum("sik,sk,sjk->sij", sides, left, sides)
     if len(some):
         result[some] = without(result[some], basis, made_up[some])
-    return Observed(result / both, count)
+    return result, count
 
 
 def balance_of(lever: Column) -> np.ndarray:
@@ -174,11 +222,19 @@ def orthonormal(vectors: np.ndarray) -> np.ndarray:
 def axes_of(information: np.ndarray, lever: Column) -> tuple[np.ndarray, np.ndarray]:
     """Return ascending eigenvalues (S, 3) of information, exactly 0 where lost, and directions (S, 3, 3) in columns.
 
-    Directions are those of x, y and ``lever`` times the heading.
+    Directions are those of x, y and ``lever`` times the heading; their signs are arbitrary.
     """
+    if not isinstance(lever, np.ndarray):
+        # Where nothing is lost, the axes do not depend on rounding.
+        axes = axes_of_one(balanced(triangle_of(information), lever))
+        if axes[0][0] > _NOTHING * axes[2][0]:
+            sizes, rows = zip(*axes, strict=True)
+            return np.array([sizes]), np.array([rows]).transpose(0, 2, 1)
     scale = balance_of(lever)
     values, vectors = np.linalg.eigh(information * (scale[:, :, None] * scale[:, None, :]))
-    values = np.where(values > _NOTHING * np.maximum(values[:, -1:], 0), values, 0.0)
+    least, largest = column_of(values[:, 0]), column_of(values[:, -1])
+    if not all_of(least > _NOTHING * larger(largest, 0.0)):
+        values = np.where(values > _NOTHING * np.maximum(values[:, -1:], 0), values, 0.0)
     return values, vectors
 
 
@@ -197,12 +253,22 @@ def covariance_of(
         reach: Farthest distance [m] and angle [rad] from the guess.
         known_axes: The result of ``axes_of``, where it is known.
     """
-    scale = balance_of(lever)
     values, vectors = axes_of(information, lever) if known_axes is None else known_axes
-    axes = vectors * scale[:, :, None]
     # In ascending order, with lost ones first.
-    if all_of(column_of(values[:, 0])):
-        return np.einsum("sik,sk,sjk->sij", axes, 1 / values, axes)
+    seen = column_of(values[:, 0]) > 0
+    if all_of(seen):
+        return matrices_of(inverse_of(triangle_of(information)))
+    covariance, rows = np.empty(information.shape), np.flatnonzero(seen)
+    if len(rows):
+        covariance[rows] = matrices_of(inverse_of([*information.reshape(-1, 9)[rows].T[UPPER]]))
+    rows = np.flatnonzero(is_not(seen))
+    axes = vectors[rows] * balance_of(lever)[rows, :, None]
+    covariance[rows] = _partly_known(values[rows], axes, reach)
+    return covariance
+
+
+def _partly_known(values: np.ndarray, axes: np.ndarray, reach: tuple[float, float]) -> np.ndarray:
+    """Return the covariance (L, 3, 3) of eigenvalues (L, 3) of an information, some of them 0, and axes in columns."""
     gone = values == 0
     inverse = np.where(gone, 0, 1 / np.where(gone, 1, values))
     covariance = np.einsum("sik,sk,sjk->sij", axes, inverse, axes)

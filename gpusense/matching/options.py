@@ -92,16 +92,23 @@ class MatchOptions:
 
     def starts(self) -> np.ndarray:
         """Return (M, 3) offsets of the starts of a search: a hexagonal grid of places times headings."""
-        step, turn = 0.6 * self.capture, math.radians(15.0)
-        reach, half = self.window
-        rings = int(reach / step * 2 / math.sqrt(3)) + 1
-        i, j = np.meshgrid(np.arange(-2 * rings, 2 * rings + 1), np.arange(-rings, rings + 1))
-        x, y = step * (i + 0.5 * j).ravel(), step * (math.sqrt(0.75) * j).ravel()
-        inside = np.hypot(x, y) <= max(reach, 1e-9) * (1 + 1e-9)
-        count = int(half / turn + 1e-9)
-        turns = turn * np.arange(-count, count + 1)
-        places = np.stack([x[inside], y[inside]], axis=1)
-        return np.concatenate([np.column_stack([places, np.full(len(places), angle)]) for angle in turns])
+        return _starts(self.capture, *self.window)
+
+
+@functools.lru_cache(maxsize=16)
+def _starts(capture: float, reach: float, half: float) -> np.ndarray:
+    """Return the offsets of ``MatchOptions.starts`` in a window."""
+    step, turn = 0.6 * capture, math.radians(15.0)
+    rings = int(reach / step * 2 / math.sqrt(3)) + 1
+    i, j = np.meshgrid(np.arange(-2 * rings, 2 * rings + 1), np.arange(-rings, rings + 1))
+    x, y = step * (i + 0.5 * j).ravel(), step * (math.sqrt(0.75) * j).ravel()
+    inside = np.hypot(x, y) <= max(reach, 1e-9) * (1 + 1e-9)
+    count = int(half / turn + 1e-9)
+    turns = turn * np.arange(-count, count + 1)
+    places = np.stack([x[inside], y[inside]], axis=1)
+    starts = np.concatenate([np.column_stack([places, np.full(len(places), angle)]) for angle in turns])
+    starts.flags.writeable = False
+    return starts
 
 
 def check_options(noise: object, capture: object, window: object) -> MatchOptions:
@@ -140,6 +147,11 @@ def check_guess(guess: object, matches: int | None, farthest: float = _FARTHEST)
         matches: S, or None for a single match.
         farthest: Largest coordinate.
     """
+    if matches is None and type(guess) is np.ndarray and guess.shape == (3,) and guess.dtype == np.float64:
+        # The other checks take longer than the rest.
+        x, y, heading = guess.tolist()
+        if abs(x) <= farthest and abs(y) <= farthest and math.isfinite(heading):
+            return np.array([[x, y, _turned(heading)]])
     read = checks.as_array("guess", guess)
     shape = (3,) if read.ndim != 2 else ("S" if matches is None else matches, 3)
     values = checks.array("guess", read, shape)
@@ -151,6 +163,11 @@ def check_guess(guess: object, matches: int | None, farthest: float = _FARTHEST)
         x, y, heading = columns_of(result)
         if any_of((abs(x) > farthest) | (abs(y) > farthest)):
             raise ValueError(f"guess: x and y must be within {farthest:g} m, got {checks.show(values)}")
-        turned = np.exp(1j * heading)
-        result[:, 2] = np.arctan2(turned.imag, turned.real)
+        result[:, 2] = _turned(heading)
     return result
+
+
+def _turned(heading: Column) -> Column:
+    """Return headings in [-pi, pi]."""
+    direction = np.exp(1j * heading)
+    return np.arctan2(direction.imag, direction.real)

@@ -62,7 +62,7 @@ class ScanMatch:
         iterations: Iterations of the last refinement.
         eigenvalues: (3,) ascending: the share of pairs of points that constrain each direction of the pose; 0 if none.
         directions: (3, 3) rows: the directions of the eigenvalues in x [m], y [m] and theta, where theta is multiplied
-            by ``lever``.
+            by ``lever``; their signs are arbitrary.
         lever: Root mean square range of the second scan [m].
         noise: Standard deviation of ranges that was used [m].
         evidence: (E,) numbers from which ``p_right`` is computed, see :data:`gpusense.matching.evidence.NAMES`.
@@ -111,10 +111,11 @@ class ScanMatch:
         if self.pose.ndim == 1:
             raise TypeError("a single match has no items")
         values = {name: value[index] for name, value in self.__dict__.items()}
-        return ScanMatch._of(values | {"status": str(values["status"])})
+        values["status"] = str(values["status"])
+        return ScanMatch.of(**values)
 
     @classmethod
-    def _of(cls, values: dict[str, Any]) -> ScanMatch:
+    def of(cls, **values: Any) -> ScanMatch:
         """Return a match with all fields by name; the constructor of a frozen class sets each of them by a call."""
         match = object.__new__(cls)
         match.__dict__.update(values)
@@ -122,7 +123,7 @@ class ScanMatch:
 
     def changed(self, **values: Any) -> ScanMatch:
         """Return matches in which some fields have other values."""
-        return ScanMatch._of(self.__dict__ | values)
+        return ScanMatch.of(**(self.__dict__ | values))
 
     @classmethod
     def joined(cls, matches: list[ScanMatch]) -> ScanMatch:

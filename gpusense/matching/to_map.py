@@ -16,6 +16,7 @@ from gpusense._util.angles import wrapped
 from gpusense.backends import Backend
 from gpusense.matching.basin import is_held
 from gpusense.matching.chain import DOUBTFUL, match_pairs
+from gpusense.matching.columns import column_of
 from gpusense.matching.evidence import pair_evidence
 from gpusense.matching.observability import axes_of, balance_of, observed_information, orthonormal
 from gpusense.matching.options import MatchOptions
@@ -24,6 +25,7 @@ from gpusense.matching.refine_on_field import climb
 from gpusense.matching.result import ScanMatch
 from gpusense.matching.score_tables import ScoreTables, field_scores
 from gpusense.matching.search import PoseGrid, Search
+from gpusense.matching.triangles import matrices_of, triangle_of
 from gpusense.matching.uncertainty import observable_directions
 from gpusense.matching.verdicts import concluded, judged, pair_sums
 from gpusense.models.scan.caster import RayCaster
@@ -239,8 +241,9 @@ class MapMatcher:
         lever = np.maximum(np.sqrt(squares.sum(axis=1) / np.maximum(hits.sum(axis=1), 1)), 1e-3)
         pairs = near.sum(axis=1)
         least, nothing = np.maximum(_LEAST_PAIRS, _LEAST_SHARE * pairs), np.zeros((len(pose), 3, 3))
-        of_field = observed_information(information, nothing, lever, pairs, least).information
-        of_field /= np.maximum(variance, 1e-12)[:, None, None]
+        given = (column_of(values) for values in (lever, pairs, least))
+        observed = observed_information(triangle_of(information), triangle_of(nothing), *given)
+        of_field = matrices_of(observed.information) / np.maximum(variance, 1e-12)[:, None, None]
         own = observable_directions(ranges, pose, variance, self._scanner, self._backend, self._real, self._options)
         # Surfaces are half a cell off the centres of cells, and poses of a search lie on a grid.
         spacing = self._stride * self._grid.resolution / math.sqrt(12) if method == "correlative" else 0.0
@@ -250,14 +253,14 @@ class MapMatcher:
         sums = pair_sums(self._backend, self._real, points, couples, self._options)
         unknown = np.full((len(pose), 3), np.nan)
         noise = np.full(len(pose), self._options.noise)
-        evidence = pair_evidence(sums, lost, unknown, noise)
+        evidence = pair_evidence(sums, column_of(lost), unknown, noise)
         status = np.full(len(pose), "converged", dtype="<U16")
         status[lost > 0] = "unobservable"
         status[~calm] = "no convergence"
         status[score < _POOR] = "poor"
         status[hits.sum(axis=1) < _FEW] = "few points"
         return concluded(
-            pose, joint, variance, score, iterations, status, lever, unknown, evidence, pairs, noise,
+            pose, triangle_of(joint), variance, score, iterations, status, lever, unknown, evidence, pairs, noise,
             self._options.window,
         )  # fmt: skip
 

@@ -11,6 +11,7 @@ sum of squares of the sums of blocks of b points is 1 + 2 sum (1 - k / b) rho_k 
 
 from __future__ import annotations
 
+import bisect
 import functools
 import itertools
 from collections.abc import Sequence
@@ -18,11 +19,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from gpusense.backends import Backend
-from gpusense.matching.columns import Column, chosen, column_of, columns_of, is_not, larger, upright, values_of
+from gpusense.matching.columns import Column, chosen, column_of, columns_of, is_not, larger, values_of
 from gpusense.matching.icp import LONG_WIDTH, WIDTH, IcpPairs, points_of_line, space_of
 from gpusense.matching.observability import LEAST_PAIRS, Observed, observed_information
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import scan_points
+from gpusense.matching.triangles import Triangle, matrices_of, triangle_of
 from gpusense.world.scanner import Scanner
 
 # Least pairs of points of a match, least share of points in common sight, and least score.
@@ -32,15 +34,8 @@ _STATUSES = np.array(["converged", "unobservable", "no convergence", "poor", "no
 _PRIOR_PAIRS = 2.0
 # Least variance of a point [m^2]: float32 resolves about a micrometre at ten metres.
 _LEAST_VARIANCE = 1e-9
-# Places of the numbers of an upper triangle in a matrix.
-_BOTH_TRIANGLES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 # A match has converged if its last step along observed directions is shorter than this [deviations of the pose].
 _SHORT = 0.5
-
-
-def symmetric(upper: np.ndarray) -> np.ndarray:
-    """Return (S, 3, 3) matrices from the six numbers of their upper triangles."""
-    return upper[:, _BOTH_TRIANGLES]
 
 
 def noise_of(ratio: Column) -> tuple[Column, Column]:
@@ -53,8 +48,26 @@ def noise_of(ratio: Column) -> tuple[Column, Column]:
         (S,) deviations in scales, at most 2, and E[w] E[w^2 e^2] / E[d(w e)/de]^2, by which the inverse of the sum of
         w J J' is multiplied.
     """
-    known, sigma, factor = _noise_table()
-    return np.interp(ratio, known, sigma), np.interp(ratio, known, factor)
+    if isinstance(ratio, np.ndarray):
+        known, sigma, factor = _noise_table()
+        return np.interp(ratio, known, sigma), np.interp(ratio, known, factor)
+    return _between(float(ratio))
+
+
+def _between(ratio: float) -> tuple[float, float]:
+    """Return the numbers of ``noise_of`` for one ratio, with the bits of ``numpy.interp``."""
+    known, sigma, factor = _noise_lists()
+    if not ratio < known[-1]:
+        return (sigma[-1], factor[-1]) if ratio == ratio else (ratio, ratio)
+    k = max(bisect.bisect_right(known, ratio) - 1, 0)
+    off, step = larger(ratio - known[k], 0.0), known[k + 1] - known[k]
+    return (sigma[k + 1] - sigma[k]) / step * off + sigma[k], (factor[k + 1] - factor[k]) / step * off + factor[k]
+
+
+@functools.cache
+def _noise_lists() -> list[list[float]]:
+    """Return the ratios, deviations and factors as Python's numbers."""
+    return [column.tolist() for column in _noise_table()]
 
 
 @functools.cache
@@ -87,6 +100,8 @@ def inflation_of(squares: Sequence[Column]) -> Column:
     for before, after in itertools.pairwise([square / first for square in squares]):
         step = after - before
         rises = rises & (step > 0)
+        if rises is False:
+            break
         total, last = total + chosen(rises, step, 0.0), chosen(rises, step, last)
     return 1 + total + last
 
@@ -115,34 +130,37 @@ def variance_of(
 
 
 def observed_pairs(
-    information: np.ndarray, doubt: np.ndarray, variance: Column, lever: Column, lines: np.ndarray | None
-) -> Observed:
+    information: Triangle, doubt: Triangle, variance: Column, lever: Column, lines: Column | None,
+    unneeded: Column = False,
+) -> Observed:  # fmt: skip
     """Return the information that pairs of points and lines observe.
 
     Args:
-        information: (S, 3, 3) sums of w J J'.
-        doubt: (S, 3, 3) the part of it that is due to a unit variance of the points.
+        information: Sums of w J J'.
+        doubt: The part of it that is due to a unit variance of the points.
         variance: Variances of the points [m^2].
         lever: Lengths by which headings are multiplied [m].
-        lines: (S,) lines without a common point; None for few.
+        lines: Lines without a common point; None for few.
+        unneeded: Which matches need no information if they lose a direction.
     """
-    return observed_information(information, doubt * upright(variance, 2), lever, lines, LEAST_PAIRS)
+    spurious = [part * variance for part in doubt]
+    return observed_information(information, spurious, lever, lines, LEAST_PAIRS, unneeded)
 
 
-def statuses(result: np.ndarray, lost: np.ndarray, step: np.ndarray) -> np.ndarray:
+def statuses(result: np.ndarray, lost: Column, step: Column) -> np.ndarray:
     """Return the status of (S, 35) results of the kernel ``match_scans``.
 
     Args:
         result: The results.
-        lost: (S,) number of lost directions.
-        step: (S,) length of the last step in deviations of the pose, along observed directions.
+        lost: Number of lost directions.
+        step: Length of the last step in deviations of the pose, along observed directions.
     """
     numbers = columns_of(result)
     seen, through, unseen = numbers[21:24]
-    code = chosen(column_of(lost) > 0, 1, 0)
+    code = chosen(lost > 0, 1, 0)
     # Of several reasons, the last one counts.
     reasons = (
-        (numbers[5] == 0) & is_not(column_of(step) < _SHORT), numbers[3] < _POOR,
+        (numbers[5] == 0) & is_not(step < _SHORT), numbers[3] < _POOR,
         seen < _OVERLAP * larger(seen + through + unseen, 1.0), numbers[18] < _FEW,
     )  # fmt: skip
     for number, failed in enumerate(reasons, 2):
@@ -179,11 +197,12 @@ def observable_directions(
         rules = options.rules(int(points.counts.max(initial=0)), points.gap)
         result = device.run(everything, np.zeros((len(pose), 1, 3)), [rules])[:, 0]
     turned = _turned(pose[:, 2], scanner.mount[:2])
-    information, doubt = (turned @ symmetric(result[:, at : at + 6]) @ turned.transpose(0, 2, 1) for at in (6, 12))
+    numbers, back = columns_of(result), turned.transpose(0, 2, 1)
+    information, doubt = (triangle_of(turned @ matrices_of(numbers[at : at + 6]) @ back) for at in (6, 12))
     lever = points.rms_range(everything)
-    lines = result[:, 19] / points_of_line(points.gap, noise, lever)
-    found = observed_pairs(information, doubt, noise**2, lever, lines)
-    return found.information / np.maximum(variance, 1e-12)[:, None, None]
+    lines = column_of(result[:, 19] / points_of_line(points.gap, noise, lever))
+    found = observed_pairs(information, doubt, column_of(noise) ** 2, column_of(lever), lines)
+    return matrices_of(found.information) / np.maximum(variance, 1e-12)[:, None, None]
 
 
 def _turned(heading: np.ndarray, mount: tuple[float, float]) -> np.ndarray:

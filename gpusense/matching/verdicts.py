@@ -26,7 +26,8 @@ from gpusense.matching.observability import Observed, axes_of, covariance_of
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import ScanPoints
 from gpusense.matching.result import ScanMatch, is_usable
-from gpusense.matching.uncertainty import inflation_of, observed_pairs, symmetric, variance_of
+from gpusense.matching.triangles import Triangle, matrices_of
+from gpusense.matching.uncertainty import inflation_of, observed_pairs, variance_of
 
 # Distances from guesses are relative to windows of at least this [m].
 _LEAST_WINDOW = 0.1
@@ -58,15 +59,15 @@ def tested(
     """
     numbers, deviation = columns_of(result), column_of(noise)
     weights = larger(numbers[19], 1e-30)
-    scale = np.array([options.least_scale for options in levels])[device.level]
-    variance, factor = variance_of(
-        numbers[20] / weights, numbers[19], column_of(scale), deviation, inflation_of(numbers[24:32])
-    )
+    scales = [options.least_scale for options in levels]
+    scale = scales[0] if len(scales) == 1 else np.array(scales)[device.level]
+    variance, factor = variance_of(numbers[20] / weights, numbers[19], scale, deviation, inflation_of(numbers[24:32]))
     largest = larger(variance, deviation * deviation)
     # Short lines decide only where the result is beyond doubt.
-    found = observed_pairs(symmetric(result[:, 6:12]), symmetric(result[:, 12:18]), largest, column_of(lever), None)
+    are_longer = LONG_WIDTH * deviation > WIDTH
+    found = observed_pairs(numbers[6:12], numbers[12:18], largest, column_of(lever), None, are_longer)
     turned = noisy | ((numbers[12] + numbers[15]) * largest > _TURNED_LINES * weights)
-    longer_lines = ((column_of(found.lost) > 0) | turned) & (LONG_WIDTH * deviation > WIDTH)
+    longer_lines = ((found.lost > 0) | turned) & are_longer
     if any_of(longer_lines):
         rows = np.flatnonzero(longer_lines)
         device.fit_lines(lambda level: LONG_WIDTH * level, rows)
@@ -80,16 +81,14 @@ def tested(
         longer = device.run(rows, result[rows, None, :3], rules)[:, 0]
         # A subset represents all points.
         longer[:, 6:18] *= np.array(strides)[device.level[rows], None]
-        lines = (result[:, 19] / points_of_line(gap, noise, lever))[rows]
-        information, doubt = symmetric(longer[:, 6:12]), symmetric(longer[:, 12:18])
-        by_longer = observed_pairs(information, doubt, values_of(largest)[rows], lever[rows], lines)
-        for values, others in zip(found, by_longer, strict=True):
-            values[rows] = others
+        numbers, lines = columns_of(longer), result[:, 19] / points_of_line(gap, noise, lever)
+        spread, ranges, lines = (column_of(values[rows]) for values in (values_of(largest), lever, lines))
+        found = found.replaced(rows, observed_pairs(numbers[6:12], numbers[12:18], spread, ranges, lines))
     return PairSums(found, factor)
 
 
 def concluded(
-    pose: np.ndarray, information: np.ndarray, factor: Column, score: np.ndarray, iterations: np.ndarray,
+    pose: np.ndarray, information: Triangle, factor: Column, score: np.ndarray, iterations: np.ndarray,
     status: np.ndarray, lever: np.ndarray, other: np.ndarray, evidence: np.ndarray, pairs: np.ndarray,
     noise: np.ndarray, window: tuple[float, float],
 ) -> ScanMatch:  # fmt: skip
@@ -97,7 +96,7 @@ def concluded(
 
     Args:
         pose: (S, 3) poses.
-        information: (S, 3, 3) information on the poses.
+        information: Information on the poses.
         factor: Factors that turn the information into a sum over pairs [m^2].
         score: (S,) scores.
         iterations: (S,) iterations.
@@ -110,23 +109,23 @@ def concluded(
         window: Half widths of the search [m, rad].
     """
     usable, lever_column = is_usable(column_of(status)), column_of(lever)
-    two = usable & has_rival(other)
+    matrices, two = matrices_of(information), usable & has_rival(other)
     if any_of(two):
         offset = np.where(upright(two), other, 0.0)
         # The covariance plus a quarter of the offset's square, by Woodbury's identity.
-        side = np.einsum("sij,sj->si", information, offset)
-        information = information - side[:, :, None] * (side / (4 + (side * offset).sum(axis=1))[:, None])[:, None, :]
+        side = np.einsum("sij,sj->si", matrices, offset)
+        matrices = matrices - side[:, :, None] * (side / (4 + (side * offset).sum(axis=1))[:, None])[:, None, :]
         status = np.where(values_of(two), "ambiguous", status)
-    values, vectors = axes_of(information, lever_column)
+    values, vectors = axes_of(matrices, lever_column)
     kept = (values, vectors) if all_of(usable) else None
     if kept is None:
         # These are not the axes of the information that is kept.
-        information = np.where(upright(usable, 2), information, 0.0)
+        matrices = np.where(upright(usable, 2), matrices, 0.0)
     shares = values * upright(factor / larger(column_of(pairs), 1.0))
-    return ScanMatch(
-        pose, covariance_of(information, lever_column, window, kept), information, np.zeros(len(pose)), score,
-        iterations.astype(np.int64), shares, vectors.transpose(0, 2, 1),
-        lever, noise, evidence, status,
+    return ScanMatch.of(
+        pose=pose, covariance=covariance_of(matrices, lever_column, window, kept), information=matrices,
+        p_right=np.zeros(len(pose)), score=score, iterations=iterations.astype(np.int64), eigenvalues=shares,
+        directions=vectors.transpose(0, 2, 1), lever=lever, noise=noise, evidence=evidence, status=status,
     )  # fmt: skip
 
 

@@ -6,7 +6,6 @@ inspected before the launch that places them.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Hashable
 from typing import NamedTuple
 
@@ -20,7 +19,7 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.models.bounds import LEAST_BOUNDED, bounds_on_device, bounds_poses
-from gpusense.tables.reachable import ReachableMap
+from gpusense.tables.reachable import MapState, ReachableMap
 from gpusense.world.frames import Cells, Mount, frame_of, place_poses
 from gpusense.world.windows import Corners, Window
 
@@ -107,15 +106,14 @@ class Poses:
         arrays.check_bounds(bounds, self.host, self._name, self._scans)
         self._last_corners = part, corners_of(bounds)
 
-    def window(
-        self, table: ReachableMap, part: Part, backend: Backend, space: Workspace | None = None
-    ) -> tuple[Buffer, Window]:
-        """Return the map's table for some poses, and its window."""
-        return table.ensure(self.hull if self.host is None else self.corners(part, backend, space))
+    def ensure_table(
+        self, reachable: ReachableMap, part: Part, backend: Backend, space: Workspace | None = None
+    ) -> MapState:
+        """Return the map with a table for some poses."""
+        return reachable.ensure(self.corners(part, backend, space) or self.hull)
 
-    def flags(self, part: Part, backend: Backend, space: Workspace) -> frozenset[str]:
-        """Return the flags of kernels that place some poses."""
-        corners = self.corners(part, backend, space)
+    def flags(self, corners: Corners | None) -> frozenset[str]:
+        """Return the flags of kernels that place poses with these corners."""
         if corners is None:
             return _HUGE_SINGLE if self._dtype == _SINGLE else _HUGE
         return _HUGE if max(-corners[0][2], corners[3][2]) > LARGEST_HEADING else _PLAIN
@@ -237,18 +235,14 @@ def place(
         real: Precision of the placed poses.
         careful: Whether low parts are needed.
     """
-    count, corners, flags = part[1] - part[0], poses.corners(part, backend, space), poses.flags(part, backend, space)
+    count, corners = part[1] - part[0], poses.corners(part, backend, space)
+    flags = poses.flags(corners)
     source, lows = poses.buffer(backend, space, part), 4 * count if careful else 4
     if source is None:
         _place_on_host(poses, part, frame, space, real, careful=careful)
         return PlacedPoses(count, corners, frame, space, real, lows, flags)
-    flags |= _precision_flags(real == _DOUBLE, careful)
+    flags |= flags_if(FLOAT64=real == _DOUBLE, TWO_PART_POINTS=careful)
     return PlacedPoses(count, corners, frame, space, real, lows, flags, source, backend.info.lanes)
-
-
-@functools.cache
-def _precision_flags(double: bool, careful: bool) -> frozenset[str]:
-    return flags_if(FLOAT64=double, TWO_PART_POINTS=careful)
 
 
 def pose_status(space: Workspace) -> Buffer:

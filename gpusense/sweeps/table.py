@@ -188,7 +188,6 @@ def columns_of(names: Sequence[str], rows: Sequence[Mapping[str, str]]) -> dict[
 
 
 def _value(cell: str) -> Any:
-    """Return the value of a cell."""
     if cell == "":
         return None
     if cell in ("true", "false"):

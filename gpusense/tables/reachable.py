@@ -24,12 +24,15 @@ def obstacles_of(grid: OccupancyGrid, unknown: str) -> np.ndarray:
     return grid.obstacles("occupied" if unknown == "occupied" else "free")
 
 
+_NOWHERE = Window(0, 0, 0, 0)
+
+
 class TableMemoryError(MemoryError):
     """Error of a device that cannot hold a map's table, whatever the size of the cloud."""
 
 
 @dataclass(frozen=True)
-class _State:
+class MapState:
     """The map and its table; a single assignment replaces both, so that no interrupt can separate them.
 
     Attributes:
@@ -37,7 +40,7 @@ class _State:
         obstacles: (H, W) mask of the map; None if an interrupted update may have written to it.
         shared: Whether the array of obstacles belongs to the grid and is read-only.
         table: The table; None without one.
-        window: The table's window.
+        window: The table's window; empty without one.
         preparations: Number of tables made.
         version: Number that grows with every change.
     """
@@ -46,7 +49,7 @@ class _State:
     obstacles: np.ndarray | None = None
     shared: bool = True
     table: Buffer = None
-    window: Window | None = None
+    window: Window = _NOWHERE
     preparations: int = 0
     version: int = 0
 
@@ -88,7 +91,7 @@ class ReachableMap:
         self._prepare, self._refresh, self._unknown = prepare, refresh, unknown
         self._mask_of, self._neighbors = obstacles_of, neighbors
         self._whole = windows.whole(grid)
-        self._state = _State(grid, self._obstacles_of(grid))
+        self._state = MapState(grid, self._obstacles_of(grid))
 
     @property
     def grid(self) -> OccupancyGrid:
@@ -107,7 +110,7 @@ class ReachableMap:
     @property
     def window(self) -> Window | None:
         """The table's window; None before the first table."""
-        return self._state.window
+        return self._state.window if self._state.window.cells else None
 
     @property
     def preparations(self) -> int:
@@ -123,8 +126,8 @@ class ReachableMap:
         """Drop the table; the next call rebuilds it."""
         self._state = replace(self._state, table=None, version=self.version + 1)
 
-    def ensure(self, corners: Corners | None) -> tuple[Buffer, Window]:
-        """Return the table and its window; rebuild both if a sensor can reach beyond the window.
+    def ensure(self, corners: Corners | None) -> MapState:
+        """Return the map with its table; rebuild the table if a sensor can reach beyond its window.
 
         Args:
             corners: Poses whose box holds all poses; None for poses anywhere.
@@ -133,7 +136,7 @@ class ReachableMap:
             TableMemoryError: The device cannot hold the table.
         """
         if self._state.window is self._whole and self._state.table is not None:
-            return self._state.table, self._whole
+            return self._state
         if self._crop and corners is not None:
             window = windows.choose(self.grid, self.window, corners, self._mount, self._reach)
         else:
@@ -141,14 +144,14 @@ class ReachableMap:
         window = self._whole if window == self._whole else window
         if window != self.window or self._state.table is None:
             # The device may not hold both tables at once.
-            self._state = replace(self._state, table=None, window=None)
+            self._state = replace(self._state, table=None, window=_NOWHERE)
             try:
                 table = self._prepare(self._backend, window.cut(self.obstacles))
             except MemoryError as error:
                 raise TableMemoryError(*error.args) from error
             count, version = self.preparations + 1, self.version + 1
             self._state = replace(self._state, table=table, window=window, preparations=count, version=version)
-        return self._state.table, window
+        return self._state
 
     def update(self, cells: object, place: object) -> OccupancyGrid:
         """Replace cells of the map; update the table now, or drop it so that the next call rebuilds it.

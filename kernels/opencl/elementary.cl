@@ -6,6 +6,9 @@
 #define LOG2_HIGH 0.6931471803691238
 #define LOG2_LOW 1.9082149292705877e-10
 #define INVERSE_LOG2 1.4426950408889634
+// 1.5 * 2^52 and its bits: a sum with it has an integer, of either sign, in its last bits.
+#define SIGNED_INTEGERS 6755399441055744.0
+#define SIGNED_BITS 0x4338000000000000L
 // Below this exponent the result is 0.
 #define LEAST_EXPONENT -700.0
 #define SQRT_HALF 0.7071067811865476
@@ -39,12 +42,11 @@
 // Return exp(x) for x <= 700; 0 below LEAST_EXPONENT.
 double exp_of(const double x) {
     const double held = x > LEAST_EXPONENT ? x : 0.0;
-    // 1.5 * 2^52: adding it rounds to an integer.
-    const double count = (held * INVERSE_LOG2 + 6755399441055744.0) - 6755399441055744.0;
+    const double shifted = held * INVERSE_LOG2 + SIGNED_INTEGERS, count = shifted - SIGNED_INTEGERS;
     const double r = (held - count * LOG2_HIGH) - count * LOG2_LOW;
     const double high = ((((EXP_0 * r + EXP_1) * r + EXP_2) * r + EXP_3) * r + EXP_4) * r + EXP_5;
     const double series = (((((high * r + EXP_6) * r + EXP_7) * r + EXP_8) * r + EXP_9) * r + EXP_10) * r + EXP_11;
-    const double power = as_double(((long)count + 1023) << 52);
+    const double power = as_double(((as_long(shifted) - SIGNED_BITS) + 1023) << 52);
     return x > LEAST_EXPONENT ? (1.0 + (r + r * r * series)) * power : 0.0;
 }
 
@@ -58,12 +60,10 @@ double odd_series(const double z) {
 double log_of(const double x) {
     const long bits = as_long(x);
     const double m = as_double((bits & 0xFFFFFFFFFFFFFL) | 0x3FE0000000000000L);
-    const int small = m < SQRT_HALF;
-    const double exponent = (double)((bits >> 52) - 1023) + (small ? 0.0 : 1.0);
-    const double scaled = small ? 2.0 * m : m;
-    const double s = (scaled - 1.0) / (scaled + 1.0);
-    const double z = s * s;
-    const double series = odd_series(z);
+    const long small = m < SQRT_HALF;
+    const double whole = as_double(((bits >> 52) - 1023) + SIGNED_BITS) - SIGNED_INTEGERS;
+    const double exponent = small ? whole : whole + 1.0, scaled = small ? 2.0 * m : m;
+    const double s = (scaled - 1.0) / (scaled + 1.0), z = s * s, series = odd_series(z);
     return exponent * LOG2_HIGH + (2.0 * s + (2.0 * s * z * series + exponent * LOG2_LOW));
 }
 

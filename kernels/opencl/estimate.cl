@@ -10,6 +10,17 @@
 #define RIGHT_ANGLE 1.5707963267948966
 #define WIDE_HEADINGS 10
 
+// Add a particle's weight, offset and turn to the sums.
+void add_pose(const double w, const double x, const double y, const double angle, double *part) {
+    const double2 heading = cos_sin(angle);
+    const double w_x = w * x, w_y = w * y, w_angle = w * angle;
+    part[0] += w, part[1] += w_x, part[2] += w_y;
+    part[3] += w * heading.x, part[4] += w * heading.y, part[5] += w_angle;
+    part[6] += w_x * x, part[7] += w_x * y, part[8] += w_x * angle;
+    part[9] += w_y * y, part[10] += w_y * angle, part[11] += w_angle * angle;
+    part[12] += fabs(angle) > RIGHT_ANGLE ? w : 0.0;
+}
+
 // Sum weights, offsets, cosines and sines, products of offsets, and the weights of far headings: one work-item takes a
 // number of lanes of a block.
 kernel void sum_poses(ARGUMENTS) {
@@ -25,13 +36,7 @@ kernel void sum_poses(ARGUMENTS) {
         for (int k = 0; k < ESTIMATE_SUMS; k++) part[k] = 0.0;
         for (int n = begin + lane; n < end; n += ESTIMATE_LANES) {
             const double w = weight[n], x = poses[3 * (long)n] - x0, y = poses[3 * (long)n + 1] - y0;
-            const double angle = wrap_once(poses[3 * (long)n + 2] - theta0);
-            const double2 heading = cos_sin(angle);
-            part[0] += w, part[1] += w * x, part[2] += w * y;
-            part[3] += w * heading.x, part[4] += w * heading.y, part[5] += w * angle;
-            part[6] += w * x * x, part[7] += w * x * y, part[8] += w * x * angle;
-            part[9] += w * y * y, part[10] += w * y * angle, part[11] += w * angle * angle;
-            part[12] += fabs(angle) > RIGHT_ANGLE ? w : 0.0;
+            add_pose(w, x, y, wrap_once(poses[3 * (long)n + 2] - theta0), part);
         }
         for (int k = 0; k < ESTIMATE_SUMS; k++) total[k] += part[k];
     }

@@ -42,7 +42,7 @@ constant uint WORDS[39] = {
 
 // Quarter turns modulo 4, and the remaining angle as the sum of two numbers.
 typedef struct {
-    int quadrant;
+    long quadrant;
     double2 rest;
 } Turn;
 
@@ -70,13 +70,14 @@ double2 pair_product_float64(const double2 a, const double2 b) {
 
 // Reduce a heading of at most LARGEST_HEADING.
 Turn reduce_ordinary(const double theta) {
-    const double count = (theta * TWO_OVER_PI + ROUNDER) - ROUNDER;
+    const double turns = theta * TWO_OVER_PI + ROUNDER, count = turns - ROUNDER;
     // The first product and difference are exact, and so are the next two products.
     const double2 first = two_sum_float64(theta - count * QUARTER_1, -(count * QUARTER_2));
     const double2 second = two_sum_float64(first.x, -(count * QUARTER_3));
     const double low = (first.y + second.y) - count * QUARTER_4;
     Turn turn;
-    turn.quadrant = (int)count & 3;
+    // The last bits of the sum with ROUNDER are the integer.
+    turn.quadrant = as_long(turns) & 3;
     turn.rest = two_sum_float64(second.x, low);
     return turn;
 }
@@ -119,13 +120,8 @@ Turn reduce_huge(const double theta) {
 }
 #endif
 
-// Return (cosine, sine) of a heading; for a heading that is not finite they are meaningless, but not NaN.
-double2 cos_sin(const double theta) {
-#if HUGE_HEADINGS
-    const Turn turn = fabs(theta) <= LARGEST_HEADING ? reduce_ordinary(theta) : reduce_huge(theta);
-#else
-    const Turn turn = reduce_ordinary(theta);
-#endif
+// Return (cosine, sine) of a reduced heading.
+double2 cos_sin_of(const Turn turn) {
     const double r = turn.rest.x, low = turn.rest.y;
     const double z = r * r;
     const double half_z = 0.5 * z;
@@ -134,7 +130,16 @@ double2 cos_sin(const double theta) {
     const double sine = r + (r * z * s + low * (1.0 - half_z));
     const double near = 1.0 - half_z;
     const double cosine = near + (((1.0 - near) - half_z) + (z * z * c - r * low));
-    const int odd = turn.quadrant & 1;
+    const long odd = (turn.quadrant & 1) != 0;
     const double x = odd ? sine : cosine, y = odd ? cosine : sine;
-    return (double2)((turn.quadrant + 1) & 2 ? -x : x, turn.quadrant & 2 ? -y : y);
+    return (double2)(((turn.quadrant + 1) & 2) != 0 ? -x : x, (turn.quadrant & 2) != 0 ? -y : y);
+}
+
+// Return (cosine, sine) of a heading; for a heading that is not finite they are meaningless, but not NaN.
+double2 cos_sin(const double theta) {
+#if HUGE_HEADINGS
+    return cos_sin_of(fabs(theta) <= LARGEST_HEADING ? reduce_ordinary(theta) : reduce_huge(theta));
+#else
+    return cos_sin_of(reduce_ordinary(theta));
+#endif
 }

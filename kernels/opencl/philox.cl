@@ -26,12 +26,15 @@ uint4 random_words(const uint4 counter, const uint key_0, const uint key_1) {
     return c;
 }
 
-// Return numbers in (0, 1), the centres of 2^32 intervals.
-double uniform_of(const uint word) { return ((double)word + 0.5) * WORD; }
+// Return a word as a number.
+double number_of(const uint word) { return (double)word; }
+
+// Return a number in (0, 1), the centre of one of 2^32 intervals.
+double uniform_of(const uint word) { return (number_of(word) + 0.5) * WORD; }
 
 // Return two independent standard normal deviates.
 double2 normal_pair(const uint word_0, const uint word_1) {
     const double radius = sqrt(-2.0 * log_of(uniform_of(word_0)));
-    const double2 turn = cos_sin((double)word_1 * WORD_TURN);
+    const double2 turn = cos_sin(number_of(word_1) * WORD_TURN);
     return (double2)(radius * turn.x, radius * turn.y);
 }

@@ -28,6 +28,24 @@ double floor_cells(const double position) {
     return whole > position ? whole - 1.0 : whole;
 }
 
+// Move a robot's pose in the world to its sensor's on the map, in cells; the heading is its cosine and sine.
+void move_to_sensor(const Frame frame, double *to_x, double *to_y, double *to_cosine, double *to_sine) {
+    double x = *to_x - frame.origin_x, y = *to_y - frame.origin_y, cosine = *to_cosine, sine = *to_sine;
+    if (frame.mount_x != 0 || frame.mount_y != 0) {
+        x += cosine * frame.mount_x - sine * frame.mount_y;
+        y += sine * frame.mount_x + cosine * frame.mount_y;
+    }
+    if (frame.yaw_sin != 0) {
+        const double x_before = x, cosine_before = cosine;
+        x = frame.yaw_cos * x + frame.yaw_sin * y;
+        y = frame.yaw_cos * y - frame.yaw_sin * x_before;
+        cosine = cosine * frame.yaw_cos + sine * frame.yaw_sin;
+        sine = sine * frame.yaw_cos - cosine_before * frame.yaw_sin;
+    }
+    *to_x = within_reach(x / frame.resolution), *to_y = within_reach(y / frame.resolution);
+    *to_cosine = cosine, *to_sine = sine;
+}
+
 // Place a sensor: a pose times the scanner's mount, without its yaw, which belongs to the bearings. pose_low gets the
 // rounding errors (low parts) of pose. pose_status, which the caller clears, becomes 1 at index 0 if a pose is not
 // finite, and at index 1 if a sensor is outside the window. A non-finite pose becomes the farthest cell, fraction 0 and
@@ -40,21 +58,7 @@ void place_pose(const int particle, global const coordinate *poses, global int2 
     const int finite = (x - x) + (y - y) + (theta - theta) == 0;
     const double2 heading = cos_sin(theta);
     double cosine = heading.x, sine = heading.y;
-    x -= frame.origin_x;
-    y -= frame.origin_y;
-    if (frame.mount_x != 0 || frame.mount_y != 0) {
-        x += cosine * frame.mount_x - sine * frame.mount_y;
-        y += sine * frame.mount_x + cosine * frame.mount_y;
-    }
-    if (frame.yaw_sin != 0) {
-        const double x_before = x, cosine_before = cosine;
-        x = frame.yaw_cos * x + frame.yaw_sin * y;
-        y = frame.yaw_cos * y - frame.yaw_sin * x_before;
-        cosine = cosine * frame.yaw_cos + sine * frame.yaw_sin;
-        sine = sine * frame.yaw_cos - cosine_before * frame.yaw_sin;
-    }
-    x = within_reach(x / frame.resolution);
-    y = within_reach(y / frame.resolution);
+    move_to_sensor(frame, &x, &y, &cosine, &sine);
     if (!finite) {
         atomic_or(&pose_status[0], 1);
         x = y = -FARTHEST;

@@ -39,10 +39,29 @@ double8 eight_at(global const double *values, const int first, const int end, co
                      count > 6 ? values[6] : missing, count > 7 ? values[7] : missing);
 }
 
+// A sum of integers over a block; in lanes, one for each lane.
+typedef double Total;
+
 // Return the sum of 8 numbers, rounded down to integers.
-double sum_eight(const double8 numbers) {
+Total sum_eight(const double8 numbers) {
     const double8 a = floor(numbers);
     return a.s0 + a.s1 + a.s2 + a.s3 + a.s4 + a.s5 + a.s6 + a.s7;
+}
+
+// Return the number that a sum is.
+double sum_of(const Total total) { return total; }
+
+// Write 8 weights from first on and their cumulative sums; return the sum of all so far.
+double write_eight(const double8 weights, const double scale, const double before, global double *weight,
+                   global double *ends, const int first, const int end) {
+    const double8 whole = floor(weights * scale);
+    double sum = before;
+#pragma unroll
+    for (int i = 0; i < 8; i++) {
+        sum += ((const double *)&whole)[i];
+        if (first + i < end) weight[first + i] = ((const double *)&weights)[i], ends[first + i] = sum;
+    }
+    return sum;
 }
 
 // Return the largest of the scores from begin to before end.

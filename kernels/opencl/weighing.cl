@@ -41,7 +41,7 @@ kernel void weigh_particles(ARGUMENTS) {
     const double high = largest_of(largest, 0, groups), left = left_of(state, stage) * settings[DEPTH];
     const double scale = settings[SCALE];
     const int end = min(begin + block, particles);
-    double weights[RUNGS], squares[RUNGS], old = 0.0;
+    Total weights[RUNGS], squares[RUNGS], old = 0.0;
     for (int k = 0; k < RUNGS; k++) weights[k] = squares[k] = 0.0;
     for (int n = begin; n < end; n += 8) {
         const double8 scores = eight_at(score, n, end, -INFINITY), prior = eight_at(before, n, end, 0.0);
@@ -56,8 +56,8 @@ kernel void weigh_particles(ARGUMENTS) {
         }
     }
     global double *row = sums + (long)b * WEIGHT_SUMS;
-    for (int k = 0; k < RUNGS; k++) row[k] = weights[k], row[RUNGS + k] = squares[k];
-    row[2 * RUNGS] = old;
+    for (int k = 0; k < RUNGS; k++) row[k] = sum_of(weights[k]), row[RUNGS + k] = sum_of(squares[k]);
+    row[2 * RUNGS] = sum_of(old);
     if (b == 0) highest[0] = high;
 }
 
@@ -99,11 +99,6 @@ kernel void set_weights(ARGUMENTS) {
         const double8 scores = eight_at(score, n, end, -INFINITY), prior = eight_at(before, n, end, 0.0);
         double8 likelihood = tempered(scores, high, low);
         for (int k = rung; k < RUNGS - 1; k++) likelihood *= likelihood;
-        const double8 chosen = prior * likelihood, whole = floor(chosen * scale);
-#pragma unroll
-        for (int i = 0; i < 8; i++) {
-            sum += ((const double *)&whole)[i];
-            if (n + i < end) weight[n + i] = ((const double *)&chosen)[i], ends[n + i] = sum;
-        }
+        sum = write_eight(prior * likelihood, scale, sum, weight, ends, n, end);
     }
 }

@@ -14,6 +14,7 @@ from support.split_scene import GRID
 import gpusense as gs
 from gpusense.backends import get_backend
 from gpusense.backends.programs import ChangingProgram, ProgramCache, RecordedProgram, RepeatedPrograms
+from gpusense.backends.workspace import Workspace
 from gpusense.interface.launches import launch
 
 REAL, POSES = np.dtype(np.float64), np.array([(1.0, 1.0, 0.3), (1.2, 1.1, -0.4)])
@@ -189,3 +190,23 @@ def test_a_forked_child_starts_no_program(needs):
         os._exit(0)
     os.waitpid(child, 0)
     assert os.read(read, 1) == bytes([4])
+
+
+def test_a_held_array_is_copied_once_for_each_key_and_again_after_an_error():
+    space, copied = Workspace(get_backend("numpy")), []
+
+    def held(key: int) -> float:
+        def make() -> np.ndarray:
+            copied.append(key)
+            return np.full(key, float(key))
+
+        out = np.empty(key)
+        space.read(space.hold("array", key, make), out)
+        return out.max()
+
+    assert [held(key) for key in (2, 2, 3, 3, 2)] == [2, 2, 3, 3, 2] and copied == [2, 3, 2]
+    with pytest.raises(ValueError, match="stop"), space:
+        raise ValueError("stop")
+    assert held(2) == 2 and copied == [2, 3, 2, 2]
+    space.release()
+    assert held(2) == 2 and len(copied) == 5

@@ -47,6 +47,7 @@ EIGHT = "a work-item reads eight numbers before it uses any; the reference takes
 BLOCKS = "a work-item reads blocks of 16 readings as sets of bits; the reference takes all readings at once"
 TILES = "a work-item of a GPU finds its particle and rays; the reference takes all of them at once"
 TEAMS = "work-items of a GPU share the points of a scan; the reference takes all points at once"
+LANES = "bodies in lanes take the function from the scalar text; Warp and NumPy have no such bodies"
 QUICK = "kernels round end points first and repeat the doubtful ones with twice the digits; the reference repeats all"
 STAGES = "on Warp's processor device each stage of a block is a loop; OpenCL has lanes for it"
 KERNELS_ONLY, REFERENCE_ONLY = (OPENCL, WARP), (NUMPY,)
@@ -65,12 +66,14 @@ ON_PURPOSE = [
     Purpose("error_free", "floor_int", (OPENCL,), FLOOR),
     Purpose("error_free", "add_strands", KERNELS_ONLY, "the reference adds the terms of strand_sums"),
     Purpose("error_free", "where_pair strands_in block_sums strand_sums _sums", REFERENCE_ONLY, ARRAYS),
+    Purpose("estimate", "add_pose", (OPENCL,), LANES),
     Purpose("field", "rounded_block", KERNELS_ONLY, QUICK),
     Purpose("field", "field_log", KERNELS_ONLY, "sum_terms of beam.py does it for both models"),
     Purpose("field", "staged_sum", (WARP,), STAGES),
     Purpose("field_gradient", "add_slope", KERNELS_ONLY, "readings come one after another"),
     Purpose("field_term", "quick_value careful_value", KERNELS_ONLY, QUICK),
     Purpose("field_term", "four_distances interpolated log_of_exponent", (WARP,), STAGES),
+    Purpose("heading", "cos_sin_of", (OPENCL,), LANES),
     Purpose("heading", "two_sum_float64 high_half_float64 pair_product_float64", (OPENCL,), FLOAT64),
     Purpose("icp_step", "add_to_blocks close_blocks", KERNELS_ONLY, "points come one after another"),
     Purpose("icp_step", "cooperates", (WARP,), "OpenCL's processors have teams as well"),
@@ -82,8 +85,11 @@ ON_PURPOSE = [
     ),
     Purpose("landmark_grid", "candidates", REFERENCE_ONLY, ARRAYS),
     Purpose("landmarks", "negative_where at_places", REFERENCE_ONLY, ARRAYS),
+    Purpose("motion", "any_of motion_of move_by", (OPENCL,), LANES),
     Purpose("passages", "floor_of", (OPENCL,), FLOOR),
     Purpose("passages", "_cells_along", REFERENCE_ONLY, ARRAYS),
+    Purpose("philox", "number_of", (OPENCL,), LANES),
+    Purpose("placement", "move_to_sensor", (OPENCL,), LANES),
     Purpose("placement", "floor_cells", (OPENCL,), FLOOR),
     Purpose("ranges", "caster_of", (WARP, NUMPY), "OpenCL requires the file caster, which sources.py resolves"),
     Purpose("raycast", "track_of rectangle_at", KERNELS_ONLY, COUNTS),
@@ -92,6 +98,7 @@ ON_PURPOSE = [
     Purpose("ray", "start_casts", REFERENCE_ONLY, ARRAYS),
     Purpose("rectangles", "reached _runs longest _quadrants", REFERENCE_ONLY, ARRAYS),
     Purpose("relative", "pair_sum_float64", (OPENCL,), FLOAT64),
+    Purpose("tempering", "sum_of write_eight", (OPENCL,), LANES),
     Purpose("tempering", "eight_at sum_eight sum_before", KERNELS_ONLY, EIGHT),
     Purpose("scan", "count_informative read_block chosen_of placed_of longest_beside fill_item", KERNELS_ONLY, BLOCKS),
     Purpose("segments", "add_row", KERNELS_ONLY, "points come one after another, added by rotations"),

@@ -240,8 +240,8 @@ def test_a_robot_that_is_carried_away_on_a_wrong_map_is_lost_and_found():
     assert max(one.p_lost for one in carried[:4]) > 0.7 and error(carried[-1], elsewhere[-1]) < 0.2
 
 
-def test_the_comparison_has_the_likeliest_other_place(model):
-    """Compare with poses all over the map: none beyond the search's resolution is likelier, and the robot's own is."""
+def test_the_comparison_has_the_best_other_place(model):
+    """Compare with poses all over the map: the robot's own place is the best one where the estimate is elsewhere."""
     here, there = np.array([4.0, 3.5, 0.3]), np.array([9.0, 9.0, 2.0])
     ranges, spread = scans([here], people=0.6)[0], np.diag([0.01, 0.01, 0.001])
     anywhere = np.random.default_rng(0).uniform((0, 0, -3), (20, 12, 3), (4000, 3))
@@ -249,19 +249,28 @@ def test_the_comparison_has_the_likeliest_other_place(model):
     search, temperature = RivalSearch([Sensor(model)]), 0.05
     for pose, mine, is_found in ((here, log_p[0], True), (there, log_p[1], False)):
         compared = search.found(pose, spread, [(0, (ranges,))], (0, 0, 0), temperature)
-        others = log_p[are_apart(np.vstack([here, there, anywhere]), pose)]
-        # Poses of the search are 0.1 m and 3 degrees apart, and the nearest one is a little less likely.
-        assert compared.lead > temperature * float(others.max() - mine) - 1.0
+        apart = are_apart(compared.poses, pose)
+        best = compared.poses[apart][np.argmax(compared.score[apart])]
+        reached = temperature * float(model.log_likelihood(best[None], ranges)[0])
+        assert compared.lead == pytest.approx(reached - temperature * float(mine), abs=1e-3)
+        assert compared.score[apart].max() == pytest.approx(reached - compared.walls, abs=1e-3)
         assert compared.is_found == is_found and compared.beams == pytest.approx(temperature * SCANNER.count)
         assert compared.ratio < -1.5 if is_found else compared.ratio > 0.2
+    # Poses of the search are 0.1 m and 3 degrees apart, and the nearest one is a little less likely.
+    others = log_p[are_apart(np.vstack([here, there, anywhere]), there)]
+    assert compared.lead > temperature * float(others.max() - log_p[1]) - 1.0 and compared.walls < 0
 
 
 def test_a_comparison_needs_information_and_has_limits():
-    def ratio(lead, beams, is_found=False):
-        return ratio_of_places(lead, beams, is_found=is_found)
+    def ratio(lead, beams, walls=-20.0, is_found=False):
+        return ratio_of_places(lead, beams, walls, is_found=is_found)
 
-    assert ratio(-math.inf, 10.0) < -3 and ratio(math.inf, 10.0) == ratio(9.0, 10.0) > 1
+    assert ratio(-math.inf, 10.0) < -2.5 and ratio(math.inf, 10.0) == ratio(9.0, 10.0) > 1
     assert ratio(2.0, 10.0, is_found=True) == pytest.approx(ratio(2.0, 10.0) - IS_FOUND * 10 / 11)
     # A scan with hardly any information is no evidence.
     assert abs(ratio(0.0, 0.01, is_found=True)) < 0.05
     assert math.isnan(ratio(math.nan, 10.0)) and math.isnan(ratio(1.0, 0.0))
+    # The lead of a place that its own beams contradict says nothing, and a pose that none leads stays right.
+    even = math.log((math.exp(ratio(9.0, 10.0)) + 1) / 2)
+    assert ratio(9.0, 10.0, walls=0.0) == pytest.approx(even) and 0 < ratio(9.0, 10.0, walls=5.0) < 0.1
+    assert ratio(-2.0, 10.0, walls=5.0) == ratio(-2.0, 10.0)

@@ -38,10 +38,11 @@ def test_one_call_is_many_calls(pairs):
         alone = gs.match_scan(first[i], second[i], RING, truth[i], backend="numpy")
         assert alone.pose.tolist() == together.pose[i].tolist()
         assert alone.status == together.status[i]
-        # A product of BLAS rounds by the number of its rows.
-        np.testing.assert_allclose(together[i].p_right, alone.p_right, rtol=1e-12)
-        for name in ("covariance", "information", "eigenvalues", "directions", "evidence", "score", "lever", "noise"):
+        for name in ("covariance", "information", "p_right", "evidence", "score", "lever", "noise"):
             np.testing.assert_array_equal(getattr(together[i], name), getattr(alone, name), err_msg=name)
+        # Axes of a single match are computed without LAPACK, and their signs are arbitrary.
+        np.testing.assert_allclose(together[i].eigenvalues, alone.eigenvalues, rtol=1e-12)
+        np.testing.assert_allclose(np.abs(together[i].directions @ alone.directions.T), np.eye(3), atol=1e-9)
     shared = gs.match_scan(first[0], np.stack([first[0]] * 2), RING, backend="numpy")
     assert len(shared) == 2
     np.testing.assert_allclose(shared.pose, 0, atol=1e-3)

@@ -14,6 +14,7 @@ from gpusense.matching.evidence import NAMES
 from gpusense.matching.noise import ROOT, scan_noise
 from gpusense.matching.observability import covariance_of, critical_ratio, observed_information
 from gpusense.matching.result import STATUSES
+from gpusense.matching.triangles import matrices_of, triangle_of
 
 # A corridor longer than the range of the scanners, and a room that is nowhere like ROOM.
 CORRIDOR = np.array([[-200.0, -1.2, 200.0, -1.2], [-200.0, 1.4, 200.0, 1.4]])
@@ -202,12 +203,17 @@ def test_observability_is_invariant_and_lost_wholly():
     frame = np.linalg.qr(np.column_stack([lost, np.eye(3)[:, :2]]))[0]
     spurious = 2.0 * np.outer(frame[:, 0], frame[:, 0])[None]
     total = (frame @ np.diag([2.4, 300.0, 200.0]) @ frame.T)[None]
-    found = observed_information(total, spurious, np.ones(1), np.full(1, 30.0), np.full(1, 1.5))
-    assert found.lost.tolist() == [1]
-    assert np.abs(found.information[0] @ lost).max() < 1e-9
-    assert np.isinf(np.diagonal(covariance_of(found.information, np.ones(1), (1.0, 1.0))[0])).all()
-    strong = observed_information(10 * total, spurious, np.ones(1), np.full(1, 30.0), np.full(1, 1.5))
-    assert strong.lost.tolist() == [0]
+    found = observed_information(triangle_of(total), triangle_of(spurious), 1.0, 30.0, 1.5)
+    information = matrices_of(found.information)
+    assert found.lost == 1
+    assert observed_information(triangle_of(total), triangle_of(spurious), 1.0, 30.0, 1.5, unneeded=True).lost == 1
+    assert np.abs(information[0] @ lost).max() < 1e-9
+    assert np.isinf(np.diagonal(covariance_of(information, 1.0, (1.0, 1.0))[0])).all()
+    strong = observed_information(triangle_of(10 * total), triangle_of(spurious), 1.0, 30.0, 1.5)
+    assert strong.lost == 0
+    # An observed information loses the part that noise contributes, and nothing else.
+    expected = 10 * total - spurious - 1e-3 * np.eye(3)
+    np.testing.assert_allclose(matrices_of(strong.information), expected, rtol=1e-12)
 
 
 def test_the_false_alarms_of_a_lost_direction_are_as_stated():

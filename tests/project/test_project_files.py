@@ -14,7 +14,7 @@ from support.paths import ROOT
 
 import gpusense as gs
 from gpusense.commands.cli import COMMANDS
-from gpusense.localization import nav2, nav2_start
+from gpusense.localization import nav2, nav2_file
 
 SETTINGS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 PROJECT = SETTINGS["project"]
@@ -70,7 +70,7 @@ IGNORED = {
 
 def test_migration_names_every_parameter_of_nav2_amcl():
     part = MIGRATION[MIGRATION.index("## nav2_amcl") : MIGRATION.index("## Beluga")]
-    known = set(nav2._DEFAULTS) | {name for name in nav2_start.NAMES if "covariance" not in name}
+    known = set(nav2._DEFAULTS) | {name for name in nav2_file.START_NAMES if "covariance" not in name}
     alphas = {"alpha2", "alpha3"}  # between alpha1 and alpha4
     assert code_spans(part) == (known | IGNORED) - alphas
     assert gs.compat.from_nav2({"amcl": {"ros__parameters": dict.fromkeys(IGNORED, 1.0)}}).ignored == tuple(

@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
+from gpusense.backends import helpers
 from gpusense.backends.base import Adopted, Backend, Buffer
 from gpusense.backends.cache import BinaryCache
 from gpusense.backends.info import BackendInfo, ProcessBound
 from gpusense.backends.opencl import arrays, pocl, pocl_kernels
 from gpusense.backends.opencl.caches import new_kernel, without_caches
 from gpusense.backends.opencl.devices import shares_memory
-from gpusense.backends.opencl.launch import Launch
+from gpusense.backends.opencl.launch import Launch, watch
 from gpusense.backends.opencl.memory import SHARED, DeviceBuffer, SharedBuffer, driver_errors, raise_clearly
 from gpusense.backends.opencl.replay import OpenCLRecording
 from gpusense.backends.opencl.slots import slots_of
@@ -78,6 +79,9 @@ class OpenCLBackend(ProcessBound, Backend):
         self._cache = _binary_cache(info, device)
         self._pocl = pocl_kernels.pocl_kernels() if pocl.is_pocl(device) else None
         self._of_bitcode = pocl.takes_bitcode(device)
+        # The last launch, if it is one of a group on one processor of several.
+        self._watches = self._pocl is not None and helpers.threads() > 1
+        self._last: cl.Event | None = None
         # Ranges are the same bits everywhere only if division is rounded correctly, which is an option on GPUs.
         rounded = bool(device.single_fp_config & _ROUNDED_DIVISION)
         self.options = ["-cl-fp32-correctly-rounded-divide-sqrt"] if rounded else []
@@ -221,6 +225,9 @@ class OpenCLBackend(ProcessBound, Backend):
         with self._count:
             queued = self._queued
         try:
+            if (last := self._last) is not None:
+                watch(last)
+                self._last = None
             self._queue.finish()
         except cl.Error as error:
             raise_clearly(error)
@@ -240,12 +247,12 @@ class OpenCLBackend(ProcessBound, Backend):
         # between.
         with self._count:
             self._queued += 1
-        cl.enqueue_nd_range_kernel(self._queue, kernel, size, group)
+        event = cl.enqueue_nd_range_kernel(self._queue, kernel, size, group)
+        self._last = event if self._watches and size == group else None
         with self._count:
             self._queued += 1
 
     def _counted(self, launches: int) -> None:
-        """Count queued launches."""
         with self._count:
             self._queued += launches
 

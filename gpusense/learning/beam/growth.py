@@ -89,7 +89,6 @@ class _Growing(Problem):
         ]  # fmt: skip
 
     def _shape_at(self, theta: Floats) -> Floats:
-        """Return the coordinates of the shape."""
         return theta[_BIAS + self.fit_bias :]
 
     def parts(self, theta: Floats) -> tuple[list[tuple[float, Floats]], tuple[Floats, Floats, Floats], Floats, Floats]:

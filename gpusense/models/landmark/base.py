@@ -180,7 +180,6 @@ class FeatureModel(PointModel):
         return False
 
     def _after(self, placed: PlacedPoses, which: Buffer, log_p: Buffer, features: int) -> Program:
-        """Return the launches after the score."""
         return ()
 
     def _prepare(self, full: np.ndarray, correspondence: object, each: bool) -> Call:

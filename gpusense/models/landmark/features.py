@@ -10,6 +10,7 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.interface import feature_layout as at
+from gpusense.interface.terms import log_weight
 from gpusense.models.landmark.sensor import Sensor, full_circle
 from gpusense.world.frames import Mount, split
 from gpusense.world.parameters import LandmarkParameters
@@ -215,14 +216,14 @@ def prepare_features(
     """
     is_measured = ~np.isnan(features)
     informative = is_measured.any(axis=1)
-    false = np.where(informative, _log(p.z_false) + (is_measured * sensor.uniforms).sum(axis=1), 0.0)
+    false = np.where(informative, log_weight(p.z_false) + (is_measured * sensor.uniforms).sum(axis=1), 0.0)
     columns = np.flatnonzero(informative)
     numbers = np.zeros((len(columns), at.FEATURE))
     measured, kept = is_measured[columns], features[columns]
     values = np.where(measured, kept, 0.0)
     bearing = values[:, 1] + mount[2]
     scales = measured * np.array(sensor.scales)
-    peak = _log(p.z_detect) + (measured * sensor.peaks).sum(axis=1)
+    peak = log_weight(p.z_detect) + (measured * sensor.peaks).sum(axis=1)
     if full_circle(p):
         peak = peak - measured[:, 1] * sensor.least_masses[1]
     numbers[:, [at.RANGE_AT, at.SIGNATURE_AT]] = values[:, [0, 2]]
@@ -286,7 +287,3 @@ def in_two_parts(numbers: np.ndarray, real: np.dtype, low_parts: Sequence[tuple[
     for column, of in low_parts:
         high[:, column] = low[:, of]
     return high
-
-
-def _log(weight: float) -> float:
-    return math.log(weight) if weight > 0 else -math.inf

@@ -189,7 +189,7 @@ class PointModel(Pickled):
         """
         backend, space, count = self._backend, self._workspace, part[1] - part[0]
         name, width = {"place_relative": ("place", 4), "wrap_headings": ("residual", 2)}[kernel]
-        flags, source = poses.flags(part, backend, space), poses.buffer(backend, space, part)
+        flags, source = poses.flags(poses.corners(part, backend, space)), poses.buffer(backend, space, part)
         if source is None:
             assert poses.host is not None
             placed = np.empty((count, width), self._real)

@@ -178,7 +178,6 @@ class DeviceCall(BoundCall):
         )  # fmt: skip
 
     def _wait(self) -> None:
-        """Wait for all starts of the program."""
         for _, program in self._programs.items():
             program.recording.wait()
 
@@ -199,8 +198,8 @@ class DeviceCall(BoundCall):
             # Keep the table, since another call of the model may replace it; free the last one first.
             self._table = None
             self._programs.clear()
-            self._table, _ = self._poses.window(pipeline.map, (0, self._poses.count), pipeline.backend)
-            version = pipeline.map.version
+            state = self._poses.ensure_table(pipeline.map, (0, self._poses.count), pipeline.backend)
+            self._table, version = state.table, state.version
             program = RecordedProgram(backend, self._program())
         # Other streams may use the buffers of this one first.
         backend.synchronize()
@@ -212,9 +211,9 @@ class DeviceCall(BoundCall):
         program: Program = ()
         for begin in range(0, count, self._chunk):
             part = (begin, min(begin + self._chunk, count))
-            placed, table = pipeline.place(self._poses, part, self._space)
+            placed, state = pipeline.place(self._poses, part, self._space)
             log_p = pipeline.backend.part(self._log_p, begin, part[1] - begin, pipeline.real)
-            scoring = pipeline.scoring(readings, placed, table, log_p, self._space, ordered=False)
+            scoring = pipeline.scoring(readings, placed, state.table, log_p, self._space, ordered=False)
             program += pipeline.program(scoring)
             # Readings stay where the first piece has placed them.
             readings = readings._replace(placing=None)

@@ -51,7 +51,7 @@ class _Gradient:
 
     def _run(self, piece: Piece, readings: Readings, rows: np.ndarray) -> None:
         pipeline, space, backend = self._pipeline, self._space, self._pipeline.backend
-        placed, table = pipeline.place(self._request.poses, piece.part, space)
+        placed, state = pipeline.place(self._request.poses, piece.part, space)
         numbers = space.empty("gradient", GRADIENT_NUMBERS * piece.count, pipeline.real)
         resolution = pipeline.grid.resolution
         mount_x, mount_y = (value / resolution for value in pipeline.scanner.mount[:2])
@@ -61,7 +61,7 @@ class _Gradient:
         size = readings.scans * -(-per_scan // LANES) * LANES if "IN_LANES" in flags else piece.count
         arguments = readings.arguments
         gradient = launch(
-            "field_gradient", flags, (size,), table=table, pose_cell=placed.cell, pose=placed.pose,
+            "field_gradient", flags, (size,), table=state.table, pose_cell=placed.cell, pose=placed.pose,
             pose_low=placed.low, point=arguments["point"], point_low=arguments["point_low"], terms=pipeline.terms,
             start=arguments["start"], constant_terms=readings.sums["constant_terms"], gradient=numbers,
             window=placed.frame.window, particles=piece.count, readings=readings.readings,

@@ -144,14 +144,14 @@ class MapCaster:
         """Make the table for some poses."""
         if poses.count:
             with self._lock:
-                poses.window(self.map, (0, poses.count), self.backend)
+                poses.ensure_table(self.map, (0, poses.count), self.backend)
 
     def save(self, path: Path, bins: int) -> None:
         """Write the look-up table."""
         with self._lock:
-            buffer, window = self.map.ensure([self.grid.origin])
-            entries = self.backend.download(buffer, np.empty(window.cells * bins, np.uint16))
-            obstacles = window.cut(self.map.obstacles)
+            state = self.map.ensure([self.grid.origin])
+            entries = self.backend.download(state.table, np.empty(state.window.cells * bins, np.uint16))
+            obstacles = state.window.cut(self.map.obstacles)
         write_lookup(path, entries, describe(obstacles, self.limit, self.outside, bins))
 
     def cast(self, poses: object, vectors: np.ndarray, out: object = None, cones: Cones = LASER) -> Any:
@@ -203,11 +203,11 @@ class MapCaster:
     ) -> None:
         """Start drawing the readings of a piece."""
         space, count, info = self._workspace, piece.count, self.backend.info
-        table, window = poses.window(self.map, piece.part, self.backend, space)
-        placed = place(poses, piece.part, Frame(window, self.grid, self.mount), self.backend, space, self.real)
+        state = poses.ensure_table(self.map, piece.part, self.backend, space)
+        placed = place(poses, piece.part, Frame(state.window, state.grid, self.mount), self.backend, space, self.real)
         cosines = space.empty("cosines", count * rays if "INCIDENCE" in cones.flags else 1, self.real)
         with space.result("ranges", flat, piece.begin * rays, count * rays, self.real) as result:
-            program = self._program(placed, table, ray, rays, (result, cosines), cones, frozenset({"COSINES"}))
+            program = self._program(placed, state.table, ray, rays, (result, cosines), cones, frozenset({"COSINES"}))
             self.backend.run((*placed.launches(), *program))
             if info.float64:
                 self.backend.run((drawing.launch(space, piece.begin, count, rays, result, cosines),))
@@ -218,14 +218,13 @@ class MapCaster:
             drawing.on_host(piece.begin, count, rays, flat[piece.begin * rays : piece.end * rays], incidence)
 
     def _cast(self, poses: Poses, piece: Piece, ray: Buffer, rays: int, flat: Any, cones: Cones) -> None:
-        """Start casting the rays of a piece."""
         space, count = self._workspace, piece.count
-        table, window = poses.window(self.map, piece.part, self.backend, space)
-        placed = place(poses, piece.part, Frame(window, self.grid, self.mount), self.backend, space, self.real)
+        state = poses.ensure_table(self.map, piece.part, self.backend, space)
+        placed = place(poses, piece.part, Frame(state.window, state.grid, self.mount), self.backend, space, self.real)
         with space.result("ranges", flat, piece.begin * rays, count * rays, self.real) as result:
             other = space.empty("echoes", count * rays if "INCIDENCE" in cones.flags else 1, self.real)
             both = (other, result) if cones.incidence else (result, other)
-            program = self._program(placed, table, ray, rays, both, cones)
+            program = self._program(placed, state.table, ray, rays, both, cones)
             self.backend.run((*placed.launches(), *program))
 
     def _program(

@@ -378,7 +378,7 @@ class ScanModel(Pickled):
         checked = Poses(poses, self._setting.backend)
         if checked.count:
             with self._lock:
-                checked.window(self._pipeline.map, (0, checked.count), self._setting.backend)
+                checked.ensure_table(self._pipeline.map, (0, checked.count), self._setting.backend)
 
     def _weights_note(self) -> str:
         return "" if self.compat is None else f" with the weights of {self._setting.weights.name} (no likelihood)"

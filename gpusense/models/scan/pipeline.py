@@ -24,7 +24,7 @@ from gpusense.models.scan.readings import Readings, Sensing, placing_launches
 from gpusense.models.scan.request import Request
 from gpusense.models.scan.rules import ModelContext
 from gpusense.models.scan.tiles import Order, Parts, order_of
-from gpusense.tables.reachable import ReachableMap
+from gpusense.tables.reachable import MapState, ReachableMap
 from gpusense.world.grid import OccupancyGrid
 
 # Rays times particles of one scan up to which several scans share their launches, by kind of device. Above, the
@@ -95,7 +95,8 @@ class ScanPipeline(ABC):
         self.setting = setting
         self.backend, self.real, self.rules = setting.backend, setting.real, setting.rules
         self.scanner, self.specialize = setting.rules.scanner, setting.rules.specialize
-        self._mount, self._readings = self.scanner.mount, setting.weights.readings
+        self._mount = self.scanner.mount
+        self._converted = setting.weights.readings if setting.weights.is_peer else None
         self.nothing = self.backend.upload(np.zeros(1, np.int32))
         # Flags, keyed by everything on which they depend.
         self._flags: dict[Hashable, frozenset[str]] = {}
@@ -182,7 +183,8 @@ class ScanPipeline(ABC):
 
     def classed(self, ranges: np.ndarray) -> ClassedScans:
         """Class, choose and group the readings of (S, K) scans."""
-        return class_scans(self._readings(ranges, self.scanner, self.end_points), self.rules)
+        readings = ranges if self._converted is None else self._converted(ranges, self.scanner, self.end_points)
+        return class_scans(readings, self.rules)
 
     def value(self, scans: ClassedScans) -> float | None:
         """Return the log-likelihood of scans if it is the same at every pose, else None."""
@@ -196,11 +198,11 @@ class ScanPipeline(ABC):
 
     # ---- poses
 
-    def place(self, poses: Poses, part: Part, space: Workspace) -> tuple[PlacedPoses, Buffer]:
-        """Place some poses in a window of the map; also return the map's table for it."""
-        table, window = poses.window(self.map, part, self.backend, space)
-        frame = Frame(window, self.map.grid, self._mount)
-        return place(poses, part, frame, self.backend, space, self.real, careful=self.careful), table
+    def place(self, poses: Poses, part: Part, space: Workspace) -> tuple[PlacedPoses, MapState]:
+        """Place some poses in a window of the map; also return the map with its table."""
+        state = self.map.ensure(poses.corners(part, self.backend, space) or poses.hull)
+        frame = Frame(state.window, state.grid, self._mount)
+        return place(poses, part, frame, self.backend, space, self.real, careful=self.careful), state
 
     # ---- program
 

@@ -12,13 +12,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpusense.backends.base import Buffer
-from gpusense.backends.programs import ChangingProgram
+from gpusense.backends.programs import ChangingProgram, RepeatedPrograms
 from gpusense.backends.workspace import Workspace
+from gpusense.interface.launches import flags_of
 from gpusense.models.poses import PlacedPoses, Poses
 from gpusense.models.run import chunk_of
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.request import FLOATS, Request
 from gpusense.models.scan.scoring import LastCall
+from gpusense.tables.reachable import MapState
 
 _IN_LANES = frozenset({"IN_LANES"})
 # Most places of poses that are kept.
@@ -41,6 +43,22 @@ class _Place(NamedTuple):
     log_p: Buffer
 
 
+class _Placed(NamedTuple):
+    """Poses in a map.
+
+    Attributes:
+        number: A number of its own.
+        poses: The poses.
+        map: The map with its table.
+        flags: Flags of the launch that places them, as ``explain`` reports them.
+    """
+
+    number: int
+    poses: PlacedPoses
+    map: MapState
+    flags: frozenset[str]
+
+
 class RepeatedScoring:
     """Starts scans of poses that were scored before.
 
@@ -54,6 +72,7 @@ class RepeatedScoring:
         self._pipeline, self._space, self._last = pipeline, space, last
         self._places: dict[tuple[int, int], _Place] = {}
         self._count = 0
+        self._placing = RepeatedPrograms(pipeline.backend, _MOST)
 
     def remember(self, poses: Any, out: Any, request: Request) -> None:
         """Keep the place of the poses of a request that was started, if it can be repeated."""
@@ -77,27 +96,30 @@ class RepeatedScoring:
         if pipeline.value(scans) is not None:
             return False
         readings = pipeline.upload(scans, space)
-        scoring = pipeline.scoring(readings, *self._placed(place), place.log_p, space)
+        placed = self._placed(place)
+        scoring = pipeline.scoring(readings, placed.poses, placed.map.table, place.log_p, space)
         key = place.number, scoring.flags, readings.key
-        program = space.kept(key, pipeline.map.version)
+        program = space.kept(key, placed.map.version)
         if program is None:
-            made = ChangingProgram(pipeline.backend, pipeline.program(scoring), pipeline.numbers(scoring))
-            program = space.keep(key, made, pipeline.map.version)
+            made = ChangingProgram(pipeline.backend, pipeline.score_launches(scoring), pipeline.numbers(scoring))
+            program = space.keep(key, made, placed.map.version)
         if before is not None:
             before()
+        self._placing.run(placed.number, placed.poses.launches)
         program(pipeline.numbers(scoring))
         last = self._last
-        last.flags = (program.flags - _IN_LANES) | (scoring.flags & _IN_LANES)
+        last.flags = program.flags | placed.flags
         last.scans, last.together, last.kernels = scans, 0, pipeline.kernel_names[False]
         return True
 
-    def _placed(self, place: _Place) -> tuple[PlacedPoses, Buffer]:
-        """Return the description of a place in the present map, and the map's table."""
+    def _placed(self, place: _Place) -> _Placed:
+        """Return the poses of a place in the present map."""
         pipeline, space = self._pipeline, self._space
         key = place.number, "placed"
-        placed: tuple[PlacedPoses, Buffer] | None = space.kept(key, pipeline.map.version)
+        placed: _Placed | None = space.kept(key, pipeline.map.version)
         if placed is None:
-            made = pipeline.place(place.poses, (0, place.poses.count), space)
-            # A table that was just made has another version.
-            placed = space.keep(key, made, pipeline.map.version)
+            poses, state = pipeline.place(place.poses, (0, place.poses.count), space)
+            self._count += 1
+            flags = flags_of(poses.launches()) - _IN_LANES
+            placed = space.keep(key, _Placed(self._count, poses, state, flags), state.version)
         return placed

@@ -96,15 +96,15 @@ class _Scorer:
     def _score(self, piece: Piece, scans: ClassedScans, readings: Readings) -> None:
         """Score a piece; log-likelihoods of readings are complete on return."""
         pipeline, request, space = self._pipeline, self._request, self._space
-        placed, table = pipeline.place(request.poses, piece.part, space)
+        placed, state = pipeline.place(request.poses, piece.part, space)
         with space.result("log_p", request.result.flat, piece.begin, piece.count, pipeline.real) as log_p:
-            scoring = pipeline.scoring(readings, placed, table, log_p, space, per_beam=request.per_beam)
+            scoring = pipeline.scoring(readings, placed, state.table, log_p, space, per_beam=request.per_beam)
             key = (scoring.flags, placed.key, readings.key)
             # As late as possible: a processor's threads are then awake for the launches that follow.
             self._begin()
             flags = space.run(
                 key, dict(pipeline.numbers(scoring), poses=placed.source, log_p=log_p),
-                lambda: pipeline.program(scoring), version=pipeline.map.version,
+                lambda: pipeline.program(scoring), version=state.version,
             )  # fmt: skip
         self._last.kernels = pipeline.kernel_names[scoring.tiles is not None]
         # Poses are placed in lanes, whatever kernel scores them.

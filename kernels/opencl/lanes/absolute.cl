@@ -2,22 +2,9 @@
 // lanes/math.
 // requires: lanes/offsets lanes/log_terms
 
-#define NEARBY 0
-#define SERIES 1
-#define VON_MISES 2
-#define WRAPS 3
-#define WAVES 6
-// Terms of a heading, as in absolute.cl.
-#define SCALE 0
-#define SCALE_LOW 1
-#define PEAK 2
-#define PEAK_LOW 3
-#define RANDOM 4
-#define DECAY 5
-#define WAVE 6
-#define NEGLIGIBLE 40.0f
-#define HALF_TURN 3.141592653589793f
-#define HALF_TURN_LOW -8.742277657347586e-08f
+// in lanes: NEARBY SERIES VON_MISES WRAPS WAVES SCALE SCALE_LOW PEAK PEAK_LOW RANDOM DECAY WAVE NEGLIGIBLE HALF_TURN
+// in lanes: HALF_TURN_LOW
+
 // The power series of the sine, as in absolute.cl; float32 needs no more terms up to pi / 2.
 #define SINES 7
 constant float SINE[SINES] = {
@@ -49,17 +36,7 @@ lanes log_other_turns_lanes(const LanePair residual, const float decay) {
     return some ? log_one_plus_lanes(others) : (lanes)0;
 }
 
-// Return the log of the ratio of the Fourier series to its first term, by Clenshaw's recurrence.
-lanes log_waves_lanes(const LanePair residual, global const real *terms) {
-    const lanes s = half_sine_lanes(residual).hi, cosine = 1 - 2 * s * s;
-    lanes newer = 0, older = 0;
-    for (int n = WAVES; n > 0; --n) {
-        const lanes next = terms[WAVE + n - 1] + 2 * cosine * newer - older;
-        older = newer;
-        newer = next;
-    }
-    return log_one_plus_lanes(cosine * newer - older);
-}
+// in lanes: log_waves
 
 // Score positions: one work-item takes LANES particles. Missing particles repeat the last one.
 kernel void score_position(ARGUMENTS) {

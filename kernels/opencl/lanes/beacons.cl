@@ -2,30 +2,16 @@
 // the order of the scalar kernel.
 // requires: lanes/offsets lanes/log_terms
 
-#define STUDENT_T 1
-#define TWO_NORMALS 2
-#define BEACON 7
-// Numbers of a density, as in beacons.cl.
-#define SCALE 0
-#define PEAK 2
-#define RANDOM 4
-#define RANGE_MAX 5
-#define WIDE_SCALE 6
-#define WIDE_PEAK 8
-#define OFFSET 6
-#define OFFSET_LOW 7
-#define POWER 8
-#define T_SCALE 9
-#define ARC 10
-#define ODD 11
-#define STEEPEST 1e18f
+// in lanes: STUDENT_T TWO_NORMALS BEACON SCALE PEAK RANDOM RANGE_MAX WIDE_SCALE WIDE_PEAK OFFSET OFFSET_LOW POWER T_SCALE
+// in lanes: ARC ODD STEEPEST
+
 // tan(pi/8), pi/4 and pi/2.
 #define EIGHTH_SLOPE 0.414213562f
 #define EIGHTH_TURN 0.785398163f
 #define QUARTER_TURN 1.57079633f
 
 // Return arctan t for t >= 0.
-lanes arc_lanes(const lanes t) {
+lanes atan_lanes(const lanes t) {
     const ilanes steep = t > 1;
     const lanes high = steep ? (lanes)1 : t, low = steep ? t : (lanes)1;
     const ilanes large = high > EIGHTH_SLOPE * low;
@@ -45,14 +31,7 @@ lanes log_normal_lanes(const LanePair residual, const lanes near, const lanes fa
     return untruncated - log_lanes(0.5f * (erf_lanes(near * scale) + erf_lanes(far * scale)));
 }
 
-// Return the mass of a Student t between -t and t.
-lanes t_mass_lanes(const lanes any_t, global const real *terms, global const real *series, const int count) {
-    const lanes t = any_t < STEEPEST ? any_t : (lanes)STEEPEST, cosine = 1 / sqrt(1 + t * t), square = cosine * cosine;
-    lanes sum = 0;
-    for (int i = count - 1; i >= 0; --i) sum = sum * square + series[i];
-    if (!(terms[ODD] > 0)) return t * cosine * sum;
-    return terms[ARC] * arc_lanes(t) + t * cosine * cosine * sum;
-}
+// in lanes: t_mass
 
 // Return the log of a truncated Student t.
 lanes log_student_t_lanes(const LanePair residual, const lanes near, const lanes far, global const real *terms,

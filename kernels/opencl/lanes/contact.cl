@@ -2,24 +2,12 @@
 // points have the bits of the scalar kernel.
 // requires: lanes/end_point lanes/log_terms
 
-#define NO_OBSTACLE 0x7fffffff
-// Numbers of the model, as in contact.cl.
-#define SCALE 0
-#define SCALE_LOW 1
-#define REACH 2
-#define REACH_LOW 3
-#define SIDE 4
-#define SIDE_LOW 5
-#define HIT_TERM 6
-#define FALSE_TERM 7
-#define MISS_TERM 8
-#define NO_HIT_TERM 9
-#define FAR_CELLS 1e9f
+// in lanes: NO_OBSTACLE SCALE SCALE_LOW REACH REACH_LOW SIDE SIDE_LOW HIT_TERM FALSE_TERM MISS_TERM NO_HIT_TERM FAR_CELLS
+// in lanes: SERIES LOG_TWO_ROOT_PI
+
 #define LOG_TWO 0.693147181f
-#define LOG_TWO_ROOT_PI 1.26551212f
 // From here on the series is accurate to float32.
 #define LARGE 4.0f
-#define SERIES 12
 
 // Poses of LANES particles.
 typedef struct {

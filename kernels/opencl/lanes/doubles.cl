@@ -5,6 +5,10 @@
 typedef double8 doubles;
 typedef long8 choices;
 #define DOUBLES 8
+// Two numbers in each lane.
+typedef struct {
+    doubles x, y;
+} DoublePair;
 // 2^52 and its bits: a sum of it and an integer below has the integer in its last bits.
 #define INTEGERS 4503599627370496.0
 #define INTEGER_BITS 0x4330000000000000UL
@@ -13,6 +17,13 @@ typedef long8 choices;
 doubles floor_lanes(const doubles x) {
     const doubles nearest = (x + INTEGERS) - INTEGERS, below = nearest > x ? nearest - 1.0 : nearest;
     return x < INTEGERS ? below : x;
+}
+
+// Return whether a comparison holds in any lane.
+int any_of_lanes(const choices holds) {
+    const long4 four = holds.lo | holds.hi;
+    const long2 two = four.lo | four.hi;
+    return (two.x | two.y) != 0;
 }
 
 // Return the sum of all lanes; exact for integers whose sum is below 2^53.

@@ -15,11 +15,7 @@ LanePair scaled_pair_lanes(const LanePair a, const float scale, const float scal
     return two_sum_lanes(product.hi, product.lo + (a.hi * scale_low + a.lo * scale));
 }
 
-// Return log(1 + x) for x > -1.
-lanes log_one_plus_lanes(const lanes x) {
-    const lanes sum = 1.0f + x;
-    return log_lanes(sum) + (x - (sum - 1.0f)) / sum;
-}
+// in lanes: log_one_plus
 
 // Return the log of the sum of two probabilities, from their logs; -inf only where both are 0.
 lanes either_lanes(const lanes a, const lanes b) {

@@ -128,3 +128,9 @@ lanes log_erfc_lanes(const lanes x) {
     return -x * (low + (square * square) * high);
 }
 #endif
+
+// Return log(1 + x) for x > -1; the rounding error of 1 + x is corrected to first order.
+lanes log1p_lanes(const lanes x) {
+    const lanes sum = 1 + x;
+    return log_lanes(sum) + (x - (sum - 1)) / sum;
+}

@@ -1,4 +1,5 @@
-// Random numbers of 8 particles: those of philox.cl. Words stand in the lower halves of integers of 64 bits.
+// Random numbers of 8 particles: those of philox.cl. Words stand in the lower halves of integers of 64 bits, whose
+// products are whole.
 // requires: philox lanes/elementary lanes/heading
 
 // Compute four random words for each index.
@@ -19,15 +20,6 @@ void random_words_lanes(const ulong8 index, const uint step, const uint stream, 
 }
 
 // Return words as numbers.
-doubles number_lanes(const ulong8 word) { return as_double8(word | INTEGER_BITS) - INTEGERS; }
+doubles number_of_lanes(const ulong8 word) { return as_double8(word | INTEGER_BITS) - INTEGERS; }
 
-// Return numbers in (0, 1): the centres of intervals out of 2^32.
-doubles uniform_of_lanes(const ulong8 word) { return (number_lanes(word) + 0.5) * WORD; }
-
-// Compute two independent standard normal deviates for each pair of words.
-void normal_pair_lanes(const ulong8 word_0, const ulong8 word_1, doubles *one, doubles *two) {
-    const doubles radius = sqrt(-2.0 * log_of_lanes(uniform_of_lanes(word_0)));
-    doubles cosine, sine;
-    cos_sin_lanes(number_lanes(word_1) * WORD_TURN, &cosine, &sine);
-    *one = radius * cosine, *two = radius * sine;
-}
+// in lanes: uniform_of normal_pair

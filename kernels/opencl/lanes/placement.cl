@@ -7,7 +7,8 @@ typedef float coordinate;
 typedef double coordinate;
 #endif
 
-#define FARTHEST 1073741824.0
+// in lanes: FARTHEST within_reach move_to_sensor
+
 #define BELOW_ONE 0x1.fffffep-1f
 
 #if POSES_FLOAT32
@@ -23,36 +24,24 @@ void load_coordinates(global const coordinate *poses, const int n, const int cou
 #define load_coordinates load_poses
 #endif
 
-// Clamp coordinates to +-FARTHEST cells; NaN becomes -FARTHEST.
-doubles within_reach_lanes(const doubles position) {
-    const doubles above = position > -FARTHEST ? position : (doubles)-FARTHEST;
-    return above < FARTHEST ? above : (doubles)FARTHEST;
-}
-
 // Return the floors of coordinates within reach.
 doubles floor_cells_lanes(const doubles position) {
     const doubles nearest = (position + ROUNDER) - ROUNDER;
     return nearest > position ? nearest - 1.0 : nearest;
 }
 
-// Return whether a comparison holds in any lane of doubles.
-int any_double(const choices holds) {
-    const long4 four = holds.lo | holds.hi;
-    const long2 two = four.lo | four.hi;
-    return (two.x | two.y) != 0;
-}
-
-// Compute the cosines and sines of headings of any size.
-void cos_sin_any(const doubles theta, doubles *cosines, doubles *sines) {
-    cos_sin_lanes(theta, cosines, sines);
+// Return (cosines, sines) of headings of any size.
+DoublePair cos_sin_any(const doubles theta) {
+    DoublePair headings = cos_sin_lanes(theta);
 #if HUGE_HEADINGS
     const choices huge = ~((theta <= LARGEST_HEADING) & (theta >= -LARGEST_HEADING));
-    if (!any_double(huge)) return;
+    if (!any_of_lanes(huge)) return headings;
     for (int i = 0; i < DOUBLES; i++) {
         const double2 heading = cos_sin(((const double *)&theta)[i]);
-        ((double *)cosines)[i] = heading.x, ((double *)sines)[i] = heading.y;
+        ((double *)&headings.x)[i] = heading.x, ((double *)&headings.y)[i] = heading.y;
     }
 #endif
+    return headings;
 }
 
 // Place the poses from begin on, at most DOUBLES of them.
@@ -61,24 +50,10 @@ void place_lanes(global const coordinate *poses, global int2 *pose_cell, global 
     doubles x, y, theta;
     load_coordinates(poses, begin, count, &x, &y, &theta);
     const choices finite = (x - x) + (y - y) + (theta - theta) == 0.0;
-    doubles cosine, sine;
-    cos_sin_any(theta, &cosine, &sine);
-    x -= frame.origin_x;
-    y -= frame.origin_y;
-    if (frame.mount_x != 0 || frame.mount_y != 0) {
-        x += cosine * frame.mount_x - sine * frame.mount_y;
-        y += sine * frame.mount_x + cosine * frame.mount_y;
-    }
-    if (frame.yaw_sin != 0) {
-        const doubles x_before = x, cosine_before = cosine;
-        x = frame.yaw_cos * x + frame.yaw_sin * y;
-        y = frame.yaw_cos * y - frame.yaw_sin * x_before;
-        cosine = cosine * frame.yaw_cos + sine * frame.yaw_sin;
-        sine = sine * frame.yaw_cos - cosine_before * frame.yaw_sin;
-    }
-    x = within_reach_lanes(x / frame.resolution);
-    y = within_reach_lanes(y / frame.resolution);
-    if (any_double(~finite)) {
+    const DoublePair heading = cos_sin_any(theta);
+    doubles cosine = heading.x, sine = heading.y;
+    move_to_sensor_lanes(frame, &x, &y, &cosine, &sine);
+    if (any_of_lanes(~finite)) {
         atomic_or(&pose_status[0], 1);
         x = finite ? x : (doubles)-FARTHEST, y = finite ? y : (doubles)-FARTHEST;
         cosine = finite ? cosine : (doubles)1.0, sine = finite ? sine : (doubles)0.0;

@@ -121,9 +121,10 @@ def _named_files(text: str) -> list[str]:
 
 
 def _scalar_source(file: str) -> str | None:
-    """Return the scalar file from which a file in lanes takes functions; None for all other files."""
+    """Return the scalar file of the name of a file in lanes that takes functions; None for all other files."""
     scalar = file.removeprefix("lanes/")
-    return scalar if scalar != file and takes_scalar_text(opencl_source(file)) else None
+    takes = scalar != file and has_opencl_source(scalar) and takes_scalar_text(opencl_source(file))
+    return scalar if takes else None
 
 
 def uses_double(file: str, flags: frozenset[str] = frozenset()) -> bool:

@@ -3,8 +3,7 @@
 An operation on an array of one number takes 20 times as long as on a number. Both round alike: sums, products,
 quotients, remainders and square roots. Other functions are those of arrays, which accept numbers, so from the same
 results of the kernel a single match has the bits that it has among others, but for the axes of its information.
-Denominators must not be 0, and conditions
-are negated by :func:`is_not`.
+Denominators must not be 0, and conditions are negated by :func:`is_not`.
 """
 
 from __future__ import annotations

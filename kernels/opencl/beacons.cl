@@ -46,11 +46,11 @@ real log_normal(const real2 residual, const real near, const real far, global co
 
 // Return the mass of a Student t between -t and t; t >= 0 is in units of its scale and sqrt(nu).
 real t_mass(const real any_t, global const real *terms, global const real *series, const int count) {
-    const real t = fmin(any_t, STEEPEST), cosine = 1 / sqrt(1 + t * t), square = cosine * cosine;
+    const real t = any_t < STEEPEST ? any_t : STEEPEST, cosine = 1 / sqrt(1 + t * t), square = cosine * cosine;
     real sum = 0;
     for (int i = count - 1; i >= 0; --i) sum = sum * square + series[i];
-    const real factor = t * cosine * (terms[ODD] > 0 ? cosine : (real)1);
-    return terms[ARC] * atan(t) + factor * sum;
+    if (!(terms[ODD] > 0)) return t * cosine * sum;
+    return terms[ARC] * atan(t) + t * cosine * cosine * sum;
 }
 
 // Return the log of a truncated Student t. Its argument, (1 + u^2 / nu) / k, includes the peak and is a sum of two

@@ -96,19 +96,19 @@ Walk start_walk(const Ray r, const int2 cell, const Window window, const real li
 }
 
 // Return a direction as a part of a full turn in [0, 1], within 2e-6: Abramowitz and Stegun 4.4.49 for the arc tangent.
-real turn_of(const real2 direction) {
-    const real x = fabs(direction.x), y = fabs(direction.y);
-    const real a = x > y ? y / x : x / y, s = a * a;
+real turn_of(const real dx, const real dy) {
+    const real x = fabs(dx), y = fabs(dy);
+    const real a = (x > y ? y : x) / (x > y ? x : y), s = a * a;
     const real tail = (real)0.02867033 + s * ((real)-0.01354934 + s * (real)0.00331601);
     const real eighth = a * ((real)0.15913362 + s * ((real)-0.05256880 + s * tail));
     const real quarter = x > y ? eighth : (real)0.25 - eighth;
-    const real upper = direction.x >= 0 ? quarter : (real)0.5 - quarter;
-    return direction.y >= 0 ? upper : (real)1 - upper;
+    const real upper = dx >= 0 ? quarter : (real)0.5 - quarter;
+    return dy >= 0 ? upper : (real)1 - upper;
 }
 
 // Return the angle bin with the nearest centre; centres are at 0, 1 / bins, ... of a turn.
 int angle_bin(const real2 direction, const int bins) {
-    const int bin = (int)(turn_of(direction) * (real)bins + (real)0.5);
+    const int bin = (int)(turn_of(direction.x, direction.y) * (real)bins + (real)0.5);
     return bin >= bins ? bin - bins : bin;
 }
 

@@ -11,7 +11,7 @@
 #define QUARTER_TURN 1.57079633f
 
 // Return arctan t for t >= 0.
-lanes arc_lanes(const lanes t) {
+lanes atan_lanes(const lanes t) {
     const ilanes steep = t > 1;
     const lanes high = steep ? (lanes)1 : t, low = steep ? t : (lanes)1;
     const ilanes large = high > EIGHTH_SLOPE * low;
@@ -31,14 +31,7 @@ lanes log_normal_lanes(const LanePair residual, const lanes near, const lanes fa
     return untruncated - log_lanes(0.5f * (erf_lanes(near * scale) + erf_lanes(far * scale)));
 }
 
-// Return the mass of a Student t between -t and t.
-lanes t_mass_lanes(const lanes any_t, global const real *terms, global const real *series, const int count) {
-    const lanes t = any_t < STEEPEST ? any_t : (lanes)STEEPEST, cosine = 1 / sqrt(1 + t * t), square = cosine * cosine;
-    lanes sum = 0;
-    for (int i = count - 1; i >= 0; --i) sum = sum * square + series[i];
-    if (!(terms[ODD] > 0)) return t * cosine * sum;
-    return terms[ARC] * arc_lanes(t) + t * cosine * cosine * sum;
-}
+// in lanes: t_mass
 
 // Return the log of a truncated Student t.
 lanes log_student_t_lanes(const LanePair residual, const lanes near, const lanes far, global const real *terms,

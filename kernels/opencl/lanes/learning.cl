@@ -8,11 +8,7 @@
 #define SUMS 13
 #endif
 
-// Return the untruncated densities of hits at distances of x scales, times sigma.
-lanes hit_phi_lanes(const lanes x, global const real *terms) {
-    const LanePair t = {(real)0.5 * x * x, 0};
-    return terms[15] * exp_lanes(-shape_exponent_lanes(t, terms[17], terms[18]).hi);
-}
+// in lanes: hit_phi
 
 // Add the terms of a pair in each lane to the sums of the lane.
 void add_pair_lanes(const lanes reading, const lanes expected_range, global const real *terms, lanes *sums) {

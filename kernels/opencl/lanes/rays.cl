@@ -41,17 +41,7 @@ lanes crossed_lanes(const lanes t, const lanes speed, const lanes a, const lanes
     return ((here < t) | (until & (here == t))) ? count + 1 : count;
 }
 
-// Return directions as parts of a full turn in [0, 1].
-lanes turn_of_lanes(const lanes dx, const lanes dy) {
-    const lanes x = fabs(dx), y = fabs(dy);
-    const ilanes flat = x > y;
-    const lanes a = (flat ? y : x) / (flat ? x : y), s = a * a;
-    const lanes tail = (real)0.02867033 + s * ((real)-0.01354934 + s * (real)0.00331601);
-    const lanes eighth = a * ((real)0.15913362 + s * ((real)-0.05256880 + s * tail));
-    const lanes quarter = flat ? eighth : (real)0.25 - eighth;
-    const lanes upper = dx >= 0 ? quarter : (real)0.5 - quarter;
-    return dy >= 0 ? upper : (real)1 - upper;
-}
+// in lanes: turn_of
 
 // Return the angle bins with the nearest centres.
 ilanes angle_bin_lanes(const lanes dx, const lanes dy, const int bins) {

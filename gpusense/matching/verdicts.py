@@ -81,8 +81,9 @@ def tested(
         longer = device.run(rows, result[rows, None, :3], rules)[:, 0]
         # A subset represents all points.
         longer[:, 6:18] *= np.array(strides)[device.level[rows], None]
-        numbers, lines = columns_of(longer), result[:, 19] / points_of_line(gap, noise, lever)
-        spread, ranges, lines = (column_of(values[rows]) for values in (values_of(largest), lever, lines))
+        lines = numbers[19] / points_of_line(gap, deviation, column_of(lever))
+        spread, ranges, lines = (column_of(values_of(column)[rows]) for column in (largest, lever, lines))
+        numbers = columns_of(longer)
         found = found.replaced(rows, observed_pairs(numbers[6:12], numbers[12:18], spread, ranges, lines))
     return PairSums(found, factor)
 

@@ -78,6 +78,9 @@ class Workspace:
         try:
             if self._backend.info.graphs:
                 self._backend.end_batch()
+        except BaseException:
+            self._held.clear()
+            raise
         finally:
             # Not earlier, since launches of the batch may write the flag.
             if kind is not None:

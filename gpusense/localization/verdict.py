@@ -214,7 +214,9 @@ class Verdict:
         scans = []
         for index, (ranges, *_) in readings.items():
             sensor = self._sensors[index]
-            if sensor.calibrates and type(ranges) is np.ndarray and ranges.shape == (sensor.model.scanner.count,):
+            # The model checks others, and refuses or converts them.
+            plain = type(ranges) is np.ndarray and ranges.dtype.kind == "f"
+            if sensor.calibrates and plain and ranges.shape == (sensor.model.scanner.count,):
                 scans.append((index, (ranges.astype(np.float64, copy=False),)))
         return scans
 

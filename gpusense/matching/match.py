@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
-from gpusense._util.typing import AnyArray, Precision
+from gpusense._util.typing import AnyArray, CasterName, Precision
 from gpusense.backends import Selection, arrays, get_backend
 from gpusense.backends.base import Backend
 from gpusense.matching.chain import match_pairs
@@ -285,6 +285,8 @@ def match_by_maps(
     for i, scan in enumerate(ranges):
         if matcher is None or len(references) > 1:
             grid = scan_map(references[i], scanner, options.capture, _CELL * options.capture)
-            matcher = MapMatcher(grid, scanner, backend, precision, options)
+            # Rectangles of a map do not pay for a single scan; both casters find the same ranges.
+            caster: CasterName = "dda" if len(references) > 1 or len(ranges) == 1 else "exact"
+            matcher = MapMatcher(grid, scanner, backend, precision, options, caster)
         matches.append(matcher.match(scan[None], guess[i : i + 1], method))
     return ScanMatch.joined(matches)

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from gpusense._util.angles import wrapped
+from gpusense._util.typing import CasterName
 from gpusense.backends import Backend
 from gpusense.matching.basin import is_held
 from gpusense.matching.chain import DOUBTFUL, match_pairs
@@ -60,11 +61,13 @@ class MapMatcher:
         backend: The device.
         precision: Precision of the fields.
         options: Capture radius, noise and window.
+        caster: The caster of expected scans, an exact one.
     """
 
     def __init__(
-        self, grid: OccupancyGrid, scanner: Scanner, backend: Backend, precision: str, options: MatchOptions
-    ) -> None:
+        self, grid: OccupancyGrid, scanner: Scanner, backend: Backend, precision: str, options: MatchOptions,
+        caster: CasterName = "exact",
+    ) -> None:  # fmt: skip
         self._grid, self._scanner, self._backend, self._options = grid, scanner, backend, options
         finest = max(_LEAST_CELLS * grid.resolution, 2 * options.noise)
         sigmas = [finest]
@@ -79,7 +82,9 @@ class MapMatcher:
         self._search: Search | None = None
         self._stride = max(round(_SEARCH_CELL * options.capture / grid.resolution), 1)
         self._real = np.dtype(precision)
-        self._caster = RayCaster(grid, scanner.range_max, backend=backend, precision=precision)  # type: ignore[arg-type]
+        self._caster = RayCaster(
+            grid, scanner.range_max, caster=caster, backend=backend, precision=precision  # type: ignore[arg-type]
+        )  # fmt: skip
 
     def _model(self, sigma: float, precision: str) -> LikelihoodFieldModel:
         farthest = max(self._options.capture, 4 * sigma)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 import os
 import re
 import threading
@@ -79,8 +80,8 @@ class OpenCLBackend(ProcessBound, Backend):
         self._cache = _binary_cache(info, device)
         self._pocl = pocl_kernels.pocl_kernels() if pocl.is_pocl(device) else None
         self._of_bitcode = pocl.takes_bitcode(device)
-        # The last launch, if it is one of a group on one processor of several.
-        self._watches = self._pocl is not None and helpers.threads() > 1
+        # The last launch, if its groups leave a processor to the calling thread.
+        self._most_watched = helpers.threads() - 1 if self._pocl is not None else 0
         self._last: cl.Event | None = None
         # Ranges are the same bits everywhere only if division is rounded correctly, which is an option on GPUs.
         rounded = bool(device.single_fp_config & _ROUNDED_DIVISION)
@@ -248,7 +249,7 @@ class OpenCLBackend(ProcessBound, Backend):
         with self._count:
             self._queued += 1
         event = cl.enqueue_nd_range_kernel(self._queue, kernel, size, group)
-        self._last = event if self._watches and size == group else None
+        self._last = event if math.prod(size) <= self._most_watched * math.prod(group) else None
         with self._count:
             self._queued += 1
 

@@ -1,4 +1,4 @@
-"""Build the text of ``BeamModel.explain()``."""
+"""Build the text of ``BeamModel.explain()``: words about a scene, of which the model itself needs none."""
 
 from __future__ import annotations
 

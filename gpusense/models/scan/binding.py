@@ -1,7 +1,8 @@
 """``bind`` of a model: the choice among bound calls, and bound calls of arrays in host memory.
 
 A call that waits is the ordinary one, except for NumPy arrays of few particles on a GPU. They are copied to the device,
-as :mod:`.packed_call` describes.
+as :mod:`.packed_call` describes. The choice names every kind of call, so it stands above :mod:`.bound`, whose calls
+filters make themselves.
 """
 
 from __future__ import annotations

@@ -103,8 +103,8 @@ def reliability(found):
 def at_share(bins, share=0.1):
     """Return the share of each bin that is off where `share` of all scans are, by weights of scans that are off.
 
-    A study has more wrong poses than a robot's day. Its other scans keep their weight. Without scans of both kinds there
-    is no such share: None.
+    A study has more wrong poses than a robot's day. Its other scans keep their weight. Without scans of
+    both kinds there is no such share: None.
     """
     off = sum(count * happened for _, _, count, _, happened in bins if count)
     right = sum(count for _, _, count, _, _ in bins) - off

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import itertools
-import math
 
 import numpy as np
 from common import table
@@ -104,11 +103,14 @@ def reliability(found):
 def at_share(bins, share=0.1):
     """Return the share of each bin that is off where `share` of all scans are, by weights of scans that are off.
 
-    A study has more wrong poses than a robot's day. Its other scans keep their weight.
+    A study has more wrong poses than a robot's day. Its other scans keep their weight. Without scans of
+    both kinds there is no such share: None.
     """
     off = sum(count * happened for _, _, count, _, happened in bins if count)
     right = sum(count for _, _, count, _, _ in bins) - off
-    weight = share / (1 - share) * right / off if off else math.nan
+    if not off or not right:
+        return [None] * len(bins)
+    weight = share / (1 - share) * right / off
     return [
         None if not count else weight * happened / (weight * happened + 1 - happened)
         for _, _, count, _, happened in bins

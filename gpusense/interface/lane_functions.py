@@ -14,6 +14,7 @@ for the names that have a form in lanes: their scalar bodies compute vectors alr
 
 from __future__ import annotations
 
+import functools
 import re
 
 from gpusense.interface.signatures import KERNELS
@@ -32,7 +33,12 @@ _STRUCTS = {"real2", "double2"}
 # A real2 that is a sum of two numbers has its high part as x.
 _FIELDS = {"x": "hi", "y": "lo"}
 _WANTED = re.compile(r"^// in lanes: (.*)\n", re.MULTILINE)
-_DEFINED = re.compile(r"^(?:[\w*]+[\s*]+)+(\w+_lanes)(?:\(|;)", re.MULTILINE)
+_DEFINED = re.compile(r"^\w[\w* ]*?[ *](\w+_lanes)[(;]", re.MULTILINE)
+_DEFINITION = re.compile(
+    r"^(?:#define (?P<macro>\w+) [^\n]*|typedef struct \{[^}]*\} (?P<struct>\w+);"
+    r"|(?:\w+ )+(?P<function>\w+)\([^;{}]*\) \{(?:[^\n]*\}$|.*?^\}))",
+    re.MULTILINE | re.DOTALL,
+)
 _MEMORY = re.compile(r"\b(?:global|constant) (?:const )?\w+ \*")
 _WORD = re.compile(r"([.]?)\b([A-Za-z_]\w*)(\(?)")
 
@@ -53,7 +59,9 @@ def written_in_lanes(text: str, file: str, sources: dict[str, str]) -> str:
     Raises:
         ValueError: No source has a definition of that name.
     """
-    known = {name for each in (*sources.values(), text) for name in _DEFINED.findall(each)}
+    if not takes_scalar_text(text):
+        return text
+    known = {name for each in (*sources.values(), text) for name in _names_in_lanes(each)}
 
     def definitions(match: re.Match[str]) -> str:
         line = text.count("\n", 0, match.start()) + 1
@@ -65,36 +73,52 @@ def written_in_lanes(text: str, file: str, sources: dict[str, str]) -> str:
     return _WANTED.sub(definitions, text)
 
 
+@functools.lru_cache(maxsize=512)
+def _names_in_lanes(text: str) -> list[str]:
+    """List the functions and types in lanes that a text defines."""
+    return _DEFINED.findall(text)
+
+
+@functools.lru_cache(maxsize=512)
+def _definitions(text: str) -> dict[str, tuple[int, str]]:
+    """Return the macros, structs and functions that a text defines, by name: line and definition of each."""
+    found: dict[str, tuple[int, str]] = {}
+    for match in _DEFINITION.finditer(text):
+        name = match["macro"] or match["struct"] or match["function"]
+        found.setdefault(name, (text.count("\n", 0, match.start()) + 1, match.group()))
+    return found
+
+
 def _written(name: str, file: str, sources: dict[str, str], known: set[str]) -> str:
     """Return one definition in lanes, with its place in the scalar file."""
-    forms = (
-        rf"#define {name} [^\n]*",
-        rf"typedef struct {{(?:(?!^}}).)*?^}} {name};",
-        rf"(?:\w+ )+{name}\([^;{{}}]*\) {{(?:[^\n]*}}$|.*?^}})",
-    )
-    definition = re.compile(f"^(?:{'|'.join(forms)})", re.MULTILINE | re.DOTALL)
     for source, text in sources.items():
-        match = definition.search(text)
-        if match is not None:
-            line = text.count("\n", 0, match.start()) + 1
-            types = {} if name in KERNELS else TYPES
-            written = match.group(0) if name.isupper() else _vectors(match.group(0), known, types)
-            return f'#line {line} "{source}.cl"\n{written}\n'
+        if name in (definitions := _definitions(text)):
+            line, definition = definitions[name]
+            if not name.isupper():
+                replaced = frozenset(word for word in _words(definition) if f"{word}_lanes" in known)
+                definition = _vectors(definition, replaced, name not in KERNELS)
+            return f'#line {line} "{source}.cl"\n{definition}\n'
     raise ValueError(f"{file}.cl: what it takes in lanes must stand in a scalar file, got {name!r}")
 
 
-def _vectors(text: str, known: set[str], types: dict[str, str]) -> str:
-    """Return a definition with vectors in the place of numbers; ``known`` are the names in lanes so far."""
+@functools.lru_cache(maxsize=512)
+def _words(text: str) -> frozenset[str]:
+    return frozenset(match[2] for match in _WORD.finditer(text))
+
+
+@functools.lru_cache(maxsize=512)
+def _vectors(text: str, replaced: frozenset[str], numbers: bool) -> str:
+    """Return a definition with vectors for ``numbers``, and with the forms in lanes of the names in ``replaced``."""
     fields = _FIELDS if re.search(r"\breal2?\b", text) else {}
+    types = TYPES if numbers else {}
 
     def word(match: re.Match[str]) -> str:
         dot, found, call = match.groups()
         if dot:
             return dot + fields.get(found, found) + call
-        in_lanes = f"{found}_lanes"
         # Structs have capitals; a variable may have the name of a function.
-        is_written = in_lanes in known and (call or found[0].isupper())
-        return (in_lanes if is_written else types.get(found, found)) + call
+        is_replaced = found in replaced and (call or found[0].isupper())
+        return (f"{found}_lanes" if is_replaced else types.get(found, found)) + call
 
     kept = _MEMORY.findall(text)
     pieces = [_WORD.sub(word, piece) for piece in _MEMORY.split(_braced(text))]

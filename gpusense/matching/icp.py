@@ -15,6 +15,7 @@ from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag, with_teams_flags
 from gpusense.interface.launches import Launch, Program, launch
 from gpusense.interface.structs import MatchRules
+from gpusense.matching.columns import Column, larger, smaller
 from gpusense.matching.points import GAP, ScanPoints
 
 # Neighbours on either side to which a line is fitted, and their largest distance: a share of the range plus a distance
@@ -38,12 +39,11 @@ _SPACES: weakref.WeakKeyDictionary[Backend, tuple[threading.RLock, Workspace]] =
 _LOCK = threading.Lock()
 
 
-def points_of_line(gap: float, noise: np.ndarray, lever: np.ndarray) -> np.ndarray:
-    """Return the number of points (S,) of a long line at half of a scan's rms range ``lever``; see ``IcpPairs``."""
+def points_of_line(gap: float, noise: Column, lever: Column) -> Column:
+    """Return the number of points of a long line at half of a scan's rms range ``lever``; see ``IcpPairs``."""
     spacing = 0.5 * lever * gap / GAP
-    width = np.maximum(WIDTH, LONG_WIDTH * noise)
-    points: np.ndarray = np.clip(2 * width / np.maximum(spacing, 1e-9), 2 * REACH + 1, 2 * _MOST + 1)
-    return points
+    points = 2 * larger(LONG_WIDTH * noise, WIDTH) / larger(spacing, 1e-9)
+    return smaller(larger(points, 2 * REACH + 1), 2 * _MOST + 1)
 
 
 def space_of(backend: Backend) -> tuple[threading.RLock, Workspace]:
@@ -124,6 +124,8 @@ class IcpPairs:
         """
         if not self._most:
             return
+        if pairs is not None and len(pairs) == len(self._pairs):
+            pairs = None
         # A fit to all scans replaces an earlier one.
         if pairs is not None and self._fits:
             self._backend.run(self._fits)

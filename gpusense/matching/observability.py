@@ -99,6 +99,8 @@ def observed_information(
         return Observed(left, np.zeros(len(clear), np.intp) if isinstance(clear, np.ndarray) else 0)
     skipped = values_of(unneeded & is_not(beyond))
     count, rows = len(skipped), np.flatnonzero(is_not(clear | skipped))
+    if not len(rows):
+        return Observed(left, column_of(skipped.astype(np.intp)))
     some, noise = (matrices_of([values_of(column)[rows] for column in triangle]) for triangle in (total, made_up))
     found, lost = _partly_observed(some, noise, *(np.broadcast_to(limit, count)[rows] for limit in (critical, least)))
     # The test on pairs is strict, so some matches have no lost direction.

@@ -200,8 +200,9 @@ def observable_directions(
     numbers, back = columns_of(result), turned.transpose(0, 2, 1)
     information, doubt = (triangle_of(turned @ matrices_of(numbers[at : at + 6]) @ back) for at in (6, 12))
     lever = points.rms_range(everything)
-    lines = column_of(result[:, 19] / points_of_line(points.gap, noise, lever))
-    found = observed_pairs(information, doubt, column_of(noise) ** 2, column_of(lever), lines)
+    deviation, length = column_of(noise), column_of(lever)
+    lines = numbers[19] / points_of_line(points.gap, deviation, length)
+    found = observed_pairs(information, doubt, deviation**2, length, lines)
     return matrices_of(found.information) / np.maximum(variance, 1e-12)[:, None, None]
 
 

@@ -81,8 +81,9 @@ def tested(
         longer = device.run(rows, result[rows, None, :3], rules)[:, 0]
         # A subset represents all points.
         longer[:, 6:18] *= np.array(strides)[device.level[rows], None]
-        numbers, lines = columns_of(longer), result[:, 19] / points_of_line(gap, noise, lever)
-        spread, ranges, lines = (column_of(values[rows]) for values in (values_of(largest), lever, lines))
+        lines = numbers[19] / points_of_line(gap, deviation, column_of(lever))
+        spread, ranges, lines = (column_of(values_of(column)[rows]) for column in (largest, lever, lines))
+        numbers = columns_of(longer)
         found = found.replaced(rows, observed_pairs(numbers[6:12], numbers[12:18], spread, ranges, lines))
     return PairSums(found, factor)
 
@@ -122,7 +123,7 @@ def concluded(
         # These are not the axes of the information that is kept.
         matrices = np.where(upright(usable, 2), matrices, 0.0)
     shares = values * upright(factor / larger(column_of(pairs), 1.0))
-    return ScanMatch.of(
+    return ScanMatch._of(
         pose=pose, covariance=covariance_of(matrices, lever_column, window, kept), information=matrices,
         p_right=np.zeros(len(pose)), score=score, iterations=iterations.astype(np.int64), eigenvalues=shares,
         directions=vectors.transpose(0, 2, 1), lever=lever, noise=noise, evidence=evidence, status=status,

@@ -26,3 +26,4 @@ def test_the_study_of_the_verdict_counts_alarms_and_misses(monkeypatch: pytest.M
     assert sum(row[2] for row in report.reliability([(job, rows)])) == 60
     weighted = report.at_share([(0.0, 0.5, 100, 0.2, 0.5), (0.5, 1.0, 100, 0.8, 1.0)], share=0.1)
     assert weighted == pytest.approx([1 / 28, 1])
+    assert report.at_share([(0.0, 0.5, 0, None, None), (0.5, 1.0, 100, 0.8, 1.0)]) == [None, None]

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import sys
 from collections.abc import Callable
+from pathlib import Path
+from types import CodeType
 
 import numpy as np
 import pytest
@@ -15,16 +18,19 @@ import gpusense as gs
 SCANNER = gs.Scanner(np.linspace(-np.pi / 2, np.pi / 2, 60), range_max=9.0)
 POSE = np.array([4.0, 3.0, 0.3])
 RANGES = gs.RayCaster(GRID, 9.0, backend="numpy").cast(POSE[None], SCANNER.bearings)[0]
+PACKAGE = Path(gs.__file__).parent
 # Largest number of calls of Python functions, NumPy's included, with Python 3.11.
 MOST_FIELD, MOST_BEAMS, MOST_STEP, MOST_BOUND = 80, 90, 230, 90
+# Most stays of a call in rooms of the package: successive calls in one room are one stay.
+MOST_STAYS = 20
 
 
-def calls_of(run: Callable[[], object]) -> int:
-    """Return the number of Python functions that a function calls.
+def called_by(run: Callable[[], object]) -> list[CodeType]:
+    """Return the Python functions that a function calls, in order.
 
     Finalizers of other tests' objects do not count, since garbage collection is off.
     """
-    called = []
+    called: list[CodeType] = []
     gc.disable()
     sys.setprofile(lambda frame, event, argument: called.append(frame.f_code) if event == "call" else None)
     try:
@@ -32,7 +38,19 @@ def calls_of(run: Callable[[], object]) -> int:
     finally:
         sys.setprofile(None)
         gc.enable()
-    return len(called) - 1
+    return called[:-1]
+
+
+def calls_of(run: Callable[[], object]) -> int:
+    """Return the number of Python functions that a function calls."""
+    return len(called_by(run))
+
+
+def stays(called: list[CodeType]) -> list[str]:
+    """Return the rooms of the package that a call enters one after the other."""
+    files = (Path(code.co_filename) for code in called)
+    rooms = (file.relative_to(PACKAGE).parts[0] for file in files if file.is_relative_to(PACKAGE))
+    return [room for room, _ in itertools.groupby(rooms)]
 
 
 @pytest.mark.parametrize(
@@ -47,6 +65,8 @@ def test_a_steady_call(kind, most, precision, needs):
         model.log_likelihood(poses, RANGES)
     counts = [calls_of(lambda: model.log_likelihood(poses, RANGES)) for _ in range(3)]
     assert max(counts) <= most and len(set(counts)) == 1, counts
+    rooms = stays(called_by(lambda: model.log_likelihood(poses, RANGES)))
+    assert {"models", "backends"} <= set(rooms) and len(rooms) <= MOST_STAYS, rooms
 
 
 def test_a_bound_call(needs):

@@ -20,7 +20,7 @@ POSE = np.array([4.0, 3.0, 0.3])
 RANGES = gs.RayCaster(GRID, 9.0, backend="numpy").cast(POSE[None], SCANNER.bearings)[0]
 PACKAGE = Path(gs.__file__).parent
 # Largest number of calls of Python functions, NumPy's included, with Python 3.11.
-MOST_FIELD, MOST_BEAMS, MOST_STEP, MOST_BOUND = 80, 90, 230, 90
+MOST_FIELD, MOST_BEAMS, MOST_STEP, MOST_BOUND = 80, 90, 190, 90
 # Most stays of a call in rooms of the package: successive calls in one room are one stay.
 MOST_STAYS = 20
 

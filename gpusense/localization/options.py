@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -136,9 +137,23 @@ def settings_of_step(
         sensors: Temperature and beams of each sensor that is used.
         one_peak: Whether the particles lie together, and no sensor has several peaks among them.
     """
+    settings = _settings_of_run(options, count, pool, tuple(sensors), one_peak).copy()
+    settings[STEP] = step
+    settings[MEAN : DEVIATION + 4], settings[REVERSE] = settings_of(motion)
+    return settings
+
+
+@functools.lru_cache(maxsize=32)
+def _settings_of_run(
+    options: Options,
+    count: int,
+    pool: tuple[int, tuple[float, float, float]],
+    sensors: tuple[tuple[float, int], ...],
+    one_peak: bool,
+) -> np.ndarray:
+    """Return the settings that steps have in common; arguments as for ``settings_of_step``."""
     s: list[float] = [0.0] * SETTINGS
-    s[SEED], s[SEED + 1], s[STEP] = *options.words, step
-    s[MEAN : DEVIATION + 4], s[REVERSE] = settings_of(motion)
+    s[SEED], s[SEED + 1] = options.words
     s[JITTER], s[FARTHEST_X], s[FARTHEST_THETA] = DEFAULTS.jitter, DEFAULTS.farthest, DEFAULTS.farthest_turn
     s[POOL], s[POOL + 1 : POOL + 4] = pool
     s[SHARE] = min(DEFAULTS.share, DEFAULTS.enough / count) if one_peak else DEFAULTS.share_apart

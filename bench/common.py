@@ -199,7 +199,7 @@ class Recorder(Proxy):
 
     def __init__(self, backend: Backend) -> None:
         super().__init__(backend)
-        self.launches: list[Callable[[], None]] = []
+        self.launches: list[Started] = []
         self._listening = False
 
     @property
@@ -223,8 +223,8 @@ class Recorder(Proxy):
         else:
             self._backend.replay(recording)
 
-    def launches_of(self, run: Callable[[], Any]) -> list[Callable[[], None]]:
-        """Run a call and return its launches."""
+    def launches_of(self, run: Callable[[], Any]) -> list[Started]:
+        """Run a call and return its launches, without those that bound its poses: the host reads their result first."""
         self.launches.clear()
         self._listening = True
         try:
@@ -232,7 +232,7 @@ class Recorder(Proxy):
         finally:
             self._listening = False
         launches, self.launches = self.launches, []
-        return launches
+        return [one for one in launches if one.launch.kernel != "bound_numbers"]
 
     def compile(self, kernel: str, flags: frozenset[str]) -> Any:
         """Return the backend's launcher, recorded with its arguments."""
@@ -245,7 +245,7 @@ class Recorder(Proxy):
         return launch
 
 
-def one_by_one(launches: list[Callable[[], None]]) -> Callable[[], None]:
+def one_by_one(launches: Sequence[Callable[[], None]]) -> Callable[[], None]:
     """Make a function that starts launches one after the other."""
 
     def start() -> None:
@@ -255,7 +255,7 @@ def one_by_one(launches: list[Callable[[], None]]) -> Callable[[], None]:
     return start
 
 
-def as_a_call(device: Any, launches: list[Callable[[], None]]) -> Callable[[], None]:
+def as_a_call(device: Any, launches: Sequence[Started]) -> Callable[[], None]:
     """Make a function that starts launches as a call does: on CUDA devices as one graph."""
     if device.info.kind != "gpu":
         return one_by_one(launches)

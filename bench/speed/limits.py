@@ -11,10 +11,11 @@ built-in building of 2000 x 2000 cells, or --map. A scan is cast exactly, with a
 counts the ranges in it.
 
 Launches are all kernels of a call with its arrays on the device (placing and ordering poses, casting, scoring,
-summing), started as the call does (on CUDA as one graph). "Alone" has a wait after each set, "in a row" after ten sets,
-or as many as fit into --seconds. The first call includes compilation (or its cache on disk) and the preparation of the
-map. Errors and bits of the first particles are against NumPy in float64 and in float32; ranges must have the same bits.
-Times are the shortest and the median of several runs; machines are noisy, so compare within a run.
+summing), started as the call does (on CUDA as one graph). Calls of many NumPy poses bound them first. "Alone" has a
+wait after each set, "in a row" after ten sets, or as many as fit into --seconds. The first call includes compilation
+(or its cache on disk) and the preparation of the map. Errors and bits of the first particles are against NumPy in
+float64 and in float32; ranges must have the same bits. Times are the shortest and the median of several runs; machines
+are noisy, so compare within a run.
 """
 
 from __future__ import annotations

@@ -112,10 +112,10 @@ class ScanMatch:
             raise TypeError("a single match has no items")
         values = {name: value[index] for name, value in self.__dict__.items()}
         values["status"] = str(values["status"])
-        return ScanMatch._of(**values)
+        return ScanMatch._of(values)
 
     @classmethod
-    def _of(cls, **values: Any) -> ScanMatch:
+    def _of(cls, values: dict[str, Any]) -> ScanMatch:
         """Return a match with all fields by name; the constructor of a frozen class sets each of them by a call."""
         match = object.__new__(cls)
         match.__dict__.update(values)
@@ -123,7 +123,7 @@ class ScanMatch:
 
     def changed(self, **values: Any) -> ScanMatch:
         """Return matches in which some fields have other values."""
-        return ScanMatch._of(**(self.__dict__ | values))
+        return ScanMatch._of(self.__dict__ | values)
 
     @classmethod
     def joined(cls, matches: list[ScanMatch]) -> ScanMatch:

@@ -123,11 +123,13 @@ def concluded(
         # These are not the axes of the information that is kept.
         matrices = np.where(upright(usable, 2), matrices, 0.0)
     shares = values * upright(factor / larger(column_of(pairs), 1.0))
-    return ScanMatch._of(
-        pose=pose, covariance=covariance_of(matrices, lever_column, window, kept), information=matrices,
-        p_right=np.zeros(len(pose)), score=score, iterations=iterations.astype(np.int64), eigenvalues=shares,
-        directions=vectors.transpose(0, 2, 1), lever=lever, noise=noise, evidence=evidence, status=status,
-    )  # fmt: skip
+    covariance = covariance_of(matrices, lever_column, window, kept)
+    return ScanMatch._of({
+        "pose": pose, "covariance": covariance, "information": matrices, "p_right": np.zeros(len(pose)),
+        "score": score, "iterations": iterations.astype(np.int64), "eigenvalues": shares,
+        "directions": vectors.transpose(0, 2, 1), "lever": lever, "noise": noise, "evidence": evidence,
+        "status": status,
+    })  # fmt: skip
 
 
 def judged(match: ScanMatch, guess: np.ndarray, options: MatchOptions) -> ScanMatch:

@@ -16,7 +16,7 @@ from gpusense.interface.launches import Program, launch
 # Number of poses from which on the wait for the device is shorter than the host's pass over them.
 LEAST_BOUNDED = 1 << 16
 # Work-items of the two launches, for each of three columns.
-_ITEMS = (3 << 14, 3 << 6)
+_ITEMS = (3 << 14, 3 << 9)
 _DOUBLE = np.dtype(np.float64)
 
 

@@ -29,6 +29,10 @@ from gpusense.sweeps.memory import memory_of, shortages, size_text
 _STARTS = 3
 # Seconds between two checks of a process that runs a call, without and with a memory limit.
 _LOOK, _LOOK_MEMORY = 0.25, 0.05
+# Threads of the libraries of linear algebra: jobs run side by side, and threads that wait for small matrices take turns
+# at the processors of other jobs. Dask starts its workers so.
+_SINGLE = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+_STARTING = threading.Lock()
 # Seconds for a process to end by itself, and after it has closed its link; seconds between two checks.
 _GRACE, _CLOSING, _SOON = 10.0, 2.0, 0.005
 
@@ -126,7 +130,8 @@ class Supervised:
         with self._lock, _parent_of_processes():
             self._check_open()
             try:
-                process.start()
+                with _single_threads():
+                    process.start()
             except OSError as error:
                 raise BrokenExecutor(f"worker: must start, got {error}") from error
             self._process, self._link = process, here
@@ -246,6 +251,19 @@ def result_of(answer: bytes) -> Any:
     if succeeded:
         return value
     raise value
+
+
+@contextlib.contextmanager
+def _single_threads() -> Iterator[None]:
+    """Give processes that start one thread for linear algebra, unless the environment says otherwise."""
+    with _STARTING:
+        added = {name: value for name, value in _SINGLE.items() if name not in os.environ}
+        os.environ.update(added)
+        try:
+            yield
+        finally:
+            for name in added:
+                os.environ.pop(name, None)
 
 
 @contextlib.contextmanager

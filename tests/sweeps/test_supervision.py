@@ -259,6 +259,18 @@ def test_the_last_start_after_an_end_from_outside_is_alone(tmp_path):
     assert crowded.started.count(1) > 1
 
 
+def test_workers_have_one_thread_for_linear_algebra_unless_the_environment_says_otherwise(monkeypatch):
+    """Jobs run side by side; the environment of this process stays as it was."""
+    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    monkeypatch.setenv("MKL_NUM_THREADS", "")
+    before = dict(os.environ)
+    with ProcessExecutor(1) as executor:
+        assert [executor.submit(os.getenv, name).result() for name in names] == ["1", "3", ""]
+    assert dict(os.environ) == before
+
+
 def test_an_end_is_described():
     ended = {
         code: str(death(code, 5, short))

@@ -41,3 +41,17 @@ def test_ranks_are_in_the_frame_of_the_true_pose():
     found = coverage.rank_of(particles, np.array([0.5, 0.3, 0.2]), np.array([0.5, 1.5, np.pi / 2]))
     np.testing.assert_allclose(found, [0.8, 0.3, 0.8])
     np.testing.assert_allclose(coverage.rank_of(particles[:1], np.ones(1), particles[0]), [0.5] * 3)
+
+
+def test_ranks_of_poses_beyond_all_particles_are_in_the_histogram():
+    rng = np.random.default_rng(0)
+    ranks = []
+    for count in rng.integers(1, 9000, 20):
+        weights, ahead = rng.random(count), rng.uniform(0.1, 0.2, (count, 3))
+        weights /= weights.sum()
+        ranks += [coverage.rank_of(side * ahead, weights, np.zeros(3)) for side in (1, -1)]
+    ranks = np.array(ranks)
+    # Sums of weights are rounded, and a histogram leaves out what is beyond its ends.
+    assert ranks.min() >= 0 and ranks.max() <= 1
+    found = coverage.coverage_report(np.zeros(ranks.shape), np.tile(np.eye(3), (len(ranks), 1, 1)), ranks)
+    assert found["rank_histogram"] == [0.5, *[0.0] * 8, 0.5]

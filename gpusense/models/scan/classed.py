@@ -181,7 +181,7 @@ def class_scans(ranges: np.ndarray, rules: Rules) -> ClassedScans:
         columns, values, vectors, vectors, np.arange(len(columns) + 1, dtype=np.int32), counts, counts, constants,
         LeftOut(hit[-1], far[-1], used[-1], used_max[-1], constant[-1], rules.z_max > 0),
     )  # fmt: skip
-    return scans if rules.separate else _separated(scans)
+    return scans if rules.separate else _separated(scans, rules.ray_of)
 
 
 def _of_complete_scan(ranges: np.ndarray, classes: tuple[np.ndarray, np.ndarray], rules: Rules) -> ClassedScans:
@@ -193,12 +193,14 @@ def _of_complete_scan(ranges: np.ndarray, classes: tuple[np.ndarray, np.ndarray]
     scans = ClassedScans(
         columns, values.astype(np.float64), vectors, vectors, first, count, count, constants, left_out
     )  # fmt: skip
-    return scans if rules.separate else _separated(scans)
+    return scans if rules.separate else _separated(scans, rules.ray_of)
 
 
-def _separated(scans: ClassedScans) -> ClassedScans:
+def _separated(scans: ClassedScans, ray_of: np.ndarray) -> ClassedScans:
     """Return scans with readings on one bearing beside each other, which share a ray."""
-    return _join([_grouped(scans.part(i, i + 1)) for i in range(scans.scans)])
+    if scans.scans == 1:
+        return _grouped(scans, ray_of)
+    return _join([_grouped(scans.part(i, i + 1), ray_of) for i in range(scans.scans)])
 
 
 def _numbers_of(chosen: np.ndarray) -> np.ndarray:
@@ -206,15 +208,15 @@ def _numbers_of(chosen: np.ndarray) -> np.ndarray:
     return np.array([np.count_nonzero(chosen)]) if len(chosen) == 1 else np.count_nonzero(chosen, axis=1)
 
 
-def _grouped(scan: ClassedScans) -> ClassedScans:
+def _grouped(scan: ClassedScans, ray_of: np.ndarray) -> ClassedScans:
     """Return a single scan with its readings in the order of their rays, which have no repetition."""
-    vectors = scan.vectors
-    _, index, inverse, counts = np.unique(vectors, axis=0, return_index=True, return_inverse=True, return_counts=True)
+    vectors, rays = scan.vectors, ray_of.take(scan.columns)
+    _, index, inverse, counts = np.unique(rays, return_index=True, return_inverse=True, return_counts=True)
     if len(index) == len(vectors):
         return scan
     # Rays are in the order of their first readings.
     place = np.argsort(index)
-    order = np.argsort(np.argsort(place)[inverse.ravel()], kind="stable")
+    order = np.argsort(np.argsort(place)[inverse], kind="stable")
     return ClassedScans(
         scan.columns[order], scan.readings[order], vectors[order], vectors[index[place]],
         np.append(0, np.cumsum(counts[place])).astype(np.int32), np.array([len(index)]), scan.counts, scan.constants,

@@ -117,6 +117,11 @@ class Rules:
         return not self.specialize or len(set(map(tuple, self.vectors.tolist()))) == len(self.vectors)
 
     @functools.cached_property
+    def ray_of(self) -> np.ndarray:
+        """Number (K,) of the ray of each bearing; equal bearings have the same one."""
+        return np.unique(self.vectors, axis=0, return_inverse=True)[1].ravel()
+
+    @functools.cached_property
     def limits(self) -> tuple[float, float]:
         """Least range, and least max reading [m]."""
         return self.scanner.range_min, self.scanner.range_max

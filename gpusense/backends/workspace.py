@@ -87,7 +87,7 @@ class Workspace:
                 self.abandon()
 
     def abandon(self) -> None:
-        """Drop the non-finite flag after an error: the next call has a cleared one. Copies may not have begun."""
+        """Drop the non-finite flag and held arrays after an error: copies and launches may not have ended."""
         self._held.clear()
         if POSE_STATUS in self._buffers:
             self._forget()

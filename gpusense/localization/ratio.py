@@ -37,7 +37,7 @@ pi = 1 / (1 + e^rho), so for q > 0 the likelihood ratio is the mean of both case
 For q < 0 it is q: also on a wrong map a wrong pose is seldom among the best. BY_CHANCE is what the best of many places
 gains by chance, which is nothing for a scan without information. OF_LEAD comes from a logistic regression with the
 ratio of the scan as an offset, on 71 simulated runs other than those above and on one log, robotdata4 of Wean Hall,
-which has a fifth of the weight of right poses. BY_CHANCE and IS_FOUND were chosen on 240 more simulated runs, half of
+which has a fifth of the weight of right poses. BY_CHANCE and IS_FOUND were chosen on 246 more simulated runs, half of
 them with 30 % of the walls moved, and on the tuning half of the recorded logs. The 200 runs alone, few of whose right
 poses are doubtful, give 0.29, 1.6 and 0.0 for the three.
 

@@ -33,12 +33,13 @@ def deviations(covariance: Floats) -> tuple[float, float]:
 
 
 class Spread(NamedTuple):
-    """How widely a distribution is spread, by its largest deviations.
+    """Classes of a covariance by the largest standard deviations of position and heading.
 
     Attributes:
-        wide: Whether the deviation of the position exceeds half a metre, or that of the heading 0.25 rad.
-        apart: Whether they exceed 1 m or 0.5 rad, so that the distribution may cover several places.
-        narrow: Whether they are so small that a normal density describes the particles well enough.
+        wide: Whether the position's exceeds 0.5 m, or the heading's 0.25 rad.
+        apart: Whether the position's exceeds 1 m, or the heading's 0.5 rad: the distribution may cover several places.
+        narrow: Whether the position's is below 0.2 m and the heading's below 0.1 rad: a normal density then describes
+            the particles well enough.
     """
 
     wide: bool
@@ -47,7 +48,7 @@ class Spread(NamedTuple):
 
 
 def spread_of(covariance: Floats) -> Spread:
-    """Return how widely a distribution with a (3, 3) covariance is spread."""
+    """Class a (3, 3) covariance of x, y [m] and heading [rad]."""
     position, heading = deviations(covariance)
     return Spread(
         position > WIDE or heading > WIDE_TURN, position > FAR or heading > FAR_TURN,

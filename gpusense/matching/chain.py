@@ -23,7 +23,7 @@ from gpusense.matching.columns import (
     square_root,
 )
 from gpusense.matching.evidence import pair_evidence
-from gpusense.matching.icp import STRAIGHT_WIDTH, WIDTH, IcpPairs, space_of
+from gpusense.matching.icp import STRAIGHT_WIDTH, WIDTH, IcpPairs, PlacedPairs, space_of
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import ScanPoints
 from gpusense.matching.result import ScanMatch
@@ -119,31 +119,55 @@ def match_pairs(
         device = IcpPairs(backend, real, points, pairs, noise, space)
         levels = Levels([options.at_noise(level) for level in device.levels], device.most_points(), points.gap)
         result = device.run(np.arange(len(pairs)), sensor[:, None], levels.rules())[:, 0]
-        best = Best(result, _NO_OTHER.repeat(len(pairs), axis=0))
-        if method == "auto":
-            score = columns_of(result)[3]
-            if any_of(score < _SURE):
-                first, second = levels.most[0] if len(pairs) == 1 else columns_of(points.counts[pairs])
-                enough = (first > 2) & (second > 2)
-                poor = enough & (score < DOUBTFUL)
-                far = (
-                    _is_moved(result, sensor, _FAR * options.capture, _FAR_TURN)
-                    & enough
-                    & is_not(poor)
-                    & (score < _SURE)
-                )
-                for some, wide in ((poor, True), (far, False)):
-                    if any_of(some):
-                        which, starts = np.flatnonzero(some), (options if wide else nearby(options)).starts()
-                        _search(device, which, sensor[which], starts, best, options, levels)
-            _repeat(device, sensor, best, options, levels)
-        noisy, lever = _straighten(device, best.result, noise, levels), points.rms_range(pairs[:, 1])
-        sums = tested(device, best.result, points.gap, lever, noise, levels.options, noisy)
-    return _finished(best, sums, lever, options, noise, mount)
+        counts = levels.most[0] if len(pairs) == 1 else columns_of(points.counts[pairs])
+        lever = points.rms_range(pairs[:, 1])
+        best, sums = judged_pairs(device, sensor, result, counts, lever, method, options, noise, levels)
+    return finished(best, sums, lever, options, noise, mount)
+
+
+def judged_pairs(
+    device: PlacedPairs,
+    guess: np.ndarray,
+    result: np.ndarray,
+    points: tuple[Column, Column],
+    lever: np.ndarray,
+    method: str,
+    options: MatchOptions,
+    noise: np.ndarray,
+    levels: Levels,
+) -> tuple[Best, PairSums]:
+    """Return the best results of pairs, and the information of their pairs of points.
+
+    Args:
+        device: The pairs.
+        guess: (S, 3) guesses in the sensors' frames.
+        result: (S, 35) results from the guesses, which are overwritten.
+        points: Points of the references, and of the second scans.
+        lever: (S,) root mean square ranges of the second scans [m].
+        method: ``"icp"`` or ``"auto"``.
+        options: Capture radius and window.
+        noise: (S,) standard deviations of ranges [m].
+        levels: Their levels.
+    """
+    best = Best(result, _NO_OTHER.repeat(len(result), axis=0))
+    if method == "auto":
+        score = columns_of(result)[3]
+        if any_of(score < _SURE):
+            first, second = points
+            enough = (first > 2) & (second > 2)
+            poor = enough & (score < DOUBTFUL)
+            far = _is_moved(result, guess, _FAR * options.capture, _FAR_TURN) & enough & is_not(poor) & (score < _SURE)
+            for some, wide in ((poor, True), (far, False)):
+                if any_of(some):
+                    which, starts = np.flatnonzero(some), (options if wide else nearby(options)).starts()
+                    _search(device, which, guess[which], starts, best, options, levels)
+        _repeat(device, guess, best, options, levels)
+    noisy = _straighten(device, best.result, noise, levels)
+    return best, tested(device, best.result, levels.gap, lever, noise, levels.options, noisy)
 
 
 def _search(
-    device: IcpPairs,
+    device: PlacedPairs,
     poor: np.ndarray,
     guess: np.ndarray,
     offsets: np.ndarray,
@@ -201,7 +225,7 @@ def _is_moved(result: np.ndarray, guess: np.ndarray, distance: float, turn: floa
     return (x > distance) | (y > distance) | (heading > turn)
 
 
-def _repeat(device: IcpPairs, guess: np.ndarray, best: Best, options: MatchOptions, levels: Levels) -> None:
+def _repeat(device: PlacedPairs, guess: np.ndarray, best: Best, options: MatchOptions, levels: Levels) -> None:
     """Match pairs again from their results where the guess was poor: ICP may have stopped short of it."""
     moved = _is_moved(best.result, guess, _NEAR * options.capture, _NEAR_TURN)
     if any_of(moved):
@@ -213,7 +237,7 @@ def _repeat(device: IcpPairs, guess: np.ndarray, best: Best, options: MatchOptio
         best.result[rows[better]] = again[better]
 
 
-def _straighten(device: IcpPairs, result: np.ndarray, noise: np.ndarray, levels: Levels) -> Column:
+def _straighten(device: PlacedPairs, result: np.ndarray, noise: np.ndarray, levels: Levels) -> Column:
     """Match pairs again with longer lines where noise turns the usual ones; return for which pairs it does."""
     numbers, deviation = columns_of(result), column_of(noise)
     noisy = (numbers[12] + numbers[15]) * (deviation * deviation) / larger(numbers[19], 1e-30) > _TURNED
@@ -280,7 +304,7 @@ def to_sensor(pose: np.ndarray, mount: tuple[float, float]) -> np.ndarray:
     return rows_of((ahead + c * x - s * y - x, aside + s * x + c * y - y, heading))
 
 
-def _finished(
+def finished(
     best: Best, sums: PairSums, lever: np.ndarray, options: MatchOptions, noise: np.ndarray,
     mount: tuple[float, float],
 ) -> ScanMatch:  # fmt: skip

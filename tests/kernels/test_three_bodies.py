@@ -85,6 +85,7 @@ ON_PURPOSE = [
     ),
     Purpose("landmark_grid", "candidates", REFERENCE_ONLY, ARRAYS),
     Purpose("landmarks", "negative_where at_places", REFERENCE_ONLY, ARRAYS),
+    Purpose("line_fit", "line_at", KERNELS_ONLY, ARRAYS),
     Purpose("motion", "any_of motion_of move_by", (OPENCL,), LANES),
     Purpose("passages", "floor_of", (OPENCL,), FLOOR),
     Purpose("passages", "_cells_along", REFERENCE_ONLY, ARRAYS),

@@ -218,6 +218,7 @@ class PlacedPairs:
             guess=space.upload("match guesses", padded),
             rules=space.hold("match rules", (padded.itemsize, *rules), lambda: np.array(rules, self._real)),
             result=buffer, scans=self._counts[0], points=self._counts[1], pairs=count, starts=starts, levels=len(rules),
+            turns=1, far=0.0, far_turn=0.0,
         )  # fmt: skip
         fits, self._fits = self._fits, ()
         self._backend.run((*fits, matching))

@@ -16,12 +16,13 @@ from gpusense.interface.constants import MATCH_RESULT
 from gpusense.interface.flags import flags_if
 from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
-from gpusense.matching.chain import Levels, finished, judged_pairs, to_sensor
+from gpusense.matching.chain import POOR, POOR_TURN, finished, judged_pairs, to_sensor
 from gpusense.matching.icp import WIDTH, PlacedPairs, line_rules, slack_of, space_of
 from gpusense.matching.noise import NoiseLevels, neighbors, noise_levels
 from gpusense.matching.options import COARSE_POINTS, MatchOptions
 from gpusense.matching.points import beams_by_angle
 from gpusense.matching.result import ScanMatch
+from gpusense.matching.start_search import Levels
 from gpusense.world.scanner import Scanner, limits
 
 _DOUBLE, _INT = np.dtype(np.float64), np.dtype(np.int32)
@@ -87,17 +88,19 @@ def match_pair(
         space.upload("pair readings", readings)
         space.upload("match guesses", padded)
         space.run(scene, {}, lambda: _program(backend, space, scene, options), version=0)
-        summary, numbers = np.empty(5), np.empty((1, MATCH_RESULT), real)
+        summary, numbers = np.empty(5), np.empty((2, MATCH_RESULT), real)
         space.download(space.empty("pair summary", 5, _DOUBLE), summary)
-        space.read(space.empty("match result", MATCH_RESULT, real), numbers)
+        space.read(space.empty("match result", 2 * MATCH_RESULT, real), numbers)
         chosen, one, other, _, squares = summary.tolist()
         level, gap = scene.levels().noise[int(chosen)], beams_by_angle(scanner, real)[4]
         points, noise = np.array([one, other], np.intp), np.array([level])
         device = PlacedPairs(backend, real, space, 2 * scanner.count, points, gap, _PAIR, [level])
         levels = Levels([options.at_noise(level)], [(int(one), int(other))], gap)
         lever = np.array([max(math.sqrt(squares / max(other, 1.0)), 1e-3)])
+        result = numbers.astype(np.float64)
+        again = result[1:] if result[1, 4] > 0 else None
         best, sums = judged_pairs(
-            device, sensor, numbers.astype(np.float64), (one, other), lever, method, options, noise, levels
+            device, sensor, result[:1], (one, other), lever, method, options, noise, levels, again
         )
     return finished(best, sums, lever, options, noise, mount)
 
@@ -138,7 +141,7 @@ def _program(backend: Backend, space: Workspace, scene: _Scene, options: MatchOp
     matched = launch(
         "match_scans", with_lanes_flag(lanes, "match_scans", flags), (1,), **buffers,
         guess=space.empty("match guesses", 4, real), rules=backend.upload(np.array(rules, real)),
-        result=space.empty("match result", MATCH_RESULT, real), scans=2, points=2 * count, pairs=1, starts=1,
-        levels=len(rules),
+        result=space.empty("match result", 2 * MATCH_RESULT, real), scans=2, points=2 * count, pairs=1, starts=1,
+        levels=len(rules), turns=2, far=POOR * scene.capture, far_turn=POOR_TURN,
     )  # fmt: skip
     return placed, matched

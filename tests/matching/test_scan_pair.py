@@ -66,13 +66,13 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.mark.sampled(0.4)
+@pytest.mark.sampled(0.2)
 @pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("guess", [(0.1, -0.05, 0.05), (-0.05, 0.05, 0.0), (0.5, 0.4, 0.4)])
 @pytest.mark.parametrize(("precision", "noise"), [("float32", "auto"), ("float64", "auto"), ("float32", 0.03)])
-def test_a_single_match_is_that_of_several(device, case, precision, noise):
+def test_a_single_match_is_that_of_several(device, case, precision, noise, guess):
     scanner, (first, second) = CASES[case]
     options = {"backend": device, "precision": precision, "noise": noise}
-    guess = (0.1, -0.05, 0.05)
     alone = gs.match_scan(first, second, scanner, guess, **options)
     among = gs.match_scan(first[None], second[None], scanner, np.array([guess]), **options)[0]
     for field in dataclasses.fields(gs.ScanMatch):
@@ -128,3 +128,16 @@ def test_scanners_and_options_in_turns_keep_their_programs(device):
         assert np.array_equal(gs.match_scan(first[0], second[0], RING, backend=device).pose, wide.pose)
         assert np.array_equal(gs.match_scan(*scans(DENSE, 0.015), DENSE, backend=device).pose, front.pose)
         assert np.array_equal(gs.match_scan(first[0], second[0], RING, backend=device, capture=0.5).pose, near.pose)
+
+
+@pytest.mark.parametrize("guess", [(0.1, -0.05, 0.05), (-0.05, 0.05, 0.0)], ids=["near", "poor"])
+def test_a_match_without_a_search_takes_a_single_wait(device, monkeypatch, guess):
+    """The kernel repeats a match whose guess was poor, without a launch of its own."""
+    first, second = scans(RING, 0.005)
+    reads = []
+    read = Workspace.read
+    monkeypatch.setattr(Workspace, "read", lambda self, *arguments: (reads.append(1), read(self, *arguments)))
+    found = gs.match_scan(first, second, RING, guess, backend=device, precision="float64")
+    assert found.converged
+    assert len(reads) == 1
+    assert (np.abs(found.pose - guess)[:2] > 0.1).any() == (guess[1] > 0)

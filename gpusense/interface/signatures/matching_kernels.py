@@ -32,8 +32,9 @@ KERNELS: dict[str, Kernel] = {
     ),
     "match_scans": kernel(
         "icp", "item", *_POINTS, "real4 line [points]", "int pair [3 * pairs]", "real4 guess [pairs * starts]",
-        f"real rules [{MATCH_RULES} * levels]", f"out real result [{MATCH_RESULT} * pairs * starts]", "int scans",
-        "int points", "int pairs", "int starts", "int levels", group=4, team=256,
+        f"real rules [{MATCH_RULES} * levels]", f"out real result [{MATCH_RESULT} * turns * pairs * starts]",
+        "int scans", "int points", "int pairs", "int starts", "int levels", "int turns", "real far", "real far_turn",
+        group=4, team=256,
     ),
     "pool_scores": kernel(
         "search", "col line image", _CELLS,

@@ -3,9 +3,12 @@
     python bench/speed/options.py --backend opencl --output bench/results/options_cpu
     python bench/speed/options.py --backend opencl --backend warp:cuda:0 --particles 100000 --beams 360
 
+    python bench/speed/options.py --backend warp:cuda:0 --particles 1000000 --launches
+
 A row is one option: parameters that remove or add a part of the density, another precision, caster or table, or the
 weights of another program. Its ratio is its time over the default's with the same particles and scan: whole calls with
-NumPy arrays in and out, medians of several rounds of all options. The intended upper bound stands beside it. The
+NumPy arrays in and out, medians of several rounds of all options. With --launches it is the time of a call's launches
+without its copies, ten calls in a row, as for arrays that stay on a GPU. The intended upper bound stands beside it. The
 quartiles of the rounds show how reliable the ratio is.
 """
 
@@ -28,8 +31,10 @@ from gpusense.backends import get_backend
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Scene, add_scene, make_parser, note, parse, publish, table
+from common import Recorder, Scene, add_scene, make_parser, note, parse, publish, table, waited
 
+# Calls of which the launches are waited for together.
+IN_A_ROW = 10
 BEAM, FIELD = gs.BeamParameters(), gs.LikelihoodFieldParameters()
 # A fit to the recorded lidar before a wall: narrow, with an offset and a deviation that grows with range.
 FITTED = gs.BeamParameters(
@@ -123,6 +128,20 @@ def rounds_of(calls: dict[str, Callable[[], Any]], rounds: int, clock: Callable[
     return times
 
 
+def launches_of(backend: str, make: Callable[..., Any], poses: np.ndarray, ranges: np.ndarray) -> Callable[[], None]:
+    """Return a function that runs the launches of a call ``IN_A_ROW`` times, without its copies."""
+    recorder = Recorder(get_backend(backend))
+    call = functools.partial(make(backend=recorder).log_likelihood, poses, ranges)
+    call()
+    launches = recorder.launches_of(call)
+
+    def start() -> None:
+        for launch in launches:
+            launch()
+
+    return waited(recorder.watched, start, IN_A_ROW)
+
+
 def measure(arguments: argparse.Namespace, scene: Scene, backend: str) -> Iterator[dict[str, Any]]:
     """Yield the ratios of every option on a device."""
     scanner = scene.scanner(arguments.beams)
@@ -137,8 +156,10 @@ def measure(arguments: argparse.Namespace, scene: Scene, backend: str) -> Iterat
             if option.name == "every bearing twice":
                 twice = gs.Scanner(np.repeat(scanner.bearings[::2], 2), scanner.range_max)
                 make, scan = functools.partial(gs.BeamModel, scene.grid, twice, BEAM), np.repeat(ranges[::2], 2)
-            model = make(backend=backend)
-            calls[option.name] = functools.partial(model.log_likelihood, poses, scan)
+            if arguments.launches:
+                calls[option.name] = launches_of(backend, make, poses, scan)
+            else:
+                calls[option.name] = functools.partial(make(backend=backend).log_likelihood, poses, scan)
             most[option.name] = option.most
         # Processor time, which leaves other work on the machine out, where the processor is the device.
         clock = time.perf_counter if get_backend(backend).info.kind == "gpu" else time.process_time
@@ -146,7 +167,8 @@ def measure(arguments: argparse.Namespace, scene: Scene, backend: str) -> Iterat
         for name, seconds in times.items():
             low, ratio, high = np.quantile(seconds / times["default"], (0.25, 0.5, 0.75))
             yield {
-                "backend": backend, "model": option.model, "option": name, "ms": 1000 * float(np.median(seconds)),
+                "backend": backend, "model": option.model, "option": name,
+                "ms": 1000 * float(np.median(seconds)) / (IN_A_ROW if arguments.launches else 1),
                 "ratio": float(ratio), "quartiles": [float(low), float(high)], "at_most": most[name],
             }  # fmt: skip
 
@@ -161,6 +183,7 @@ def main() -> None:
     parser.add_argument(
         "--rounds", type=int, default=15, help="in which every option has a turn (default: %(default)s)"
     )
+    parser.add_argument("--launches", action="store_true", help="time the launches of calls, without copies")
     parser.add_argument("--only", action="append", default=[], help="a row's name, repeatable; default: all")
     arguments = parse(parser)
     scene = Scene(arguments)
@@ -177,7 +200,8 @@ def main() -> None:
                 ]
             )  # fmt: skip
             note(" ".join(rows[-1]))
-    names = ["backend", "model", "option", "ms a call", "times the default", "quartiles", "at most"]
+    timed = "ms, launches" if arguments.launches else "ms a call"
+    names = ["backend", "model", "option", timed, "times the default", "quartiles", "at most"]
     sizes = f"{arguments.particles} particles x {arguments.beams} beams, {arguments.cloud}, {scene.label}"
     title = f"# Options of the scan models\n\n{sizes}.\n\n"
     publish(__file__, arguments, title + table(names, rows), {"rows": report})

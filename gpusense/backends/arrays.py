@@ -84,8 +84,14 @@ def _adopt(array: Any, backend: Backend, name: str, *, in_place: bool = False) -
     )
 
 
-def host_poses(array: object, name: str, scans: int | None = None) -> np.ndarray:
+def host_poses(array: object, name: str, scans: int | None = None, *, single: bool = False) -> np.ndarray:
     """Return (N, 3) poses in host memory, or the poses of S scans in sequence: C-contiguous float64 numbers.
+
+    Args:
+        array: The poses.
+        name: Their name in messages.
+        scans: S; None without scans.
+        single: Whether (N, 3) poses in float32 remain float32 numbers.
 
     Raises:
         TypeError: Not numbers.
@@ -94,7 +100,7 @@ def host_poses(array: object, name: str, scans: int | None = None) -> np.ndarray
     read = array if type(array) is np.ndarray else to_host(array, name)
     shape = ("N", 3) if scans is None else (scans, "N", 3)
     if scans is None and isinstance(read, np.ndarray) and read.dtype.kind == "f" and read.shape[1:] == (3,):
-        return np.ascontiguousarray(read, np.float64)
+        return np.ascontiguousarray(read, None if single and read.dtype == np.float32 else np.float64)
     return np.ascontiguousarray(checks.array(name, read, shape, finite=False)).reshape(-1, 3)
 
 

@@ -25,6 +25,7 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
     "fit_lines": (set(),),
     "match_scans": (set(),),
     "move_particles": (set(),),
+    "place_pair": (set(),),
     "place_poses": (set(),),
     "score_beacons": (set(),),
     "score_beams": (set(),),

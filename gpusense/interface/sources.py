@@ -22,7 +22,7 @@ typedef {real}2 real2;
 typedef {real}4 real4;
 #define FLOAT64 {float64}
 #define SPLITTER ((real){splitter})
-#if defined(__FMA__) || defined(__ARM_FEATURE_FMA) || defined({fast_fma})
+#if defined(__FMA__) || defined(__ARM_FEATURE_FMA) || defined(__NV_CL_C_VERSION) || defined({fast_fma})
 #define FUSES 1
 #else
 #define FUSES 0
@@ -37,7 +37,8 @@ _REQUIRES = re.compile(r"^// requires: (.*)$", re.MULTILINE)
 def prelude(*, float64: bool, doubles: bool = False) -> str:
     """Return the head of every program, which forbids contraction and defines ``real``.
 
-    FUSES says whether the device has a fused multiply-add; elsewhere ``fma`` is a slow call.
+    FUSES says whether the device has a fused multiply-add; elsewhere ``fma`` is a slow call. NVIDIA's driver does not
+    define the macro for it.
 
     Args:
         float64: Whether ``real`` is float64.

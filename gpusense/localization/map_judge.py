@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import MOMENTS
+from gpusense.interface.lanes import with_teams_flags
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.structs import BeamRules, Frame
-from gpusense.reference.passages import judge_beams
+from gpusense.reference.passages import STEP, judge_beams
 from gpusense.world.frames import frame_of
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Scanner
@@ -218,10 +219,13 @@ class MapJudge:
 
     def _launches(self, setting: _Setting, estimate: Buffer, judged: Buffer, beams: int) -> Program:
         (top, bottom), (left, right) = self._part
+        info, steps = self._backend.info, int(setting.rules.limit / setting.frame.resolution / STEP)
+        flags, team = with_teams_flags(info.kind, "judge_beams", _PLAIN, steps, self._backend.largest_group)
         return (
             launch(
-                "judge_beams", _PLAIN, (beams,), cells=self._cells, estimate=estimate, scan=self._scan, judged=judged,
-                frame=setting.frame, rules=setting.rules, rows=bottom - top, cols=right - left, beams=beams,
+                "judge_beams", flags, (team * beams,), cells=self._cells, estimate=estimate, scan=self._scan,
+                judged=judged, frame=setting.frame, rules=setting.rules, rows=bottom - top, cols=right - left,
+                beams=beams,
             ),
         )  # fmt: skip
 

@@ -11,6 +11,7 @@ from gpusense.backends import Backend
 from gpusense.backends.arrays import Bounds
 from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
+from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
 
 # Number of poses from which on the wait for the device is shorter than the host's pass over them.
@@ -25,23 +26,27 @@ def bounds_poses(backend: Backend) -> bool:
     return backend.info.kind == "gpu" and backend.info.float64
 
 
-def bounds_on_device(backend: Backend, space: Workspace, poses: Buffer, count: int) -> Bounds:
+def bounds_on_device(backend: Backend, space: Workspace, poses: Buffer, count: int, *, single: bool = False) -> Bounds:
     """Return the least and the largest x, y and theta of poses, NaN for a column with NaN.
 
     Args:
         backend: The device.
         space: Holds the results.
-        poses: ``count`` poses on the device, float64.
+        poses: ``count`` poses on the device.
         count: Their number, not 0.
+        single: Whether they are float32 numbers, not float64.
     """
     program: Program = ()
+    flags = flags_if(POSES_FLOAT32=single)
     number, numbers, apart = poses, 3 * count, 0
     for items in _ITEMS:
         found = space.empty(f"bounds of {items}", 2 * items, _DOUBLE)
         program += (
-            launch("bound_numbers", (), (items,), number=number, bounds=found, count=numbers, apart=apart, items=items),
-        )
-        number, numbers, apart = found, items, items
+            launch(
+                "bound_numbers", flags, (items,), number=number, bounds=found, count=numbers, apart=apart, items=items
+            ),
+        )  # fmt: skip
+        number, numbers, apart, flags = found, items, items, frozenset()
     backend.run(program)
     halves = np.empty((2, _ITEMS[-1] // 3, 3))
     space.read(number, halves)

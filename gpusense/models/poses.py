@@ -1,7 +1,7 @@
 """Poses of a request: checks, bounds, and placement in a window of the map.
 
-NumPy arrays are checked and bounded on the host, or by a GPU where they are many; the values of device poses are not
-inspected before the launch that places them.
+NumPy arrays are checked and bounded on the host, or by a GPU where they are many, which also converts those in float32;
+the values of device poses are not inspected before the launch that places them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from gpusense.world.windows import Corners, Window
 _INT = np.dtype(np.int32)
 _SINGLE, _DOUBLE = np.dtype(np.float32), np.dtype(np.float64)
 _PLAIN, _HUGE = frozenset[str](), frozenset({"HUGE_HEADINGS"})
-_HUGE_SINGLE = _HUGE | {"POSES_FLOAT32"}
+_SINGLE_PLAIN = frozenset({"POSES_FLOAT32"})
+_HUGE_SINGLE = _HUGE | _SINGLE_PLAIN
 
 Part = tuple[int, int]
 """Poses from a first one to before a last one."""
@@ -70,9 +71,13 @@ class Poses:
             )
             self._dtype = _SINGLE if single else _DOUBLE
             return
-        self.host = arrays.host_poses(poses, name, scans)
+        late = late and bounds_poses(backend)
+        self.host = arrays.host_poses(poses, name, scans, single=late)
         self.count = len(self.host)
-        self._late = late and self.count >= LEAST_BOUNDED and bounds_poses(backend)
+        self._late = late and self.count >= LEAST_BOUNDED
+        if not self._late:
+            self.host = self.host.astype(np.float64, copy=False)
+        self._dtype = self.host.dtype
         if not self._late:
             self._bound((0, self.count), backend, None)
 
@@ -100,7 +105,7 @@ class Poses:
         count, poses = part[1] - part[0], self.host[slice(*part)]
         if self._late and space is not None and count >= LEAST_BOUNDED:
             self._ahead = part, space, space.upload("poses", poses)
-            bounds = bounds_on_device(backend, space, self._ahead[2], count)
+            bounds = bounds_on_device(backend, space, self._ahead[2], count, single=self._dtype == _SINGLE)
         else:
             bounds = arrays.bounds_of(poses)
         arrays.check_bounds(bounds, self.host, self._name, self._scans)
@@ -114,9 +119,10 @@ class Poses:
 
     def flags(self, corners: Corners | None) -> frozenset[str]:
         """Return the flags of kernels that place poses with these corners."""
-        if corners is None:
-            return _HUGE_SINGLE if self._dtype == _SINGLE else _HUGE
-        return _HUGE if max(-corners[0][2], corners[3][2]) > LARGEST_HEADING else _PLAIN
+        huge = corners is None or max(-corners[0][2], corners[3][2]) > LARGEST_HEADING
+        if self._dtype == _SINGLE:
+            return _HUGE_SINGLE if huge else _SINGLE_PLAIN
+        return _HUGE if huge else _PLAIN
 
     def buffer(self, backend: Backend, space: Workspace, part: Part) -> Buffer:
         """Return some poses on the device, uploaded from host memory; None where the host must place them."""

@@ -42,6 +42,12 @@ def two_product(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return product, ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
 
 
+def rest_of(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Return ``c - a * b``, where c is a b rounded or nearly so."""
+    product, error = two_product(a, b)
+    return (c - product) - error
+
+
 def pair_sum(a: Pair, b: Pair) -> Pair:
     """Add two numbers of two parts each, to about twice the working precision.
 

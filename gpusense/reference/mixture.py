@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import erf
 
-from gpusense.reference.error_free import Pair, pair_product, pair_sum, two_product, two_sum
+from gpusense.reference.error_free import Pair, pair_sum, rest_of, two_product, two_sum
 from gpusense.reference.hit_shape import half_mass, shape_exponent
 
 TINY = 1e-30
@@ -60,17 +60,17 @@ def hit_offset(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms
 
 
 def hit_scale(flags: frozenset[str], expected: np.ndarray, terms: np.ndarray) -> Pair:
-    """Return sigma_hit / sigma at ranges as a sum of two numbers."""
+    """Return sigma_hit / sigma at ranges: the first number times (1 + the second)."""
     one, none = np.ones_like(expected), np.zeros_like(expected)
     if "GROWTH" not in flags:
         return one, none
     if "EXACT_EXPONENT" not in flags:
         return one / (one + terms[12] * expected), none
-    growth = pair_product((terms[12] + none, terms[13] + none), (expected, none))
-    x = pair_sum((one, none), growth)
-    y = one / x[0]
-    back = two_product(y, x[0])
-    return y, (((one - back[0]) - back[1]) - y * x[1]) * y
+    total = one + terms[12] * expected
+    share = one / total
+    # By how much the sum is too large; below 2^24 the sum less 1 is exact.
+    excess = rest_of(terms[12] + none, expected, total - one) - terms[13] * expected
+    return share, rest_of(total, share, one) + excess * share
 
 
 def normal_exponent(
@@ -83,14 +83,16 @@ def normal_exponent(
     """
     off, off_low = hit_offset(flags, z, expected, terms)
     scale = hit_scale(flags, expected, terms)
+    scaled = off * scale[0]
     if "EXACT_EXPONENT" not in flags:
-        scaled = off * scale[0]
         return scaled * (scaled * terms[1]), np.zeros_like(off)
+    if "GROWTH" in flags:
+        off_low = (off_low * scale[0] + scaled * scale[1]) - rest_of(off, scale[0], scaled)
+        off = scaled
     square, square_low = two_product(off, off)
     square_low = square_low + 2 * off * off_low
     product = two_product(square, terms[1])
-    exponent = product[0], product[1] + (square_low * terms[1] + square * terms[9])
-    return pair_product(exponent, pair_product(scale, scale)) if "GROWTH" in flags else exponent
+    return product[0], product[1] + (square_low * terms[1] + square * terms[9])
 
 
 def hit_exponent(
@@ -115,19 +117,18 @@ def short_factor(x: np.ndarray) -> np.ndarray:
     return np.where(h > TINY, safe / np.tanh(safe) + h, x.dtype.type(1))
 
 
-def log_short(z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """Return ``log(z_short p_short(z | z*))``; terms are those of the log domain."""
-    inside = (z <= expected) & (expected > 0)
-    x = terms[4] * expected
-    log_p = terms[3] + np.log(short_factor(x)) - np.log(np.where(inside, expected, 1)) - terms[4] * z
-    return np.where(inside, log_p, -np.inf)
-
-
 def short_peak(decay: float, expected: np.ndarray) -> np.ndarray:
     """Return ``lambda / (1 - exp(-2 h))`` as lambda (1 + t) / (2 t), h = lambda z* / 2 and t = tanh(h); 1 / z* at 0."""
     h = expected.dtype.type(0.5) * (decay * expected)
     t = np.tanh(np.where(h > TINY, h, 1))
     return np.where(h > TINY, decay * (1 + t), 1) / np.where(h > TINY, 2 * t, np.maximum(expected, SMALLEST_RANGE))
+
+
+def log_short(z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """Return ``log(z_short p_short(z | z*))``; terms are those of the log domain."""
+    inside = (z <= expected) & (expected > 0)
+    log_p = (terms[3] + np.log(short_peak(terms[4], expected))) - terms[4] * z
+    return np.where(inside, log_p, -np.inf)
 
 
 def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> np.ndarray:

@@ -1,6 +1,12 @@
 // Bounds of poses, in float64 and exact. Work-items are a multiple of three, so that each of them sees one column. A
 // first launch bounds the poses, and a second one the bounds of its work-items, which lie in two halves.
 
+#if POSES_FLOAT32
+typedef float coordinate;
+#else
+typedef double coordinate;
+#endif
+
 // Write the least of some numbers, and the largest of the numbers that lie apart from them: one work-item takes every
 // items-th number. NaN remains.
 kernel void bound_numbers(ARGUMENTS) {

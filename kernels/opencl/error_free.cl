@@ -31,6 +31,13 @@ real2 two_product(const real a, const real b) {
     return (real2)(product, error);
 }
 
+// Return c - a b, where c is a b rounded or nearly so.
+real rest_of(const real a, const real b, const real c) {
+    if (FUSES) return fma(-a, b, c);
+    const real2 product = two_product(a, b);
+    return (c - product.x) - product.y;
+}
+
 // Add two numbers of two parts each, to about twice the working precision. Where the first parts cancel, their sum is
 // at least the last bit of either, so its exponent is at least that of the second parts.
 real2 pair_sum(const real2 a, const real2 b) {

@@ -65,17 +65,16 @@ real2 hit_offset(const real z, const real expected, global const real *terms) {
 #endif
 }
 
-// Return sigma_hit / sigma at a range as a sum of two numbers.
+// Return sigma_hit / sigma at a range: the first number times (1 + the second).
 real2 hit_scale(const real expected, global const real *terms) {
 #if GROWTH
+    const real sum = 1 + terms[12] * expected, scale = 1 / sum;
 #if EXACT_EXPONENT
-    const real2 growth = pair_product((real2)(terms[12], terms[13]), (real2)(expected, 0));
-    const real2 x = pair_sum((real2)(1, 0), growth);
-    const real y = 1 / x.x;
-    const real2 back = two_product(y, x.x);
-    return (real2)(y, (((1 - back.x) - back.y) - y * x.y) * y);
+    // By how much the sum is too large; below 2^24 the sum less 1 is exact.
+    const real excess = rest_of(terms[12], expected, sum - 1) - terms[13] * expected;
+    return (real2)(scale, rest_of(sum, scale, 1) + excess * scale);
 #else
-    return (real2)(1 / (1 + terms[12] * expected), 0);
+    return (real2)(scale, 0);
 #endif
 #else
     return (real2)(1, 0);
@@ -85,20 +84,22 @@ real2 hit_scale(const real expected, global const real *terms) {
 // Return (z - mean)^2 / (2 sigma^2) as a sum of two numbers. Where the density's peak is high, exponent and log peak are
 // large and nearly cancel; the second part keeps the digits that remain.
 real2 normal_exponent(const real z, const real expected, global const real *terms) {
-    const real2 off = hit_offset(z, expected, terms);
+    real2 off = hit_offset(z, expected, terms);
 #if EXACT_EXPONENT
+#if GROWTH
+    const real2 scale = hit_scale(expected, terms);
+    const real scaled = off.x * scale.x;
+    off.y = (off.y * scale.x + scaled * scale.y) - rest_of(off.x, scale.x, scaled);
+    off.x = scaled;
+#endif
     real2 square = two_product(off.x, off.x);
 #if BIAS
     square.y += 2 * off.x * off.y;
+#elif GROWTH
+    square.y += 2 * off.x * off.y;
 #endif
     const real2 product = two_product(square.x, terms[1]);
-    const real2 exponent = (real2)(product.x, product.y + (square.y * terms[1] + square.x * terms[9]));
-#if GROWTH
-    const real2 scale = hit_scale(expected, terms);
-    return pair_product(exponent, pair_product(scale, scale));
-#else
-    return exponent;
-#endif
+    return (real2)(product.x, product.y + (square.y * terms[1] + square.x * terms[9]));
 #else
 #if GROWTH
     const real scaled = off.x * hit_scale(expected, terms).x;
@@ -134,17 +135,17 @@ real short_factor(const real x) {
     return h > TINY_DECAY ? h / tanh(h) + h : (real)1;
 }
 
-// Return log(z_short p_short(z | z*)); terms are those of the log domain.
-real log_short(const real z, const real expected, global const real *terms) {
-    if (!(z <= expected && expected > 0)) return -INFINITY;
-    return terms[3] + log(short_factor(terms[4] * expected)) - log(expected) - terms[4] * z;
-}
-
 // Return short_factor(x) / z* with one division: lambda / (1 - exp(-2 h)) = lambda (1 + t) / (2 t) with t = tanh(h).
 real short_peak(const real lambda, const real expected) {
     const real h = (real)0.5 * (lambda * expected), t = tanh(h);
     const real shortest = expected > SMALLEST_RANGE ? expected : SMALLEST_RANGE;
     return (h > TINY_DECAY ? lambda * (1 + t) : (real)1) / (h > TINY_DECAY ? 2 * t : shortest);
+}
+
+// Return log(z_short p_short(z | z*)); terms are those of the log domain.
+real log_short(const real z, const real expected, global const real *terms) {
+    if (!(z <= expected && expected > 0)) return -INFINITY;
+    return (terms[3] + log(short_peak(terms[4], expected))) - terms[4] * z;
 }
 #endif
 

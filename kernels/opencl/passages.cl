@@ -1,5 +1,6 @@
 // Classes of the beams of a scan at one pose: each beam is walked through the map with two companions that start beside
-// it and diverge. gpusense.localization.passages describes the classes. Steps are half a cell.
+// it and diverge. gpusense.localization.passages describes the classes. Steps are half a cell. With IN_TEAMS the work-items
+// of a group share the steps of a walk, of which each takes some neighbours.
 // requires: heading
 
 // Values of cells that are unknown, and of places off the map, which are unknown as well.
@@ -8,11 +9,43 @@
 // Step of a walk, and farthest start of one, where no map reaches [cells].
 #define STEP 0.5
 #define AFAR 1e9
+
+// Work-items that share a walk.
+#if SMALL_TEAMS
+#define WALKERS 32
+#else
+#define WALKERS 256
+#endif
 #define BEAM_NOTHING 0
 #define BEAM_AGREES 1
 #define BEAM_SHORT 2
 #define BEAM_THROUGH 3
 #define BEAM_VANISHED 4
+
+// A work-item's number among those that share a walk, their number, and memory that they share.
+typedef struct {
+    int member, members;
+#if IN_TEAMS
+    local double2 *shared;
+#endif
+} Walkers;
+
+// Return the least numbers of all members.
+double2 least_of_team(const double2 own, const Walkers team) {
+#if IN_TEAMS
+    local double2 *mine = team.shared + team.member;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    *mine = own;
+    for (int apart = team.members / 2; apart > 0; apart /= 2) {
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (team.member < apart) *mine = fmin(*mine, mine[apart]);
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    return team.shared[0];
+#else
+    return own;
+#endif
+}
 
 // Return the floor of a coordinate; some drivers call floor as a function.
 int floor_of(const double position) {
@@ -32,12 +65,17 @@ int is_wall(const int value, const int occupied) {
 }
 
 // Return the distances along a ray to the first wall, and to the first unknown cell before it [cells]; infinite for none.
-// A pair of walls that share a corner stops a ray.
-double2 walk_ray(const double2 start, const double2 slope, const int steps, global const uchar *cells, const int rows,
-                 const int cols, const int occupied) {
+// A pair of walls that share a corner stops a ray. The steps are those from begin to before end.
+double2 walk_ray(const double2 start, const double2 slope, const int begin, const int end, global const uchar *cells,
+                 const int rows, const int cols, const int occupied) {
     double2 first = (double2)(INFINITY, INFINITY);
     int col_before = 0, row_before = 0, value_before = OFF;
-    for (int k = 0; k < steps; ++k) {
+    if (begin > 0) {
+        const double distance = STEP * (begin - 1);
+        col_before = floor_of(slope.x * distance + start.x), row_before = floor_of(slope.y * distance + start.y);
+        value_before = value_at(cells, col_before, row_before, rows, cols);
+    }
+    for (int k = begin; k < end; ++k) {
         const double distance = STEP * k;
         const int col = floor_of(slope.x * distance + start.x), row = floor_of(slope.y * distance + start.y);
         // Nothing is new in the same cell.
@@ -61,12 +99,20 @@ double2 walk_ray(const double2 start, const double2 slope, const int steps, glob
 // diverges.
 double2 walk_beside(const double side, const double direction, const double2 origin, const double2 companion,
                     const int steps, global const uchar *cells, const int rows, const int cols, const double cell,
-                    const int occupied) {
+                    const int occupied, const Walkers team) {
     const double2 along = cos_sin(direction), slope = cos_sin(direction + side * companion.y);
     const double shift = side * companion.x;
     const double x = (origin.x - shift * along.y) / cell, y = (origin.y + shift * along.x) / cell;
     const double2 start = (double2)(fmin(fmax(x, -AFAR), AFAR), fmin(fmax(y, -AFAR), AFAR));
-    return walk_ray(start, slope, steps, cells, rows, cols, occupied) * cell;
+#if IN_TEAMS
+    const int share = (steps + team.members - 1) / team.members, begin = team.member * share;
+    const double2 own = walk_ray(start, slope, begin, min(begin + share, steps), cells, rows, cols, occupied);
+    double2 first = least_of_team(own, team);
+    if (first.y > first.x) first.y = INFINITY;
+    return first * cell;
+#else
+    return walk_ray(start, slope, 0, steps, cells, rows, cols, occupied) * cell;
+#endif
 }
 
 // Return where the beams of an estimated pose begin, relative to the corner of the cells along the map's axes [m].
@@ -91,11 +137,17 @@ double2 deviations_of(global const double *estimate) {
     return (double2)(sqrt((xx + yy) / 2 + sqrt(half_apart * half_apart + xy * xy)), sqrt(tt));
 }
 
-// Judge the beams of an estimated pose: one work-item takes a beam. The scan has their directions relative to the
-// heading, in the map's frame, then their readings, which are NaN for no beam. The result has their classes, then the
-// distances to the first wall on the beam itself.
+// Judge the beams of an estimated pose: a work-item, or with IN_TEAMS a team of them, takes a beam. The scan has their
+// directions relative to the heading, in the map's frame, then their readings, which are NaN for no beam. The result has
+// their classes, then the distances to the first wall on the beam itself.
 kernel void judge_beams(ARGUMENTS) {
-    const int b = get_global_id(0);
+#if IN_TEAMS
+    local double2 shared[WALKERS];
+    const Walkers team = {get_local_id(0), WALKERS, shared};
+#else
+    const Walkers team = {0, 1};
+#endif
+    const int b = get_global_id(0) / team.members;
     if (b >= beams) return;
     if (isnan(scan[beams + b])) {
         judged[b] = BEAM_NOTHING;
@@ -114,13 +166,13 @@ kernel void judge_beams(ARGUMENTS) {
     const int within = returned && reading <= rules.limit, steps = (int)(fmin(after, rules.limit) / (cell * STEP)) + 1;
     // A ray gives no evidence beyond the first unknown cell.
     const double end = returned ? before : reading;
-    const double2 own = walk_beside(0, direction, origin, companion, steps, cells, rows, cols, cell, occupied);
+    const double2 own = walk_beside(0, direction, origin, companion, steps, cells, rows, cols, cell, occupied, team);
     int kind = BEAM_NOTHING;
     if (within && own.x >= before && own.x <= after && own.y >= fmin(own.x, end)) {
         kind = BEAM_AGREES;
     } else {
-        const double2 left = walk_beside(1, direction, origin, companion, steps, cells, rows, cols, cell, occupied);
-        const double2 right = walk_beside(-1, direction, origin, companion, steps, cells, rows, cols, cell, occupied);
+        const double2 left = walk_beside(1, direction, origin, companion, steps, cells, rows, cols, cell, occupied, team);
+        const double2 right = walk_beside(-1, direction, origin, companion, steps, cells, rows, cols, cell, occupied, team);
         const double nearest = fmin(own.x, fmin(left.x, right.x)), farthest = fmax(own.x, fmax(left.x, right.x));
         const int seen = own.y >= fmin(own.x, end) && left.y >= fmin(left.x, end) && right.y >= fmin(right.x, end);
         if (seen && within && isinf(nearest)) kind = BEAM_SHORT;

@@ -15,7 +15,7 @@ INFINITE, MINUS_INFINITE = wp.constant(wp.float64(float("inf"))), wp.constant(wp
 
 @functools.cache
 def make(name, flags):
-    """Make a kernel of the file; no flag changes it."""
+    """Make a kernel of the file for a set of flags."""
 
     # Write the least of some numbers, and the largest of the numbers that lie apart from them: one work-item takes
     # every items-th number. NaN remains.
@@ -27,8 +27,8 @@ def make(name, flags):
         low = INFINITE
         high = MINUS_INFINITE
         for n in range(i, count, items):
-            a = number[n]
-            b = number[apart + n]
+            a = wp.float64(number[n])
+            b = wp.float64(number[apart + n])
             low = wp.where(a < low or a != a, a, low)
             high = wp.where(b > high or b != b, b, high)
         bounds[i] = low

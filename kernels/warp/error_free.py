@@ -62,6 +62,14 @@ def functions(flags):
         error = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
         return vec2(product, error)
 
+    # Return c - a b, where c is a b rounded or nearly so.
+    @wp.func
+    def rest_of(a: real, b: real, c: real):
+        if at_once():
+            return multiply_add(-a, b, c)
+        product = two_product(a, b)
+        return (c - product.x) - product.y
+
     # Add two numbers of two parts each, to about twice the working precision. Where the first parts cancel, their sum
     # is at least the last bit of either, so its exponent is at least that of the second parts.
     @wp.func

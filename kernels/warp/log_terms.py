@@ -10,7 +10,7 @@ import warp as wp
 
 from . import error_free
 from .lanes import math as lane_math
-from .prelude import precision
+from .prelude import fuses_on_gpu, log1p_of_gpu, precision
 
 
 @functools.cache
@@ -18,6 +18,7 @@ def functions(flags):
     """Make the functions of the file for a set of flags."""
     types = precision(flags)
     real, vec2 = types.real, types.vec2
+    gpu_log1p = log1p_of_gpu(real)
     pair_product = error_free.functions(flags).pair_product
     log = lane_math.functions(flags).log_lanes if "IN_LANES" in flags else wp.log
     ZERO, ONE = real(0.0), real(1.0)
@@ -31,9 +32,11 @@ def functions(flags):
             held = vec2(LARGEST_ROOT, ZERO)
         return pair_product(held, held)
 
-    # Return log(1 + x) for x > -1; the rounding error of 1 + x is corrected to first order.
+    # Return log(1 + x) for x > -1; on processors the rounding error of 1 + x is corrected to first order.
     @wp.func
     def log_one_plus(x: real):
+        if fuses_on_gpu():
+            return gpu_log1p(x)
         more = ONE + x
         return log(more) + (x - (more - ONE)) / more
 

@@ -27,7 +27,7 @@ def functions(flags):
     real, vec2 = types.real, types.vec2
     exact = error_free.functions(flags)
     two_sum, two_product = exact.two_sum, exact.two_product
-    pair_sum, pair_product = exact.pair_sum, exact.pair_product
+    pair_sum, rest_of = exact.pair_sum, exact.rest_of
     shape = hit_shape.functions(flags)
     shape_exponent, half_mass = shape.shape_exponent, shape.half_mass
     MASS_TABLE = "MASS_TABLE" in flags
@@ -102,19 +102,18 @@ def functions(flags):
         else:
             return vec2(z - expected, ZERO)
 
-    # Return sigma_hit / sigma at a range as a sum of two numbers.
+    # Return sigma_hit / sigma at a range: the first number times (1 + the second).
     @wp.func
     def hit_scale(expected: real, terms: wp.array(dtype=real)):
         scale = vec2(ONE, ZERO)
         if GROWTH:
+            total = ONE + at(terms, 12) * expected
+            share = ONE / total
+            scale = vec2(share, ZERO)
             if EXACT_EXPONENT:
-                growth = pair_product(vec2(at(terms, 12), at(terms, 13)), vec2(expected, ZERO))
-                x = pair_sum(vec2(ONE, ZERO), growth)
-                y = ONE / x.x
-                back = two_product(y, x.x)
-                scale = vec2(y, (((ONE - back.x) - back.y) - y * x.y) * y)
-            else:
-                scale = vec2(ONE / (ONE + at(terms, 12) * expected), ZERO)
+                # By how much the sum is too large; below 2^24 the sum less 1 is exact.
+                excess = rest_of(at(terms, 12), expected, total - ONE) - at(terms, 13) * expected
+                scale = vec2(share, rest_of(total, share, ONE) + excess * share)
         return scale
 
     # Return (z - mean)^2 / (2 sigma^2) as a sum of two numbers. Where the density's peak is high, exponent and log peak
@@ -123,15 +122,16 @@ def functions(flags):
     def normal_exponent(z: real, expected: real, terms: wp.array(dtype=real)):
         off = hit_offset(z, expected, terms)
         if EXACT_EXPONENT:
-            square = two_product(off.x, off.x)
-            if BIAS:
-                square = vec2(square.x, square.y + TWO * off.x * off.y)
-            product = two_product(square.x, at(terms, 1))
-            exponent = vec2(product.x, product.y + (square.y * at(terms, 1) + square.x * at(terms, 9)))
             if GROWTH:
                 scale = hit_scale(expected, terms)
-                exponent = pair_product(exponent, pair_product(scale, scale))
-            return exponent
+                shortened = off.x * scale.x
+                rest = rest_of(off.x, scale.x, shortened)
+                off = vec2(shortened, (off.y * scale.x + shortened * scale.y) - rest)
+            square = two_product(off.x, off.x)
+            if BIAS or GROWTH:
+                square = vec2(square.x, square.y + TWO * off.x * off.y)
+            product = two_product(square.x, at(terms, 1))
+            return vec2(product.x, product.y + (square.y * at(terms, 1) + square.x * at(terms, 9)))
         else:
             scaled = off.x
             if GROWTH:
@@ -164,13 +164,6 @@ def functions(flags):
             return h / wp.tanh(h) + h
         return ONE
 
-    # Return log(z_short p_short(z | z*)); terms are those of the log domain.
-    @wp.func
-    def log_short(z: real, expected: real, terms: wp.array(dtype=real)):
-        if z <= expected and expected > ZERO:
-            return at(terms, 3) + wp.log(short_factor(at(terms, 4) * expected)) - wp.log(expected) - at(terms, 4) * z
-        return NEVER
-
     # Return short_factor(x) / z* with one division: lambda / (1 - exp(-2 h)) = lambda (1 + t) / (2 t) with t = tanh(h).
     @wp.func
     def short_peak(rate: real, expected: real):
@@ -182,6 +175,13 @@ def functions(flags):
             above = rate * (ONE + t)
             below = t + t
         return above / below
+
+    # Return log(z_short p_short(z | z*)); terms are those of the log domain.
+    @wp.func
+    def log_short(z: real, expected: real, terms: wp.array(dtype=real)):
+        if z <= expected and expected > ZERO:
+            return (at(terms, 3) + wp.log(short_peak(at(terms, 4), expected))) - at(terms, 4) * z
+        return NEVER
 
     if LINEAR:
         # Return log p(z | z*). p_rand > 0 bounds the sum from below, so components may underflow, and one logarithm

@@ -1,6 +1,7 @@
 """Classes of the beams of a scan at one pose: each beam is walked through the map with two companions.
 
-These start beside it and diverge. gpusense.localization.passages describes the classes. Steps are half a cell.
+These start beside it and diverge. gpusense.localization.passages describes the classes. Steps are half a cell. With
+IN_TEAMS the work-items of a group share the steps of a walk, of which each takes some neighbours.
 """
 
 import functools
@@ -11,7 +12,7 @@ import warp as wp
 from gpusense.interface import constants
 
 from . import heading
-from .prelude import kernel, precision
+from .prelude import kernel, precision, work_item
 
 # Values of cells that are unknown, and of places off the map, which are unknown as well.
 UNKNOWN, OFF = wp.constant(255), wp.constant(256)
@@ -23,6 +24,41 @@ FOREVER = wp.constant(wp.float64(math.inf))
 NOTHING, AGREES = wp.constant(constants.NOTHING), wp.constant(constants.AGREES)
 SHORT, THROUGH = wp.constant(constants.SHORT), wp.constant(constants.THROUGH)
 VANISHED = wp.constant(constants.VANISHED)
+MOST_WALKERS, FEWER_WALKERS = 256, 32
+_WALKERS = """
+#if defined(__CUDA_ARCH__)
+return blockDim.x;
+#else
+return 1;
+#endif
+"""
+_LEAST_OF_TEAM = f"""
+#if defined(__CUDA_ARCH__)
+__shared__ double shared[2 * {MOST_WALKERS}];
+double *mine = shared + 2 * threadIdx.x;
+__syncthreads();
+mine[0] = own.c[0], mine[1] = own.c[1];
+for (int apart = blockDim.x / 2; apart > 0; apart /= 2) {{
+    __syncthreads();
+    if (threadIdx.x >= apart) continue;
+    mine[0] = fmin(mine[0], mine[2 * apart]), mine[1] = fmin(mine[1], mine[2 * apart + 1]);
+}}
+__syncthreads();
+return wp::vec_t<2, double>(shared[0], shared[1]);
+#else
+return own;
+#endif
+"""
+
+
+# Return the number of work-items that share a walk; those of processors share nothing, so the first one takes it all.
+@wp.func_native(_WALKERS)
+def walkers() -> wp.int32: ...
+
+
+# Return the least numbers of all members.
+@wp.func_native(_LEAST_OF_TEAM)
+def least_of_team(own: wp.vec2d) -> wp.vec2d: ...
 
 
 # Return the value of a cell.
@@ -41,19 +77,24 @@ def is_wall(value: wp.int32, occupied: wp.int32):
 
 
 # Return the distances along a ray to the first wall, and to the first unknown cell before it [cells]; infinite for
-# none. A pair of walls that share a corner stops a ray.
+# none. A pair of walls that share a corner stops a ray. The steps are those from begin to before end.
 @wp.func
 def walk_ray(
-    start: wp.vec2d, slope: wp.vec2d, steps: wp.int32, cells: wp.array(dtype=wp.uint8), rows: wp.int32, cols: wp.int32,
-    occupied: wp.int32,
+    start: wp.vec2d, slope: wp.vec2d, begin: wp.int32, end: wp.int32, cells: wp.array(dtype=wp.uint8), rows: wp.int32,
+    cols: wp.int32, occupied: wp.int32,
 ):  # fmt: skip
     wall = wp.float64(FOREVER)
     unknown = wp.float64(FOREVER)
     col_before = int(0)
     row_before = int(0)
     value_before = int(OFF)
-    k = int(0)
-    while k < steps:
+    if begin > 0:
+        last = STEP * wp.float64(begin - 1)
+        col_before = wp.int32(wp.floor(slope.x * last + start.x))
+        row_before = wp.int32(wp.floor(slope.y * last + start.y))
+        value_before = value_at(cells, col_before, row_before, rows, cols)
+    k = begin + 0
+    while k < end:
         distance = STEP * wp.float64(k)
         col = wp.int32(wp.floor(slope.x * distance + start.x))
         row = wp.int32(wp.floor(slope.y * distance + start.y))
@@ -68,7 +109,7 @@ def walk_ray(
         k += 1
         if stops:
             wall = distance
-            k = steps
+            k = end
         col_before = col
         row_before = row
         value_before = value
@@ -81,6 +122,10 @@ def make(name, flags):
     structs = precision(flags)
     BeamRules, Frame = structs.BeamRules, structs.Frame
     cos_sin = heading.functions(flags & {"HUGE_HEADINGS"}).cos_sin
+    IN_TEAMS = "IN_TEAMS" in flags
+    TEAM = 1
+    if IN_TEAMS:
+        TEAM = FEWER_WALKERS if "SMALL_TEAMS" in flags else MOST_WALKERS
 
     # Return the distances [m] along a beam (side 0) or its companion on one side (1 or -1), which starts beside it and
     # diverges.
@@ -88,6 +133,7 @@ def make(name, flags):
     def walk_beside(
         side: wp.float64, direction: wp.float64, origin: wp.vec2d, companion: wp.vec2d, steps: wp.int32,
         cells: wp.array(dtype=wp.uint8), rows: wp.int32, cols: wp.int32, cell: wp.float64, occupied: wp.int32,
+        member: wp.int32,
     ):  # fmt: skip
         along = cos_sin(direction)
         slope = cos_sin(direction + side * companion.y)
@@ -95,7 +141,15 @@ def make(name, flags):
         x = (origin.x - shift * along.y) / cell
         y = (origin.y + shift * along.x) / cell
         start = wp.vec2d(wp.min(wp.max(x, MINUS_AFAR), AFAR), wp.min(wp.max(y, MINUS_AFAR), AFAR))
-        return walk_ray(start, slope, steps, cells, rows, cols, occupied) * cell
+        if not IN_TEAMS:
+            return walk_ray(start, slope, 0, steps, cells, rows, cols, occupied) * cell
+        share = (steps + walkers() - 1) / walkers()
+        begin = member * share
+        own = walk_ray(start, slope, begin, wp.min(begin + share, steps), cells, rows, cols, occupied)
+        first = least_of_team(own)
+        if first.y > first.x:
+            first = wp.vec2d(first.x, FOREVER)
+        return first * cell
 
     # Return where the beams of an estimated pose begin, relative to the corner of the cells along the map's axes [m].
     @wp.func
@@ -125,13 +179,15 @@ def make(name, flags):
         half_apart = (xx - yy) / TWO
         return wp.vec2d(wp.sqrt((xx + yy) / TWO + wp.sqrt(half_apart * half_apart + xy * xy)), wp.sqrt(tt))
 
-    # Judge the beams of an estimated pose: one work-item takes a beam. The scan has their directions relative to the
-    # heading, in the map's frame, then their readings, which are NaN for no beam. The result has their classes, then
-    # the distances to the first wall on the beam itself.
+    # Judge the beams of an estimated pose: a work-item, or with IN_TEAMS a team of them, takes a beam. The scan has
+    # their directions relative to the heading, in the map's frame, then their readings, which are NaN for no beam. The
+    # result has their classes, then the distances to the first wall on the beam itself.
     @kernel(flags)
     def judge_beams(cells, estimate, scan, judged, frame, rules, rows, cols, beams):
-        b = wp.tid()
-        if b >= beams:
+        item = work_item(wp.tid())
+        b = item // TEAM
+        member = item - b * TEAM
+        if b >= beams or (IN_TEAMS and member >= walkers()):
             return
         reading = scan[beams + b]
         if wp.isnan(reading):
@@ -148,7 +204,7 @@ def make(name, flags):
         )
         direction = scan[b] + estimate[2]
         cell = frame.resolution
-        occupied = rules.occupied
+        wall = rules.occupied
         returned = reading < rules.range_max
         if not returned:
             reading = rules.range_max
@@ -159,14 +215,14 @@ def make(name, flags):
         steps = wp.int32(wp.min(after, rules.limit) / (cell * STEP)) + 1
         # A ray gives no evidence beyond the first unknown cell.
         end = wp.where(returned, before, reading)
-        own = walk_beside(ZERO, direction, origin, companion, steps, cells, rows, cols, cell, occupied)
+        own = walk_beside(ZERO, direction, origin, companion, steps, cells, rows, cols, cell, wall, member)
         seen = own.y >= wp.min(own.x, end)
         kind = NOTHING
         if within and own.x >= before and own.x <= after and seen:
             kind = AGREES
         else:
-            left = walk_beside(ONE, direction, origin, companion, steps, cells, rows, cols, cell, occupied)
-            right = walk_beside(MINUS_ONE, direction, origin, companion, steps, cells, rows, cols, cell, occupied)
+            left = walk_beside(ONE, direction, origin, companion, steps, cells, rows, cols, cell, wall, member)
+            right = walk_beside(MINUS_ONE, direction, origin, companion, steps, cells, rows, cols, cell, wall, member)
             nearest = wp.min(own.x, wp.min(left.x, right.x))
             farthest = wp.max(own.x, wp.max(left.x, right.x))
             seen = seen and left.y >= wp.min(left.x, end) and right.y >= wp.min(right.x, end)

@@ -210,6 +210,17 @@ def exact_fma(real):
     return multiply_add
 
 
+@functools.cache
+def log1p_of_gpu(real):
+    """Make a function that returns log(1 + x) on a GPU; processors have none that compiled kernels may call."""
+    name = "log1p" if real == wp.float64 else "log1pf"
+
+    @wp.func_native(f"#if defined(__CUDA_ARCH__)\nreturn {name}(x);\n#else\nreturn x;\n#endif\n")
+    def log1p(x: real) -> real: ...
+
+    return log1p
+
+
 # Return the number of bits that are set.
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)

@@ -46,7 +46,7 @@ FLOAT64 = "error_free.cl has the precision of real, which may be float32; Warp a
 EIGHT = "a work-item reads eight numbers before it uses any; the reference takes all of them at once"
 BLOCKS = "a work-item reads blocks of 16 readings as sets of bits; the reference takes all readings at once"
 TILES = "a work-item of a GPU finds its particle and rays; the reference takes all of them at once"
-TEAMS = "work-items of a GPU share the points of a scan; the reference takes all points at once"
+TEAMS = "work-items of a GPU share points or steps; the reference takes all of them at once"
 LANES = "bodies in lanes take the function from the scalar text; Warp and NumPy have no such bodies"
 QUICK = "kernels round end points first and repeat the doubtful ones with twice the digits; the reference repeats all"
 STAGES = "on Warp's processor device each stage of a block is a loop; OpenCL has lanes for it"
@@ -87,8 +87,11 @@ ON_PURPOSE = [
     ),
     Purpose("landmark_grid", "candidates", REFERENCE_ONLY, ARRAYS),
     Purpose("landmarks", "negative_where at_places", REFERENCE_ONLY, ARRAYS),
+    Purpose("line_fit", "line_at", KERNELS_ONLY, ARRAYS),
     Purpose("motion", "any_of motion_of move_by", (OPENCL,), LANES),
     Purpose("passages", "floor_of", (OPENCL,), FLOOR),
+    Purpose("passages", "walkers", (WARP,), "OpenCL has get_local_size"),
+    Purpose("passages", "least_of_team", KERNELS_ONLY, TEAMS),
     Purpose("passages", "_cells_along", REFERENCE_ONLY, ARRAYS),
     Purpose("philox", "number_of", (OPENCL,), LANES),
     Purpose("placement", "move_to_sensor", (OPENCL,), LANES),

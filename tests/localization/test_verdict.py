@@ -98,7 +98,9 @@ def test_the_map_may_lie_anywhere_and_be_turned(origin):
     assert kinds(place, scan_at(POSE), grid) == kinds(POSE, scan_at(POSE))
 
 
-def test_every_device_judges_beams_alike(backend):
+@pytest.mark.parametrize("gpu", [False, True], ids=["processor", "GPU"])
+def test_every_device_judges_beams_alike(backend, as_gpu, gpu):
+    as_gpu(gpu)
     rng = np.random.default_rng(3)
     # With short ranges the device holds parts of the map.
     for share, side, farthest in ((0.003, 0.05, 12.0), (0.05, 0.3, 12.0), (0.3, 0.1, 12.0), (0.02, 0.3, 2.0)):

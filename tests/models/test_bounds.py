@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -36,6 +38,10 @@ def test_bounds_are_those_of_numpy(count: int, device: Backend) -> None:
         changed[row, column] = poses[row, column] if odd is None else odd
         found = bounds_on_device(device, space, space.upload("poses", changed), count)
         np.testing.assert_array_equal(found, [changed.min(axis=0), changed.max(axis=0)])
+        with np.errstate(over="ignore", under="ignore"):
+            single = changed.astype(np.float32)
+        found = bounds_on_device(device, space, space.upload("poses", single), count, single=True)
+        np.testing.assert_array_equal(found, [single.min(axis=0), single.max(axis=0)])
 
 
 @settings(deadline=None)
@@ -76,15 +82,23 @@ def test_results_have_the_bits_of_poses_that_the_host_bounds(
     rng = np.random.default_rng(3)
     cloud = np.column_stack([rng.uniform(1, 18, 50), rng.uniform(1, 13, 50), rng.normal(0, 9, 50)])
     turned = cloud + np.array([0.0, 0.0, 2.0**21])
-    used: list[int] = []
+    used: list[bool] = []
     real = poses_module.bounds_on_device
-    monkeypatch.setattr(poses_module, "bounds_on_device", lambda *given: used.append(given[-1]) or real(*given))
+
+    def bounds(*given: Any, single: bool) -> object:
+        used.append(single)
+        return real(*given, single=single)
+
+    monkeypatch.setattr(poses_module, "bounds_on_device", bounds)
     for name, call in calls(device):
         # Each number of poses once each way, since GPUs have a shorter path for sizes that repeat.
-        for poses in (cloud, turned[1:], cloud[:3]):
+        for poses in (cloud, turned[1:], cloud[:3], cloud.astype(np.float32), turned[1:].astype(np.float32)):
             used.clear()
             found = call(poses)  # type: ignore[operator]
             assert bool(used) == (len(poses) > 3 and not name.startswith("no ")), name
+            assert not any(used) or poses.dtype == np.float32
+            # Poses of several scans are float64 numbers on the way.
+            assert all(used) or poses.dtype != np.float32 or name == "scans", name
             with monkeypatch.context() as early:
                 early.setattr(poses_module, "bounds_poses", lambda backend: False)
                 np.testing.assert_array_equal(found, call(poses), err_msg=name)  # type: ignore[operator]

@@ -31,8 +31,8 @@ _FIELD_TABLE = "real table [(window.rows + 4) * (window.cols + 4)]"
 KERNELS: dict[str, Kernel] = {
     "place_poses": kernel("placement", "particle", *_GIVEN, *_FRAME, in_lanes=True),
     "bound_numbers": kernel(
-        "bounds", "item", "double number [apart + count]", "out double bounds [2 * items]", "int count", "int apart",
-        "int items",
+        "bounds", "item", "coordinate number [apart + count]", "out double bounds [2 * items]", "int count",
+        "int apart", "int items",
     ),
     "place_inputs": kernel(
         "scan", "item", *_GIVEN, "measured ranges [scan]", "int beam [beams]", "double vector [2 * each * beams]",

@@ -108,7 +108,8 @@ class FieldPipeline(ScanPipeline):
             # Missing and max readings have no length; their points hold nan and inf.
             finite = np.isfinite(cells)
             lengths = np.where(finite, cells, 0.0)
-        high, low = split(scans.vectors * lengths[:, None], self.real)
+        # Products of long rows take NumPy half the time of those of pairs.
+        high, low = split((scans.vectors.reshape(-1) * lengths.repeat(2)).reshape(-1, 2), self.real)
         if not self.specialize:
             high[~finite] = cells[~finite, None]
         arrays = dict(point=high, point_low=low)
@@ -129,7 +130,7 @@ class FieldPipeline(ScanPipeline):
             dict(point=uploaded["point"], point_low=uploaded["point_low"], guard=uploaded.get("guard"), start=start),
             dict(counts=counts, constant_terms=uploaded.get("constant_terms", self.terms)),
             float(scans.constants[0]) + self.setting.constant_term,
-            (scans.scans, scans.most_readings, len(scans.readings)), float(np.maximum.reduce(lengths)) + 2,
+            (scans.scans, scans.most_readings, len(scans.readings)), lengths.item(lengths.argmax()) + 2,
         )  # fmt: skip
 
     def _longest_of_blocks(self, lengths: np.ndarray, scans: ClassedScans) -> np.ndarray:

@@ -6,10 +6,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .. import error_free, hit_shape
+from .. import error_free, hit_shape, mixture
 from ..error_free import BLOCK_TERMS
 from ..mixture import MIXTURE_TERMS
-from ..prelude import apart, exact_fma, fuses, precision, reader
+from ..prelude import apart, precision, reader
 from . import math as lane_math
 
 
@@ -21,8 +21,9 @@ def functions(flags):
     block_numbers = wp.types.vector(length=BLOCK_TERMS, dtype=real)
     block_bins = wp.types.vector(length=BLOCK_TERMS, dtype=wp.int32)
     exact = error_free.functions(flags)
-    two_sum, two_product, pair_sum = exact.two_sum, exact.two_product, exact.pair_sum
-    multiply_add = exact_fma(real)
+    two_sum, two_product, pair_sum, rest_of = exact.two_sum, exact.two_product, exact.pair_sum, exact.rest_of
+    scalar = mixture.functions(flags)
+    mean_range, hit_scale = scalar.mean_range, scalar.hit_scale
     elementary = lane_math.functions(flags)
     exp_lanes, log_lanes, erf_lanes = elementary.exp_lanes, elementary.log_lanes, elementary.erf_lanes
     one_minus_exp_lanes = elementary.one_minus_exp_lanes
@@ -52,38 +53,6 @@ def functions(flags):
     # Up to this 1 - exp(-x) is x within a quarter of the last bit.
     SMALL_DECAY = real(2.98023224e-08)
 
-    # Return c - a b, where c is a b rounded or nearly so.
-    @wp.func
-    def rest_lanes(a: real, b: real, c: real):
-        if fuses():
-            return multiply_add(-a, b, c)
-        product = two_product(a, b)
-        return (c - product.x) - product.y
-
-    # Return the mean of p_hit.
-    @wp.func
-    def mean_range_lanes(expected: real, terms: wp.array(dtype=real)):
-        if BIAS:
-            return wp.min(wp.max(expected + at(terms, 10), ZERO), at(terms, 6))
-        else:
-            return expected
-
-    # Return sigma_hit / sigma at a range: the first number times (1 + the second).
-    @wp.func
-    def hit_scale_lanes(expected: real, terms: wp.array(dtype=real)):
-        if GROWTH:
-            growth = at(terms, 12)
-            total = ONE + growth * expected
-            scale = ONE / total
-            low = real(0.0)
-            if EXACT_EXPONENT:
-                # By how much the sum is too large; below 2^24 the sum less 1 is exact.
-                excess = rest_lanes(growth, expected, total - ONE) - at(terms, 13) * expected
-                low = rest_lanes(total, scale, ONE) + excess * scale
-            return vec2(scale, low)
-        else:
-            return vec2(ONE, ZERO)
-
     # Return (z - mean)^2 / (2 sigma^2) as a sum of two numbers.
     @wp.func
     def normal_exponent_lanes(z: real, expected: real, scale: vec2, terms: wp.array(dtype=real)):
@@ -93,14 +62,14 @@ def functions(flags):
             # z, z* and the bias nearly cancel.
             bias = at(terms, 10)
             exact_off = pair_sum(two_sum(z, -expected), vec2(-bias, -at(terms, 11)))
-            mean = mean_range_lanes(expected, terms)
+            mean = mean_range(expected, terms)
             inside = mean == expected + bias
             off = wp.where(inside, exact_off.x, z - mean)
             off_low = wp.where(inside, exact_off.y, ZERO)
         if EXACT_EXPONENT:
             if GROWTH:
                 scaled = off * scale.x
-                off_low = (off_low * scale.x + scaled * scale.y) - rest_lanes(off, scale.x, scaled)
+                off_low = (off_low * scale.x + scaled * scale.y) - rest_of(off, scale.x, scaled)
                 off = scaled
             square = two_product(off, off)
             square_low = square.y
@@ -134,8 +103,8 @@ def functions(flags):
         masses, far = block_numbers(), block_numbers()
         i = int(0)
         while i < BLOCK_TERMS:
-            mean = mean_range_lanes(expected[i], terms)
-            scale = at(terms, 2) * hit_scale_lanes(expected[i], terms).x
+            mean = mean_range(expected[i], terms)
+            scale = at(terms, 2) * hit_scale(expected[i], terms).x
             below = mean * scale
             above = (at(terms, 6) - mean) * scale
             if MASS_TABLE:
@@ -164,7 +133,7 @@ def functions(flags):
     # Return the density of a hit before its division by its mass, or its logarithm.
     @wp.func
     def hit_density_lanes(z: real, expected: real, terms: wp.array(dtype=real)):
-        scale = hit_scale_lanes(expected, terms)
+        scale = hit_scale(expected, terms)
         exponent = hit_exponent_lanes(z, expected, scale, terms)
         if LINEAR:
             hit = at(terms, 0) * exp_lanes(-exponent.x)
@@ -243,8 +212,8 @@ def functions(flags):
                 else:
                     hits[i] = hit_density_lanes(z[i], expected[i], terms)
                 if not AMCL:
-                    mean = mean_range_lanes(expected[i], terms)
-                    scale = at(terms, 2) * hit_scale_lanes(expected[i], terms).x
+                    mean = mean_range(expected[i], terms)
+                    scale = at(terms, 2) * hit_scale(expected[i], terms).x
                     doubtful += near_an_end(mean, scale, terms)
                 i += 1
         if doubtful > 0:

@@ -67,10 +67,14 @@ def match_pairs(
     with lock, space:
         device = IcpPairs(backend, real, points, pairs, noise, space)
         levels = Levels([options.at_noise(level) for level in device.levels], device.most_points(), points.gap)
-        result = device.run(np.arange(len(pairs)), sensor[:, None], levels.rules())[:, 0]
+        again = None
+        if len(pairs) == 1 and method == "auto":
+            result, again = device.run_in_turns(sensor, levels.rules(), POOR * options.capture, POOR_TURN)
+        else:
+            result = device.run(np.arange(len(pairs)), sensor[:, None], levels.rules())[:, 0]
         counts = levels.most[0] if len(pairs) == 1 else columns_of(points.counts[pairs])
         lever = points.rms_range(pairs[:, 1])
-        best, sums = judged_pairs(device, sensor, result, counts, lever, method, options, noise, levels)
+        best, sums = judged_pairs(device, sensor, result, counts, lever, method, options, noise, levels, again)
     return finished(best, sums, lever, options, noise, mount)
 
 

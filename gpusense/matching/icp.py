@@ -33,6 +33,7 @@ _SPARSE = 0.12
 _MOST_STARTS = {"cpu": 1 << 12, "gpu": 1 << 18}
 
 _INT = np.dtype(np.int32)
+_FIRST_PAIR = np.zeros(1, np.intp)
 # Flags by the bytes of a number.
 _FLAGS = {4: flags_if(), 8: flags_if(FLOAT64=True)}
 
@@ -183,12 +184,31 @@ class PlacedPairs:
         starts = guesses.shape[1]
         step = self.pairs_of_launch(starts)
         if 0 < len(pairs) <= step:
-            return self._run(pairs, guesses, rules)[..., :columns].astype(np.float64)
+            return self._run(pairs, guesses, rules)[:, :, 0, :columns].astype(np.float64)
         result = np.empty((len(pairs), starts, columns))
         for begin in range(0, len(pairs), step):
             part = slice(begin, begin + step)
-            result[part] = self._run(pairs[part], guesses[part], rules)[..., :columns]
+            result[part] = self._run(pairs[part], guesses[part], rules)[:, :, 0, :columns]
         return result
+
+    def run_in_turns(
+        self, guess: np.ndarray, rules: Sequence[MatchRules], far: float, far_turn: float
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Match a single pair, and again from its result if that is farther from the guess than a limit.
+
+        Args:
+            guess: (1, 3) pose of the second scan in the reference's frame.
+            rules: Those of its level.
+            far: Limit along an axis [m].
+            far_turn: Limit of the turn [rad].
+
+        Returns:
+            (1, 35) both results; the second one is None where the match was not repeated.
+        """
+        first, again = self._run(_FIRST_PAIR, guess[:, None], rules, (2, far, far_turn))[0, 0, :, None].astype(
+            np.float64
+        )
+        return first, again if again[0, 4] > 0 else None
 
     def pairs_of_launch(self, starts: int) -> int:
         """Return the most pairs of a launch of some starts each."""
@@ -200,10 +220,13 @@ class PlacedPairs:
         points = self._points[self._pairs[pairs, :2]].max(axis=1)
         return int((-(-points // strides[self.level[pairs]])).max())
 
-    def _run(self, pairs: np.ndarray, guesses: np.ndarray, rules: Sequence[MatchRules]) -> np.ndarray:
-        """Return the results (P, M, 35) of the pairs of one launch."""
-        count, starts = guesses.shape[:2]
-        result = np.empty((count, starts, MATCH_RESULT), self._real)
+    def _run(
+        self, pairs: np.ndarray, guesses: np.ndarray, rules: Sequence[MatchRules],
+        again: tuple[int, float, float] = (1, 0.0, 0.0),
+    ) -> np.ndarray:  # fmt: skip
+        """Return the results (P, M, T, 35) of the pairs of one launch, in T turns; see ``run_in_turns``."""
+        (count, starts), (turns, far, far_turn) = guesses.shape[:2], again
+        result = np.empty((count, starts, turns, MATCH_RESULT), self._real)
         padded = np.zeros((count, starts, 4), self._real)
         padded[..., :3] = guesses
         space, chosen = self._space, self._pairs[pairs]
@@ -218,7 +241,7 @@ class PlacedPairs:
             guess=space.upload("match guesses", padded),
             rules=space.hold("match rules", (padded.itemsize, *rules), lambda: np.array(rules, self._real)),
             result=buffer, scans=self._counts[0], points=self._counts[1], pairs=count, starts=starts, levels=len(rules),
-            turns=1, far=0.0, far_turn=0.0,
+            turns=turns, far=far, far_turn=far_turn,
         )  # fmt: skip
         fits, self._fits = self._fits, ()
         self._backend.run((*fits, matching))

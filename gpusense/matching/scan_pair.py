@@ -40,6 +40,7 @@ class _Scene(NamedTuple):
         kind: Type of the readings, to which the scanner's limits are rounded.
         capture: Farthest distance between paired points at the start [m].
         noise: Standard deviation of ranges [m]; None where the scans tell it.
+        turns: 2 where a match from a poor guess is repeated from its result, otherwise 1.
     """
 
     scanner: Scanner
@@ -47,6 +48,7 @@ class _Scene(NamedTuple):
     kind: np.dtype
     capture: float
     noise: float | None
+    turns: int
 
     def levels(self) -> NoiseLevels:
         """Return the levels of noise."""
@@ -76,11 +78,10 @@ def match_pair(
         given: Whether the noise is that of the options; otherwise the scans tell it.
     """
     mount = scanner.mount[:2]
-    sensor, kind = (
-        to_sensor(guess, mount),
-        first.dtype if first.dtype == second.dtype else np.result_type(first, second),
-    )
-    scene = _Scene(scanner, real, kind, options.capture, options.noise if given else None)
+    sensor = to_sensor(guess, mount)
+    kind = first.dtype if first.dtype == second.dtype else np.result_type(first, second)
+    turns = 2 if method == "auto" else 1
+    scene = _Scene(scanner, real, kind, options.capture, options.noise if given else None, turns)
     readings, padded = np.empty((2, scanner.count)), np.zeros(4, real)
     readings[0], readings[1], padded[:3] = first, second, sensor[0]
     lock, space = space_of(backend)
@@ -88,7 +89,7 @@ def match_pair(
         space.upload("pair readings", readings)
         space.upload("match guesses", padded)
         space.run(scene, {}, lambda: _program(backend, space, scene, options), version=0)
-        summary, numbers = np.empty(5), np.empty((2, MATCH_RESULT), real)
+        summary, numbers = np.empty(5), np.empty((turns, MATCH_RESULT), real)
         space.download(space.empty("pair summary", 5, _DOUBLE), summary)
         space.read(space.empty("match result", 2 * MATCH_RESULT, real), numbers)
         chosen, one, other, _, squares = summary.tolist()
@@ -98,7 +99,7 @@ def match_pair(
         levels = Levels([options.at_noise(level)], [(int(one), int(other))], gap)
         lever = np.array([max(math.sqrt(squares / max(other, 1.0)), 1e-3)])
         result = numbers.astype(np.float64)
-        again = result[1:] if result[1, 4] > 0 else None
+        again = result[1:] if turns > 1 and result[1, 4] > 0 else None
         best, sums = judged_pairs(
             device, sensor, result[:1], (one, other), lever, method, options, noise, levels, again
         )
@@ -142,6 +143,6 @@ def _program(backend: Backend, space: Workspace, scene: _Scene, options: MatchOp
         "match_scans", with_lanes_flag(lanes, "match_scans", flags), (1,), **buffers,
         guess=space.empty("match guesses", 4, real), rules=backend.upload(np.array(rules, real)),
         result=space.empty("match result", 2 * MATCH_RESULT, real), scans=2, points=2 * count, pairs=1, starts=1,
-        levels=len(rules), turns=2, far=POOR * scene.capture, far_turn=POOR_TURN,
+        levels=len(rules), turns=scene.turns, far=POOR * scene.capture, far_turn=POOR_TURN,
     )  # fmt: skip
     return placed, matched

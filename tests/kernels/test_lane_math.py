@@ -1,4 +1,4 @@
-"""Functions of kernels/opencl/lanes/math.cl against more digits, in ulps, and the source of their constants."""
+"""Functions of lanes/math in OpenCL and Warp against more digits, in ulps, and the source of their constants."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy import special
 from support.bench_scripts import derived
 
 from gpusense.evaluation.tolerances import TOLERANCES
-from gpusense.interface.kernel_files import opencl_source
+from gpusense.interface.kernel_files import opencl_source, warp_module
 from gpusense.interface.signatures import LANES
 from gpusense.interface.sources import prelude, resolve
 
@@ -66,12 +66,45 @@ def evaluate(needs):
     return run
 
 
+@pytest.fixture
+def evaluate_warp(needs):
+    """Return a function that evaluates a function of Warp's file at every number of an array, on the processor."""
+    needs("warp")
+    import warp as wp
+
+    lanes = warp_module("lanes.math")
+    exp, one_minus_exp, log, erf = (getattr(lanes, name) for name in FUNCTIONS)
+
+    def each(given, found):
+        i = wp.tid()
+        found[0, i] = exp(given[i])
+        found[1, i] = one_minus_exp(given[i])
+        found[2, i] = log(given[i])
+        found[3, i] = erf(given[i])
+
+    each.__annotations__ = dict(given=wp.array(dtype=wp.float32), found=wp.array2d(dtype=wp.float32))
+    kernel = wp.kernel(module="unique", enable_backward=False, module_options=dict(fuse_fp=False))(each)
+
+    def run(function: str, numbers: np.ndarray) -> np.ndarray:
+        found = wp.empty((len(FUNCTIONS), len(numbers)), dtype=wp.float32, device="cpu")
+        wp.launch(kernel, len(numbers), [wp.array(numbers, dtype=wp.float32, device="cpu"), found], device="cpu")
+        return found.numpy()[list(FUNCTIONS).index(function)]
+
+    return run
+
+
+@pytest.fixture(params=["opencl", "warp"])
+def in_either(request):
+    """Return ``evaluate`` or ``evaluate_warp``."""
+    return request.getfixturevalue("evaluate" if request.param == "opencl" else "evaluate_warp")
+
+
 @pytest.mark.parametrize("function", FUNCTIONS)
-def test_errors_in_ulps(function, evaluate):
+def test_errors_in_ulps(function, in_either):
     numbers, exact = FUNCTIONS[function]
     truth = exact(numbers.astype(np.float64))
     ulp = np.spacing(np.abs(truth).astype(np.float32)).astype(np.float64)
-    off = np.abs(evaluate(function, numbers) - truth) / ulp
+    off = np.abs(in_either(function, numbers) - truth) / ulp
     worst = int(np.argmax(off))
     print(f"{function}: {off[worst]:.3f} ulp at {numbers[worst]!r}")
     row = "erf in lanes" if function == "erf_lanes" else "exp, 1 - exp and log in lanes"
@@ -110,13 +143,13 @@ def test_the_log_of_erfc_is_within_two_eps(evaluate):
     assert off.max() <= 2
 
 
-def test_ends(evaluate):
+def test_ends(in_either):
     """Check exact values, far arguments, and that no value depends on a neighbour."""
 
     def at(function: str, *numbers: float) -> list[float]:
         given = np.resize(np.array(numbers, np.float32), LANES)
-        alone = [evaluate(function, np.full(LANES, number, np.float32))[0] for number in given[: len(numbers)]]
-        together = evaluate(function, given)[: len(numbers)].tolist()
+        alone = [in_either(function, np.full(LANES, number, np.float32))[0] for number in given[: len(numbers)]]
+        together = in_either(function, given)[: len(numbers)].tolist()
         assert together == [float(value) for value in alone]
         return together
 
@@ -138,3 +171,14 @@ def test_constants_are_those_that_were_derived():
     defined = re.findall(r"^#define (\w+) (\S+)f$", text, re.MULTILINE)
     found = {name: float(np.float32(value)) for name, value in defined}
     assert {name: found[name] for name in expected} == expected
+
+
+def test_constants_of_warp_are_those_of_opencl(needs):
+    needs("warp")
+    defined = re.findall(r"^#define (\w+) (\S+?)f?$", opencl_source("lanes/math"), re.MULTILINE)
+    lanes = vars(warp_module("lanes.math"))
+    both = {name: value for name, value in defined if name in lanes}
+    assert {f"{letter}{i}" for letter, last in (("E", 4), ("L", 7), ("W", 8)) for i in range(last + 1)} < both.keys()
+    for name, value in both.items():
+        number = int(value, 16) if value.startswith("0x") else np.float32(value)
+        assert type(number)(lanes[name].value) == number, name

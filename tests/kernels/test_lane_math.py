@@ -1,4 +1,4 @@
-"""Functions of lanes/math in OpenCL and Warp against float64, in ulps of float32, and the source of their constants."""
+"""Functions of lanes/math in OpenCL and Warp against more digits, in ulps, and the source of their constants."""
 
 from __future__ import annotations
 
@@ -44,21 +44,22 @@ def evaluate(needs):
     from gpusense.backends import get_backend
 
     backend = get_backend(selection)
-    files = [resolve(opencl_source(name), frozenset(), name) for name in ("lanes/types", "lanes/math")]
     context = backend._context
     queue = cl.CommandQueue(context)
 
     def run(function: str, numbers: np.ndarray) -> np.ndarray:
+        double = numbers.dtype == np.float64
+        flags, lanes = frozenset({"FLOAT64"} if double else ()), LANES // 2 if double else LANES
+        files = [resolve(opencl_source(name), flags, name) for name in ("lanes/types", "lanes/math")]
         kernel = (
-            "kernel void each(global const float *in, global float *out) {\n"
+            "kernel void each(global const real *in, global real *out) {\n"
             f"    store_lanes({function}(load_lanes(get_global_id(0), in)), get_global_id(0), out);\n}}\n"
         )
-        source = prelude(float64=False) + "".join(files) + kernel
+        source = prelude(float64=double) + "".join(files) + kernel
         program = backend._built(cl.Program(context, source))
-        flags = cl.mem_flags.COPY_HOST_PTR
-        given = cl.Buffer(context, cl.mem_flags.READ_ONLY | flags, hostbuf=numbers)
+        given = cl.Buffer(context, cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR, hostbuf=numbers)
         made, found = cl.Buffer(context, cl.mem_flags.WRITE_ONLY, numbers.nbytes), np.empty_like(numbers)
-        program.each(queue, (len(numbers) // LANES,), None, given, made)
+        program.each(queue, (len(numbers) // lanes,), None, given, made)
         cl.enqueue_copy(queue, found, made)
         return found
 
@@ -108,6 +109,20 @@ def test_errors_in_ulps(function, in_either):
     print(f"{function}: {off[worst]:.3f} ulp at {numbers[worst]!r}")
     row = "erf in lanes" if function == "erf_lanes" else "exp, 1 - exp and log in lanes"
     assert off[worst] <= TOLERANCES[row].value
+
+
+def test_one_minus_exp_of_float64_is_within_5_ulp(evaluate):
+    a = -np.concatenate([np.geomspace(1e-30, 40.0, 3000), np.linspace(0.2, 0.3, 1000)])
+    found = evaluate("one_minus_exp_lanes", a)
+    with mp.workdps(40):
+        exact = [-mp.expm1(mp.mpf(each)) for each in a.tolist()]
+        off = [
+            abs(float((mp.mpf(one) - truth) / mp.mpf(np.spacing(float(truth)))))
+            for one, truth in zip(found.tolist(), exact, strict=True)
+        ]
+    print(f"one_minus_exp_lanes: {max(off):.3f} ulp at {a[int(np.argmax(off))]!r}")
+    assert max(off) <= 5
+    assert evaluate("one_minus_exp_lanes", np.resize([0.0, -800.0, -np.inf], LANES // 2))[:3].tolist() == [0, 1, 1]
 
 
 def test_arc_rest_is_below_a_fifth_of_the_last_bit(evaluate):

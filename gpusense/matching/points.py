@@ -97,9 +97,15 @@ def scan_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype, motion: np
     # View each point as a single item, so that a mask selects whole points.
     items = everything.view(_ITEMS[everything.itemsize])[..., 0]
     point = items[hit].view(real).reshape(-1, 4)
-    # In the order of beams, as kernels add; without beams there is no last sum.
-    squares = np.add.accumulate(np.square(z), axis=1)[:, -1:].sum(axis=1)
-    return _points(point, hit, gap, squares)
+    return _points(point, hit, gap, _sums_of_squares(z))
+
+
+def _sums_of_squares(z: np.ndarray) -> np.ndarray:
+    """Return the sums (S,) of the squares of (S, K) numbers, added in their order as kernels add."""
+    if len(z) == 1:
+        # NumPy would add a single row by pairs; without numbers there is no last sum.
+        return np.add.accumulate(np.square(z), axis=1)[:, -1:].sum(axis=1)
+    return np.add.reduce(np.square(z.T, order="C"), axis=0)
 
 
 @functools.lru_cache(maxsize=16)

@@ -161,3 +161,13 @@ def test_a_match_without_a_search_takes_a_single_wait(device, monkeypatch, guess
     assert found.converged
     assert len(reads) == 1
     assert (np.abs(found.pose - guess)[:2] > 0.1).any() == (guess[1] > 0)
+
+
+@pytest.mark.parametrize("scans_of_call", [1, 2, 3, 64])
+def test_squared_ranges_are_added_in_the_order_of_beams(scans_of_call):
+    """NumPy adds rows by pairs, or in lanes; kernels add one after another."""
+    z = np.random.default_rng(scans_of_call).uniform(0.1, 29.0, (scans_of_call, RING.count))
+    expected = np.zeros(scans_of_call)
+    for beam in np.argsort(np.mod(RING.bearings, 2 * np.pi), kind="stable"):
+        expected += z[:, beam] * z[:, beam]
+    assert scan_points(z, RING, np.dtype(np.float64)).squares.tolist() == expected.tolist()

@@ -109,7 +109,8 @@ def as_gpu(backend: str) -> Iterator[Callable[..., Backend]]:
 
     def pretend(gpu: bool = True, *, scalar: bool = False) -> Backend:
         lanes = 1 if gpu or scalar else before.lanes
-        device.info = dataclasses.replace(before, kind="gpu" if gpu else "cpu", lanes=lanes)
+        kind, loops = "gpu" if gpu else "cpu", before.vector_loops and not (gpu or scalar)
+        device.info = dataclasses.replace(before, kind=kind, lanes=lanes, vector_loops=loops)
         return device
 
     yield pretend

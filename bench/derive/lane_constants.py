@@ -1,4 +1,4 @@
-"""Derive the constants of ``kernels/opencl/lanes/math.cl`` with mpmath, and print them and their errors.
+"""Derive the constants of ``lanes/math`` in OpenCL and Warp with mpmath, and print them and their errors.
 
 Minimax polynomials (Remez's exchange) for the relative error of the function: e^r = 1 + r + r^2 E(r) for |r| <=
 log(2)/2, judged by e^r - 1; log(1 + f) = f - f^2/2 + f^3 L(f) for 1 + f from sqrt(1/2) to sqrt(2); erf(x) = 1 - exp(-x

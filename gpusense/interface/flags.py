@@ -34,7 +34,7 @@ FLAGS = {
     "SENSOR_TABLE": "log densities come from a table over readings and expected ranges",
     "CUBES": "a sum of cubes is wanted, as nav2_amcl and Beluga weigh scans",
     "AMCL": "the densities to be cubed are nav2_amcl's, not Beluga's",
-    "IN_LANES": "a work-item computes 16 particles or beams at once in vector types, as on PoCL",
+    "IN_LANES": "a work-item computes 16 particles or beams at once: vectors on PoCL, loops on Warp's processor device",
     "IN_TEAMS": "the work-items of a group share one item, as matches of scans do on GPUs",
     "SMALL_TEAMS": "an eighth of them share it, where an item has few points or groups hold fewer work-items",
     "SHARED_RAYS": "several readings have the same bearing",

@@ -25,6 +25,7 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
     "fit_lines": (set(),),
     "match_scans": (set(),),
     "move_particles": (set(),),
+    "place_pair": (set(),),
     "place_poses": (set(),),
     "score_beacons": (set(),),
     "score_beams": (set(),),
@@ -40,6 +41,9 @@ _NEEDED: dict[str, tuple[set[str], ...]] = {
 }
 # By kernel: flags with which its body in lanes computes in float64 where real numbers are float32.
 _DOUBLE: dict[str, frozenset[str]] = {"score_field": frozenset({"BILINEAR"})}
+# By kernel: flags with which Warp's body has no loops that become vectors, and flags that it requires.
+_NO_LOOPS = {"score_beams": frozenset({"FLOAT64", "SENSOR_TABLE"}), "score_field": frozenset({"ALL_READINGS"})}
+_IN_LOOPS: dict[str, frozenset[str]] = {"score_beams": frozenset(), "score_field": frozenset({"BILINEAR"})}
 # Flags of teams, the largest first.
 _TEAMS = (frozenset({"IN_TEAMS"}), frozenset({"IN_TEAMS", "SMALL_TEAMS"}))
 
@@ -65,6 +69,19 @@ def _flagged(lanes: int, kernel: str, flags: frozenset[str], float64: bool) -> f
     if not float64 and kernel in _DOUBLE and _DOUBLE[kernel] <= flags:
         return flags
     if lanes == 1 or flags & never or not any(needed <= flags for needed in _NEEDED.get(kernel, ())):
+        return flags
+    return flags | {"IN_LANES"}
+
+
+def with_loops_flag(vector_loops: bool, kernel: str, flags: frozenset[str]) -> frozenset[str]:
+    """Return the flags of a launch, with IN_LANES where the compiler makes vectors of the kernel's loops over readings.
+
+    Args:
+        vector_loops: Whether the device's compiler does so, as in ``BackendInfo``.
+        kernel: The kernel.
+        flags: Its other flags.
+    """
+    if not vector_loops or flags & _NO_LOOPS[kernel] or not _IN_LOOPS[kernel] <= flags:
         return flags
     return flags | {"IN_LANES"}
 

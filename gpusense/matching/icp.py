@@ -32,6 +32,8 @@ _SPARSE = 0.12
 # Most starts of one launch; a call can be interrupted between launches.
 _MOST_STARTS = {"cpu": 1 << 12, "gpu": 1 << 18}
 
+_INT = np.dtype(np.int32)
+_FIRST_PAIR = np.zeros(1, np.intp)
 # Flags by the bytes of a number.
 _FLAGS = {4: flags_if(), 8: flags_if(FLOAT64=True)}
 
@@ -55,44 +57,56 @@ def space_of(backend: Backend) -> tuple[threading.RLock, Workspace]:
     return kept
 
 
-class IcpPairs:
-    """Pairs of scans on a device.
+def line_rules(width: float, gap: float) -> dict[str, float]:
+    """Return the rules of lines by the names of the kernel's arguments.
+
+    Args:
+        width: Half their length [m].
+        gap: Largest step between the bearings of two neighbours that hides nothing [rad].
+    """
+    most = _MOST if width > WIDTH else _FEWER
+    reach = 1 if gap > GAP * _SPARSE else REACH
+    return {"reach": reach, "most": most, "ratio": max(_RATIO, _STEPS * gap / GAP), "width": width, "gap": gap}
+
+
+def slack_of(noise: float) -> float:
+    """Return the distance that is added to that of neighbours on a line, by the noise of ranges [m]."""
+    return max(_SLACK, _SLACK_DEVIATIONS * noise)
+
+
+class PlacedPairs:
+    """Pairs of scans whose points and lines are on a device.
 
     Pairs whose ranges have equal noise form a level, with rules of its own.
 
     Args:
         backend: The device.
         real: Precision.
-        points: The points of all scans.
-        pairs: (S, 2) numbers of the reference and of the second scan.
-        noise: (S,) standard deviations of ranges [m]; a scan belongs to pairs of one level.
-        space: The workspace of the buffers.
+        space: The workspace with the buffers ``match points``, ``match start`` and ``match lines``.
+        room: Points for which they have room.
+        points: (N,) points of each scan.
+        gap: Largest step between the bearings of two neighbours that hides nothing [rad].
+        pairs: (S, 3) reference, second scan and level of each pair.
+        levels: Noise of each level [m], ascending; a scan belongs to pairs of one level.
 
     Attributes:
-        levels: Noise of each level [m], ascending.
-        level: (S,) number of the level of each pair.
+        levels: Noise of each level.
+        level: (S,) level of each pair.
     """
 
     def __init__(
-        self, backend: Backend, real: np.dtype, points: ScanPoints, pairs: np.ndarray, noise: np.ndarray,
-        space: Workspace,
+        self, backend: Backend, real: np.dtype, space: Workspace, room: int, points: np.ndarray, gap: float,
+        pairs: np.ndarray, levels: list[float],
     ):  # fmt: skip
         self._backend, self._real, self._space = backend, real, space
         self._flags = _FLAGS[real.itemsize]
-        self._counts = len(points.start) - 1, len(points.point)
-        point = points.point if len(points.point) else np.zeros((1, 4), real)
-        self._point, self._start = space.upload("match points", point), space.upload("match start", points.start)
-        self._line = space.empty("match lines", point.size, real)
-        self._points, self._most, self._gap = points, max(points.counts.tolist(), default=0), points.gap
-        levels = np.unique(noise) if len(noise) > 1 else noise
-        self.levels: list[float] = levels.tolist()
-        self.level = np.searchsorted(levels, noise) if len(levels) > 1 else np.zeros(len(noise), np.intp)
-        # (S, 3) reference, second scan and level.
-        self._pairs = np.empty((len(pairs), 3), np.int32)
-        self._pairs[:, :2], self._pairs[:, 2] = pairs, self.level
+        self._counts, self._points, self._gap = (len(points), room), points, gap
+        self._most = max(points.tolist(), default=0)
+        self._point, self._line = (space.empty(name, 4 * room, real) for name in ("match points", "match lines"))
+        self._start = space.empty("match start", len(points) + 1, _INT)
+        self.levels, self._pairs, self.level = levels, pairs, pairs[:, 2]
         # Launches that start with the next match, so that its copies need not wait for them.
         self._fits: Program = ()
-        self.fit_lines(lambda noise: WIDTH)
 
     def of_levels(self, pairs: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
         """Yield the levels of some pairs (P,), each with the places of its pairs among these."""
@@ -106,12 +120,12 @@ class IcpPairs:
     def most_points(self, pairs: np.ndarray | None = None) -> list[tuple[int, int]]:
         """Return for each level the most points of a reference, and of a second scan, of all or of some pairs (P,)."""
         if len(self._pairs) == 1:
-            first, second = self._points.counts[self._pairs[0, :2]].tolist()
+            first, second = self._points[self._pairs[0, :2]].tolist()
             return [(first, second)]
         rows = np.arange(len(self._pairs)) if pairs is None else pairs
         most = [(0, 0)] * len(self.levels)
         for level, some in self.of_levels(rows):
-            before, second = self._points.counts[self._pairs[rows[some], :2]].max(axis=0, initial=0).tolist()
+            before, second = self._points[self._pairs[rows[some], :2]].max(axis=0, initial=0).tolist()
             most[level] = before, second
         return most
 
@@ -149,10 +163,8 @@ class IcpPairs:
         return launch(
             "fit_lines", flags, (self._most, chosen), point=self._point, start=self._start,
             which=which, line=self._line, chosen=chosen,
-            scans=self._counts[0], points=self._counts[1], reach=1 if self._gap > GAP * _SPARSE else REACH,
-            most=_MOST if width > WIDTH else _FEWER,
-            ratio=max(_RATIO, _STEPS * self._gap / GAP), slack=max(_SLACK, _SLACK_DEVIATIONS * self.levels[level]),
-            width=width, gap=self._gap,
+            scans=self._counts[0], points=self._counts[1], slack=slack_of(self.levels[level]),
+            **line_rules(width, self._gap),
         )  # fmt: skip
 
     def run(
@@ -172,12 +184,31 @@ class IcpPairs:
         starts = guesses.shape[1]
         step = self.pairs_of_launch(starts)
         if 0 < len(pairs) <= step:
-            return self._run(pairs, guesses, rules)[..., :columns].astype(np.float64)
+            return self._run(pairs, guesses, rules)[:, :, 0, :columns].astype(np.float64)
         result = np.empty((len(pairs), starts, columns))
         for begin in range(0, len(pairs), step):
             part = slice(begin, begin + step)
-            result[part] = self._run(pairs[part], guesses[part], rules)[..., :columns]
+            result[part] = self._run(pairs[part], guesses[part], rules)[:, :, 0, :columns]
         return result
+
+    def run_in_turns(
+        self, guess: np.ndarray, rules: Sequence[MatchRules], far: float, far_turn: float
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Match a single pair, and again from its result if that is farther from the guess than a limit.
+
+        Args:
+            guess: (1, 3) pose of the second scan in the reference's frame.
+            rules: Those of its level.
+            far: Limit along an axis [m].
+            far_turn: Limit of the turn [rad].
+
+        Returns:
+            (1, 35) both results; the second one is None where the match was not repeated.
+        """
+        first, again = self._run(_FIRST_PAIR, guess[:, None], rules, (2, far, far_turn))[0, 0, :, None].astype(
+            np.float64
+        )
+        return first, again if again[0, 4] > 0 else None
 
     def pairs_of_launch(self, starts: int) -> int:
         """Return the most pairs of a launch of some starts each."""
@@ -186,13 +217,16 @@ class IcpPairs:
     def _points_used(self, pairs: np.ndarray, rules: Sequence[MatchRules]) -> int:
         """Return the most points of a scan that a start of some pairs uses."""
         strides = np.array([rule.stride if rule.thin else 1 for rule in rules])
-        points = self._points.counts[self._pairs[pairs, :2]].max(axis=1)
+        points = self._points[self._pairs[pairs, :2]].max(axis=1)
         return int((-(-points // strides[self.level[pairs]])).max())
 
-    def _run(self, pairs: np.ndarray, guesses: np.ndarray, rules: Sequence[MatchRules]) -> np.ndarray:
-        """Return the results (P, M, 35) of the pairs of one launch."""
-        count, starts = guesses.shape[:2]
-        result = np.empty((count, starts, MATCH_RESULT), self._real)
+    def _run(
+        self, pairs: np.ndarray, guesses: np.ndarray, rules: Sequence[MatchRules],
+        again: tuple[int, float, float] = (1, 0.0, 0.0),
+    ) -> np.ndarray:  # fmt: skip
+        """Return the results (P, M, T, 35) of the pairs of one launch, in T turns; see ``run_in_turns``."""
+        (count, starts), (turns, far, far_turn) = guesses.shape[:2], again
+        result = np.empty((count, starts, turns, MATCH_RESULT), self._real)
         padded = np.zeros((count, starts, 4), self._real)
         padded[..., :3] = guesses
         space, chosen = self._space, self._pairs[pairs]
@@ -207,8 +241,36 @@ class IcpPairs:
             guess=space.upload("match guesses", padded),
             rules=space.hold("match rules", (padded.itemsize, *rules), lambda: np.array(rules, self._real)),
             result=buffer, scans=self._counts[0], points=self._counts[1], pairs=count, starts=starts, levels=len(rules),
+            turns=turns, far=far, far_turn=far_turn,
         )  # fmt: skip
         fits, self._fits = self._fits, ()
         self._backend.run((*fits, matching))
         space.read(buffer, result)
         return result
+
+
+class IcpPairs(PlacedPairs):
+    """Pairs of scans whose points are copied to a device, with lines of the least length.
+
+    Args:
+        backend: The device.
+        real: Precision.
+        points: The points of all scans.
+        pairs: (S, 2) numbers of the reference and of the second scan.
+        noise: (S,) standard deviations of ranges [m]; a scan belongs to pairs of one level.
+        space: The workspace of the buffers.
+    """
+
+    def __init__(
+        self, backend: Backend, real: np.dtype, points: ScanPoints, pairs: np.ndarray, noise: np.ndarray,
+        space: Workspace,
+    ):  # fmt: skip
+        point = points.point if len(points.point) else np.zeros((1, 4), real)
+        space.upload("match points", point)
+        space.upload("match start", points.start)
+        levels = np.unique(noise) if len(noise) > 1 else noise
+        numbers = np.empty((len(pairs), 3), np.int32)
+        numbers[:, :2] = pairs
+        numbers[:, 2] = np.searchsorted(levels, noise) if len(levels) > 1 else 0
+        super().__init__(backend, real, space, len(point), points.counts, points.gap, numbers, levels.tolist())
+        self.fit_lines(lambda noise: WIDTH)

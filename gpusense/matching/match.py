@@ -18,6 +18,7 @@ from gpusense.matching.noise import ASSUMED_NOISE, map_noise, match_noise, scan_
 from gpusense.matching.options import MatchOptions, check_guess, check_options
 from gpusense.matching.points import scan_points
 from gpusense.matching.result import ScanMatch
+from gpusense.matching.scan_pair import match_pair, takes
 from gpusense.matching.to_map import MapMatcher, match_to_map
 from gpusense.matching.verdicts import judged
 from gpusense.models.arguments import real_dtype
@@ -140,6 +141,10 @@ def _matches(
         return _by_noise(noise, options, to_map), second.ndim == 1
     first = readings("reference", reference, scanner, device)
     single = first.ndim == 1 and second.ndim == 1
+    if single and method in ("auto", "icp") and motions[0] is None and motions[1] is None and takes(device, scanner):
+        poses, real = check_guess(guess, None), np.dtype(precision)
+        match = match_pair(device, real, first, second, scanner, poses, method, options, given=given)
+        return judged(match, poses, options), True
     first, second = (scans[None] if scans.ndim == 1 else scans for scans in (first, second))
     if len(first) not in (1, len(second)):
         rule = f"must be one scan, or as many as ranges has, {len(second)}"

@@ -15,7 +15,7 @@ from gpusense.matching.columns import Column, any_of, columns_of
 from gpusense.matching.points import GAP
 
 # Points that are used while the scale shrinks, and for each start of a search.
-_COARSE_POINTS, _SEARCH_POINTS = 200, 30
+COARSE_POINTS, _SEARCH_POINTS = 200, 30
 # Most points of the reference in a search.
 _SEARCH_REFERENCE = 64
 # Margin by which poses on the edge of a window count as inside [m, rad].
@@ -61,7 +61,7 @@ class MatchOptions:
 
     def rules(self, points: int, gap: float) -> MatchRules:
         """Return the rules of a match from a guess; ``points`` is the number of points of a scan."""
-        stride = max(points // _COARSE_POINTS, 1)
+        stride = max(points // COARSE_POINTS, 1)
         scale, least = self.capture, self.least_scale
         near = max(0.3 * self.capture, 3 * least, _SPARSE * gap / GAP)
         return MatchRules(

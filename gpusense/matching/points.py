@@ -84,7 +84,7 @@ def scan_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype, motion: np
     """
     if motion is not None and motion.any():
         return _moved_points(ranges, scanner, real, motion)
-    order, bearing, cosine, sine, gap = _beams_by_angle(scanner, real)
+    order, bearing, cosine, sine, gap = beams_by_angle(scanner, real)
     z = ranges.take(order, axis=1)
     hit = hits(z, scanner.range_min, scanner.range_max)
     hit &= z > _NEAREST
@@ -97,11 +97,19 @@ def scan_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype, motion: np
     # View each point as a single item, so that a mask selects whole points.
     items = everything.view(_ITEMS[everything.itemsize])[..., 0]
     point = items[hit].view(real).reshape(-1, 4)
-    return _points(point, hit, gap, np.einsum("sk,sk->s", z, z))
+    return _points(point, hit, gap, _sums_of_squares(z))
+
+
+def _sums_of_squares(z: np.ndarray) -> np.ndarray:
+    """Return the sums (S,) of the squares of (S, K) numbers, added in their order as kernels add."""
+    if len(z) == 1:
+        # NumPy would add a single row by pairs; without numbers there is no last sum.
+        return np.add.accumulate(np.square(z), axis=1)[:, -1:].sum(axis=1)
+    return np.add.reduce(np.square(z.T, order="C"), axis=0)
 
 
 @functools.lru_cache(maxsize=16)
-def _beams_by_angle(scanner: Scanner, real: np.dtype) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
+def beams_by_angle(scanner: Scanner, real: np.dtype) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
     """Return the order of beams by their angles; angles in a precision, cosines, sines in this order; and the gap."""
     angle = np.mod(scanner.bearings + scanner.mount[2], _FULL_TURN)
     order = np.argsort(angle, kind="stable")

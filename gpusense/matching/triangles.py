@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gpusense.matching.columns import Column, larger
+from gpusense.matching.columns import Column, chosen, larger
 
 Triangle = Sequence[Column]
 
@@ -60,15 +60,21 @@ def is_definite(triangle: Triangle) -> Column:
 
 
 def inverse_of(triangle: Triangle) -> Triangle:
-    """Return the inverses of positive definite matrices, by factors L D L'."""
+    """Return the inverses of positive definite matrices, by factors L D L'; all numbers of other ones are NaN."""
     xx, xy, xt, yy, yt, tt = triangle
-    a, b = xy / xx, xt / xx
-    second, beside = yy - a * xy, yt - a * xt
+    first = _pivot(xx)
+    a, b = xy / first, xt / first
+    second, beside = _pivot(yy - a * xy), yt - a * xt
     c = beside / second
     # The first column and the last row of the inverse of L, and the inverse of D.
-    d, u, v = a * c - b, 1 / xx, 1 / second
-    w = 1 / (tt - b * xt - c * beside)
+    d, u, v = a * c - b, 1 / first, 1 / second
+    w = 1 / _pivot(tt - b * xt - c * beside)
     return u + a * a * v + d * d * w, -a * v - c * d * w, d * w, v + c * c * w, -c * w, w
+
+
+def _pivot(number: Column) -> Column:
+    """Return positive numbers, and NaN in place of others, by which Python's numbers can be divided."""
+    return chosen(number > 0, number, math.nan)
 
 
 def moved(triangle: Triangle, x: Column, y: Column) -> Triangle:

@@ -21,7 +21,7 @@ from gpusense.matching.columns import (
     values_of,
 )
 from gpusense.matching.evidence import DOUBTED, DOUBTED_PARTLY, has_rival, probability_right
-from gpusense.matching.icp import LONG_WIDTH, WIDTH, IcpPairs, points_of_line, space_of
+from gpusense.matching.icp import LONG_WIDTH, WIDTH, IcpPairs, PlacedPairs, points_of_line, space_of
 from gpusense.matching.observability import Observed, axes_of, covariance_of
 from gpusense.matching.options import MatchOptions
 from gpusense.matching.points import ScanPoints
@@ -43,7 +43,7 @@ class PairSums(NamedTuple):
 
 
 def tested(
-    device: IcpPairs, result: np.ndarray, gap: float, lever: np.ndarray, noise: np.ndarray,
+    device: PlacedPairs, result: np.ndarray, gap: float, lever: np.ndarray, noise: np.ndarray,
     levels: Sequence[MatchOptions], noisy: Column,
 ) -> PairSums:  # fmt: skip
     """Return the directions that pairs observe, by the matches' lines or, where noise may turn these, by longer lines.

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.interface.constants import MATCH_RESULT, MATCH_RULES
-from gpusense.reference.icp_match import match_pair, rules_of
+from gpusense.reference.icp_match import match_in_turns, rules_of
 
 
 def match_scans(
     flags: frozenset[str], point: np.ndarray, start: np.ndarray, line: np.ndarray, pair: np.ndarray, guess: np.ndarray,
     rules: np.ndarray, result: np.ndarray, scans: int, points: int, pairs: int, starts: int, levels: int,
+    turns: int, far: float, far_turn: float,
 ) -> None:  # fmt: skip
     """Match pairs of scans (reference, second scan, level of its rules) from guesses (x, y, theta).
 
@@ -19,9 +20,10 @@ def match_scans(
     the information (6), its part that is due to errors of the lines (6), pairs, sum of weights, weighted sum of squared
     errors, points that the other scan should see, points through which it saw, points that it did not see, and for
     blocks of 1, 2, 4 to 128 successive points the sum of squares of the blocks' sums of weighted errors (8), 0 with
-    ``thin``; the last step (3).
+    ``thin``; the last step (3). With two turns, pairs are matched again from results that are farther from their
+    guesses than ``far`` along an axis or ``far_turn``.
     """
     which, of = pair[: 3 * pairs].reshape(-1, 3), rules[: MATCH_RULES * levels].reshape(-1, MATCH_RULES)
-    for n, out in enumerate(result[: MATCH_RESULT * pairs * starts].reshape(-1, MATCH_RESULT)):
+    for n, out in enumerate(result[: MATCH_RESULT * turns * pairs * starts].reshape(-1, turns, MATCH_RESULT)):
         first, second, level = which[n // starts]
-        match_pair(point, start, line, (first, second), guess[n, :3], rules_of(of[level]), out)
+        match_in_turns(point, start, line, (first, second), guess[n, :3], rules_of(of[level]), out, far, far_turn)

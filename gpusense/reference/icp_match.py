@@ -98,8 +98,8 @@ def mutual_agreement(
 def match_pair(
     point: np.ndarray, start: np.ndarray, line: np.ndarray, pair: tuple[int, int], guess: np.ndarray,
     rules: structs.MatchRules, out: np.ndarray,
-) -> None:  # fmt: skip
-    """Match a pair (reference, second scan) from a guess, and write the result; its numbers are in icp.py."""
+) -> np.ndarray:  # fmt: skip
+    """Match a pair (reference, second scan) from a guess, write the result and return the pose; numbers: see icp.py."""
     first, second = (slice(start[scan], start[scan + 1]) for scan in pair)
     match = refine(point[first], line[first], point[second], guess, rules)
     both = mutual_agreement(point, line, first, second, match.pose, rules)
@@ -111,3 +111,20 @@ def match_pair(
     out[6:12], out[12:18] = match.information[upper], match.doubt[upper]
     weights, errors, pairs = match.numbers
     out[18:] = pairs, weights, errors, *both[1:], *match.squares, *match.moved
+    return match.pose
+
+
+def match_in_turns(
+    point: np.ndarray, start: np.ndarray, line: np.ndarray, pair: tuple[int, int], guess: np.ndarray,
+    rules: structs.MatchRules, out: np.ndarray, far: float, far_turn: float,
+) -> None:  # fmt: skip
+    """Match a pair from a guess, and with two rows of results again from its result if that is far from the guess.
+
+    It is far beyond ``far`` along an axis or ``far_turn``; otherwise the second result has 0 iterations.
+    """
+    out[1:, 4] = 0
+    for row in out:
+        pose = match_pair(point, start, line, pair, guess, rules, row)
+        if not (np.abs(pose - guess) > [far, far, far_turn]).any():
+            return
+        guess = pose

@@ -285,21 +285,37 @@ def classify(ranges: ArrayLike, scanner: Scanner) -> NDArray[np.uint8]:
     return classes(z, scanner.range_min, scanner.range_max)
 
 
+def _rounded_limits(dtype: np.dtype, range_min: float, range_max: float) -> tuple[Any, Any]:
+    """Return the limits of ranges rounded to the type of readings."""
+    with np.errstate(over="ignore"):  # range_max may exceed float16
+        return dtype.type(range_min), dtype.type(range_max)
+
+
+def limits(dtype: np.dtype, range_min: float, range_max: float) -> tuple[float, float]:
+    """Return the least reading that is a hit, and the least larger one that is none; see :func:`classify`.
+
+    Args:
+        dtype: Type of the readings.
+        range_min: Lower limit of ranges [m].
+        range_max: Upper limit of ranges [m].
+    """
+    nearest, farthest = map(float, _rounded_limits(dtype, range_min, range_max))
+    return max(nearest, math.ulp(0.0)) if range_min > 0 else nearest, farthest
+
+
 def hits(z: NDArray[np.floating], range_min: float, range_max: float) -> NDArray[np.bool]:
     """Return which readings of any shape are of the class ``HIT``; see :func:`classify`."""
     nearest: float | np.floating = range_min
     farthest: float | np.floating = range_max
     if z.dtype != np.float64:
-        with np.errstate(over="ignore"):  # range_max may exceed float16
-            nearest, farthest = z.dtype.type(range_min), z.dtype.type(range_max)
+        nearest, farthest = _rounded_limits(z.dtype, range_min, range_max)
     near_enough: NDArray[np.bool] = (z < farthest) & (z >= nearest)
     return near_enough & (z > 0) if range_min > 0 else near_enough
 
 
 def classes(z: NDArray[np.floating], range_min: float, range_max: float) -> NDArray[np.uint8]:
     """Classify readings of any shape between two ranges; see :func:`classify`."""
-    with np.errstate(over="ignore"):  # range_max may exceed float16
-        nearest, farthest = z.dtype.type(range_min), z.dtype.type(range_max)
+    nearest, farthest = _rounded_limits(z.dtype, range_min, range_max)
     too_near = (z < nearest) | (z <= 0) if range_min > 0 else z < 0
     result = np.full(z.shape, Reading.HIT, dtype=np.uint8)
     result[z >= farthest] = Reading.MAX

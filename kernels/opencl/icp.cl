@@ -14,5 +14,6 @@ kernel void match_scans(ARGUMENTS) {
     const Team team = {0};
 #endif
     if (n >= pairs * starts) return;
-    match_pair(point, start, line, pair + 3 * (n / starts), guess[n], rules, result + (long)MATCH_RESULT * n, team);
+    match_in_turns(point, start, line, pair + 3 * (n / starts), guess[n], rules, result + (long)MATCH_RESULT * turns * n,
+                   turns, far, far_turn, team);
 }

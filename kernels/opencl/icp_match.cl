@@ -87,15 +87,15 @@ real4 mutual_agreement(global const real4 *point, global const real4 *line, cons
                              inverse, rules.near, rules.gap, team);
 }
 
-// Match a pair (reference, second scan, level of its rules) from a guess, and write the result.
-void match_pair(global const real4 *point, global const int *start, global const real4 *line, global const int *pair,
+// Match a pair (reference, second scan, level of its rules) from a guess, write the result, and return the pose.
+real4 match_pair(global const real4 *point, global const int *start, global const real4 *line, global const int *pair,
                 const real4 guess, global const real *rules, global real *out, const Team team) {
     const int first = start[pair[0]], count = start[pair[0] + 1] - first;
     const int second = start[pair[1]], others = start[pair[1] + 1] - second;
     const MatchRules of = rules_of(rules, pair[2]);
     const Match match = refine(point + first, line + first, count, point + second, others, guess, of, team);
     const real4 both = mutual_agreement(point, line, first, count, second, others, match.pose, of, team);
-    if (team.member > 0) return;
+    if (team.member > 0) return match.pose;
     const real all = both.y + both.z + UNSEEN * both.w;
     out[0] = match.pose.x, out[1] = match.pose.y, out[2] = match.pose.z;
     out[3] = all > 0 ? (both.x - (real)0.5 * both.z) / all : 0;
@@ -108,4 +108,20 @@ void match_pair(global const real4 *point, global const int *start, global const
     out[21] = both.y, out[22] = both.z, out[23] = both.w;
     for (int i = 0; i < MATCH_BLOCKS; ++i) out[24 + i] = match.squares[i];
     out[32] = match.moved.x, out[33] = match.moved.y, out[34] = match.moved.z;
+    return match.pose;
+}
+
+// Match a pair from a guess, and with two turns again from its result if that is farther from the guess than a distance
+// along an axis or a turn; otherwise the second result has 0 iterations.
+void match_in_turns(global const real4 *point, global const int *start, global const real4 *line, global const int *pair,
+                    const real4 guess, global const real *rules, global real *out, const int turns, const real far,
+                    const real far_turn, const Team team) {
+    real4 from = guess;
+    if (turns > 1 && team.member == 0) out[MATCH_RESULT + 4] = 0;
+    for (int turn = 0; turn < turns; ++turn) {
+        const real4 pose = match_pair(point, start, line, pair, from, rules, out + MATCH_RESULT * turn, team);
+        const real4 off = fabs(pose - from);
+        if (!(off.x > far || off.y > far || off.z > far_turn)) return;
+        from = pose;
+    }
 }

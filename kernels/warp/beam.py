@@ -11,6 +11,7 @@ import warp as wp
 from . import compat, echo, error_free, mixture, sensor_table
 from . import ray as ray_file
 from .error_free import BLOCK_TERMS, STRANDS
+from .lanes import mixture as lane_mixture
 from .prelude import kernel, precision, reader, work_item, writer
 from .ranges import caster_of
 from .tiles import TILE_RAYS, tile_group, tile_place, tile_ray, tile_step
@@ -28,6 +29,9 @@ def make(name, flags):
     tabulated_density = sensor_table.functions(flags).tabulated_density
     compat_density = compat.functions(flags).compat_density
     SENSOR_TABLE = "SENSOR_TABLE" in flags
+    IN_LANES = "IN_LANES" in flags
+    made = lane_mixture.functions(flags) if IN_LANES else None
+    block_terms, block_of_bins = (made.block_terms, made.block_of_bins) if made else (None, None)
     CUBES = "CUBES" in flags
     log_density = mixture.functions(flags).log_density
     last_range = mixture.functions(flags).last_range
@@ -44,6 +48,7 @@ def make(name, flags):
     SCANS = "SCANS" in flags
     nearest_echo = echo.functions(flags).nearest_echo
     incidence_terms = echo.functions(flags).incidence_terms
+    block_numbers = wp.types.vector(length=BLOCK_TERMS, dtype=real)
     cell_at, pose_at, ray_at = reader(wp.vec2i), reader(vec4), reader(vec2)
     number_at, put = reader(real), writer(real)
     ZERO, ONE = real(0.0), real(1.0)
@@ -91,6 +96,15 @@ def make(name, flags):
         else:
             return log_density(z, expected, terms)
 
+    # Return the sums of a block's strands.
+    @wp.func
+    def strands_of(values: block_numbers):
+        strands = vec4(values[0], values[1], values[2], values[3])
+        strands += vec4(values[4], values[5], values[6], values[7])
+        strands += vec4(values[8], values[9], values[10], values[11])
+        strands += vec4(values[12], values[13], values[14], values[15])
+        return strands
+
     # Return the logarithm of a scan from its sum.
     @wp.func
     def scan_log(total: real):
@@ -129,41 +143,72 @@ def make(name, flags):
             scan = (n + batch.ahead) // batch.per_scan
             before, size, readings_before = readings_of_scan(scan, start, first)
             constant_term = constant_terms[scan]
+        count = int(size)
+        if SHARED_RAYS:
+            count = first[before + size] - readings_before
         total = vec2(constant_term, ZERO)
-        strands = vec4()
-        impossible = bool(False)
-        for r in range(size):
-            limit = scale.limit
-            if STOPS:
-                limit = ray_limit(number_at(reading, readings_before + r), terms, scale)
-            expected = cast_beam(
-                map_table, normals, window, cell, sensor_pose, ray, before + r, cone, limit, caster, scale
-            )
-            bin_terms = terms
-            if INCIDENCE:
-                bin_terms = incidence_terms(terms, edges, tables.incidence_bins, expected.y)
-            begin = r
-            end = r + 1
-            if SHARED_RAYS:
-                begin = first[before + r] - readings_before
-                end = first[before + r + 1] - readings_before
-            for k in range(begin, end):
-                z = number_at(reading, readings_before + k)
-                term = reading_term(z, expected.x, bin_terms, sensor, tables, scale.range_max)
-                if PER_BEAM:
-                    parts[n * readings + k] = term
-                if LINEAR:
-                    strands[k % STRANDS] = strands[k % STRANDS] + term
+        impossible = int(0)
+        z, expected, cosine, values = block_numbers(), block_numbers(), block_numbers(), block_numbers()
+        seen = vec2()
+        ray_end = int(0)
+        r = int(0)
+        k = int(0)
+        while k < count:
+            width = wp.min(count - k, BLOCK_TERMS)
+            i = int(0)
+            while i < width:
+                z[i] = number_at(reading, readings_before + k + i)
+                limit = scale.limit
+                if STOPS:
+                    limit = ray_limit(z[i], terms, scale)
+                if SHARED_RAYS:
+                    # Readings of a ray are neighbours.
+                    while ray_end <= k + i:
+                        seen = cast_beam(
+                            map_table, normals, window, cell, sensor_pose, ray, before + r, cone, limit, caster, scale
+                        )
+                        r += 1
+                        ray_end = first[before + r] - readings_before
                 else:
-                    if term == NEVER:
-                        impossible = True
-                    else:
-                        strands[k % STRANDS] = strands[k % STRANDS] + term
-                if (k + 1) % BLOCK_TERMS == 0:
-                    total = add_strands(total, strands)
-                    strands = vec4()
-        total = add_strands(total, strands)
-        if impossible:
+                    seen = cast_beam(
+                        map_table, normals, window, cell, sensor_pose, ray, before + k + i, cone, limit, caster, scale
+                    )
+                expected[i] = seen.x
+                if INCIDENCE:
+                    cosine[i] = seen.y
+                i += 1
+            if IN_LANES:
+                if INCIDENCE:
+                    values = block_of_bins(z, expected, cosine, terms, edges, tables.incidence_bins)
+                else:
+                    values = block_terms(z, expected, terms)
+            else:
+                i = int(0)
+                while i < width:
+                    bin_terms = terms
+                    if INCIDENCE:
+                        bin_terms = incidence_terms(terms, edges, tables.incidence_bins, cosine[i])
+                    values[i] = reading_term(z[i], expected[i], bin_terms, sensor, tables, scale.range_max)
+                    i += 1
+            i = int(0)
+            if PER_BEAM:
+                while i < width:
+                    parts[n * readings + k + i] = values[i]
+                    i += 1
+            i = int(width)
+            while i < BLOCK_TERMS:
+                values[i] = ZERO
+                i += 1
+            if not LINEAR:
+                i = int(0)
+                while i < BLOCK_TERMS:
+                    never = values[i] == NEVER
+                    impossible += int(never)
+                    values[i] = wp.where(never, ZERO, values[i])
+                    i += 1
+            total = add_strands(total, strands_of(values))
+            k += width
+        if impossible > 0:
             log_p[n] = NEVER
         else:
             log_p[n] = score.temperature * scan_log(total.x + total.y)

@@ -106,7 +106,8 @@ def functions(flags):
                 if INCIDENCE:
                     r = make_ray(pose, ray[i])
                     normal = hit_normal(normals, window, cell, r, t)
-                    known = not wp.isnan(normal.x)
+                    # A comparison, since compilers of processors call isnan.
+                    known = normal.x == normal.x
                     cosine = wp.where(known, wp.abs(r.direction.x * normal.x + r.direction.y * normal.y), ONE)
                     if cosine >= cone.critical:
                         echo.t = t

@@ -12,6 +12,7 @@ from . import end_point as end_points
 from . import error_free, field_term
 from .end_point import field_cell
 from .error_free import BLOCK_TERMS
+from .lanes import field_term as lane_field_term
 from .prelude import kernel, precision, reader, work_item
 
 # Particles per work-group of field_blocks.
@@ -39,12 +40,9 @@ def make(name, flags):
     WHOLE_BLOCK, HALF_BLOCK = 16, 8
     number_at, cell_at, point_at, pose_at = reader(real), reader(wp.vec2i), reader(vec2), reader(vec4)
     two_at = reader(vec2, 2)
-    EXACT_EXPONENT = "EXACT_EXPONENT" in flags
-    STAGED = "BILINEAR" in flags and "ALL_READINGS" not in flags
-    four_distances, interpolated = made.four_distances, made.interpolated
-    field_exponent, log_of_exponent = made.field_exponent, made.log_of_exponent
-    EndPoint = ends.EndPoint
-    block_numbers = wp.types.vector(length=BLOCK_TERMS, dtype=real)
+    IN_LANES = "IN_LANES" in flags
+    staged = lane_field_term.functions(flags)
+    block_exponents, block_logs = staged.block_exponents, staged.block_logs
     block_cells = wp.types.vector(length=BLOCK_TERMS, dtype=wp.int32)
 
     # Return the sum of the readings from begin to end by rounded cells, again with more digits where an end point is
@@ -110,66 +108,28 @@ def make(name, flags):
     def staged_sum(
         table: wp.array(dtype=real), origin: wp.vec2i, sensor_pose: vec4, sensor_low: vec4, point: wp.array(dtype=vec2),
         point_low: wp.array(dtype=vec2), terms: wp.array(dtype=real), parts: wp.array(dtype=real), window: types.Window,
-        begin: wp.int32, size: wp.int32, first_part: wp.int32, guard: real, before: vec2,
+        begin: wp.int32, size: wp.int32, first_part: wp.int32, before: vec2,
     ):  # fmt: skip
         total = before
+        filled = wp.min(size, BLOCK_TERMS)
         k = int(0)
-        rest_x, rest_y, next_x, next_y = block_numbers(), block_numbers(), block_numbers(), block_numbers()
-        rest_x_low, rest_y_low = block_numbers(), block_numbers()
-        next_x_low, next_y_low = block_numbers(), block_numbers()
-        a, b, c, d = block_numbers(), block_numbers(), block_numbers(), block_numbers()
-        exponent, exponent_low = block_numbers(), block_numbers()
-        cols, rows = block_cells(), block_cells()
         while k < size:
-            first = begin + k
-            width = wp.min(size - k, BLOCK_TERMS)
-            i = int(0)
-            while i < width:
-                to_low = vec2()
-                if TWO_PART_POINTS:
-                    to_low = point_at(point_low, first + i)
-                end = end_point(sensor_pose, sensor_low, point_at(point, first + i), to_low, HALF, guard)
-                cols[i] = end.cell.x
-                rows[i] = end.cell.y
-                rest_x[i] = end.rest_x.x
-                rest_y[i] = end.rest_y.x
-                next_x[i] = end.to_next_x.x
-                next_y[i] = end.to_next_y.x
-                if EXACT_EXPONENT:
-                    rest_x_low[i] = end.rest_x.y
-                    rest_y_low[i] = end.rest_y.y
-                    next_x_low[i] = end.to_next_x.y
-                    next_y_low[i] = end.to_next_y.y
-                i += 1
-            i = int(0)
-            while i < width:
-                four = four_distances(table, origin + wp.vec2i(cols[i], rows[i]), window)
-                a[i] = four.x
-                b[i] = four.y
-                c[i] = four.z
-                d[i] = four.w
-                i += 1
-            i = int(0)
-            while i < width:
-                at = EndPoint()
-                at.rest_x = vec2(rest_x[i], rest_x_low[i])
-                at.rest_y = vec2(rest_y[i], rest_y_low[i])
-                at.to_next_x = vec2(next_x[i], next_x_low[i])
-                at.to_next_y = vec2(next_y[i], next_y_low[i])
-                parts_of = field_exponent(interpolated(vec4(a[i], b[i], c[i], d[i]), at), terms)
-                exponent[i] = parts_of.x
-                exponent_low[i] = parts_of.y
-                i += 1
+            # The last block begins with readings of the one before it, so that all have as many.
+            lead = k - wp.min(k, size - filled)
+            exponent, exponent_low = block_exponents(
+                table, origin, sensor_pose, sensor_low, point, point_low, terms, window, begin + k - lead, filled
+            )
+            values = block_logs(exponent, exponent_low, terms)
             block = ZERO
-            i = int(0)
-            while i < width:
-                term = log_of_exponent(vec2(exponent[i], exponent_low[i]), terms)
+            i = int(lead)
+            while i < filled:
+                term = values[i]
                 if PER_BEAM:
-                    parts[first_part + k + i] = term
+                    parts[first_part + k + i - lead] = term
                 block += term
                 i += 1
             total = add_term(total, block)
-            k += width
+            k += BLOCK_TERMS
         return total
 
     # Score scans: one work-item takes a particle.
@@ -232,10 +192,10 @@ def make(name, flags):
                     i += 1
                 total = add_term(total, block)
                 k += width
-        elif STAGED:
+        elif IN_LANES:
             total = staged_sum(
                 table, origin, sensor_pose, sensor_low, point, point_low, terms, parts, window, begin, size,
-                n * readings, guard, total,
+                n * readings, total,
             )  # fmt: skip
         else:
             while k < size:

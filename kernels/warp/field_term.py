@@ -45,16 +45,6 @@ def functions(flags):
         else:
             return vec2(weight_a.x * a.x + weight_b.x * b.x, ZERO)
 
-    # Return the distances of the four cell centres around an end point.
-    @wp.func
-    def four_distances(table: wp.array(dtype=real), cell: wp.vec2i, window: types.Window):
-        return vec4(
-            number_at(table, field_cell(cell.x, cell.y, window)),
-            number_at(table, field_cell(cell.x + 1, cell.y, window)),
-            number_at(table, field_cell(cell.x, cell.y + 1, window)),
-            number_at(table, field_cell(cell.x + 1, cell.y + 1, window)),
-        )
-
     # Interpolate between four distances, in two parts.
     @wp.func
     def interpolated(four: vec4, end: EndPoint):
@@ -65,7 +55,13 @@ def functions(flags):
     # Interpolate the distance between the four cell centres around an end point, in two parts.
     @wp.func
     def bilinear(table: wp.array(dtype=real), cell: wp.vec2i, end: EndPoint, window: types.Window):
-        return interpolated(four_distances(table, cell, window), end)
+        four = vec4(
+            number_at(table, field_cell(cell.x, cell.y, window)),
+            number_at(table, field_cell(cell.x + 1, cell.y, window)),
+            number_at(table, field_cell(cell.x, cell.y + 1, window)),
+            number_at(table, field_cell(cell.x + 1, cell.y + 1, window)),
+        )
+        return interpolated(four, end)
 
     # Return the exponent of a normal in two parts, since for a high peak exponent and log peak nearly cancel.
     # terms[8] = {hit, 1 / (2 sigma^2), rand, log z_max, the low parts of terms 0 and 1, two numbers of the shape of a
@@ -83,11 +79,12 @@ def functions(flags):
     def field_exponent(distance: vec2, terms: wp.array(dtype=real)):
         return shape_exponent(field_square(distance, terms), terms[6], terms[7])
 
-    # Return log p of the exponent of the density of a hit.
+    # Return log p of the distance from an end point to the nearest obstacle.
     if LINEAR:
 
         @wp.func
-        def log_of_exponent(exponent: vec2, terms: wp.array(dtype=real)):
+        def log_field(distance: vec2, terms: wp.array(dtype=real)):
+            exponent = field_exponent(distance, terms)
             p = terms[2]
             if HIT:
                 p += terms[0] * wp.exp(-exponent.x) * (ONE - exponent.y)
@@ -96,18 +93,14 @@ def functions(flags):
     else:
 
         @wp.func
-        def log_of_exponent(exponent: vec2, terms: wp.array(dtype=real)):
+        def log_field(distance: vec2, terms: wp.array(dtype=real)):
+            exponent = field_exponent(distance, terms)
             hit = (terms[0] - exponent.x) + (terms[4] - exponent.y)
             if RAND:
                 # The larger of two exponentials is 1.
                 return wp.max(hit, terms[2]) + wp.log(ONE + wp.exp(-wp.abs(hit - terms[2])))
             else:
                 return hit
-
-    # Return log p of the distance from an end point to the nearest obstacle.
-    @wp.func
-    def log_field(distance: vec2, terms: wp.array(dtype=real)):
-        return log_of_exponent(field_exponent(distance, terms), terms)
 
     # Return the term of one reading. The table holds log densities, or cubes of densities (CUBES), or, where it is
     # interpolated, capped distances in metres.

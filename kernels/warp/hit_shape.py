@@ -61,18 +61,27 @@ def functions(flags):
         else:
             return ZERO
 
-    # Return the mass between the mean and a distance; the table begins at a place of the terms.
+    # Return the place of a distance in the table of masses, in cells.
     @wp.func
-    def half_mass(b: real, terms: wp.array(dtype=real), place: wp.int32):
-        at = log_one_plus(b) * TABLE_PER_LOG
+    def mass_place(b: real):
+        return log_one_plus(b) * TABLE_PER_LOG
+
+    # Return the mass between the mean and a place of the table, which begins at index begin of the terms.
+    @wp.func
+    def mass_at(at: real, terms: wp.array(dtype=real), begin: wp.int32):
         if not at < real(TABLE_CELLS):
             return HALF
         cell = wp.int32(at)
         share = at - real(cell)
-        first = place + cell * TABLE_POWERS
+        first = begin + cell * TABLE_POWERS
         mass = number_at(terms, first + TABLE_POWERS - 1)
         for i in range(TABLE_POWERS - 1):
             mass = mass * share + number_at(terms, first + TABLE_POWERS - 2 - i)
         return mass
+
+    # Return the mass between the mean and a distance; the table begins at a place of the terms.
+    @wp.func
+    def half_mass(b: real, terms: wp.array(dtype=real), place: wp.int32):
+        return mass_at(mass_place(b), terms, place)
 
     return SimpleNamespace(**locals())

@@ -12,19 +12,22 @@ from .prelude import kernel, work_item
 @functools.cache
 def make(name, flags):
     """Make a kernel of the file for a set of flags."""
-    match_pair = icp_match.functions(flags).match_pair
+    match_in_turns = icp_match.functions(flags).match_in_turns
     TEAM = icp_step.functions(flags).TEAM
 
     # Match scans: a work-item, or with IN_TEAMS a team of them, takes a pair (reference, second scan, level of its
     # rules) and a guess (x, y, theta), the pose of the second scan in the reference's frame. With one_way the
     # reference's points do not count in the score.
     @kernel(flags)
-    def match_scans(point, start, line, pair, guess, rules, result, scans, points, pairs, starts, levels):
+    def match_scans(
+        point, start, line, pair, guess, rules, result, scans, points, pairs, starts, levels, turns, far, far_turn
+    ):  # fmt: skip
         item = work_item(wp.tid())
         n = item // TEAM
         if n < pairs * starts:
-            match_pair(
-                point, start, line, pair, 3 * (n // starts), guess[n], rules, result, n * MATCH_RESULT, item - n * TEAM
-            )
+            match_in_turns(
+                point, start, line, pair, 3 * (n // starts), guess[n], rules, result, n * MATCH_RESULT * turns, turns,
+                far, far_turn, item - n * TEAM,
+            )  # fmt: skip
 
     return locals()[name]

@@ -137,8 +137,8 @@ def functions(flags):
                 )
         return both
 
-    # Match a pair (reference, second scan, level of its rules), which is numbers from which on, from a guess, and write
-    # the result from out on.
+    # Match a pair (reference, second scan, level of its rules), which is numbers from which on, from a guess, write the
+    # result from out on, and return the pose.
     @wp.func
     def match_pair(
         point: wp.array(dtype=vec4), start: wp.array(dtype=wp.int32), line: wp.array(dtype=vec4),
@@ -155,7 +155,7 @@ def functions(flags):
         )
         both = mutual_agreement(point, line, first, count, second, others, pose, of, member)
         if member > 0:
-            return
+            return pose
         everything = both.y + both.z + UNSEEN * both.w
         score = real(0.0)
         if everything > ZERO:
@@ -180,5 +180,30 @@ def functions(flags):
         result[out + 32] = moved.x
         result[out + 33] = moved.y
         result[out + 34] = moved.z
+        return pose
+
+    # Match a pair from a guess, and with two turns again from its result if that is farther from the guess than a
+    # distance along an axis or a turn; otherwise the second result has 0 iterations.
+    @wp.func
+    def match_in_turns(
+        point: wp.array(dtype=vec4), start: wp.array(dtype=wp.int32), line: wp.array(dtype=vec4),
+        pair: wp.array(dtype=wp.int32), which: wp.int32, guess: vec4, rules: wp.array(dtype=real),
+        result: wp.array(dtype=real), out: wp.int32, turns: wp.int32, far: real, far_turn: real, member: wp.int32,
+    ):  # fmt: skip
+        start_pose = guess
+        turn = int(0)
+        if turns > 1 and member == 0:
+            result[out + MATCH_RESULT + 4] = ZERO
+        while turn < turns:
+            pose = match_pair(
+                point, start, line, pair, which, start_pose, rules, result, out + MATCH_RESULT * turn, member
+            )
+            x = wp.abs(pose.x - start_pose.x)
+            y = wp.abs(pose.y - start_pose.y)
+            turned = wp.abs(pose.z - start_pose.z)
+            turn += 1
+            if not (x > far or y > far or turned > far_turn):
+                turn = turns
+            start_pose = pose
 
     return SimpleNamespace(**locals())

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import error_free
+from .lanes import math as lane_math
 from .prelude import fuses_on_gpu, log1p_of_gpu, precision
 
 
@@ -19,6 +20,7 @@ def functions(flags):
     real, vec2 = types.real, types.vec2
     gpu_log1p = log1p_of_gpu(real)
     pair_product = error_free.functions(flags).pair_product
+    log = lane_math.functions(flags).log_lanes if "IN_LANES" in flags else wp.log
     ZERO, ONE = real(0.0), real(1.0)
     LARGEST_ROOT = real(1e140 if "FLOAT64" in flags else 1e17)
 
@@ -36,7 +38,7 @@ def functions(flags):
         if fuses_on_gpu():
             return gpu_log1p(x)
         more = ONE + x
-        return wp.log(more) + (x - (more - ONE)) / more
+        return log(more) + (x - (more - ONE)) / more
 
     # Return the log of the sum of two probabilities, from their logs; -inf only where both are 0.
     @wp.func

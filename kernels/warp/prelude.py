@@ -23,6 +23,10 @@ OPTIONS = {"fuse_fp": False, "fast_math": False, "enable_backward": False}
 # it.
 _ONE_EACH = {"grid_stride": False} if "grid_stride" in inspect.signature(wp.kernel).parameters else {}
 
+# Decorator of functions that stay calls, where this version of Warp can do so: their numbers occupy no registers
+# of the loops of their caller, and they are compiled once.
+apart = functools.partial(wp.func, inline=False) if "inline" in inspect.signature(wp.func).parameters else wp.func
+
 _module = wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS, **_ONE_EACH)
 
 

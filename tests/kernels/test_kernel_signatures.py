@@ -62,7 +62,7 @@ def test_a_kernel_without_a_row_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
         source_text("ranges")
 
 
-def test_twenty_kernels_have_a_second_body_in_lanes() -> None:
+def test_twenty_one_kernels_have_a_second_body_in_lanes() -> None:
     lanes = frozenset({"IN_LANES"})
     programs = {
         row.file: assemble(row.file, lanes) for row in KERNELS.values() if "IN_LANES" in relevant(row.file, lanes)
@@ -77,6 +77,7 @@ def test_twenty_kernels_have_a_second_body_in_lanes() -> None:
         "fit_lines",
         "match_scans",
         "move_particles",
+        "place_pair",
         "place_poses",
         "score_beacons",
         "score_beams",

@@ -1,4 +1,4 @@
-"""Functions of kernels/opencl/lanes/math.cl against float64, in ulps of float32, and the source of their constants."""
+"""Functions of lanes/math in OpenCL and Warp against more digits, in ulps, and the source of their constants."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy import special
 from support.bench_scripts import derived
 
 from gpusense.evaluation.tolerances import TOLERANCES
-from gpusense.interface.kernel_files import opencl_source
+from gpusense.interface.kernel_files import opencl_source, warp_module
 from gpusense.interface.signatures import LANES
 from gpusense.interface.sources import prelude, resolve
 
@@ -44,37 +44,85 @@ def evaluate(needs):
     from gpusense.backends import get_backend
 
     backend = get_backend(selection)
-    files = [resolve(opencl_source(name), frozenset(), name) for name in ("lanes/types", "lanes/math")]
     context = backend._context
     queue = cl.CommandQueue(context)
 
     def run(function: str, numbers: np.ndarray) -> np.ndarray:
+        double = numbers.dtype == np.float64
+        flags, lanes = frozenset({"FLOAT64"} if double else ()), LANES // 2 if double else LANES
+        files = [resolve(opencl_source(name), flags, name) for name in ("lanes/types", "lanes/math")]
         kernel = (
-            "kernel void each(global const float *in, global float *out) {\n"
+            "kernel void each(global const real *in, global real *out) {\n"
             f"    store_lanes({function}(load_lanes(get_global_id(0), in)), get_global_id(0), out);\n}}\n"
         )
-        source = prelude(float64=False) + "".join(files) + kernel
+        source = prelude(float64=double) + "".join(files) + kernel
         program = backend._built(cl.Program(context, source))
-        flags = cl.mem_flags.COPY_HOST_PTR
-        given = cl.Buffer(context, cl.mem_flags.READ_ONLY | flags, hostbuf=numbers)
+        given = cl.Buffer(context, cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR, hostbuf=numbers)
         made, found = cl.Buffer(context, cl.mem_flags.WRITE_ONLY, numbers.nbytes), np.empty_like(numbers)
-        program.each(queue, (len(numbers) // LANES,), None, given, made)
+        program.each(queue, (len(numbers) // lanes,), None, given, made)
         cl.enqueue_copy(queue, found, made)
         return found
 
     return run
 
 
+@pytest.fixture
+def evaluate_warp(needs):
+    """Return a function that evaluates a function of Warp's file at every number of an array, on the processor."""
+    needs("warp")
+    import warp as wp
+
+    lanes = warp_module("lanes.math")
+    exp, one_minus_exp, log, erf = (getattr(lanes, name) for name in FUNCTIONS)
+
+    def each(given, found):
+        i = wp.tid()
+        found[0, i] = exp(given[i])
+        found[1, i] = one_minus_exp(given[i])
+        found[2, i] = log(given[i])
+        found[3, i] = erf(given[i])
+
+    each.__annotations__ = dict(given=wp.array(dtype=wp.float32), found=wp.array2d(dtype=wp.float32))
+    kernel = wp.kernel(module="unique", enable_backward=False, module_options=dict(fuse_fp=False))(each)
+
+    def run(function: str, numbers: np.ndarray) -> np.ndarray:
+        found = wp.empty((len(FUNCTIONS), len(numbers)), dtype=wp.float32, device="cpu")
+        wp.launch(kernel, len(numbers), [wp.array(numbers, dtype=wp.float32, device="cpu"), found], device="cpu")
+        return found.numpy()[list(FUNCTIONS).index(function)]
+
+    return run
+
+
+@pytest.fixture(params=["opencl", "warp"])
+def in_either(request):
+    """Return ``evaluate`` or ``evaluate_warp``."""
+    return request.getfixturevalue("evaluate" if request.param == "opencl" else "evaluate_warp")
+
+
 @pytest.mark.parametrize("function", FUNCTIONS)
-def test_errors_in_ulps(function, evaluate):
+def test_errors_in_ulps(function, in_either):
     numbers, exact = FUNCTIONS[function]
     truth = exact(numbers.astype(np.float64))
     ulp = np.spacing(np.abs(truth).astype(np.float32)).astype(np.float64)
-    off = np.abs(evaluate(function, numbers) - truth) / ulp
+    off = np.abs(in_either(function, numbers) - truth) / ulp
     worst = int(np.argmax(off))
     print(f"{function}: {off[worst]:.3f} ulp at {numbers[worst]!r}")
     row = "erf in lanes" if function == "erf_lanes" else "exp, 1 - exp and log in lanes"
     assert off[worst] <= TOLERANCES[row].value
+
+
+def test_one_minus_exp_of_float64_is_within_5_ulp(evaluate):
+    a = -np.concatenate([np.geomspace(1e-30, 40.0, 3000), np.linspace(0.2, 0.3, 1000)])
+    found = evaluate("one_minus_exp_lanes", a)
+    with mp.workdps(40):
+        exact = [-mp.expm1(mp.mpf(each)) for each in a.tolist()]
+        off = [
+            abs(float((mp.mpf(one) - truth) / mp.mpf(np.spacing(float(truth)))))
+            for one, truth in zip(found.tolist(), exact, strict=True)
+        ]
+    print(f"one_minus_exp_lanes: {max(off):.3f} ulp at {a[int(np.argmax(off))]!r}")
+    assert max(off) <= 5
+    assert evaluate("one_minus_exp_lanes", np.resize([0.0, -800.0, -np.inf], LANES // 2))[:3].tolist() == [0, 1, 1]
 
 
 def test_arc_rest_is_below_a_fifth_of_the_last_bit(evaluate):
@@ -95,13 +143,13 @@ def test_the_log_of_erfc_is_within_two_eps(evaluate):
     assert off.max() <= 2
 
 
-def test_ends(evaluate):
+def test_ends(in_either):
     """Check exact values, far arguments, and that no value depends on a neighbour."""
 
     def at(function: str, *numbers: float) -> list[float]:
         given = np.resize(np.array(numbers, np.float32), LANES)
-        alone = [evaluate(function, np.full(LANES, number, np.float32))[0] for number in given[: len(numbers)]]
-        together = evaluate(function, given)[: len(numbers)].tolist()
+        alone = [in_either(function, np.full(LANES, number, np.float32))[0] for number in given[: len(numbers)]]
+        together = in_either(function, given)[: len(numbers)].tolist()
         assert together == [float(value) for value in alone]
         return together
 
@@ -123,3 +171,14 @@ def test_constants_are_those_that_were_derived():
     defined = re.findall(r"^#define (\w+) (\S+)f$", text, re.MULTILINE)
     found = {name: float(np.float32(value)) for name, value in defined}
     assert {name: found[name] for name in expected} == expected
+
+
+def test_constants_of_warp_are_those_of_opencl(needs):
+    needs("warp")
+    defined = re.findall(r"^#define (\w+) (\S+?)f?$", opencl_source("lanes/math"), re.MULTILINE)
+    lanes = vars(warp_module("lanes.math"))
+    both = {name: value for name, value in defined if name in lanes}
+    assert {f"{letter}{i}" for letter, last in (("E", 4), ("L", 7), ("W", 8)) for i in range(last + 1)} < both.keys()
+    for name, value in both.items():
+        number = int(value, 16) if value.startswith("0x") else np.float32(value)
+        assert type(number)(lanes[name].value) == number, name

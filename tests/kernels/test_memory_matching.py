@@ -63,8 +63,11 @@ for width in sorted(set(lanes)):
     both[0].info = dataclasses.replace(before, lanes=width)
     for real in ("float32", "float64"):
         agree(lambda one: gs.match_scan(ranges, second, scanner, np.zeros((3, 3)), "icp", one, precision=real).pose)
+        both[0].info = dataclasses.replace(both[0].info, kind="cpu")
         lone = gs.match_scan(ranges[0], np.full(41, np.inf), scanner, backend=both[0], precision=real)
         wrong += lone.status != "few points"
+        agree(lambda one: gs.match_scan(ranges[2], second[2], scanner, np.zeros(3), "icp", one, precision=real).pose)
+        both[0].info = dataclasses.replace(both[0].info, kind=before.kind)
     for part in range(3):
         agree(lambda one: gs.LikelihoodFieldModel(grid, scanner, field, backend=one).gradient(many, ranges[0])[part],
               rtol=1e-3, atol=1e-2)

@@ -54,6 +54,7 @@ KERNELS_ONLY, REFERENCE_ONLY = (OPENCL, WARP), (NUMPY,)
 
 ON_PURPOSE = [
     Purpose("beam", "readings_of_scan", (WARP, NUMPY), "OpenCL moves pointers to a scan's beginning"),
+    Purpose("beam", "strands_of", (WARP,), STAGES),
     Purpose("beam", "sum_terms", REFERENCE_ONLY, ARRAYS),
     Purpose("bits", "lowest_bit highest_bit", KERNELS_ONLY, "the reference unpacks words to bool"),
     Purpose("bits", "unpacked", REFERENCE_ONLY, "the reference unpacks words to bool"),
@@ -72,9 +73,10 @@ ON_PURPOSE = [
     Purpose("field", "staged_sum", (WARP,), STAGES),
     Purpose("field_gradient", "add_slope", KERNELS_ONLY, "readings come one after another"),
     Purpose("field_term", "quick_value careful_value", KERNELS_ONLY, QUICK),
-    Purpose("field_term", "four_distances interpolated log_of_exponent", (WARP,), STAGES),
+    Purpose("field_term", "interpolated", (WARP,), STAGES),
     Purpose("heading", "cos_sin_of", (OPENCL,), LANES),
     Purpose("heading", "two_sum_float64 high_half_float64 pair_product_float64", (OPENCL,), FLOAT64),
+    Purpose("hit_shape", "mass_place mass_at", (WARP,), STAGES),
     Purpose("icp_step", "add_to_blocks close_blocks", KERNELS_ONLY, "points come one after another"),
     Purpose("icp_step", "cooperates", (WARP,), "OpenCL's processors have teams as well"),
     Purpose("icp_step", "log_share add_over_team add_joint_blocks", KERNELS_ONLY, TEAMS),
@@ -85,6 +87,7 @@ ON_PURPOSE = [
     ),
     Purpose("landmark_grid", "candidates", REFERENCE_ONLY, ARRAYS),
     Purpose("landmarks", "negative_where at_places", REFERENCE_ONLY, ARRAYS),
+    Purpose("line_fit", "line_at", KERNELS_ONLY, ARRAYS),
     Purpose("motion", "any_of motion_of move_by", (OPENCL,), LANES),
     Purpose("passages", "floor_of", (OPENCL,), FLOOR),
     Purpose("passages", "walkers", (WARP,), "OpenCL has get_local_size"),

@@ -75,3 +75,18 @@ def test_one_ratio_has_the_noise_that_it_has_among_others():
     ratios = np.concatenate([[0.0, np.inf, np.nan, 1e-300], np.random.default_rng(6).uniform(0, 1.1, 2000)])
     alone = np.array([noise_of(ratio) for ratio in ratios.tolist()])
     np.testing.assert_array_equal(alone.T, noise_of(ratios))
+
+
+@pytest.mark.parametrize("count", [1, 40])
+def test_the_inverse_of_a_matrix_that_is_not_definite_is_nan(count):
+    """Zero, singular, indefinite and negative ones, alone and among definite ones."""
+    others = np.array([np.zeros((3, 3)), np.ones((3, 3)), np.diag([1.0, 1.0, 0.0]), np.diag([1.0, 0.0, 1.0]),
+                       np.diag([0.0, 1.0, 1.0]), np.diag([1.0, -1.0, 1.0]), np.diag([1.0, 1.0, -2.0]), -np.eye(3),
+                       np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]])])  # fmt: skip
+    for other in others:
+        matrices = drawn(count)
+        matrices[count // 2] = other
+        with np.errstate(all="raise"):
+            inverse = matrices_of(inverse_of(triangle_of(matrices)))
+        assert np.isnan(inverse[count // 2]).all()
+        assert np.isfinite(np.delete(inverse, count // 2, axis=0)).all()

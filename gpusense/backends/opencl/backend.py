@@ -105,7 +105,7 @@ class OpenCLBackend(ProcessBound, Backend):
             if isinstance(buffer, SHARED):
                 if self._ended != self._queued:
                     self.synchronize()
-                buffer.bytes[: array.nbytes] = array.reshape(-1).view(np.uint8)
+                buffer.view[: array.nbytes] = array.data.cast("B")
                 return buffer
             if self._staging is not None and self._staging.upload(array, buffer):
                 return buffer
@@ -117,7 +117,7 @@ class OpenCLBackend(ProcessBound, Backend):
     def refill(self, array: np.ndarray, buffer: Buffer) -> None:
         """See Backend.refill; shared memory needs no wait."""
         if isinstance(buffer, SHARED):
-            buffer.bytes[: array.nbytes] = array.reshape(-1).view(np.uint8)
+            buffer.view[: array.nbytes] = array.data.cast("B")
         else:
             self.upload(array, buffer, wait=False)
 
@@ -161,7 +161,7 @@ class OpenCLBackend(ProcessBound, Backend):
             if isinstance(buffer, SHARED):
                 if self._ended != self._queued:
                     self.synchronize()
-                out.reshape(-1).view(np.uint8)[:] = buffer.bytes[: out.nbytes]
+                out.data.cast("B")[:] = buffer.view[: out.nbytes]
                 return out
             if self._staging is not None and self._staging.download(buffer, out):
                 return out

@@ -26,6 +26,7 @@ class SharedBuffer(cl.SVMAllocation):
 
     Attributes:
         bytes: The memory as an array of the host.
+        view: The same, for copies: assignments of slices take a third of the time of an array's.
     """
 
     def __init__(self, context: cl.Context, size: int, settle: Callable[[], None]) -> None:
@@ -33,6 +34,7 @@ class SharedBuffer(cl.SVMAllocation):
         super().__init__(context, size, _ALIGNMENT, flags)
         # By address: an attribute that is a view of this object would be a cycle.
         self.bytes: np.ndarray = np.ctypeslib.as_array((ctypes.c_uint8 * size).from_address(self.svm_ptr))
+        self.view = self.bytes.data
         self._settle = settle
 
     def __del__(self, run: Callable[[Callable[[], object]], None] = undisturbed) -> None:
@@ -48,10 +50,12 @@ class SharedPart(cl.SVM):  # type: ignore[type-arg]
 
     Attributes:
         bytes: The memory as an array of the host.
+        view: See SharedBuffer.
     """
 
     def __init__(self, whole: SharedBuffer | SharedPart, first: int, size: int) -> None:
         self.bytes: np.ndarray = whole.bytes[first : first + size]
+        self.view = self.bytes.data
         super().__init__(self.bytes)
         self._whole = whole
 

@@ -23,10 +23,18 @@ KERNELS: dict[str, Kernel] = {
         "int chosen", "int reach", "int most", "real ratio", "real slack", "real width", "real gap", in_lanes=True,
         lanes_group=8,
     ),
+    "place_pair": kernel(
+        "scan_pair", "item", "double reading [2 * beams]", "double beam [4 * beams]", "double weight [2 * padded]",
+        "double level [2 * levels]", "out double work [4 * padded]", "out real4 point [2 * beams]",
+        "out real4 line [2 * beams]", "out int start [3]", "out int pair [3]", "out double summary [5]", "int beams",
+        "int places", "int padded", "int step", "double nearest", "double farthest", "int levels", "int assumed",
+        "int coarse", "int strides", "int reach", "int most", "real ratio", "real width", "real gap", group=1,
+    ),
     "match_scans": kernel(
         "icp", "item", *_POINTS, "real4 line [points]", "int pair [3 * pairs]", "real4 guess [pairs * starts]",
-        f"real rules [{MATCH_RULES} * levels]", f"out real result [{MATCH_RESULT} * pairs * starts]", "int scans",
-        "int points", "int pairs", "int starts", "int levels", group=4, team=256,
+        f"real rules [{MATCH_RULES} * levels]", f"out real result [{MATCH_RESULT} * turns * pairs * starts]",
+        "int scans", "int points", "int pairs", "int starts", "int levels", "int turns", "real far", "real far_turn",
+        group=4, team=256,
     ),
     "pool_scores": kernel(
         "search", "col line image", _CELLS,

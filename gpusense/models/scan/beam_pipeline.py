@@ -10,7 +10,7 @@ from gpusense.backends.base import Buffer
 from gpusense.backends.workspace import Workspace
 from gpusense.interface.constants import BLOCK_TERMS, strands_in
 from gpusense.interface.flags import flags_if
-from gpusense.interface.lanes import with_lanes_flag
+from gpusense.interface.lanes import with_lanes_flag, with_loops_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.interface.structs import MixtureTables
 from gpusense.models.poses import PlacedPoses
@@ -126,7 +126,8 @@ class BeamPipeline(ScanPipeline):
             flags -= {"STOPS"}
         if tiled:
             return flags
-        return with_lanes_flag(self.backend.info.lanes, "score_beams", flags | flags_if(PER_BEAM=per_beam))
+        info, flags = self.backend.info, flags | flags_if(PER_BEAM=per_beam)
+        return with_loops_flag(info.vector_loops, "score_beams", with_lanes_flag(info.lanes, "score_beams", flags))
 
     def layout(self, readings: Readings, flags: frozenset[str]) -> tuple[int, int]:
         if "STRANDED" in flags:

@@ -42,15 +42,22 @@ class BeamChoice:
         return BeamChoice(columns, len(columns), False)
 
     @functools.cached_property
-    def _steps(self) -> np.ndarray:
-        """(most,) numbers of the readings that are used."""
-        return np.arange(self.most)
+    def _even(self) -> dict[int, np.ndarray]:
+        """Evenly chosen places among a number of places, by this number."""
+        return {}
 
     def used(self, informative: np.ndarray) -> np.ndarray:
         """Return which of the informative readings of a scan are used."""
-        places = self.columns.compress(informative.take(self.columns))
-        if len(places) > self.most:
-            places = places.take((self._steps * len(places)) // max(self.most, 1))
+        if len(self.columns) == len(informative):
+            places = informative.nonzero()[0]
+        else:
+            places = self.columns.compress(informative.take(self.columns))
+        count = len(places)
+        if count > self.most:
+            chosen = self._even.get(count)
+            if chosen is None:
+                chosen = self._even[count] = (np.arange(self.most) * count) // max(self.most, 1)
+            places = places.take(chosen)
         used = np.zeros(len(informative), bool)
         used[places] = True
         return used
@@ -58,9 +65,10 @@ class BeamChoice:
     def among(self, hit: np.ndarray, far: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return which of the ranges and of the informative max readings of (S, K) scans are used."""
         informative = hit | far
-        used = np.empty_like(informative)
-        for row, each in zip(used, informative, strict=True):
-            row[:] = self.used(each)
+        if len(informative) == 1:
+            used = self.used(informative[0])[None]
+        else:
+            used = np.stack([self.used(each) for each in informative])
         return hit & used, far & used
 
 

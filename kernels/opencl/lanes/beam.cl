@@ -16,9 +16,9 @@ lanes ray_limit_lanes(const lanes z, global const real *terms, const RangeScale 
 }
 
 // Return the components of the terms of readings in the sum; bin_at becomes where the terms of their bins begin.
-DensityParts reading_parts_lanes(const lanes z, const EchoLanes echo, global const real *terms, global const real *edges,
-                                 global const real *sensor, const MixtureTables tables, const RangeScale scale,
-                                 ilanes *bin_at) {
+INLINE DensityParts reading_parts_lanes(const lanes z, const EchoLanes echo, global const real *terms,
+                                        global const real *edges, global const real *sensor, const MixtureTables tables,
+                                        const RangeScale scale, ilanes *bin_at) {
     const lanes expected = range_lanes(echo.t, scale);
     *bin_at = 0;
 #if INCIDENCE

@@ -20,3 +20,6 @@ lanes rest_lanes(const lanes a, const lanes b, const lanes c) {
     const LanePair product = two_product_lanes(a, b);
     return (c - product.hi) - product.lo;
 }
+
+// Return a b + c, rounded once where the device has a fused multiply-add.
+lanes multiply_add_lanes(const lanes a, const lanes b, const lanes c) { return FUSES ? fma(a, b, c) : a * b + c; }

@@ -88,12 +88,13 @@ kernel void score_field(ARGUMENTS) {
             total[v] = sum;
         }
     }
-    for (int i = 0; i < count; ++i) {
-        const real high = ((const real *)total)[i];
 #if CUBES
-        log_p[begin + i] = score.temperature * log(high + ((const real *)total_low)[i]);
+    for (int i = 0; i < count; ++i)
+        log_p[begin + i] = score.temperature * log(((const real *)total)[i] + ((const real *)total_low)[i]);
 #else
-        log_p[begin + i] = isinf(high) ? high : score.temperature * (high + ((const real *)total_low)[i]);
-#endif
+    for (int v = 0; v * LANES < count; ++v) {
+        const lanes high = total[v], sum = score.temperature * (high + total_low[v]);
+        store_some(high - high == 0 ? sum : high, log_p + begin + v * LANES, count - v * LANES);
     }
+#endif
 }

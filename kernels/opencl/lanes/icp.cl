@@ -7,5 +7,6 @@ kernel void match_scans(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= pairs * starts) return;
     const Team team = {0};
-    match_pair(point, start, line, pair + 3 * (n / starts), guess[n], rules, result + (long)MATCH_RESULT * n, team);
+    match_in_turns(point, start, line, pair + 3 * (n / starts), guess[n], rules, result + (long)MATCH_RESULT * turns * n,
+                   turns, far, far_turn, team);
 }

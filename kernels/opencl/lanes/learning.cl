@@ -16,9 +16,8 @@ void add_pair_lanes(const lanes reading, const lanes expected_range, global cons
     const ilanes known = reading == reading;
     const lanes z = known ? reading : (lanes)0, expected = known ? expected_range : (lanes)0;
 
-    ilanes clamped;
-    int within;
-    const lanes mean = mean_range_lanes(expected, terms, 0, &clamped);
+    int any_clamped, within;
+    const lanes mean = mean_range_lanes(expected, terms, 0, &any_clamped);
     const lanes mass = mass_within_lanes(mean, terms[2], terms, 0, &within);
     const lanes off = z - mean;
     const LanePair exponent = shape_exponent_lanes((LanePair){off * (off * terms[1]), 0}, terms[17], terms[18]);
@@ -53,8 +52,14 @@ void add_pair_lanes(const lanes reading, const lanes expected_range, global cons
         w = x_0 * x_0 * pull_0 + x_1 * x_1 * pull_1;
     }
     const lanes bend = shape_bend_lanes(square, terms[17]);
-    // A clamped mean does not move with the bias. Terms of a cause that is impossible may be infinite.
-    const ilanes is_hit = r_hit > 0, is_short = r_short > 0, moved = is_hit & ~clamped;
+    // Terms of a cause that is impossible may be infinite.
+    const ilanes is_hit = r_hit > 0, is_short = r_short > 0;
+#if BIAS
+    // A clamped mean does not move with the bias.
+    const ilanes moved = is_hit & ~is_clamped_lanes(mean, expected, terms, 0);
+#else
+    const ilanes moved = is_hit;
+#endif
     const lanes h_s = is_hit ? square - 1 + t : (lanes)0, h_m = moved ? pull + slope : (lanes)0;
     const lanes x = terms[4] * expected, f = expected > SMALLEST_RANGE ? expected / length : (lanes)1, left = f - x;
     const lanes s_l = is_short ? 1 - left - terms[4] * z : (lanes)0;

@@ -1,58 +1,10 @@
 // Lines through LANES points of a scan at once: fit_lines of lines.cl.
-// requires: lanes/math
+// requires: lanes/line_fit
 
 // Fit lines to LANES points and at most MOST neighbours on either side.
-#define MOST 48
-#define WHOLE_TURN 6.283185307179586f
 kernel void fit_lines(ARGUMENTS) {
     const int begin = LANES * get_global_id(0), scan = which[get_global_id(1)];
     const int first = start[scan], count = start[scan + 1] - first;
     if (begin >= count) return;
-    // Points from MOST before the block to MOST behind it.
-    real x[LANES + 2 * MOST], y[LANES + 2 * MOST], range[LANES + 2 * MOST], angle[LANES + 2 * MOST];
-    for (int i = 0, k = begin - most; i < LANES + 2 * most; ++i, ++k) {
-        k = k < 0 ? k + count : k >= count ? k - count : k;
-        const real4 p = point[first + (k < 0 || k >= count ? 0 : k)];
-        x[i] = p.x, y[i] = p.y, angle[i] = p.z, range[i] = p.w;
-    }
-    const lanes centre_x = load_lanes(0, x + most), centre_y = load_lanes(0, y + most);
-    const lanes centre_range = load_lanes(0, range + most), centre_angle = load_lanes(0, angle + most);
-    lanes sum_x = 0, sum_y = 0, xx = 0, xy = 0, yy = 0, size = 1;
-    for (int direction = -1; direction <= 1; direction += 2) {
-        lanes last_x = centre_x, last_y = centre_y, last_range = centre_range, last_angle = centre_angle;
-        ilanes joined = -1;
-        for (int j = 1; j <= most && 2 * j < count; ++j) {
-            const int at = most + direction * j;
-            const lanes next_x = load_lanes(0, x + at), next_y = load_lanes(0, y + at);
-            const lanes between_x = next_x - last_x, between_y = next_y - last_y;
-            const lanes dx = next_x - centre_x, dy = next_y - centre_y, farthest = slack + ratio * last_range;
-            const lanes next_angle = load_lanes(0, angle + at), turn = fabs(next_angle - last_angle);
-            joined &= between_x * between_x + between_y * between_y <= farthest * farthest;
-            joined &= fmin(turn, WHOLE_TURN - turn) <= gap;
-            if (j > reach) joined &= dx * dx + dy * dy <= width * width;
-            if (!any_lane(joined)) break;
-            sum_x += joined ? dx : (lanes)0;
-            sum_y += joined ? dy : (lanes)0;
-            xx += joined ? dx * dx : (lanes)0;
-            xy += joined ? dx * dy : (lanes)0;
-            yy += joined ? dy * dy : (lanes)0;
-            size += joined ? (lanes)1 : (lanes)0;
-            last_x = next_x, last_y = next_y, last_angle = next_angle, last_range = load_lanes(0, range + at);
-        }
-    }
-    const lanes mean_x = sum_x / size, mean_y = sum_y / size;
-    const lanes a = xx - size * mean_x * mean_x, b = xy - size * mean_x * mean_y, d = yy - size * mean_y * mean_y;
-    const lanes middle = 0.5f * (a - d), root = sqrt(middle * middle + b * b), length = 0.5f * (a + d) + root;
-    lanes along_x = middle >= 0.0f ? middle + root : b, along_y = middle >= 0.0f ? b : root - middle;
-    lanes size_along = sqrt(along_x * along_x + along_y * along_y);
-    const ilanes is_line = length > 0.0f && size_along > 0.0f;
-    along_x = is_line ? along_x : -centre_y;
-    along_y = is_line ? along_y : centre_x;
-    size_along = is_line ? size_along : centre_range;
-    const lanes normal_x = -along_y / size_along, normal_y = along_x / size_along;
-    const lanes offset = normal_x * (centre_x + mean_x) + normal_y * (centre_y + mean_y);
-    const lanes doubt = is_line ? 1 / length : (lanes)-1;
-    for (int i = 0; i < LANES && begin + i < count; ++i)
-        line[first + begin + i] = (real4)(((const real *)&normal_x)[i], ((const real *)&normal_y)[i],
-                                          ((const real *)&offset)[i], ((const real *)&doubt)[i]);
+    fit_block(point + first, count, begin, reach, most, ratio, slack, width, gap, line + first);
 }

@@ -17,61 +17,91 @@
 // Return the larger numbers.
 lanes larger_lanes(const lanes a, const lanes b) { return a > b ? a : b; }
 
+// A density that were a call would pass vectors through memory, and load all constants again.
+#define INLINE inline __attribute__((always_inline))
+#define NOT_INLINE __attribute__((noinline))
+
 #if HIT
-// Return the means of p_hit; clamped becomes whether a mean is at an end of the range.
-lanes mean_range_lanes(const lanes expected, global const real *terms, const ilanes bin_at, ilanes *clamped) {
+// Return the means of p_hit; any_clamped becomes whether one is at an end of the range.
+INLINE lanes mean_range_lanes(const lanes expected, global const real *terms, const ilanes bin_at, int *any_clamped) {
+    *any_clamped = 0;
 #if BIAS
-    const lanes wanted = expected + TERM(10), raised = wanted < 0 ? (lanes)0 : wanted;
-    const lanes mean = raised > terms[6] ? (lanes)terms[6] : raised;
-    *clamped = mean != wanted;
-    return mean;
+    const lanes wanted = expected + TERM(10);
+    *any_clamped = any_lane((wanted < 0) | (wanted > terms[6]));
+    if (*any_clamped) {
+        const lanes raised = wanted < 0 ? (lanes)0 : wanted;
+        return raised > terms[6] ? (lanes)terms[6] : raised;
+    }
+    return wanted;
 #else
-    *clamped = 0;
     return expected;
 #endif
 }
 
+#if BIAS
+// Return whether means are at an end of the range.
+ilanes is_clamped_lanes(const lanes mean, const lanes expected, global const real *terms, const ilanes bin_at) {
+    return mean != expected + TERM(10);
+}
+#endif
+
 // Return sigma_hit / sigma at ranges: the first number times (1 + the second).
 LanePair hit_scale_lanes(const lanes expected, global const real *terms, const ilanes bin_at) {
 #if GROWTH
-    const lanes growth = TERM(12), sum = 1 + growth * expected, scale = 1 / sum;
 #if EXACT_EXPONENT
+    const lanes growth = TERM(12), sum = multiply_add_lanes(growth, expected, (lanes)1), scale = 1 / sum;
     // By how much the sum is too large; below 2^24 the sum less 1 is exact.
-    const lanes excess = rest_lanes(growth, expected, sum - 1) - TERM(13) * expected;
-    return (LanePair){scale, rest_lanes(sum, scale, (lanes)1) + excess * scale};
+    const lanes excess = multiply_add_lanes(-TERM(13), expected, rest_lanes(growth, expected, sum - 1));
+    return (LanePair){scale, multiply_add_lanes(excess, scale, rest_lanes(sum, scale, (lanes)1))};
 #else
-    return (LanePair){scale, 0};
+    return (LanePair){1 / (1 + TERM(12) * expected), 0};
 #endif
 #else
     return (LanePair){1, 0};
 #endif
 }
 
-// Return (z - mean)^2 / (2 sigma^2) as sums of two numbers.
-LanePair normal_exponent_lanes(const lanes z, const lanes expected, const lanes mean, const ilanes clamped,
-                               const LanePair scale, global const real *terms, const ilanes bin_at) {
-    LanePair off = {z - expected, 0};
+// Return z less the mean as sums of two numbers. z less the offset is near z* where the density is high, so their
+// difference is exact there.
+INLINE LanePair hit_offset_lanes(const lanes z, const lanes expected, const lanes mean, const int any_clamped,
+                                 global const real *terms, const ilanes bin_at) {
 #if BIAS
-    // z, z* and the bias nearly cancel.
-    const LanePair bias = {-TERM(10), -TERM(11)};
-    off = pair_sum_lanes(two_sum_lanes(z, -expected), bias);
-    off.hi = clamped ? z - mean : off.hi;
-    off.lo = clamped ? (lanes)0 : off.lo;
+    const LanePair unbiased = two_sum_lanes(z, -TERM(10));
+    LanePair off = ordered_sum_lanes(unbiased.hi - expected, unbiased.lo - TERM(11));
+    if (any_clamped) {
+        const ilanes clamped = is_clamped_lanes(mean, expected, terms, bin_at);
+        off.hi = clamped ? z - mean : off.hi;
+        off.lo = clamped ? (lanes)0 : off.lo;
+    }
+    return off;
+#else
+    return (LanePair){z - expected, 0};
 #endif
+}
+
+// Return (z - mean)^2 / (2 sigma^2) as sums of two numbers.
+LanePair normal_exponent_lanes(const lanes z, const lanes expected, const lanes mean, const int any_clamped,
+                               const LanePair scale, global const real *terms, const ilanes bin_at) {
+    LanePair off = hit_offset_lanes(z, expected, mean, any_clamped, terms, bin_at);
 #if EXACT_EXPONENT
 #if GROWTH
-    const lanes scaled = off.hi * scale.hi;
-    off.lo = (off.lo * scale.hi + scaled * scale.lo) - rest_lanes(off.hi, scale.hi, scaled);
-    off.hi = scaled;
+    const LanePair scaled = two_product_lanes(off.hi, scale.hi);
+    off.lo = multiply_add_lanes(off.lo, scale.hi, multiply_add_lanes(scaled.hi, scale.lo, scaled.lo));
+    off.hi = scaled.hi;
 #endif
     LanePair square = two_product_lanes(off.hi, off.hi);
 #if BIAS
-    square.lo += 2 * off.hi * off.lo;
+    square.lo = multiply_add_lanes(2 * off.hi, off.lo, square.lo);
 #elif GROWTH
-    square.lo += 2 * off.hi * off.lo;
+    square.lo = multiply_add_lanes(2 * off.hi, off.lo, square.lo);
 #endif
     const LanePair product = two_product_lanes(square.hi, TERM(1));
+#if GROWTH
+    const lanes rest = multiply_add_lanes(square.hi, TERM(9), product.lo);
+    return (LanePair){product.hi, multiply_add_lanes(square.lo, TERM(1), rest)};
+#else
     return (LanePair){product.hi, product.lo + (square.lo * TERM(1) + square.hi * TERM(9))};
+#endif
 #else
 #if GROWTH
     const lanes scaled = off.hi * scale.hi;
@@ -83,24 +113,27 @@ LanePair normal_exponent_lanes(const lanes z, const lanes expected, const lanes 
 }
 
 // Return the exponents of a hit's density as sums of two numbers.
-LanePair hit_exponent_lanes(const lanes z, const lanes expected, const lanes mean, const ilanes clamped,
+LanePair hit_exponent_lanes(const lanes z, const lanes expected, const lanes mean, const int any_clamped,
                             const LanePair scale, global const real *terms, const ilanes bin_at) {
-    const LanePair t = normal_exponent_lanes(z, expected, mean, clamped, scale, terms, bin_at);
+    const LanePair t = normal_exponent_lanes(z, expected, mean, any_clamped, scale, terms, bin_at);
     return shape_exponent_lanes(t, TERM(17), TERM(18));
 }
 
+// Return the normal's mass between two distances from the mean, in sigma times the root of 2.
+NOT_INLINE lanes mass_between_lanes(const lanes below, const lanes above) {
+    return (real)0.5 * (erf_lanes(below < above ? below : above) + erf_lanes(below < above ? above : below));
+}
+
 // Return the normal's mass on [0, range_max]; within becomes whether it is 1 in every lane.
-lanes hit_mass_lanes(const lanes mean, const lanes erf_scale, const real range_max, int *within) {
+INLINE lanes hit_mass_lanes(const lanes mean, const lanes erf_scale, const real range_max, int *within) {
     const lanes below = mean * erf_scale, above = (range_max - mean) * erf_scale;
-    const lanes nearer = below < above ? below : above;
-    *within = !any_lane(nearer < ERF_ONE);
-    if (*within) return 1;
-    return (real)0.5 * (erf_lanes(nearer) + erf_lanes(below < above ? above : below));
+    *within = !any_lane((below < above ? below : above) < ERF_ONE);
+    return *within ? (lanes)1 : mass_between_lanes(below, above);
 }
 
 // Return the mass of a hit of any shape on [0, range_max]; within becomes whether it is 1 in every lane.
-lanes mass_within_lanes(const lanes mean, const lanes scale, global const real *terms, const ilanes bin_at,
-                        int *within) {
+INLINE lanes mass_within_lanes(const lanes mean, const lanes scale, global const real *terms, const ilanes bin_at,
+                               int *within) {
 #if MASS_TABLE
     *within = 0;
 #if INCIDENCE
@@ -125,21 +158,22 @@ lanes short_length_lanes(const lanes expected, global const real *terms, const i
 }
 #endif
 
-// Densities of components, or their logarithms. A sum of densities is in the first number.
+// Densities of components, or their logarithms. A sum of densities is in the first number. The logarithm of p_short may
+// be that of its numerator alone, beside the reciprocal of the length that divides it.
 typedef struct {
-    lanes hit, shorter;
+    lanes hit, shorter, reciprocal;
 } DensityParts;
 
 #if LINEAR
 // Return p(z | z*). p_rand > 0 bounds the sum from below, so components may underflow, and one logarithm suffices.
-DensityParts density_parts_lanes(const lanes z, const lanes expected, global const real *terms, const ilanes bin_at) {
+INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, global const real *terms,
+                                        const ilanes bin_at) {
     lanes p = TERM(5);
 #if HIT
-    ilanes clamped;
-    int within;
-    const lanes mean = mean_range_lanes(expected, terms, bin_at, &clamped);
+    int any_clamped, within;
+    const lanes mean = mean_range_lanes(expected, terms, bin_at, &any_clamped);
     const LanePair scale = hit_scale_lanes(expected, terms, bin_at);
-    const LanePair exponent = hit_exponent_lanes(z, expected, mean, clamped, scale, terms, bin_at);
+    const LanePair exponent = hit_exponent_lanes(z, expected, mean, any_clamped, scale, terms, bin_at);
     lanes hit = TERM(0) * exp_lanes(-exponent.hi);
 #if GROWTH
     hit *= scale.hi;
@@ -166,14 +200,14 @@ lanes log_of_parts_lanes(const DensityParts parts, global const real *terms, con
 }
 #else
 // Return the logarithms of components of p(z | z*).
-DensityParts density_parts_lanes(const lanes z, const lanes expected, global const real *terms, const ilanes bin_at) {
-    DensityParts parts = {-INFINITY, -INFINITY};
+INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, global const real *terms,
+                                        const ilanes bin_at) {
+    DensityParts parts = {-INFINITY, -INFINITY, 1};
 #if HIT
-    ilanes clamped;
-    int within;
-    const lanes mean = mean_range_lanes(expected, terms, bin_at, &clamped);
+    int any_clamped, within;
+    const lanes mean = mean_range_lanes(expected, terms, bin_at, &any_clamped);
     const LanePair scale = hit_scale_lanes(expected, terms, bin_at);
-    const LanePair exponent = hit_exponent_lanes(z, expected, mean, clamped, scale, terms, bin_at);
+    const LanePair exponent = hit_exponent_lanes(z, expected, mean, any_clamped, scale, terms, bin_at);
     lanes hit = (TERM(0) - exponent.hi) + (TERM(8) - exponent.lo);
 #if GROWTH
     hit += log_lanes(scale.hi);
@@ -185,7 +219,13 @@ DensityParts density_parts_lanes(const lanes z, const lanes expected, global con
     parts.hit = hit;
 #endif
 #if SHORT
-    const lanes decayed = (TERM(3) - log_lanes(short_length_lanes(expected, terms, bin_at))) - TERM(4) * z;
+    const lanes length = short_length_lanes(expected, terms, bin_at);
+#if SINGLE
+    const lanes decayed = (TERM(3) - log_lanes(length)) - TERM(4) * z;
+#else
+    const lanes decayed = TERM(3) - TERM(4) * z;
+    parts.reciprocal = 1 / length;
+#endif
     parts.shorter = ((z <= expected) & (expected > 0)) ? decayed : (lanes)-INFINITY;
 #endif
     return parts;
@@ -208,16 +248,12 @@ lanes log_of_parts_lanes(const DensityParts parts, global const real *terms, con
     p += exp_lanes(hit - largest);
 #endif
 #if SHORT
-    p += exp_lanes(shorter - largest);
+    p += exp_lanes(shorter - largest) * parts.reciprocal;
 #endif
 #else
-    // The larger component counts as 1.
-    lanes p = 1;
-#if HIT
-#if SHORT
-    p += exp_lanes((hit < shorter ? hit : shorter) - largest);
-#endif
-#endif
+    // The larger numerator counts as 1; a mixture of two components has these.
+    const lanes smaller = exp_lanes((hit < shorter ? hit : shorter) - largest);
+    const lanes p = (hit < shorter ? smaller : (lanes)1) + (hit < shorter ? (lanes)1 : smaller) * parts.reciprocal;
 #endif
     const lanes sum = largest + log_lanes(p);
     return largest == -INFINITY ? largest : sum;

@@ -44,6 +44,31 @@ DoublePair cos_sin_any(const doubles theta) {
     return headings;
 }
 
+// Write the first count pairs of integers.
+void store_pairs(const int8 a, const int8 b, global int *place, const int count) {
+    const int16 pairs = (int16)((int8)(a.s0, b.s0, a.s1, b.s1, a.s2, b.s2, a.s3, b.s3),
+                                (int8)(a.s4, b.s4, a.s5, b.s5, a.s6, b.s6, a.s7, b.s7));
+    if (count == DOUBLES) {
+        vstore16(pairs, 0, place);
+        return;
+    }
+    for (int i = 0; i < 2 * count; i++) place[i] = ((const int *)&pairs)[i];
+}
+
+// Write the first count groups of four numbers.
+void store_fours(const float8 a, const float8 b, const float8 c, const float8 d, global float *place, const int count) {
+    // Pairs of a and b and of c and d, of the lower and of the upper half.
+    const float8 p = (float8)(a.lo, b.lo), q = (float8)(c.lo, d.lo), r = (float8)(a.hi, b.hi), s = (float8)(c.hi, d.hi);
+    const float16 fours[2] = {(float16)(p.s04, q.s04, p.s15, q.s15, p.s26, q.s26, p.s37, q.s37),
+                              (float16)(r.s04, s.s04, r.s15, s.s15, r.s26, s.s26, r.s37, s.s37)};
+    if (count == DOUBLES) {
+        vstore16(fours[0], 0, place);
+        vstore16(fours[1], 1, place);
+        return;
+    }
+    for (int i = 0; i < 4 * count; i++) place[i] = ((const float *)fours)[i];
+}
+
 // Place the poses from begin on, at most DOUBLES of them.
 void place_lanes(global const coordinate *poses, global int2 *pose_cell, global real4 *pose, global real4 *pose_low,
                  global int *pose_status, const Frame frame, const Window window, const int begin, const int count) {
@@ -72,18 +97,15 @@ void place_lanes(global const coordinate *poses, global int2 *pose_cell, global 
     rounded_x = rounded_x < BELOW_ONE ? rounded_x : (float8)BELOW_ONE;
     rounded_y = rounded_y < BELOW_ONE ? rounded_y : (float8)BELOW_ONE;
     const float8 rounded_cosine = convert_float8(cosine), rounded_sine = convert_float8(sine);
-#define LANE(type, of, i) ((const type *)&of)[i]
-    for (int i = 0; i < count; i++) {
-        pose_cell[begin + i] = (int2)(LANE(int, col, i), LANE(int, row, i));
-        const real4 rounded = (real4)(LANE(float, rounded_x, i), LANE(float, rounded_y, i),
-                                      LANE(float, rounded_cosine, i), LANE(float, rounded_sine, i));
-        pose[begin + i] = rounded;
+    store_pairs(col, row, (global int *)(pose_cell + begin), count);
+    store_fours(rounded_x, rounded_y, rounded_cosine, rounded_sine, (global float *)(pose + begin), count);
 #if TWO_PART_POINTS
-        pose_low[begin + i] = (real4)((real)(LANE(double, x, i) - rounded.x), (real)(LANE(double, y, i) - rounded.y),
-                                      (real)(LANE(double, cosine, i) - rounded.z),
-                                      (real)(LANE(double, sine, i) - rounded.w));
+    const float8 low_x = convert_float8(x - convert_double8(rounded_x));
+    const float8 low_y = convert_float8(y - convert_double8(rounded_y));
+    const float8 low_cosine = convert_float8(cosine - convert_double8(rounded_cosine));
+    const float8 low_sine = convert_float8(sine - convert_double8(rounded_sine));
+    store_fours(low_x, low_y, low_cosine, low_sine, (global float *)(pose_low + begin), count);
 #endif
-    }
 }
 
 // A work-item takes LANES particles.

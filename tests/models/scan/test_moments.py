@@ -108,6 +108,23 @@ def test_models_have_the_densities_on_every_backend(shape, real, backend):
         assert (log_p == model.log_likelihood(poses, z)).all() or backend.startswith("warp:cuda")
 
 
+@pytest.mark.parametrize("growth", [0.0, 0.1])
+def test_small_offsets_of_narrow_densities_keep_all_digits(growth, backend):
+    """The offset has digits beyond the last one of z - z*, which is as large as it."""
+    grid, scanner, poses, expected = scene("float32")
+    rng = np.random.default_rng(8)
+    for sigma, bias in ((1e-4, -1.5e-3), (1e-4, 2.3e-4), (2e-3, 0.7), (3e-3, -0.0123), (0.02, 3.1)):
+        p = gs.BeamParameters(0.9, 0.05, 0.0, 0.05, sigma, range_bias=bias, sigma_growth=growth * sigma)
+        z = np.abs(expected[5] + bias + sigma * rng.uniform(-4, 4, 40)).astype(np.float32)
+        model = gs.BeamModel(grid, scanner, p, backend=backend)
+        _, parts = model.log_likelihood(poses[5:6], z, per_beam=True)
+        # A mean near the longest range has a mass of its rounding.
+        within = (expected[5] + bias + 9 * sigma < RANGE) & (z < RANGE)
+        truth = log_mixture(z.astype(float), expected[5].astype(float), range_max=RANGE, **p.to_dict())
+        assert within.sum() > 5
+        assert (np.abs(parts[0] - truth) <= per_beam(truth, np.float32))[within].all()
+
+
 def test_parameters_of_0_change_no_bit_and_are_left_out(backend):
     grid, scanner, poses, expected = scene("float32")
     plain = gs.BeamModel(grid, scanner, gs.BeamParameters(), backend=backend)

@@ -1,0 +1,67 @@
+"""Lines through the points of a scan and their neighbours, for point-to-line ICP: total least squares."""
+
+from __future__ import annotations
+
+import numpy as np
+
+WHOLE_TURN = 6.283185307179586
+
+
+def line_through(point: np.ndarray, sums: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Return the lines through points and their neighbours: unit normals, offsets, 1 / (sums of squares along them).
+
+    Without neighbours a line is perpendicular to the point's beam, with -1 in place of that sum.
+
+    Args:
+        point: (N, 4) points.
+        sums: (5, N) sums of the neighbours' x, y, x x, x y and y y relative to the points.
+        size: (N,) numbers of points.
+    """
+    mean_x, mean_y = sums[0] / size, sums[1] / size
+    a, b = sums[2] - size * mean_x * mean_x, sums[3] - size * mean_x * mean_y
+    d = sums[4] - size * mean_y * mean_y
+    middle = (a - d) / 2
+    root = np.sqrt(middle * middle + b * b)
+    length = (a + d) / 2 + root
+    along = np.where(middle >= 0, [middle + root, b], [b, root - middle])
+    is_line = (length > 0) & ((along**2).sum(axis=0) > 0)
+    along = np.where(is_line, along, [-point[:, 1], point[:, 0]])
+    along = along / np.where(is_line, np.hypot(*along), point[:, 3])
+    offset = -along[1] * (point[:, 0] + mean_x) + along[0] * (point[:, 1] + mean_y)
+    doubt = np.where(is_line, 1 / np.where(is_line, length, 1), -1)
+    return np.stack([-along[1], along[0], offset, doubt], axis=1)
+
+
+def fit_scan(
+    point: np.ndarray, reach: int, most: int, ratio: float, slack: float, width: float, gap: float
+) -> np.ndarray:
+    """Return the lines (N, 4) through the points of a scan and their neighbours.
+
+    Args:
+        point: (N, 4) points.
+        reach: Neighbours on either side.
+        most: Most neighbours on either side, those beyond ``reach`` within a distance of ``width``.
+        ratio: Farthest distance of a neighbour from the one before, by the range of that one.
+        slack: The distance that is added to it [m].
+        width: Half the least length of a line [m].
+        gap: Largest step of bearing between neighbours [rad].
+    """
+    count = len(point)
+    sums, size = np.zeros((5, count), point.dtype), np.ones(count, point.dtype)
+    for direction in (-1, 1):
+        last, joined = point, np.ones(count, bool)
+        for j in range(1, most + 1):
+            if 2 * j >= count:
+                break
+            following = point[(np.arange(count) + direction * j) % count]
+            between = following[:, :2] - last[:, :2]
+            joined = joined & ((between**2).sum(axis=1) <= (slack + ratio * last[:, 3]) ** 2)
+            turn = np.abs(following[:, 2] - last[:, 2])
+            joined = joined & (np.minimum(turn, point.dtype.type(WHOLE_TURN) - turn) <= gap)
+            if j > reach:
+                joined = joined & (((following[:, :2] - point[:, :2]) ** 2).sum(axis=1) <= width * width)
+            x, y = (np.where(joined, following[:, i] - point[:, i], 0) for i in (0, 1))
+            sums += np.stack([x, y, x * x, x * y, y * y])
+            size += joined
+            last = following
+    return line_through(point, sums, size)

@@ -1,0 +1,104 @@
+"""Exponential, logarithm and error function by arithmetic alone: opencl/lanes/math.cl, a number at a time.
+
+LLVM makes vectors of loops over them, and none of loops that call the C library. With |r| <= log(2) / 2 and 1 + f from
+sqrt(1/2) to sqrt(2): e^a = 2^k e^r, e^r = 1 + r + r^2 E(r); log(2^k (1 + f)) = k log 2 + f - f^2 / 2 + f^3 L(f);
+erf(x) = 1 - exp(-x W(x)). bench/derive/lane_constants.py derives the constants. float64 has the functions of
+elementary.py.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from .. import elementary
+
+_number = wp.float32
+
+
+def _numbers(*values):
+    """Return constants of float32."""
+    return tuple(wp.constant(_number(value)) for value in values)
+
+
+ZERO, HALF, ONE = _numbers(0.0, 0.5, 1.0)
+# log 2 in two parts; the first has 16 bits, so that its products with counts are exact.
+LOG2_HIGH, LOG2_LOW, ONE_OVER_LOG2 = _numbers(0.693145752, 1.42860677e-06, 1.44269502)
+# 1.5 * 2^23: a sum with it is rounded to a whole number, which stands in its last bits.
+ROUNDER = wp.constant(_number(12582912.0))
+ROUNDER_BITS = wp.constant(wp.int32(0x4B400000))
+# e^EXP_ZERO is close to the smallest normal number; e^EXP_LOST is below half of the last bit of 1.
+EXP_ZERO, EXP_LOST = _numbers(-87.0, -20.0)
+EXPONENT_BIAS, MANTISSA_BITS = wp.constant(wp.int32(127)), wp.constant(wp.int32(23))
+MANTISSA = wp.constant(wp.int32(0x7FFFFF))
+# Bits of sqrt(1/2).
+ROOT_HALF = wp.constant(wp.int32(0x3F3504F3))
+# From here on the error function is 1 to the last bit.
+ERF_ONE = wp.constant(_number(4.0))
+# E, L and W, lowest power first.
+E0, E1, E2, E3, E4 = _numbers(0.49999997, 0.166665465, 0.041667223, 0.00836638454, 0.00138791779)
+L0, L1, L2, L3 = _numbers(0.333333313, -0.250008196, 0.200012267, -0.166233569)
+L4, L5, L6, L7 = _numbers(0.142017633, -0.131601855, 0.127615467, -0.0763445124)
+W0, W1, W2, W3 = _numbers(1.12837923, 0.636619389, 0.102777831, -0.0191530641)
+W4, W5, W6, W7 = _numbers(-0.000160394105, 0.00166702515, -0.000632835436, 0.000117640826)
+W8 = wp.constant(_number(-9.25621225e-06))
+
+
+# Return e^r - 1 and the count k of e^a. Polynomials are summed in pairs, which processors compute side by side.
+@wp.func
+def reduced_exp_lanes(a: wp.float32):
+    shifted = a * ONE_OVER_LOG2 + ROUNDER
+    k = shifted - ROUNDER
+    r = (a - k * LOG2_HIGH) - k * LOG2_LOW
+    square = r * r
+    rest = r + square * ((E0 + E1 * r) + square * ((E2 + E3 * r) + square * E4))
+    return rest, wp.cast(shifted, wp.int32) - ROUNDER_BITS
+
+
+# Return e^a for a <= 0; 0 where it would be denormal.
+@wp.func
+def exp_lanes(a: wp.float32):
+    rest, k = reduced_exp_lanes(a)
+    power = (ONE + rest) * wp.cast((k + EXPONENT_BIAS) << MANTISSA_BITS, wp.float32)
+    return wp.where(a < EXP_ZERO, ZERO, power)
+
+
+# Return 1 - e^a for a <= 0. Nothing cancels: where the count is 0, so is the first term.
+@wp.func
+def one_minus_exp_lanes(a: wp.float32):
+    rest, k = reduced_exp_lanes(wp.where(a < EXP_LOST, EXP_LOST, a))
+    scale = wp.cast((k + EXPONENT_BIAS) << MANTISSA_BITS, wp.float32)
+    return (ONE - scale) - scale * rest
+
+
+# Return log(p) of a finite normal number p > 0.
+@wp.func
+def log_lanes(p: wp.float32):
+    above = wp.cast(p, wp.int32) - ROOT_HALF
+    k = wp.float32(above >> MANTISSA_BITS)
+    f = wp.cast((above & MANTISSA) + ROOT_HALF, wp.float32) - ONE
+    square = f * f
+    low = (L0 + L1 * f) + square * (L2 + L3 * f)
+    high = (L4 + L5 * f) + square * (L6 + L7 * f)
+    cubic = (square * f) * (low + (square * square) * high)
+    return (f + ((cubic + k * LOG2_LOW) - HALF * square)) + k * LOG2_HIGH
+
+
+# Return erf(x) for x >= 0; exactly 1 from ERF_ONE on.
+@wp.func
+def erf_lanes(x: wp.float32):
+    b = wp.where(x < ERF_ONE, x, ERF_ONE)
+    square = b * b
+    low = (W0 + W1 * b) + square * (W2 + W3 * b)
+    high = (W4 + W5 * b) + square * ((W6 + W7 * b) + square * W8)
+    return one_minus_exp_lanes(-b * (low + (square * square) * high))
+
+
+@functools.cache
+def functions(flags):
+    """Return the functions of the file for a set of flags."""
+    if "FLOAT64" in flags:
+        return SimpleNamespace(exp_lanes=elementary.exp_of, log_lanes=elementary.log_of)
+    return SimpleNamespace(
+        exp_lanes=exp_lanes, one_minus_exp_lanes=one_minus_exp_lanes, log_lanes=log_lanes, erf_lanes=erf_lanes
+    )

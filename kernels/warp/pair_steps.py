@@ -1,0 +1,139 @@
+"""Noise and points of scans, from their readings; see gpusense/matching/noise.py and points.py."""
+
+import functools
+import math
+from types import SimpleNamespace
+
+import warp as wp
+
+from .prelude import precision
+from .sorting import sort_numbers
+
+ZERO, ONE, MINUS_ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0)), wp.constant(wp.float64(-1.0))
+FOREVER = wp.constant(wp.float64(math.inf))
+# Median absolute value of a normal error [standard deviations], and the deviation of rounding to steps of sqrt(12).
+MEDIAN, ROOT_OF_12 = wp.constant(wp.float64(0.6745)), wp.constant(wp.float64(3.4641016151377544))
+# Neighbours whose ranges differ by more than this share do not belong to one surface.
+LARGEST_STEP = wp.constant(wp.float64(0.35))
+# Ranges come in steps if all differences are multiples of a step of at least this size [m], to within this share of it.
+LEAST_STEP, LEAST_GAP = wp.constant(wp.float64(1e-3)), wp.constant(wp.float64(0.5e-3))
+ODD = wp.constant(wp.float64(0.02))
+# Least beams for an estimate of noise.
+LEAST_BEAMS = wp.constant(12)
+# Points nearer than this have no bearing [m].
+NEAREST = wp.constant(wp.float64(1e-6))
+
+
+# Return whether a reading is a range.
+@wp.func
+def is_hit(reading: wp.float64, nearest: wp.float64, farthest: wp.float64):
+    return reading < farthest and reading >= nearest
+
+
+# Return how far a range is from the one that its neighbours predict on a straight wall, in the standard deviation of
+# this difference; infinite where they do not lie on one surface. left and right are the neighbours' weights.
+@wp.func
+def deviation_of(before: wp.float64, here: wp.float64, after: wp.float64, left: wp.float64, right: wp.float64):
+    expected = ONE / (left / before + right / after)
+    limit = LARGEST_STEP * here
+    deviation = wp.float64(FOREVER)
+    if expected > ZERO and wp.abs(before - here) < limit and wp.abs(after - here) < limit:
+        one = expected / before
+        other = expected / after
+        from_left = one * one * left
+        from_right = other * other * right
+        deviation = wp.abs(here - expected) / wp.sqrt(ONE + from_left * from_left + from_right * from_right)
+    return deviation
+
+
+# Return the deviation of rounding to the steps in which some ascending ranges come, 0 without steps, or where it is
+# smaller than another deviation.
+@wp.func
+def rounding_of(number: wp.array(dtype=wp.float64), first: wp.int32, count: wp.int32, deviation: wp.float64):
+    step = wp.float64(FOREVER)
+    gaps = int(0)
+    for i in range(1, count):
+        gap = number[first + i] - number[first + i - 1]
+        if gap > LEAST_GAP:
+            step = wp.min(gap, step)
+            gaps += 1
+    rounding = step / ROOT_OF_12
+    if gaps < LEAST_BEAMS or not (step > LEAST_STEP and rounding > deviation):
+        return ZERO
+    for i in range(1, count):
+        gap = number[first + i] - number[first + i - 1]
+        multiple = gap / step
+        if gap > LEAST_GAP and wp.abs(multiple - wp.rint(multiple)) > ODD:
+            rounding = ZERO
+    return rounding
+
+
+# Return the standard deviation of a scan's ranges, -1 where too few beams measure it. Every step-th beam but the ends
+# is a place; padded is their number as a multiple of 8. work has room for four lists of it.
+@wp.func
+def noise_of(
+    reading: wp.array(dtype=wp.float64), first: wp.int32, weight: wp.array(dtype=wp.float64), places: wp.int32,
+    padded: wp.int32, step: wp.int32, nearest: wp.float64, farthest: wp.float64, work: wp.array(dtype=wp.float64),
+):  # fmt: skip
+    number = int(0)
+    for i in range(padded):
+        work[i] = FOREVER
+        work[padded + i] = FOREVER
+        if i < places:
+            before = reading[first + step * i]
+            here = reading[first + step * i + 1]
+            after = reading[first + step * i + 2]
+            used = is_hit(before, nearest, farthest) and is_hit(here, nearest, farthest)
+            if used and is_hit(after, nearest, farthest):
+                deviation = deviation_of(before, here, after, weight[2 * i], weight[2 * i + 1])
+                if deviation < FOREVER:
+                    work[i] = deviation
+                    work[padded + i] = here
+                    number += 1
+    if number < LEAST_BEAMS:
+        return MINUS_ONE
+    sort_numbers(work, 0, padded, 2 * padded)
+    sort_numbers(work, padded, padded, 3 * padded)
+    deviation = work[2 * padded + (number - 1) // 2] / MEDIAN
+    return wp.max(rounding_of(work, 3 * padded, number, deviation), deviation)
+
+
+# Return the level of noise of a pair: the first one whose largest noise is not exceeded, the last one beyond all of
+# them, or the assumed one where neither scan measures its noise. A level is its largest noise, and the slack of its
+# lines.
+@wp.func
+def level_of(noise: wp.float64, level: wp.array(dtype=wp.float64), levels: wp.int32, assumed: wp.int32):
+    number = int(0)
+    while number < levels - 1 and noise > level[2 * number]:
+        number += 1
+    if noise < ZERO:
+        number = assumed
+    return number
+
+
+@functools.cache
+def functions(flags):
+    """Make the functions of the file for a set of flags."""
+    types = precision(flags)
+    real, vec4 = types.real, types.vec4
+
+    # Write the points of a scan's hits from to on, and return their number and the sum of squared ranges. A beam is its
+    # cosine and sine, its bearing in [0, 2 pi), and the place of its reading; beams come by bearing.
+    @wp.func
+    def place_points(
+        reading: wp.array(dtype=wp.float64), first: wp.int32, beam: wp.array(dtype=wp.float64), beams: wp.int32,
+        nearest: wp.float64, farthest: wp.float64, point: wp.array(dtype=vec4), to: wp.int32,
+    ):  # fmt: skip
+        count = int(0)
+        squares = wp.float64(0.0)
+        for i in range(beams):
+            z = reading[first + wp.int32(beam[4 * i + 3])]
+            if is_hit(z, nearest, farthest) and z > NEAREST:
+                point[to + count] = vec4(
+                    real(z * beam[4 * i]), real(z * beam[4 * i + 1]), real(beam[4 * i + 2]), real(z)
+                )
+                squares += z * z
+                count += 1
+        return count, squares
+
+    return SimpleNamespace(place_points=place_points)

@@ -160,7 +160,7 @@ def warp_as_gpu(needs: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) ->
     installed(monkeypatch)
     monkeypatch.setattr(arrays, "on_device", lambda array: isinstance(array, (wp.array, Array, Adopted)))
     found = get_backend("warp:cpu")
-    monkeypatch.setattr(found, "info", dataclasses.replace(found.info, kind="gpu", lanes=1))
+    monkeypatch.setattr(found, "info", dataclasses.replace(found.info, kind="gpu", lanes=1, vector_loops=False))
     return found
 
 

@@ -71,10 +71,9 @@ class Poses:
             )
             self._dtype = _SINGLE if single else _DOUBLE
             return
-        late = late and bounds_poses(backend)
         self.host = arrays.host_poses(poses, name, scans, single=late)
         self.count = len(self.host)
-        self._late = late and self.count >= LEAST_BOUNDED
+        self._late = late and self.count >= LEAST_BOUNDED and bounds_poses(backend)
         if not self._late:
             self.host = self.host.astype(np.float64, copy=False)
         self._dtype = self.host.dtype

@@ -218,7 +218,7 @@ class ScanModel(Pickled):
                 of range_max or more are max readings.
             per_beam: Also return the term of each reading, before the temperature; NumPy arrays.
             out: The array for the log-likelihoods, which is returned: of their shape and precision, C-contiguous, in
-                the memory of the poses.
+                the memory of the poses. After an error its contents are undefined.
 
         Returns:
             (N,) log-likelihoods, or (S, N), in the model's precision: a density in 1/m for each hit, a probability for

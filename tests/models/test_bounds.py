@@ -92,7 +92,8 @@ def test_results_have_the_bits_of_poses_that_the_host_bounds(
     monkeypatch.setattr(poses_module, "bounds_on_device", bounds)
     for name, call in calls(device):
         # Each number of poses once each way, since GPUs have a shorter path for sizes that repeat.
-        for poses in (cloud, turned[1:], cloud[:3], cloud.astype(np.float32), turned[1:].astype(np.float32)):
+        single = cloud[2:].astype(np.float32), turned[3:].astype(np.float32)
+        for poses in (cloud, turned[1:], cloud[:3], *single):
             used.clear()
             found = call(poses)  # type: ignore[operator]
             assert bool(used) == (len(poses) > 3 and not name.startswith("no ")), name

@@ -21,7 +21,7 @@ def compat_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, t
     if "AMCL" in flags:
         short = terms[3] * terms[4] * np.exp(-terms[4] * z)
     else:
-        p = p / hit_mass(expected, terms[2], terms[6])
+        p = p / hit_mass(expected, terms[6] - expected, terms[2])
         short = terms[3] * short_factor(terms[4] * expected) * np.exp(-terms[4] * z) / expected
     p = p + np.where(z < expected, short, 0)
     at_max = np.where(z > terms[6], 0, terms[7]) if "AMCL" in flags else terms[7]

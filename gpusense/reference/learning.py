@@ -27,7 +27,15 @@ import numpy as np
 from gpusense.interface.constants import BLOCK_TERMS
 from gpusense.reference.error_free import add_term
 from gpusense.reference.hit_shape import shape_bend, shape_exponent, shape_weight
-from gpusense.reference.mixture import hit_offset, log_hit, log_short, mass_within, mean_range, short_factor
+from gpusense.reference.mixture import (
+    above_mean,
+    hit_offset,
+    log_hit,
+    log_short,
+    mass_within,
+    mean_range,
+    short_factor,
+)
 
 
 def responsibilities(
@@ -53,12 +61,13 @@ def hit_slopes(
     flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return W u^2, and the derivatives h_s, h_m, h_ss, h_sm and h_mm of log p_hit of pairs."""
-    mean, numbers, half = mean_range(flags, expected, terms), terms[17:19], terms.dtype.type(0.5)
-    u, x_0, x_1 = hit_offset(flags, z, expected, terms)[0] * terms[14], mean * terms[14], (terms[6] - mean) * terms[14]
+    mean, above = mean_range(flags, expected, terms), above_mean(flags, expected, terms)
+    numbers, half = terms[17:19], terms.dtype.type(0.5)
+    u, x_0, x_1 = hit_offset(flags, z, expected, terms)[0] * terms[14], mean * terms[14], above * terms[14]
     weight = shape_weight(flags, half * u * u, numbers)
     pull = weight * u
     square = pull * u
-    mass = mass_within(flags, mean, terms[2], terms)
+    mass = mass_within(flags, mean, above, terms[2], terms)
     near = mass < 1
     phi_0, phi_1 = (np.where(near, hit_phi(flags, x, terms) / mass, 0) for x in (x_0, x_1))
     pull_0, pull_1 = (shape_weight(flags, half * x * x, numbers) * x * phi for x, phi in ((x_0, phi_0), (x_1, phi_1)))

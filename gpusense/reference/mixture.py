@@ -28,23 +28,33 @@ def last_range(z: np.ndarray, terms: np.ndarray) -> np.ndarray:
     return np.maximum(terms[14] + terms[15] * z, terms[16])
 
 
-def hit_mass(expected: np.ndarray, erf_scale: float | np.ndarray, range_max: np.floating) -> np.ndarray:
-    """Return the mass of the normal around z* on [0, range_max], a sum of positive terms, so nothing cancels."""
-    half = expected.dtype.type(0.5)
-    return half * (erf(expected * erf_scale) + erf((range_max - expected) * erf_scale))
+def hit_mass(before: np.ndarray, after: np.ndarray, erf_scale: float | np.ndarray) -> np.ndarray:
+    """Return the mass of the normal from a distance before its mean to one after it, a sum of positive terms."""
+    half = before.dtype.type(0.5)
+    return half * (erf(before * erf_scale) + erf(after * erf_scale))
 
 
-def mass_within(flags: frozenset[str], mean: np.ndarray, scale: np.ndarray, terms: np.ndarray) -> np.ndarray:
-    """Return the mass of a hit of any shape on [0, range_max]."""
+def mass_within(
+    flags: frozenset[str], mean: np.ndarray, above: np.ndarray, scale: np.ndarray, terms: np.ndarray
+) -> np.ndarray:
+    """Return the mass of a hit of any shape on [0, range_max], given its mean and the distance to range_max."""
     if "MASS_TABLE" not in flags:
-        return hit_mass(mean, scale, terms[6])
+        return hit_mass(mean, above, scale)
     numbers = terms[17:19]
-    return half_mass(flags, mean * scale, numbers) + half_mass(flags, (terms[6] - mean) * scale, numbers)
+    return half_mass(flags, mean * scale, numbers) + half_mass(flags, above * scale, numbers)
 
 
 def mean_range(flags: frozenset[str], expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
     """Return the mean of p_hit."""
     return np.clip(expected + terms[10], 0, terms[6]) if "BIAS" in flags else expected
+
+
+def above_mean(flags: frozenset[str], expected: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """Return the distance from the mean of p_hit to range_max, which keeps its digits where it is short."""
+    if "BIAS" not in flags:
+        return terms[6] - expected
+    last, rest = two_sum(terms[6], -terms[10])
+    return np.clip((last - expected) + (rest - terms[11]), 0, terms[6])
 
 
 def hit_offset(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: np.ndarray) -> Pair:
@@ -107,7 +117,8 @@ def log_hit(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, terms: n
     exponent = hit_exponent(flags, z, expected, terms)
     scale = hit_scale(flags, expected, terms)[0]
     log_p = (terms[0] - exponent[0]) + (terms[8] - exponent[1]) + np.log(scale)
-    return log_p - np.log(mass_within(flags, mean_range(flags, expected, terms), terms[2] * scale, terms))
+    mean, above = mean_range(flags, expected, terms), above_mean(flags, expected, terms)
+    return log_p - np.log(mass_within(flags, mean, above, terms[2] * scale, terms))
 
 
 def short_factor(x: np.ndarray) -> np.ndarray:
@@ -139,7 +150,8 @@ def log_density(flags: frozenset[str], z: np.ndarray, expected: np.ndarray, term
         if "HIT" in flags:
             exponent = hit_exponent(flags, z, expected, terms)
             scale = hit_scale(flags, expected, terms)[0]
-            mass = mass_within(flags, mean_range(flags, expected, terms), terms[2] * scale, terms)
+            mean, above = mean_range(flags, expected, terms), above_mean(flags, expected, terms)
+            mass = mass_within(flags, mean, above, terms[2] * scale, terms)
             p += terms[0] * scale * np.exp(-exponent[0]) * (1 - exponent[1]) / mass
         if "SHORT" in flags:
             density = terms[3] * np.exp(-terms[4] * z) * short_peak(terms[4], expected)

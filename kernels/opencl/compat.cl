@@ -13,7 +13,7 @@ real compat_density(const real z, const real expected, global const real *terms)
     if (z < expected) p += terms[3] * terms[4] * exp(-terms[4] * z);
     if (z > terms[6]) return p;
 #else
-    p /= hit_mass(expected, terms[2], terms[6]);
+    p /= hit_mass(expected, terms[6] - expected, terms[2]);
     if (z < expected) p += terms[3] * short_factor(terms[4] * expected) * exp(-terms[4] * z) / expected;
 #endif
     return p + (z >= terms[6] ? terms[7] : terms[5]);

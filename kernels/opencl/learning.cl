@@ -43,11 +43,12 @@ typedef struct {
 
 // Return the derivatives of log p_hit of a pair.
 HitSlopes hit_slopes(const real z, const real expected, global const real *terms) {
-    const real mean = mean_range(expected, terms), u = hit_offset(z, expected, terms).x * terms[14];
-    const real x_0 = mean * terms[14], x_1 = (terms[6] - mean) * terms[14];
+    const real mean = mean_range(expected, terms), above = above_mean(expected, terms);
+    const real u = hit_offset(z, expected, terms).x * terms[14];
+    const real x_0 = mean * terms[14], x_1 = above * terms[14];
     const real weight = shape_weight((real)0.5 * u * u, terms[17], terms[18]), pull = weight * u, square = pull * u;
     real t = 0, p = 0, v = 0, q = 0, w = 0;
-    const real mass = mass_within(mean, terms[2], terms);
+    const real mass = mass_within(mean, above, terms[2], terms);
     if (mass < 1) {
         const real phi_0 = hit_phi(x_0, terms) / mass, phi_1 = hit_phi(x_1, terms) / mass;
         const real pull_0 = shape_weight((real)0.5 * x_0 * x_0, terms[17], terms[18]) * x_0 * phi_0;

@@ -24,23 +24,23 @@ real last_range(const real z, global const real *terms) {
 #endif
 
 #if HIT
-// Return the mass of the untruncated normal around z* on [0, range_max], a sum of positive terms, so nothing cancels.
+// Return the mass of the untruncated normal from a distance before its mean to one after it, a sum of positive terms.
 // Most ranges are far from both ends, and nearly all from at least one; rays without an obstacle are at one end.
-real hit_mass(const real expected, const real erf_scale, const real range_max) {
-    const real below = expected * erf_scale, above = (range_max - expected) * erf_scale;
+real hit_mass(const real before, const real after, const real erf_scale) {
+    const real below = before * erf_scale, above = after * erf_scale;
     const real nearer = below < above ? below : above, farther = below < above ? above : below;
     if (nearer > ERF_ONE) return 1;
     const real rest = farther > ERF_ONE ? (real)1 : erf(farther);
     return (real)0.5 * (nearer > 0 ? erf(nearer) + rest : rest);
 }
 
-// Return the mass of a hit of any shape on [0, range_max].
-real mass_within(const real mean, const real scale, global const real *terms) {
+// Return the mass of a hit of any shape on [0, range_max], given its mean and the distance from there to range_max.
+real mass_within(const real mean, const real above, const real scale, global const real *terms) {
 #if MASS_TABLE
     global const real *table = terms + (int)terms[19];
-    return half_mass(mean * scale, table) + half_mass((terms[6] - mean) * scale, table);
+    return half_mass(mean * scale, table) + half_mass(above * scale, table);
 #else
-    return hit_mass(mean, scale, terms[6]);
+    return hit_mass(mean, above, scale);
 #endif
 }
 
@@ -51,6 +51,18 @@ real mean_range(const real expected, global const real *terms) {
     return mean < 0 ? 0 : mean > terms[6] ? terms[6] : mean;
 #else
     return expected;
+#endif
+}
+
+// Return the distance from the mean of p_hit to range_max, which keeps its digits where it is short: there z* is nearly
+// range_max less the bias, and their difference is exact.
+real above_mean(const real expected, global const real *terms) {
+#if BIAS
+    const real2 last = two_sum(terms[6], -terms[10]);
+    const real above = (last.x - expected) + (last.y - terms[11]);
+    return above < 0 ? 0 : above > terms[6] ? terms[6] : above;
+#else
+    return terms[6] - expected;
 #endif
 }
 
@@ -123,7 +135,7 @@ real log_hit(const real z, const real expected, global const real *terms) {
 #if GROWTH
     log_p += log(scale);
 #endif
-    const real mass = mass_within(mean_range(expected, terms), terms[2] * scale, terms);
+    const real mass = mass_within(mean_range(expected, terms), above_mean(expected, terms), terms[2] * scale, terms);
     return mass == 1 ? log_p : log_p - log(mass);
 }
 #endif
@@ -157,7 +169,7 @@ real log_density(const real z, const real expected, global const real *terms) {
     const real2 exponent = hit_exponent(z, expected, terms);
     const real scale = hit_scale(expected, terms).x;
     const real hit = terms[0] * scale * exp(-exponent.x) * (1 - exponent.y);
-    const real mass = mass_within(mean_range(expected, terms), terms[2] * scale, terms);
+    const real mass = mass_within(mean_range(expected, terms), above_mean(expected, terms), terms[2] * scale, terms);
     p += mass == 1 ? hit : hit / mass;
 #endif
 #if SHORT

@@ -33,7 +33,7 @@ def functions(flags):
             if z > terms[6]:
                 return p
         else:
-            p /= hit_mass(expected, terms[2], terms[6])
+            p /= hit_mass(expected, terms[6] - expected, terms[2])
             if z < expected:
                 p += terms[3] * short_factor(terms[4] * expected) * wp.exp(-terms[4] * z) / expected
         if z >= terms[6]:

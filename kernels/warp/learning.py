@@ -41,7 +41,8 @@ def make(name, flags):
     vec6 = wp.types.vector(length=6, dtype=real)
     mixture = mixture_file.functions(flags)
     log_hit, log_short, short_factor = mixture.log_hit, mixture.log_short, mixture.short_factor
-    mean_range, hit_offset, mass_within = mixture.mean_range, mixture.hit_offset, mixture.mass_within
+    mean_range, above_mean, hit_offset = mixture.mean_range, mixture.above_mean, mixture.hit_offset
+    mass_within = mixture.mass_within
     shape = hit_shape.functions(flags)
     shape_exponent, shape_weight, shape_bend = shape.shape_exponent, shape.shape_weight, shape.shape_bend
     BLOCK_TERMS = error_free.BLOCK_TERMS
@@ -73,9 +74,10 @@ def make(name, flags):
     @wp.func
     def hit_slopes(z: real, expected: real, terms: wp.array(dtype=real)):
         mean = mean_range(expected, terms)
+        above = above_mean(expected, terms)
         u = hit_offset(z, expected, terms).x * terms[14]
         x_0 = mean * terms[14]
-        x_1 = (terms[6] - mean) * terms[14]
+        x_1 = above * terms[14]
         weight = shape_weight(HALF * u * u, terms[17], terms[18])
         pull = weight * u
         square = pull * u
@@ -84,7 +86,7 @@ def make(name, flags):
         v = real(0.0)
         q = real(0.0)
         w = real(0.0)
-        mass = mass_within(mean, terms[2], terms)
+        mass = mass_within(mean, above, terms[2], terms)
         if mass < ONE:
             phi_0 = hit_phi(x_0, terms) / mass
             phi_1 = hit_phi(x_1, terms) / mass

@@ -54,13 +54,13 @@ def functions(flags):
     def last_range(z: real, terms: wp.array(dtype=real)):
         return wp.max(at(terms, 14) + at(terms, 15) * z, at(terms, 16))
 
-    # Return the mass of the untruncated normal around z* on [0, range_max], a sum of positive terms, so nothing
-    # cancels. Most ranges are far from both ends, and nearly all from at least one; rays without an obstacle are at one
+    # Return the mass of the untruncated normal from a distance before its mean to one after it, a sum of positive
+    # terms. Most ranges are far from both ends, and nearly all from at least one; rays without an obstacle are at one
     # end.
     @wp.func
-    def hit_mass(expected: real, erf_scale: real, range_max: real):
-        below = expected * erf_scale
-        above = (range_max - expected) * erf_scale
+    def hit_mass(before: real, after: real, erf_scale: real):
+        below = before * erf_scale
+        above = after * erf_scale
         nearer = wp.min(below, above)
         farther = wp.max(below, above)
         if nearer > ERF_ONE:
@@ -74,13 +74,13 @@ def functions(flags):
 
     # Return the mass of a hit of any shape on [0, range_max].
     @wp.func
-    def mass_within(mean: real, scale: real, terms: wp.array(dtype=real)):
+    def mass_within(mean: real, above: real, scale: real, terms: wp.array(dtype=real)):
         if MASS_TABLE:
             place = wp.int32(at(terms, 19))
             below = half_mass(mean * scale, terms, place)
-            return below + half_mass((at(terms, 6) - mean) * scale, terms, place)
+            return below + half_mass(above * scale, terms, place)
         else:
-            return hit_mass(mean, scale, at(terms, 6))
+            return hit_mass(mean, above, scale)
 
     # Return the mean of p_hit.
     @wp.func
@@ -89,6 +89,16 @@ def functions(flags):
         if BIAS:
             mean = wp.clamp(expected + at(terms, 10), ZERO, at(terms, 6))
         return mean
+
+    # Return the distance from the mean of p_hit to range_max, which keeps its digits where it is short: there z* is
+    # nearly range_max less the bias, and their difference is exact.
+    @wp.func
+    def above_mean(expected: real, terms: wp.array(dtype=real)):
+        above = at(terms, 6) - expected
+        if BIAS:
+            last = two_sum(at(terms, 6), -at(terms, 10))
+            above = wp.clamp((last.x - expected) + (last.y - at(terms, 11)), ZERO, at(terms, 6))
+        return above
 
     # Return z minus the mean of p_hit as a sum of two numbers; z, z* and the bias nearly cancel.
     @wp.func
@@ -151,7 +161,7 @@ def functions(flags):
         log_p = (at(terms, 0) - exponent.x) + (at(terms, 8) - exponent.y)
         if GROWTH:
             log_p += wp.log(scale)
-        mass = mass_within(mean_range(expected, terms), at(terms, 2) * scale, terms)
+        mass = mass_within(mean_range(expected, terms), above_mean(expected, terms), at(terms, 2) * scale, terms)
         if mass == ONE:
             return log_p
         return log_p - wp.log(mass)
@@ -193,7 +203,9 @@ def functions(flags):
                 exponent = hit_exponent(z, expected, terms)
                 scale = hit_scale(expected, terms).x
                 hit = at(terms, 0) * scale * wp.exp(-exponent.x) * (ONE - exponent.y)
-                mass = mass_within(mean_range(expected, terms), at(terms, 2) * scale, terms)
+                mass = mass_within(
+                    mean_range(expected, terms), above_mean(expected, terms), at(terms, 2) * scale, terms
+                )
                 if mass == ONE:
                     p += hit
                 else:

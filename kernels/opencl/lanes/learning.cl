@@ -18,7 +18,8 @@ void add_pair_lanes(const lanes reading, const lanes expected_range, global cons
 
     int any_clamped, within;
     const lanes mean = mean_range_lanes(expected, terms, 0, &any_clamped);
-    const lanes mass = mass_within_lanes(mean, terms[2], terms, 0, &within);
+    const lanes above = above_mean_lanes(expected, any_clamped, terms, 0);
+    const lanes mass = mass_within_lanes(mean, above, terms[2], terms, 0, &within);
     const lanes off = z - mean;
     const LanePair exponent = shape_exponent_lanes((LanePair){off * (off * terms[1]), 0}, terms[17], terms[18]);
     lanes hit = terms[0] - exponent.hi + (terms[8] - exponent.lo);
@@ -41,7 +42,7 @@ void add_pair_lanes(const lanes reading, const lanes expected_range, global cons
     const lanes square = pull * u;
     lanes t = 0, v = 0, q = 0, w = 0, slope = 0;
     if (!within) {
-        const lanes x_0 = mean * terms[14], x_1 = (terms[6] - mean) * terms[14];
+        const lanes x_0 = mean * terms[14], x_1 = above * terms[14];
         const lanes phi_0 = hit_phi_lanes(x_0, terms) / mass, phi_1 = hit_phi_lanes(x_1, terms) / mass;
         const lanes pull_0 = shape_weight_lanes((real)0.5 * x_0 * x_0, terms[17], terms[18]) * x_0 * phi_0;
         const lanes pull_1 = shape_weight_lanes((real)0.5 * x_1 * x_1, terms[17], terms[18]) * x_1 * phi_1;

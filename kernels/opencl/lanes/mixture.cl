@@ -38,6 +38,21 @@ INLINE lanes mean_range_lanes(const lanes expected, global const real *terms, co
 #endif
 }
 
+// Return the distances from the means of p_hit to range_max, which keep their digits where they are short.
+INLINE lanes above_mean_lanes(const lanes expected, const int any_clamped, global const real *terms, const ilanes bin_at) {
+#if BIAS
+    const LanePair last = two_sum_lanes((lanes)terms[6], -(lanes)(TERM(10)));
+    const lanes above = (last.hi - expected) + (last.lo - TERM(11));
+    if (any_clamped) {
+        const lanes raised = above < 0 ? (lanes)0 : above;
+        return raised > terms[6] ? (lanes)terms[6] : raised;
+    }
+    return above;
+#else
+    return terms[6] - expected;
+#endif
+}
+
 #if BIAS
 // Return whether means are at an end of the range.
 ilanes is_clamped_lanes(const lanes mean, const lanes expected, global const real *terms, const ilanes bin_at) {
@@ -124,16 +139,16 @@ NOT_INLINE lanes mass_between_lanes(const lanes below, const lanes above) {
     return (real)0.5 * (erf_lanes(below < above ? below : above) + erf_lanes(below < above ? above : below));
 }
 
-// Return the normal's mass on [0, range_max]; within becomes whether it is 1 in every lane.
-INLINE lanes hit_mass_lanes(const lanes mean, const lanes erf_scale, const real range_max, int *within) {
-    const lanes below = mean * erf_scale, above = (range_max - mean) * erf_scale;
+// Return the normal's mass from a distance before its mean to one after it; within becomes whether it is 1 in every lane.
+INLINE lanes hit_mass_lanes(const lanes before, const lanes after, const lanes erf_scale, int *within) {
+    const lanes below = before * erf_scale, above = after * erf_scale;
     *within = !any_lane((below < above ? below : above) < ERF_ONE);
     return *within ? (lanes)1 : mass_between_lanes(below, above);
 }
 
 // Return the mass of a hit of any shape on [0, range_max]; within becomes whether it is 1 in every lane.
-INLINE lanes mass_within_lanes(const lanes mean, const lanes scale, global const real *terms, const ilanes bin_at,
-                               int *within) {
+INLINE lanes mass_within_lanes(const lanes mean, const lanes above, const lanes scale, global const real *terms,
+                               const ilanes bin_at, int *within) {
 #if MASS_TABLE
     *within = 0;
 #if INCIDENCE
@@ -142,9 +157,9 @@ INLINE lanes mass_within_lanes(const lanes mean, const lanes scale, global const
 #else
     const ilanes place = (int)terms[19];
 #endif
-    return half_mass_lanes(mean * scale, terms, place) + half_mass_lanes((terms[6] - mean) * scale, terms, place);
+    return half_mass_lanes(mean * scale, terms, place) + half_mass_lanes(above * scale, terms, place);
 #else
-    return hit_mass_lanes(mean, scale, terms[6], within);
+    return hit_mass_lanes(mean, above, scale, within);
 #endif
 }
 #endif
@@ -172,14 +187,15 @@ INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, glo
 #if HIT
     int any_clamped, within;
     const lanes mean = mean_range_lanes(expected, terms, bin_at, &any_clamped);
+    const lanes above = above_mean_lanes(expected, any_clamped, terms, bin_at);
     const LanePair scale = hit_scale_lanes(expected, terms, bin_at);
     const LanePair exponent = hit_exponent_lanes(z, expected, mean, any_clamped, scale, terms, bin_at);
     lanes hit = TERM(0) * exp_lanes(-exponent.hi);
 #if GROWTH
     hit *= scale.hi;
-    const lanes mass = mass_within_lanes(mean, TERM(2) * scale.hi, terms, bin_at, &within);
+    const lanes mass = mass_within_lanes(mean, above, TERM(2) * scale.hi, terms, bin_at, &within);
 #else
-    const lanes mass = mass_within_lanes(mean, TERM(2), terms, bin_at, &within);
+    const lanes mass = mass_within_lanes(mean, above, TERM(2), terms, bin_at, &within);
 #endif
 #if EXACT_EXPONENT
     // Where the density underflows, the second part is arbitrary.
@@ -206,14 +222,15 @@ INLINE DensityParts density_parts_lanes(const lanes z, const lanes expected, glo
 #if HIT
     int any_clamped, within;
     const lanes mean = mean_range_lanes(expected, terms, bin_at, &any_clamped);
+    const lanes above = above_mean_lanes(expected, any_clamped, terms, bin_at);
     const LanePair scale = hit_scale_lanes(expected, terms, bin_at);
     const LanePair exponent = hit_exponent_lanes(z, expected, mean, any_clamped, scale, terms, bin_at);
     lanes hit = (TERM(0) - exponent.hi) + (TERM(8) - exponent.lo);
 #if GROWTH
     hit += log_lanes(scale.hi);
-    const lanes mass = mass_within_lanes(mean, TERM(2) * scale.hi, terms, bin_at, &within);
+    const lanes mass = mass_within_lanes(mean, above, TERM(2) * scale.hi, terms, bin_at, &within);
 #else
-    const lanes mass = mass_within_lanes(mean, TERM(2), terms, bin_at, &within);
+    const lanes mass = mass_within_lanes(mean, above, TERM(2), terms, bin_at, &within);
 #endif
     if (!within) hit = mass == 1 ? hit : hit - log_lanes(mass);
     parts.hit = hit;
@@ -271,7 +288,7 @@ lanes compat_density_lanes(const lanes z, const lanes expected, global const rea
     return z > terms[6] ? p : p + (z >= terms[6] ? (lanes)terms[7] : (lanes)terms[5]);
 #else
     int within;
-    const lanes mass = hit_mass_lanes(expected, terms[2], terms[6], &within);
+    const lanes mass = hit_mass_lanes(expected, terms[6] - expected, terms[2], &within);
     p = within ? p : p / mass;
     p += z < expected ? terms[3] * exp_lanes(-terms[4] * z) / short_length_lanes(expected, terms, 0) : (lanes)0;
     return p + (z >= terms[6] ? (lanes)terms[7] : (lanes)terms[5]);

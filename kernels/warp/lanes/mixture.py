@@ -23,7 +23,7 @@ def functions(flags):
     exact = error_free.functions(flags)
     two_sum, two_product, pair_sum, rest_of = exact.two_sum, exact.two_product, exact.pair_sum, exact.rest_of
     scalar = mixture.functions(flags)
-    mean_range, hit_scale = scalar.mean_range, scalar.hit_scale
+    mean_range, above_mean, hit_scale = scalar.mean_range, scalar.above_mean, scalar.hit_scale
     elementary = lane_math.functions(flags)
     exp_lanes, log_lanes, erf_lanes = elementary.exp_lanes, elementary.log_lanes, elementary.erf_lanes
     one_minus_exp_lanes = elementary.one_minus_exp_lanes
@@ -91,11 +91,11 @@ def functions(flags):
 
     # Return whether the mass of a hit on [0, range_max] may be less than 1.
     @wp.func
-    def near_an_end(mean: real, scale: real, terms: wp.array(dtype=real)):
+    def near_an_end(mean: real, above: real, scale: real):
         if MASS_TABLE:
             return int(1)
         else:
-            return int(wp.min(mean, at(terms, 6) - mean) * scale < ERF_ONE)
+            return int(wp.min(mean, above) * scale < ERF_ONE)
 
     # Return the masses of hits of any shape on [0, range_max]. Look-ups in a table keep a loop scalar.
     @wp.func
@@ -106,7 +106,7 @@ def functions(flags):
             mean = mean_range(expected[i], terms)
             scale = at(terms, 2) * hit_scale(expected[i], terms).x
             below = mean * scale
-            above = (at(terms, 6) - mean) * scale
+            above = above_mean(expected[i], terms) * scale
             if MASS_TABLE:
                 masses[i] = mass_place(below)
                 far[i] = mass_place(above)
@@ -214,7 +214,7 @@ def functions(flags):
                 if not AMCL:
                     mean = mean_range(expected[i], terms)
                     scale = at(terms, 2) * hit_scale(expected[i], terms).x
-                    doubtful += near_an_end(mean, scale, terms)
+                    doubtful += near_an_end(mean, above_mean(expected[i], terms), scale)
                 i += 1
         if doubtful > 0:
             masses = masses_within(expected, terms)

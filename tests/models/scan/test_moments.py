@@ -118,11 +118,26 @@ def test_small_offsets_of_narrow_densities_keep_all_digits(growth, backend):
         z = np.abs(expected[5] + bias + sigma * rng.uniform(-4, 4, 40)).astype(np.float32)
         model = gs.BeamModel(grid, scanner, p, backend=backend)
         _, parts = model.log_likelihood(poses[5:6], z, per_beam=True)
-        # A mean near the longest range has a mass of its rounding.
-        within = (expected[5] + bias + 9 * sigma < RANGE) & (z < RANGE)
+        within = z < RANGE
         truth = log_mixture(z.astype(float), expected[5].astype(float), range_max=RANGE, **p.to_dict())
         assert within.sum() > 5
         assert (np.abs(parts[0] - truth) <= per_beam(truth, np.float32))[within].all()
+
+
+@pytest.mark.parametrize("shape", ["normal", "student"])
+def test_means_near_the_longest_range_keep_all_digits(shape, backend):
+    """The distance from there to range_max has digits beyond the last one of the mean."""
+    grid, scanner, poses, expected = scene("float32")
+    sigma = 2e-3
+    for sigmas in (-1.5, 0.3, 1.0, 4.0):
+        mean = RANGE - sigmas * sigma
+        p = gs.BeamParameters(0.9, 0.0, 0.0, 0.1, sigma, range_bias=mean - float(expected[5, 0]), hit=shape)
+        z = np.full(expected.shape[1], np.nan, np.float32)
+        z[0] = min(mean - 0.5 * sigma, RANGE - 1e-4)
+        model = gs.BeamModel(grid, scanner, p, backend=backend)
+        _, parts = model.log_likelihood(poses[5:6], z, per_beam=True)
+        truth = log_mixture(z[:1].astype(float), expected[5, :1].astype(float), range_max=RANGE, **p.to_dict())
+        assert np.abs(parts[0, 0] - truth[0]) <= per_beam(truth, np.float32)[0], sigmas
 
 
 def test_parameters_of_0_change_no_bit_and_are_left_out(backend):

@@ -9,6 +9,11 @@
 // Step of a walk, and farthest start of one, where no map reaches [cells].
 #define STEP 0.5
 #define AFAR 1e9
+#define BEAM_NOTHING 0
+#define BEAM_AGREES 1
+#define BEAM_SHORT 2
+#define BEAM_THROUGH 3
+#define BEAM_VANISHED 4
 
 // Work-items that share a walk.
 #if SMALL_TEAMS
@@ -16,11 +21,6 @@
 #else
 #define WALKERS 256
 #endif
-#define BEAM_NOTHING 0
-#define BEAM_AGREES 1
-#define BEAM_SHORT 2
-#define BEAM_THROUGH 3
-#define BEAM_VANISHED 4
 
 // A work-item's number among those that share a walk, their number, and memory that they share.
 typedef struct {
@@ -104,15 +104,11 @@ double2 walk_beside(const double side, const double direction, const double2 ori
     const double shift = side * companion.x;
     const double x = (origin.x - shift * along.y) / cell, y = (origin.y + shift * along.x) / cell;
     const double2 start = (double2)(fmin(fmax(x, -AFAR), AFAR), fmin(fmax(y, -AFAR), AFAR));
-#if IN_TEAMS
     const int share = (steps + team.members - 1) / team.members, begin = team.member * share;
     const double2 own = walk_ray(start, slope, begin, min(begin + share, steps), cells, rows, cols, occupied);
     double2 first = least_of_team(own, team);
     if (first.y > first.x) first.y = INFINITY;
     return first * cell;
-#else
-    return walk_ray(start, slope, 0, steps, cells, rows, cols, occupied) * cell;
-#endif
 }
 
 // Return where the beams of an estimated pose begin, relative to the corner of the cells along the map's axes [m].

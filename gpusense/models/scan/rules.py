@@ -18,6 +18,12 @@ from gpusense.world.scanner import Reading, Scanner
 Beams = int | Sequence[int] | np.ndarray | None
 
 
+@functools.lru_cache(maxsize=256)
+def _evenly(most: int, count: int) -> np.ndarray:
+    """Return ``most`` evenly chosen places among ``count``."""
+    return (np.arange(most) * count) // max(most, 1)
+
+
 @dataclass(frozen=True)
 class BeamChoice:
     """The beams that ``beams=`` chooses.
@@ -41,23 +47,14 @@ class BeamChoice:
         columns = np.asarray(beams, np.intp)
         return BeamChoice(columns, len(columns), False)
 
-    @functools.cached_property
-    def _even(self) -> dict[int, np.ndarray]:
-        """Evenly chosen places among a number of places, by this number."""
-        return {}
-
     def used(self, informative: np.ndarray) -> np.ndarray:
         """Return which of the informative readings of a scan are used."""
         if len(self.columns) == len(informative):
             places = informative.nonzero()[0]
         else:
             places = self.columns.compress(informative.take(self.columns))
-        count = len(places)
-        if count > self.most:
-            chosen = self._even.get(count)
-            if chosen is None:
-                chosen = self._even[count] = (np.arange(self.most) * count) // max(self.most, 1)
-            places = places.take(chosen)
+        if len(places) > self.most:
+            places = places.take(_evenly(self.most, len(places)))
         used = np.zeros(len(informative), bool)
         used[places] = True
         return used

@@ -27,7 +27,7 @@ INLINE lanes mean_range_lanes(const lanes expected, global const real *terms, co
     *any_clamped = 0;
 #if BIAS
     const lanes wanted = expected + TERM(10);
-    *any_clamped = any_lane((wanted < 0) | (wanted > terms[6]));
+    *any_clamped = any_lane((wanted < 0) | (wanted >= terms[6]));
     if (*any_clamped) {
         const lanes raised = wanted < 0 ? (lanes)0 : wanted;
         return raised > terms[6] ? (lanes)terms[6] : raised;

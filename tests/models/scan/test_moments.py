@@ -140,6 +140,27 @@ def test_means_near_the_longest_range_keep_all_digits(shape, backend):
         assert np.abs(parts[0, 0] - truth[0]) <= per_beam(truth, np.float32)[0], sigmas
 
 
+@pytest.mark.parametrize("shape", ["normal", "student"])
+def test_a_mean_that_rounds_to_the_longest_range_has_half_of_its_mass(shape, backend):
+    """The sum of z* and the bias lies above range_max by less than half of its last bit, which is many sigma."""
+    grid, scanner, poses, expected = scene("float32")
+    start = float(expected[5, 0])
+    bias = RANGE - start + 2e-7
+    assert np.float32(start) + np.float32(bias) == RANGE < start + bias
+    z = np.full(expected.shape[1], np.nan, np.float32)
+    z[0] = np.nextafter(np.float32(RANGE), np.float32(0))
+    for sigma in (1e-7, 1e-6, 1e-5):
+        p = gs.BeamParameters(0.9, 0.0, 0.0, 0.1, sigma, range_bias=bias, hit=shape)
+        log_p = gs.BeamModel(grid, scanner, p, backend=backend).log_likelihood(poses[5:6], z)
+        # The mean moves by half of its last bit, and half of the density lies below it.
+        offset, moved = RANGE - z[0], RANGE - z[0] + 2.4e-7
+        near, far = (
+            log_mixture(RANGE - by, RANGE, range_max=RANGE, **p.replace(range_bias=0.0).to_dict())
+            for by in (offset, moved)
+        )
+        assert far - 1e-3 <= log_p[0] <= near + 1e-3, (sigma, far, near)
+
+
 def test_parameters_of_0_change_no_bit_and_are_left_out(backend):
     grid, scanner, poses, expected = scene("float32")
     plain = gs.BeamModel(grid, scanner, gs.BeamParameters(), backend=backend)

@@ -80,11 +80,14 @@ def row(kind: str, name: str, guess: str, backend: str, truth: np.ndarray, call:
 
 
 def one_by_one(
-    first: np.ndarray, second: np.ndarray, scanner: gs.Scanner, guess: np.ndarray, backend: str
+    first: np.ndarray, second: np.ndarray, scanner: gs.Scanner, guess: np.ndarray, backend: str, times: list[float]
 ) -> ScanMatch:
-    """Return the matches of pairs, each from a call of its own."""
-    calls = zip(first, second, guess, strict=True)
-    matches = [gs.match_scan(before, after, scanner, start, backend=backend) for before, after, start in calls]
+    """Return the matches of pairs, each from a call of its own, and append the time of each call [s]."""
+    matches = []
+    for before, after, start in zip(first, second, guess, strict=True):
+        begun = time.perf_counter()
+        matches.append(gs.match_scan(before, after, scanner, start, backend=backend))
+        times.append(time.perf_counter() - begun)
     return ScanMatch(**{f.name: np.stack([getattr(match, f.name) for match in matches]) for f in fields(ScanMatch)})
 
 
@@ -101,10 +104,12 @@ def recorded(data: Path, backend: str, limit: int, chosen: list[str]) -> list[di
         ranges, scanner = scans[name]
         first, second = ranges[pairs[:, 0].astype(int)], ranges[pairs[:, 1].astype(int)]
         if "single" in chosen:
-            rows.append(
-                row("single", f"{name} +{each['step']}", "odometry", backend, pairs[:, 2:5],
-                    lambda a=first, b=second, s=scanner, g=pairs[:, 5:8]: one_by_one(a, b, s, g, backend))
+            times: list[float] = []
+            found = row("single", f"{name} +{each['step']}", "odometry", backend, pairs[:, 2:5],
+                        lambda a=first, b=second, s=scanner, g=pairs[:, 5:8], t=times: one_by_one(a, b, s, g, backend, t)
             )  # fmt: skip
+            least = np.array(times).reshape(-1, len(first)).min(axis=0)
+            rows.append(found | {"shortest_ms": 1e3 * least.min(), "middle_ms": 1e3 * np.median(least)})
         if "pairs" not in chosen:
             continue
         for label, guess in {"odometry": pairs[:, 5:8], "none": 0 * pairs[:, 5:8], "perturbed": pairs[:, 8:11]}.items():
@@ -197,12 +202,13 @@ def main(argv: list[str] | None = None) -> None:
             r["what"], r["set"], r["guess"], str(r["matches"]), f"{r['median_mm']:.1f} / {r['p95_mm']:.0f}",
             f"{r['median_deg']:.3f} / {r['p95_deg']:.2f}", f"{r['wrong_percent']:.1f}", str(r["confident_wrong"]),
             f"{r['nees_mean']:.2f} / {r['nees_median']:.2f}", by_turn(r), f"{r['ms']:.2f}", f"{r['processor_ms']:.2f}",
+            f"{r['shortest_ms']:.2f} / {r['middle_ms']:.2f}" if "shortest_ms" in r else "-",
         ]
         for r in rows
     ]  # fmt: skip
     columns = [
         "what", "set", "guess", "matches", "median / p95 mm", "median / p95 deg", "wrong %", "confident and wrong",
-        "NEES mean / median", "least / largest turn", "ms", "processor ms",
+        "NEES mean / median", "least / largest turn", "ms", "processor ms", "shortest call / median pair, ms",
     ]  # fmt: skip
     publish(__file__, arguments, table(columns, lines), {"rows": rows})
 

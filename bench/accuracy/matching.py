@@ -4,12 +4,13 @@
 
 Rows "pairs": the sets of ``matching_pairs`` (300 pairs each; truth from reflectors or corrected poses) from the
 odometry's guess, without a guess, and from the reference +-0.5 m and +-10 degrees. Rows "single": the same from the
-odometry's guess, with a call for each match. Rows "simulated": exact and noisy scans of neighbouring poses in six maps,
-from guesses with such errors. Rows "map": odd scans of logs in the maps of their even ones, from such guesses. A match
-is wrong beyond 0.2 m or 5 degrees. Times are those of one call with all matches, the best of ``--repeats``, after a
-first call that compiles; processor times are summed over cores. NEES is the squared error by the predicted covariance
-over 3, with a mean of 1 for right covariances; for pairs it is also given for the third of the matches with the
-smallest turns of the robot, and for the third with the largest ones.
+odometry's guess, with a call for each match; the shortest of all calls, and the median pair's shortest one. Rows
+"simulated": exact and noisy scans of neighbouring poses in six maps, from guesses with such errors. Rows "map": odd
+scans of logs in the maps of their even ones, from such guesses. A match is wrong beyond 0.2 m or 5 degrees. Times are
+those of one call with all matches, the best of ``--repeats``, after a first call that compiles; processor times are
+summed over cores. NEES is the squared error by the predicted covariance over 3, with a mean of 1 for right covariances;
+for pairs it is also given for the third of the matches with the smallest turns of the robot, and for the third with the
+largest ones.
 """
 
 from __future__ import annotations
@@ -105,8 +106,9 @@ def recorded(data: Path, backend: str, limit: int, chosen: list[str]) -> list[di
         first, second = ranges[pairs[:, 0].astype(int)], ranges[pairs[:, 1].astype(int)]
         if "single" in chosen:
             times: list[float] = []
-            found = row("single", f"{name} +{each['step']}", "odometry", backend, pairs[:, 2:5],
-                        lambda a=first, b=second, s=scanner, g=pairs[:, 5:8], t=times: one_by_one(a, b, s, g, backend, t)
+            found = row(
+                "single", f"{name} +{each['step']}", "odometry", backend, pairs[:, 2:5],
+                lambda a=first, b=second, s=scanner, g=pairs[:, 5:8], t=times: one_by_one(a, b, s, g, backend, t),
             )  # fmt: skip
             least = np.array(times).reshape(-1, len(first)).min(axis=0)
             rows.append(found | {"shortest_ms": 1e3 * least.min(), "middle_ms": 1e3 * np.median(least)})

@@ -21,7 +21,7 @@ from gpusense.learning.beam.pairs import impossible_ranges
 from gpusense.logs import Scan
 from gpusense.models.scan.beam import BeamModel
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.scanner import classes
+from gpusense.world.scanner import reading_classes
 
 Floats = NDArray[np.float64]
 
@@ -75,7 +75,7 @@ class RangeData:
     @property
     def kinds(self) -> NDArray[np.uint8]:
         """Return (n,) the class of every reading."""
-        return classes(self.ranges, self.range_min, self.range_max)
+        return reading_classes(self.ranges, self.range_min, self.range_max)
 
 
 def data_of_log(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gpusense.matching.points import ScanPoints
-from gpusense.world.scanner import Reading, Scanner, classes
+from gpusense.world.scanner import Reading, Scanner, reading_classes
 
 _FULL_TURN = 2 * math.pi
 # Largest step between the bearings of neighbouring beams [usual steps].
@@ -43,7 +43,7 @@ def beams_of(ranges: np.ndarray, scanner: Scanner, points: ScanPoints) -> Beams:
     """Return the beams of (S, K) readings with these points."""
     angle = np.mod(scanner.bearings + scanner.mount[2], _FULL_TURN)
     order = np.argsort(angle, kind="stable")
-    state = classes(ranges, scanner.range_min, scanner.range_max)[:, order]
+    state = reading_classes(ranges, scanner.range_min, scanner.range_max)[:, order]
     scan = np.repeat(np.arange(len(ranges)), points.counts)
     bearing = angle[order]
     beam = _beams_of_points(points, bearing, scan, state)

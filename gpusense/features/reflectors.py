@@ -8,7 +8,7 @@ import numpy as np
 
 from gpusense._util.angles import wrapped
 from gpusense.features.result import Found, nothing
-from gpusense.world.scanner import Reading, Scanner, classes
+from gpusense.world.scanner import Scanner, classify_ranges
 
 # Least intensity of a bright beam, and of a reflector's brightest beam [medians of the scan].
 _BRIGHT, _BRIGHTEST = 2.0, 3.0
@@ -27,7 +27,7 @@ def find_reflectors(ranges: np.ndarray, intensities: np.ndarray, scanner: Scanne
     bearing = angle[order]
     steps = np.mod(np.roll(bearing, -1) - bearing, 2 * math.pi)
     step = float(np.median(steps)) if len(steps) else 0.0
-    hit = (classes(ranges, scanner.range_min, scanner.range_max)[:, order] == Reading.HIT) & (ranges[:, order] > 0)
+    hit = classify_ranges(ranges, scanner.range_min, scanner.range_max)[0][:, order] & (ranges[:, order] > 0)
     bright = np.where(hit & np.isfinite(intensities[:, order]), intensities[:, order], 0.0)
     rows: list[list[float]] = []
     for scan, (light, r) in enumerate(zip(bright, ranges[:, order], strict=True)):

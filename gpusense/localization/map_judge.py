@@ -23,7 +23,7 @@ from gpusense.interface.structs import BeamRules, Frame
 from gpusense.reference.passages import STEP, judge_beams
 from gpusense.world.frames import frame_of
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.scanner import Scanner
+from gpusense.world.scanner import Scanner, classify_ranges
 
 Floats = NDArray[np.float64]
 
@@ -89,11 +89,8 @@ class _Expected(NamedTuple):
 
 def chosen_beams(scanner: Scanner, ranges: Floats) -> Beams:
     """Return the beams of a scan (K,) that are judged."""
-    # Missing readings are below the least range, or NaN.
-    present = ranges >= scanner.range_min
-    if scanner.range_min > 0:
-        present &= ranges > 0
-    chosen = present.nonzero()[0]
+    hit, far = classify_ranges(ranges, scanner.range_min, scanner.range_max)
+    chosen = (hit | far).nonzero()[0]
     if len(chosen) > BEAMS:
         chosen = chosen[_MIDDLES * len(chosen) // JUDGED]
     return Beams(scanner.bearings[chosen], ranges[chosen])

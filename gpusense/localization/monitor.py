@@ -17,6 +17,7 @@ from gpusense.localization.sensors import sensors_of
 from gpusense.localization.spread import share_off, spread_of
 from gpusense.localization.verdict import Verdict, VerdictState
 from gpusense.localization.words import LOST, Word, word_of
+from gpusense.world.scanner import float64_readings
 
 # Number of poses drawn from a covariance to predict features.
 _DRAWN = 64
@@ -104,8 +105,9 @@ class PoseMonitor:
         readings = dict(readings_of(ranges, self._sensors))
         for index, reading in readings.items():
             if self._sensors[index].calibrates:
-                count = self._sensors[index].model.scanner.count
-                readings[index] = (checks.array("ranges", reading[0], (count,), finite=False), *reading[1:])
+                scanner = self._sensors[index].model.scanner
+                values = checks.array("ranges", reading[0], (scanner.count,), finite=False, dtype=None)
+                readings[index] = (float64_readings(values, scanner), *reading[1:])
         self._verdict.corrected()
         if self._verdict.watches(readings):
             drawn = starts.normal(place, _finite(spread), _DRAWN, (self._seed & 0xFFFFFFFF, self._seed >> 32, 0))

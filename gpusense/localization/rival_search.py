@@ -28,6 +28,7 @@ from gpusense.matching.likely import likely_poses
 from gpusense.models.landmark.base import FeatureModel
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.world.parameters import LikelihoodFieldParameters
+from gpusense.world.scanner import classify_ranges, float64_readings
 
 # Candidates of each search on a map; effective number of candidates that begin a rival; beams of a scan in a search.
 _CANDIDATES, _EFFECTIVE, _BEAMS = 40, 5, 60
@@ -130,8 +131,10 @@ class RivalSearch:
         for index, reading in readings:
             sensor = self._sensors[index]
             if sensor.calibrates:
-                ranges = np.asarray(arrays.copied_to_host(reading[0], sensor.backend, "ranges"), np.float64)
-                field, returned = self._field_of(sensor), np.isfinite(ranges)
+                on_host = np.asarray(arrays.copied_to_host(reading[0], sensor.backend, "ranges"))
+                field, scanner = self._field_of(sensor), sensor.model.scanner
+                ranges = float64_readings(on_host, scanner)
+                returned = classify_ranges(ranges, scanner.range_min, scanner.range_max)[0]
                 longer = np.where(ranges < np.median(ranges[returned]), np.nan, ranges) if returned.any() else ranges
                 return np.vstack([likely_poses(field, each, _CANDIDATES) for each in (ranges, longer)])
         return np.empty((0, 3))

@@ -22,6 +22,7 @@ from gpusense.models.point.base import PointModel
 from gpusense.models.scan.bound import DeviceCall
 from gpusense.models.scan.model import ScanModel
 from gpusense.world.grid import OccupancyGrid
+from gpusense.world.scanner import float64_readings
 
 _DOUBLE = np.dtype(np.float64)
 # Calls that may be started before the host waits.
@@ -175,8 +176,8 @@ class Sensor:
                 self.backend.copy(adopted.buffer, self._ranges, count * _DOUBLE.itemsize)
                 return
         ranges = arrays.copied_to_host(ranges, self.backend, "ranges")
-        values = checks.array("ranges", ranges, (count,), finite=False)
-        self.backend.upload(np.ascontiguousarray(values, _DOUBLE), self._ranges)
+        values = checks.array("ranges", ranges, (count,), finite=False, dtype=None)
+        self.backend.upload(np.ascontiguousarray(float64_readings(values, self.model.scanner)), self._ranges)
 
     def program(self, poses: Any, out: Any) -> tuple[Program, object]:
         """Return the launches that score poses on the device, and the owner of their memory."""

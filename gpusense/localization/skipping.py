@@ -83,7 +83,7 @@ def without_skipped(
     explained = weights @ (near > least) >= share * weights.sum()
     if np.count_nonzero(used & ~explained) > _MOST_SKIPPED * np.count_nonzero(used):
         return reading
-    ranges = np.array(arrays.copied_to_host(reading[0], sensor.backend, "ranges"), np.float64)
+    ranges = np.array(arrays.copied_to_host(reading[0], sensor.backend, "ranges"))
     ranges[~(used & explained)] = np.nan
     return (ranges, *reading[1:])
 

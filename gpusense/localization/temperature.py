@@ -290,7 +290,7 @@ def calibrate_temperature(model: Any, scans: AnyArray, poses: AnyArray) -> float
     if not isinstance(model, ScanModel):
         raise TypeError(f"model: must be a model of scans, got {checks.show(model)}")
     at = checks.array("poses", poses, ("S", 3))
-    readings = checks.array("scans", scans, (len(at), model.scanner.count), finite=False)
+    readings = checks.array("scans", scans, (len(at), model.scanner.count), finite=False, dtype=None)
     if len(at) < _LEAST_SCANS:
         raise ValueError(f"scans: must be at least {_LEAST_SCANS}, got {len(at)}")
     correlation = BeamCorrelation()

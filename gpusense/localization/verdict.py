@@ -28,6 +28,7 @@ from gpusense.localization.sensors import Sensor
 from gpusense.localization.spread import Spread, is_wide, spread_of
 from gpusense.localization.words import TRACKING
 from gpusense.models.landmark.base import FeatureModel
+from gpusense.world.scanner import float64_readings
 
 # Random poses.
 _RANDOM = 64
@@ -267,8 +268,10 @@ def sightings(
     for index, reading in readings.items():
         sensor = sensors[index]
         if sensor.calibrates:
-            ranges = np.asarray(arrays.copied_to_host(reading[0], sensor.backend, "ranges"), np.float64)
-            result.append(passages(sensor.model.grid, sensor.model.scanner, pose, ranges, covariance, sensor.judge()))
+            grid, scanner = sensor.model.grid, sensor.model.scanner
+            on_host = np.asarray(arrays.copied_to_host(reading[0], sensor.backend, "ranges"))
+            ranges = float64_readings(on_host, scanner)
+            result.append(passages(grid, scanner, pose, ranges, covariance, sensor.judge()))
     return result
 
 

@@ -16,7 +16,7 @@ from gpusense.mapping.rays import SCANS, RayEnds, Survey, batches, check_lengths
 from gpusense.world.deskew import check_motion
 from gpusense.world.grid import OccupancyGrid, grid_of_checked
 from gpusense.world.grid_frame import GridFrame, check_origin, check_resolution
-from gpusense.world.scanner import Scanner
+from gpusense.world.scanner import Scanner, float64_readings
 from gpusense.world.sensor_scans import check_scans
 from gpusense.world.windows import LONGEST_SIDE, Window
 
@@ -219,7 +219,7 @@ class MapBuilder:
 
 def _readings(name: str, value: Any, scanner: Scanner) -> np.ndarray:
     """Return the readings (S, K) of a scanner."""
-    read = checks.array(name, value, ("S", scanner.count), finite=False)
+    read = float64_readings(checks.array(name, value, ("S", scanner.count), finite=False, dtype=None), scanner)
     scanner._first_scans.look_at(name, read)
     return read
 

@@ -30,7 +30,7 @@ from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.tables.distances import distance_transform
 from gpusense.world.field_density import FieldDensity
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.scanner import Reading, classes
+from gpusense.world.scanner import classify_ranges
 
 # Side of the largest block with one bound, relative to the field's max_distance, and most levels.
 _BLOCK, _MOST_LEVELS = 0.8, 5
@@ -185,7 +185,7 @@ class FieldSearch:
         log_p = model.log_likelihood(poses, ranges).astype(np.float64)
         # Readings that are not hits have the same density at all poses.
         nearest, farthest = model.scanner.range_min, model.scanner.range_max
-        others = np.where(classes(ranges, nearest, farthest) == Reading.HIT, np.nan, ranges)
+        others = np.where(classify_ranges(ranges, nearest, farthest)[0], np.nan, ranges)
         log_p -= float(model.log_likelihood(poses[:1], others)[0])
         steps: np.ndarray = (log_p / model.temperature - hits * self._low) * (TOP / self._step())
         return steps

@@ -19,7 +19,7 @@ from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.models.scan.rules import BeamChoice
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.scanner import Reading, classify
+from gpusense.world.scanner import Reading, classify, float64_readings
 
 # Side of the largest block with one bound, relative to the field's max_distance, and most levels.
 _BLOCK, _MOST_LEVELS = 0.8, 5
@@ -93,7 +93,9 @@ def locate_scan(
     allowed = _allowed(grid, stride) if positions == "free" else None
     rows, cols = (-(-size // stride) for size in grid.shape)
     searched = PoseGrid(np.array([[0.5, 0.5]]), headings, rows, cols)
-    hits, points = end_points_of(model, ranges)
+    values = checks.array("ranges", ranges, (model.scanner.count,), finite=False, dtype=None)
+    values = float64_readings(values, model.scanner)
+    hits, points = end_points_of(model, values)
     options = dict(resolution=stride * cell, angle=2 * math.pi / turns, poses=searched.count)
     if not len(points):
         nothing = np.full(3, np.nan)
@@ -101,12 +103,12 @@ def locate_scan(
         return Location(nothing, 0.0, 0.0, 0.0, (), *said, evaluated=0, **options)  # type: ignore[arg-type]
     search = field_search(model, stride)
     with search.lock:
-        found = search.find(np.asarray(ranges, np.float64), points, searched, allowed, _DEPTH)
-    chosen = _modes(model, ranges, hits, search, found, modes)
+        found = search.find(values, points, searched, allowed, _DEPTH)
+    chosen = _modes(model, values, hits, search, found, modes)
     top = chosen[0]
     pose = top.pose
     if refine:
-        near = _refined(search.smooth, np.asarray(ranges, np.float64), pose, 2 * stride * cell, 4 * math.pi / turns)
+        near = _refined(search.smooth, values, pose, 2 * stride * cell, 4 * math.pi / turns)
         pose = near if positions == "all" or _is_free(grid, near) else pose
     return Location(
         pose, top.score, top.log_likelihood, top.agreement, chosen, *_said(chosen, min_probability),
@@ -114,14 +116,13 @@ def locate_scan(
     )  # fmt: skip
 
 
-def end_points_of(model: LikelihoodFieldModel, ranges: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def end_points_of(model: LikelihoodFieldModel, ranges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices of the hits that the model uses, and their (M, 2) end points on the robot [m]."""
     scanner = model.scanner
-    z = checks.array("ranges", ranges, (scanner.count,), finite=False)
-    scanner._first_scans.look_at("ranges", z, math.hypot(model.grid.width, model.grid.height))
-    hits = np.flatnonzero(BeamChoice.of(model.beams, scanner.count).used(classify(z, scanner) == Reading.HIT))
+    scanner._first_scans.look_at("ranges", ranges, math.hypot(model.grid.width, model.grid.height))
+    hits = np.flatnonzero(BeamChoice.of(model.beams, scanner.count).used(classify(ranges, scanner) == Reading.HIT))
     vectors = ray_vectors(scanner.bearings, scanner.mount)
-    return hits, z[hits, None] * vectors[hits] + np.array(scanner.mount[:2])
+    return hits, ranges[hits, None] * vectors[hits] + np.array(scanner.mount[:2])
 
 
 def _allowed(grid: OccupancyGrid, stride: int) -> np.ndarray:
@@ -137,13 +138,13 @@ def _allowed(grid: OccupancyGrid, stride: int) -> np.ndarray:
 
 
 def _modes(
-    model: LikelihoodFieldModel, ranges: ArrayLike, hits: np.ndarray, search: FieldSearch, found: Candidates, most: int
+    model: LikelihoodFieldModel, ranges: np.ndarray, hits: np.ndarray, search: FieldSearch, found: Candidates, most: int
 ) -> tuple[PoseMode, ...]:
     """Return the best pose and the other local maxima among the poses, by falling score."""
     poses, radius = found.poses, max(_MODE_RADIUS, 2 * search.stride * search.grid.resolution)
     chosen = distinct_poses(poses, most, radius, _MODE_ANGLE, found.best)
     log_p = model.log_likelihood(poses[chosen], ranges)
-    shares = _shares(model, np.asarray(ranges, np.float64), hits, search.caster, poses[chosen])
+    shares = _shares(model, ranges, hits, search.caster, poses[chosen])
     return tuple(
         PoseMode(poses[i], float(found.score[i]), float(log_p[n]), *(float(share) for share in shares[n]))
         for n, i in enumerate(chosen)

@@ -25,7 +25,7 @@ from gpusense.models.arguments import real_dtype
 from gpusense.world.deskew import check_motion, still_readings
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.scanner import Reading, Scanner, classes
+from gpusense.world.scanner import Scanner, classify_ranges
 
 # Side of a map's cell in capture radii, and most cells along a side; larger scans have larger cells.
 _CELL, _MOST_CELLS = 0.05, 1500
@@ -265,7 +265,7 @@ def scan_map(ranges: np.ndarray, scanner: Scanner, margin: float, cell: float) -
         margin: Width of the space around the hits [m].
         cell: Least side of a cell [m].
     """
-    hits = classes(ranges, scanner.range_min, scanner.range_max) == Reading.HIT
+    hits = classify_ranges(ranges, scanner.range_min, scanner.range_max)[0]
     place = ranges[hits, None] * ray_vectors(scanner.bearings, scanner.mount)[hits] + np.array(scanner.mount[:2])
     if not len(place):
         place = np.zeros((1, 2))

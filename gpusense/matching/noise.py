@@ -17,7 +17,7 @@ import numpy as np
 from gpusense.matching.columns import Column, chosen, column_of, larger, smaller, values_of
 from gpusense.reference.pair_steps import noise_of
 from gpusense.world.grid import OccupancyGrid
-from gpusense.world.scanner import Scanner, hits
+from gpusense.world.scanner import Scanner, classify_ranges
 
 # Most beams of a scan that are evaluated.
 _PLACES = 120
@@ -32,7 +32,7 @@ def scan_noise(ranges: np.ndarray, scanner: Scanner) -> np.ndarray:
     """Return the standard deviations (S,) of the ranges of (S, K) readings [m], NaN where too few beams measure it."""
     if scanner.count < 3 or not len(ranges):
         return np.full(len(ranges), np.nan)
-    known = np.where(hits(ranges, scanner.range_min, scanner.range_max), ranges, np.nan)
+    known = np.where(classify_ranges(ranges, scanner.range_min, scanner.range_max)[0], ranges, np.nan)
     return noise_of(known.astype(np.float64, copy=False), *neighbors(scanner))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from gpusense.matching.columns import column_of, larger, square_root, values_of
 from gpusense.world.deskew import sensor_points
-from gpusense.world.scanner import Scanner, hits
+from gpusense.world.scanner import Scanner, classify_ranges
 
 _FULL_TURN = 2 * math.pi
 # Points nearer than this have no bearing [m].
@@ -86,7 +86,7 @@ def scan_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype, motion: np
         return _moved_points(ranges, scanner, real, motion)
     order, bearing, cosine, sine, gap = beams_by_angle(scanner, real)
     z = ranges.take(order, axis=1)
-    hit = hits(z, scanner.range_min, scanner.range_max)
+    hit = classify_ranges(z, scanner.range_min, scanner.range_max)[0]
     hit &= z > _NEAREST
     z = np.where(hit, z, 0).astype(np.float64, copy=False)
     everything = np.empty((*z.shape, 4), real)
@@ -126,7 +126,7 @@ def _gap_of(bearing: np.ndarray) -> float:
 
 def _moved_points(ranges: np.ndarray, scanner: Scanner, real: np.dtype, motion: np.ndarray) -> ScanPoints:
     """Return the points of scans of a robot that moves."""
-    hit = hits(ranges, scanner.range_min, scanner.range_max) & (ranges > _NEAREST)
+    hit = classify_ranges(ranges, scanner.range_min, scanner.range_max)[0] & (ranges > _NEAREST)
     place = sensor_points(ranges.astype(np.float64), scanner, motion)[hit]
     direction = np.mod(np.arctan2(place[:, 1], place[:, 0]), _FULL_TURN)
     point = np.column_stack([place, direction, np.hypot(*place.T)]).astype(real)

@@ -23,7 +23,7 @@ from gpusense.matching.options import COARSE_POINTS, MatchOptions
 from gpusense.matching.points import beams_by_angle
 from gpusense.matching.result import ScanMatch
 from gpusense.matching.start_search import Levels
-from gpusense.world.scanner import Scanner, limits
+from gpusense.world.scanner import Scanner, range_limits
 
 _DOUBLE, _INT = np.dtype(np.float64), np.dtype(np.int32)
 _PAIR = np.array([[0, 1, 0]], np.int32)
@@ -116,7 +116,7 @@ def _program(backend: Backend, space: Workspace, scene: _Scene, options: MatchOp
     room = -(-size // _AT_ONCE) * _AT_ONCE
     weight = np.zeros((room, 2))
     weight[:size] = np.transpose(weights)
-    nearest, farthest = limits(scene.kind, scene.scanner.range_min, scene.scanner.range_max)
+    nearest, farthest = range_limits(scene.kind, scene.scanner.range_min, scene.scanner.range_max)
     strides = max(count // COARSE_POINTS, 1)
     rules = [
         options.at_noise(noise).rules(COARSE_POINTS * stride, gap)

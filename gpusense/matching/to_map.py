@@ -35,7 +35,7 @@ from gpusense.tables.distances import distance_transform
 from gpusense.world.frames import ray_vectors
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.parameters import LikelihoodFieldParameters
-from gpusense.world.scanner import Reading, Scanner, classes
+from gpusense.world.scanner import Scanner, classify_ranges
 
 # Weight of readings unrelated to the map.
 _RANDOM = 0.2
@@ -228,8 +228,7 @@ class MapMatcher:
         return near
 
     def _hits(self, ranges: np.ndarray) -> np.ndarray:
-        hits: np.ndarray = classes(ranges, self._scanner.range_min, self._scanner.range_max) == Reading.HIT
-        return hits
+        return classify_ranges(ranges, self._scanner.range_min, self._scanner.range_max)[0]
 
     def _finished(
         self, ranges: np.ndarray, pose: np.ndarray, iterations: np.ndarray, calm: np.ndarray, method: str

@@ -112,7 +112,7 @@ def draw_scan(ax: Axes, grid: OccupancyGrid, scanner: Scanner, pose: ArrayLike, 
     from matplotlib.collections import LineCollection
 
     x, y, theta = checks.array("pose", pose, (3,)).tolist()
-    z = checks.array("ranges", ranges, (scanner.count,), finite=False)
+    z = checks.array("ranges", ranges, (scanner.count,), finite=False, dtype=None)
     hit = classify(z, scanner) == Reading.HIT
     ahead, aside, turn = scanner.mount
     c, s = math.cos(theta), math.sin(theta)

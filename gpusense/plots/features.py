@@ -49,7 +49,7 @@ def draw_features(ax: Axes, features: Features, ranges: ArrayLike, scanner: Scan
         >>> ax.get_xlabel()
         'x [m]'
     """
-    z = checks.array("ranges", ranges, (scanner.count,), finite=False)
+    z = checks.array("ranges", ranges, (scanner.count,), finite=False, dtype=None)
     points = points_of(z, scanner)
     ax.plot(points[:, 0], points[:, 1], ".", color=POINTS, ms=2.5, zorder=2, label="readings")
     shown = set()

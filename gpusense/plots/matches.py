@@ -61,7 +61,7 @@ def match_figure(
 
 def points_of(ranges: ArrayLike, scanner: Scanner) -> np.ndarray:
     """Return the end points of the hits of a scan in the robot's frame."""
-    z = np.asarray(masks.filled(ranges), np.float64)
+    z = np.asarray(masks.filled(ranges))
     hit = classify(z, scanner) == Reading.HIT
     points: np.ndarray = z[hit, None] * ray_vectors(scanner.bearings, scanner.mount)[hit] + np.array(scanner.mount[:2])
     return points

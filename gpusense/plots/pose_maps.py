@@ -138,7 +138,7 @@ def draw_scan_field(
         >>> gs.plots.draw_scan_field(ax, [1.0, 2.0], scanner).get_array().shape
         (40, 36)
     """
-    z = checks.array("ranges", ranges, (scanner.count,), finite=False)
+    z = checks.array("ranges", ranges, (scanner.count,), finite=False, dtype=None)
     hits = classify(z, scanner) == Reading.HIT
     if not hits.any():
         raise ValueError("ranges: must have a range, got none")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gpusense.reference.reading_class import is_hit
 from gpusense.reference.sorting import sort_numbers
 
 # Median absolute value of a normal error [standard deviations].
@@ -17,12 +18,6 @@ LEAST_STEP, ODD = 1e-3, 0.02
 LEAST_BEAMS = 12
 # Points nearer than this have no bearing [m].
 NEAREST = 1e-6
-
-
-def is_hit(readings: np.ndarray, nearest: float, farthest: float) -> np.ndarray:
-    """Return which readings are ranges."""
-    hit: np.ndarray = (readings < farthest) & (readings >= nearest)
-    return hit
 
 
 def deviation_of(

@@ -12,6 +12,7 @@ import numpy as np
 from gpusense.interface import structs
 from gpusense.interface.constants import BLOCK_TERMS, MAX_FIXED, MAX_LEFT_OUT, MAX_PLACED
 from gpusense.reference.placement import place_poses
+from gpusense.reference.reading_class import is_hit, is_max
 
 
 def is_chosen(rank: np.ndarray, informative: int, chosen: int) -> np.ndarray:
@@ -73,7 +74,7 @@ def place_reading(
     ``possible``.
     """
     z = reading_of(flags, ranges, beam, rules.beams)
-    hit, far = (z >= rules.nearest) & (z < rules.farthest), z >= rules.farthest
+    hit, far = is_hit(z, rules.nearest, rules.farthest), is_max(z, rules.farthest)
     informative = hit | (far & (rules.max_readings != MAX_LEFT_OUT))
     rank = np.cumsum(informative) - 1
     used = informative & is_chosen(rank, int(np.count_nonzero(informative)), rules.chosen)

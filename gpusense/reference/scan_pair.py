@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from gpusense.reference.line_fit import fit_scan
-from gpusense.reference.pair_steps import is_hit, level_of, noise_of, place_points
+from gpusense.reference.pair_steps import level_of, noise_of, place_points
+from gpusense.reference.reading_class import is_hit
 
 
 def place_pair(

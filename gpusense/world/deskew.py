@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
 from gpusense.world.frames import ray_vectors
-from gpusense.world.scanner import Reading, Scanner, classes
+from gpusense.world.scanner import Scanner, classify_ranges, float64_readings
 
 Floats = NDArray[np.float64]
 
@@ -120,7 +120,7 @@ def deskew_scan(ranges: ArrayLike, scanner: Scanner, motion: ArrayLike) -> Float
     checks.instance("scanner", scanner, Scanner)
     read = checks.as_array("ranges", ranges, masked=True)
     shape = ("S", scanner.count) if read.ndim == 2 else (scanner.count,)
-    values = np.atleast_2d(checks.array("ranges", read, shape, finite=False))
+    values = np.atleast_2d(checks.array("ranges", read, shape, finite=False, dtype=None))
     moved = check_motion("motion", motion, len(values))
     if moved is None:
         raise TypeError("motion: must be (3,) or (S, 3), got None")
@@ -130,10 +130,10 @@ def deskew_scan(ranges: ArrayLike, scanner: Scanner, motion: ArrayLike) -> Float
 
 def still_readings(ranges: Floats, scanner: Scanner, motion: Floats) -> Floats:
     """Return (S, K) readings of a robot at rest; see :func:`deskew_scan`."""
+    ranges = float64_readings(ranges, scanner)
     if scanner.count < 2:
-        return ranges.astype(np.float64)
-    ranges = ranges.astype(np.float64)
-    hit = classes(ranges, scanner.range_min, scanner.range_max) == Reading.HIT
+        return ranges
+    hit = classify_ranges(ranges, scanner.range_min, scanner.range_max)[0]
     point = sensor_points(ranges, scanner, motion)
     # Beams without a hit turn with the robot.
     bearing = scanner.bearings + beam_poses(motion, scanner.count)[1]

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
+from gpusense.reference.reading_class import is_hit, is_max
 from gpusense.world import plausible
 from gpusense.world.messages import laser_geometry
 
@@ -282,42 +283,41 @@ def classify(ranges: ArrayLike, scanner: Scanner) -> NDArray[np.uint8]:
     if z.ndim not in (1, 2) or z.shape[-1] != scanner.count:
         rule = f"shape must be ({scanner.count},) or (S, {scanner.count})"
         raise ValueError(f"ranges: {rule}, got {checks.shape_text(z.shape)}")
-    return classes(z, scanner.range_min, scanner.range_max)
+    return reading_classes(z, scanner.range_min, scanner.range_max)
 
 
-def _rounded_limits(dtype: np.dtype, range_min: float, range_max: float) -> tuple[Any, Any]:
-    """Return the limits of ranges rounded to the type of readings."""
-    with np.errstate(over="ignore"):  # range_max may exceed float16
-        return dtype.type(range_min), dtype.type(range_max)
+def classify_ranges(
+    z: NDArray[np.floating], range_min: float, range_max: float
+) -> tuple[NDArray[np.bool], NDArray[np.bool]]:
+    """Return which readings of any shape are hits, and which are max readings; the others are missing."""
+    nearest, farthest = range_limits(z.dtype, range_min, range_max)
+    return is_hit(z, nearest, farthest), is_max(z, farthest)
 
 
-def limits(dtype: np.dtype, range_min: float, range_max: float) -> tuple[float, float]:
-    """Return the least reading that is a hit, and the least larger one that is none; see :func:`classify`.
+def reading_classes(z: NDArray[np.floating], range_min: float, range_max: float) -> NDArray[np.uint8]:
+    """Return the class of each reading of any shape, as :func:`classify` does."""
+    hit, far = classify_ranges(z, range_min, range_max)
+    kinds: NDArray[np.uint8] = np.full(z.shape, Reading.MISSING, np.uint8)
+    kinds[hit], kinds[far] = Reading.HIT, Reading.MAX
+    return kinds
 
-    Args:
-        dtype: Type of the readings.
-        range_min: Lower limit of ranges [m].
-        range_max: Upper limit of ranges [m].
+
+def float64_readings(z: NDArray[Any], scanner: Scanner) -> NDArray[np.float64]:
+    """Convert readings to float64 and keep their classes, which depend on limits rounded to the original type."""
+    if z.dtype.kind != "f" or z.dtype == np.float64:
+        return z.astype(np.float64, copy=False)
+    hit, far = classify_ranges(z, scanner.range_min, scanner.range_max)
+    return np.where(hit, np.maximum(z.astype(np.float64), scanner.range_min), np.where(far, np.inf, np.nan))
+
+
+@functools.lru_cache(maxsize=64)
+def range_limits(dtype: np.dtype, range_min: float, range_max: float) -> tuple[float, float]:
+    """Return the least hit and the least max reading, rounded to the type of the readings.
+
+    A reading of 0 is missing if range_min > 0, even where range_min is rounded to 0.
     """
-    nearest, farthest = map(float, _rounded_limits(dtype, range_min, range_max))
-    return max(nearest, math.ulp(0.0)) if range_min > 0 else nearest, farthest
-
-
-def hits(z: NDArray[np.floating], range_min: float, range_max: float) -> NDArray[np.bool]:
-    """Return which readings of any shape are of the class ``HIT``; see :func:`classify`."""
-    nearest: float | np.floating = range_min
-    farthest: float | np.floating = range_max
-    if z.dtype != np.float64:
-        nearest, farthest = _rounded_limits(z.dtype, range_min, range_max)
-    near_enough: NDArray[np.bool] = (z < farthest) & (z >= nearest)
-    return near_enough & (z > 0) if range_min > 0 else near_enough
-
-
-def classes(z: NDArray[np.floating], range_min: float, range_max: float) -> NDArray[np.uint8]:
-    """Classify readings of any shape between two ranges; see :func:`classify`."""
-    nearest, farthest = _rounded_limits(z.dtype, range_min, range_max)
-    too_near = (z < nearest) | (z <= 0) if range_min > 0 else z < 0
-    result = np.full(z.shape, Reading.HIT, dtype=np.uint8)
-    result[z >= farthest] = Reading.MAX
-    result[too_near | np.isnan(z)] = Reading.MISSING
-    return result
+    with np.errstate(over="ignore"):  # range_max may exceed float16
+        nearest, farthest = float(dtype.type(range_min)), float(dtype.type(range_max))
+    if nearest == 0 < range_min:
+        nearest = float(np.finfo(dtype).smallest_subnormal)
+    return nearest, max(nearest, farthest)

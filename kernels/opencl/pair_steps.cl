@@ -1,5 +1,6 @@
 // Noise and points of scans, from their readings; see gpusense/matching/noise.py and points.py. sort_numbers, scalar or in
 // lanes, stands before this file in a program.
+// requires: reading_class
 
 // Median absolute value of a normal error [standard deviations], and the deviation of rounding to steps of sqrt(12).
 #define MEDIAN 0.6745
@@ -13,11 +14,6 @@
 #define LEAST_BEAMS 12
 // Points nearer than this have no bearing [m].
 #define NEAREST 1e-6
-
-// Return whether a reading is a range.
-int is_hit(const double reading, const double nearest, const double farthest) {
-    return reading < farthest && reading >= nearest;
-}
 
 // Return how far a range is from the one that its neighbours predict on a straight wall, in the standard deviation of this
 // difference; infinite where they do not lie on one surface. weight has those of the neighbours.

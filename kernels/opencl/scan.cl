@@ -2,7 +2,7 @@
 // gpusense.models.scan.classed does it on the host. Uninformative readings are left out and the others move up, so that
 // sums over blocks of readings have the same bits. The places that remain at the end get missing readings (nan), which
 // add nothing.
-// requires: error_free placement
+// requires: error_free placement reading_class
 
 #if RANGES_FLOAT32
 typedef float measured;
@@ -40,7 +40,8 @@ int count_informative(global const measured *ranges, global const int *beam, con
     int informative = 0;
     for (int k = 0; k < rules.beams; ++k) {
         const double z = reading_of(k, ranges, beam, rules.beams);
-        informative += z >= rules.nearest && (z < rules.farthest || rules.max_readings != MAX_LEFT_OUT);
+        informative += is_hit(z, rules.nearest, rules.farthest) ||
+                       (rules.max_readings != MAX_LEFT_OUT && is_max(z, rules.farthest));
     }
     return informative;
 }
@@ -53,8 +54,8 @@ uint2 read_block(const int first, global const measured *ranges, global const in
     uint hits = 0, fars = 0;
 #pragma unroll
     for (int i = 0; i < BLOCK_TERMS; ++i) {
-        hits |= (uint)(several[i] >= rules.nearest && several[i] < rules.farthest) << i;
-        fars |= (uint)(several[i] >= rules.farthest) << i;
+        hits |= (uint)is_hit(several[i], rules.nearest, rules.farthest) << i;
+        fars |= (uint)is_max(several[i], rules.farthest) << i;
     }
     return (uint2)(hits, fars);
 }

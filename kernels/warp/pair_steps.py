@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from .prelude import precision
+from .reading_class import is_hit
 from .sorting import sort_numbers
 
 ZERO, ONE, MINUS_ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0)), wp.constant(wp.float64(-1.0))
@@ -22,12 +23,6 @@ ODD = wp.constant(wp.float64(0.02))
 LEAST_BEAMS = wp.constant(12)
 # Points nearer than this have no bearing [m].
 NEAREST = wp.constant(wp.float64(1e-6))
-
-
-# Return whether a reading is a range.
-@wp.func
-def is_hit(reading: wp.float64, nearest: wp.float64, farthest: wp.float64):
-    return reading < farthest and reading >= nearest
 
 
 # Return how far a range is from the one that its neighbours predict on a straight wall, in the standard deviation of

@@ -13,6 +13,7 @@ import warp as wp
 from . import placement
 from .error_free import BLOCK_TERMS
 from .prelude import kernel, popcount, precision, work_item
+from .reading_class import is_hit, is_max
 
 # Max readings are left out, part of the constant term, or evaluated like others.
 MAX_LEFT_OUT, MAX_FIXED, MAX_PLACED = wp.constant(0), wp.constant(1), wp.constant(2)
@@ -67,7 +68,8 @@ def make(name, flags):
             informative = int(0)
             for k in range(rules.beams):
                 z = reading_of(k, ranges, beam, rules.beams)
-                if z >= rules.nearest and (z < rules.farthest or rules.max_readings != MAX_LEFT_OUT):
+                far = rules.max_readings != MAX_LEFT_OUT and is_max(z, rules.farthest)
+                if is_hit(z, rules.nearest, rules.farthest) or far:
                     informative += 1
         return informative
 
@@ -83,8 +85,8 @@ def make(name, flags):
         hits = int(0)
         fars = int(0)
         for i in range(BLOCK_TERMS):
-            hits = hits | (int(several[i] >= rules.nearest and several[i] < rules.farthest) << i)
-            fars = fars | (int(several[i] >= rules.farthest) << i)
+            hits = hits | (int(is_hit(several[i], rules.nearest, rules.farthest)) << i)
+            fars = fars | (int(is_max(several[i], rules.farthest)) << i)
         return several, hits, fars
 
     # Return the set of those of a block's informative readings that are chosen; the first one has the rank.

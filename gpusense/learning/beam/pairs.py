@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
 from gpusense.world.plausible import look_at_readings
-from gpusense.world.scanner import Reading, classes
+from gpusense.world.scanner import Reading, reading_classes
 
 # Largest number of readings for estimating a sensor's rounding step.
 _SAMPLE = 20_000
@@ -86,7 +86,7 @@ def make_pairs(ranges: ArrayLike, expected: ArrayLike, range_max: float, range_m
             f"{checks.shape_text(z_expected.shape)}"
         )
     z, z_expected = z.ravel(), z_expected.ravel()
-    kinds = classes(z, range_min, range_max)
+    kinds = reading_classes(z, range_min, range_max)
     look_at_readings("ranges", z, range_max)
     if not (kinds != Reading.MISSING).any():
         raise ValueError(f"ranges: must hold a reading that is not missing, got {z.size} of which none is")

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gpusense._util import checks
-from gpusense.world.scanner import Reading, classes
+from gpusense.world.scanner import Reading, reading_classes
 
 # Largest number of steps along a beam: its table takes 134 MB in float64.
 MOST_BINS = 4096
@@ -32,7 +32,7 @@ def check_pairs(ranges: object, expected: object, range_max: float) -> tuple[NDA
     """
     z = checks.array("ranges", ranges, finite=False, dtype=None)
     z_exp = checks.array("expected", expected, z.shape, finite=False, dtype=None)
-    kinds = classes(z, 0.0, range_max)
+    kinds = reading_classes(z, 0.0, range_max)
     bad = ~(z_exp >= 0) & (kinds != Reading.MISSING)
     if bad.any():
         rule = "every value must be >= 0 where the reading is not missing"

@@ -5,7 +5,6 @@ Readings are classed first and thinned afterwards, so that ``beams=60`` means 60
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -13,7 +12,7 @@ import numpy as np
 
 from gpusense._util import checks
 from gpusense.models.scan.rules import Rules
-from gpusense.world.scanner import Scanner
+from gpusense.world.scanner import Scanner, classify_ranges
 
 
 class LeftOut(NamedTuple):
@@ -126,29 +125,11 @@ def check_ranges(ranges: object, scanner: Scanner) -> np.ndarray:
     return checks.array("ranges", readings, shape=shape, finite=False, dtype=None)
 
 
-@functools.lru_cache(maxsize=64)
-def _limits(range_min: float, range_max: float, dtype: np.dtype) -> tuple[np.floating, np.floating]:
-    """Return the scanner's limits, rounded to the type of the readings."""
-    with np.errstate(over="ignore"):
-        return dtype.type(range_min), dtype.type(range_max)
-
-
-def hits_and_max(ranges: np.ndarray, limits: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return which readings of scans are ranges, and which are max readings, by range_min and range_max."""
-    nearest, farthest = _limits(*limits, ranges.dtype)
-    hit, far = ranges >= nearest, ranges >= farthest
-    if nearest == 0 < limits[0]:
-        # A reading of 0 is missing, even if the limit is rounded to 0.
-        hit, far = ranges > 0, far & (ranges > 0)
-    hit &= ranges < farthest
-    return hit, far
-
-
 def class_scans(ranges: np.ndarray, rules: Rules) -> ClassedScans:
     """Class, choose and group the readings of (S, K) scans, S > 0."""
     if rules.first_scans.left:
         rules.first_scans.look_at("ranges", ranges, rules.map_size)
-    hit, far = hits_and_max(ranges, rules.limits)
+    hit, far = classify_ranges(ranges, *rules.limits)
     if rules.max_is_range:
         finite = np.isfinite(ranges)
         hit, far = hit | (far & finite), far & ~finite

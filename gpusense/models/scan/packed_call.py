@@ -18,9 +18,9 @@ from gpusense.backends.programs import ProgramCache
 from gpusense.backends.workspace import Workspace
 from gpusense.models.poses import corners_of
 from gpusense.models.scan.bound import DeviceCall
-from gpusense.models.scan.classed import hits_and_max
 from gpusense.models.scan.pipeline import ScanPipeline
 from gpusense.models.scan.tiles import LEAST_ORDERED
+from gpusense.world.scanner import classify_ranges
 from gpusense.world.windows import Corners
 
 # Largest size that is copied with the launches [bytes]; longer arrays take the ordinary call.
@@ -229,7 +229,7 @@ class ShortCalls:
 
     def _has_range(self, ranges: np.ndarray) -> bool:
         """Return whether a reading depends on the pose; without one the constant term is rounded differently."""
-        return bool(hits_and_max(ranges, self._pipeline.rules.limits)[0].any())
+        return bool(classify_ranges(ranges, *self._pipeline.rules.limits)[0].any())
 
     def _corners(self, poses: np.ndarray) -> Corners | None:
         """Return corners of the box of poses; None where one is not finite."""

@@ -17,7 +17,7 @@ from gpusense.interface.structs import ReadingRules
 from gpusense.models.poses import PlacedPoses
 from gpusense.models.scan.rules import BeamChoice, Beams
 from gpusense.world.range_causes import NoReturn
-from gpusense.world.scanner import Scanner
+from gpusense.world.scanner import Scanner, range_limits
 
 _INT = np.dtype(np.int32)
 # The kernel places readings in whole groups of work-items, so that the work-items of poses begin a new group.
@@ -129,15 +129,6 @@ class Sensing:
         """Tell whether readings without a place may add a constant term."""
         return self.max_readings == MAX_FIXED or not self.possible
 
-    def limits(self, dtype: np.dtype) -> tuple[float, float]:
-        """Return the least range, and the least max reading, of readings of a type."""
-        with np.errstate(over="ignore"):
-            nearest, farthest = dtype.type(self.scanner.range_min), dtype.type(self.scanner.range_max)
-        if self.scanner.range_min > 0:
-            # A reading of 0 is missing, even if the limit is rounded to 0.
-            nearest = max(nearest, np.finfo(dtype).smallest_subnormal)
-        return float(nearest), float(farthest)
-
 
 def device_readings(
     sensing: Sensing, ranges: Buffer, dtype: np.dtype, limits: np.dtype, space: Workspace
@@ -167,7 +158,7 @@ def device_readings(
         END_POINTS=end_points, FLOAT64=real == np.float64, ALL_READINGS=not sensing.specialize,
         RANGES_FLOAT32=dtype == np.float32, SOME_BEAMS=len(columns) < sensing.scanner.count,
     )  # fmt: skip
-    nearest, farthest = sensing.limits(limits)
+    nearest, farthest = range_limits(limits, sensing.scanner.range_min, sensing.scanner.range_max)
     chosen = sensing.choice.most
     kind = sensing.max_readings
     arguments = dict(

@@ -27,6 +27,7 @@ models leave out. Bearings move by 0.125 degrees at most.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections import Counter
 from collections.abc import Iterator
@@ -40,13 +41,13 @@ from gpusense._util.angles import wrapped
 from gpusense._util.notices import warn_user
 from gpusense.logs.bags import ODOMETRY, SCAN, TRANSFORMS, errors_at, messages, topics_of
 from gpusense.logs.records import Floats, Odometry, Pose, Scan
-from gpusense.logs.transforms import Transforms, matrix_of, planar_mount
+from gpusense.logs.transform_buffer import TransformBuffer, TransformError
+from gpusense.logs.transforms import planar_mount
 from gpusense.world.messages import (
     distinct_beams,
     laser_geometry,
     planar_pose,
     real_field,
-    rotation_of,
     spread_readings,
     stamp_of,
 )
@@ -78,7 +79,6 @@ class _Bag:
         times: Times of odometry [s].
         poses: Poses of odometry.
         transforms: Transforms between frames.
-        moved: Times and poses in the frame odom, by child frame.
     """
 
     topic: str
@@ -88,8 +88,7 @@ class _Bag:
     geometries: Counter[Geometry] = field(default_factory=Counter)
     times: list[float] = field(default_factory=list)
     poses: list[Pose] = field(default_factory=list)
-    transforms: Transforms = field(default_factory=Transforms)
-    moved: dict[str, list[tuple[float, Pose]]] = field(default_factory=dict)
+    transforms: TransformBuffer = field(default_factory=TransformBuffer)
 
 
 def read(
@@ -148,12 +147,12 @@ def _survey(path: Path, topic: str | None) -> _Bag:
                 bag.poses.append(_odometry_pose(message.fields))
                 bag.base = bag.base or str(field_of("message", message.fields, "child_frame_id")) or None
             else:
-                _take_transforms(bag, message.fields)
+                for each in field_of("message", message.fields, "transforms"):
+                    bag.transforms.add(each, static=message.topic.endswith("tf_static"))
     if not bag.geometries:
         raise ValueError(f"{path}: must hold scans on {bag.topic}, got none")
-    if not bag.times and bag.moved:
-        base = next((each for each in _BASES if each in bag.moved), min(bag.moved))
-        bag.base, bag.times, bag.poses = base, [time for time, _ in bag.moved[base]], [p for _, p in bag.moved[base]]
+    if not bag.times:
+        _take_odometry(bag)
     return bag
 
 
@@ -176,15 +175,16 @@ def _scan_topic(path: Path, known: list[str], topic: str | None) -> str:
     return known[0]
 
 
-def _take_transforms(bag: _Bag, message: object) -> None:
-    for each in field_of("message", message, "transforms"):
-        rotation = rotation_of("message.rotation", field_of("message", each, "transform.rotation"))
-        place = [real_field("message", each, f"transform.translation.{axis}") for axis in "xyz"]
-        parent, child = (str(field_of("message", each, name)) for name in ("header.frame_id", "child_frame_id"))
-        bag.transforms.add(parent, child, matrix_of(rotation, place))
-        if parent.lstrip("/") == "odom":
-            pose = place[0], place[1], math.atan2(rotation[1, 0], rotation[0, 0])
-            bag.moved.setdefault(child.lstrip("/"), []).append((stamp_of("message", each), pose))
+def _take_odometry(bag: _Bag) -> None:
+    """Take odometry from the transforms between odom and the robot's base."""
+    children = [link.child for link in bag.transforms.links() if link.parent == "odom"]
+    for base in (*_BASES, *sorted(children)) if children else ():
+        with contextlib.suppress(TransformError):
+            times, poses = bag.transforms.history("odom", base)
+            headings = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
+            planar = zip(poses[:, 0, 3].tolist(), poses[:, 1, 3].tolist(), headings.tolist(), strict=True)
+            bag.base, bag.times, bag.poses = base, times.tolist(), list(planar)
+            return
 
 
 def _odometry_pose(message: object) -> Pose:
@@ -194,7 +194,10 @@ def _odometry_pose(message: object) -> Pose:
 def _mount(path: Path, bag: _Bag, given: Pose | None) -> tuple[Pose, bool]:
     """Return the laser's mount, and whether it is upside down; warn if a given mount contradicts the transforms."""
     bases = [bag.base] if bag.base else list(_BASES)
-    found = [matrix for base in bases if (matrix := bag.transforms.between(base, bag.frame)) is not None]
+    found = []
+    for base in bases:
+        with contextlib.suppress(TransformError):
+            found.append(bag.transforms.fixed(base, bag.frame))
     if not found:
         if given is None:
             warn_user(

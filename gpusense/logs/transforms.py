@@ -1,67 +1,20 @@
-"""Static transforms between the frames of a robot: the pose of a laser on its base, and a check of it against data."""
+"""The pose of a laser on its robot by a transform, and a check of it against data."""
 
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from gpusense._util.angles import wrapped
 from gpusense.logs.records import Floats, Pose, Scan
 
-# Largest change of a transform that still counts as fixed [m, 1].
-_FIXED = 1e-5
 # Smallest cosine between vertical axes of a laser that scans a level plane.
 _LEVEL = 0.985
 # Check of a mount: headings tried, most pairs of scans, distance and turn between two scans of a pair.
 _HEADINGS, _PAIRS = 24, 12
 _SHIFT, _TURN = (0.15, 1.0), 0.2
-
-
-@dataclass
-class Transforms:
-    """Transforms of a log: the fixed ones, and the frames that move.
-
-    Attributes:
-        fixed: (4, 4) matrix of each pair (parent, child) whose transform does not change.
-        moving: Pairs whose transform changed.
-    """
-
-    fixed: dict[tuple[str, str], Floats] = field(default_factory=dict)
-    moving: set[tuple[str, str]] = field(default_factory=set)
-
-    def add(self, parent: str, child: str, matrix: Floats) -> None:
-        """Add a transform."""
-        pair = parent.lstrip("/"), child.lstrip("/")
-        known = self.fixed.setdefault(pair, matrix)
-        if np.abs(known - matrix).max() > _FIXED:
-            self.moving.add(pair)
-
-    def between(self, base: str, frame: str) -> Floats | None:
-        """Return the (4, 4) pose of a frame in the base's along fixed transforms; None without a chain of them."""
-        links: dict[str, list[tuple[str, Floats]]] = {}
-        for (parent, child), matrix in self.fixed.items():
-            if (parent, child) not in self.moving:
-                links.setdefault(parent, []).append((child, matrix))
-                links.setdefault(child, []).append((parent, np.asarray(np.linalg.inv(matrix), np.float64)))
-        reached, queue = {base.lstrip("/"): np.eye(4)}, deque([base.lstrip("/")])
-        while queue:
-            at = queue.popleft()
-            for other, matrix in links.get(at, []):
-                if other not in reached:
-                    reached[other] = reached[at] @ matrix
-                    queue.append(other)
-        return reached.get(frame.lstrip("/"))
-
-
-def matrix_of(rotation: Floats, translation: Sequence[float]) -> Floats:
-    """Return the (4, 4) matrix of a rotation and a translation."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, translation
-    return matrix
 
 
 def planar_mount(matrix: Floats) -> tuple[Pose, bool]:

@@ -57,8 +57,8 @@ def stamp_of(name: str, message: object) -> float:
     raise TypeError(f"{name}: must have a stamp with sec and nanosec, or secs and nsecs, got {checks.show(stamp)}")
 
 
-def rotation_of(name: str, quaternion: object) -> np.ndarray:
-    """Return the (3, 3) rotation matrix of a quaternion with fields x, y, z and w.
+def unit_quaternion(name: str, quaternion: object) -> tuple[float, float, float, float]:
+    """Return (x, y, z, w) of a quaternion with these fields, divided by its norm.
 
     Raises:
         TypeError: A field is absent or not a number.
@@ -66,14 +66,28 @@ def rotation_of(name: str, quaternion: object) -> np.ndarray:
     """
     x, y, z, w = (real_field(name, quaternion, each) for each in "xyzw")
     size = math.hypot(x, y, z, w)
-    if not size > 1e-6:
+    if not 1e-6 < size < math.inf:
         raise ValueError(f"{name}: must be a rotation, got the quaternion ({x:g}, {y:g}, {z:g}, {w:g})")
-    x, y, z, w = (each / size for each in (x, y, z, w))
+    return x / size, y / size, z / size, w / size
+
+
+def rotation_matrix(x: float, y: float, z: float, w: float) -> np.ndarray:
+    """Return the (3, 3) matrix of a quaternion of norm 1."""
     return np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ])  # fmt: skip
+
+
+def rotation_of(name: str, quaternion: object) -> np.ndarray:
+    """Return the (3, 3) rotation matrix of a quaternion with fields x, y, z and w.
+
+    Raises:
+        TypeError: A field is absent or not a number.
+        ValueError: The quaternion is not finite, or 0.
+    """
+    return rotation_matrix(*unit_quaternion(name, quaternion))
 
 
 def planar_pose(name: str, pose: object) -> tuple[float, float, float]:

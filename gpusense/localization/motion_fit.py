@@ -9,7 +9,8 @@ noise: the variances are multiplied by the mean square of standardised errors, e
 
 Errors of an odometer repeat from step to step (a wheel's radius, a slope), while a filter draws new noise at each step.
 Their constant part is also fitted (on the intel log 3 degrees a metre). For the rest, variances are multiplied by
-1 + 2 sum rho_l, the inflation of the variance of a sum by the autocorrelation rho_l of standardised errors.
+1 + 2 sum rho_l, the inflation of the variance of a sum by the autocorrelation rho_l of standardised errors, if it is
+significant.
 
 A log may not determine each variance: a robot that never turned says nothing about the noise of turns. The logarithm of
 each variance has a normal prior around the default, with a deviation of a factor of ten. A variance without data keeps
@@ -42,8 +43,8 @@ _LEAST_ALPHA, _MOST_ALPHA = 1e-6, 1.0
 _LEAST, _MOST, _FAR = 0.002, 0.1, 9.0
 # Distance by which a reversed translation must fit better to count [m].
 _CLEAR = 0.05
-# Longest lag of the autocorrelation, and the largest inflation.
-_LAGS, _MOST_INFLATION = 10, 10.0
+# Longest lag of the autocorrelation, deviations beyond which its sums are significant, and the largest inflation.
+_LAGS, _SIGNIFICANT, _MOST_INFLATION = 10, 4.0, 10.0
 # Prior deviation of each of the three parts of the systematic error; rounds of the fit.
 _PRIOR, _ROUNDS = 0.1, 3
 # Defaults of the variances, prior deviation of their logarithms, and number of steps that the default of ``reverse``
@@ -262,14 +263,24 @@ def _log_errors(noise: np.ndarray, errors: Errors) -> np.ndarray:
 def _inflation(noise: np.ndarray, errors: Errors) -> float:
     """Return the factor of the variances by the tails of errors and by their autocorrelation."""
     variances = np.diagonal(errors.covariances(noise), axis1=1, axis2=2)
-    standardised = list((errors.residual / np.sqrt(variances)).T)
-    factors, tails = [1.0], [float(np.mean(np.minimum(error**2, _FAR))) for error in standardised]
-    for error in standardised:
-        held = np.clip(error, -4, 4)
-        products = [held[lag:] @ held[: len(held) - lag] for lag in range(min(_LAGS, len(held) - 1) + 1)]
-        if products[0] > 0:
-            factors.append(1 + 2 * sum(max(product, 0.0) for product in products[1:]) / products[0])
-    return float(min(max(factors), _MOST_INFLATION)) * max(float(np.mean(tails)), 0.5)
+    standardised = errors.residual / np.sqrt(variances)
+    tails = float(np.mean(np.minimum(standardised**2, _FAR)))
+    return min(_correlation_factor(np.clip(standardised, -4, 4)), _MOST_INFLATION) * max(tails, 0.5)
+
+
+def _correlation_factor(errors: np.ndarray) -> float:
+    """Return 1 + 2 sum rho_l of errors (G, C), the mean over the components with a significant autocorrelation.
+
+    The rho_l keep their signs, so noise has no mean effect. The sum of the first m of them has the variance m / G for
+    independent errors, or less. A component counts if one of its sums exceeds a multiple of the deviation.
+    """
+    lags = np.arange(1, min(_LAGS, len(errors) - 1) + 1)
+    squares = np.maximum(np.sum(errors**2, axis=0), 1e-300)
+    products = np.array([np.sum(errors[lag:] * errors[:-lag], axis=0) for lag in lags])
+    sums = np.cumsum(products / squares, axis=0)
+    significant = (sums > _SIGNIFICANT * np.sqrt(lags / len(errors))[:, None]).any(axis=0)
+    factors = 1 + 2 * sums[-1, significant]
+    return max(float(factors.mean()), 1.0) if len(factors) else 1.0
 
 
 def _cost(noise: np.ndarray, errors: Errors) -> float:

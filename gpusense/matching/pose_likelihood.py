@@ -30,7 +30,8 @@ class PoseLikelihood:
         grid: The map.
         log_p: (H', W', A) log p(z | x, m) at each row, column and heading; NaN where it was not evaluated.
         headings: (A,) headings in the world [rad].
-        step: Cells between neighbouring positions.
+        step: Cells between neighbouring positions: the side of a tile.
+        cells: (H', W', 2) row and column of the cell of each position.
 
     Example:
         >>> import gpusense as gs, numpy as np
@@ -45,17 +46,17 @@ class PoseLikelihood:
     log_p: NDArray[np.floating] = field(repr=False)
     headings: Floats = field(repr=False)
     step: int
+    cells: NDArray[np.int64] = field(repr=False)
 
     @property
     def resolution(self) -> float:
-        """Distance between neighbouring positions [m]."""
+        """Side of a tile, the usual distance between neighbouring positions [m]."""
         return self.step * self.grid.resolution
 
     def poses(self, row: ArrayLike, col: ArrayLike, heading: ArrayLike) -> Floats:
         """Return (M, 3) poses in the world of M indices of rows, columns and headings [m, m, rad]."""
         row, col, heading = (index.ravel() for index in np.broadcast_arrays(row, col, heading))
-        places = np.stack([col, row], axis=-1)
-        xy = self.grid._to_world((places * self.step + self.step // 2 + 0.5) * self.grid.resolution)
+        xy = self.grid._to_world((self.cells[row, col][:, ::-1] + 0.5) * self.grid.resolution)
         return np.column_stack([xy, self.headings[heading]])
 
     @property
@@ -140,15 +141,17 @@ def pose_likelihood(
 ) -> PoseLikelihood:
     """Compute P(z | x, m) over all positions and headings of a map.
 
-    Positions are centres of cells: the middle cells of square tiles, counted from the map's first corner. Headings are
-    0, 2 pi / A, ... in the world. The model evaluates them in tiles, so memory is that of the result.
+    The map is divided into square tiles, counted from its first corner; tiles at its far edges may be smaller. Each
+    position is the centre of a tile's middle cell. Headings are 0, 2 pi / A, ... in the world. The model evaluates
+    poses in batches, so memory is that of the result.
 
     Args:
         model: A scan model: its map, parameters and device are used.
         ranges: (K,) readings [m].
         resolution: Distance between neighbouring positions [m], > 0; rounded to whole cells, at least one.
         headings: Number A of headings.
-        positions: ``"all"``, or ``"free"`` to leave out positions in occupied and unknown cells.
+        positions: ``"all"``; or ``"free"``, where each position is the centre of the free cell nearest to the tile's
+            middle, and tiles without a free cell are left out.
 
     Raises:
         TypeError: the model is no scan model, or an argument is of the wrong kind.
@@ -188,20 +191,51 @@ def prepare_tiles(
         raise ValueError(f"resolution: there must be at most {_MOST} poses, got {rows} x {cols} x {count}")
     log_p = np.full((rows, cols, count), np.nan, model.precision)
     directions: Floats = 2 * math.pi / count * np.arange(count, dtype=np.float64)
-    result = PoseLikelihood(grid, log_p, directions, step)
-    return result, _fill(model, z, result, positions == "free")
-
-
-def _fill(model: ScanModel, ranges: np.ndarray, result: PoseLikelihood, free: bool) -> Iterator[float]:
-    """Evaluate the poses of a result, tile by tile."""
-    rows, cols, count = result.log_p.shape
-    middle = result.step // 2
-    if free:
-        padded = np.zeros((rows * result.step, cols * result.step), bool)
-        padded[: result.grid.shape[0], : result.grid.shape[1]] = result.grid.free
-        row, col = np.nonzero(padded[middle :: result.step, middle :: result.step])
+    if positions == "free":
+        cells, evaluated = _free_cells(grid.free, step)
     else:
-        row, col = (index.ravel() for index in np.indices((rows, cols)))
+        cells = np.stack(np.meshgrid(*(_middles(size, step) for size in grid.shape), indexing="ij"), axis=-1)
+        evaluated = np.ones((rows, cols), bool)
+    result = PoseLikelihood(grid, log_p, directions, step, cells)
+    return result, _fill(model, z, result, evaluated)
+
+
+def _middles(size: int, step: int) -> NDArray[np.int64]:
+    """Return the middle index of each part of an axis; the last part may be shorter than a step."""
+    first = np.arange(0, size, step)
+    middles: NDArray[np.int64] = first + np.minimum(step, size - first) // 2
+    return middles
+
+
+def _free_cells(free: NDArray[np.bool], step: int) -> tuple[NDArray[np.int64], NDArray[np.bool]]:
+    """Return the free cell (H', W', 2) nearest to the middle of each tile, and which tiles (H', W') have one.
+
+    Of equally near cells the lowest column counts, then the lowest row. Tiles without a free cell have their middle.
+    """
+    middles, columns = [_middles(size, step) for size in free.shape], np.arange(free.shape[1])
+    cells = np.stack(np.meshgrid(*middles, indexing="ij"), axis=-1)
+    has_free = np.zeros(cells.shape[:2], bool)
+    far = np.iinfo(np.int64).max // 2
+    across = (columns - middles[1][columns // step]) ** 2
+    first = np.arange(0, len(columns), step)
+    for k, row in enumerate(middles[0]):
+        part = free[k * step : (k + 1) * step]
+        # The nearest free row of each column, then the nearest column of each tile.
+        down = np.where(part, (np.arange(k * step, k * step + len(part)) - row)[:, None] ** 2, far)
+        nearest = down.argmin(axis=0)
+        squared = np.where(part.any(axis=0), down[nearest, columns] + across, far)
+        least = np.minimum.reduceat(squared, first)
+        has_free[k] = least < far
+        chosen = np.flatnonzero((squared == np.repeat(least, np.diff([*first, len(columns)]))) & (squared < far))
+        tiles, at = np.unique(chosen // step, return_index=True)
+        cells[k, tiles] = np.stack([k * step + nearest[chosen[at]], chosen[at]], axis=1)
+    return cells, has_free
+
+
+def _fill(model: ScanModel, ranges: np.ndarray, result: PoseLikelihood, evaluated: np.ndarray) -> Iterator[float]:
+    """Evaluate the poses of some of the tiles of a result, in batches."""
+    count = len(result.headings)
+    row, col = np.nonzero(evaluated)
     each = max(_TILE // count, 1)
     for first in range(0, len(row), each):
         part = slice(first, min(first + each, len(row)))

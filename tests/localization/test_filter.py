@@ -346,7 +346,7 @@ def test_motion_noise_that_repeats_from_step_to_step_is_inflated(repeated):
         truth, odometry = np.zeros((401, 3)), np.zeros((401, 3))
         odometry[:, 0] = np.arange(401)
         for k, noise in enumerate(drawn):
-            truth[k + 1] = gs.compose_poses(truth[k], noise + (1, 0, 0))
+            truth[k + 1] = gs.compose_poses(truth[k], noise + np.array([1.0, 0.0, 0.0]))
         motion = gs.fit_odometry_motion(odometry, truth, systematic=False).motion
         inflation.append((motion.sampled_turns(0.0, 1.0, 0.0).deviation[1] / 0.05) ** 2)
     # Means of 8 fits have a deviation of 4 to 9 %.

@@ -28,7 +28,8 @@ def test_values_are_those_of_the_model(backend, kind, monkeypatch):
     ranges = gs.BeamModel(grid, SCANNER, backend="numpy").expected_ranges(np.array([[*xy, 0.7]]))[0]
     p = gs.pose_likelihood(model, ranges, resolution=0.4, headings=9)
     assert p.log_p.shape == (9, 13, 9) and p.resolution == pytest.approx(0.4)
-    rows, cols = np.mgrid[1:18:2, 1:26:2]
+    # The last tiles have one row and one column of the map's 17 x 25 cells.
+    rows, cols = np.meshgrid([*range(1, 17, 2), 16], [*range(1, 25, 2), 24], indexing="ij")
     centers = grid.cell_centers(rows.ravel(), cols.ravel())
     turns = 2 * math.pi / 9 * np.arange(9)
     poses = np.array([(x, y, turn) for x, y in centers for turn in turns])
@@ -49,6 +50,31 @@ def test_free_positions_alone_and_a_scan_that_says_nothing():
     np.testing.assert_array_equal(np.isnan(p.log_p), np.repeat(~grid.free[:, :, None], 4, axis=2))
     assert p.entropy == pytest.approx(math.log(4 * grid.free.sum()))
     assert p.log_evidence == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize("shape", [(1, 9), (9, 1), (1, 1), (7, 10), (8, 12)])
+@pytest.mark.parametrize("step", [1, 2, 3, 4, 20])
+@pytest.mark.parametrize("content", ["free", "mixed", "unknown", "full"])
+def test_positions_lie_on_the_map_and_near_all_free_cells(shape, step, content):
+    cells = np.full(shape, {"free": 0, "mixed": 0, "unknown": -1, "full": 100}[content])
+    if content == "mixed":
+        cells[np.random.default_rng(sum(shape)).random(shape) < 0.6] = 100
+    grid = gs.OccupancyGrid(cells, 0.5, (3.0, -2.0, 0.7))
+    model = gs.LikelihoodFieldModel(grid, gs.Scanner([0.0, 1.0], 4.0), backend="numpy")
+    tiles = {(row // step, col // step) for row, col in zip(*np.nonzero(grid.free), strict=True)}
+    for positions in ("all", "free"):
+        p = gs.pose_likelihood(model, [1.0, 1.5], resolution=0.5 * step, headings=3, positions=positions)
+        rows, cols = np.nonzero(~np.isnan(p.log_p).all(axis=2))
+        assert len(rows) == p.log_p[..., 0].size if positions == "all" else set(zip(rows, cols, strict=True)) == tiles
+        col, row = np.floor(grid.world_to_cells(p.poses(rows, cols, 0)[:, :2])).astype(int).T
+        np.testing.assert_array_equal(np.stack([row // step, col // step]), np.stack([rows, cols]))
+        assert p.probability.sum() == pytest.approx(1.0 if len(rows) else 0.0)
+    tiles, cells = np.stack([rows, cols], axis=1), np.stack([row, col], axis=1)
+    middles = tiles * step + np.minimum(step, np.array(shape) - tiles * step) // 2
+    for tile, middle, cell in zip(tiles, middles, cells, strict=True):
+        squared = [np.sum((free - middle) ** 2) for free in np.argwhere(grid.free) if (free // step == tile).all()]
+        assert grid.free[tuple(cell)] and np.sum((cell - middle) ** 2) == min(squared)
+    assert p.log_p.shape[:2] == tuple(-(-size // step) for size in shape)
 
 
 def test_modes_are_local_maxima():

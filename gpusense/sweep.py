@@ -1,6 +1,5 @@
 """Sweeps: jobs as plain data, run on processes or a Dask cluster, with a table that survives crashes."""
 
-from gpusense.localization.distributed.filter import SplitParticleFilter
 from gpusense.sweeps.cluster import DaskExecutor
 from gpusense.sweeps.deaths import JobTimeout, WorkerDied
 from gpusense.sweeps.executors import ProcessExecutor, SerialExecutor
@@ -17,7 +16,6 @@ __all__ = [
     "JobTimeout",
     "ProcessExecutor",
     "SerialExecutor",
-    "SplitParticleFilter",
     "Store",
     "Sweep",
     "SweepLost",

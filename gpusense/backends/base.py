@@ -207,10 +207,6 @@ class Backend(ABC):
         """Start copying ``size`` bytes of a buffer from byte ``begin`` on into another, from byte ``to`` on."""
         raise TypeError(f"{self.info.selection} does not copy between buffers")
 
-    def copies_from(self, other: Backend) -> bool:
-        """Return whether ``copy`` accepts source buffers of another device, whose work on them has ended."""
-        return other is self
-
     def lend(self, buffer: Buffer, shape: tuple[int, ...], dtype: np.dtype) -> object:
         """Return a buffer as an array of the backend's library."""
         raise TypeError(f"{self.info.selection} does not lend buffers")

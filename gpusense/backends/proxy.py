@@ -43,7 +43,7 @@ class Proxy(Backend):
     replays = _forwarded_property("replays")
     upload, empty, download, part = map(_forwarded, ("upload", "empty", "download", "part"))
     refill = _forwarded("refill")
-    empty_result, blank, copy, copies_from = map(_forwarded, ("empty_result", "blank", "copy", "copies_from"))
+    empty_result, blank, copy = map(_forwarded, ("empty_result", "blank", "copy"))
     compile, source, synchronize = map(_forwarded, ("compile", "source", "synchronize"))
     largest_group = _forwarded("largest_group")
     begin_batch, submit, end_batch = map(_forwarded, ("begin_batch", "submit", "end_batch"))

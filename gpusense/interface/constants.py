@@ -59,10 +59,7 @@ TEMPERATURE = 27
 SYSTEMATIC, INDEPENDENT, RESIDUAL = 0, 1, 2
 # Factor of all rungs of a stage: 1, or less if even the last rung leaves too few particles with weight.
 DEPTH = 60
-# For a filter over several devices: index of this device's first particle, and particles of the whole filter now and in
-# the next step; both counts are 0 on a single device.
-FIRST, WHOLE, DRAWN = 61, 62, 63
-SETTINGS = 64
+SETTINGS = 61
 # Streams of random numbers within a step; each stage of a correction has DRAW_STREAMS further streams.
 MOTION_STREAM, DRAW_STREAM, DRAW_STREAMS = 0, 16, 4
 # Kernel file sampling: first of its streams of random numbers, one per beam; numbers of a mixture; numbers of its

@@ -16,10 +16,9 @@ from gpusense.backends.base import Backend, Buffer
 from gpusense.backends.programs import ProgramCache, RecordedProgram, RepeatedPrograms
 from gpusense.interface.constants import ESTIMATE, LEFT, MOMENTS, SLOW_RATE, STAGE, STATE, WIDE_HEADINGS
 from gpusense.interface.launches import Program
-from gpusense.localization.filter_cloud import Contents, Summary, deeper, is_starved, meaningful, summary_of
+from gpusense.localization.cloud_state import Contents, Summary, deeper, is_starved, meaningful, summary_of
 from gpusense.localization.map_judge import JUDGED, MapJudge
 from gpusense.localization.particles import Particles, Places, Stage
-from gpusense.localization.sums import weight_block
 
 _DOUBLE = np.dtype(np.float64)
 _MOST_RECORDED, _MOST_STAGES = 64, 48
@@ -57,14 +56,12 @@ class Cloud(Particles):
         self._prepared: Callable[[], list[MapJudge]] | None = None
         self._judges: Sequence[MapJudge] = ()
 
-    def place(self, poses: np.ndarray, weights: np.ndarray | None = None) -> None:
-        """Replace all particles."""
-        count = len(poses)
-        w = np.ones(count) if weights is None else weights * (count / weights.sum())
-        places = self.places.placed(self.kept)
-        self._fill((self.poses[places.shown], poses), (self.weights[places.weight], w),
+    def place(self, poses: np.ndarray) -> None:
+        """Replace all particles by (N, 3) poses of equal weight, and forget the state of corrections."""
+        count, places = len(poses), self.places.placed(self.kept)
+        self._fill((self.poses[places.shown], poses), (self.weights[places.weight], np.ones(count)),
                    (self.states[places.state], np.zeros(STATE)))  # fmt: skip
-        self.set_particles(places, count, weight_block(self.backend, count))
+        self.set_particles(places, count)
 
     def _fill(self, *arrays: tuple[Buffer, np.ndarray]) -> None:
         """Copy arrays to buffers that earlier steps may still use."""
@@ -147,7 +144,7 @@ class Cloud(Particles):
                 break
         self._last_stage = stage.number
         self._estimated_of = (stage.places, self.count) if self._estimates_too else None
-        self.set_particles(stage.places, drawn, weight_block(self.backend, drawn))
+        self.set_particles(stage.places, drawn)
 
     def _deepen(self, stage: Stage, settings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Weigh a stage again on lower rungs while too few particles have weight; return state and settings."""
@@ -330,7 +327,7 @@ class Cloud(Particles):
         places, arrays = contents.places_and_arrays(self.kept)
         self._fill(*((getattr(self, name)[index], array) for name, index, array in arrays),
                    (self.states[places.state], contents.state))  # fmt: skip
-        self.set_particles(places, contents.next_count, weight_block(self.backend, contents.next_count))
+        self.set_particles(places, contents.next_count)
 
     def _read(self, buffer: Buffer, count: int) -> np.ndarray:
         return self.backend.download(buffer, np.empty(count))

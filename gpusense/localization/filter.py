@@ -12,7 +12,6 @@ from gpusense.backends import BackendInfo
 from gpusense.localization import options
 from gpusense.localization.assessment import estimate_of
 from gpusense.localization.defaults import DEFAULTS
-from gpusense.localization.device_cloud import DeviceCloud
 from gpusense.localization.diagnosis import Diagnosis, diagnose
 from gpusense.localization.estimates import Estimate
 from gpusense.localization.filter_cloud import FilterCloud
@@ -96,12 +95,8 @@ class ParticleFilter(Whole):
         if self.options.recovery == "augmented" and grid_of(self._sensors) is None:
             raise ValueError("recovery: 'augmented' needs a model with a map, got none")
         self._begin_journals()
-        self._cloud = self._new_cloud()
+        self._cloud = FilterCloud(self._sensors, self.options.most, residual=self.options.resampling == "residual")
         self._parts = FilterParts(self._sensors, self.options, self._cloud)
-
-    def _new_cloud(self) -> FilterCloud:
-        """Return room for the particles."""
-        return DeviceCloud(self._sensors, self.options.most, residual=self.options.resampling == "residual")
 
     def _keep(self) -> None:
         self._parts.keep()
@@ -325,7 +320,6 @@ class ParticleFilter(Whole):
         """Seconds that the models' log-likelihoods have taken since ``time_scoring`` was called.
 
         Without ``time_scoring`` only the time of starting them counts; it is 0 where a step is one recorded program.
-        The times of several devices are added up.
         """
         return self._cloud.scoring_seconds
 
@@ -389,7 +383,7 @@ class ParticleFilter(Whole):
         """Take over the state of a filter with the same options and models, and continue with the same bits.
 
         Args:
-            state: The result of :meth:`state`, also of a filter on another device or split over several devices.
+            state: The result of :meth:`state`, also of a filter on another device.
 
         Raises:
             TypeError, ValueError: ``state`` is no state, or belongs to a filter with other options or models.

@@ -1,272 +1,50 @@
-"""The interface of a filter's particles on one device or split over several."""
+"""The particles of a filter on one device, scored by its sensors."""
 
 from __future__ import annotations
 
-import math
-from abc import ABC, abstractmethod
+import functools
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
 
-import numpy as np
-
-from gpusense.interface.constants import (
-    DEGENERATE,
-    DEPTH,
-    EVIDENCE,
-    FARTHEST_THETA,
-    FARTHEST_X,
-    INJECTED,
-    JITTER,
-    LEFT,
-    LOWEST,
-    RESAMPLED,
-    RUNG,
-    SAMPLE_SIZE,
-    SHARE,
-    STAGE,
-    STATE,
-)
-from gpusense.localization.particles import Places
-from gpusense.reference.tempering import left_of
-
-# Lowest depth of a ladder: distances of a million deviations differ by 2^-39 on its last rung.
-_DEEPEST = LOWEST**5
-# Effective sample size below which a stage is weighed again on a deeper ladder.
-_FEWEST = 10.0
-# Jitter of a stage on a deeper ladder: the peak lies beyond the particles, which must not contract before they reach
-# it.
-_WIDE_JITTER = 0.7
-# Index of a sensor, and its readings.
-SensorReadings = tuple[int, tuple[Any, ...]]
+from gpusense.localization.cloud import Cloud
+from gpusense.localization.cloud_state import SensorReadings, Step
+from gpusense.localization.map_judge import MapJudge
+from gpusense.localization.scoring import FilterScoring
+from gpusense.localization.sensors import Sensor
 
 
-class Step(NamedTuple):
-    """Arguments of a correction.
-
-    Attributes:
-        settings: Settings, by the places in ``interface.constants``.
-        kind: Kind of the motion that begins it.
-        stages: Most stages.
-        drawn: Particles of the next step.
-        readings: Indices of sensors with their readings.
-        judged: The scans that are to be judged at the pose after it, with the indices of their sensors; a cloud may
-            leave that to the verdict.
-    """
-
-    settings: np.ndarray
-    kind: int
-    stages: int
-    drawn: int
-    readings: list[SensorReadings]
-    judged: Sequence[SensorReadings] = ()
-
-
-class Contents(NamedTuple):
-    """Particles on the host.
-
-    Attributes:
-        poses: (N, 3) shown poses.
-        weights: (N,) their weights, before they are normalised.
-        next_poses: (M, 3) poses of the next step; None if these are the shown ones, which were not weighed.
-        next_weights: (M,) weights with which the next step begins; None together with ``next_poses``.
-        state: State of the last correction, as the kernels hold it.
-        pool: Poses from which recovery injects particles; None without them.
-    """
-
-    poses: np.ndarray
-    weights: np.ndarray
-    next_poses: np.ndarray | None
-    next_weights: np.ndarray | None
-    state: np.ndarray
-    pool: np.ndarray | None
-
-    @property
-    def next_count(self) -> int:
-        """Number of particles of the next step."""
-        return len(self.poses if self.next_poses is None else self.next_poses)
-
-    def places_and_arrays(self, now: Places) -> tuple[Places, list[tuple[str, int, np.ndarray]]]:
-        """Return buffers for these particles that do not overwrite kept ones, and the array for each buffer.
-
-        Args:
-            now: The buffers at the beginning of the call, which are kept.
-
-        Returns:
-            Places, and arrays by the name ("poses" or "weights") and index of their buffer.
-        """
-        places = now.placed(now)
-        if self.next_poses is None or self.next_weights is None:
-            return places, [("poses", places.shown, self.poses), ("weights", places.weight, self.weights)]
-        places = places._replace(next=places.shown + 1, weight=places.before - 1)
-        return places, [
-            ("poses", places.shown, self.poses), ("weights", places.weight, self.weights),
-            ("poses", places.next, self.next_poses), ("weights", places.before, self.next_weights),
-        ]  # fmt: skip
-
-
-class Summary(NamedTuple):
-    """The state of a filter after a correction.
-
-    Attributes:
-        effective_sample_size: Effective sample size of the last stage, at most the number of distinct particles after
-            earlier stages.
-        temperature: Share of the temperature that all stages used.
-        degenerate: Whether no particle was possible.
-        stages: Number of stages that ran.
-        numbers: The state as the kernels hold it.
-        resampled: Whether particles were drawn at the end.
-    """
-
-    effective_sample_size: float
-    temperature: float
-    degenerate: bool
-    stages: int
-    numbers: np.ndarray
-    resampled: bool
-
-
-def summary_of(numbers: np.ndarray) -> Summary:
-    """Return the summary of a state as the kernels hold it."""
-    used, stage, distinct = 0.0, 0, math.inf
-    while True:
-        own = numbers[stage * STAGE : (stage + 1) * STAGE]
-        used += float(own[RUNG])
-        if own[LEFT] == 0.0:
-            break
-        # Each copy is jittered by the difference of two other parents, so m parents have at most m^3 distinct copies.
-        distinct = min(distinct, float(own[SAMPLE_SIZE]) ** 3)
-        stage += 1
-    size = min(float(own[SAMPLE_SIZE]), distinct)
-    return Summary(size, min(used, 1.0), bool(numbers[DEGENERATE]), stage + 1, numbers, bool(own[RESAMPLED]))
-
-
-def is_starved(numbers: np.ndarray, settings: np.ndarray, stage: int, count: int) -> bool:
-    """Tell whether even the last rung of a stage leaves too few particles with weight, and a deeper rung may not.
-
-    Args:
-        numbers: The state after the stage.
-        settings: Numbers of the step.
-        stage: The stage.
-        count: Particles.
-    """
-    own = numbers[stage * STAGE : (stage + 1) * STAGE]
-    lowest = left_of(numbers, stage) * settings[DEPTH] * LOWEST
-    least = min(settings[SHARE] * count, _FEWEST)
-    few = own[RUNG] == lowest > 0.0 and not own[DEGENERATE] and own[SAMPLE_SIZE] < least
-    return bool(few and settings[DEPTH] > _DEEPEST)
-
-
-def deeper(settings: np.ndarray) -> np.ndarray:
-    """Return the settings of a step whose ladder begins below the last rung of the present ladder."""
-    result = settings.copy()
-    result[DEPTH] *= LOWEST
-    result[JITTER], result[FARTHEST_X], result[FARTHEST_THETA] = _WIDE_JITTER, math.inf, math.pi
-    return result
-
-
-def meaningful(numbers: np.ndarray, averages: bool) -> np.ndarray:
-    """Clear the numbers of a state that nothing reads: of stages that did not run, and of unused averages.
-
-    Args:
-        numbers: The state as the kernels hold it.
-        averages: Whether recovery follows the averages of the likelihood.
-    """
-    end, result = summary_of(numbers).stages * STAGE, np.zeros(STATE)
-    result[:end] = numbers[:end]
-    if averages:
-        result[EVIDENCE : INJECTED + 1] = numbers[EVIDENCE : INJECTED + 1]
-    return result
-
-
-class FilterCloud(ABC):
-    """Particles of a filter.
+class FilterCloud(Cloud):
+    """Particles of a filter on the device of its sensors.
 
     Steps write no buffer that ``kept`` names, and finally name the new buffers in ``places``. So an interrupted call of
     a filter is undone by restoring the attributes in ``MEMORY``.
 
-    Attributes:
-        MEMORY: Names of the attributes that a step changes.
-        PARTS: Names of attributes that hold state themselves; none.
-        count: Particles of the next step.
-        places: Buffers of the particles.
-        kept: Buffers at the beginning of the filter's running call.
+    Args:
+        sensors: The sensors of the filter.
+        capacity: Most particles.
+        residual: Whether to draw by residual resampling.
     """
 
-    MEMORY: ClassVar[tuple[str, ...]]
-    PARTS: ClassVar[tuple[str, ...]]
-    count: int
-    places: Places
-    kept: Places
+    def __init__(self, sensors: Sequence[Sensor], capacity: int, *, residual: bool = False) -> None:
+        super().__init__(sensors[0].backend, capacity, len(sensors), sensors[0].precision, residual=residual)
+        self._scored, self._scoring = sensors, FilterScoring(sensors)
 
-    # ---- steps
-
-    @abstractmethod
-    def place(self, poses: np.ndarray) -> None:
-        """Replace all particles by (N, 3) poses of equal weight, and forget the state of corrections."""
-
-    @abstractmethod
-    def set_pool(self, poses: np.ndarray) -> None:
-        """Set the (M, 3) poses from which recovery injects particles."""
-
-    @abstractmethod
-    def move(self, settings: np.ndarray, kind: int) -> None:
-        """Move the particles now, by the settings of a step and a kind of motion."""
-
-    @abstractmethod
     def correct(self, step: Step) -> None:
         """Run a correction."""
+        score = self._scoring.of(self, step.readings)
+        stages = self.places.stages(self.kept, step.stages, step.drawn, step.kind, same=step.drawn == self.count)
+        judges = functools.partial(self._judges_of, step.judged) if step.judged else None
+        self.run_stages(step.settings, stages, step.drawn, len(step.readings), score, judges)
 
-    # ---- results, where ``count`` is the number of shown particles
-
-    @abstractmethod
-    def estimate(self, count: int) -> np.ndarray:
-        """Return the estimate of the shown particles: mean, covariance, sum of weights."""
-
-    @abstractmethod
-    def summary(self) -> Summary:
-        """Return the state after the last correction."""
-
-    @abstractmethod
-    def particles(self, count: int) -> Any:
-        """Return the shown poses: on a GPU an array of the device's library."""
-
-    @abstractmethod
-    def shares(self, count: int) -> Any:
-        """Return the weights of the shown particles, whose sum is 1: on a GPU an array of the device's library."""
-
-    @abstractmethod
-    def moments(self, count: int) -> Any:
-        """Return mean and covariance of the shown particles: on a GPU an array of the device's library."""
-
-    @abstractmethod
-    def host_poses(self, index: int, count: int) -> np.ndarray:
-        """Return a copy of the poses of a buffer."""
-
-    @abstractmethod
-    def host_weights(self, count: int) -> np.ndarray:
-        """Return a copy of the weights of the shown particles, before they are normalised."""
-
-    @abstractmethod
-    def explain(self) -> str:
-        """Describe in one line how a step is started."""
-
-    # ---- state
-
-    @abstractmethod
-    def contents(self, count: int) -> Contents:
-        """Return a copy of all particles."""
-
-    @abstractmethod
-    def restore(self, contents: Contents) -> None:
-        """Replace all particles by those of ``contents``."""
-
-    # ---- times
+    def _judges_of(self, judged: Sequence[SensorReadings]) -> list[MapJudge]:
+        """Return the judges of scans, prepared for them."""
+        sensors = ((self._scored[index], reading[0]) for index, reading in judged)
+        return [judge for sensor, ranges in sensors if (judge := sensor.judge()).expects(sensor.model.scanner, ranges)]
 
     @property
-    @abstractmethod
     def scoring_seconds(self) -> float:
-        """Seconds of all log-likelihoods, summed over devices."""
+        """Seconds of all log-likelihoods; 0 where a step is one recorded program."""
+        return sum(sensor.seconds for sensor in self._scored)
 
-    @abstractmethod
     def time_scoring(self) -> None:
         """Wait for the log-likelihoods of each stage from now on, so that ``scoring_seconds`` is their time."""
+        self._scoring.timed = True

@@ -9,8 +9,9 @@ import numpy as np
 
 from gpusense._util.typing import AnyArray
 from gpusense.localization import skipping, starts
+from gpusense.localization.cloud_state import Contents
 from gpusense.localization.defaults import DEFAULTS
-from gpusense.localization.filter_cloud import Contents, FilterCloud
+from gpusense.localization.filter_cloud import FilterCloud
 from gpusense.localization.motion import SampledMotion
 from gpusense.localization.options import Options
 from gpusense.localization.recovery import Recovery

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from gpusense.backends.base import Backend, Buffer
+from gpusense.backends.base import Backend
 from gpusense.interface.constants import ESTIMATE, SETTINGS, STATE
 from gpusense.interface.flags import flags_if
 from gpusense.interface.launches import Program, launch
@@ -176,9 +176,9 @@ class Particles:
         """Number of blocks of particles."""
         return -(-self.count // self.block)
 
-    def set_particles(self, places: Places, count: int, block: int) -> None:
+    def set_particles(self, places: Places, count: int) -> None:
         """Set the buffers, the number of particles, and the number in a block of weights."""
-        self.places, self.count, self.block = places, count, block
+        self.places, self.count, self.block = places, count, weight_block(self.backend, count)
 
     def use(self, sensors: int) -> None:
         """Set the number of sensors of the next correction."""
@@ -209,27 +209,13 @@ class Particles:
             for sensor, log_p in enumerate(self.log_p[:sensors])
         )  # fmt: skip
 
-    def drawing(
-        self, source: tuple[Buffer, Buffer, int], stage: Stage, drawn: int, copies: Buffer | None = None
-    ) -> Program:
-        """Return the launch that draws from ``source``: poses, their cumulative weights, and their number."""
-        poses, ends, count = source
-        copies = next(one for one in (copies, self._copies, ends) if one is not None)
-        return self.sums.launch("draw_particles", drawn, source=poses, weight=self.weights[stage.weight], ends=ends,
-                                copies=copies, settings=self.settings, state=self.states[stage.state], pool=self.pool,
-                                target=self.poses[stage.target], after=self.weights[stage.after], particles=count,
-                                drawn=drawn, stage=stage.number)  # fmt: skip
-
-    def setting(self, stage: Stage) -> Program:
-        """Return the launch that sets the weights of a stage."""
-        out = self.weights[stage.weight], self.ends
-        return self.sums.set_weights(self.numbers(stage), (stage.number, stage.most), out)
-
     def weighing(self, stage: Stage) -> Program:
         """Return the launches of a stage after its scores: weights, and the draw if its size is known."""
         find, *scored = self.sums.highest(self.blocks)
         found = scored[0], scored[1]
-        weights = self.sums.weigh(self.numbers(stage), found, stage.number) + self.setting(stage)
+        numbers, out = self.numbers(stage), (self.weights[stage.weight], self.ends)
+        weights = self.sums.weigh(numbers, found, stage.number)
+        weights += self.sums.set_weights(numbers, (stage.number, stage.most), out)
         draw = self.draw(stage, stage.drawn) if stage.drawn else ()
         return self.scoring(self._sensors) + find + weights + draw
 
@@ -239,4 +225,10 @@ class Particles:
         if self._copies is not None:
             numbers = {name: self.numbers(stage)[name] for name in ("state", "particles", "block", "blocks")}
             copies = self.sums.copies(dict(numbers, ends=self.ends), self._copies, drawn, stage.number)
-        return copies + self.drawing((self.poses[stage.source], self.ends, self.count), stage, drawn)
+        draw = self.sums.launch(
+            "draw_particles", drawn, source=self.poses[stage.source], weight=self.weights[stage.weight],
+            ends=self.ends, copies=self.ends if self._copies is None else self._copies, settings=self.settings,
+            state=self.states[stage.state], pool=self.pool, target=self.poses[stage.target],
+            after=self.weights[stage.after], particles=self.count, drawn=drawn, stage=stage.number,
+        )  # fmt: skip
+        return copies + draw

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from gpusense.localization import starts
-from gpusense.localization.device_cloud import DeviceCloud
-from gpusense.localization.filter_cloud import SensorReadings
+from gpusense.localization.cloud_state import SensorReadings
+from gpusense.localization.filter_cloud import FilterCloud
 from gpusense.localization.motion import SampledMotion
 from gpusense.localization.rival import COMPARISONS, PARTICLES, PRIOR, Rival, evidence_of
 from gpusense.localization.rival_search import can_search
@@ -121,7 +121,7 @@ class Recovery:
             options = tracker.options._replace(
                 least=PARTICLES, most=PARTICLES, seed=tracker.options.seed ^ _RIVAL, recovery=None, beam_skip=None
             )
-            cloud = DeviceCloud(tracker.sensors, PARTICLES, residual=options.resampling == "residual")
+            cloud = FilterCloud(tracker.sensors, PARTICLES, residual=options.resampling == "residual")
             self.rival = Rival(Tracker(tracker.sensors, options, cloud))
         return self.rival
 

@@ -28,7 +28,7 @@ import numpy as np
 from gpusense.interface.constants import EVIDENCE
 from gpusense.localization import starts
 from gpusense.localization.belief import correlation, motion_between, new_part
-from gpusense.localization.filter_cloud import Contents, SensorReadings, Summary
+from gpusense.localization.cloud_state import Contents, SensorReadings, Summary
 from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import SampledMotion
 from gpusense.localization.ratio import ratio_of_scan

@@ -18,7 +18,7 @@ import numpy as np
 
 from gpusense.backends import arrays
 from gpusense.localization import starts
-from gpusense.localization.filter_cloud import SensorReadings
+from gpusense.localization.cloud_state import SensorReadings
 from gpusense.localization.pose_algebra import wrap_angle
 from gpusense.localization.ratio import ratio_of_places, ratio_of_scan
 from gpusense.localization.sensors import Sensor

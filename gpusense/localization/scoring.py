@@ -13,7 +13,7 @@ from gpusense.backends.base import Buffer
 from gpusense.backends.programs import ProgramCache
 from gpusense.interface.launches import Program
 from gpusense.localization.cloud import Cloud
-from gpusense.localization.filter_cloud import SensorReadings
+from gpusense.localization.cloud_state import SensorReadings
 from gpusense.localization.particles import Stage
 from gpusense.localization.sensors import Sensor
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from gpusense.backends import arrays
-from gpusense.localization.filter_cloud import SensorReadings
+from gpusense.localization.cloud_state import SensorReadings
 from gpusense.localization.pose_algebra import mean_pose
 from gpusense.localization.sensors import Sensor
 

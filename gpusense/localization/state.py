@@ -12,7 +12,7 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.backends import arrays
 from gpusense.backends.base import Backend
-from gpusense.localization.filter_cloud import Contents
+from gpusense.localization.cloud_state import Contents
 from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.options import Options
 from gpusense.localization.recovery import Recovery

@@ -14,9 +14,10 @@ import numpy as np
 from gpusense._util import checks
 from gpusense.localization import starts
 from gpusense.localization.adaptive import kld_count
+from gpusense.localization.cloud_state import Contents, SensorReadings, Step
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.estimates import covariance_of
-from gpusense.localization.filter_cloud import Contents, FilterCloud, SensorReadings, Step
+from gpusense.localization.filter_cloud import FilterCloud
 from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import STILL, SampledMotion
 from gpusense.localization.options import Options, settings_of_step

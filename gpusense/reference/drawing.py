@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.interface.constants import DRAWN, FIRST, RESIDUAL, STAGE, STRATIFIED, TOTAL, WEIGHT_SUMS
+from gpusense.interface.constants import RESIDUAL, STAGE, STRATIFIED, TOTAL, WEIGHT_SUMS
 from gpusense.reference.draws import (
     copies_of,
     copy_particle,
@@ -54,13 +54,11 @@ def draw_particles(
     if is_copied(own, particles, drawn):
         copy_particle(source[: 3 * particles], weight, settings, own, target, after, particles, n)
         return
-    index = n + int(settings[FIRST])
-    start = start_of(settings, stage, index if settings[STRATIFIED] > 0.0 else np.zeros(1, np.uint64))
-    whole = settings[DRAWN] if settings[DRAWN] > 0.0 else float(drawn)
+    start = start_of(settings, stage, n if settings[STRATIFIED] > 0.0 else np.zeros(1, np.uint64))
     if settings[STRATIFIED] == RESIDUAL:
-        certain = found_at(copies, index.astype(np.float64), particles)
-        rest = found_residual(ends, copies, start, own[TOTAL], particles, int(whole))
-        chosen = np.where(index < copies[particles - 1], certain, rest)
+        certain = found_at(copies, n.astype(np.float64), particles)
+        rest = found_residual(ends, copies, start, own[TOTAL], particles, drawn)
+        chosen = np.where(n < copies[particles - 1], certain, rest)
     else:
-        chosen = found_at(ends, mark_of((index + start) / whole, own[TOTAL]), particles)
+        chosen = found_at(ends, mark_of((n + start) / drawn, own[TOTAL]), particles)
     draw_particle(source, ends, settings, state, pool, target, after, particles, stage, n, chosen)

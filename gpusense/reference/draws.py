@@ -12,7 +12,6 @@ from gpusense.interface.constants import (
     DRAW_STREAMS,
     FARTHEST_THETA,
     FARTHEST_X,
-    FIRST,
     INJECTED,
     JITTER,
     LEFT,
@@ -23,7 +22,6 @@ from gpusense.interface.constants import (
     STAGE,
     STEP,
     TOTAL,
-    WHOLE,
 )
 from gpusense.reference.motion import wrap_once
 from gpusense.reference.philox import random_words, uniform_of
@@ -73,7 +71,7 @@ def copy_particle(
     """Copy particles with their weights, relative to the mean weight."""
     total, old = own[TOTAL], weight[n % particles]
     target.reshape(-1, 3)[n] = source.reshape(-1, 3)[n % particles]
-    mean = total / (settings[SCALE] * (settings[WHOLE] if settings[WHOLE] > 0.0 else particles))
+    mean = total / (settings[SCALE] * particles)
     after[n] = np.where(old > 0.0, np.maximum(old / mean, LEAST_WEIGHT), 0.0) if total > 0.0 else 1.0
 
 
@@ -99,11 +97,11 @@ def draw_particle(
     after: np.ndarray, particles: int, stage: int, n: np.ndarray, chosen: np.ndarray,
 ) -> None:  # fmt: skip
     """Draw particles from those with indices ``chosen``: move them by jitter where a stage follows, or inject poses."""
-    poses, index = source[: 3 * particles].reshape(-1, 3), n + int(settings[FIRST])
+    poses = source[: 3 * particles].reshape(-1, 3)
     pose, total = poses[chosen], state[stage * STAGE + TOTAL]
     after[n] = 1.0
     if state[stage * STAGE + LEFT] > 0.0:
-        words = words_of(settings, stage, index, 1)
+        words = words_of(settings, stage, n, 1)
         one = poses[found_at(ends, mark_of(uniform_of(words[0]), total), particles)]
         other = poses[found_at(ends, mark_of(uniform_of(words[1]), total), particles)]
         d = one - other
@@ -113,7 +111,7 @@ def draw_particle(
         pose += (settings[JITTER] / far)[:, None] * d
         pose[:, 2] = wrap_once(pose[:, 2])
     if stage == 0 and state[INJECTED] > 0.0 and settings[POOL] > 0.0:
-        words, more = words_of(settings, stage, index, 2), words_of(settings, stage, index, 3)
+        words, more = words_of(settings, stage, n, 2), words_of(settings, stage, n, 3)
         injected = uniform_of(words[0]) < state[INJECTED]
         row = np.minimum(np.floor(uniform_of(words[1]) * settings[POOL]), settings[POOL] - 1.0).astype(np.int64)
         for axis in range(3):

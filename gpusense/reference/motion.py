@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpusense.interface.constants import DEVIATION, FIRST, MEAN, MOTION_STREAM, REVERSE, SEED, STEP, VELOCITY_MODEL
+from gpusense.interface.constants import DEVIATION, MEAN, MOTION_STREAM, REVERSE, SEED, STEP, VELOCITY_MODEL
 from gpusense.reference.elementary import angle_of
 from gpusense.reference.heading import cos_sin
 from gpusense.reference.philox import normal_pair, random_words, uniform_of
@@ -46,7 +46,7 @@ def move_particles(
     flags: frozenset[str], source: np.ndarray, settings: np.ndarray, target: np.ndarray, particles: int, kind: int
 ) -> None:
     """Move particles from ``source`` to ``target``, which may be the same array."""
-    n = np.arange(particles) + int(settings[FIRST])
+    n = np.arange(particles)
     zero = np.zeros(particles, np.uint64)
     step, key = zero + np.uint64(settings[STEP]), (int(settings[SEED]), int(settings[SEED + 1]))
     words = random_words((n, step, zero + np.uint64(MOTION_STREAM), zero), *key)

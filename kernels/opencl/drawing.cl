@@ -43,15 +43,14 @@ kernel void draw_particles(ARGUMENTS) {
         copy_particle(source, weight, settings, own, target, after, particles, n);
         return;
     }
-    const uint index = (uint)settings[FIRST] + (uint)n;
-    const double start = start_of(settings, stage, settings[STRATIFIED] > 0.0 ? index : 0);
-    const double whole = settings[DRAWN] > 0.0 ? settings[DRAWN] : (double)drawn, at = (double)index;
+    const double start = start_of(settings, stage, settings[STRATIFIED] > 0.0 ? n : 0);
+    const double at = (double)n;
     int chosen;
     if (settings[STRATIFIED] == RESIDUAL) {
         chosen = at < copies[particles - 1] ? found_at(copies, at, particles)
-                                            : found_residual(ends, copies, start, own[TOTAL], particles, (int)whole);
+                                            : found_residual(ends, copies, start, own[TOTAL], particles, drawn);
     } else {
-        chosen = found_at(ends, mark_of((at + start) / whole, own[TOTAL]), particles);
+        chosen = found_at(ends, mark_of((at + start) / (double)drawn, own[TOTAL]), particles);
     }
     draw_particle(source, ends, settings, state, pool, target, after, particles, stage, n, chosen);
 }

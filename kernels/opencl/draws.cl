@@ -8,8 +8,6 @@
 #define SCALE 21
 #define STRATIFIED 26
 #define RESIDUAL 2.0
-#define WHOLE 62
-#define DRAWN 63
 #define LEFT 0
 #define TOTAL 1
 #define RESAMPLED 3
@@ -67,8 +65,8 @@ void copy_particle(global const double *source, global const double *weight, glo
                    const int n) {
     const long place = 3 * (long)n, from = 3 * (long)(n % particles);
     for (int axis = 0; axis < 3; axis++) target[place + axis] = source[from + axis];
-    const double whole = settings[WHOLE] > 0.0 ? settings[WHOLE] : (double)particles, total = own[TOTAL];
-    const double old = weight[n % particles], relative = old / (total / (settings[SCALE] * whole));
+    const double total = own[TOTAL];
+    const double old = weight[n % particles], relative = old / (total / (settings[SCALE] * (double)particles));
     const double kept = old > 0.0 ? (relative > LEAST_WEIGHT ? relative : LEAST_WEIGHT) : 0.0;
     after[n] = total > 0.0 ? kept : 1.0;
 }
@@ -88,13 +86,12 @@ double start_of(global const double *settings, const int stage, const uint index
 void draw_particle(global const double *source, global const double *ends, global const double *settings,
                    global const double *state, global const double *pool, global double *target,
                    global double *after, const int particles, const int stage, const int n, const int chosen) {
-    const uint index = (uint)settings[FIRST] + (uint)n;
     const long place = 3 * (long)n, from = 3 * (long)chosen;
     double x = source[from], y = source[from + 1], theta = source[from + 2];
     after[n] = 1.0;
     if (state[stage * STAGE + LEFT] > 0.0) {
         const double total = state[stage * STAGE + TOTAL];
-        const uint4 words = words_of(settings, stage, index, 1);
+        const uint4 words = words_of(settings, stage, n, 1);
         const long one = 3 * (long)found_at(ends, mark_of(uniform_of(words.x), total), particles);
         const long other = 3 * (long)found_at(ends, mark_of(uniform_of(words.y), total), particles);
         const double dx = source[one] - source[other], dy = source[one + 1] - source[other + 1];
@@ -105,8 +102,8 @@ void draw_particle(global const double *source, global const double *ends, globa
         x += part * dx, y += part * dy, theta = wrap_once(theta + part * turn);
     }
     if (stage == 0 && state[INJECTED] > 0.0 && settings[POOL] > 0.0) {
-        const uint4 words = words_of(settings, stage, index, 2);
-        const uint4 more = words_of(settings, stage, index, 3);
+        const uint4 words = words_of(settings, stage, n, 2);
+        const uint4 more = words_of(settings, stage, n, 3);
         if (uniform_of(words.x) < state[INJECTED]) {
             const double row = floor(uniform_of(words.y) * settings[POOL]);
             const long held = 3 * (long)(row < settings[POOL] - 1.0 ? row : settings[POOL] - 1.0);

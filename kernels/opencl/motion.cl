@@ -10,7 +10,6 @@
 #define MEAN 3
 #define DEVIATION 7
 #define REVERSE 11
-#define FIRST 61
 #define MOTION_STREAM 0
 #define VELOCITY_MODEL 1
 #define SMALL_ARC 1e-4
@@ -76,11 +75,10 @@ kernel void move_particles(ARGUMENTS) {
     const int n = get_global_id(0);
     if (n >= particles) return;
     const uint step = (uint)settings[STEP], key_0 = (uint)settings[SEED], key_1 = (uint)settings[SEED + 1];
-    const uint index = (uint)settings[FIRST] + (uint)n;
-    const uint4 words = random_words((uint4)(index, step, MOTION_STREAM, 0), key_0, key_1);
+    const uint4 words = random_words((uint4)((uint)n, step, MOTION_STREAM, 0), key_0, key_1);
     Motion motion = motion_of(normal_pair(words.x, words.y), normal_pair(words.z, words.w), settings, kind);
     if (settings[REVERSE] > 0.0) {
-        const uint4 more = random_words((uint4)(index, step, MOTION_STREAM + 1, 0), key_0, key_1);
+        const uint4 more = random_words((uint4)((uint)n, step, MOTION_STREAM + 1, 0), key_0, key_1);
         motion.ahead = uniform_of(more.x) < settings[REVERSE] ? -motion.ahead : motion.ahead;
     }
     const long place = 3 * (long)n;

@@ -15,7 +15,7 @@ import warp as wp
 from . import draws
 from .prelude import kernel
 
-STRATIFIED, FIRST, DRAWN, TOTAL, STAGE = (wp.constant(place) for place in (26, 61, 63, 1, 8))
+STRATIFIED, TOTAL, STAGE = (wp.constant(place) for place in (26, 1, 8))
 WEIGHT_SUMS = wp.constant(17)
 ZERO, RESIDUAL = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(2.0))
 
@@ -69,9 +69,8 @@ def make(name, flags):
         if is_copied(state, stage, particles, drawn):
             copy_particle(source, weight, settings, total, target, after, particles, n)
             return
-        index = wp.uint32(settings[FIRST]) + wp.uint32(n)
+        index = wp.uint32(n)
         at = wp.float64(index)
-        whole = wp.where(settings[DRAWN] > ZERO, settings[DRAWN], wp.float64(drawn))
         first = wp.uint32(0)
         if settings[STRATIFIED] > ZERO:
             first = index
@@ -81,9 +80,9 @@ def make(name, flags):
             if at < copies[particles - 1]:
                 chosen = found_at(copies, at, particles)
             else:
-                chosen = found_residual(ends, copies, start, total, particles, wp.int32(whole))
+                chosen = found_residual(ends, copies, start, total, particles, drawn)
         else:
-            chosen = found_at(ends, mark_of((at + start) / whole, total), particles)
+            chosen = found_at(ends, mark_of((at + start) / wp.float64(drawn), total), particles)
         draw_particle(source, ends, settings, state, pool, target, after, particles, stage, n, chosen)
 
     return locals()[name]

@@ -12,7 +12,7 @@ from . import motion
 from .philox import random_words, uniform_of
 
 SEED, STEP, JITTER, FARTHEST_X, FARTHEST_THETA, POOL = (wp.constant(place) for place in (0, 2, 12, 13, 14, 15))
-SCALE, STRATIFIED, FIRST, WHOLE, DRAWN = (wp.constant(place) for place in (21, 26, 61, 62, 63))
+SCALE = wp.constant(21)
 LEFT, TOTAL, RESAMPLED, STAGE, INJECTED = (wp.constant(place) for place in (0, 1, 3, 8, 51))
 DRAW_STREAM, DRAW_STREAMS = wp.constant(16), wp.constant(4)
 LEAST_WEIGHT = wp.constant(wp.float64(1e-6))
@@ -89,8 +89,7 @@ def functions(flags):
             target[3 * n + axis] = source[3 * copied + axis]
         kept = ONE
         if total > ZERO:
-            whole = wp.where(settings[WHOLE] > ZERO, settings[WHOLE], wp.float64(particles))
-            kept = wp.max(weight[copied] / (total / (settings[SCALE] * whole)), LEAST_WEIGHT)
+            kept = wp.max(weight[copied] / (total / (settings[SCALE] * wp.float64(particles))), LEAST_WEIGHT)
             if weight[copied] == ZERO:
                 kept = weight[copied]
         after[n] = kept
@@ -115,7 +114,7 @@ def functions(flags):
         state: wp.array(dtype=wp.float64), pool: wp.array(dtype=wp.float64), target: wp.array(dtype=wp.float64),
         after: wp.array(dtype=wp.float64), particles: wp.int32, stage: wp.int32, n: wp.int32, chosen: wp.int32,
     ):  # fmt: skip
-        index = wp.uint32(settings[FIRST]) + wp.uint32(n)
+        index = wp.uint32(n)
         x = source[3 * chosen]
         y = source[3 * chosen + 1]
         theta = source[3 * chosen + 2]

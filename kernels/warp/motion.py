@@ -16,7 +16,7 @@ from .elementary import angle_of
 from .philox import random_words, uniform_of
 from .prelude import kernel
 
-SEED, STEP, MEAN, DEVIATION, REVERSE, FIRST = (wp.constant(place) for place in (0, 2, 3, 7, 11, 61))
+SEED, STEP, MEAN, DEVIATION, REVERSE = (wp.constant(place) for place in (0, 2, 3, 7, 11))
 MOTION_STREAM, REVERSE_STREAM = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 VELOCITY_MODEL = wp.constant(1)
 SMALL_ARC, SIX = wp.constant(wp.float64(1e-4)), wp.constant(wp.float64(6.0))
@@ -75,7 +75,7 @@ def make(name, flags):
         step = wp.uint32(settings[STEP])
         key_0 = wp.uint32(settings[SEED])
         key_1 = wp.uint32(settings[SEED + 1])
-        index = wp.uint32(settings[FIRST]) + wp.uint32(n)
+        index = wp.uint32(n)
         words = random_words(index, step, MOTION_STREAM, key_0, key_1)
         one = normal_pair(words[0], words[1])
         two = normal_pair(words[2], words[3])

@@ -9,7 +9,7 @@ import weakref
 
 import numpy as np
 import pytest
-from support.split_scene import GRID
+from support.tracking_scene import GRID
 
 import gpusense as gs
 from gpusense.backends import get_backend

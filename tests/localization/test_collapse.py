@@ -7,7 +7,7 @@ import pytest
 
 import gpusense as gs
 from gpusense.interface import constants as c
-from gpusense.localization.filter_cloud import is_starved, summary_of
+from gpusense.localization.cloud_state import is_starved, summary_of
 
 
 def follow(backend, prior, sigma, far, corrections, **options):

@@ -1,20 +1,17 @@
-"""Each member of the interface between a filter and its particles, for a cloud on one device and on several."""
+"""Each member of the interface between a filter and its particles, on every backend."""
 
 from __future__ import annotations
 
-import inspect
 from typing import Any
 
 import numpy as np
 import pytest
-from support.split_scene import field, scans
+from support.tracking_scene import field, scans
 
 from gpusense.backends import get_backend
 from gpusense.interface.constants import FAST, SLOW, SLOW_RATE, STRAIGHT
-from gpusense.localization.device_cloud import DeviceCloud
-from gpusense.localization.distributed.cloud import SplitCloud
-from gpusense.localization.distributed.teams import LocalTeam
-from gpusense.localization.filter_cloud import Contents, FilterCloud, Step
+from gpusense.localization.cloud_state import Contents, Step
+from gpusense.localization.filter_cloud import FilterCloud
 from gpusense.localization.motion import STILL, OdometryMotion
 from gpusense.localization.options import checked, settings_of_step
 from gpusense.localization.sensors import Sensor
@@ -23,11 +20,11 @@ COUNT = 100
 POSES = np.random.default_rng(0).normal((3.0, 2.5, 0.4), (0.2, 0.2, 0.1), (COUNT, 3))
 
 
-def made(kind: str, backend: str, capacity: int = COUNT) -> Any:
-    """Return an empty cloud."""
-    if kind == "one device":
-        return DeviceCloud([Sensor(field(backend))], capacity)
-    return SplitCloud(LocalTeam([[field(backend)], [field(backend)]], capacity, False), capacity)
+def made(backend: str, capacity: int = COUNT) -> FilterCloud:
+    """Return a cloud at the poses."""
+    cloud = FilterCloud([Sensor(field(backend))], capacity)
+    cloud.place(POSES)
+    return cloud
 
 
 def host(values: Any) -> np.ndarray:
@@ -47,37 +44,15 @@ def step(drawn: int = COUNT, recovery: str | None = None, pool: Any = (0, (0.0, 
                 [(0, (scans(4)[1][0],))])  # fmt: skip
 
 
-@pytest.fixture(params=["one device", "split"])
-def kind(request) -> str:
-    return request.param
+@pytest.fixture
+def cloud(backend) -> FilterCloud:
+    return made(backend)
 
 
 @pytest.fixture
-def cloud(kind, backend) -> Any:
-    found = made(kind, backend)
-    found.place(POSES)
-    return found
-
-
-@pytest.fixture
-def other(kind, backend) -> Any:
-    """Return the cloud of the other kind, which must have the same bits."""
-    found = made({"one device": "split", "split": "one device"}[kind], backend)
-    found.place(POSES)
-    return found
-
-
-def test_the_interface_is_the_only_base_and_is_implemented_by_both():
-    assert SplitCloud.__mro__[1] is FilterCloud and issubclass(DeviceCloud, FilterCloud)
-    members = {name for name, _ in inspect.getmembers(FilterCloud) if not name.startswith("_")} - {"MEMORY", "PARTS"}
-    tested = {
-        "place", "set_pool", "move", "correct", "estimate", "summary", "particles", "shares", "moments", "host_poses",
-        "host_weights", "explain", "contents", "restore", "scoring_seconds", "time_scoring",
-    }  # fmt: skip
-    assert members == tested
-    for kind in (DeviceCloud, SplitCloud):
-        assert not inspect.isabstract(kind)
-        assert {"count", "places"} <= set(kind.MEMORY)
+def other(backend) -> FilterCloud:
+    """Return a cloud with more room, which must have the same bits."""
+    return made(backend, 3 * COUNT)
 
 
 def test_places_are_shown_and_weighed_alike(cloud):
@@ -99,7 +74,7 @@ def test_a_move_shows_moved_particles(cloud, other):
 
 
 @pytest.mark.parametrize("drawn", [COUNT, 60])
-def test_a_correction_has_the_bits_of_the_other_kind(cloud, other, drawn):
+def test_a_correction_has_the_bits_of_a_cloud_with_more_room(cloud, other, drawn):
     for each in (cloud, other):
         each.correct(step(drawn))
     assert cloud.count == other.count == drawn and cloud.places == other.places
@@ -137,7 +112,7 @@ def test_a_pool_is_injected(cloud, other):
     assert 5 < np.count_nonzero(drawn[:, 0] > 6.8) < 40
 
 
-def test_contents_go_from_one_kind_to_the_other(cloud, other):
+def test_contents_go_from_one_cloud_to_another(cloud, other):
     cloud.correct(step())
     contents = cloud.contents(COUNT)
     assert isinstance(contents, Contents) and contents.next_count == COUNT
@@ -160,8 +135,8 @@ def test_seconds_are_those_of_waiting_for_scores(cloud, backend):
     assert first == cloud.scoring_seconds == 0 if recorded else 0 < first < cloud.scoring_seconds < 60
 
 
-def test_explanations(cloud, kind):
-    assert cloud.explain().startswith({"one device": "launches one by one", "split": "split: 48 on "}[kind])
+def test_explanations(cloud):
+    assert cloud.explain() == "launches one by one"
 
 
 def test_steps_leave_what_they_begin_with(cloud):

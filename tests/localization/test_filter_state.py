@@ -8,11 +8,9 @@ import pickle
 import numpy as np
 import pytest
 from support.filter_scene import COVARIANCE, FILTERS, START, begun, everything, odometry, readings
-from support.split_scene import field
+from support.tracking_scene import field
 
 import gpusense as gs
-from gpusense.localization.distributed.filter import SplitParticleFilter
-from gpusense.sweeps.executors import ProcessExecutor
 
 
 def continued(pf, first=3, steps=4):
@@ -48,7 +46,7 @@ def test_a_copy_continues_with_the_same_bits(name, how, backend):
     pf.predict(*odometry(2))
     made = COPIES[how](pf, lambda: FILTERS[name](backend))
     assert everything(made) == everything(pf) and repr(made) == repr(pf)
-    assert (made.models == pf.models) == (how == "copy" and name != "split")
+    assert (made.models == pf.models) == (how == "copy")
     before = everything(pf)
     expected = continued(made)
     # The original is unchanged, and continues in the same way.
@@ -79,32 +77,6 @@ def test_a_long_run_is_repeated_from_the_middle(needs):
     assert continued(restored(pf, lambda: gs.ParticleFilter(field("opencl"), **pf.state().options)), 8) == continued(
         pf, 8
     )
-
-
-def test_a_state_goes_from_one_device_to_several_and_back(backend):
-    options = dict(particles=200, seed=9)
-    one = begun(gs.ParticleFilter(field(backend), **options))
-    split = SplitParticleFilter(field, devices=[backend] * 3, **options)
-    split.restore(one.state())
-    back = gs.ParticleFilter(field(backend), **options)
-    back.restore(split.state())
-    assert everything(one) == everything(split) == everything(back)
-    assert continued(one) == continued(split) == continued(back)
-
-
-def test_a_split_filter_over_processes_has_a_state_and_no_copy():
-    executors = [ProcessExecutor(["numpy"]) for _ in range(2)]
-    try:
-        pf = begun(SplitParticleFilter(field, devices=["numpy"] * 2, executors=executors, particles=100, seed=1), 1)
-        for call in (copy.copy, copy.deepcopy, pickle.dumps):
-            with pytest.raises(TypeError, match="must have its shares in this process to be copied or pickled"):
-                call(pf)
-        one = gs.ParticleFilter(field("numpy"), **pf.state().options)
-        one.restore(pf.state())
-        assert everything(one) == everything(pf)
-    finally:
-        for each in executors:
-            each.shutdown()
 
 
 def test_a_state_has_no_device_and_tells_its_options():

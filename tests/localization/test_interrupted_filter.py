@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from support.filter_scene import COVARIANCE, FILTERS, START, Filter, begun, everything, odometry, readings
 from support.interrupts import Line, executed_lines, interrupt
-from support.split_scene import field
+from support.tracking_scene import field
 
 import gpusense as gs
 from gpusense.localization import journal, starts
@@ -107,9 +107,8 @@ def test_a_call_that_was_interrupted_has_changed_all_or_nothing(name, call, most
 
 
 @some_lines
-@pytest.mark.parametrize("name", ["field", "split"])
-def test_a_correction_on_a_device_that_was_interrupted_has_changed_all_or_nothing(name, most, device):
-    interrupt_lines(name, device.info.selection, "correct", most)
+def test_a_correction_on_a_device_that_was_interrupted_has_changed_all_or_nothing(most, device):
+    interrupt_lines("field", device.info.selection, "correct", most)
 
 
 @some_lines

@@ -13,6 +13,7 @@ from gpusense.backends import get_backend
 from gpusense.interface import constants as c
 from gpusense.interface.launches import launch
 from gpusense.localization.cloud import Cloud
+from gpusense.localization.cloud_state import Contents
 from gpusense.localization.estimates import covariance_of
 from gpusense.localization.motion import settings_of
 from gpusense.localization.sums import Sums
@@ -266,7 +267,7 @@ def test_estimates_are_the_moments_of_the_cloud(backend, name):
     weights = rng.exponential(size=len(poses))
     weights[0] = 1e-6
     cloud = Cloud(get_backend(backend), len(poses), 0, np.dtype(np.float32))
-    cloud.place(poses, weights)
+    cloud.restore(Contents(poses, weights, None, None, np.zeros(c.STATE), None))
     for _ in range(3):
         # The third one is a recording.
         numbers = cloud.estimate(len(poses))

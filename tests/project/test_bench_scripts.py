@@ -321,12 +321,6 @@ def test_field_gradients_are_measured(needs: Callable[[str], str], tmp_path: Pat
     assert all(row["lookups"] > 0 and row["call_ms"] > 0 and row["kernels_ms"] > 0 for row in report["rows"])
 
 
-def test_split_filters_are_measured(tmp_path: Path) -> None:
-    small = ["--device", "numpy", "--device", "numpy", "--size", "200", "15", "--steps", "2", "--stages", "2"]
-    (row,) = run_here("speed/split_filter.py", *small, output=tmp_path / "split")["rows"]
-    assert row["equal"] and row["difference"] == 0 and row["one_ms"] > 0 and row["split_ms"] > 0
-
-
 @pytest.mark.slow
 def test_sweeps_are_measured(tmp_path: Path) -> None:
     small = ["--workers", "1", "--jobs", "2", "--particles", "20", "--beams", "11", "--scans", "2", "--repeats", "2"]

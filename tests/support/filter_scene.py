@@ -8,10 +8,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from support.split_scene import GRID, SCANNER, TRUTH, field, field_and_compass, scans
+from support.tracking_scene import GRID, SCANNER, TRUTH, field, field_and_compass, scans
 
 import gpusense as gs
-from gpusense.localization.distributed.filter import SplitParticleFilter
 
 XY = np.random.default_rng(3).uniform(0, 6, (8, 2))
 START = TRUTH + np.array([0.2, -0.2, 0.1])
@@ -27,7 +26,7 @@ def landmarks(backend: str) -> gs.LandmarkModel:
     return gs.LandmarkModel(gs.LandmarkMap(XY), backend=backend)
 
 
-# Filters, given a backend. The last one is split.
+# Filters, given a backend.
 FILTERS: dict[str, Callable[[str], Filter]] = {
     "field": lambda b: gs.ParticleFilter(field(b), particles=200, seed=1),
     "beam, residual, skipping": lambda b: gs.ParticleFilter(
@@ -36,7 +35,6 @@ FILTERS: dict[str, Callable[[str], Filter]] = {
     "augmented": lambda b: gs.ParticleFilter(field(b), particles=(50, 300), seed=3, recovery="augmented", stages=2),
     "sensors, resetting": lambda b: gs.ParticleFilter(field_and_compass(b), particles=100, seed=4, recovery="sensor"),
     "landmarks": lambda b: gs.ParticleFilter(landmarks(b), particles=100, seed=5, motion=gs.OmniMotion()),
-    "split": lambda b: SplitParticleFilter(field, devices=[b, b], particles=200, seed=6),
 }
 
 

@@ -115,20 +115,6 @@ def test_a_result_that_ends_with_its_worker_is_not_waited_for(tmp_path, executor
     assert executor.submit(abs, -2).result(timeout=60) == 2
 
 
-def test_an_executor_of_one_worker_does_not_wait_for_a_lost_one(executor):
-    awaited(lambda: executor.slots == 1)
-    (each,) = executor.on_each()
-    process = each.submit(os.getpid).result(timeout=60)
-    assert each.submit(os.getpid).result(timeout=60) == process != executor.submit(os.getpid).result(timeout=60)
-    running = each.submit(time.sleep, 600)
-    time.sleep(0.5)
-    os.kill(parent(process), signal.SIGKILL)
-    for future in (running, each.submit(abs, -1)):
-        with pytest.raises(WorkerDied, match="with its Dask worker"):
-            future.result(timeout=60)
-    each.shutdown()
-
-
 def test_executors_on_one_cluster_keep_apart_and_leave_nothing(tmp_path, cluster, executor):
     executor.send({"a.txt": b"one"})
     with gs.sweep.DaskExecutor(cluster.address, timeout=60) as other:

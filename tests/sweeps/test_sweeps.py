@@ -10,10 +10,8 @@ import time
 from importlib.util import find_spec
 from pathlib import Path
 
-import numpy as np
 import pytest
 from support.room_log import write_room
-from support.split_scene import field, states
 
 import gpusense as gs
 from gpusense.commands import cli
@@ -192,14 +190,6 @@ def test_a_cluster_listens_on_the_loopback_only(cluster):
     workers = cluster._workers().values()
     assert all(address.startswith("tcp://127.0.0.1:") for address in cluster._workers())
     assert {one["host"] for one in workers} == {"127.0.0.1"} and {one["nthreads"] for one in workers} == {1}
-
-
-@dask
-def test_a_filter_is_split_over_the_workers_of_a_cluster(cluster):
-    pf = gs.sweep.SplitParticleFilter(field, devices=["numpy"] * 2, executors=cluster.on_each(), particles=300, seed=3)
-    found, expected = states(pf, 2), states(gs.ParticleFilter(field("numpy"), particles=300, seed=3), 2)
-    assert all(np.array_equal(one, other) for one, other in zip(found, expected, strict=True)) and pf.exchanged > 0
-    pf.close()
 
 
 @dask

@@ -158,10 +158,6 @@ class WarpBackend(ProcessBound, Backend):
         from_size, to_size = (wp.types.type_size_in_bytes(array.dtype) for array in (source, target))
         wp.copy(target, source, dest_offset=to // to_size, src_offset=begin // from_size, count=size // from_size)
 
-    def copies_from(self, other: Backend) -> bool:
-        """See Backend.copies_from; between GPUs directly where they are linked, else through the host."""
-        return other is self or (isinstance(other, WarpBackend) and self._device.is_cuda and other._device.is_cuda)
-
     def lend(self, buffer: wp.array, shape: tuple[int, ...], dtype: np.dtype) -> wp.array:
         return buffer if buffer.shape == shape else buffer.reshape(shape)
 

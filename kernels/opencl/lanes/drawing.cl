@@ -8,7 +8,6 @@ kernel void draw_particles(ARGUMENTS) {
     global const double *own = state + stage * STAGE;
     const int copied = is_copied(own, particles, drawn), stratified = settings[STRATIFIED] > 0.0;
     const int residual = settings[STRATIFIED] == RESIDUAL;
-    const double whole = settings[DRAWN] > 0.0 ? settings[DRAWN] : (double)drawn;
     double start = start_of(settings, stage, 0);
     int chosen = 0;
     for (int n = first; n < last; n++) {
@@ -16,15 +15,14 @@ kernel void draw_particles(ARGUMENTS) {
             copy_particle(source, weight, settings, own, target, after, particles, n);
             continue;
         }
-        const uint index = (uint)settings[FIRST] + (uint)n;
-        if (stratified) start = start_of(settings, stage, index);
-        const double at = (double)index;
+        if (stratified) start = start_of(settings, stage, n);
+        const double at = (double)n;
         if (residual) {
             chosen = at < copies[particles - 1]
                          ? found_at(copies, at, particles)
-                         : found_residual(ends, copies, start, own[TOTAL], particles, (int)whole);
+                         : found_residual(ends, copies, start, own[TOTAL], particles, drawn);
         } else {
-            const double mark = mark_of((at + start) / whole, own[TOTAL]);
+            const double mark = mark_of((at + start) / (double)drawn, own[TOTAL]);
             if (n == first) chosen = found_at(ends, mark, particles);
             while (chosen < particles - 1 && !(ends[chosen] > mark)) chosen++;
         }

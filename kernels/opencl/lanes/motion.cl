@@ -1,15 +1,14 @@
 // Sampled motions of 8 particles at once: motion.cl.
 // requires: lanes/philox
 
-// in lanes: SEED STEP MEAN DEVIATION REVERSE FIRST MOTION_STREAM VELOCITY_MODEL SMALL_ARC WHOLE_TURN FARTHEST_ONCE
+// in lanes: SEED STEP MEAN DEVIATION REVERSE MOTION_STREAM VELOCITY_MODEL SMALL_ARC WHOLE_TURN FARTHEST_ONCE
 // in lanes: angle_of Motion chord_of wrap_once wrap_any motion_of move_by
 
 // Move the particles from begin on, at most DOUBLES of them.
 void move_lanes(global const double *source, global const double *settings, global double *target, const int begin,
                 const int count, const int kind) {
     const uint step = (uint)settings[STEP], key_0 = (uint)settings[SEED], key_1 = (uint)settings[SEED + 1];
-    const uint index = (uint)settings[FIRST] + (uint)begin;
-    const ulong8 indices = ((ulong)index + (ulong8)(0, 1, 2, 3, 4, 5, 6, 7)) & 0xFFFFFFFFUL;
+    const ulong8 indices = (ulong)begin + (ulong8)(0, 1, 2, 3, 4, 5, 6, 7);
     ulong8 words[4];
     random_words_lanes(indices, step, MOTION_STREAM, key_0, key_1, words);
     Motion_lanes motion = motion_of_lanes(normal_pair_lanes(words[0], words[1]), normal_pair_lanes(words[2], words[3]),

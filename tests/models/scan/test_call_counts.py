@@ -12,7 +12,7 @@ from types import CodeType
 
 import numpy as np
 import pytest
-from support.split_scene import GRID
+from support.tracking_scene import GRID
 
 import gpusense as gs
 

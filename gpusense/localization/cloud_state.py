@@ -1,0 +1,177 @@
+"""Plain data of a filter's particles: the arguments of a step, the state of a correction, copies on the host."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gpusense.interface.constants import (
+    DEGENERATE,
+    DEPTH,
+    EVIDENCE,
+    FARTHEST_THETA,
+    FARTHEST_X,
+    INJECTED,
+    JITTER,
+    LEFT,
+    LOWEST,
+    RESAMPLED,
+    RUNG,
+    SAMPLE_SIZE,
+    SHARE,
+    STAGE,
+    STATE,
+)
+from gpusense.localization.particles import Places
+from gpusense.reference.tempering import left_of
+
+# Lowest depth of a ladder: distances of a million deviations differ by 2^-39 on its last rung.
+_DEEPEST = LOWEST**5
+# Effective sample size below which a stage is weighed again on a deeper ladder.
+_FEWEST = 10.0
+# Jitter of a stage on a deeper ladder: the peak lies beyond the particles, which must not contract before they reach
+# it.
+_WIDE_JITTER = 0.7
+# Index of a sensor, and its readings.
+SensorReadings = tuple[int, tuple[Any, ...]]
+
+
+class Step(NamedTuple):
+    """Arguments of a correction.
+
+    Attributes:
+        settings: Settings, by the places in ``interface.constants``.
+        kind: Kind of the motion that begins it.
+        stages: Most stages.
+        drawn: Particles of the next step.
+        readings: Indices of sensors with their readings.
+        judged: The scans that are to be judged at the pose after it, with the indices of their sensors; a cloud may
+            leave that to the verdict.
+    """
+
+    settings: np.ndarray
+    kind: int
+    stages: int
+    drawn: int
+    readings: list[SensorReadings]
+    judged: Sequence[SensorReadings] = ()
+
+
+class Contents(NamedTuple):
+    """Particles on the host.
+
+    Attributes:
+        poses: (N, 3) shown poses.
+        weights: (N,) their weights, before they are normalised.
+        next_poses: (M, 3) poses of the next step; None if these are the shown ones, which were not weighed.
+        next_weights: (M,) weights with which the next step begins; None together with ``next_poses``.
+        state: State of the last correction, as the kernels hold it.
+        pool: Poses from which recovery injects particles; None without them.
+    """
+
+    poses: np.ndarray
+    weights: np.ndarray
+    next_poses: np.ndarray | None
+    next_weights: np.ndarray | None
+    state: np.ndarray
+    pool: np.ndarray | None
+
+    @property
+    def next_count(self) -> int:
+        """Number of particles of the next step."""
+        return len(self.poses if self.next_poses is None else self.next_poses)
+
+    def places_and_arrays(self, now: Places) -> tuple[Places, list[tuple[str, int, np.ndarray]]]:
+        """Return buffers for these particles that do not overwrite kept ones, and the array for each buffer.
+
+        Args:
+            now: The buffers at the beginning of the call, which are kept.
+
+        Returns:
+            Places, and arrays by the name ("poses" or "weights") and index of their buffer.
+        """
+        places = now.placed(now)
+        if self.next_poses is None or self.next_weights is None:
+            return places, [("poses", places.shown, self.poses), ("weights", places.weight, self.weights)]
+        places = places._replace(next=places.shown + 1, weight=places.before - 1)
+        return places, [
+            ("poses", places.shown, self.poses), ("weights", places.weight, self.weights),
+            ("poses", places.next, self.next_poses), ("weights", places.before, self.next_weights),
+        ]  # fmt: skip
+
+
+class Summary(NamedTuple):
+    """The state of a filter after a correction.
+
+    Attributes:
+        effective_sample_size: Effective sample size of the last stage, at most the number of distinct particles after
+            earlier stages.
+        temperature: Share of the temperature that all stages used.
+        degenerate: Whether no particle was possible.
+        stages: Number of stages that ran.
+        numbers: The state as the kernels hold it.
+        resampled: Whether particles were drawn at the end.
+    """
+
+    effective_sample_size: float
+    temperature: float
+    degenerate: bool
+    stages: int
+    numbers: np.ndarray
+    resampled: bool
+
+
+def summary_of(numbers: np.ndarray) -> Summary:
+    """Return the summary of a state as the kernels hold it."""
+    used, stage, distinct = 0.0, 0, math.inf
+    while True:
+        own = numbers[stage * STAGE : (stage + 1) * STAGE]
+        used += float(own[RUNG])
+        if own[LEFT] == 0.0:
+            break
+        # Each copy is jittered by the difference of two other parents, so m parents have at most m^3 distinct copies.
+        distinct = min(distinct, float(own[SAMPLE_SIZE]) ** 3)
+        stage += 1
+    size = min(float(own[SAMPLE_SIZE]), distinct)
+    return Summary(size, min(used, 1.0), bool(numbers[DEGENERATE]), stage + 1, numbers, bool(own[RESAMPLED]))
+
+
+def is_starved(numbers: np.ndarray, settings: np.ndarray, stage: int, count: int) -> bool:
+    """Tell whether even the last rung of a stage leaves too few particles with weight, and a deeper rung may not.
+
+    Args:
+        numbers: The state after the stage.
+        settings: Numbers of the step.
+        stage: The stage.
+        count: Particles.
+    """
+    own = numbers[stage * STAGE : (stage + 1) * STAGE]
+    lowest = left_of(numbers, stage) * settings[DEPTH] * LOWEST
+    least = min(settings[SHARE] * count, _FEWEST)
+    few = own[RUNG] == lowest > 0.0 and not own[DEGENERATE] and own[SAMPLE_SIZE] < least
+    return bool(few and settings[DEPTH] > _DEEPEST)
+
+
+def deeper(settings: np.ndarray) -> np.ndarray:
+    """Return the settings of a step whose ladder begins below the last rung of the present ladder."""
+    result = settings.copy()
+    result[DEPTH] *= LOWEST
+    result[JITTER], result[FARTHEST_X], result[FARTHEST_THETA] = _WIDE_JITTER, math.inf, math.pi
+    return result
+
+
+def meaningful(numbers: np.ndarray, averages: bool) -> np.ndarray:
+    """Clear the numbers of a state that nothing reads: of stages that did not run, and of unused averages.
+
+    Args:
+        numbers: The state as the kernels hold it.
+        averages: Whether recovery follows the averages of the likelihood.
+    """
+    end, result = summary_of(numbers).stages * STAGE, np.zeros(STATE)
+    result[:end] = numbers[:end]
+    if averages:
+        result[EVIDENCE : INJECTED + 1] = numbers[EVIDENCE : INJECTED + 1]
+    return result

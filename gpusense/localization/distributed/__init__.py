@@ -1,1 +1,0 @@
-"""A filter whose particles are spread over several devices."""

@@ -106,14 +106,21 @@ def read_mapping(file: Path) -> dict[Any, Any]:
     """Read the mapping in a YAML file of plain values; numbers are decimal.
 
     Raises:
-        ValueError: The file is too large, is not plain YAML, holds no mapping, or breaks a bound of :func:`check_yaml`.
+        ValueError: The file is too large, is not plain YAML, holds no mapping or a doubled key, or breaks a bound of
+            :func:`check_yaml`.
     """
     import yaml
 
     text = _bounded(file, _LARGEST_YAML_BYTES, "a YAML file")
     try:
         check_yaml(text)
-        data = yaml.load(text, _loader())
+        loader = _loader()(text)
+        try:
+            root = loader.get_single_node()
+            _check_keys(loader, root)
+            data = None if root is None else loader.construct_document(root)
+        finally:
+            loader.dispose()
     except (yaml.YAMLError, ValueError, RecursionError, AttributeError, KeyError) as error:
         mark = getattr(error, "problem_mark", None)
         line = f" in line {mark.line + 1}" if mark else ""
@@ -121,6 +128,34 @@ def read_mapping(file: Path) -> dict[Any, Any]:
     if not isinstance(data, dict):
         raise ValueError(f"{file}: must hold a YAML mapping, got {checks.show(data)}")
     return data
+
+
+def _check_keys(loader: Any, root: Any) -> None:
+    """Refuse mappings with a doubled key, of which PyYAML would silently keep the last value.
+
+    Raises:
+        yaml.YAMLError: A key is doubled.
+    """
+    import yaml
+
+    nodes, seen = [root], set[int]()
+    while nodes:
+        node = nodes.pop()
+        if not isinstance(node, yaml.CollectionNode) or id(node) in seen:
+            continue
+        seen.add(id(node))
+        if isinstance(node, yaml.SequenceNode):
+            nodes += node.value
+            continue
+        lines: dict[Any, int] = {}
+        for key, value in node.value:
+            nodes += (key, value)
+            if isinstance(key, yaml.ScalarNode) and not key.tag.endswith(":merge"):
+                name = loader.construct_object(key)
+                if name in lines:
+                    problem = f"the key {checks.show(name)} is doubled, first in line {lines[name]}"
+                    raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
+                lines[name] = key.start_mark.line + 1
 
 
 def _problem(error: Exception) -> str:

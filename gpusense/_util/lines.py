@@ -25,13 +25,14 @@ def numbered_lines(file: Path) -> Iterator[tuple[int, bytes]]:
     Yields:
         The line's number, from 1 on, and the line with its end.
 
-    A truncated compressed file is read up to its end, with a warning.
+    A byte order mark is left out. A truncated compressed file is read up to its end, with a warning.
 
     Raises:
         ValueError: A line is too long, or a compressed file is broken or grows without bound; the message begins with
             file and line.
     """
     number = 0
+    mark = b"\xef\xbb\xbf"  # byte order mark of UTF-8
     try:
         with file.open("rb") as plain:
             compressed = plain.read(2) == b"\x1f\x8b"
@@ -47,7 +48,7 @@ def numbered_lines(file: Path) -> Iterator[tuple[int, bytes]]:
                     if room < 0 or number > lines:
                         what = f"{most_bytes(file.stat().st_size)} bytes" if room < 0 else f"{lines} lines"
                         raise ValueError(f"{file}:{number}: must hold at most {what} in its compressed size, got more")
-                    yield number, line
+                    yield number, line.removeprefix(mark) if number == 1 else line
     except EOFError as error:
         if not number:
             raise ValueError(f"{file}:1: must be a whole gzip file, got one that is cut off: {error}") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
@@ -48,17 +49,12 @@ def write_tum(path: Path, times: Iterable[float], poses: Iterable[Floats], *, in
     write_whole(path, write)
 
 
-def _numbers(path: Path) -> Iterator[list[float]]:
-    """Return the eight numbers of each line; text after # is a comment.
+def _rows(path: Path, lines: Iterator[tuple[int, bytes]]) -> Iterator[list[float]]:
+    """Yield the eight numbers of each numbered line; text after # is a comment.
 
     Raises:
-        ValueError: a line has not eight finite numbers.
+        ValueError: a line has not eight numbers.
     """
-    yield from until_cut(path, lambda lines: _rows(path, lines))
-
-
-def _rows(path: Path, lines: Iterator[tuple[int, bytes]]) -> Iterator[list[float]]:
-    """Yield the numbers of numbered lines."""
     for line, data in lines:
         text = data.decode(errors="backslashreplace")
         if text.strip() == _INDICES:
@@ -68,8 +64,8 @@ def _rows(path: Path, lines: Iterator[tuple[int, bytes]]) -> Iterator[list[float
             numbers = [float(word) for word in words]
         except ValueError:
             numbers = []
-        if words and not (len(numbers) == 8 and all(map(math.isfinite, numbers))):
-            raise ValueError(f"{path}: line {line} must have eight finite numbers, got {checks.show(text.strip())}")
+        if words and len(numbers) != 8:
+            raise ValueError(f"{path}: line {line} must have eight numbers, got {checks.show(text.strip())}")
         if words:
             yield numbers
 
@@ -77,14 +73,19 @@ def _rows(path: Path, lines: Iterator[tuple[int, bytes]]) -> Iterator[list[float
 def read_tum(path: Path) -> tuple[Floats, Floats]:
     """Read a TUM trajectory: times (T,) [s] and poses (T, 3), with headings from the quaternions.
 
+    Poses that are not finite are skipped, with one warning.
+
     Raises:
-        ValueError: a line has not eight finite numbers, there is no line, a quaternion is 0, a coordinate exceeds 1e9
-            m, or times do not increase.
+        ValueError: a line has not eight numbers, no pose is finite, a quaternion is 0, a coordinate exceeds 1e9 m, or
+            times do not increase.
         FileNotFoundError: the file is missing.
     """
-    rows = np.array(list(_numbers(path))).reshape(-1, 8)
+    every = np.array(list(until_cut(path, lambda lines: _rows(path, lines)))).reshape(-1, 8)
+    rows = every[np.isfinite(every).all(axis=1)]
     if not len(rows):
         raise ValueError(f"{path}: must have a pose, got none")
+    if len(rows) < len(every):
+        warnings.warn(f"{path}: {len(every) - len(rows)} of {len(every)} poses are not finite: skipped", stacklevel=2)
     if not (np.diff(rows[:, 0]) > 0).all():
         line = int(np.argmin(np.diff(rows[:, 0]) > 0)) + 1
         raise ValueError(f"{path}: must have increasing times, got {rows[line, 0]} after {rows[line - 1, 0]}")

@@ -42,6 +42,8 @@ def find_reflectors(ranges: np.ndarray, intensities: np.ndarray, scanner: Scanne
 def _runs(bright: np.ndarray, r: np.ndarray, steps: np.ndarray, step: float) -> list[np.ndarray]:
     """Return runs of bright beams in the order of bearings, across the last beam if beams cover a full turn."""
     count = len(bright)
+    # Only bright beams have finite ranges.
+    r = np.where(bright, r, 0.0)
     linked = bright & np.roll(bright, -1) & (steps <= _NEIGHBOURS * step) & (np.abs(np.roll(r, -1) - r) < _STEP)
     first = np.flatnonzero(bright & ~np.roll(linked, 1))
     last = np.flatnonzero(bright & ~linked)

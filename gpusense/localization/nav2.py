@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 from gpusense._util import checks
 from gpusense._util.documents import read_mapping
 from gpusense.localization.motion import MotionModel, OdometryMotion, OmniMotion
-from gpusense.localization.nav2_file import START_NAMES, Matrix, first_covariance, first_pose, nodes_of, parameters_of
+from gpusense.localization.nav2_file import (
+    ROS_1,
+    START_NAMES,
+    Matrix,
+    first_covariance,
+    first_pose,
+    nodes_of,
+    parameters_of,
+)
 from gpusense.models.scan.beam import BeamModel
 from gpusense.models.scan.field import LikelihoodFieldModel
 from gpusense.peers.parameters import BeamWeights, FieldWeights
@@ -160,6 +168,7 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str |
         source: The file of parameters, or its content: a mapping with ``amcl: ros__parameters:`` in any namespace, or
             the mapping of the parameters themselves.
         node: Name of the node, with or without its namespaces, such as ``"/robot1/amcl"``; None for the only amcl.
+            Names in the file match it as in ROS 2: ``*`` is one level, ``**`` any number, and the exact name wins.
 
     Returns:
         The options: model, parameters, motion, particles, gates, frames.
@@ -167,7 +176,11 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str |
     Raises:
         FileNotFoundError: The file is missing.
         TypeError: A value has the wrong type; the message names the parameter.
-        ValueError: A value breaks its rule, or the file has parameters for no such node, or for several.
+        ValueError: A value breaks its rule, the file has parameters for no such node or for several, or its names are
+            those of amcl in ROS 1.
+
+    Warns:
+        UserWarning: A wildcard in the file overrides the exact name in ROS 2, or a name of ROS 1 has no effect there.
 
     Example:
         >>> import gpusense as gs
@@ -215,7 +228,11 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str |
 
 def has_parameters(content: Mapping[Any, Any]) -> bool:
     """Return whether a file holds parameters by ROS nodes, or amcl's parameters without a node."""
-    return any(key in content for key in _DEFAULTS) or any(True for _ in nodes_of(content))
+    flat = (*_DEFAULTS, *ROS_1)
+    inner = content.get("amcl")
+    return any(key in content or (isinstance(inner, Mapping) and key in inner) for key in flat) or any(
+        True for _ in nodes_of(content)
+    )
 
 
 def _content(source: str | os.PathLike[str] | Mapping[str, Any]) -> tuple[Mapping[str, Any], str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
@@ -20,10 +21,20 @@ START_NAMES = (*_POSE, *_COVARIANCES)
 _OWN = "ros__parameters"
 # Mappings of a file of gpusense fit that hold no nodes.
 FITTED = ("beam_model", "incidence_model", "odometry_motion")
+ROS_1 = {
+    "odom_model_type": "robot_model_type", "kld_err": "pf_err", "kld_z": "pf_z", "laser_max_beams": "max_beams",
+    "initial_pose_x": "initial_pose.x", "initial_pose_y": "initial_pose.y", "initial_pose_a": "initial_pose.yaw",
+    **{f"odom_alpha{k}": f"alpha{k}" for k in range(1, 6)},
+    **{f"laser_{name}": name for name in ("z_hit", "z_short", "z_max", "z_rand", "sigma_hit", "lambda_short")},
+}  # fmt: skip
+"""Names of the parameters of amcl in ROS 1, and their names in ROS 2."""
 
 
 def parameters_of(content: Mapping[str, Any], name: str, node: str | None, known: Collection[str]) -> dict[str, Any]:
-    """Return the parameters of a node by dotted names; as in ROS, ``/**`` supplies the parameters that the node lacks.
+    """Return the parameters of a node by dotted names.
+
+    As in rclcpp, ``*`` in the name of a node stands for one level and ``**`` for any number of levels; of several
+    wildcards the last one in the file wins. The node's exact name wins over wildcards.
 
     A mapping within the parameters is equivalent to dotted names: ``initial_pose: {x: 1}`` is ``initial_pose.x: 1``.
 
@@ -35,36 +46,93 @@ def parameters_of(content: Mapping[str, Any], name: str, node: str | None, known
 
     Raises:
         TypeError: ``node`` is no string.
-        ValueError: There is no such node, or more than one; or a parameter has two values.
+        ValueError: There is no such node, or more than one; a parameter has two values; or the names are from ROS 1.
     """
     if node is not None and not isinstance(node, str):
         raise TypeError(f"node: must be a string or None, got {checks.show(node)}")
-    if any(key in content for key in known):
+    if any(key in content for key in (*known, *ROS_1)):
         if node is not None:
             raise ValueError(f"node: must be None where source has the parameters themselves, got {checks.show(node)}")
+        _check_names(content, name)
         return _dotted(content, name)
-    found = list(nodes_of(content))
-    anywhere = {key: value for path, own in found if path == "/**" for key, value in _dotted(own, name).items()}
-    own_nodes = [(path, own) for path, own in found if path != "/**"]
+    nodes = list(nodes_of(content))
     wanted = "amcl" if node is None else node.strip("/")
-    chosen = [(path, own) for path, own in own_nodes if f"/{path}".endswith(f"/{wanted}")]
-    if len(chosen) > 1 and node is not None:
-        chosen = [one for one in chosen if one[0].strip("/") == wanted] or chosen
-    if len(chosen) > 1:
-        paths = sorted(path for path, _ in chosen)
-        raise ValueError(f"node: must name one of {checks.show(paths)} in {name}, got {checks.show(node)}")
-    if chosen:
-        return {key: value for key, value in anywhere.items() if key in known} | _dotted(chosen[0][1], name)
-    if node is not None:
-        paths = sorted(path for path, _ in own_nodes)
+    exact = [path for path, _ in nodes if "*" not in path and path.endswith(f"/{wanted}")]
+    if len(exact) > 1 and node is not None:
+        exact = [path for path in exact if path == f"/{wanted}"] or exact
+    if len(exact) > 1:
+        raise ValueError(f"node: must name one of {checks.show(sorted(exact))} in {name}, got {checks.show(node)}")
+    full = exact[0] if exact else f"/{wanted}"
+    matching = [(path, _dotted(own, name)) for path, own in nodes if _matches(path, full)]
+    if matching:
+        found = _merged(matching, full, name)
+        _warn_of_ros_1(found, name)
+        return {key: value for key, value in found.items() if not exact or key in known or key in matching[-1][1]}
+    if node is not None or any("*" in path for path, _ in nodes):
+        paths = sorted(path for path, _ in nodes)
         raise ValueError(f"node: must be a node of {name}, one of {checks.show(paths)}, got {checks.show(node)}")
-    if anywhere or any(path == "/**" for path, _ in found):
-        return anywhere
     if "beam_model" in content:
         return {"laser_model_type": "beam"}
     if "odometry_motion" in content:
         return {}
+    if isinstance(content.get("amcl"), Mapping):
+        _check_names(content["amcl"], name)
     raise ValueError(f"{name}: must hold amcl's {_OWN}, got the keys {checks.show(sorted(map(str, content)))}")
+
+
+def _matches(pattern: str, node: str) -> bool:
+    """Return whether the name of a node in a file, with wildcards, is that of a node."""
+    levels = node.split("/")[1:]
+    ends = {0}
+    for part in pattern.split("/")[1:]:
+        if part == "**":
+            ends = set(range(min(ends), len(levels) + 1)) if ends else ends
+        else:
+            ends = {end + 1 for end in ends if end < len(levels) and part in ("*", levels[end])}
+    return len(levels) in ends
+
+
+def _merged(matching: list[tuple[str, dict[str, Any]]], full: str, name: str) -> dict[str, Any]:
+    """Merge the parameters under all names of one node; the entry of its exact name becomes the last one.
+
+    A wildcard below the exact name in the file wins in rclcpp, which a warning says where values differ.
+    """
+    found: dict[str, Any] = {}
+    in_order: dict[str, Any] = {}
+    for _, own in matching:
+        in_order |= own
+    matching.sort(key=lambda one: one[0] == full)
+    for _, own in matching:
+        found |= own
+    later = [key for key in found if found[key] != in_order[key]]
+    if later:
+        warnings.warn(
+            f"{name}: {full}: {', '.join(later)} also stands under a wildcard below this name, which wins in ROS 2: "
+            "the value under the exact name is taken",
+            stacklevel=2,
+        )
+    return found
+
+
+def _check_names(values: Mapping[Any, Any], name: str) -> None:
+    """Refuse parameters by their names in ROS 1, whose defaults differ.
+
+    Raises:
+        ValueError: A name is from ROS 1.
+    """
+    if old := _ros_1_names(values):
+        raise ValueError(f"{name}: must have amcl's names in ROS 2, got those of ROS 1: {old}")
+
+
+def _warn_of_ros_1(values: Mapping[Any, Any], name: str) -> None:
+    """Warn of parameters by their names in ROS 1, which nav2_amcl ignores."""
+    if old := _ros_1_names(values):
+        warnings.warn(f"{name}: names of ROS 1's amcl have no effect in ROS 2: {old}", stacklevel=2)
+
+
+def _ros_1_names(values: Mapping[Any, Any]) -> str:
+    """Return the names from ROS 1, each with the name in ROS 2, as one text."""
+    return ", ".join(f"{old} (now {new})" for old, new in ROS_1.items() if old in values)
 
 
 def _dotted(values: Mapping[Any, Any], name: str) -> dict[str, Any]:

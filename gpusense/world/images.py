@@ -108,13 +108,20 @@ def _open_pnm(stream: BinaryIO, file: Path, size: int) -> Raster:
     channels = 3 if magic in (b"P3", b"P6") else 1
     cols, rows, maxval = _pnm_header(stream, file)
     _check_size(file, rows, cols)
+    begin = stream.tell()
     if not 1 <= maxval <= 65535:
         raise ValueError(f"{file}: must have a maximum value of 1 to 65535, got {maxval}")
     count = rows * cols * channels
     width = 1 if maxval < 256 else 2
     plain = magic in (b"P2", b"P3")
     needed = 2 * count - 1 if plain else width * count  # a plain value takes a digit and a blank
-    available = size - stream.tell()
+    stream.seek(0)
+    header, next_byte = stream.read(begin), stream.read(1)
+    # A line break of two bytes ends the header where its other lines end so, or the size says so.
+    crlf = header.endswith(b"\r") and next_byte == b"\n"
+    begin += crlf and (b"\r\n" in header or size - begin == needed + 1)
+    stream.seek(begin)
+    available = size - begin
     if available < needed:
         raise ValueError(f"{file}: must have a raster of at least {needed} bytes, got {available}")
     _check_memory(file, rows, cols)

@@ -47,7 +47,8 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
       ``round(100 (p - free_thresh) / (occupied_thresh - free_thresh))``. A pixel that is not opaque is unknown.
     - Mode ``raw``: g, unknown if that exceeds 100.
 
-    Numbers of the YAML file are decimal, as nav2 reads them: 010 is ten, and 1:30 is refused.
+    Numbers of the YAML file are decimal, as nav2 reads them: 010 is ten, and 1:30 is refused. They may be quoted. A
+    doubled key is refused.
 
     The image's bottom row is ``cells[0]``. The content of the image determines its format: PGM (P2, P5; 8 or 16 bits),
     PPM (P3, P6), PNG (1 to 16 bits; grey, palette or colour, with or without alpha) or uncompressed BMP. Of a 16-bit
@@ -199,6 +200,7 @@ def _read_yaml(file: Path) -> _MapYaml:
         raise ValueError(f"{file}: image: must be a file name, got {checks.show(image)}")
     if not isinstance(origin, list) or len(origin) != 3:
         raise ValueError(f"{file}: origin: must be a list of x, y and yaw, got {checks.show(origin)}")
+    negate = {"0": 0, "1": 1, "false": 0, "true": 1}.get(negate, negate) if isinstance(negate, str) else negate
     if negate not in (0, 1) or isinstance(negate, float):
         raise ValueError(f"{file}: negate: must be 0 or 1, got {checks.show(negate)}")
     if not isinstance(mode, str) or mode.lower() not in ("trinary", "scale", "raw"):
@@ -237,8 +239,8 @@ def _image(file: Path, name: str) -> Path:
 
 
 def _number(file: Path, key: str, value: object, **limits: float) -> float:
-    # 5e-2 is a number in YAML 1.2 and for map_server, but a string in YAML 1.1 and for PyYAML.
-    if isinstance(value, str) and re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+", value):
+    # map_server reads quoted numbers, and 5e-2, which is a string in YAML 1.1 and for PyYAML.
+    if isinstance(value, str) and re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", value.strip(), re.ASCII):
         value = float(value)
     try:
         return checks.real(f"{file}: {key}", value, **limits)

@@ -26,6 +26,8 @@ _CALLS = 32
 # Readings beyond these multiples of range_max or of the map are in other units; a single such value may be a code for
 # "no return".
 _TIMES_RANGE, _TIMES_MAP, _VALUES = 10.0, 100.0, 3
+# Share of readings of exactly 0 beyond which 0 is probably a code.
+_ZEROS = 0.1
 
 
 class PlausibilityWarning(UserWarning):
@@ -106,14 +108,17 @@ def look_at_scene(range_max: float, size: float) -> None:
         )
 
 
-def look_at_readings(name: str, ranges: NDArray[np.floating], range_max: float, size: float | None = None) -> bool:
-    """Warn of negative readings, and of readings in other units than metres.
+def look_at_readings(
+    name: str, ranges: NDArray[np.floating], range_max: float, size: float | None = None, range_min: float = 0.0
+) -> bool:
+    """Warn of negative readings, of many readings of exactly 0 m, and of readings in other units than metres.
 
     Args:
         name: Name of the argument.
         ranges: Readings of one scan or of several, of any value [m].
         range_max: Longest range of the scanner [m].
         size: Diagonal of the map [m]; None without a map.
+        range_min: Shortest range of the scanner [m]; above 0, readings of 0 are missing.
 
     Returns:
         Whether there was a reason for a warning.
@@ -125,6 +130,13 @@ def look_at_readings(name: str, ranges: NDArray[np.floating], range_max: float, 
         _notice(
             f"{name}: negative readings are missing readings, which say nothing (0 nats): a scanner's code for an "
             "error, or another sign than meant? NaN is a missing reading without this warning"
+        )
+    zeros = 0 if range_min > 0 else int(np.count_nonzero(finite == 0))
+    if zeros >= _VALUES and zeros > _ZEROS * ranges.size:
+        doubtful = True
+        _notice(
+            f"{name}: {zeros} of {ranges.size} readings are exactly 0, a range of 0 m: a scanner's code for no return "
+            "or an error? A range_min > 0 or NaN makes them missing readings, range_max makes them no return"
         )
     positive = finite[finite > 0]
     if len(positive):
@@ -143,15 +155,16 @@ class FirstScans:
 
     Args:
         range_max: Longest range of the scanner [m].
+        range_min: Shortest range of the scanner [m].
 
     Attributes:
         left: Number of further calls to check.
     """
 
-    __slots__ = ("_range_max", "left")
+    __slots__ = ("_range_max", "_range_min", "left")
 
-    def __init__(self, range_max: float) -> None:
-        self._range_max, self.left = range_max, _CALLS
+    def __init__(self, range_max: float, range_min: float) -> None:
+        self._range_max, self._range_min, self.left = range_max, range_min, _CALLS
 
     def look_at(self, name: str, ranges: NDArray[np.floating], size: float | None = None) -> None:
         """Warn of implausible readings; arguments as for :func:`look_at_readings`."""
@@ -159,7 +172,9 @@ class FirstScans:
             return
         self.left -= 1
         least = np.fmin.reduce(ranges, axis=None, initial=np.inf)
-        if not 0 <= least < self._range_max and look_at_readings(name, ranges, self._range_max, size):
+        if 0 < least < self._range_max or (least == 0 and self._range_min > 0):
+            return
+        if look_at_readings(name, ranges, self._range_max, size, self._range_min):
             self.left = 0
 
 

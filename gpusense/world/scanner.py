@@ -99,7 +99,7 @@ class Scanner:
         self._critical = critical_incidence
         if critical_incidence is not None:
             self._critical = checks.real("critical_incidence", critical_incidence, above=0, high=math.pi / 2)
-        self._first_scans = plausible.FirstScans(self._range_max)
+        self._first_scans = plausible.FirstScans(self._range_max, self._range_min)
         plausible.look_at_bearings("bearings", directions)
         plausible.look_at_scanner(self._range_max, self._mount)
         # Adding 0.0 makes -0.0 and 0.0, which are equal, hash alike.

@@ -45,6 +45,17 @@ def test_reflectors_are_where_they_shine():
     assert 0.3 < np.mean(squares) / 2 < 2.0
 
 
+@pytest.mark.parametrize("value", [math.inf, math.nan, -math.inf, 30.0, 0.0, -1.0])
+def test_missing_readings_beside_each_other_are_no_feature(value):
+    ranges, light = scan()
+    gone = ranges.copy()
+    gone[[3, 4, 5, -2, -1, 0]] = value
+    found = gs.extract_features(gone, SCANNER, "reflector", backend="numpy", intensities=light)
+    # One reflector lies behind the scanner, where its beams begin and end.
+    assert len(found) == 2
+    assert not len(gs.extract_features(np.full(1440, value), SCANNER, backend="numpy", intensities=light))
+
+
 def test_reflectors_need_light():
     ranges, light = scan()
     for intensities in (None, np.ones(1440), np.zeros(1440), np.full(1440, np.nan), light.clip(max=2.5)):

@@ -55,6 +55,11 @@ def test_plain_and_compressed(log, name, end):
     assert len(list(read_log(log(flaser([1.0]), flaser([2.0]), name=name, end=end)))) == 2
 
 
+@pytest.mark.parametrize("name", ["run.log", "run.log.gz"])
+def test_a_byte_order_mark_hides_no_message(log, name):
+    assert len(list(read_log(log("\N{BOM}" + flaser([0.5]), flaser([0.75]), name=name), range_max=10.0))) == 2
+
+
 def test_compression_is_recognised_by_content(log, tmp_path):
     file = log(flaser([1.0]), name="run.log.gz")
     assert len(list(read_log(file.rename(tmp_path / "run.log")))) == 1

@@ -45,6 +45,11 @@ def test_colours_count_by_their_luma(place):
         ("P5", pgm(GREYS)),
         ("P5 with comments", b"P5 # made by\n# hand\n2 # columns\n2\n255\n" + GREYS.tobytes()),
         ("P5 and a line feed", pgm(GREYS) + b"\n"),
+        ("P5 with CRLF", b"P5\r\n2 2\r\n255\r\n" + GREYS.tobytes()),
+        ("P5 with CRLF and comments", b"P5\r\n# made by\r\n2 2\r\n255\r\n" + GREYS.tobytes() + b"\r\n"),
+        ("P5 with one CRLF", b"P5 2 2 255\r\n" + GREYS.tobytes()),
+        ("P5 with CR", b"P5\r2 2\r255\r" + GREYS.tobytes()),
+        ("P6 with CRLF", b"P6\r\n2 2\r\n255\r\n" + GREYS.repeat(3).tobytes()),
         ("P5 of 16 bits", pgm(GREYS.astype(int) * 257, 65535)),
         ("P5 of 10 bits", pgm(GREYS * 4.0, 1020)),
         ("P5 of 1 bit", None),
@@ -59,6 +64,12 @@ def test_netpbm(place, name, image):
         assert read_map(place(pgm([[0, 1]], 1))).cells.tolist() == [[100, 0]]
     else:
         assert read_map(place(image)).cells.tolist() == CELLS
+
+
+def test_a_raster_may_begin_with_a_line_feed(place):
+    assert read_map(place(b"P5 2 2 255\r" + bytes([10, 0, 0, 0]), mode="raw")).cells.tolist() == [[0, 0], [10, 0]]
+    with pytest.raises(ValueError, match="must have a raster of at least 4 bytes, got 3"):
+        read_map(place(b"P5\r\n2 2\r\n255\r\n" + bytes(3)))
 
 
 def test_16_bits_are_a_fraction_of_their_own_maximum(place):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+import yaml
 from support.map_files import CELLS, GREYS, pgm, yaml_text
 
 from gpusense.world.map_files import read_map
@@ -55,6 +56,22 @@ def test_numbers_as_yaml_1_2_writes_them(place):
     file = place(pgm(GREYS))
     file.write_text(file.read_text().replace("resolution: 0.05", "resolution: 5e-2"))
     assert read_map(file).resolution == 0.05
+
+
+@pytest.mark.parametrize("quote", ["'", '"'])
+def test_numbers_may_be_quoted(place, quote):
+    file = place(pgm(GREYS), negate=1)
+    plain = read_map(file)
+    quoted = {key: f"{quote}{value}{quote}" for key, value in yaml.safe_load(file.read_text()).items()}
+    quoted["origin"] = "[" + ", ".join(f"{quote}{value}{quote}" for value in plain.origin) + "]"
+    file.write_text("\n".join(f"{key}: {value}" for key, value in quoted.items()))
+    assert read_map(file) == plain
+    file.write_text("\N{BOM}" + file.read_text(), encoding="utf-8")
+    assert read_map(file) == plain
+    for wrong in ("0.05 m", "nan", "1e999", "0x10", "1_0", ""):
+        file.write_text("\n".join(f"{k}: {v}" for k, v in (quoted | {"resolution": f"{quote}{wrong}{quote}"}).items()))
+        with pytest.raises(ValueError, match=r"resolution: must be "):
+            read_map(file)
 
 
 def test_an_image_elsewhere(tmp_path):

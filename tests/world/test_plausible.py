@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import warnings
 from collections.abc import Iterator
@@ -118,6 +119,27 @@ def test_readings_that_become_negative_later() -> None:
         one.log_likelihood(POSES, -RANGES)
 
 
+@pytest.mark.parametrize("zeros", [3, 8, 19])
+def test_readings_of_exactly_0(zeros: int) -> None:
+    some = np.where(np.arange(19) < zeros, 0.0, RANGES)
+    text = f"ranges: {zeros} of 19 readings are exactly 0, a range of 0 m: a scanner's code for no return or an error?"
+    one = model()
+    with warns_once(text):
+        for _ in range(3):
+            one.log_likelihood(POSES, some)
+    with warns_once(text), contextlib.suppress(ValueError):
+        gs.match_scan(some, some, scanner(), backend="numpy")
+    with warns_once(text.replace("19", "171").replace(f": {zeros}", f": {9 * zeros}")):
+        gs.fit_beam_parameters(np.tile(some, 9), np.tile(RANGES, 9), 12.0, backend="numpy")
+
+
+@pytest.mark.usefixtures("no_warning")
+def test_readings_of_0_below_range_min_are_quiet() -> None:
+    model(scanner(range_min=0.1)).log_likelihood(POSES, np.zeros(19))
+    one = np.where(np.arange(19) < 9, 0.0, RANGES)
+    gs.fit_beam_parameters(np.tile(one, 9), np.tile(RANGES, 9), 12.0, range_min=0.1, backend="numpy")
+
+
 def test_readings_in_millimetres() -> None:
     for one in (scanner(), scanner(range_max=1000.0)):
         with warns_once("are they in millimetres? Metres are meant"):
@@ -136,7 +158,7 @@ def test_readings_in_millimetres() -> None:
 @pytest.mark.usefixtures("no_warning")
 def test_ordinary_readings_are_quiet() -> None:
     for readings in (
-        RANGES, np.full(19, np.nan), np.full(19, np.inf), np.full(19, -np.inf), np.full(19, 655.35), np.full(19, 0.0),
+        RANGES, np.full(19, np.nan), np.full(19, np.inf), np.full(19, -np.inf), np.full(19, 655.35), np.where(np.arange(19) < 2, 0.0, RANGES),
         np.where(np.arange(19) < 9, 8191.0, RANGES), np.where(np.arange(19) < 18, np.nan, 24.8), 2 * RANGES + 12,
     ):  # fmt: skip
         model().log_likelihood(POSES, readings)

@@ -87,7 +87,7 @@ def make_pairs(ranges: ArrayLike, expected: ArrayLike, range_max: float, range_m
         )
     z, z_expected = z.ravel(), z_expected.ravel()
     kinds = reading_classes(z, range_min, range_max)
-    look_at_readings("ranges", z, range_max)
+    look_at_readings("ranges", z, range_max, range_min=range_min)
     if not (kinds != Reading.MISSING).any():
         raise ValueError(f"ranges: must hold a reading that is not missing, got {z.size} of which none is")
     outside = impossible_ranges(kinds, z_expected, range_max)

@@ -33,8 +33,8 @@ ROS_1 = {
 def parameters_of(content: Mapping[str, Any], name: str, node: str | None, known: Collection[str]) -> dict[str, Any]:
     """Return the parameters of a node by dotted names.
 
-    As in rclcpp, ``*`` in the name of a node stands for one level and ``**`` for any number of levels; of several
-    wildcards the last one in the file wins. The node's exact name wins over wildcards.
+    As in rclcpp, ``*`` in the name of a node matches one level, ``**`` any number of levels, and the last matching
+    wildcard wins. The node's exact name wins over wildcards.
 
     A mapping within the parameters is equivalent to dotted names: ``initial_pose: {x: 1}`` is ``initial_pose.x: 1``.
 
@@ -81,7 +81,7 @@ def parameters_of(content: Mapping[str, Any], name: str, node: str | None, known
 
 
 def _matches(pattern: str, node: str) -> bool:
-    """Return whether the name of a node in a file, with wildcards, is that of a node."""
+    """Return whether a name with wildcards matches the name of a node."""
     levels = node.split("/")[1:]
     ends = {0}
     for part in pattern.split("/")[1:]:
@@ -93,9 +93,9 @@ def _matches(pattern: str, node: str) -> bool:
 
 
 def _merged(matching: list[tuple[str, dict[str, Any]]], full: str, name: str) -> dict[str, Any]:
-    """Merge the parameters under all names of one node; the entry of its exact name becomes the last one.
+    """Merge the parameters under all names of one node, and move its exact name to the end.
 
-    A wildcard below the exact name in the file wins in rclcpp, which a warning says where values differ.
+    In rclcpp the last name in the file wins, exact or not. A warning names the parameters with another value there.
     """
     found: dict[str, Any] = {}
     in_order: dict[str, Any] = {}
@@ -107,21 +107,21 @@ def _merged(matching: list[tuple[str, dict[str, Any]]], full: str, name: str) ->
     later = [key for key in found if found[key] != in_order[key]]
     if later:
         warnings.warn(
-            f"{name}: {full}: {', '.join(later)} also stands under a wildcard below this name, which wins in ROS 2: "
-            "the value under the exact name is taken",
+            f"{name}: {full}: {', '.join(later)} is also set under a wildcard further down, which wins in ROS 2; "
+            "the value under the exact name is used",
             stacklevel=2,
         )
     return found
 
 
 def _check_names(values: Mapping[Any, Any], name: str) -> None:
-    """Refuse parameters by their names in ROS 1, whose defaults differ.
+    """Refuse parameters by their names in ROS 1, since the defaults differ.
 
     Raises:
         ValueError: A name is from ROS 1.
     """
     if old := _ros_1_names(values):
-        raise ValueError(f"{name}: must have amcl's names in ROS 2, got those of ROS 1: {old}")
+        raise ValueError(f"{name}: must have amcl's names in ROS 2, got names of ROS 1: {old}")
 
 
 def _warn_of_ros_1(values: Mapping[Any, Any], name: str) -> None:

@@ -117,7 +117,7 @@ def _open_pnm(stream: BinaryIO, file: Path, size: int) -> Raster:
     needed = 2 * count - 1 if plain else width * count  # a plain value takes a digit and a blank
     stream.seek(0)
     header, next_byte = stream.read(begin), stream.read(1)
-    # A line break of two bytes ends the header where its other lines end so, or the size says so.
+    # CR LF ends the header if other lines of it end in CR LF, or if the size leaves one byte over.
     crlf = header.endswith(b"\r") and next_byte == b"\n"
     begin += crlf and (b"\r\n" in header or size - begin == needed + 1)
     stream.seek(begin)

@@ -32,8 +32,10 @@ def test_other_errors_of_the_parser_stay():
 @pytest.mark.parametrize(
     "text, line, first",
     [
-        ("a: 1\nb: 2\na: 3\n", 3, 1), ("x:\n  - {a: 1, 'a': 1}\n", 2, 2), ("16: 1\n0x10: 2\n", 2, 1), ("{a: 1, a: 1}", 1, 1),
-        ("true: 1\nyes: 2\n", 2, 1), ("base: &b {a: 1, a: 2}\nother: {<<: *b}\n", 1, 1), ("? [x]\n: {a: 1, a: 2}", 2, 2),
+        ("a: 1\nb: 2\na: 3\n", 3, 1), ("x:\n  - {a: 1, 'a': 1}\n", 2, 2),
+        ("16: 1\n0x10: 2\n", 2, 1), ("{a: 1, a: 1}", 1, 1),
+        ("true: 1\nyes: 2\n", 2, 1), ("base: &b {a: 1, a: 2}\nother: {<<: *b}\n", 1, 1),
+        ("? [x]\n: {a: 1, a: 2}", 2, 2),
     ],
 )  # fmt: skip
 def test_doubled_keys_are_refused(tmp_path, text, line, first):

@@ -62,7 +62,7 @@ def test_wildcards_are_merged_in_the_order_of_the_file(tmp_path: Path) -> None:
     assert from_nav2(dict(reversed(wild.items())), node="/robot2/amcl").max_beams == 1
     exact = from_nav2(wild | {"/robot2/amcl": node_of(max_beams=3)})
     assert (exact.max_beams, exact.weights.z_hit) == (3, 0.7)
-    with pytest.warns(UserWarning, match="/robot2/amcl: max_beams also stands under a wildcard below this name"):
+    with pytest.warns(UserWarning, match="/robot2/amcl: max_beams is also set under a wildcard further down"):
         assert from_nav2({"/robot2/amcl": node_of(max_beams=3)} | wild).max_beams == 3
     with pytest.raises(ValueError, match=r"node: must be a node of source, one of \['/robot2/\*\*'\], got None"):
         from_nav2({"/robot2/**": node_of(max_beams=3)})

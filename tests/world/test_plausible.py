@@ -158,7 +158,8 @@ def test_readings_in_millimetres() -> None:
 @pytest.mark.usefixtures("no_warning")
 def test_ordinary_readings_are_quiet() -> None:
     for readings in (
-        RANGES, np.full(19, np.nan), np.full(19, np.inf), np.full(19, -np.inf), np.full(19, 655.35), np.where(np.arange(19) < 2, 0.0, RANGES),
+        RANGES, np.full(19, np.nan), np.full(19, np.inf), np.full(19, -np.inf), np.full(19, 655.35),
+        np.where(np.arange(19) < 2, 0.0, RANGES),
         np.where(np.arange(19) < 9, 8191.0, RANGES), np.where(np.arange(19) < 18, np.nan, 24.8), 2 * RANGES + 12,
     ):  # fmt: skip
         model().log_likelihood(POSES, readings)

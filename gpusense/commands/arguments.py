@@ -42,11 +42,14 @@ def _temperature(text: str) -> float | str:
     return text if text == "auto" else positive_number(text)
 
 
-def add_json(parser: argparse.ArgumentParser) -> None:
-    """Add ``--json``."""
-    parser.add_argument(
+def add_json(parser: argparse.ArgumentParser, *, verbose: bool = False) -> None:
+    """Add ``--json``, and ``--verbose`` in place of it where the command has more to print."""
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument(
         "--json", action="store_true", help="print one JSON document, and nothing else, on standard output"
     )
+    if verbose:
+        group.add_argument("-v", "--verbose", action="store_true", help="print all details as well")
 
 
 def add_seed(parser: argparse.ArgumentParser) -> None:

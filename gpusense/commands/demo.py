@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,10 +20,8 @@ from gpusense.commands.demo_scene import (
     BEAMS,
     FIELD,
     FIELD_OF_VIEW,
-    PATIENCE,
     PRECISION,
     RANGE_MAX,
-    REPETITIONS,
     SIGMA_THETA,
     SIGMA_XY,
     SIZE,
@@ -79,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE", help="file of the picture (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument("--no-plot", action="store_true", help="draw no picture")
-    arguments.add_json(parser)
+    arguments.add_json(parser, verbose=True)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -89,8 +86,8 @@ def run(args: argparse.Namespace) -> int:
         check_writable(args.output)
     backends, failures = arguments.open_backends(args.backend)
     scene = make_scene(args.seed, args.particles, args.beams)
-    if not args.json:
-        _introduce(scene, args.seed, backends)
+    if args.verbose:
+        _describe(scene, args.seed, backends)
     scores: list[Score] = []
     drawn, stopped = False, None
     try:
@@ -109,6 +106,8 @@ def run(args: argparse.Namespace) -> int:
         output.print_json(_document(scene, args.seed, scores, failures, written))
     else:
         _report(scene, scores, failures, written)
+    if args.verbose:
+        _explain(scores)
     if stopped is not None:
         raise stopped
     return 1 if failures else 0
@@ -122,7 +121,7 @@ def _score_all(
     for name in (BEAM, FIELD):
         step(f"{name}, float64 reference")
         truth = make_model(scene, name, "numpy", "float64")
-        reference = np.asarray(truth.log_likelihood(scene.poses[scene.checked], scene.ranges))
+        reference = np.asarray(truth.log_likelihood(scene.poses[:-1][scene.checked], scene.ranges))
         for backend in backends:
             step(f"{name} on {backend.info.selection}")
             try:
@@ -136,7 +135,7 @@ def _score_all(
 def draw(scene: Scene, scores: list[Score], path: Path) -> None:
     """Draw the scan at the best pose, the particles, and P(z | x, m) at the best heading by both models."""
     beam = _fastest(scores, BEAM)
-    best = scene.poses[beam.log_p[:-1].argmax()]
+    best = beam.best
     poses, free, extent = plots.pose_lattice(scene.grid, LATTICE, float(best[2]))
     densities = {}
     for name in (BEAM, FIELD):
@@ -144,7 +143,7 @@ def draw(scene: Scene, scores: list[Score], path: Path) -> None:
         density[free] = _fastest(scores, name).model.log_likelihood(poses[free.ravel()], scene.ranges)
         densities[f"{name.capitalize()}: every position at the best heading; ring: the truth"] = density
     figure = plots.localization_figure(
-        scene.grid, scene.scanner, scene.ranges, scene.truth, best, scene.poses[:-1], beam.log_p[:-1], densities, extent
+        scene.grid, scene.scanner, scene.ranges, scene.truth, best, beam.poses[:-1], beam.log_p[:-1], densities, extent
     )
     title = f"Where is the robot?   P(z | x, m) of one scan, {scene.beams} of its {BEAMS} beams, by gpusense"
     figure.suptitle(title, fontsize=15)
@@ -156,53 +155,57 @@ def _fastest(scores: list[Score], name: str) -> Score:
     return max((score for score in scores if score.name == name), key=lambda score: score.rate)
 
 
-def _introduce(scene: Scene, seed: int, backends: list[Backend]) -> None:
-    rows, cols = scene.grid.shape
-    hits = int((scene.ranges < RANGE_MAX).sum())
-    print(f"""Where is the robot?
-  building   {SIZE[0]:g} x {SIZE[1]:g} m, {cols} x {rows} cells of {scene.grid.resolution:g} m, seed {seed}
-  scan       {BEAMS} beams over {FIELD_OF_VIEW:g} degrees up to {RANGE_MAX:g} m, drawn from the beam model:
-             {hits} ranges, {BEAMS - hits} without return
-  particles  {grouped(len(scene.poses) - 1)}: half over all free cells, half around the true pose
-             (standard deviations {SIGMA_XY:g} m and {SIGMA_THETA:g} rad)
-  models     {scene.beams} of the beams, {PRECISION}, default parameters
-  devices    {", ".join(f"{backend.info.selection} ({backend.info.name})" for backend in backends)}
-""", flush=True)  # fmt: skip
-
-
 def _report(scene: Scene, scores: list[Score], failures: list[str], written: Path | None) -> None:
-    columns = ["backend", "model", "first [s]", "steady [s]", "rate [M/s]", "error", "rank"]
-    rows = []
-    for score in scores:
-        steady = f"{score.steady_s:.3f}" if score.repetitions else "-"
-        rate, error = f"{score.rate / 1e6:.1f}", f"{score.errors.max():.0e}"
-        rows.append([
-            score.model.device.selection, score.name, f"{score.first_s:.3f}", steady, rate, error, grouped(score.rank)
-        ])  # fmt: skip
-    output.print_table(columns, rows, right=columns[2:])
-    every = f"{scene.checked.step}th pose".removeprefix("1th ")
-    print(f"""
-first   first call: constructor, compilation (or its cache on disk), map preparation, scoring
-steady  best of up to {REPETITIONS} further calls, transfers included; none for NumPy above {PATIENCE:g} s a call
-rate    millions of particle-beams per second of a steady whole call, NumPy in and out; beams without return are not
-        evaluated nor counted
-error   largest error of log p [nats] against the NumPy reference in float64, at every {every}
-rank    of the true pose: 1 if no particle scores better""")
+    """Print the likeliest pose, the table of devices, and the file of the picture."""
+    particles = grouped(len(scene.poses) - 1)
     for name in dict.fromkeys(score.name for score in scores):
-        metres, degrees = _offset(scene, fastest := _fastest(scores, name))
-        print(f"\nThe best particle by the {name} is {metres:.2f} m and {degrees:.1f} degrees off the true pose.")
-        if name == FIELD and metres > SIGMA_XY:
-            print("It ignores obstacles between the robot and an end point, so similar places can score alike.")
-        print(f"Specialisation of the kernels: {fastest.model.explain()}")
+        metres, degrees = _fastest(scores, name).off
+        text = (
+            f"{name}: the likeliest of {particles} poses is {metres:.2f} m and {degrees:.1f} degrees off the true pose"
+        )
+        output.print_result(f"{text[0].upper()}{text[1:]}.")
+    columns = ["backend", "model", "first call [s]", "next call [s]", "rate [M/s]", "error"]
+    rows = [
+        [
+            score.model.device.selection, score.name, f"{score.first_s:.2f}", f"{score.steady_s:.3f}",
+            f"{score.rate / 1e6:.0f}" if score.rate > 1e7 else f"{score.rate / 1e6:.1f}", f"{score.errors.max():.0e}",
+        ]
+        for score in scores
+    ]  # fmt: skip
+    print()
+    output.print_table(columns, rows, right=columns[2:])
+    print(f"""
+rate   particle-beams a second of whole calls, NumPy arrays in and out
+error  largest error of log p [nats], by the NumPy reference in float64 at one pose in {scene.checked.step};
+       NumPy scores these poses alone
+Half of the poses lie all over the building, half around the true one. -v prints the scene, and what the
+kernels leave out.""")
     print("".join(f"\nfailed: {failure}\n" for failure in failures), end="")
     if written is not None:
         print(f"\nPicture: {written}")
 
 
-def _offset(scene: Scene, score: Score) -> tuple[float, float]:
-    """Return the distance of the best particle from the true pose [m, degrees]."""
-    dx, dy, turn = (scene.poses[score.log_p[:-1].argmax()] - scene.truth).tolist()
-    return math.hypot(dx, dy), abs(math.degrees(math.remainder(turn, math.tau)))
+def _describe(scene: Scene, seed: int, backends: list[Backend]) -> None:
+    """Print the scene."""
+    rows, cols = scene.grid.shape
+    hits = int((scene.ranges < RANGE_MAX).sum())
+    print(f"""\
+building   {SIZE[0]:g} x {SIZE[1]:g} m, {cols} x {rows} cells of {scene.grid.resolution:g} m, seed {seed}
+scan       {BEAMS} beams over {FIELD_OF_VIEW:g} degrees up to {RANGE_MAX:g} m, drawn from the beam model:
+           {hits} ranges, {BEAMS - hits} without return
+particles  {grouped(len(scene.poses) - 1)}: half over all free cells, half around the true pose
+           (standard deviations {SIGMA_XY:g} m and {SIGMA_THETA:g} rad)
+models     {scene.beams} of the beams, {PRECISION}, default parameters
+devices    {", ".join(f"{backend.info.selection} ({backend.info.name})" for backend in backends)}
+""", flush=True)  # fmt: skip
+
+
+def _explain(scores: list[Score]) -> None:
+    """Print the rank of the true pose, and what the kernels of the fastest device leave out."""
+    for name in dict.fromkeys(score.name for score in scores):
+        fastest = _fastest(scores, name)
+        print(f"\nRank of the true pose by the {name}: {grouped(fastest.rank)} (1: no particle scores better)")
+        print(f"Specialisation of the kernels: {fastest.model.explain()}")
 
 
 def _document(
@@ -212,15 +215,15 @@ def _document(
     results = []
     for score in scores:
         device = score.model.device
-        metres, degrees = _offset(scene, score)
-        best = int(score.log_p[:-1].argmax())
+        metres, degrees = score.off
         results.append({
             "backend": device.selection, "device": device.name, "kind": device.kind, "driver": device.driver,
             "model": score.name, "precision": score.model.precision, "first_call_s": score.first_s,
             "steady_s": score.steady_s, "repetitions": score.repetitions, "beams_evaluated": score.evaluated,
             "particle_beams_per_s": score.rate, "largest_error": score.errors.max(), "error_poses": len(score.errors),
-            "rank_of_true_pose": score.rank, "log_p_of_true_pose": score.log_p[-1], "best_log_p": score.log_p[best],
-            "best_pose": scene.poses[best], "best_pose_off_m": metres, "best_pose_off_degrees": degrees,
+            "rank_of_true_pose": score.rank, "log_p_of_true_pose": score.log_p[-1], "poses": len(score.poses) - 1,
+            "best_log_p": score.log_p[:-1].max(), "best_pose": score.best, "best_pose_off_m": metres,
+            "best_pose_off_degrees": degrees,
             "explain": score.model.explain(),
         })  # fmt: skip
     return {

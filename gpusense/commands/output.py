@@ -34,6 +34,11 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, os.PathLike) else value
 
 
+def print_result(text: str) -> None:
+    """Print the result of a command in one line, in bold on a terminal."""
+    print(f"\033[1m{text}\033[0m" if is_terminal(sys.stdout) and "NO_COLOR" not in os.environ else text, flush=True)
+
+
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, right: Sequence[str] = ()) -> None:
     """Print a table: by rich on a terminal, as plain text elsewhere.
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
 from support.command_line import SMALL, error_of, script
 from support.paths import ROOT
 
-from gpusense.commands import cli, demo
+from gpusense.commands import cli, demo, demo_scene
 
 # Largest difference of a float32 model from the float64 reference on 60 beams [nats], on its own rounded inputs.
 DEMO_TOLERANCE = 1e-2
@@ -58,11 +59,26 @@ def test_demo_as_text(tmp_path, monkeypatch, capsys):
     assert cli.main([*SMALL, "--backend", "numpy", "--no-plot"]) == 0
     out, err = capsys.readouterr()
     assert err == ""
-    assert "particles  400: half over all free cells" in out
-    rows = [line for line in out.splitlines() if line.startswith("numpy ")]
-    assert len(rows) == 2
-    assert out.count("Specialisation of the kernels: ") == 2
+    lines = out.splitlines()
+    assert re.fullmatch(r"Beam model: the likeliest of 400 poses is \S+ m and \S+ degrees off the true pose.", lines[0])
+    assert len([line for line in lines if line.startswith("numpy ")]) == 2
+    assert len(lines) < 20 and "Specialisation" not in out
     assert list(tmp_path.iterdir()) == []
+
+
+def test_demo_prints_details_on_request(capsys):
+    assert cli.main([*SMALL, "--backend", "numpy", "--no-plot", "-v"]) == 0
+    out = capsys.readouterr().out
+    assert "particles  400: half over all free cells" in out
+    assert out.count("Specialisation of the kernels: ") == 2
+
+
+def test_numpy_scores_a_part_of_many_poses(monkeypatch, capsys):
+    monkeypatch.setattr(demo_scene, "REFERENCE_PARTICLES", 50)
+    assert cli.main([*SMALL, "--backend", "numpy", "--no-plot", "--json"]) == 0
+    for result in json.loads(capsys.readouterr().out)["results"]:
+        assert 40 <= result["poses"] == result["error_poses"] <= 50
+        assert 1 <= result["rank_of_true_pose"] <= 51 and result["largest_error"] <= DEMO_TOLERANCE
 
 
 def test_demo_is_the_same_for_the_same_seed(capsys):

@@ -66,7 +66,7 @@ COMMANDS: dict[str, tuple[list[str], int, str]] = {
     "bench": (["--quick", "--particles", "8", "--checked", "6", "--beams", "7", "--repeats", "1", "--no-peers",
                "--backend", "numpy", "--scene", "clutter", "--method", "exact", "--output", "OUT"], 3, "exact"),
     "demo": (["--particles", "400", "--beams", "20", "--backend", "numpy", "--output", "OUT/made.png"], 3,
-             "The best particle by the beam model"),
+             "Beam model: the likeliest of"),
 }  # fmt: skip
 FILES = {"map": "made.yaml", "likelihood_map": "made.png", "localize": "made.tum", "sweep": "made.csv",
          "bench": "report.json", "features": "made.csv"}  # fmt: skip

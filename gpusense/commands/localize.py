@@ -36,14 +36,15 @@ LOST = 1
 EPILOG = """\
 The filter begins around the first reference pose or that of --start, with deviations of 0.5 m and 0.26 rad, or with
 --global anywhere in the free space of the map. It moves with the log's odometry and weighs each chosen scan. Errors
-are those of the weighted mean against reference poses: those of --reference, or the logged ones. Coverage is the share
+are those of the weighted mean against reference poses: those of --reference, or the logged ones. They count from the
+first scan on after which the next five are within 1 m and 20 degrees. With -v, coverage is the share
 of reference poses inside the 50, 80 and 95 % regions of the estimate. A rank is the share of particles behind a
 reference pose, to its right, or clockwise of it: many near 0 and 100 % are overconfidence. NEES is the squared distance
 of a reference pose in deviations.
 
-The verdict at the end does not need reference poses. It is 'tracking'; 'uncertain', where the particles lie apart or
-the scans leave doubt; or 'lost', where scans contradict the pose, as beams that pass through walls do on a wrong map.
-p_lost is the probability that the pose is off by more than 1 m or 0.5 rad. Evidence and the likely cause follow it.
+The first line is the verdict, which needs no reference poses. It is 'tracking'; 'uncertain', where the particles lie
+apart or the scans leave doubt; or 'lost', where scans contradict the pose, as beams that pass through walls do on a
+wrong map. p_lost is the probability that the pose is off by more than 1 m or 0.5 rad. -v prints calibration and times.
 
 A file of nav2 gives amcl's model, beams, particles, noise of the odometry, recovery and initial pose; options of this
 command come first. Its frames, topics and gates (update_min_d, update_min_a, resample_interval) have no effect.
@@ -100,7 +101,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_choice(parser)
     add_backend(parser)
     add_seed(parser)
-    add_json(parser)
+    add_json(parser, verbose=True)
     add("--tum", type=output_path(".tum", ".txt"), metavar="FILE", help="write the trajectory, as evo reads it")
     add("--tum-from", choices=("tracking", "start"), default="tracking",
         help="where the trajectory begins: at the first scan whose verdict is 'tracking', or at the first one "

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpusense.commands.output import print_json
+from gpusense.commands.output import print_json, print_result
 from gpusense.commands.scans import scan_times
 from gpusense.evaluation.machine import machine, machine_line
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 # Figures that are not a single number.
 _NO_NUMBER = ("rank_histogram", "verdict", "evidence")
+_PARTS = ("predict", "score", "resample", "estimate")
 
 
 def report(
@@ -63,9 +64,11 @@ def report(
         print_json(document | {"poses": poses, "times": times, "machine": machine()})
         return result
     _print(pf, result, chosen, track)
-    for path in (args.tum, args.plot, args.record):
+    for path, opened in ((args.tum, ""), (args.plot, ""), (args.record, f"; open it with: rerun {args.record}")):
         if path is not None:
-            print(f"written: {path}")
+            print(f"written    {path}{opened}")
+    if args.verbose:
+        _print_details(pf, result)
     return result
 
 
@@ -79,46 +82,74 @@ def _left_out(track: Track) -> int:
 
 
 def _print(pf: ParticleFilter, result: dict[str, Any], chosen: int, track: Track) -> None:
-    """Print the summary."""
-    s = {name: "-" if value is None else f"{value:.4g}" for name, value in result.items() if name not in _NO_NUMBER}
-    print(f"{pf!r}\n")
+    """Print the verdict with the error in one line, and then the last pose and the errors."""
+    deviations = [math.sqrt(max(value, 0.0)) for value in track.covariances[-1].diagonal()]
+    known = result["error_median"] is not None and not result["references_repeat_odometry"]
+    settled = result["settled_median"] if known else None
+    error = "" if settled is None else f"; median error {length(settled)}"
+    print_result(_verdict(result, deviations) + error)
     if result["scans"] < chosen:
         print(f"interrupted: results of {result['scans']} of {chosen} scans")
-    print(f"scans                 {s['scans']}, temperature {s['temperature']}")
-    deviations = [math.sqrt(max(value, 0.0)) for value in track.covariances[-1].diagonal()]
-    print(f"last pose             {_three(track.poses[-1])}; deviations {_three(deviations)}")
+    print(f"last pose  {_pose(track.poses[-1])}; deviations {_deviations(deviations)}")
+    print(f"scans      {result['scans']}, {sum(result[f'ms_{part}'] for part in _PARTS):.2g} ms each")
     if result["scans"] > 1 and not result["odometry_moves"]:
-        print("odometry              does not move: the log has none, or the robot stands")
-    if 0 < result["references"] < result["scans"]:
-        print(f"reference             poses of {result['references']} scans")
+        print("odometry   does not move: the log has none, or the robot stands")
     if result["references_repeat_odometry"]:
+        print("reference  none: the logged poses are the odometry's own, "
+              f"{length(result['error_median'])} away in the median")  # fmt: skip
+    elif known:
+        _print_errors(result)
+    sys.stdout.flush()
+
+
+def _print_errors(result: dict[str, Any]) -> None:
+    """Print the errors of poses, those before and after convergence apart."""
+    some = "" if result["references"] == result["scans"] else f" (reference poses of {result['references']} scans)"
+    if result["converged_at"] is None:
+        print(f"error      never within 1 m and 20 degrees for long; median {length(result['error_median'])}{some}")
+        return
+    start = result["converged_at"]
+    since = f"from scan {start} on: " if start else ""
+    turns = f"{math.degrees(result['settled_heading_median']):.2g} and {math.degrees(result['settled_heading_95']):.2g}"
+    print(f"error      {since}median {length(result['settled_median'])}, 95 % below {length(result['settled_95'])}; "
+          f"heading {turns} degrees{some}")  # fmt: skip
+    if start:
+        print(f"           before: median {length(result['early_median'])}")
+
+
+def _print_details(pf: ParticleFilter, result: dict[str, Any]) -> None:
+    """Print calibration, times, options of the filter, and the machine."""
+    s = {name: "-" if value is None else f"{value:.3g}" for name, value in result.items() if name not in _NO_NUMBER}
+    print()
+    if result["error_median"] is not None and not result["references_repeat_odometry"]:
         print(
-            "reference             none: the logged poses are the odometry's own\n"
-            f"distance from these   median {s['error_median']} m, 95 % below {s['error_95']} m"
-        )
-    elif result["error_median"] is not None:
-        at = "never" if result["converged_at"] is None else f"after {result['converged_at']} scans"
-        print(
-            f"position error        median {s['error_median']} m, 95 % below {s['error_95']} m\n"
-            f"heading error         median {s['heading_median']} rad, 95 % below {s['heading_95']} rad\n"
             f"error of one step     median {s['relative_median']} m, 95 % below {s['relative_95']} m\n"
-            f"within 1 m, 20 deg    {at}\n"
             f"coverage              {s['coverage_50']} of the 50 %, {s['coverage_80']} of the 80 % and "
             f"{s['coverage_95']} of the 95 % regions; median NEES {s['nees_median']} (2.37 is right)\n"
             f"width of 95 %         {s['width_95']} m, {s['width_heading_95']} rad\n"
             f"ranks of references   {_ranks(result['rank_histogram'])} % in tenths (10 each is right)"
         )
     print(
-        f"effective sample size median {s['effective_sample_size_median']}\n"
+        f"effective sample size median {s['effective_sample_size_median']}; temperature {s['temperature']}\n"
         f"ms per scan           predict {s['ms_predict']}, score {s['ms_score']}, resample {s['ms_resample']}, "
-        f"estimate {s['ms_estimate']}\n\n"
-        f"verdict: {_verdict(result, deviations)}\n\n{machine_line()}",
+        f"estimate {s['ms_estimate']}\n{pf!r}\n{machine_line()}",
     )
-    sys.stdout.flush()
 
 
-def _three(values: Any) -> str:
-    return "{:.3f} m, {:.3f} m, {:.3f} rad".format(*values)
+def length(metres: float) -> str:
+    """Format a length with two digits and the unit that suits it."""
+    if metres < 0.01:
+        return f"{metres * 1000:.2g} mm"
+    return f"{metres * 100:.2g} cm" if metres < 0.995 else f"{metres:.1f} m"
+
+
+def _pose(pose: Any) -> str:
+    x, y, theta = pose
+    return f"{x:.2f} m, {y:.2f} m, {math.degrees(theta):.1f} degrees"
+
+
+def _deviations(values: list[float]) -> str:
+    return f"{length(values[0])}, {length(values[1])}, {math.degrees(values[2]):.2g} degrees"
 
 
 def _ranks(histogram: list[float]) -> str:
@@ -127,18 +158,17 @@ def _ranks(histogram: list[float]) -> str:
 
 def _verdict(result: dict[str, Any], deviations: list[float]) -> str:
     """Return the verdict with its evidence, and the likely cause if there is one."""
-    p_lost = f"p_lost {result['p_lost']:.2g}"
+    verdict = f"{result['verdict'].upper()} (p_lost {result['p_lost']:.2g})"
     # A spread-out cloud is uncertain even without a reading.
     if result["explained_at_end"] is None and result["p_lost"] <= 0.5:
-        return f"none, no scan at the end has a reading to judge by; {result['verdict']}, {p_lost}"
+        return f"NO VERDICT: no scan at the end has a reading to judge by; {result['verdict']}"
     if result["verdict"] == "tracking":
-        share = f"{100 * result['explained_at_end']:.0f} % of the beams of the last scans agree with the map"
-        return f"not lost (tracking), {p_lost}: {share}"
+        return f"{verdict}: {100 * result['explained_at_end']:.0f} % of the beams of the last scans agree with the map"
     evidence = result["evidence"]["text"]
-    if result["verdict"] == "lost":
-        return f"LOST, {p_lost}: {evidence}"
-    wide = f"the particles lie {max(deviations[:2]):.1f} m and {deviations[2]:.2f} rad apart; "
-    return f"UNCERTAIN, {p_lost}: {wide if result['p_lost'] > 0.5 else ''}{evidence}"
+    if result["verdict"] == "lost" or result["p_lost"] <= 0.5:
+        return f"{verdict}: {evidence}"
+    wide = f"the particles lie {max(deviations[:2]):.1f} m and {math.degrees(deviations[2]):.0f} degrees apart"
+    return f"{verdict}: {wide}; {evidence}"
 
 
 def _draw(path: Path, pf: ParticleFilter, track: Track) -> None:

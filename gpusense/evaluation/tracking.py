@@ -200,16 +200,17 @@ def _errors(differences: Floats, references: Floats, poses: Floats) -> dict[str,
     if len(poses) > 1:
         step = pose_difference(pose_difference(references[:-1], references[1:]), pose_difference(poses[:-1], poses[1:]))
     step_errors = np.hypot(step[:, 0], step[:, 1])
-    values = (
-        float(np.median(position)), float(np.percentile(position, 95)), float(np.median(heading)),
-        float(np.percentile(heading, 95)), float(np.median(step_errors)), float(np.percentile(step_errors, 95)),
-        _converged(position, heading),
-    )  # fmt: skip
-    return dict(zip(_ERRORS, values, strict=True))
+    start = _converged(position, heading)
+    settled = slice(len(position) if start is None else start, None)
+    parts = (position, heading, step_errors, position[settled], heading[settled])
+    values = [None if not len(part) else float(np.percentile(part, q)) for part in parts for q in (50, 95)]
+    early = float(np.median(position[:start])) if start else None
+    return dict(zip(_ERRORS, (*values, early, start), strict=True))
 
 
 _ERRORS = (
-    "error_median", "error_95", "heading_median", "heading_95", "relative_median", "relative_95", "converged_at",
+    "error_median", "error_95", "heading_median", "heading_95", "relative_median", "relative_95", "settled_median",
+    "settled_95", "settled_heading_median", "settled_heading_95", "early_median", "converged_at",
 )  # fmt: skip
 _WITH_REFERENCE = (
     *_ERRORS, *(f"coverage_{name}" for name in REGIONS), "nees_median", "width_95", "width_heading_95",

@@ -62,7 +62,12 @@ def test_a_log_is_tracked_and_written(place, capsys):
     parameters = ["--parameters", str(place / "poses.yaml"), "--tum", str(tum), "--plot", str(plot)]
     assert cli.main(call(place, *parameters)) == 0
     out = capsys.readouterr().out
-    assert "verdict: not lost" in out and "position error" in out and "ms per scan" in out
+    assert re.match(
+        r"TRACKING \(p_lost \S+\): \d+ % of the beams .* agree with the map; median error \S+ [cm]?m\n", out
+    )
+    assert "\nerror      median " in out and "coverage" not in out and len(out.splitlines()) == 6
+    assert cli.main(call(place, "-v")) == 0
+    assert "\ncoverage  " in (out := capsys.readouterr().out) and "ms per scan" in out and "ParticleFilter(" in out
     rows = np.loadtxt(tum)
     assert rows.shape == (12, 8) and plot.stat().st_size > 10_000
     truth = [scan.pose for scan in gs.read_log(place / "run.log", range_max=20.0)]
@@ -75,8 +80,9 @@ def test_a_start_around_a_pose(place, capsys):
     out = capsys.readouterr().out
     last = list(gs.read_log(place / "run.log", range_max=20.0))[-1].pose
     line = next(line for line in out.splitlines() if line.startswith("last pose"))
-    numbers = [float(value) for value in re.findall(r"-?[0-9]+[.][0-9]+", line)]
-    assert np.abs(np.array(numbers[:3]) - last).max() < 0.15 and 0 < max(numbers[3:]) < 0.3
+    x, y, degrees = (float(value) for value in re.findall(r"-?[0-9]+[.][0-9]+", line)[:3])
+    assert np.abs(np.array([x, y, np.radians(degrees)]) - last).max() < 0.15
+    assert re.search(r"deviations [0-9.]+ cm, [0-9.]+ cm, [0-9.]+ degrees$", line)
     assert "must be a finite number, got 'north'" in error_of(call(place, "--start", "1", "2", "north"), capsys)
     assert "not allowed with argument --start" in error_of(call(place, "--start", "1", "-2", "0", "--global"), capsys)
 
@@ -115,18 +121,18 @@ def test_what_the_command_fit_wrote_is_used(place, capsys, tmp_path):
 def test_a_log_on_a_wrong_map_is_lost(place, capsys):
     assert cli.main(call(place, "--start", "3", "1.9", "0.2", grid="other.yaml")) == 1
     out = capsys.readouterr().out
-    assert "verdict: LOST, p_lost " in out and "pass through them, most near x = " in out
+    assert out.startswith("LOST (p_lost ") and "pass through them, most near x = " in out
     assert "likely cause: wrong map" in out
     # The map has no place on which the particles could agree.
     assert cli.main(call(place, "--global", "--particles", "500", grid="other.yaml")) == 1
-    assert "verdict: LOST" in (out := capsys.readouterr().out) or "verdict: UNCERTAIN" in out
+    assert capsys.readouterr().out.startswith(("LOST (p_lost ", "UNCERTAIN (p_lost "))
 
 
 def test_a_filter_that_has_not_converged_is_uncertain(place, capsys):
     arguments = call(place, "--global", "--limit", "1", "--tum", str(place / "none.tum"))
     assert cli.main(arguments) == 1
     printed = capsys.readouterr()
-    assert "verdict: UNCERTAIN, p_lost " in printed.out and " m and " in printed.out
+    assert re.match(r"UNCERTAIN \(p_lost \S+\): .* m and \d+ degrees apart", printed.out)
     # No pose serves as a reference.
     assert "the first 1 of 1 scans" in printed.err and not (place / "none.tum").read_text()
     assert cli.main([*arguments, "--tum-from", "start"]) == 1
@@ -183,7 +189,7 @@ def test_two_lasers_of_a_bag_track_together(place, capsys, tmp_path):
     tum = tmp_path / "run.tum"
     both = call(place, "--topic", "/front", "/rear", "--global", "--particles", "4000", "--tum", str(tum))
     both[both.index("--log") + 1] = str(bag.path)
-    assert cli.main(both) == 0, capsys.readouterr().out
+    assert cli.main([*both, "-v"]) == 0, capsys.readouterr().out
     assert "LikelihoodFieldModel, LikelihoodFieldModel" in capsys.readouterr().out
     rows = np.loadtxt(tum)
     # The time before the filter has converged is left out.
@@ -253,7 +259,7 @@ def test_a_run_is_recorded_for_the_viewer(place, capsys, monkeypatch, tmp_path):
     fake = SimpleNamespace(RecordingStream=open_stream, **dict.fromkeys(names, archetype))
     monkeypatch.setitem(sys.modules, "rerun", fake)
     assert cli.main(call(place, "--limit", "3", "--record", str(path))) == 0
-    assert f"written: {path}" in capsys.readouterr().out
+    assert f"written    {path}; open it with: rerun {path}" in capsys.readouterr().out
     names = path.read_text().split()
     each = ["particles", "scan", "estimate", "reference", "error", "effective_sample_size", "p_lost"]
     assert names == ["map", *each * 3, "path/estimate", "path/reference"]

@@ -110,7 +110,7 @@ def test_noise_is_given_or_learned(place, capsys):
 def test_without_returns_there_is_no_verdict(place, capsys):
     arguments = [*call(place, "--start", "3", "1.5", "3"), "--range-max", "0.01", "--limit", "3"]
     assert cli.main(arguments) == 1
-    assert "verdict: none, no scan at the end has a reading" in capsys.readouterr().out
+    assert "NO VERDICT: no scan at the end has a reading" in capsys.readouterr().out
 
 
 def test_the_verdict_names_the_share_that_decides(place, capsys, tmp_path):
@@ -140,7 +140,7 @@ def test_a_log_whose_odometry_does_not_move_is_named(place, capsys, tmp_path):
     arguments[arguments.index("--log") + 1] = str(tmp_path / "still.log")
     assert cli.main(arguments) == 0
     out = capsys.readouterr().out
-    assert "odometry              does not move" in out and "the odometry's own" not in out
+    assert "odometry   does not move" in out and "the odometry's own" not in out
 
 
 def test_times_that_repeat_become_indices(place, capsys, tmp_path):

@@ -148,14 +148,12 @@ class MatchRules(NamedTuple):
 class BeamRules(NamedTuple):
     """Companions of a scan's rays in a part of the map, and rules for its readings; see the kernel file ``passages``.
 
-    The part begins at its corner, relative to the map's and along its axes [m]. Companions start ``beside`` the beam,
-    or by the deviation of the position up to ``most_beside`` [m]. They diverge by ``apart``, or by the deviation of the
+    The part begins at the column ``left`` and the row ``top`` of the map. Companions start ``beside`` the beam, or by
+    the deviation of the position up to ``most_beside`` [m]. They diverge by ``apart``, or by the deviation of the
     heading up to ``most_apart``, and by ``cone`` [rad]. Tolerances of readings are ``part`` of them, at least ``least``
     and the deviation of the position; rays are walked up to ``limit`` [m]. Walls have the value ``occupied`` or more.
     """
 
-    corner_x: double
-    corner_y: double
     beside: double
     most_beside: double
     apart: double
@@ -166,6 +164,8 @@ class BeamRules(NamedTuple):
     limit: double
     range_max: double
     occupied: int
+    left: int
+    top: int
 
 
 STRUCTS: dict[str, type[tuple[Any, ...]]] = {

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 
 from gpusense.localization.estimates import Estimate, clustered
 from gpusense.localization.recovery import Recovery
-from gpusense.localization.rival import evidence_of
 from gpusense.localization.spread import Spread, share_off, share_off_of, spread_of
 from gpusense.localization.tracker import Tracker
 from gpusense.localization.verdict import Verdict
@@ -19,16 +15,13 @@ from gpusense.localization.words import word_of
 _MOST_LOOKED_AT = 100_000
 
 
-def estimate_of(
-    tracker: Tracker, verdict: Verdict, recovery: Recovery, readings: Mapping[int, tuple[Any, ...]], method: str
-) -> Estimate:
-    """Return the estimate of a filter, and judge its pose by the last readings.
+def estimate_of(tracker: Tracker, verdict: Verdict, recovery: Recovery, method: str) -> Estimate:
+    """Return the estimate of a filter.
 
     Args:
         tracker: The particles.
         verdict: Verdict on their pose.
         recovery: Recovery with the rivals of the particles.
-        readings: Last readings by the index of their sensor.
         method: "mean", "cluster" or "best".
     """
     cloud, shown = tracker.cloud, tracker.shown
@@ -38,19 +31,13 @@ def estimate_of(
         pose = tracker.host_particles()[int(np.argmax(cloud.host_weights(shown)))]
     elif method == "cluster":
         pose, covariance = clustered(tracker.host_particles(), cloud.host_weights(shown))
-    explained = verdict.judge(pose, covariance, readings, evidence_of(summary))
     spread = spread_of(covariance)
     p_lost = _p_lost(tracker, verdict, recovery, pose, covariance, spread)
     word = word_of(p_lost, verdict.wrong, wide=spread.wide, apart=spread.apart)
-    size = summary.effective_sample_size
-    if not size > 0:
-        # The kernels have no sum of squares before a correction, or where no weighted particle was possible.
-        weights = cloud.host_weights(shown)
-        size = float(weights.sum() ** 2 / (weights @ weights))
     temperature = tracker.sensors[0].temperature(tracker.options.temperature)
     return Estimate(
-        pose, covariance, size * tracker.distinct, p_lost, word, explained, temperature, summary.temperature,
-        summary.degenerate, shown,
+        pose, covariance, tracker.sample_size(), p_lost, word, verdict.state.explained, temperature,
+        summary.temperature, summary.degenerate, shown,
     )  # fmt: skip
 
 

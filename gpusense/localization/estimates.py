@@ -21,7 +21,8 @@ class Estimate:
     Attributes:
         pose: (3,) x, y, theta [m, m, rad].
         covariance: (3, 3) covariance of the particles about it.
-        effective_sample_size: ``1 / sum w^2`` of the last correction, 1 to N.
+        effective_sample_size: ``1 / sum w^2`` of the last correction, 1 to N; until the next motion, copies of a
+            particle count as one.
         p_lost: Probability that the pose is off by more than 1 m or 0.5 rad; see ``docs/localization.md``.
         verdict: "tracking"; "uncertain", if the particles are spread widely or over several places, or p_lost is above
             0.1; or "lost", where scans or features contradict the pose and p_lost is above 0.5.
@@ -74,6 +75,21 @@ def covariance_of(numbers: np.ndarray) -> np.ndarray:
     xx, xy, xt, yy, yt, tt = numbers[3:9].tolist()
     xx, yy, tt = max(xx, 0.0), max(yy, 0.0), max(tt, 0.0)
     return np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
+
+
+def sample_size_of(weights: np.ndarray, poses: np.ndarray | None = None) -> float:
+    """Return the effective sample size of particles.
+
+    Args:
+        weights: (N,) weights >= 0.
+        poses: (N, 3) particles, of which equal ones count as one; None for different ones.
+    """
+    if poses is not None:
+        order = np.lexsort(poses.T)
+        ordered = poses[order]
+        begins = np.flatnonzero(np.append(True, (ordered[1:] != ordered[:-1]).any(axis=1)))
+        weights = np.add.reduceat(weights[order], begins)
+    return float(weights.sum() ** 2 / (weights @ weights))
 
 
 def clustered(poses: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -193,7 +193,7 @@ class ParticleFilter(Whole):
         """
         self._parts.check_started()
         sampled = self.motion.sampled(*motion)
-        if self._parts.tracker.pending is None and self._parts.recovery.active is None:
+        if self._parts.tracker.progress.motion is None and self._parts.recovery.active is None:
             # A single assignment, which no interrupt divides.
             self._parts.tracker.follow(sampled)
         else:
@@ -205,13 +205,13 @@ class ParticleFilter(Whole):
 
     @settled
     def flush(self) -> None:
-        """Run the motion of the last ``predict`` now; otherwise the next correction runs it."""
-        if self._parts.tracker.pending is not None:
+        """Run the motion of the last ``predict`` now; otherwise the next correction or result runs it."""
+        if self._parts.tracker.progress.motion is not None:
             self._move()
 
     @whole
     def _move(self) -> None:
-        self._parts.tracker.move(None)
+        self._parts.tracker.move()
 
     @whole
     def correct(self, readings: Any) -> None:
@@ -221,7 +221,7 @@ class ParticleFilter(Whole):
             readings: The reading of the filter's only model, or a mapping from models to their readings. If
                 ``log_likelihood`` takes several arguments, pass a tuple of them: ``(features, correspondence)``,
                 ``(ranges, ids)``, ``(fix, covariance)``. None is a missing reading. Arrays on a device must not change
-                until :meth:`estimate` and :meth:`reset`, which read them again.
+                until :meth:`diagnose`, :meth:`reset` and :meth:`state`, which read them again.
 
         If it raises, even by an interrupt of the user, the filter is unchanged, so the correction can be repeated. This
         holds for all calls of a filter.
@@ -262,7 +262,7 @@ class ParticleFilter(Whole):
 
     @settled
     def estimate(self, method: str = "mean") -> Estimate:
-        """Return the pose of the robot.
+        """Return the pose of the robot, without a change of the filter: corrections judge the pose themselves.
 
         Args:
             method: "mean", the weighted mean with the circular mean of headings; "cluster", the mean of the heaviest
@@ -274,7 +274,7 @@ class ParticleFilter(Whole):
         """
         checks.choice("method", method, ("mean", "cluster", "best"))
         parts = self._parts
-        return estimate_of(self._moved(), parts.verdict, parts.recovery, parts.last, method)
+        return estimate_of(self._moved(), parts.verdict, parts.recovery, method)
 
     @settled
     def diagnose(self, *, search: bool = True) -> Diagnosis:
@@ -376,6 +376,7 @@ class ParticleFilter(Whole):
     @settled
     def state(self) -> FilterState:
         """Return a copy of the filter's state, without models and device: see :class:`FilterState`."""
+        self.flush()
         return FilterState(*self._kind(), *self._parts.state())
 
     @whole

@@ -14,6 +14,7 @@ from gpusense.localization.defaults import DEFAULTS
 from gpusense.localization.filter_cloud import FilterCloud
 from gpusense.localization.motion import SampledMotion
 from gpusense.localization.options import Options
+from gpusense.localization.pose_algebra import compose_poses
 from gpusense.localization.recovery import Recovery
 from gpusense.localization.scoring import readings_of
 from gpusense.localization.sensors import Sensor, grid_of
@@ -98,8 +99,8 @@ class FilterParts:
 
     def _begin(self, poses: np.ndarray) -> None:
         """Replace all particles, and forget the history of the previous ones."""
-        self.tracker.place(poses)
-        self.tracker.pending, self.last = None, {}
+        self.tracker.begin(poses)
+        self.last = {}
         self.recovery.restart()
         self.verdict.reset()
         for sensor in self.sensors:
@@ -123,8 +124,7 @@ class FilterParts:
             verdict.predicted(*tracker.moved_particles(), everything)
         if share is not None:
             used = skipping.skipped(self.sensors, used, tracker.moved_particles(), verdict.anywhere, share)
-        judged = verdict.expected(everything, tracker.pending)
-        tracker.weigh(used, judged=judged, corrected_before=bool(self.last))
+        tracker.weigh(used, judged=verdict.expected(everything, tracker.progress.motion))
         # The caller may write the next readings to the same arrays.
         self.last = {index: tuple(map(_copied, reading)) for index, reading in everything.items()}
         verdict.corrected()
@@ -132,13 +132,13 @@ class FilterParts:
         self.recovery.corrected(used, self.last)
 
     def reset(self) -> None:
-        """Replace half of the particles by poses at which the last readings are likely."""
+        """Replace half of the particles by poses at which the last readings are likely, moved as since these."""
         tracker = self.tracker
+        tracker.move()
         tries = tracker.random_poses(starts.tries_of(tracker.cloud.count))
-        temperature, key = self.options.temperature, tracker.key()
-        tracker.place(
-            starts.with_likely_poses(tracker.next_particles(), tries, self.sensors, self.last, temperature, key)
-        )
+        likely = starts.likeliest(tries, tracker.cloud.count, self.sensors, self.last, self.options.temperature)
+        moved = compose_poses(likely, tracker.progress.moved or np.zeros(3))
+        tracker.place(starts.with_poses(tracker.next_particles(), moved, tracker.key()))
 
     # ---- state
 

@@ -62,7 +62,7 @@ class _Setting(NamedTuple):
         scanner: The scanner.
         turn: Direction of bearing 0 in the map, less the robot's heading [rad].
         frame: Frame of the map.
-        rules: Rules for readings, with the corner of the map's part.
+        rules: Rules for readings, with the first row and column of the map's part.
     """
 
     scanner: Scanner
@@ -279,9 +279,9 @@ def _setting_of(grid: OccupancyGrid, scanner: Scanner, corner: tuple[int, int] =
     """Return the setting of a scanner in a map, or in its part from a row and a column on."""
     side, (top, left) = grid.resolution, corner
     rules = BeamRules(
-        left * side, top * side, max(BESIDE, side), max(_MOST_BESIDE, side), _APART, _MOST_APART, scanner.cone / 2,
+        max(BESIDE, side), max(_MOST_BESIDE, side), _APART, _MOST_APART, scanner.cone / 2,
         max(_LEAST, _LEAST_CELLS * side), _PART, min(_FARTHEST, scanner.range_max), scanner.range_max,
-        grid.occupied_threshold,
+        grid.occupied_threshold, left, top,
     )  # fmt: skip
     turn = math.remainder(scanner.mount[2] - grid.origin[2], math.tau)
     return _Setting(scanner, turn, frame_of(grid, scanner.mount), rules)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
@@ -38,6 +38,16 @@ class SampledMotion(NamedTuple):
     deviation: tuple[float, float, float, float]
     kind: int = STRAIGHT
     reverse: float = 0.0
+
+    def after(self, pose: Sequence[float]) -> tuple[float, float, float]:
+        """Return a pose (x, y, theta) [m, m, rad] after the mean motion."""
+        (x, y, theta), (first, ahead, left, second) = pose, self.mean
+        if self.kind == VELOCITY_MODEL:
+            # The chord of an arc that turns by twice the first turn.
+            ahead, second = ahead * (math.sin(first) / first if first else 1.0), first + second
+        cosine, sine = math.cos(theta + first), math.sin(theta + first)
+        turned = math.remainder(theta + first + second, math.tau)
+        return x + cosine * ahead - sine * left, y + sine * ahead + cosine * left, turned
 
 
 # No motion.

@@ -77,29 +77,35 @@ class Recovery:
         return apart or verdict.wrong > _DOUBT or verdict.explains_little
 
     def corrected(self, readings: list[SensorReadings], last: Mapping[int, tuple[Any, ...]]) -> None:
-        """Compare the particles with their rival, or search for a rival if scans contradict the pose.
+        """Compare the particles with their rival, judge their pose, and search for a rival if scans contradict it.
+
+        A search needs two judgements in a row that contradict the pose.
 
         Args:
             readings: Indices of sensors, with the readings that corrected the particles.
             last: Copies of the same readings with all beams.
         """
-        if not self._searches:
-            return
-        if self.active is not None:
-            self._compare(self.active, readings)
-            return
-        tracker = self._tracker
-        if tracker.wide or (self.everywhere and not tracker.together):
-            return
-        if not (self.everywhere or self.is_doubted() or self._verdict.due):
+        tracker, verdict, rival = self._tracker, self._verdict, self.active
+        searches = self._searches and rival is None and self._is_wanted()
+        if rival is not None:
+            self._compare(rival, readings)
+        if not verdict.is_informed_by(last):
             return
         pose, covariance = tracker.mean_and_covariance()
-        self._verdict.judge(pose, covariance, last, evidence_of(tracker.cloud.summary()))
-        if self.everywhere or self.is_doubted():
+        verdict.judge(pose, covariance, last, evidence_of(tracker.cloud.summary()))
+        if searches and self._is_wanted():
             prior = 0.0 if self.everywhere else PRIOR
             self.everywhere = max(self.everywhere - 1, 0)
-            ratio = self._made().start(pose, covariance, list(last.items()), step=tracker.step, prior=prior)
-            self._verdict.compared(pose, covariance, ratio)
+            step = tracker.progress.step
+            ratio = self._made().start(pose, covariance, list(last.items()), step=step, prior=prior)
+            verdict.compared(pose, covariance, ratio)
+
+    def _is_wanted(self) -> bool:
+        """Tell whether something contradicts the pose, or it is to be compared, and the particles are not too wide."""
+        tracker = self._tracker
+        if tracker.wide or (self.everywhere and not tracker.together):
+            return False
+        return bool(self.everywhere) or self.is_doubted()
 
     def _compare(self, rival: Rival, readings: list[SensorReadings]) -> None:
         """Correct the rival, and let it replace the particles if it has won."""

@@ -34,7 +34,7 @@ from gpusense.localization.motion import SampledMotion
 from gpusense.localization.ratio import ratio_of_scan
 from gpusense.localization.rival_search import RivalSearch, are_apart, drawn
 from gpusense.localization.spread import FAR, FAR_TURN, deviations
-from gpusense.localization.tracker import Tracker
+from gpusense.localization.tracker import Progress, Tracker
 from gpusense.localization.verdict import sightings
 
 # Log Bayes factors at which a rival wins, and at which a losing rival ends; scans to win for a converged rival, and for
@@ -126,7 +126,7 @@ class Rival:
         Returns:
             Log-likelihood ratio of other places against the estimate; NaN without a search of the whole map.
         """
-        self._tracker.step = step
+        self._tracker.progress = Progress(step)
         key, options = self._tracker.key(), self._tracker.options
         found = self._search.found(pose, covariance, readings, key, options.temperature)
         tries, score, ratio = found.poses, found.score, found.ratio
@@ -136,7 +136,6 @@ class Rival:
         chosen = drawn(score, options.most, found.effective)
         if chosen is None:
             return ratio
-        self._tracker.pending = None
         self._tracker.place(starts.spread(tries[chosen], _SPREAD, options.most, key, each=True))
         self.active, self.log_odds, self._prior, self._scans, self._settled = True, prior, prior, 0, False
         # No trace of an earlier rival may remain in the state.

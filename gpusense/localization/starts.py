@@ -164,31 +164,32 @@ def tries_of(particles: int) -> int:
     return max(_LEAST_TRIES, _TRIES * _replaced(particles))
 
 
-def with_likely_poses(
-    poses: np.ndarray,
+def likeliest(
     tries: np.ndarray,
+    particles: int,
     sensors: Sequence[Sensor],
     readings: Mapping[int, tuple[Any, ...]],
     temperature: float | str,
-    key: Key,
 ) -> np.ndarray:
-    """Replace half of the particles by draws around the likeliest of ``tries``, and return all particles.
+    """Return the likeliest of ``tries``, around which a reset of particles draws.
 
     Args:
-        poses: (N, 3) particles.
         tries: (M, 3) poses anywhere.
+        particles: Number of particles.
         sensors: The filter's sensors.
         readings: Last readings by the index of their sensor.
         temperature: Temperature of scans, or "auto".
-        key: Seed and step.
     """
     score = np.zeros(len(tries))
     for index, reading in readings.items():
         sensor = sensors[index]
         score += sensor.temperature(temperature) * sensor.log_likelihood(tries, reading)
-    count = _replaced(len(poses))
     with np.errstate(invalid="ignore"):
-        best = np.argsort(-score, kind="stable")[: max(count // _SHARE, 1)]
-    result = poses.copy()
-    result[:: max(len(poses) // count, 1)][:count] = spread(tries[best], _SPREAD, count, key, each=True)
+        return np.asarray(tries[np.argsort(-score, kind="stable")[: max(_replaced(particles) // _SHARE, 1)]])
+
+
+def with_poses(particles: np.ndarray, poses: np.ndarray, key: Key) -> np.ndarray:
+    """Replace half of the particles (N, 3) by draws around ``poses``, and return all particles."""
+    count, result = _replaced(len(particles)), particles.copy()
+    result[:: max(len(particles) // count, 1)][:count] = spread(poses, _SPREAD, count, key, each=True)
     return result

@@ -54,7 +54,7 @@ class FilterState:
 
     @property
     def particles(self) -> np.ndarray:
-        """(N, 3) poses after the last step; a predicted motion that is still pending is in ``memory``."""
+        """(N, 3) poses after the last step."""
         return self.contents.poses
 
     @property
@@ -65,7 +65,7 @@ class FilterState:
     @property
     def step(self) -> int:
         """Number of the last step, on which random numbers depend."""
-        return int(self.memory["tracker"]["step"])
+        return int(self.memory["tracker"]["progress"].step)
 
 
 def constructor_options(options: Options, motion: Any) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from gpusense.localization import starts
 from gpusense.localization.adaptive import kld_count
 from gpusense.localization.cloud_state import Contents, SensorReadings, Step
 from gpusense.localization.defaults import DEFAULTS
-from gpusense.localization.estimates import covariance_of
+from gpusense.localization.estimates import covariance_of, sample_size_of
 from gpusense.localization.filter_cloud import FilterCloud
 from gpusense.localization.journal import plain_state, set_state
 from gpusense.localization.motion import STILL, SampledMotion
@@ -26,6 +26,22 @@ from gpusense.localization.skipping import TOGETHER
 
 # Interval [corrections] at which a converged filter re-checks that it is converged.
 _LOOK = 5
+
+
+class Progress(NamedTuple):
+    """Progress of the particles in time; immutable, so one assignment changes it.
+
+    Attributes:
+        step: Number of the last step, which a start, a motion or a correction without one begins.
+        motion: The last motion while it has not run, so that one program does it and the correction.
+        moved: Mean motion since the last correction, as a pose; None without a motion.
+        copies: Whether the last correction weighed particles that had been drawn since the motion before it.
+    """
+
+    step: int = 0
+    motion: SampledMotion | None = None
+    moved: tuple[float, float, float] | None = None
+    copies: bool = False
 
 
 class Tracker:
@@ -38,27 +54,24 @@ class Tracker:
 
     Attributes:
         started: Whether there are particles.
-        step: Number of the last step.
-        pending: The motion with which the next step begins.
+        progress: Steps so far, and the motion since the last correction.
         shown: Number of shown particles, which are those of the last step.
         wide: Number of remaining corrections at a low temperature.
         together: Whether the particles lie together, as far as is known.
         pool: Number of poses that recovery injects, and half widths of the box around each.
-        distinct: Share of distinct particles before the last correction.
         corrections: Corrections so far.
     """
 
     MEMORY: ClassVar[tuple[str, ...]] = (
-        "started", "step", "pending", "shown", "wide", "together", "pool", "distinct", "corrections",
+        "started", "progress", "shown", "wide", "together", "pool", "corrections",
     )  # fmt: skip
     PARTS: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, sensors: Sequence[Sensor], options: Options, cloud: FilterCloud) -> None:
         self.sensors, self.options, self.cloud = sensors, options, cloud
         self._models = [sensor.model for sensor in sensors]
-        self.started, self.step, self.shown, self.wide = False, 0, options.most, 0
-        self.pending: SampledMotion | None = None
-        self.together, self.distinct, self.corrections = False, 1.0, 0
+        self.started, self.progress, self.shown, self.wide = False, Progress(), options.most, 0
+        self.together, self.corrections = False, 0
         self.pool: tuple[int, starts.Spread] = 0, (0.0, 0.0, 0.0)
 
     def keep(self) -> None:
@@ -69,13 +82,18 @@ class Tracker:
 
     def key(self) -> starts.Key:
         """Return the two words of the seed, and the number of a new step."""
-        self.step += 1
-        return *self.options.words, self.step
+        self.progress = self.progress._replace(step=self.progress.step + 1)
+        return *self.options.words, self.progress.step
 
     def number(self, particles: int | None) -> int:
         """Return a checked number of particles; None gives the most."""
         most = self.options.most
         return most if particles is None else checks.integer("particles", particles, low=1, high=most)
+
+    def begin(self, poses: np.ndarray) -> None:
+        """Replace all particles, and forget the motion of the previous ones."""
+        self.progress = Progress(self.progress.step)
+        self.place(poses)
 
     def place(self, poses: np.ndarray) -> None:
         """Replace all particles."""
@@ -99,9 +117,8 @@ class Tracker:
         return self.cloud.host_poses(self.cloud.places.shown, self.shown)
 
     def moved_particles(self) -> tuple[np.ndarray, np.ndarray]:
-        """Run a pending motion; return copies of the particles' poses and weights."""
-        if self.pending is not None:
-            self.move(None)
+        """Run a postponed motion; return copies of the particles' poses and weights."""
+        self.move()
         return self.host_particles(), self.host_weights()
 
     def next_particles(self) -> np.ndarray:
@@ -133,44 +150,47 @@ class Tracker:
 
     def follow(self, motion: SampledMotion) -> None:
         """Postpone a motion to the next correction, so that one program does both."""
-        if self.pending is None:
-            self.pending = motion
-        else:
-            self.move(motion)
+        self.move()
+        now = self.progress
+        moved = motion.after(now.moved or (0.0, 0.0, 0.0))
+        self.progress = now._replace(step=now.step + 1, motion=motion, moved=moved)
 
-    def move(self, following: SampledMotion | None) -> None:
-        """Run the pending motion; ``following`` becomes the pending one."""
-        motion = STILL if self.pending is None else self.pending
-        self.cloud.move(self.settings(motion, []), motion.kind)
-        self.shown, self.pending = self.cloud.count, following
+    def move(self) -> None:
+        """Run a postponed motion."""
+        if (motion := self.progress.motion) is not None:
+            self.cloud.move(self.settings(motion, []), motion.kind)
+            self.shown, self.progress = self.cloud.count, self.progress._replace(motion=None)
 
-    def weigh(
-        self,
-        readings: list[SensorReadings],
-        *,
-        judged: Sequence[SensorReadings] = (),
-        corrected_before: bool = False,
-    ) -> None:
-        """Run the motion, and correct the particles by readings of sensors.
+    def weigh(self, readings: list[SensorReadings], *, judged: Sequence[SensorReadings] = ()) -> None:
+        """Run a postponed motion, and correct the particles by readings of sensors.
 
         Args:
             readings: Indices of sensors with their readings.
             judged: Scans that will be judged at the pose after the correction.
-            corrected_before: Whether the particles were corrected before, so that some may be copies.
         """
-        chosen, motion = self.options, STILL if self.pending is None else self.pending
-        self.distinct = self._distinct_share() if self.pending is None and corrected_before else 1.0
-        drawn = self.cloud.count if chosen.least == chosen.most else self._wanted()
+        chosen, drawn = self.options, self.cloud.count
+        if chosen.least != chosen.most:
+            self.move()
+            drawn = kld_count(self.next_particles(), chosen.least, chosen.most)
+        copies = False
+        if self.progress.moved is None:
+            copies = self.progress.copies or self.cloud.summary().resampled
+            self.key()
+        motion = self.progress.motion or STILL
         settings = self.settings(motion, [index for index, _ in readings])
-        self.shown, self.pending = self.cloud.count, None
+        self.shown, self.progress = self.cloud.count, Progress(self.progress.step, copies=copies)
         self.cloud.correct(Step(settings, motion.kind, chosen.stages, drawn, readings, judged))
         self.wide = max(self.wide - 1, 0)
 
-    def _distinct_share(self) -> float:
-        """Return the share of distinct particles before a correction without motion, where copies are equal."""
-        last = self.cloud.summary()
-        before = self.distinct if last.stages == 1 else 1.0
-        return before * min(last.effective_sample_size / self.shown, 1.0) if last.resampled else before
+    def sample_size(self) -> float:
+        """Return the effective sample size of the last correction, 1 to the number of shown particles."""
+        size, now = self.cloud.summary().effective_sample_size, self.progress
+        if now.copies and now.moved is None:
+            size = sample_size_of(self.cloud.host_weights(self.shown), self.host_particles())
+        elif not size > 0:
+            # The kernels have no sum of squares before a correction, or where no weighted particle was possible.
+            size = sample_size_of(self.cloud.host_weights(self.shown))
+        return min(max(size, 1.0), float(self.shown))
 
     def learn(self, readings: list[SensorReadings], is_doubted: Callable[[], bool]) -> None:
         """Determine whether the particles lie together, and learn from scans at a pose that nothing contradicts.
@@ -190,18 +210,14 @@ class Tracker:
                 sensor.correlate(pose, covariance, reading)
 
     def settings(self, motion: SampledMotion, indices: list[int]) -> np.ndarray:
-        """Return the settings of a new step with readings of sensors, by their indices."""
+        """Return the settings of the present step with readings of sensors, by their indices."""
         temperature, sensors = self.options.temperature, []
         wide = DEFAULTS.wide_share if self.wide and temperature == "auto" else 1.0
         for sensor in (self.sensors[index] for index in indices):
             sensors.append((sensor.temperature(temperature) * (wide if sensor.calibrates else 1.0), sensor.beams))
-        step, count = self.key()[2], self.cloud.count
+        step, count = self.progress.step, self.cloud.count
         one_peak = self.together and not any(self.sensors[index].ambiguous for index in indices)
         return settings_of_step(self.options, motion, step, count, self.pool, sensors, one_peak)
-
-    def _wanted(self) -> int:
-        """Return the number of particles of the next step by KLD sampling."""
-        return kld_count(self.next_particles(), self.options.least, self.options.most)
 
 
 def _due_of(sensors: Sequence[Sensor], readings: Sequence[SensorReadings]) -> list[tuple[Sensor, tuple[Any, ...]]]:

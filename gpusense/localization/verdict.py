@@ -19,7 +19,7 @@ import numpy as np
 
 from gpusense._util import masks
 from gpusense.backends import arrays
-from gpusense.localization.belief import Belief
+from gpusense.localization.belief import Belief, motion_between
 from gpusense.localization.evidence import LEAST_GAIN, Evidence, Gains
 from gpusense.localization.motion import STILL, SampledMotion
 from gpusense.localization.passages import Passages, passages
@@ -35,8 +35,6 @@ _RANDOM = 64
 # A pose with at most this belief of being wrong is judged again after this distance [m], turn [rad], number of
 # corrections, or drop of the readings' log-likelihood [nats].
 _SURE, _WAY, _TURNED, _SELDOM, _DROP = 0.05, 0.25, 0.25, 10, 3.0
-# Corrections after which a filter with an unsure pose judges even without a call of ``estimate``.
-_INTERVAL = 5
 # Share of explained beams below which a search elsewhere is worthwhile.
 _FEW = 0.4
 
@@ -88,8 +86,8 @@ class Verdict:
             for index, sensor in enumerate(sensors)
             if isinstance(sensor.model, FeatureModel)
         }
-        # Corrections and pose of the last call of ``judge``, which nothing but ``expected`` reads.
-        self._asked: tuple[int, np.ndarray | None] = -1, None
+        # Pose of the last call of ``judge``; it is no state, since only the speed depends on it.
+        self._pose: np.ndarray | None = None
         self.informed = bool(self._evidence) or any(sensor.calibrates for sensor in sensors)
         self.state = VerdictState()
 
@@ -100,6 +98,10 @@ class Verdict:
             anywhere: Whether the pose is searched on the whole map.
         """
         self.state = VerdictState(Belief.anywhere() if anywhere else Belief())
+
+    def is_informed_by(self, readings: Mapping[int, tuple[Any, ...]]) -> bool:
+        """Tell whether a sensor with a map took any of the readings, so that the pose is judged after them."""
+        return any(self._sensors[index].calibrates or index in self._evidence for index in readings)
 
     def watches(self, readings: Mapping[int, tuple[Any, ...]]) -> bool:
         """Tell whether readings include features, whose prediction is judged before the correction."""
@@ -135,11 +137,6 @@ class Verdict:
         state = self.state
         self.state = state._replace(corrections=state.corrections + 1, belief=state.belief.counted())
 
-    @property
-    def due(self) -> bool:
-        """Tell whether a filter judges now even without a call of ``estimate``."""
-        return self.state.corrections % (_SELDOM if self.state.belief.wrong <= _SURE else _INTERVAL) == 0
-
     def doubt(self) -> None:
         """Restart with a pose that a search has just found, for which the scans of the search are no evidence."""
         places = self.state.places + 1
@@ -162,7 +159,7 @@ class Verdict:
         readings: Mapping[int, tuple[Any, ...]],
         evidence: float = -math.inf,
     ) -> float:
-        """Judge a pose by the last readings, at most once per correction, and less often if the pose is sure.
+        """Judge a pose by the last readings, unless it is sure and they add almost nothing.
 
         Args:
             pose: (3,) estimated pose.
@@ -174,8 +171,8 @@ class Verdict:
             Share of the beams that the pose explains; NaN without beams.
         """
         state, spread = self.state, spread_of(covariance)
-        self._asked = state.corrections, pose
-        if state.judged == state.corrections or self._adds_nothing(pose, spread, evidence):
+        self._pose = pose
+        if self._adds_nothing(pose, spread, evidence):
             return state.explained
         scans = sightings(self._sensors, readings, pose, covariance)
         ratio, explained = evidence_of_scan(scans)
@@ -209,8 +206,7 @@ class Verdict:
             readings: Readings of the next correction by the index of their sensor.
             motion: The motion before it; None without one.
         """
-        state, (asked, pose) = self.state, self._asked
-        if asked != state.corrections or pose is None or self._stays(pose, STILL if motion is None else motion):
+        if self._pose is None or self._stays(self._pose, STILL if motion is None else motion):
             return []
         scans = []
         for index, (ranges, *_) in readings.items():
@@ -227,12 +223,8 @@ class Verdict:
         before = state.belief.pose
         if before is None or state.judged < 0 or state.belief.wrong > _SURE or state.ratios:
             return False
-        first, ahead, left, second = motion.mean
-        x, y, theta = pose.tolist()
-        c, s = math.cos(theta + first), math.sin(theta + first)
-        near = math.hypot(x + c * ahead - s * left - before[0], y + s * ahead + c * left - before[1]) < _WAY
-        turn = abs(math.remainder(theta + first + second - before[2], math.tau))
-        return near and turn < _TURNED and state.corrections + 1 - state.judged < _SELDOM
+        way, turn = motion_between(motion.after(pose.tolist()), before)
+        return way < _WAY and turn < _TURNED and state.corrections + 1 - state.judged < _SELDOM
 
     def compared(self, pose: np.ndarray, covariance: np.ndarray, ratio: float) -> None:
         """Add a comparison of the pose judged last with other places of the map, unless the pose is wide.
@@ -255,9 +247,8 @@ class Verdict:
             return False
         if not evidence >= state.evidence - _DROP:
             return False
-        near = math.hypot(pose[0] - before[0], pose[1] - before[1]) < _WAY
-        turn = abs(math.remainder(float(pose[2]) - before[2], math.tau))
-        return near and turn < _TURNED and state.corrections - state.judged < _SELDOM
+        way, turn = motion_between(pose, before)
+        return way < _WAY and turn < _TURNED and state.corrections - state.judged < _SELDOM
 
 
 def sightings(

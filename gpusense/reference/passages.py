@@ -34,8 +34,9 @@ def is_wall(value: np.ndarray, occupied: int) -> np.ndarray:
 
 
 def walk_ray(
-    start: np.ndarray, slope: np.ndarray, steps: np.ndarray, cells: np.ndarray, rows: int, cols: int, occupied: int
-) -> np.ndarray:
+    start: np.ndarray, slope: np.ndarray, steps: np.ndarray, cells: np.ndarray, part: tuple[int, int], rows: int,
+    cols: int, occupied: int,
+) -> np.ndarray:  # fmt: skip
     """Return the distances (2, R) along rays to the first wall, and to the first unknown cell before it [cells].
 
     They are infinite for none. A pair of walls that share a corner stops a ray.
@@ -44,9 +45,10 @@ def walk_ray(
         start: (2, R) columns and rows where rays begin [cells].
         slope: (2, R) directions.
         steps: (R,) numbers of steps.
-        cells: Values of the map's cells.
-        rows: Rows of the map.
-        cols: Columns of the map.
+        cells: Values of the cells of a part of the map.
+        part: Column and row of the map at which the part begins.
+        rows: Rows of the part.
+        cols: Columns of the part.
         occupied: Least value of a wall.
     """
     # All steps of all rays in sequence.
@@ -54,7 +56,7 @@ def walk_ray(
     number = np.arange(len(ray))
     number -= (steps.cumsum() - steps).repeat(steps)
     distance = STEP * number
-    col, row = (_cells_along(start[axis], slope[axis], steps, distance) for axis in (0, 1))
+    col, row = (_cells_along(start[axis], slope[axis], steps, distance) - np.int32(part[axis]) for axis in (0, 1))
     # As unsigned numbers, negative indices exceed every limit.
     within = (col.view(np.uint32) < cols) & (row.view(np.uint32) < rows)
     index = row.astype(np.int64)
@@ -89,7 +91,7 @@ def _cells_along(start: np.ndarray, slope: np.ndarray, steps: np.ndarray, distan
 
 def walk_beside(
     direction: np.ndarray, origin: tuple[float, float], companion: tuple[float, float], steps: np.ndarray,
-    cells: np.ndarray, rows: int, cols: int, cell: float, occupied: int,
+    cells: np.ndarray, part: tuple[int, int], rows: int, cols: int, cell: float, occupied: int,
 ) -> np.ndarray:  # fmt: skip
     """Return the distances (2, 3, B) [m] along beams and their companions on both sides.
 
@@ -98,9 +100,10 @@ def walk_beside(
         origin: Where the beams begin [m].
         companion: Distance by which companions start beside a beam [m], and angle by which they diverge [rad].
         steps: (B,) numbers of steps.
-        cells: Values of the map's cells.
-        rows: Rows of the map.
-        cols: Columns of the map.
+        cells: Values of the cells of a part of the map.
+        part: Column and row of the map at which the part begins.
+        rows: Rows of the part.
+        cols: Columns of the part.
         cell: Side of a cell [m].
         occupied: Least value of a wall.
     """
@@ -113,22 +116,19 @@ def walk_beside(
     start /= cell
     np.minimum(np.maximum(start, -AFAR, out=start), AFAR, out=start)
     first = walk_ray(
-        start.reshape(2, -1), slope.reshape(2, -1), np.tile(steps, len(SIDES)), cells, rows, cols, occupied
+        start.reshape(2, -1), slope.reshape(2, -1), np.tile(steps, len(SIDES)), cells, part, rows, cols, occupied
     )
     return first.reshape(slope.shape) * cell
 
 
-def origin_of(estimate: np.ndarray, frame: structs.Frame, rules: structs.BeamRules) -> tuple[float, float]:
-    """Return where the beams of an estimated pose begin, relative to the corner of the cells, along the axes [m]."""
+def origin_of(estimate: np.ndarray, frame: structs.Frame) -> tuple[float, float]:
+    """Return where the beams of an estimated pose begin, along the map's axes [m]."""
     x, y = float(estimate[0]) - frame.origin_x, float(estimate[1]) - frame.origin_y
     if frame.mount_x != 0 or frame.mount_y != 0:
         cos, sin = (float(part[0]) for part in cos_sin(estimate[2:3]))
         x += cos * frame.mount_x - sin * frame.mount_y
         y += sin * frame.mount_x + cos * frame.mount_y
-    return (
-        frame.yaw_cos * x + frame.yaw_sin * y - rules.corner_x,
-        frame.yaw_cos * y - frame.yaw_sin * x - rules.corner_y,
-    )
+    return frame.yaw_cos * x + frame.yaw_sin * y, frame.yaw_cos * y - frame.yaw_sin * x
 
 
 def deviations_of(estimate: np.ndarray) -> tuple[float, float]:
@@ -155,7 +155,7 @@ def judge_beams(
     beam. The result has their classes, then the distances to the first wall on the beam itself.
     """
     relative, measured = scan[: 2 * beams].reshape(2, beams)
-    origin, (position, turn) = origin_of(estimate, frame, rules), deviations_of(estimate)
+    origin, (position, turn) = origin_of(estimate, frame), deviations_of(estimate)
     beside = min(max(rules.beside, position), rules.most_beside)
     companion = beside, min(max(rules.apart, turn), rules.most_apart) + rules.cone
     direction, cell = relative + estimate[2], frame.resolution
@@ -168,7 +168,8 @@ def judge_beams(
     steps = (np.minimum(after, rules.limit) / (cell * STEP)).astype(np.int64) + 1
     # A ray gives no evidence beyond the first unknown cell.
     end = np.where(returned, before, reading)
-    first, unknown = walk_beside(direction, origin, companion, steps, cells, rows, cols, cell, rules.occupied)
+    part = rules.left, rules.top
+    first, unknown = walk_beside(direction, origin, companion, steps, cells, part, rows, cols, cell, rules.occupied)
     seen, own = unknown >= np.minimum(first, end), first[0]
     alone = within & (own >= before) & (own <= after) & seen[0]
     nearest, farthest, seen = first.min(axis=0), first.max(axis=0), seen.all(axis=0)

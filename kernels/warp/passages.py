@@ -77,11 +77,12 @@ def is_wall(value: wp.int32, occupied: wp.int32):
 
 
 # Return the distances along a ray to the first wall, and to the first unknown cell before it [cells]; infinite for
-# none. A pair of walls that share a corner stops a ray. The steps are those from begin to before end.
+# none. A pair of walls that share a corner stops a ray. The steps are those from begin to before end. The cells are a
+# part of the map, which begins at a column and a row of the map.
 @wp.func
 def walk_ray(
-    start: wp.vec2d, slope: wp.vec2d, begin: wp.int32, end: wp.int32, cells: wp.array(dtype=wp.uint8), rows: wp.int32,
-    cols: wp.int32, occupied: wp.int32,
+    start: wp.vec2d, slope: wp.vec2d, begin: wp.int32, end: wp.int32, cells: wp.array(dtype=wp.uint8), part: wp.vec2i,
+    rows: wp.int32, cols: wp.int32, occupied: wp.int32,
 ):  # fmt: skip
     wall = wp.float64(FOREVER)
     unknown = wp.float64(FOREVER)
@@ -90,14 +91,14 @@ def walk_ray(
     value_before = int(OFF)
     if begin > 0:
         last = STEP * wp.float64(begin - 1)
-        col_before = wp.int32(wp.floor(slope.x * last + start.x))
-        row_before = wp.int32(wp.floor(slope.y * last + start.y))
+        col_before = wp.int32(wp.floor(slope.x * last + start.x)) - part[0]
+        row_before = wp.int32(wp.floor(slope.y * last + start.y)) - part[1]
         value_before = value_at(cells, col_before, row_before, rows, cols)
     k = begin + 0
     while k < end:
         distance = STEP * wp.float64(k)
-        col = wp.int32(wp.floor(slope.x * distance + start.x))
-        row = wp.int32(wp.floor(slope.y * distance + start.y))
+        col = wp.int32(wp.floor(slope.x * distance + start.x)) - part[0]
+        row = wp.int32(wp.floor(slope.y * distance + start.y)) - part[1]
         value = value_at(cells, col, row, rows, cols)
         stops = is_wall(value, occupied)
         if col != col_before and row != row_before and value != OFF and value_before != OFF:
@@ -120,7 +121,7 @@ def walk_ray(
 def make(name, flags):
     """Make a kernel of the file for a set of flags."""
     structs = precision(flags)
-    BeamRules, Frame = structs.BeamRules, structs.Frame
+    Frame = structs.Frame
     cos_sin = heading.functions(flags & {"HUGE_HEADINGS"}).cos_sin
     IN_TEAMS = "IN_TEAMS" in flags
     TEAM = 1
@@ -132,8 +133,8 @@ def make(name, flags):
     @wp.func
     def walk_beside(
         side: wp.float64, direction: wp.float64, origin: wp.vec2d, companion: wp.vec2d, steps: wp.int32,
-        cells: wp.array(dtype=wp.uint8), rows: wp.int32, cols: wp.int32, cell: wp.float64, occupied: wp.int32,
-        member: wp.int32,
+        cells: wp.array(dtype=wp.uint8), part: wp.vec2i, rows: wp.int32, cols: wp.int32, cell: wp.float64,
+        occupied: wp.int32, member: wp.int32,
     ):  # fmt: skip
         along = cos_sin(direction)
         slope = cos_sin(direction + side * companion.y)
@@ -142,28 +143,25 @@ def make(name, flags):
         y = (origin.y + shift * along.x) / cell
         start = wp.vec2d(wp.min(wp.max(x, MINUS_AFAR), AFAR), wp.min(wp.max(y, MINUS_AFAR), AFAR))
         if not IN_TEAMS:
-            return walk_ray(start, slope, 0, steps, cells, rows, cols, occupied) * cell
+            return walk_ray(start, slope, 0, steps, cells, part, rows, cols, occupied) * cell
         share = (steps + walkers() - 1) / walkers()
         begin = member * share
-        own = walk_ray(start, slope, begin, wp.min(begin + share, steps), cells, rows, cols, occupied)
+        own = walk_ray(start, slope, begin, wp.min(begin + share, steps), cells, part, rows, cols, occupied)
         first = least_of_team(own)
         if first.y > first.x:
             first = wp.vec2d(first.x, FOREVER)
         return first * cell
 
-    # Return where the beams of an estimated pose begin, relative to the corner of the cells along the map's axes [m].
+    # Return where the beams of an estimated pose begin, along the map's axes [m].
     @wp.func
-    def origin_of(estimate: wp.array(dtype=wp.float64), frame: Frame, rules: BeamRules):
+    def origin_of(estimate: wp.array(dtype=wp.float64), frame: Frame):
         x = estimate[0] - frame.origin_x
         y = estimate[1] - frame.origin_y
         if frame.mount_x != ZERO or frame.mount_y != ZERO:
             heading = cos_sin(estimate[2])
             x += heading.x * frame.mount_x - heading.y * frame.mount_y
             y += heading.y * frame.mount_x + heading.x * frame.mount_y
-        return wp.vec2d(
-            frame.yaw_cos * x + frame.yaw_sin * y - rules.corner_x,
-            frame.yaw_cos * y - frame.yaw_sin * x - rules.corner_y,
-        )
+        return wp.vec2d(frame.yaw_cos * x + frame.yaw_sin * y, frame.yaw_cos * y - frame.yaw_sin * x)
 
     # Return the largest deviation of an estimated position over directions [m], and that of the heading [rad]. Both are
     # infinite if the covariance is not finite; a variance is negative by rounding.
@@ -195,7 +193,7 @@ def make(name, flags):
             judged[b] = ZERO
             judged[beams + b] = FOREVER
             return
-        origin = origin_of(estimate, frame, rules)
+        origin = origin_of(estimate, frame)
         deviation = deviations_of(estimate)
         near = wp.min(deviation.x, rules.most_beside)
         companion = wp.vec2d(
@@ -205,6 +203,7 @@ def make(name, flags):
         direction = scan[b] + estimate[2]
         cell = frame.resolution
         wall = rules.occupied
+        part = wp.vec2i(rules.left, rules.top)
         returned = reading < rules.range_max
         if not returned:
             reading = rules.range_max
@@ -215,14 +214,16 @@ def make(name, flags):
         steps = wp.int32(wp.min(after, rules.limit) / (cell * STEP)) + 1
         # A ray gives no evidence beyond the first unknown cell.
         end = wp.where(returned, before, reading)
-        own = walk_beside(ZERO, direction, origin, companion, steps, cells, rows, cols, cell, wall, member)
+        own = walk_beside(ZERO, direction, origin, companion, steps, cells, part, rows, cols, cell, wall, member)
         seen = own.y >= wp.min(own.x, end)
         kind = NOTHING
         if within and own.x >= before and own.x <= after and seen:
             kind = AGREES
         else:
-            left = walk_beside(ONE, direction, origin, companion, steps, cells, rows, cols, cell, wall, member)
-            right = walk_beside(MINUS_ONE, direction, origin, companion, steps, cells, rows, cols, cell, wall, member)
+            left = walk_beside(ONE, direction, origin, companion, steps, cells, part, rows, cols, cell, wall, member)
+            right = walk_beside(
+                MINUS_ONE, direction, origin, companion, steps, cells, part, rows, cols, cell, wall, member
+            )
             nearest = wp.min(own.x, wp.min(left.x, right.x))
             farthest = wp.max(own.x, wp.max(left.x, right.x))
             seen = seen and left.y >= wp.min(left.x, end) and right.y >= wp.min(right.x, end)

@@ -26,7 +26,10 @@ if TYPE_CHECKING:
     from gpusense.evaluation.steps import Step
     from gpusense.evaluation.tracking import Track
     from gpusense.localization.filter import ParticleFilter
+    from gpusense.plots.animation import Animation
     from gpusense.plots.viewer import Recording
+
+    Recorder = Recording | Animation
 
 NAME = "localize"
 HELP = "Localise a robot along a recorded log with a particle filter."
@@ -37,7 +40,7 @@ EPILOG = """\
 The filter begins around the first reference pose or that of --start, with deviations of 0.5 m and 0.26 rad, or with
 --global anywhere in the free space of the map. It moves with the log's odometry and weighs each chosen scan. Errors
 are those of the weighted mean against reference poses: those of --reference, or the logged ones. They count from the
-first scan on after which the next five are within 1 m and 20 degrees. With -v, coverage is the share
+first of five scans in a row that are within 1 m and 20 degrees. With -v, coverage is the share
 of reference poses inside the 50, 80 and 95 % regions of the estimate. A rank is the share of particles behind a
 reference pose, to its right, or clockwise of it: many near 0 and 100 % are overconfidence. NEES is the squared distance
 of a reference pose in deviations.
@@ -57,6 +60,7 @@ Exit codes: 0 the verdict is 'tracking', 1 uncertain or lost at the end, or no r
 examples:
   gpusense localize --map map.yaml --log run.log.gz
   gpusense localize --map map.yaml --log run.log.gz --global --particles 20000 --tum run.tum --plot run.png
+  gpusense localize --map map.yaml --log run.bag --global --animate run.gif
   gpusense localize --map map.yaml --log run.bag --topic /front --start 1.5 -2 0.3
   gpusense localize --map map.yaml --log run.mcap --parameters nav2_params.yaml
   gpusense localize --map map.yaml --log run.log.gz --every 2 --offset 1 --parameters fitted/parameters.yaml"""
@@ -108,6 +112,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "(default: %(default)s)")  # fmt: skip
     add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
         help="draw map, particles, estimated and reference poses")  # fmt: skip
+    add("--animate", type=output_path(".gif"), metavar="FILE", help="animate the run: particles, scan, verdict")
     add("--record", type=output_path(".rrd"), metavar="FILE", help="record the run for the viewer Rerun")
 
 
@@ -124,33 +129,38 @@ def run(args: argparse.Namespace) -> int:
     pf = make_filter(args, grid, steps, read)
     pose, covariance = start_of(args, read.nav2) or (None, None)
     start(pf, steps, everywhere=args.everywhere, pose=pose, covariance=covariance)
-    track, recording = Track(), _recording(args, pf)
+    track, recorders = Track(), _recorders(args, pf, len(steps))
     try:
         with progress(len(steps)) as step:
             step("starting")
             for one in follow(pf, steps, track):
                 step(_text(track, one))
-                if recording is not None:
-                    recording.add(pf, track, one)
+                for recorder in recorders.values():
+                    recorder.add(pf, track, one)
     except KeyboardInterrupt:
         if track.steps:
-            report(args, pf, track, len(steps), recording)
+            report(args, pf, track, len(steps), recorders)
         raise
-    found = report(args, pf, track, len(steps), recording)
+    found = report(args, pf, track, len(steps), recorders)
     return 0 if found["verdict"] == "tracking" and found["explained_at_end"] is not None else LOST
 
 
-def _recording(args: argparse.Namespace, pf: ParticleFilter) -> Recording | None:
-    """Begin a recording; None if none is requested.
+def _recorders(args: argparse.Namespace, pf: ParticleFilter, scans: int) -> dict[Path, Recorder]:
+    """Return what records the run, by the files that the options name.
 
     Raises:
-        ImportError: the library is not installed.
+        ImportError: The viewer's library is not installed.
     """
-    if args.record is None:
-        return None
-    from gpusense.plots.viewer import Recording
+    recorders: dict[Path, Recorder] = {}
+    if args.record is not None:
+        from gpusense.plots.viewer import Recording
 
-    return Recording(pf.grid)
+        recorders[args.record] = Recording(pf.grid)
+    if args.animate is not None:
+        from gpusense.plots.animation import Animation
+
+        recorders[args.animate] = Animation(pf.grid, scans)
+    return recorders
 
 
 def _text(track: Track, step: Step) -> str:

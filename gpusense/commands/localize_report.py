@@ -14,9 +14,9 @@ from gpusense.commands.scans import scan_times
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
+    from gpusense.commands.localize import Recorder
     from gpusense.evaluation.tracking import Track
     from gpusense.localization.filter import ParticleFilter
-    from gpusense.plots.viewer import Recording
 
 
 # Figures that are not a single number.
@@ -25,7 +25,7 @@ _PARTS = ("predict", "score", "resample", "estimate")
 
 
 def report(
-    args: argparse.Namespace, pf: ParticleFilter, track: Track, chosen: int, recording: Recording | None
+    args: argparse.Namespace, pf: ParticleFilter, track: Track, chosen: int, recorders: dict[Path, Recorder]
 ) -> dict[str, Any]:
     """Write the files, and print the results of all scans, or of the scans before an interrupt.
 
@@ -34,7 +34,7 @@ def report(
         pf: The filter after the last scan.
         track: Estimates of the scans so far.
         chosen: Number of scans chosen by the options.
-        recording: Recording for the viewer, or None.
+        recorders: Recordings of the run by their files.
 
     Returns:
         The figures of :func:`gpusense.evaluation.tracking.summary`.
@@ -54,8 +54,8 @@ def report(
         write_tum(args.tum, times[first:], track.poses[first:], indices=indices)
     if args.plot is not None:
         _draw(args.plot, pf, track)
-    if recording is not None:
-        recording.write(track, args.record)
+    for path, recorder in recorders.items():
+        recorder.write(track, path)
     if args.json:
         options = {name: value for name, value in vars(args).items() if name not in ("run", "command", "json")}
         poses = [[step.index, *pose.tolist()] for step, pose in zip(track.steps, track.poses, strict=True)]
@@ -64,9 +64,8 @@ def report(
         print_json(document | {"poses": poses, "times": times, "machine": machine()})
         return result
     _print(pf, result, chosen, track)
-    for path, opened in ((args.tum, ""), (args.plot, ""), (args.record, f"; open it with: rerun {args.record}")):
-        if path is not None:
-            print(f"written    {path}{opened}")
+    for path in filter(None, (args.tum, args.plot, *recorders)):
+        print(f"written    {path}{f'; open it with: rerun {path}' if path == args.record else ''}")
     if args.verbose:
         _print_details(pf, result)
     return result

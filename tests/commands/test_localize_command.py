@@ -16,6 +16,7 @@ import gpusense as gs
 from gpusense.commands import cli
 from gpusense.evaluation import tracking
 from gpusense.evaluation.steps import read_steps
+from gpusense.plots import animation
 
 BEARINGS = np.radians(np.arange(-90, 91, 1.0))
 
@@ -273,3 +274,19 @@ def test_a_run_is_recorded_for_the_viewer(place, capsys, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "rerun", None)
     message = error_of(call(place, "--record", str(path)), capsys)
     assert "needs the library rerun-sdk, which is not installed" in message and "pip install '.[rerun]'" in message
+
+
+def test_a_run_is_animated(place, tmp_path, capsys, monkeypatch):
+    from PIL import Image
+
+    path = tmp_path / "run.gif"
+    assert cli.main(call(place, "--animate", str(path))) == 0
+    assert f"written    {path}" in capsys.readouterr().out
+    with Image.open(path) as movie:
+        assert movie.n_frames == 12 and movie.info["loop"] == 0
+        frames = [movie.seek(number) or movie.convert("RGB").tobytes() for number in (0, 6, 11)]
+    assert len(set(frames)) == 3
+    monkeypatch.setattr(animation, "FRAMES", 5)
+    assert cli.main(call(place, "--animate", str(path))) == 0
+    with Image.open(path) as movie:
+        assert movie.n_frames == 4

@@ -30,10 +30,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from commits import git
 from error_vs_time.choices import SHOWN, WISHES, answer, chosen
-from error_vs_time.reports import ROWS
+from error_vs_time.reports import LISTS, ROWS, parsed
 
 from gpusense._util.files import write_whole
-from gpusense.evaluation.benchmark.report import SCHEMA, table
+from gpusense.evaluation.benchmark.report import table
 
 COUNTS = Path(__file__).with_name("agreement.csv")
 
@@ -63,13 +63,13 @@ class Report:
     def whole_runs(self) -> bool:
         """Tell whether a processor's tasks are timed as whole runs."""
         return self.kind == "tasks" and any(
-            row["kind"] == "cpu" and "by_run" not in row for row in self.measured.values()
+            row["kind"] == "cpu" and not row.get("by_run") for row in self.measured.values()
         )
 
     def within(self, common: set[tuple[Any, ...]]) -> dict[str, Any]:
         """Return the document with only these points or rows."""
         kept = [point for key, point in self.measured.items() if key in common]
-        return {**self.document, "points" if self.kind == "models" else "rows": kept}
+        return {**self.document, LISTS[self.kind]: kept}
 
 
 @dataclass(frozen=True)
@@ -93,11 +93,12 @@ class Answer:
 
 def report_of(name: str, text: str) -> Report | None:
     """Return a report from its text; None for one of another form, or of several devices."""
-    document = json.loads(text)
-    kind = "tasks" if document.get("kind") == "needs" else "models"
-    if kind == "models" and document.get("schema") != SCHEMA:
+    kind = "tasks" if json.loads(text).get("kind") == "needs" else "models"
+    try:
+        document = parsed(text, name, kind)
+    except ValueError:
         return None
-    points = [point for point in document["points" if kind == "models" else "rows"] if point["backend"] != "outside"]
+    points = [point for point in document[LISTS[kind]] if point["backend"] != "outside"]
     able = [point for point in points if (point["status"] == "ok" if kind == "models" else point["seconds"])]
     measured = {tuple(point[name] for name in KEYS[kind]): point for point in able}
     name = f"{name}, {document['date']}"

@@ -24,15 +24,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import needs
+import reports
 from common import command_line, note, stated_commit
-from reports import read_tasks
 
-from gpusense._util.files import write_whole
 from gpusense.backends import get_backend
 from gpusense.commands import bench
-from gpusense.evaluation.benchmark.report import document, plain, to_json
+from gpusense.evaluation.benchmark.report import document, plain
 from gpusense.evaluation.benchmark.runner import Outcome, Plan, run
-from gpusense.evaluation.benchmark.stored import read_report
 from gpusense.evaluation.machine import machine
 
 SIZE = ["--particles", "10000", "--beams", "360", "--repeats", "15"]
@@ -148,7 +146,7 @@ def earlier(output: Path, kind: str, stated: str) -> dict[str, Any] | None:
     file = output.with_name(f"{output.name}_{kind}.json")
     if not file.is_file():
         return None
-    report = (read_report if kind == "models" else read_tasks)(file)
+    report = reports.read(file, kind)
     same(report["commit"], stated, "the commit")
     same(report["machine"], plain(machine()), "the machine")
     return report
@@ -187,7 +185,7 @@ def main() -> None:
 def write(output: Path, kind: str, report: dict[str, Any]) -> None:
     """Write a report."""
     file = output.with_name(f"{output.name}_{kind}.json")
-    write_whole(file, lambda stream: stream.write(to_json(report).encode()))
+    reports.write(file, report, kind)
     note(f"written: {file.name}")
 
 

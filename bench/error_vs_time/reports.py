@@ -1,4 +1,8 @@
-"""Read the reports that docs/error-vs-time.md is made of, as rows of one form; refuse reports of other code."""
+"""Read and write the reports behind docs/error-vs-time.md; refuse reports of other code.
+
+A report file holds the fields that the page shows. ``same`` lists the fields with a single value, ``lines`` contains a
+row for each point or task, and a row refers to strings by their index in ``texts``.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +20,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from commits import ROOT, commits_since
 
-from gpusense.evaluation.benchmark.rows import ALL, Row, model_rows, origin_of, titles_of
-from gpusense.evaluation.benchmark.stored import read_report
+from gpusense._util.files import write_whole
+from gpusense.evaluation.benchmark.rows import ALL, MODEL_MEASURES, Row, model_rows, origin_of, titles_of
 
 RESULTS = ROOT / "bench" / "results"
 PATTERN = "error_vs_time_*_{}.json"
@@ -27,6 +31,16 @@ LIMIT = 100
 TASK_MEASURES = {"median": "median error", "p95": "95 % error", "max": "largest error"}
 UNITS = {"%": "relative"}
 DISCRETE = "gs.DiscreteBeamModel(gs.BeamParameters(), range_max=scanner.range_max)"
+# The list and the version of each kind of report.
+LISTS = {"models": "points", "tasks": "rows"}
+SCHEMAS = {"models": 2, "tasks": 1}
+POINT = (
+    "scene", "cloud", "problem", "backend", "device", "kind", "method", "variant", "knob", "value", "code", "precision",
+    "exact", "outside", "particles", "beams", "work", "checked", "status", "reason",
+    *(f"time.{name}" for name in ("call_min_s", "call_q1_s", "call_median_s", "call_q3_s", "processor_s")),
+    *dict.fromkeys(".".join(("errors", *place)) for each in MODEL_MEASURES.values() for place, *_ in each),
+)  # fmt: skip
+"""Fields of a point that a report file holds."""
 # Relative standard deviation of a run's median error by need, for reports of few runs.
 SPREAD = {"localisation": 0.15, "learning": 0.3}
 
@@ -50,7 +64,7 @@ class Source:
     @property
     def missing(self) -> str:
         """Return a phrase with the number of points or settings, and of those left out or failed."""
-        points = self.report["points" if self.kind == "models" else "rows"]
+        points = self.report[LISTS[self.kind]]
         lost = sum(one["status"] != "ok" if self.kind == "models" else one["seconds"] is None for one in points)
         return f"{lost} of {len(points)}"
 
@@ -85,12 +99,12 @@ def sources(folder: Path = RESULTS) -> list[Source]:
         ValueError: A report is damaged, or of uncommitted changes, or two are of the same device.
     """
     found = []
-    for kind, read in (("models", read_report), ("tasks", read_tasks)):
+    for kind in LISTS:
         for file in sorted(folder.glob(PATTERN.format(kind))):
-            report = read(file)
+            report = read(file, kind)
             if not report["commit"] or report["commit"].endswith("+"):
                 raise ValueError(f"{file.name}: {commit_trouble(report['commit'] or '')}")
-            points = report["points" if kind == "models" else "rows"]
+            points = report[LISTS[kind]]
             named = titles_of(
                 (p for p in points if p["backend"] != "outside"), report["machine"], report.get("devices", ())
             )
@@ -108,16 +122,79 @@ def _place(source: Source) -> tuple[bool, str, str]:
     return any("NVIDIA" in title for title in source.titles), device, source.kind
 
 
-def read_tasks(file: Path) -> dict[str, Any]:
-    """Read a report of needs.py.
+# ---- files
+
+
+def write(file: Path, report: Mapping[str, Any], kind: str) -> None:
+    """Write the fields of a report that the page shows."""
+    flat = [_flat(one) for one in report[LISTS[kind]]]
+    fields = [name for name in dict.fromkeys(name for one in flat for name in one) if kind == "tasks" or name in POINT]
+    columns = {name: [one.get(name) for one in flat] for name in fields}
+    same = {name: column[0] for name, column in columns.items() if all(value == column[0] for value in column)}
+    texts: dict[str, list[Any]] = {}
+    for name in fields:
+        if name not in same and any(isinstance(value, (str, bool)) for value in columns[name]):
+            texts[name] = list(dict.fromkeys(columns[name]))
+            columns[name] = [texts[name].index(value) for value in columns[name]]
+    varied = [name for name in fields if name not in same]
+    lines = list(zip(*(columns[name] for name in varied), strict=True)) if varied else [()] * len(flat)
+    left_out = (LISTS[kind], "profiles", "absent", "truth")
+    head = {name: value for name, value in report.items() if name not in left_out}
+    head |= {"same": same, "texts": texts, "fields": varied}
+    if "scenes" in head:
+        head["scenes"] = [{name: scene.get(name) for name in ("name", "fingerprint")} for scene in head["scenes"]]
+    parts = [f"{json.dumps(name)}: {_json(value)}" for name, value in head.items()]
+    parts.append('"lines": [\n' + ",\n".join(map(_json, lines)) + "\n]")
+    write_whole(file, lambda stream: stream.write(("{" + ",\n".join(parts) + "}\n").encode()))
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, allow_nan=False, separators=(",", ":"))
+
+
+def read(file: Path, kind: str) -> dict[str, Any]:
+    """Read a report file.
 
     Raises:
-        ValueError: The file is not such a report.
+        ValueError: The file is not a report of this kind.
     """
-    report = json.loads(file.read_text(encoding="utf-8"))
-    if not isinstance(report, dict) or report.get("kind") != "needs" or report.get("schema") != 1:
-        raise ValueError(f"{file.name}: must be a report of bench/error_vs_time/needs.py")
+    return parsed(file.read_text(encoding="utf-8"), file.name, kind)
+
+
+def parsed(text: str, name: str, kind: str) -> dict[str, Any]:
+    """Read a report from its text; see :func:`read`."""
+    report = json.loads(text)
+    if not isinstance(report, dict) or report.get("schema") != SCHEMAS[kind]:
+        raise ValueError(f"{name}: must be a report of {kind} by bench/error_vs_time/measure.py")
+    # Reports in the history before this form hold the list itself.
+    if LISTS[kind] not in report:
+        same, texts, fields, lines = (report.pop(key) for key in ("same", "texts", "fields", "lines"))
+        report[LISTS[kind]] = [
+            _nested(same | {n: texts[n][v] if n in texts else v for n, v in zip(fields, line, strict=True)})
+            for line in lines
+        ]
     return report
+
+
+def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested fields by dotted names."""
+    found: dict[str, Any] = {}
+    for name, item in value.items():
+        found |= _flat(item, f"{prefix}{name}.") if isinstance(item, Mapping) else {prefix + name: item}
+    return found
+
+
+def _nested(flat: Mapping[str, Any]) -> Any:
+    """Return fields with dotted names as nested ones; a mapping of nothing but None is None."""
+    if all(value is None for value in flat.values()):
+        return None
+    inner: dict[str, dict[str, Any]] = {}
+    for name, value in flat.items():
+        head, dot, rest = name.partition(".")
+        if dot:
+            inner.setdefault(head, {})[rest] = value
+    plain = {name: value for name, value in flat.items() if "." not in name}
+    return plain | {name: _nested(value) for name, value in inner.items()}
 
 
 # ---- rows
@@ -137,7 +214,7 @@ def task_rows(report: Mapping[str, Any]) -> list[Row]:
             Row(
                 one["need"], titles[one["backend"]], ALL, one["method"], one["setting"], one["precision"],
                 code_of(one["code"]), seconds, quartiles, errors, dict.fromkeys(errors, unit),
-                outside=one.get("outside", ""), origin=origin, doubt=doubt(one),
+                outside=one.get("outside") or "", origin=origin, doubt=doubt(one),
             )
         )  # fmt: skip
     return rows
@@ -153,7 +230,7 @@ def code_of(text: str) -> str:
 
 def doubt(row: Mapping[str, Any]) -> float:
     """Return the factor by which the error of other seeds may exceed a row's error, at two standard deviations."""
-    errors = row.get("by_run", {}).get("error", ())
+    errors = (row.get("by_run") or {}).get("error") or ()
     spread = SPREAD.get(row["need"], 0.0)
     if len(errors) > 2 and spread:
         middle = statistics.fmean(errors)

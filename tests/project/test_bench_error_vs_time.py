@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import json
 import subprocess
 import sys
 from collections.abc import Callable
@@ -184,7 +183,7 @@ def test_tasks_are_measured(
     given = argparse.Namespace(need=["landmarks"], rounds=2, seconds=99.0, longest=99.0, commit="abc", no_peers=True)
     report = tasks.report_of(given, [selection], "python bench/error_vs_time/needs.py")
     measure.write(tmp_path / "x", "tasks", report)
-    assert json.loads((tmp_path / "x_tasks.json").read_text()) == report
+    assert measure.reports.read(tmp_path / "x_tasks.json", "tasks") == report
     assert (report["kind"], report["commit"]) == ("needs", "abc")
     rows = {(row["method"], row["precision"]): row for row in report["rows"]}
     assert rows["known", "float64"]["error"]["max"] < 1e-9 < 1e-3 < rows["nearest", "float32"]["error"]["median"]

@@ -71,6 +71,31 @@ def test_reports_state_command_and_device(reports: ModuleType) -> None:
         assert "--quick" not in source.report["command"], f"{source.name}: of 512 particles"
 
 
+def test_a_report_is_stored_as_a_table(reports: ModuleType, tmp_path: Path) -> None:
+    """A stored report has the same rows; results in git stay small; a report of another form is refused."""
+    failed = task("icp", "", 1, 1) | {"seconds": None, "error": None, "processor_s": None}
+    lists = {
+        "tasks": [task("beam", "9 x 6", 1.5, 0.25), task("field", "8 x 6", 2.5, 0.5, outside="x 1"), failed],
+        "models": [
+            made_point(method="dda"), made_point(method="lookup", knob="bins", value=32, exact=True),
+            made_point(cloud="tracking", status="left out", time=None, errors=None),
+        ],
+    }  # fmt: skip
+    for kind, rows in lists.items():
+        head = {"schema": reports.SCHEMAS[kind], "machine": {"processors": 2, "processor": "X"}, "date": "2026-01-01",
+                "commit": "abc", "command": "python x"}  # fmt: skip
+        report = head | {reports.LISTS[kind]: rows}
+        reports.write(tmp_path / "x", report, kind)
+        stored = reports.read(tmp_path / "x", kind)
+        assert reports.ROWS[kind](stored) == reports.ROWS[kind](report) and reports.ROWS[kind](report)
+        assert {name: stored[name] for name in head} == head
+        assert (reports.Source("x", kind, stored, ()).missing)[0] == "1"
+        (tmp_path / "x").write_text(json.dumps(head | {"schema": 7, reports.LISTS[kind]: []}))
+        with pytest.raises(ValueError, match=f"must be a report of {kind}"):
+            reports.read(tmp_path / "x", kind)
+    assert sum(file.stat().st_size for file in reports.RESULTS.iterdir()) < 1.2e6
+
+
 # ---- commits
 
 

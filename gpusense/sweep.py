@@ -1,12 +1,11 @@
 """Sweeps: jobs as plain data, run on processes or a Dask cluster, with a table that survives crashes."""
 
 from gpusense.sweeps.cluster import DaskExecutor
-from gpusense.sweeps.deaths import JobTimeout, WorkerDied
 from gpusense.sweeps.executors import ProcessExecutor, SerialExecutor
 from gpusense.sweeps.job import Job
 from gpusense.sweeps.plan import read_plan
-from gpusense.sweeps.run import Sweep, run
-from gpusense.sweeps.starts import SweepLost
+from gpusense.sweeps.process import JobTimeout, WorkerDied
+from gpusense.sweeps.run import Sweep, SweepLost, run
 from gpusense.sweeps.store import Store
 from gpusense.sweeps.table import read_table
 

@@ -36,9 +36,8 @@ _TLS = {
 EPILOG = """\
 A plan is a YAML file: each combination of its axes is a job. docs/sweeps.md describes it.
 
-A row is appended to the table as soon as its job ends. A failed job is a row with its error; one that ends its worker,
-hangs beyond --job-timeout or grows beyond --memory-limit fails alone. After a crash or Ctrl-C, --resume runs the jobs
-that have no row yet.
+A row is appended to the table as soon as its job ends. A failed job is a row with its error; one that ends its worker
+or hangs beyond --job-timeout fails alone. After a crash or Ctrl-C, --resume runs the jobs that have no row yet.
 
 Jobs run in a process of their own; with --processes or several --device in several, one for each device; with --dask on
 a Dask cluster. A cluster of 'local' listens on the loopback only. Whoever reaches the ports of a Dask cluster executes
@@ -49,7 +48,7 @@ Exit codes: 0 success, 1 some jobs failed, 2 bad input, or the cluster ended, 13
 examples:
   gpusense sweep examples/sweep_logs.yaml --root data --table sweep.csv --processes 2 --plot sweep.png
   gpusense sweep plan.yaml --device warp:cuda:0 --device warp:cuda:1
-  gpusense sweep plan.yaml --processes 8 --job-timeout 600 --memory-limit 4GB
+  gpusense sweep plan.yaml --processes 8 --job-timeout 600
   gpusense sweep plan.yaml --dask tcp://10.0.0.1:8786 --resume
   gpusense sweep plan.yaml --dask tls://10.0.0.1:8786 --tls-ca ca.pem --tls-cert cert.pem --tls-key key.pem"""
 
@@ -74,22 +73,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="largest number of starts of a job whose worker ends (default: %(default)s)")  # fmt: skip
     add("--job-timeout", type=positive_number, metavar="SECONDS",
         help="longest time of a job, which then fails, and its worker is replaced (default: none)")  # fmt: skip
-    add("--memory-limit", type=_memory, metavar="SIZE",
-        help="largest memory of a worker, such as 4GB; a worker beyond it is ended, and its job started again, "
-        "up to --attempts times (default: none)")  # fmt: skip
     add("--list", action="store_true", help="print the jobs with their keys, and run none")
     add_json(parser)
     add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
         help="draw error against run time, with a point for each job")  # fmt: skip
-
-
-def _memory(text: str) -> int:
-    from gpusense.sweeps.memory import size
-
-    try:
-        return size("size", text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error).removeprefix("size: ")) from None
 
 
 def run(args: argparse.Namespace) -> int:
@@ -178,29 +165,29 @@ def _executor(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Iterator[Execu
     if given and (args.dask in (None, LOCAL) or len(given) < len(_TLS)):
         rule = "must be given together, and with --dask and an address"
         raise ValueError(f"--tls-ca, --tls-cert, --tls-key: {rule}, got --tls-{given[0]}")
-    limits = {"job_timeout": args.job_timeout, "memory_limit": args.memory_limit}
     if args.dask is not None:
-        with _dask(args, names, limits) as cluster:
+        with _dask(args, names) as cluster:
             if args.dask != LOCAL and not args.no_send:
-                from gpusense.sweeps.job_inputs import contents_of
+                from gpusense.sweeps.store import contents_of
 
                 cluster.send(contents_of(jobs, args.root))
             yield cluster
     else:
-        with ProcessExecutor(names, **limits) as processes:
+        with ProcessExecutor(names, job_timeout=args.job_timeout) as processes:
             yield processes
 
 
 @contextlib.contextmanager
-def _dask(args: argparse.Namespace, names: list[str] | int, limits: dict[str, Any]) -> Iterator[DaskExecutor]:
-    from gpusense.sweeps.cluster import DaskExecutor
-    from gpusense.sweeps.local_cluster import security_of
+def _dask(args: argparse.Namespace, names: list[str] | int) -> Iterator[DaskExecutor]:
+    from gpusense.sweeps.cluster import DaskExecutor, security_of
 
     local = args.dask == LOCAL
     try:
         files = [checks.existing_file(one) for one in (args.tls_ca, args.tls_cert, args.tls_key) if one is not None]
         security = security_of(*files) if files else None
-        cluster = DaskExecutor(None if local else args.dask, devices=names, security=security, **limits)
+        cluster = DaskExecutor(
+            None if local else args.dask, devices=names, security=security, job_timeout=args.job_timeout
+        )
     except ImportError as error:
         raise ValueError(str(error)) from None
     with cluster:

@@ -1,52 +1,57 @@
 """Sweeps on Dask: on a cluster on this machine, which listens on the loopback only, or on a cluster at an address.
 
-A Dask cluster runs what its clients send: whoever reaches its ports executes code there. ``docs/sweeps.md`` has the
-consequences.
+Dask hands jobs to its workers, and its nannies replace workers that end. A job runs in a process of its worker, as on
+all executors, so that its end is no end of the worker.
+
+A Dask cluster runs what its clients send: whoever reaches its ports executes code there; see ``docs/sweeps.md``.
 """
 
 from __future__ import annotations
 
 import contextlib
 import gc
+import itertools
 import logging
 import pickle
 import secrets
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent import futures
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Executor, Future, InvalidStateError
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from gpusense._util import checks
 from gpusense._util.extras import library
-from gpusense.sweeps import on_worker
 from gpusense.sweeps.executors import device_names
-from gpusense.sweeps.local_cluster import RESOURCE, local_cluster
-from gpusense.sweeps.remote import Found, Link, RemoteWorker
-from gpusense.sweeps.supervised import limits_of
-from gpusense.sweeps.watch import Watch
+from gpusense.sweeps.on_worker import DEVICES, answer, one_start, processes
+from gpusense.sweeps.process import WorkerDied, result_of
 
-# Seconds for the scheduler to answer, and for workers to end their jobs.
-_ANSWER, _GOODBYE = 5.0, 10.0
+_LOG = logging.getLogger("gpusense")
+_LOOPBACK = "127.0.0.1"
+# Resource of a Dask worker that represents its device; a job takes one.
+_RESOURCE = "gpusense"
+# Seconds between two checks of the cluster, for the scheduler to answer, and for workers to end their jobs.
+_LOOK, _ANSWER, _GOODBYE = 1.0, 5.0, 10.0
 
 
 class DaskExecutor(Executor):
     """Jobs on a Dask cluster, one at a time on each worker, in a process that the worker supervises.
 
     Workers of a cluster at an address are started by ``GPUSENSE_SWEEP_DEVICE=warp:cuda:0 dask worker ADDRESS
-    --nthreads 1 --resources gpusense=1``, one for each device. If any worker declares this resource, workers without it
+    --nthreads 1 --resources gpusense=1`` for each device. If any worker declares this resource, workers without it
     take no jobs.
 
     Args:
-        address: Address of a scheduler, such as ``"tcp://10.0.0.1:8786"``; None starts a cluster in this process, whose
-            scheduler, workers and dashboard listen on 127.0.0.1 only.
-        devices: Devices of a cluster that is started: selection strings, one for each worker, or the number of workers.
+        address: Address of a scheduler, such as ``"tcp://10.0.0.1:8786"``; None starts a cluster in this process that
+            listens on 127.0.0.1 only.
+        devices: Devices of a cluster that is started: a selection string for each worker, or the number of workers.
         security: A ``distributed.Security`` with certificates for TLS; None takes the certificates of Dask's
             configuration, if any.
-        timeout: Longest time to connect, and to wait for a worker if there is none [s].
+        timeout: Longest time to connect, and to wait for a worker or an answer of the scheduler [s].
         job_timeout: See :class:`ProcessExecutor`.
-        memory_limit: See :class:`ProcessExecutor`; the memory limit of a Dask worker also applies to its jobs.
 
     Attributes:
         slots: Number of workers.
@@ -67,34 +72,30 @@ class DaskExecutor(Executor):
         security: Any = None,
         timeout: float = 30.0,
         job_timeout: float | None = None,
-        memory_limit: int | None = None,
     ) -> None:
         library("distributed", "a sweep on Dask")
-        patience = checks.real("timeout", timeout, above=0)
-        limits = limits_of(job_timeout, memory_limit)
+        self._patience = checks.real("timeout", timeout, above=0)
+        self._seconds = None if job_timeout is None else checks.real("job_timeout", job_timeout, above=0)
         names = device_names(devices) if address is None else []
-        self._name = secrets.token_hex(8)
+        self._name, self._numbers, self._lost = secrets.token_hex(8), itertools.count(), ""
+        self._lock, self._end, self._open = threading.Lock(), threading.Event(), set[Future[Any]]()
         self._client: Any
         self._cluster: Any
         self._client = self._cluster = None
-        self._watch: Watch | None = None
         try:
-            self._connect(address, names, security, patience)
+            self._connect(address, names, security)
             self.address = str(self._client.scheduler.address)
             workers = self._workers()
             if workers is None:
                 raise OSError(f"dask: must have a scheduler that answers, got none at {self.address}")
-            self._pinned = any(one.get("resources", {}).get(RESOURCE) for one in workers.values())
-            options = {"resources": {RESOURCE: 1}} if self._pinned else {}
-            self._watch = Watch(
-                lambda watch: Link(self._client, self._name, limits, options, lambda: watch.lost or self._ended),
-                self._usable, lambda: self._ended, patience,
-            )  # fmt: skip
+            self._pinned = any(one.get("resources", {}).get(_RESOURCE) for one in workers.values())
+            self.slots = self._usable(workers)
+            threading.Thread(target=self._watch, name="gpusense-sweep-watch", daemon=True).start()
         except BaseException:
             self._leave()
             raise
 
-    def _connect(self, address: str | None, names: list[str], security: Any, patience: float) -> None:
+    def _connect(self, address: str | None, names: list[str], security: Any) -> None:
         """Start a cluster or connect to the one at the address, and wait for a worker.
 
         Raises:
@@ -110,11 +111,12 @@ class DaskExecutor(Executor):
         if address is not None:
             _check_address(address)
         try:
-            self._cluster = None if address is not None else local_cluster(names, security)
+            self._cluster = None if address is not None else _local_cluster(names, security)
             target = address if self._cluster is None else self._cluster
-            self._client = distributed.Client(target, timeout=patience, security=security, set_as_default=False)
-            self._client.wait_for_workers(1, timeout=patience)
-            self._client.register_plugin(_plugin(self._name, {}), name=f"gpusense-{self._name}")
+            self._client = distributed.Client(target, timeout=self._patience, security=security, set_as_default=False)
+            self._client.wait_for_workers(1, timeout=self._patience)
+            self._client.register_plugin(one_start(self._name), name=f"gpusense-{self._name}")
+            self.send({})
         except (ImportError, AttributeError, pickle.PickleError) as error:
             raise ImportError(f"dask: every worker must have this version of gpusense, got {error}") from error
         except TypeError as error:
@@ -123,7 +125,7 @@ class DaskExecutor(Executor):
             raise ValueError(f"security: must have certificates for TLS, got none for {address}") from error
         except (OSError, TimeoutError) as error:
             rule = f"dask: must have a scheduler with workers at {address or 'the loopback'}"
-            raise OSError(f"{rule}, got none in {patience:g} s: {checks.show(str(error))}") from error
+            raise OSError(f"{rule}, got none in {self._patience:g} s: {checks.show(str(error))}") from error
 
     def __repr__(self) -> str:
         return f"DaskExecutor({self.address!r}, {self.slots} slots)"
@@ -135,6 +137,8 @@ class DaskExecutor(Executor):
             self.terminate()
         return super().__exit__(kind, error, trace)
 
+    # ---- the cluster
+
     def _workers(self) -> Mapping[str, Any] | None:
         """Return the scheduler's list of workers; None if it does not answer."""
         try:
@@ -144,26 +148,14 @@ class DaskExecutor(Executor):
         workers: Mapping[str, Any] = answer["workers"]
         return workers
 
-    def _usable(self) -> list[Found] | None:
-        """Return the workers that take jobs."""
-        workers = self._workers()
-        if workers is None:
-            return None
-        return [
-            Found(address, one["local_directory"], one.get("status", "running") == "running")
-            for address, one in workers.items()
-            if one["resources"].get(RESOURCE) or not self._pinned
-        ]
+    def _usable(self, workers: Mapping[str, Any]) -> int:
+        """Return the number of workers that take jobs."""
+        return sum(bool(one["resources"].get(_RESOURCE) or not self._pinned) for one in workers.values())
 
     @property
-    def slots(self) -> int:
-        """Number of jobs that run at once: the workers of a second ago."""
-        return len(self._watched.workers)
-
-    @property
-    def _watched(self) -> Watch:
-        assert self._watch is not None
-        return self._watch
+    def window(self) -> int:
+        """Number of jobs to submit at once: jobs that wait at a Dask worker would count as started when it ends."""
+        return max(self.slots, 1)
 
     @property
     def dashboard(self) -> str:
@@ -176,39 +168,105 @@ class DaskExecutor(Executor):
         """Tell whether the scheduler is running."""
         return bool(self._client.status == "running" and not self._client.scheduler_comm.comm.closed())
 
-    @property
-    def _ended(self) -> str:
-        """Reason why the scheduler has ended; empty while it runs."""
-        return "" if self.alive else "the scheduler has ended"
+    def _watch(self) -> None:
+        """Follow the workers of the cluster until it is lost."""
+        answered = present = time.monotonic()
+        while not self._end.wait(_LOOK):
+            workers, now = self._workers() if self.alive else None, time.monotonic()
+            if not self.alive:
+                self._lose("the scheduler has ended")
+            elif workers is None:
+                if now - answered > self._patience:
+                    self._lose(f"the scheduler has not answered for {self._patience:g} s")
+            else:
+                before, self.slots, answered = self.slots, self._usable(workers), now
+                if self.slots:
+                    present = now
+                elif before:
+                    _LOG.warning("sweep: no worker is left, waiting %g s for one", self._patience)
+                elif now - present > self._patience:
+                    self._lose(f"no worker has been there for {self._patience:g} s")
+
+    def _lose(self, reason: str) -> None:
+        """End all calls, and accept no further ones."""
+        self._end.set()
+        with self._lock:
+            self._lost = self._lost or reason
+            running = list(self._open)
+        for future in running:
+            with contextlib.suppress(InvalidStateError):
+                future.set_exception(OSError(self._lost))
+
+    # ---- calls
 
     def send(self, contents: Mapping[str, Any]) -> None:
         """Send maps and the bytes of logs once to each worker, including workers that join later."""
-        self._client.register_plugin(_plugin(self._name, dict(contents)), name=f"gpusense-{self._name}")
+        self._client.register_plugin(processes(self._name, dict(contents)), name=f"gpusense-{self._name}")
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Queue a function for the next free worker; if the worker ends, the future raises :class:`WorkerDied`."""
-        return self._watched.submit(_payload(fn, args, kwargs))
+        import cloudpickle
 
-    def on_each(self) -> list[Executor]:
-        """Return an executor for each worker, which runs functions there in one process and nowhere else."""
-        return [_OneWorker(one, f"{self._name}-each") for one in list(self._watched.workers.values())]
+        # Another machine may not be able to import the function.
+        payload, future = bytes(cloudpickle.dumps((fn, args, kwargs))), Future[Any]()
+        with self._lock:
+            if self._lost:
+                raise RuntimeError(self._lost)
+            self._open.add(future)
+        number = next(self._numbers)
+        remote = self._client.submit(
+            answer, self._name, payload, self._seconds, key=f"gpusense-{self._name}-{number}", priority=-number,
+            retries=0, **({"resources": {_RESOURCE: 1}} if self._pinned else {}),
+        )  # fmt: skip
+        remote.add_done_callback(lambda done: self._settle(future, done))
+        future.add_done_callback(lambda done: self._closed(done, remote))
+        return future
+
+    def _settle(self, future: Future[Any], remote: Any) -> None:
+        """Hand the end of a Dask task to the future of its call."""
+        import distributed
+
+        error: BaseException
+        try:
+            value = result_of(remote.result(timeout=self._patience))
+        except distributed.KilledWorker:
+            error = WorkerDied("with its Dask worker", outside=True)
+        except TimeoutError:
+            error = WorkerDied("before its result was fetched", outside=True)
+        except (CancelledError, distributed.CancelledError):
+            error = CancelledError("the scheduler has lost the job")
+        except BaseException as problem:
+            error = problem
+        else:
+            with contextlib.suppress(InvalidStateError):
+                future.set_result(value)
+            return
+        with contextlib.suppress(InvalidStateError):
+            future.set_exception(error)
+
+    def _closed(self, future: Future[Any], remote: Any) -> None:
+        """Forget a call, and end it if it was cancelled."""
+        with self._lock:
+            self._open.discard(future)
+        if future.cancelled() and self.alive:
+            with contextlib.suppress(Exception):
+                remote.cancel()
+
+    # ---- the end
 
     def terminate(self) -> None:
         """End the running jobs, and leave the cluster."""
-        if self._watch is not None:
-            self._watch.lose("the executor has been shut down")
+        self._lose("the executor has been shut down")
         self._leave()
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Leave the cluster after the running jobs, and end it if it was started here."""
-        if self._watch is not None and not self._watch.lost:
-            if self._ended:
-                self._watch.lose(self._ended)
-            running = self._watch.open
-            for future in running if cancel_futures else ():
-                future.cancel()
-            if wait:
-                futures.wait(running)
+        with self._lock:
+            running = list(self._open)
+        for future in running if cancel_futures else ():
+            future.cancel()
+        if wait:
+            futures.wait(running)
         self.terminate()
 
     def _leave(self) -> None:
@@ -219,7 +277,6 @@ class DaskExecutor(Executor):
             thread = threading.Thread(target=self._say_goodbye, daemon=True)
             thread.start()
             thread.join(_GOODBYE)
-        on_worker.close_pools(self._name)
         for one in (self._client, self._cluster):
             if one is not None:
                 with contextlib.suppress(OSError, TimeoutError):
@@ -228,6 +285,7 @@ class DaskExecutor(Executor):
     def _say_goodbye(self) -> None:
         with contextlib.suppress(Exception):
             self._client.unregister_worker_plugin(f"gpusense-{self._name}")
+            self._client.unregister_scheduler_plugin(f"gpusense-{self._name}")
 
 
 def _check_address(address: str) -> None:
@@ -250,43 +308,38 @@ async def _identity(client: Any) -> Any:
     return await client.scheduler.identity(n_workers=-1)
 
 
-class _OneWorker(Executor):
-    """Functions on one worker of a cluster, in a process that runs nothing else."""
-
-    def __init__(self, worker: RemoteWorker, name: str) -> None:
-        self._worker, self._name, self.slots = worker, name, 1
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="gpusense-sweep")
-
-    def __repr__(self) -> str:
-        return f"_OneWorker({self._worker.address!r})"
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        return self._thread.submit(self._worker.call, _payload(fn, args, kwargs), self._name)
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        self._thread.shutdown(wait=wait, cancel_futures=cancel_futures)
-
-
-def _payload(fn: Callable[..., Any], args: Any, kwargs: Any) -> bytes:
-    """Return the pickle of a call, even of a function that another machine cannot import."""
-    import cloudpickle
-
-    return bytes(cloudpickle.dumps((fn, args, kwargs)))
-
-
-def _plugin(name: str, contents: dict[str, Any]) -> Any:
-    """Return a plugin that hands contents to each worker, and ends the processes of an executor when it leaves."""
+def _local_cluster(names: list[str], security: Any) -> Any:
+    """Start a cluster in this process, with all ports on the loopback."""
+    import dask
     import distributed
 
-    class Contents(distributed.WorkerPlugin):  # type: ignore[misc]
-        """Maps and logs of a sweep."""
+    common: dict[str, Any] = dict(host=_LOOPBACK, security=security)
+    scheduler = {
+        "cls": distributed.Scheduler,
+        "options": {**common, "port": 0, "dashboard": True, "dashboard_address": f"{_LOOPBACK}:0"},
+    }
+    options = {**common, "nthreads": 1, "resources": {_RESOURCE: 1}, "memory_limit": 0, "dashboard": False}
+    specification = {index: {"cls": distributed.Worker, "options": options} for index in range(len(names))}
+    # Workers in this process are never lost, even if the machine sleeps for long.
+    with dask.config.set({"distributed.scheduler.worker-ttl": None}):
+        cluster = distributed.SpecCluster(
+            scheduler=scheduler, workers=specification, silence_logs=50, asynchronous=False, security=security
+        )
+    DEVICES.update({worker.id: names[index] for index, worker in cluster.workers.items()})
+    return cluster
 
-        def setup(self, worker: Any) -> None:
-            """Keep the contents for the processes of the worker."""
-            on_worker.open_pool(worker, name, contents)
 
-        def teardown(self, worker: Any) -> None:
-            """End the processes of the worker."""
-            on_worker.close_pools(name, worker)
+def security_of(authority: Path, certificate: Path, key: Path) -> Any:
+    """Return the TLS settings of a client, from files in PEM.
 
-    return Contents()
+    Args:
+        authority: Certificate of the authority that has signed the cluster's certificates.
+        certificate: Certificate of the client.
+        key: Private key of the client.
+
+    Raises:
+        ImportError: Dask is not installed.
+    """
+    return library("distributed", "a sweep on Dask").Security(
+        tls_ca_file=str(authority), tls_client_cert=str(certificate), tls_client_key=str(key), require_encryption=True
+    )

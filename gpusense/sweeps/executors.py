@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any
 
 from gpusense._util import checks
-from gpusense.sweeps.supervised import Supervised, limits_of, pickled, result_of
+from gpusense.sweeps.process import Worker, deafen, pickled, result_of
 
 
 class SerialExecutor(Executor):
@@ -43,24 +43,21 @@ class SerialExecutor(Executor):
 
 
 class ProcessExecutor(Executor):
-    """Run jobs in spawned processes, one for each device.
+    """Run jobs in a spawned process for each device.
 
     A process runs one job at a time. If it ends during its job, it raises :class:`WorkerDied` in the job's future and
     is replaced. If the ``with`` block ends by an exception, such as Ctrl-C, the processes are ended at once.
 
     Args:
-        devices: Selection strings of the devices, one for each process; or the number of processes, which then use the
-            sweep's device.
+        devices: A selection string for each process; or the number of processes, all on the sweep's device.
         job_timeout: Longest time of a job [s]; its process is ended and replaced, and its future raises
             :class:`JobTimeout`. None for no limit.
-        memory_limit: Most resident memory of a process [bytes], checked 20 times a second; a process beyond it is ended
-            and replaced, with :class:`WorkerDied`. None for no limit.
 
     Attributes:
         slots: Number of processes.
 
     Raises:
-        TypeError, ValueError: ``devices`` has no process or holds no strings, or a limit breaks its rule.
+        TypeError, ValueError: ``devices`` has no process or holds no strings, or the limit breaks its rule.
 
     Example:
         >>> import gpusense as gs
@@ -68,20 +65,14 @@ class ProcessExecutor(Executor):
         ProcessExecutor(['opencl:0:0', 'warp:cuda:0'])
     """
 
-    def __init__(
-        self,
-        devices: int | Sequence[str] = 1,
-        *,
-        job_timeout: float | None = None,
-        memory_limit: int | None = None,
-    ) -> None:
-        self._limits = limits_of(job_timeout, memory_limit)
+    def __init__(self, devices: int | Sequence[str] = 1, *, job_timeout: float | None = None) -> None:
+        self._seconds = None if job_timeout is None else checks.real("job_timeout", job_timeout, above=0)
         self._names = device_names(devices)
         self.slots = len(self._names)
         # A thread for each process hands it one job after another.
-        self._threads = ThreadPoolExecutor(self.slots, thread_name_prefix="gpusense-sweep")
-        self._free: queue.SimpleQueue[Supervised] = queue.SimpleQueue()
-        self._all = [Supervised(name) for name in self._names]
+        self._threads = ThreadPoolExecutor(self.slots, "gpusense-sweep", deafen)
+        self._free: queue.SimpleQueue[Worker] = queue.SimpleQueue()
+        self._all = [Worker(name) for name in self._names]
         for one in self._all:
             self._free.put(one)
 
@@ -100,12 +91,11 @@ class ProcessExecutor(Executor):
         return self._threads.submit(self._run, fn, args, kwargs)
 
     def _run(self, fn: Callable[..., Any], args: Any, kwargs: Any) -> Any:
-        payload = pickled(fn, args, kwargs)
-        process = self._free.get()
+        payload, worker = pickled(fn, args, kwargs), self._free.get()
         try:
-            return result_of(process.call(payload, self._limits))
+            return result_of(worker.call(payload, self._seconds))
         finally:
-            self._free.put(process)
+            self._free.put(worker)
 
     @property
     def processes(self) -> tuple[int, ...]:
@@ -116,16 +106,15 @@ class ProcessExecutor(Executor):
         """End the processes at once, together with their jobs."""
         self._threads.shutdown(wait=False, cancel_futures=True)
         for one in self._all:
-            one.close(wait=False)
+            one.close()
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes after their running jobs."""
         self._threads.shutdown(wait=wait, cancel_futures=cancel_futures)
-        if not wait:
+        if wait:
+            self.terminate()
+        else:
             threading.Thread(target=self.shutdown, name="gpusense-sweep-end").start()
-            return
-        for one in self._all:
-            one.close()
 
 
 def device_names(devices: int | Sequence[str]) -> list[str]:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +17,8 @@ if TYPE_CHECKING:
 
 # Most objects of each kind that are kept: maps, logs, models.
 _KEPT = 4
+# Largest log that is sent [bytes]; larger logs need a shared file system.
+_LARGEST = 1 << 30
 
 
 class Store:
@@ -36,25 +37,14 @@ class Store:
         self._root, self.device, self.reads = Path(root), device, 0
         self._kept: dict[str, OrderedDict[Hashable, Any]] = {}
         self._sent: dict[str, Any] = {}
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{len(kept)} {kind}" for kind, kept in self._kept.items())
         return f"Store({str(self._root)!r}, device={self.device!r}, {counts or 'empty'})"
 
     def receive(self, sent: Mapping[str, Any]) -> None:
-        """Take over maps and the bytes of logs that were sent, by their paths; other paths are read from the root."""
-        if self._folder is None:
-            self._folder = tempfile.TemporaryDirectory(prefix="gpusense-sweep-")
-        folder = Path(self._folder.name)
-        for index, (path, content) in enumerate(sent.items(), len(self._sent)):
-            if isinstance(content, bytes):
-                # Only the suffixes are taken from the sender, since they select the format.
-                file = folder / f"{index}{''.join(Path(path).suffixes[-2:])}"
-                file.write_bytes(content)
-                self._sent[path] = file
-            else:
-                self._sent[path] = content
+        """Use sent maps, and files of logs, in place of the files under the root."""
+        self._sent.update(sent)
 
     def path(self, name: str) -> Path:
         """Return the path of a log or another file.
@@ -125,3 +115,31 @@ def _chosen(job: Job, group: str = "") -> dict[str, Any]:
     values = job.group(group) if group else job.by_name
     defaults = TRAINING if group else _ALL
     return {"range_max": job.option("range_max"), **{name: values.get(name, one) for name, one in defaults.items()}}
+
+
+def contents_of(jobs: Iterable[Job], root: str | Path) -> dict[str, Any]:
+    """Read the maps and the bytes of the logs of jobs, by the paths that the jobs name.
+
+    Args:
+        jobs: The jobs.
+        root: Folder of their files.
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: a map breaks its format, or a log is a folder or too large.
+    """
+    from gpusense.world.map_files import read_map
+
+    folder, contents = Path(root), dict[str, Any]()
+    for job in jobs:
+        if job.map and job.map not in contents:
+            contents[job.map] = read_map(folder / job.map)
+        if job.log and job.log not in contents:
+            file = folder / job.log
+            if file.is_dir():
+                raise ValueError(f"log: must be a file to be sent, got the folder {file}: share it, and use --no-send")
+            size = checks.existing_file(file).stat().st_size
+            if size > _LARGEST:
+                raise ValueError(f"log: must have at most {_LARGEST} bytes to be sent, got {size} of {file}")
+            contents[job.log] = file.read_bytes()
+    return contents

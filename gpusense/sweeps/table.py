@@ -1,6 +1,6 @@
 """The table of a sweep: a CSV file to which whole lines are appended, and a Parquet file once the sweep ends.
 
-A crash can leave a torn last line, which is cut off when the file is opened again. All other lines are complete.
+A crash can leave a torn last line; opening the file again cuts it off. All other lines are complete.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Table:
     """Rows of finished jobs in a CSV file.
 
     Args:
-        path: The file, which ends in ``.csv``; or ``.parquet``, whose CSV file then lies beside it.
+        path: A ``.csv`` file; or a ``.parquet`` file, with a CSV file in the same folder.
         resume: Whether the file may exist already.
 
     Attributes:
@@ -106,7 +106,7 @@ class Table:
         return row
 
     def _merged(self, row: Iterable[str]) -> tuple[str, ...]:
-        """Return the columns extended by those of a row."""
+        """Return the columns, extended by the columns of a row."""
         middle = [name for name in (*self.columns, *row) if name not in (*FIRST, *LAST)]
         return (*FIRST, *dict.fromkeys(middle), *LAST)
 

@@ -22,8 +22,7 @@ ALLOWED = {
     "backends/child.py": {"json.loads": "what this package's own process said"},
     "backends/opencl/drivers.py": {"json.loads": "what this package's own process said"},
     "logs/carmen_writer.py": {"gzip.GzipFile": "only to write"},
-    "sweeps/child.py": {"pickle.loads": "jobs of this package's own process, by a pipe"},
-    "sweeps/supervised.py": {"pickle.loads": "results of this package's own process, by a pipe"},
+    "sweeps/process.py": {"pickle.loads": "jobs and results of this package's own processes, by pipes"},
 }
 
 

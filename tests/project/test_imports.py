@@ -131,7 +131,7 @@ def test_this_sees_the_imports_of_the_package(graph):
     assert len(graph) > 400 and sum(map(len, graph.values())) > 1500
     # At the top, in a function, in a table of modules.
     assert "gpusense.backends.base" in graph["gpusense.backends.opencl.backend"]
-    assert "gpusense.world.map_files" in graph["gpusense.sweeps.job_inputs"]
+    assert "gpusense.world.map_files" in graph["gpusense.sweeps.store"]
     assert "gpusense.backends.opencl.library" in graph["gpusense.backends.registry"]
     assert "gpusense.logs.carmen" in graph["gpusense.logs.reader"]
 

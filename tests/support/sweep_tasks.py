@@ -43,12 +43,6 @@ def slow(job, store):
     return {"value": job.seed * 0.1}
 
 
-def written_down(folder):
-    """Write the process's id."""
-    with open(Path(folder) / "runs", "a") as file:
-        file.write(f"{os.getpid()}\n")
-
-
 def ended_from_above(job, store):
     """Kill the Dask worker of the process in the first start of seed 1."""
     started(job)
@@ -70,13 +64,6 @@ def starts(folder, count):
     return [lines.count(str(seed)) for seed in range(count)]
 
 
-def _fill():
-    held = []
-    while True:
-        held.append(bytearray(1 << 23))
-        time.sleep(0.002)
-
-
 def _fork():
     # The other process keeps all inherited files open.
     if os.fork():
@@ -91,7 +78,6 @@ ENDS = {
     "abort": os.abort,
     "kill": lambda: os.kill(os.getpid(), signal.SIGKILL),
     "terminate": lambda: os.kill(os.getpid(), signal.SIGTERM),
-    "memory": _fill,
     "fork": _fork,
     "SystemExit": lambda: sys.exit("enough"),
     "KeyboardInterrupt": lambda: os.kill(os.getpid(), signal.SIGINT) or signal.raise_signal(signal.SIGINT) or raised(),
@@ -125,10 +111,3 @@ def sent_text(name):
     from gpusense.sweeps.worker import _SENT
 
     return Path(_SENT[name]).read_text()
-
-
-def await_file(path):
-    """Wait until a file is there."""
-    while not os.path.exists(path):
-        time.sleep(0.02)
-    return "there"

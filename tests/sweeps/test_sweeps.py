@@ -19,8 +19,8 @@ from gpusense.evaluation.steps import read_steps
 from gpusense.evaluation.tracking import Track, follow, start, summary
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.sweep import Job, ProcessExecutor, SerialExecutor, SweepLost
-from gpusense.sweeps.job_inputs import contents_of
 from gpusense.sweeps.plan import jobs_of
+from gpusense.sweeps.store import contents_of
 from gpusense.sweeps.tasks import is_timing
 from gpusense.sweeps.worker import work
 

@@ -10,7 +10,7 @@ from gpusense._util.typing import CasterName
 from gpusense.commands.arguments import add_backend, add_json, add_seed, whole_number
 from gpusense.commands.model_options import add_model, add_parameters, parameters_of
 from gpusense.commands.output import print_json
-from gpusense.commands.scans import add_log, add_range_max, read_scan
+from gpusense.commands.scans import OPTIONS, add_log, add_range_max, read_scan
 from gpusense.evaluation.machine import machine
 
 if TYPE_CHECKING:
@@ -93,9 +93,9 @@ def _scene(args: argparse.Namespace) -> tuple[OccupancyGrid, Scanner, np.ndarray
     if args.log is not None and args.map is None:
         raise ValueError(f"--map: must come with --log, got --log {args.log} alone")
     if args.log is None:
-        for name in ("scan", "topic", "mount", "range_max"):
+        for name in ("scan", "topic", "mount", "range_max", "range_min", "frame", "odometry_from"):
             if getattr(args, name) is not None:
-                raise ValueError(f"--{name.replace('_', '-')}: must come with --log, got it alone")
+                raise ValueError(f"--{OPTIONS.get(name, name)}: must come with --log, got it alone")
     grid, scanner = make_world(args.seed)
     if args.map is not None:
         grid = read_map(args.map)

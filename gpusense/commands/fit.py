@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from gpusense._util.files import check_writable, write_whole
 from gpusense._util.progress import progress
-from gpusense.commands.arguments import add_backend, add_json, add_seed, check_writer, positive_number, whole_number
+from gpusense.commands.arguments import add_backend, add_json, add_seed, check_writer, whole_number
 from gpusense.commands.fit_results import FitResult, PartialFit
 from gpusense.commands.output import print_json, print_table
-from gpusense.commands.scans import add_choice, add_log, add_reference, options_named, read_scans
+from gpusense.commands.scans import OPTIONS, add_choice, add_log, add_reference, log_options, options_named, read_scans
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
@@ -76,7 +76,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a file of columns separated by commas instead: reading [m], expected range [m] and, optionally, angle of "
         "incidence [rad]; needs --range-max")  # fmt: skip
     add_choice(parser, "scan or pair", "scans or pairs")
-    add("--range-min", type=positive_number, metavar="M", help="readings below this are missing [m] (default: none)")
     add("--method", choices=("em", "em-book", "gradient", "hill_climb", "genetic"), default="em",
         help="optimiser; em-book is table 6.2 as printed (default: %(default)s)")  # fmt: skip
     add("--range-bias", action="store_true", help="also fit an offset of all correct ranges")
@@ -116,9 +115,11 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_sources(args: argparse.Namespace) -> None:
     if args.pairs is not None:
-        for name in ("map", "log", "reference", "topic", "mount"):
+        for name in ("map", "log", "reference", "topic", "mount", "frame", "odometry_from"):
             if getattr(args, name) is not None:
-                raise ValueError(f"--{name}: must be left out with --pairs, got {getattr(args, name)}")
+                raise ValueError(
+                    f"--{OPTIONS.get(name, name)}: must be left out with --pairs, got {getattr(args, name)}"
+                )
         if args.fit_motion:
             raise ValueError("--fit-motion: must have a --log with odometry, got --pairs")
         if args.range_max is None:
@@ -145,9 +146,6 @@ def _read(args: argparse.Namespace) -> RangeData:
         return data
     grid = read_map(args.map)
     scans = read_scans(args)
-    top = scans[0][1].scanner.range_max
-    if range_min >= top:
-        raise ValueError(f"--range-min: must be < the log's range_max = {top}, got {range_min}")
     with progress(-(-len(scans) // range_data.SCANS)) as step:
         return range_data.data_of_log(
             grid, scans, backend=args.backend, range_min=range_min, block=args.block or 1,
@@ -194,7 +192,7 @@ def _motion(args: argparse.Namespace) -> MotionFit | None:
     sensors = () if args.topic is None else (args.topic,)
     with options_named():
         steps = read_steps(
-            args.log, every=args.every, offset=args.offset, limit=args.limit, sensors=sensors, mount=args.mount
+            args.log, every=args.every, offset=args.offset, limit=args.limit, sensors=sensors, **log_options(args)
         )
     if args.reference is not None:
         steps = with_references(steps, *read_tum(args.reference))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gpusense.commands.parameter_files import Localization, read_localization
-from gpusense.commands.scans import options_named
+from gpusense.commands.scans import log_options, options_named
 from gpusense.localization.defaults import DEFAULTS
 from gpusense.world.scanner import Scanner
 
@@ -50,9 +50,8 @@ def read_chosen(args: argparse.Namespace, read: Localization) -> list[Step]:
 
     with options_named():
         steps = read_steps(
-            args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit,
-            sensors=args.topic, mount=args.mount,
-        )  # fmt: skip
+            args.log, every=args.every, offset=args.offset, limit=args.limit, sensors=args.topic, **log_options(args)
+        )
     if read.nav2 is not None:
         near, far = read.nav2.range_limits
         steps = _limited(steps, near, None if args.range_max is not None else far)

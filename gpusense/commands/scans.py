@@ -12,14 +12,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpusense.commands.arguments import finite_number, positive_number, whole_number
+from gpusense.commands.arguments import finite_number, not_negative_number, positive_number, whole_number
 
 if TYPE_CHECKING:
     from gpusense.logs import Scan
+    from gpusense.logs.reader import LogOptions
 
 FORMATS = "CARMEN or Wean Hall, plain or .gz; a bag of ROS 1 (.bag) or of ROS 2 (folder, .db3, .mcap)"
-# Arguments of the library, and the options that set them.
-_OPTIONS = {"topic": "topic", "sensors": "topic", "mount": "mount", "node": "node"}
+OPTIONS = {
+    "topic": "topic", "sensors": "topic", "mount": "mount", "node": "node", "frame": "frame",
+    "odometry_from": "odometry", "range_min": "range-min", "range_max": "range-max",
+}  # fmt: skip
+"""Options of the command line by the arguments of the library that they set."""
 
 
 def add_log(parser: argparse.ArgumentParser, what: str, *, required: bool = True, several: str | None = None) -> None:
@@ -40,11 +44,15 @@ def add_log(parser: argparse.ArgumentParser, what: str, *, required: bool = True
     else:
         add("--topic", metavar="NAME", help=f"laser: {names}")
     add("--mount", type=finite_number, nargs=3, metavar=("X", "Y", "THETA"),
-        help="pose of a bag's laser on the robot [m, m, rad] (default: by the bag's fixed transforms)")  # fmt: skip
+        help="pose of a bag's laser on the robot [m, m, rad] (default: by the bag's transforms)")  # fmt: skip
+    add("--frame", metavar="NAME", help="frame of the laser, if several share a bag's topic")
+    add("--odometry", dest="odometry_from", metavar="NAME",
+        help="topic of a bag's odometry, or frame of the transforms that move the robot (default: beside the scans, "
+        "/odom, or the first one)")  # fmt: skip
 
 
 def add_choice(parser: argparse.ArgumentParser, what: str = "scan", several: str = "scans") -> None:
-    """Add the options that choose among the scans of a log, and ``--range-max``."""
+    """Add the options that choose among the scans of a log, ``--range-max`` and ``--range-min``."""
     add = parser.add_argument
     add("--every", type=whole_number(low=1), default=1, metavar="E",
         help=f"every E-th {what}, from --offset on; '--every 2 --offset 1' are the odd ones (default: 1)")  # fmt: skip
@@ -54,11 +62,23 @@ def add_choice(parser: argparse.ArgumentParser, what: str = "scan", several: str
 
 
 def add_range_max(parser: argparse.ArgumentParser) -> None:
-    """Add ``--range-max``, from which on readings are "no return"."""
+    """Add ``--range-max`` and ``--range-min``, the limits of readings."""
     parser.add_argument(
         "--range-max", type=positive_number, metavar="M",
         help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')",
     )  # fmt: skip
+    parser.add_argument(
+        "--range-min", type=not_negative_number, metavar="M",
+        help="readings of a bag below this are missing [m] (default: the bag's value)",
+    )  # fmt: skip
+
+
+def log_options(args: argparse.Namespace) -> LogOptions:
+    """Return the options of the log as the library's readers take them."""
+    return {
+        "range_max": args.range_max, "range_min": args.range_min, "frame": args.frame, "mount": args.mount,
+        "odometry_from": args.odometry_from,
+    }  # fmt: skip
 
 
 def add_reference(parser: argparse.ArgumentParser) -> None:
@@ -81,9 +101,9 @@ def options_named() -> Iterator[None]:
         yield
     except ValueError as error:
         found = re.match(r"(\w+): ", str(error))
-        if found is None or found[1] not in _OPTIONS:
+        if found is None or found[1] not in OPTIONS:
             raise
-        raise ValueError(f"--{_OPTIONS[found[1]]}: {str(error)[found.end() :]}") from None
+        raise ValueError(f"--{OPTIONS[found[1]]}: {str(error)[found.end() :]}") from None
 
 
 def read_scans(args: argparse.Namespace, *, posed: bool = True) -> list[tuple[int, Scan]]:
@@ -101,9 +121,8 @@ def read_scans(args: argparse.Namespace, *, posed: bool = True) -> list[tuple[in
 
     with options_named():
         scans = chosen_scans(
-            args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit,
-            topic=args.topic, mount=args.mount,
-        )  # fmt: skip
+            args.log, every=args.every, offset=args.offset, limit=args.limit, topic=args.topic, **log_options(args)
+        )
     if args.reference is not None:
         scans = [(scans[k][0], scan) for k, scan in _referenced(args, [scan for _, scan in scans])]
     return (with_poses if posed else with_one_scanner)(scans, args.log)
@@ -120,7 +139,7 @@ def read_scan(args: argparse.Namespace) -> Scan:
 
     wanted, index = args.scan or 0, 0
     with options_named():
-        for scan in read_laser(args.log, args.topic, range_max=args.range_max, mount=args.mount):
+        for scan in read_laser(args.log, args.topic, **log_options(args)):
             if index == wanted:
                 return scan
             index += 1
@@ -143,9 +162,8 @@ def read_scans_of_lasers(args: argparse.Namespace) -> tuple[list[tuple[int, Scan
         return scans, [0] * len(scans)
     with options_named():
         steps = read_steps(
-            args.log, range_max=args.range_max, every=args.every, offset=args.offset, limit=args.limit,
-            sensors=args.topic, mount=args.mount,
-        )  # fmt: skip
+            args.log, every=args.every, offset=args.offset, limit=args.limit, sensors=args.topic, **log_options(args)
+        )
     chosen = list(enumerate(step.scan for step in steps))
     if args.reference is not None:
         chosen = _referenced(args, [scan for _, scan in chosen])

@@ -13,10 +13,10 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, Unpack, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from gpusense._util import checks
 from gpusense.backends import BackendInfo
@@ -25,6 +25,8 @@ from gpusense.evaluation.worlds import cloud_around, cloud_uniform
 from gpusense.localization.weights import normalize_weights
 from gpusense.logs import Pose, Scan
 from gpusense.logs.merge import read_laser
+from gpusense.logs.reader import LogOptions
+from gpusense.logs.records import check_scanner
 from gpusense.models.scan.rules import choose_beams
 from gpusense.world.grid import OccupancyGrid
 from gpusense.world.scanner import Reading, classify
@@ -180,30 +182,28 @@ def summary(score: BackendScore) -> dict[str, Any]:
 def chosen_scans(
     path: str | os.PathLike[str],
     *,
-    range_max: float | None = None,
     every: int = 1,
     offset: int = 0,
     limit: int | None = None,
     topic: str | None = None,
-    mount: ArrayLike | None = None,
+    **options: Unpack[LogOptions],
 ) -> list[tuple[int, Scan]]:
     """Read scans of a log with their indices: ``offset``, ``offset + every``, ..., at most ``limit`` scans.
 
     Args:
         path: The log.
-        range_max: Readings of at least this are "no return" [m]; None for the log's "no return".
         every: Stride of the scans.
         offset: Index of the first scan.
         limit: Largest number of scans; None for all.
         topic: The laser, see :func:`gpusense.logs.merge.read_laser`; None for the only or main laser.
-        mount: Pose of a bag's laser on the robot [m, m, rad]; None takes the mount from the bag's transforms.
+        options: See :func:`gpusense.read_log`.
 
     Raises:
         ValueError: the log breaks its format, or no scan is chosen.
         FileNotFoundError: the log is missing.
     """
     last = None if limit is None else offset + every * limit
-    scans = read_laser(path, topic, range_max=range_max, mount=mount)
+    scans = read_laser(path, topic, **options)
     chosen = list(itertools.islice(enumerate(scans), offset, last, every))
     if not chosen:
         raise ValueError(f"log: must have a scan of index {offset}, the first one chosen, got fewer scans in {path}")
@@ -242,8 +242,7 @@ def with_one_scanner(scans: list[tuple[int, Scan]], path: str | os.PathLike[str]
         ValueError: a scan has another scanner.
     """
     for index, scan in scans:
-        if scan.scanner != scans[0][1].scanner:
-            raise ValueError(f"log: every scan must come from the same scanner, got another at scan {index} of {path}")
+        check_scanner(scan, scans[0][1].scanner, f"scan {index} of {path}")
     return scans
 
 

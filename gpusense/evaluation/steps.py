@@ -5,14 +5,17 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Unpack
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from gpusense.evaluation.trajectory_files import poses_at
 from gpusense.localization.pose_algebra import compose_poses, pose_difference, wrap_angle
 from gpusense.logs import Odometry, Pose, Scan
 from gpusense.logs.merge import read_lasers
+from gpusense.logs.reader import LogOptions
+from gpusense.logs.records import check_scanner
 from gpusense.world.scanner import Scanner
 
 Floats = NDArray[np.float64]
@@ -43,12 +46,11 @@ class Step:
 def read_steps(
     path: str | os.PathLike[str],
     *,
-    range_max: float | None = None,
     every: int = 1,
     offset: int = 0,
     limit: int | None = None,
     sensors: Sequence[str] = (),
-    mount: ArrayLike | None = None,
+    **options: Unpack[LogOptions],
 ) -> list[Step]:
     """Read scans of a log with raw odometry.
 
@@ -57,12 +59,11 @@ def read_steps(
 
     Args:
         path: The log.
-        range_max: Readings of at least this are "no return" [m]; None for the log's.
         every: Stride of the scans of each laser.
         offset: Index of the first scan of each laser.
         limit: Largest number of scans; None for all. Nothing is read after the last one.
         sensors: Lasers of the log: topics of a bag, front or rear of a CARMEN log; none for its only or main laser.
-        mount: Pose of a bag's only laser on the robot [m, m, rad]; None takes the mounts from the bag's transforms.
+        options: See :func:`gpusense.read_log`.
 
     Raises:
         ValueError: the log breaks its format, has no chosen scan, or a laser changes its geometry.
@@ -72,7 +73,7 @@ def read_steps(
     steps: list[Step] = []
     counts = [0] * max(len(sensors), 1)
     scanners: dict[int, Scanner] = {}
-    for sensor, record in read_lasers(path, sensors, range_max=range_max, mount=mount):
+    for sensor, record in read_lasers(path, sensors, **options):
         if isinstance(record, Odometry):
             between = record.pose
             continue
@@ -83,8 +84,7 @@ def read_steps(
         last, between = record, None
         count = counts[sensor]
         if count >= offset and (count - offset) % every == 0:
-            if record.scanner != scanners.setdefault(sensor, record.scanner):
-                raise ValueError(f"log: every scan must come from the same scanner, got another at scan {count}")
+            check_scanner(record, scanners.setdefault(sensor, record.scanner), f"scan {count}")
             x, y, theta = (float(value) for value in chained)
             steps.append(Step(count, record, (x, y, theta), sensor, record.pose))
             if len(steps) == limit:

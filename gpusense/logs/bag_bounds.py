@@ -20,6 +20,7 @@ from typing import Any
 
 from gpusense._util.documents import check_yaml
 from gpusense._util.inflate import inflated, most_bytes
+from gpusense.logs.cut_bags import zstd
 
 LARGEST_CHUNK = 1 << 29
 """Most bytes of a decompressed chunk or message of a bag."""
@@ -52,15 +53,15 @@ def install() -> None:
         importlib.import_module(f"rosbags.{name}")
         for name in ("rosbag1.reader", "rosbag2.reader", "rosbag2.storage_mcap", "rosbag2.storage_sqlite3")
     )
-    zstd, parse = reader2.zstd, reader2.parse_qos
+    packed, parse = zstd(), reader2.parse_qos
     chunks, first = _table(mcap, "DECOMPRESSORS"), _table(reader1, "decompressors")
-    for name, make in (("lz4", lz4), ("zstd", zstd.ZstdDecompressor)):
+    for name, make in (("lz4", lz4), ("zstd", packed.ZstdDecompressor)):
         chunks[name] = functools.partial(_chunk, make)
     for name, make in (("lz4", lz4), ("bz2", bz2.BZ2Decompressor)):
         first[name] = functools.partial(_whole, make)
     bounded: dict[str, Any] = {
         "zstd": SimpleNamespace(
-            decompress=functools.partial(_whole, zstd.ZstdDecompressor), open=functools.partial(_Bounded, zstd.open)
+            decompress=functools.partial(_whole, packed.ZstdDecompressor), open=functools.partial(_Bounded, packed.open)
         ),
         "parse_qos": functools.partial(_qos, parse),
     }
@@ -91,6 +92,11 @@ def _chunk(make: Callable[[], Any], data: bytes, size: int) -> bytes:
 def _whole(make: Callable[[], Any], data: bytes) -> bytes:
     """Decompress a chunk or a message."""
     return inflated(make, data, LARGEST_CHUNK)
+
+
+def decompressed(message: bytes) -> bytes:
+    """Decompress a message that is compressed by zstd."""
+    return _whole(zstd().ZstdDecompressor, message)
 
 
 def _qos(parse: Callable[[Any], Any], profiles: Any) -> Any:

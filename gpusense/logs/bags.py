@@ -7,17 +7,22 @@ layouts that come with rosbags, and by one layout that is defined here.
 from __future__ import annotations
 
 import contextlib
-import warnings
+import dataclasses
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from gpusense._util.extras import library
-from gpusense.logs.bag_bounds import check_metadata, install
-from gpusense.logs.cut_bags import uncut
+from gpusense._util.notices import warn_user
+from gpusense.logs.bag_bounds import check_metadata, decompressed, install
+from gpusense.logs.bag_files import ZSTD, has_metadata, is_ros1, readable, storage_files
 
 SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
+ECHOES = "sensor_msgs/msg/MultiEchoLaserScan"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 # ROS 1's first version of transforms has the layout of the second.
 _SAME_LAYOUT = {"tf/msg/tfMessage": TRANSFORMS}
@@ -34,17 +39,25 @@ class Message(NamedTuple):
 
 
 def topics_of(path: Path) -> dict[str, list[str]]:
-    """Return the topics of a bag, sorted, by the type of their messages."""
-    found: dict[str, set[str]] = {}
-    with errors_at(str(path)), _open(path) as (reader, _):
-        for connection in reader.connections:
-            kind = _SAME_LAYOUT.get(connection.msgtype, connection.msgtype)
-            found.setdefault(kind, set()).add(connection.topic)
-    return {kind: sorted(topics) for kind, topics in found.items()}
+    """Return the topics of a bag, sorted, by the type of their messages; without empty topics, if others have messages.
+
+    Raises:
+        ValueError: The bag is broken.
+    """
+    counts: dict[tuple[str, str], int] = {}
+    with errors_at(str(path)), _open(path, tell=True) as (readers, _):
+        for connection in (each for reader in readers for each in reader.connections):
+            key = _kind(connection), connection.topic
+            counts[key] = counts.get(key, 0) + connection.msgcount
+    found: dict[str, list[str]] = {}
+    for kind, topic in sorted(counts):
+        if counts[kind, topic] or not any(counts.values()):
+            found.setdefault(kind, []).append(topic)
+    return found
 
 
 def messages(path: Path, wanted: Mapping[str, set[str] | None]) -> Iterator[Message]:
-    """Read messages in the bag's order.
+    """Read messages in the bag's order. Scans with several echoes become scans of the first echo.
 
     Args:
         path: The bag.
@@ -54,26 +67,42 @@ def messages(path: Path, wanted: Mapping[str, set[str] | None]) -> Iterator[Mess
         ValueError: The bag or a message is broken; the error names the file, the topic and the message's number.
     """
     place = str(path)
-    with errors_at(place), _open(path) as (reader, decode):
-        chosen = []
-        for connection in reader.connections:
-            topics = wanted.get(_SAME_LAYOUT.get(connection.msgtype, connection.msgtype), set())
-            if topics is None or connection.topic in topics:
-                chosen.append(connection)
+    with errors_at(place), _open(path) as (readers, decode):
         numbers: dict[str, int] = {}
-        stream = iter(reader.messages(connections=chosen)) if chosen else iter(())
-        while True:
-            with errors_at(place):
-                each = next(stream, None)
-            if each is None:
-                return
-            connection, clock, raw = each
-            number = numbers[connection.topic] = numbers.get(connection.topic, 0) + 1
-            where = f"{path}: {connection.topic}, message {number}"
-            kind = _SAME_LAYOUT.get(connection.msgtype, connection.msgtype)
-            with errors_at(where):
-                fields = decode(raw, kind)
-            yield Message(where, kind, connection.topic, clock / 1e9, fields)
+        for reader in readers:
+            chosen = []
+            for connection in reader.connections:
+                topics = wanted.get(_kind(connection), set())
+                if topics is None or connection.topic in topics:
+                    chosen.append(connection)
+            stream = iter(reader.messages(connections=chosen)) if chosen else iter(())
+            while True:
+                with errors_at(place):
+                    each = next(stream, None)
+                if each is None:
+                    break
+                connection, clock, raw = each
+                number = numbers[connection.topic] = numbers.get(connection.topic, 0) + 1
+                where = f"{path}: {connection.topic}, message {number}"
+                kind = _kind(connection)
+                with errors_at(where):
+                    fields = decode(raw, kind)
+                    if kind == ECHOES:
+                        kind, fields = SCAN, _first_echo(fields)
+                yield Message(where, kind, connection.topic, clock / 1e9, fields)
+
+
+def _kind(connection: Any) -> str:
+    return _SAME_LAYOUT.get(connection.msgtype, connection.msgtype)
+
+
+def _first_echo(message: Any) -> Any:
+    """Return a scan with several echoes as a scan of the first one; a beam without echoes has NaN."""
+    firsts = {}
+    for name in ("ranges", "intensities"):
+        values = [each.echoes[0] if len(each.echoes) else math.nan for each in getattr(message, name)]
+        firsts[name] = np.array(values, np.float32)
+    return dataclasses.replace(message, **firsts)
 
 
 @contextmanager
@@ -91,27 +120,43 @@ def errors_at(where: str) -> Iterator[None]:
 
 
 @contextmanager
-def _open(path: Path) -> Iterator[tuple[Any, Any]]:
-    """Open a bag: the reader of rosbags, and the function that decodes a message of a type."""
-    first = path.suffix.lower() == ".bag"
+def _open(path: Path, tell: bool = False) -> Iterator[tuple[list[Any], Any]]:
+    """Open a bag: the readers of rosbags in the order of time, and the function that decodes a message of a type.
+
+    Args:
+        path: The bag.
+        tell: Whether to warn of a bag that is cut off.
+    """
+    first = is_ros1(path)
     purpose = f"{path}: a ROS bag"
     readers = library("rosbags.rosbag1" if first else "rosbags.rosbag2", purpose)
     types = library("rosbags.typesys", purpose)
     install()
-    if path.is_dir():
-        check_metadata(path)
     store = types.get_typestore(types.Stores.ROS1_NOETIC if first else types.Stores.ROS2_HUMBLE)
     if TRANSFORMS not in store.types:
         store.register(types.get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
-    with contextlib.closing(_opened(readers.Reader, path)) as reader:
-        yield reader, store.deserialize_ros1 if first else store.deserialize_cdr
+    if path.is_dir() and has_metadata(path):
+        check_metadata(path)
+        parts = [path]
+    else:
+        parts = storage_files(path) if path.is_dir() else [path]
+    with contextlib.ExitStack() as stack:
+        opened = [stack.enter_context(contextlib.closing(_opened(readers.Reader, part, tell))) for part in parts]
+        opened.sort(key=lambda reader: reader.start_time)
+
+        def decode(raw: bytes, kind: str) -> Any:
+            if first:
+                return store.deserialize_ros1(raw, kind)
+            return store.deserialize_cdr(decompressed(raw) if raw[:4] == ZSTD else raw, kind)
+
+        yield opened, decode
 
 
-def _opened(kind: Any, path: Path) -> Any:
-    """Return an open reader of a bag; for a truncated bag, with a warning, of its messages up to the cut."""
-    repaired = uncut(path)
-    if repaired is not None:
-        warnings.warn(f"{path}: the bag is cut off; it is read up to there", stacklevel=2)
-    reader = kind(repaired or path)
+def _opened(kind: Any, path: Path, tell: bool) -> Any:
+    """Return an open reader of a bag; for a truncated bag, of its messages up to the cut."""
+    file, cut = readable(path)
+    if cut and tell:
+        warn_user(f"{path}: the bag is cut off; it is read up to there")
+    reader = kind(file)
     reader.open()
     return reader

@@ -1,8 +1,7 @@
 """Recover bags that are cut off by a killed recorder, a full disk or an interrupted copy.
 
-Such a bag has no index, or the index of a longer file. A new bag is made from its messages up to the cut, in a
-temporary folder that is deleted at the end of the process. Lengths in headers are compared with the file before
-anything is allocated.
+Such a bag has no index, or the index of a longer file. A new bag is made from its messages up to the cut. Lengths in
+headers are compared with the file before anything is allocated.
 
 Formats: https://wiki.ros.org/Bags/Format/2.0, https://mcap.dev/spec, https://www.sqlite.org/fileformat.html.
 """
@@ -12,16 +11,17 @@ from __future__ import annotations
 import bz2
 import contextlib
 import functools
+import importlib
 import io
 import os
 import shutil
 import struct
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
-_MCAP, _ROS1, _SQLITE = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n", b"SQLite format 3\0"
+MCAP, ROS1, SQLITE = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n", b"SQLite format 3\0"
+"""First bytes of the files of bags."""
 # Kinds of records in MCAP (header, schema, channel, message, chunk), and in ROS 1 (message, chunk, connection).
 _M_HEADER, _M_SCHEMA, _M_CHANNEL, _M_MESSAGE, _M_CHUNK = 1, 3, 4, 5, 6
 _R_MESSAGE, _R_CHUNK, _R_CONNECTION = 2, 5, 7
@@ -38,54 +38,40 @@ class _Record(NamedTuple):
     whole: bool
 
 
-def uncut(path: Path) -> Path | None:
-    """Return a bag of the messages up to the cut; None for a bag that is not cut off.
+def begins(file: Path, first: bytes) -> bool:
+    """Return whether a file begins with some bytes."""
+    with file.open("rb") as stream:
+        return stream.read(len(first)) == first
+
+
+def zstd() -> Any:
+    """Import the module that decompresses zstd, which is Python's from 3.14 on."""
+    try:
+        return importlib.import_module("compression.zstd")
+    except ImportError:
+        return importlib.import_module("backports.zstd")
+
+
+def mender_of(file: Path, size: int) -> Callable[[Path], object] | None:
+    """Return the function that writes the messages up to the cut into a new file; None for a file that is not cut off.
 
     Args:
-        path: The bag: a file, or a folder with ``metadata.yaml``.
+        file: A file of a bag.
+        size: Its size [bytes].
     """
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    stats = tuple((file, file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.is_file())
-    return _uncut(path, stats)
+    if begins(file, MCAP):
+        return None if _ends_with(file, MCAP) else functools.partial(_mcap, file, size)
+    if begins(file, ROS1):
+        return functools.partial(_ros1, file, size) if _is_cut_ros1(file, size) else None
+    return functools.partial(_sqlite, file) if begins(file, SQLITE) and size < _stated_size(file) else None
 
 
-@functools.lru_cache(maxsize=4)
-def _uncut(path: Path, stats: tuple[tuple[Path, int, int], ...]) -> Path | None:
-    mended: dict[Path, Callable[[Path], object]] = {}
-    for file, size, _ in stats:
-        with file.open("rb") as stream:
-            begins = stream.read(100)
-        if begins.startswith(_MCAP):
-            if not _ends_with(file, _MCAP):
-                mended[file] = functools.partial(_mcap, file, size)
-        elif begins.startswith(_ROS1):
-            if _is_cut_ros1(file, size):
-                mended[file] = functools.partial(_ros1, file, size)
-        elif begins.startswith(_SQLITE):
-            page, pages = struct.unpack(">H", begins[16:18])[0], struct.unpack(">I", begins[28:32])[0]
-            if size < (65536 if page == 1 else page) * pages:
-                mended[file] = functools.partial(_sqlite, file)
-    if not mended:
-        return None
-    folder = _folder() / path.name
-    if path.is_dir():
-        folder.mkdir()
-        for file, _, _ in stats:
-            if file not in mended:
-                os.symlink(file.resolve(), folder / file.name)
-    for file, make in mended.items():
-        make(folder / file.name if path.is_dir() else folder)
-    return folder
-
-
-def _folder() -> Path:
-    """Make a folder that exists until the end of the process."""
-    made = tempfile.TemporaryDirectory(prefix="gpusense-bag-")
-    _FOLDERS.append(made)
-    return Path(made.name)
-
-
-_FOLDERS: list[Any] = []
+def _stated_size(file: Path) -> int:
+    """Return the size of a database by its header [bytes]."""
+    with file.open("rb") as stream:
+        header = stream.read(32)
+    page, pages = struct.unpack(">H", header[16:18])[0], struct.unpack(">I", header[28:32])[0]
+    return int((65536 if page == 1 else page) * pages)
 
 
 def _ends_with(file: Path, end: bytes) -> bool:
@@ -100,7 +86,7 @@ def _ends_with(file: Path, end: bytes) -> bool:
 def _mcap(file: Path, size: int, out: Path) -> None:
     """Write the records of a file up to its cut, without an index."""
     with file.open("rb") as stream, out.open("wb") as target:
-        target.write(stream.read(len(_MCAP)))
+        target.write(stream.read(len(MCAP)))
         for record in _mcap_records(stream, size):
             if record.kind <= _M_CHUNK and record.whole:
                 _put(target, record)
@@ -109,7 +95,7 @@ def _mcap(file: Path, size: int, out: Path) -> None:
                 for inner in _mcap_messages(record.data):
                     _put(target, inner)
         # The end of the data, and the end of a file without an index.
-        target.write(b"\x0f" + struct.pack("<QI", 4, 0) + b"\x02" + struct.pack("<QQQI", 20, 0, 0, 0) + _MCAP)
+        target.write(b"\x0f" + struct.pack("<QI", 4, 0) + b"\x02" + struct.pack("<QQQI", 20, 0, 0, 0) + MCAP)
 
 
 def _put(target: BinaryIO, record: _Record) -> None:
@@ -154,9 +140,7 @@ def _decompressed(data: bytes, compression: bytes) -> bytes:
         stream = LZ4FrameDecompressor()
         return bytes(stream.decompress(data, _LARGEST))
     if compression == b"zstd":
-        from backports.zstd import ZstdDecompressor
-
-        stream = ZstdDecompressor()
+        stream = zstd().ZstdDecompressor()
         return bytes(stream.decompress(data, _LARGEST))
     raise ValueError(f"must have chunks of a known compression, got {compression[:20]!r}")
 
@@ -170,7 +154,7 @@ def _ros1(file: Path, size: int, out: Path) -> None:
 
     connections: dict[bytes, Any] = {}
     with file.open("rb") as stream, Writer(out) as writer:
-        stream.seek(len(_ROS1))
+        stream.seek(len(ROS1))
         for record in _ros1_records(stream, size):
             if record.kind != _R_CHUNK:
                 continue
@@ -183,7 +167,7 @@ def _ros1(file: Path, size: int, out: Path) -> None:
 def _is_cut_ros1(file: Path, size: int) -> bool:
     """Return whether the index, whose place is in the first record, is absent or incomplete."""
     with file.open("rb") as stream:
-        stream.seek(len(_ROS1))
+        stream.seek(len(ROS1))
         place = next((record.fields.get(b"index_pos", b"") for record in _ros1_records(stream, size)), b"")
         index = struct.unpack("<Q", place)[0] if len(place) == 8 else 0
         if not 0 < index < size:
@@ -248,12 +232,8 @@ def _sqlite(file: Path, out: Path) -> None:
     padded = out.with_name(f"{out.name}.padded")
     shutil.copyfile(file, padded)
     with padded.open("r+b") as stream:
-        stream.seek(16)
-        page = struct.unpack(">H", stream.read(2))[0]
-        stream.seek(28)
-        pages = struct.unpack(">I", stream.read(4))[0]
         # The file has a hole, or memory is short.
-        stream.truncate((65536 if page == 1 else page) * pages)
+        stream.truncate(_stated_size(file))
     with contextlib.closing(sqlite3.connect(f"file:{padded}?mode=ro&immutable=1", uri=True)) as source, \
             contextlib.closing(sqlite3.connect(out)) as target:  # fmt: skip
         source.execute("PRAGMA trusted_schema = OFF")

@@ -5,15 +5,18 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, overload
+from typing import Literal, TypedDict, overload
 
 from numpy.typing import ArrayLike
 
 from gpusense._util import checks
 from gpusense._util.lines import numbered_lines
+from gpusense.logs.bag_files import ZSTD, is_bag_folder
+from gpusense.logs.cut_bags import MCAP, SQLITE
 from gpusense.logs.records import Odometry, Scan
+from gpusense.world.scanner import Scanner
 
 
 @dataclass(frozen=True)
@@ -23,35 +26,38 @@ class Format:
     Attributes:
         name: Name of the format in messages, with an article.
         module: The module whose function ``read(file, *, range_max, odometry, rear)`` yields its records.
-        suffixes: Suffixes of its files; empty for the format of all files that no other format claims.
-        begins: First bytes of its text files, instead of suffixes.
-        folder: File in a folder that makes the folder a log of this format; "" if logs are no folders.
-        topics: Whether ``read`` also takes ``topic`` and ``mount``.
+        magic: First bytes of its binary files, which decide before any suffix does.
+        suffixes: Suffixes of its files without these bytes.
+        begins: First bytes of its text files.
+        topics: Whether ``read`` also takes the options of bags.
     """
 
     name: str
     module: str
+    magic: tuple[bytes, ...] = ()
     suffixes: tuple[str, ...] = ()
     begins: tuple[bytes, ...] = ()
-    folder: str = ""
     topics: bool = False
 
-    def claims(self, file: Path) -> bool:
-        """Return whether a file has a suffix or the first bytes of this format."""
-        if file.is_dir():
-            return bool(self.folder) and (file / self.folder).is_file()
-        if self.begins:
-            return next((line for _, line in numbered_lines(file)), b"").startswith(self.begins)
-        return not self.suffixes or file.name.lower().endswith(self.suffixes)
 
-
-# The first format that claims a file is used.
+BAG2 = Format("a ROS 2 bag", "gpusense.logs.ros", (MCAP, SQLITE, ZSTD), (".db3", ".mcap"), topics=True)
+# The last format is that of all files that no other format claims.
 FORMATS = (
-    Format("a ROS 1 bag", "gpusense.logs.ros", (".bag",), topics=True),
-    Format("a ROS 2 bag", "gpusense.logs.ros", (".db3", ".mcap"), folder="metadata.yaml", topics=True),
+    Format("a ROS 1 bag", "gpusense.logs.ros", (b"#ROSBAG V",), (".bag",), topics=True),
+    BAG2,
     Format("a Wean Hall log", "gpusense.logs.wean", begins=(b"L ", b"O ")),
     Format("a CARMEN log", "gpusense.logs.carmen"),
 )
+
+
+class LogOptions(TypedDict, total=False):
+    """Options of :func:`read_log` that choose the laser and the odometry."""
+
+    range_max: float | None
+    range_min: float | None
+    frame: str | None
+    mount: ArrayLike | None
+    odometry_from: str | None
 
 
 @overload
@@ -61,8 +67,11 @@ def read_log(
     range_max: float | None = None,
     odometry: Literal[False] = False,
     rear: bool = False,
+    range_min: float | None = None,
     topic: str | None = None,
+    frame: str | None = None,
     mount: ArrayLike | None = None,
+    odometry_from: str | None = None,
 ) -> Iterator[Scan]: ...
 
 
@@ -73,8 +82,11 @@ def read_log(
     range_max: float | None = None,
     odometry: bool,
     rear: bool = False,
+    range_min: float | None = None,
     topic: str | None = None,
+    frame: str | None = None,
     mount: ArrayLike | None = None,
+    odometry_from: str | None = None,
 ) -> Iterator[Scan | Odometry]: ...
 
 
@@ -84,27 +96,38 @@ def read_log(
     range_max: float | None = None,
     odometry: bool = False,
     rear: bool = False,
+    range_min: float | None = None,
     topic: str | None = None,
+    frame: str | None = None,
     mount: ArrayLike | None = None,
+    odometry_from: str | None = None,
 ) -> Iterator[Scan] | Iterator[Scan | Odometry]:
     """Read a log, one record at a time and in the file's order.
 
     Formats are CARMEN and Wean Hall logs, plain or compressed by gzip, rosbags of ROS 1, and of ROS 2 with sqlite3 or
-    MCAP storage, as a folder or a single file. ROS is not needed. The module of each format describes how messages
-    become records, such as :mod:`gpusense.logs.carmen` and :mod:`gpusense.logs.ros`.
+    MCAP storage, as a folder or a single file; the first bytes of a file decide, then its suffix. ROS is not needed.
+    The module of each format describes how messages become records, such as :mod:`gpusense.logs.carmen` and
+    :mod:`gpusense.logs.ros`.
 
     Args:
         path: The file, or the folder of a ROS 2 bag.
         range_max: Readings of at least ``range_max`` are "no return" [m]. None takes the limit from the log: the value
             stated in each message, or, for old messages without one, the largest reading of the log. If that reading
             occurs at least three times, it is the scanner's code for "no return"; else the limit is the next float64
-            above it, so that every reading is a return. This requires a first pass over the file.
+            above it, so that every reading is a return. This requires a first pass over the file. In a ROS bag it
+            replaces the messages' value, whatever that is.
         odometry: Whether to also yield :class:`Odometry` records.
         rear: Whether to yield the scans of the rear laser of a CARMEN log instead of those of the front laser.
+        range_min: Readings below ``range_min`` are missing [m]; None takes the messages' value in a ROS bag, else 0.
         topic: Topic of the scans in a ROS bag; None takes ``/scan``, or the only one.
-        mount: Pose (x, y, theta) of a ROS bag's laser on the robot [m, m, rad]; None takes it from the bag's fixed
-            transforms. A warning reports that these contradict the given mount, or that there are none and (0, 0, 0) is
+        frame: Frame of the laser, if several lasers of a ROS bag share the topic; None reads all of them, each with the
+            mount of its frame.
+        mount: Pose (x, y, theta) of a ROS bag's laser on the robot [m, m, rad]; None takes it from the bag's
+            transforms. A warning reports that these contradict ``mount``, or that there are none and (0, 0, 0) is
             assumed; see also :func:`check_mount`.
+        odometry_from: Topic of the odometry in a ROS bag, or the frame of the transforms that move the robot's base;
+            None takes the topic beside the scans, ``/odom``, the first topic by name, or a frame such as ``odom``. A
+            warning lists the alternatives.
 
     Returns:
         An iterator of :class:`Scan`, and of :class:`Odometry` if ``odometry``.
@@ -112,7 +135,7 @@ def read_log(
     Raises:
         FileNotFoundError: The file is missing; raised by the call, as are the next two.
         TypeError: An argument has the wrong type.
-        ValueError: ``range_max`` is not finite and > 0, or the file has another format.
+        ValueError: A limit of ranges breaks its rule, an option does not suit the format, or a folder is no bag.
         ImportError: While reading a ROS bag, the library rosbags cannot be imported.
         ValueError: While reading, a message breaks the format; the error names the file and the line, or the topic and
             the message's number.
@@ -128,13 +151,29 @@ def read_log(
     file = checks.path("path", path)
     if range_max is not None:
         range_max = checks.real("range_max", range_max, above=0)
+    if range_min is not None:
+        range_min = checks.real("range_min", range_min, low=0)
     for name, flag in (("odometry", odometry), ("rear", rear)):
         checks.boolean(name, flag)
     form = format_of(file)
     options: dict[str, object] = dict(range_max=range_max, odometry=odometry, rear=rear)
-    options |= _ros_options(form, topic, mount)
+    options |= _ros_options(form, mount, topic=topic, frame=frame, odometry_from=odometry_from)
+    if form.topics:
+        options["range_min"] = range_min
     records: Iterator[Scan | Odometry] = importlib.import_module(form.module).read(file, **options)
-    return records
+    return records if form.topics or range_min is None else _with_range_min(records, range_min)
+
+
+def _with_range_min(records: Iterator[Scan | Odometry], range_min: float) -> Iterator[Scan | Odometry]:
+    """Yield the records of a format that states no lower limit of ranges, with scanners that have one."""
+    scanners: dict[Scanner, Scanner] = {}
+    for record in records:
+        if isinstance(record, Scan):
+            one = record.scanner
+            if one not in scanners:
+                scanners[one] = Scanner(one.bearings, one.range_max, range_min, one.mount)
+            record = replace(record, scanner=scanners[one])
+        yield record
 
 
 def format_of(file: Path) -> Format:
@@ -144,28 +183,36 @@ def format_of(file: Path) -> Format:
         FileNotFoundError: It is missing.
         ValueError: It is a folder but no ROS 2 bag.
     """
-    if not file.is_dir():
-        checks.existing_file(file)
-    form = next((each for each in FORMATS if each.claims(file)), None)
-    if form is None:
+    if file.is_dir():
+        if is_bag_folder(file):
+            return BAG2
         known = " or ".join(each.name for each in FORMATS)
-        raise ValueError(f"{file}: must be {known}, got a folder without metadata.yaml")
-    return form
+        raise ValueError(f"{file}: must be {known}, got a folder without metadata.yaml, .db3 or .mcap files")
+    checks.existing_file(file)
+    with file.open("rb") as stream:
+        head = stream.read(16)
+    found = [each for each in FORMATS if head.startswith(each.magic)]
+    found = found or [each for each in FORMATS if file.name.lower().endswith(each.suffixes)]
+    if not found:
+        first = next((line for _, line in numbered_lines(file)), b"")
+        found = [each for each in FORMATS if first.startswith(each.begins)]
+    return (found or FORMATS[-1:])[0]
 
 
-def _ros_options(form: Format, topic: object, mount: ArrayLike | None) -> dict[str, object]:
+def _ros_options(form: Format, mount: ArrayLike | None, **others: object) -> dict[str, object]:
     """Return the checked options of ROS bags.
 
     Raises:
-        TypeError: ``topic`` is no string, or ``mount`` does not hold numbers.
-        ValueError: ``mount`` has another shape, or the format has no topics.
+        TypeError: A name is no string, or ``mount`` does not hold numbers.
+        ValueError: ``mount`` has another shape, or the format is no bag.
     """
-    if topic is not None and not isinstance(topic, str):
-        raise TypeError(f"topic: must be a string or None, got {checks.show(topic)}")
+    for name in ("topic", "frame", "odometry_from"):
+        if others[name] is not None and not isinstance(others[name], str):
+            raise TypeError(f"{name}: must be a string or None, got {checks.show(others[name])}")
     place = None if mount is None else tuple(checks.array("mount", mount, (3,)).tolist())
     if form.topics:
-        return dict(topic=topic, mount=place)
-    for name, value in (("topic", topic), ("mount", mount)):
+        return {**others, "mount": place}
+    for name, value in {**others, "mount": mount}.items():
         if value is not None:
             raise ValueError(f"{name}: must be left out for {form.name}, got {checks.show(value)}")
     return {}

@@ -51,6 +51,20 @@ class Scan:
         return f"Scan(time={self.time}, {len(self.ranges)} readings, odometry={self.odometry}, pose={self.pose})"
 
 
+def check_scanner(scan: Scan, scanner: Scanner, where: str) -> None:
+    """Check that a scan of a log comes from the scanner of the scans before.
+
+    Raises:
+        ValueError: It comes from another one.
+    """
+    if scan.scanner != scanner:
+        remedy = ""
+        if scan.scanner.mount != scanner.mount:
+            mounts = " and ".join(f"({', '.join(f'{x:.4g}' for x in each.mount)})" for each in (scanner, scan.scanner))
+            remedy = f", with mounts {mounts}: --frame chooses one laser, --mount sets one mount"
+        raise ValueError(f"log: every scan must come from the same scanner, got another at {where}{remedy}")
+
+
 @dataclass(frozen=True)
 class Odometry:
     """One reading of the wheel odometry.

@@ -27,68 +27,26 @@ models leave out. Bearings move by 0.125 degrees at most.
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpusense._util.angles import wrapped
 from gpusense._util.notices import warn_user
-from gpusense.logs.bags import ODOMETRY, SCAN, TRANSFORMS, errors_at, messages, topics_of
+from gpusense.logs.bag_beams import Beams, shared_beams
+from gpusense.logs.bag_survey import BASES, Bag, base_order, frame_of, odometry_pose, scans_on, survey
+from gpusense.logs.bags import ODOMETRY, Message, messages
 from gpusense.logs.records import Floats, Odometry, Pose, Scan
-from gpusense.logs.transform_buffer import TransformBuffer, TransformError
+from gpusense.logs.transform_buffer import TransformError
 from gpusense.logs.transforms import planar_mount
-from gpusense.world.messages import (
-    distinct_beams,
-    laser_geometry,
-    planar_pose,
-    real_field,
-    spread_readings,
-    stamp_of,
-)
-from gpusense.world.messages import field as field_of
+from gpusense.world.messages import LEVEL, stamp_of
 from gpusense.world.scanner import Scanner
 
-_BASES = ("base_footprint", "base_link")
-# Beams of the common scanner of scans whose beams vary.
-_PLACES = 1440
-# Longest plausible time of a scan [s].
-_LONGEST = 2.0
 # Mounts that are further apart than this contradict each other [m, rad].
 _APART = (0.02, math.radians(2))
-
-Geometry = tuple[float, float, int, float, float]
-"""angle_min, angle_increment, count, range_min, range_max."""
-
-
-@dataclass
-class _Bag:
-    """Contents of a bag, without the readings of its scans.
-
-    Attributes:
-        topic: Topic of the scans.
-        odometer: Topic of the odometry; "" without one.
-        frame: Frame of the laser.
-        base: Frame of the robot's base, or None.
-        geometries: Numbers of scans by geometry.
-        times: Times of odometry [s].
-        poses: Poses of odometry.
-        transforms: Transforms between frames.
-    """
-
-    topic: str
-    odometer: str
-    frame: str = ""
-    base: str | None = None
-    geometries: Counter[Geometry] = field(default_factory=Counter)
-    times: list[float] = field(default_factory=list)
-    poses: list[Pose] = field(default_factory=list)
-    transforms: TransformBuffer = field(default_factory=TransformBuffer)
 
 
 def read(
@@ -97,172 +55,187 @@ def read(
     range_max: float | None,
     odometry: bool,
     rear: bool,
+    range_min: float | None = None,
     topic: str | None = None,
+    frame: str | None = None,
     mount: Pose | None = None,
+    odometry_from: str | None = None,
 ) -> Iterator[Scan | Odometry]:
     """Read the records of a bag; see :func:`gpusense.read_log` for arguments and errors."""
     if rear:
         raise ValueError("rear: must be False for a ROS bag, whose lasers have topics (topic=), got True")
-    return _records(path, range_max, odometry, topic, mount)
+    return _records(path, range_max, range_min, odometry, topic, frame, mount, odometry_from)
 
 
 def _records(
-    path: Path, range_max: float | None, odometry: bool, topic: str | None, mount: Pose | None
+    path: Path,
+    range_max: float | None,
+    range_min: float | None,
+    odometry: bool,
+    topic: str | None,
+    frame: str | None,
+    mount: Pose | None,
+    odometry_from: str | None,
 ) -> Iterator[Scan | Odometry]:
-    bag = _survey(path, topic)
-    place, upside_down = _mount(path, bag, mount)
-    scanner = _scanner(path, bag, range_max, place, upside_down)
-    order = np.argsort(bag.times, kind="stable")
-    times, poses = np.array(bag.times)[order], np.array(bag.poses).reshape(-1, 3)[order]
-    poses[:, 2] = np.unwrap(poses[:, 2])
-    wanted = {SCAN: {bag.topic}, ODOMETRY: {bag.odometer} if odometry else set()}
-    for message in messages(path, wanted):
-        with errors_at(message.where):
-            time = stamp_of("message", message.fields) or message.time
-            if message.kind == ODOMETRY:
-                record: Scan | Odometry = Odometry(time, _odometry_pose(message.fields))
-            else:
-                ranges = _readings(message.fields, scanner, len(bag.geometries) > 1, upside_down)
-                lasted = 0.0 if len(bag.geometries) > 1 else _duration(message.fields, scanner.count)
-                light = None if len(bag.geometries) > 1 else _intensities(message.fields, scanner.count)
-                record = Scan(time, ranges, scanner, _pose_at(time, times, poses), None, lasted, light)
-        yield record
+    bag = survey(path, topic, frame, odometry_from)
+    lasers = _lasers(bag, mount, range_min, range_max)
+    times, poses = bag.track.sorted()
+    for message in messages(path, {**scans_on(bag.topic), ODOMETRY: {bag.odometer} if odometry else set()}):
+        try:
+            record = _record(bag, message, lasers, times, poses)
+        except ValueError:
+            # The survey has warned of it.
+            continue
+        if record is not None:
+            yield record
 
 
-def _survey(path: Path, topic: str | None) -> _Bag:
-    """Read everything but readings."""
-    topics = topics_of(path)
-    odometers = topics.get(ODOMETRY, [])
-    odometer = "/odom" if "/odom" in odometers else min(odometers, default="")
-    bag = _Bag(_scan_topic(path, topics.get(SCAN, []), topic), odometer)
-    for message in messages(path, {SCAN: {bag.topic}, ODOMETRY: {odometer}, TRANSFORMS: None}):
-        with errors_at(message.where):
-            if message.kind == SCAN:
-                geometry = laser_geometry(message.fields)
-                names = ("angle_min", "angle_increment", "count", "range_min", "range_max")
-                bag.geometries[tuple(geometry[name] for name in names)] += 1
-                bag.frame = bag.frame or str(field_of("message", message.fields, "header.frame_id"))
-            elif message.kind == ODOMETRY:
-                bag.times.append(stamp_of("message", message.fields) or message.time)
-                bag.poses.append(_odometry_pose(message.fields))
-                bag.base = bag.base or str(field_of("message", message.fields, "child_frame_id")) or None
-            else:
-                for each in field_of("message", message.fields, "transforms"):
-                    bag.transforms.add(each, static=message.topic.endswith("tf_static"))
-    if not bag.geometries:
-        raise ValueError(f"{path}: must hold scans on {bag.topic}, got none")
-    if not bag.times:
-        _take_odometry(bag)
-    return bag
+def _record(
+    bag: Bag, message: Message, lasers: dict[str, _Laser], times: Floats, poses: Floats
+) -> Scan | Odometry | None:
+    """Return the record of a message; None for a scan of another laser."""
+    stamp = stamp_of("message", message.fields)
+    if message.kind == ODOMETRY:
+        return Odometry(stamp if bag.track.times.stamped else message.time, odometry_pose(message.fields)[0])
+    laser = lasers.get(frame_of(message.fields) or bag.unnamed)
+    if laser is None:
+        return None
+    time = stamp if bag.times.stamped else message.time
+    ranges, light, lasted = laser.beams.take(message.fields)
+    return Scan(time, ranges, laser.scanner(time), _pose_at(time, times, poses), None, lasted, light)
 
 
-def _scan_topic(path: Path, known: list[str], topic: str | None) -> str:
-    """Return the topic of the scans.
+@dataclass
+class _Laser:
+    """A laser of a bag.
+
+    Attributes:
+        mount: Its mount.
+        upside_down: Whether its beams run clockwise.
+        tilt: Its largest tilt [rad].
+        moves: Largest distance [m] and turn [rad] between its mounts; None if it is fixed to the robot.
+        at: Function of the time that returns its pose on the base; None if one mount serves.
+    """
+
+    mount: Pose = (0.0, 0.0, 0.0)
+    upside_down: bool = False
+    tilt: float = 0.0
+    moves: tuple[float, float] | None = None
+    at: Callable[[float], Floats] | None = None
+    beams: Beams = field(init=False)
+    _scanners: dict[tuple[Pose, bool], Scanner] = field(default_factory=dict)
+
+    def scanner(self, time: float) -> Scanner:
+        """Return the scanner at a time; the same object for the same mount."""
+        key = (self.mount, self.upside_down) if self.at is None else planar_mount(self.at(time))[:2]
+        if key not in self._scanners:
+            self._scanners[key] = self.beams.scanner(*key)
+        return self._scanners[key]
+
+
+def _lasers(bag: Bag, given: Pose | None, range_min: float | None, range_max: float | None) -> dict[str, _Laser]:
+    """Return the lasers by their frames."""
+    found = _mounted(bag, given)
+    for frame, laser in found.items():
+        place = f"{bag.path}: {bag.topic}" + (f" in {frame}" if len(found) > 1 else "")
+        laser.beams = shared_beams(place, bag.lasers[frame], range_min, range_max)
+    return found
+
+
+def _mounted(bag: Bag, given: Pose | None) -> dict[str, _Laser]:
+    """Return the lasers with their mounts, by their frames.
 
     Raises:
-        ValueError: There is no such topic, or the user must choose one.
+        ValueError: Only some lasers of the topic have transforms.
+
+    Warns:
+        UserWarning: A mount contradicts transforms, is not level, moves, is assumed, or serves several lasers.
     """
-    if not known:
-        raise ValueError(f"{path}: must hold sensor_msgs/LaserScan messages, got none")
-    if topic is not None:
-        if topic not in known:
-            raise ValueError(f"topic: must be one of {', '.join(known)} in {path}, got {topic!r}")
-        return topic
-    if "/scan" in known:
-        return "/scan"
-    if len(known) > 1:
-        raise ValueError(f"topic: must be given, one of {', '.join(known)}, for {path}, got None")
-    return known[0]
-
-
-def _take_odometry(bag: _Bag) -> None:
-    """Take odometry from the transforms between odom and the robot's base."""
-    children = [link.child for link in bag.transforms.links() if link.parent == "odom"]
-    for base in (*_BASES, *sorted(children)) if children else ():
-        with contextlib.suppress(TransformError):
-            times, poses = bag.transforms.history("odom", base)
-            headings = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
-            planar = zip(poses[:, 0, 3].tolist(), poses[:, 1, 3].tolist(), headings.tolist(), strict=True)
-            bag.base, bag.times, bag.poses = base, times.tolist(), list(planar)
-            return
-
-
-def _odometry_pose(message: object) -> Pose:
-    return planar_pose("message.pose", field_of("message", message, "pose.pose"))
-
-
-def _mount(path: Path, bag: _Bag, given: Pose | None) -> tuple[Pose, bool]:
-    """Return the laser's mount, and whether it is upside down; warn if a given mount contradicts the transforms."""
-    bases = [bag.base] if bag.base else list(_BASES)
-    found = []
-    for base in bases:
-        with contextlib.suppress(TransformError):
-            found.append(bag.transforms.fixed(base, bag.frame))
-    if not found:
-        if given is None:
-            warn_user(
-                f"{path}: has no fixed transforms from {' or '.join(bases)} to {bag.frame or 'the laser'}: the laser "
-                "is taken to be at the robot's centre, with mount (0, 0, 0); give its place as mount= or --mount"
+    bases = _bases(bag)
+    found: dict[str, _Laser] = {}
+    reasons: dict[str, str] = {}
+    for frame in bag.lasers:
+        for base in bases:
+            if frame not in found:
+                try:
+                    found[frame] = _by_transforms(bag, base, frame)
+                except TransformError as error:
+                    reasons.setdefault(frame, str(error))
+    frames = ", ".join(bag.lasers)
+    absent = [frame for frame in bag.lasers if frame not in found]
+    if len(bag.lasers) > 1:
+        if given is not None:
+            warn_user(f"{bag.path}: {bag.topic} has scans in the frames {frames}; the mount {given} is used for all")
+        elif absent:
+            raise ValueError(
+                f"{bag.path}: {bag.topic} has scans in the frames {frames}, but no transforms from "
+                f"{' or '.join(bases)} to {', '.join(absent)}: choose a laser by frame= or --frame, or set the mount "
+                "of all by mount= or --mount"
             )
-        return given or (0.0, 0.0, 0.0), False
-    with errors_at(f"{path}: transform to {bag.frame}"):
-        place, upside_down = planar_mount(found[0])
-    if given is None:
-        return place, upside_down
+    if given is not None:
+        for laser in found.values():
+            if laser.moves is None and laser.tilt <= LEVEL:
+                _compare(bag, given, laser.mount)
+        return {frame: _Laser(given, frame in found and found[frame].upside_down) for frame in bag.lasers}
+    for frame in absent:
+        warn_user(
+            f"{bag.path}: has no transforms from {' or '.join(bases)} to {frame or 'the laser'} ({reasons[frame]}): "
+            "the laser is taken to be at the robot's centre, with mount (0, 0, 0); give its place as mount= or --mount"
+        )
+    for frame, laser in found.items():
+        if laser.moves is not None:
+            kept = "one mount serves all scans" if laser.at is None else "each scan has the mount of its time"
+            warn_user(
+                f"{bag.path}: the transforms to {frame} move the laser on the robot, by up to {laser.moves[0]:.3g} m "
+                f"and {math.degrees(laser.moves[1]):.3g} deg: {kept}; mount= or --mount sets one"
+            )
+        if laser.tilt > LEVEL:
+            warn_user(
+                f"{bag.path}: the laser is tilted by {math.degrees(laser.tilt):.3g} deg by the transforms to {frame}: "
+                "x, y and yaw of its mount are used, as if it scanned a level plane"
+            )
+    return {frame: found.get(frame) or _Laser() for frame in bag.lasers}
+
+
+def _by_transforms(bag: Bag, base: str, frame: str) -> _Laser:
+    """Return a laser by the transforms from the robot's base to its frame.
+
+    Raises:
+        TransformError: They are not connected, or never known at the same time.
+    """
+    buffer = bag.transforms
+    try:
+        return _Laser(*planar_mount(buffer.fixed(base, frame)))
+    except TransformError:
+        times, matrices = buffer.history(base, frame)
+    if not len(times):
+        raise TransformError(f"the transforms from {base} to {frame} have no time in common")
+    mounts = [planar_mount(matrix) for matrix in matrices]
+    x, y, heading = np.array([mount for mount, _, _ in mounts]).T
+    turn = np.unwrap(heading)
+    moves = math.hypot(np.ptp(x), np.ptp(y)), float(np.ptp(turn))
+    mount, upside_down, _ = mounts[len(mounts) // 2]
+    laser = _Laser(mount, upside_down, max(tilt for _, _, tilt in mounts), moves)
+    if moves[0] > _APART[0] or moves[1] > _APART[1]:
+        first, last = float(times[0]), float(times[-1])
+        laser.at = lambda time: buffer.look_up(base, frame, min(max(time, first), last))
+    return laser
+
+
+def _bases(bag: Bag) -> list[str]:
+    """Return the frames that may be the robot's base, the likeliest first."""
+    if bag.track.base:
+        return [bag.track.base]
+    names = {name for link in bag.transforms.links() for name in (link.parent, link.child)}
+    return sorted((name for name in names if name.rpartition("/")[2] in BASES), key=base_order) or list(BASES)
+
+
+def _compare(bag: Bag, given: Pose, place: Pose) -> None:
+    """Warn if a mount contradicts the transforms."""
     apart = math.hypot(given[0] - place[0], given[1] - place[1])
-    turn = abs(wrapped(given[2] - place[2]))
-    if apart > _APART[0] or turn > _APART[1]:
+    if apart > _APART[0] or abs(wrapped(given[2] - place[2])) > _APART[1]:
         shown = ", ".join(f"{value:.4g}" for value in place)
-        warn_user(f"{path}: mount {given} contradicts the transforms of the log, by which it is ({shown})")
-    return given, upside_down
-
-
-def _scanner(path: Path, bag: _Bag, range_max: float | None, mount: Pose, upside_down: bool) -> Scanner:
-    """Return the scanner of all scans; a common one if their beams vary."""
-    with errors_at(f"{path}: {bag.topic}"):
-        farthest = range_max or max(each[4] for each in bag.geometries)
-        nearest = min(max(min(each[3] for each in bag.geometries), 0.0), farthest)
-        if len(bag.geometries) > 1:
-            step = 2 * math.pi / _PLACES
-            return Scanner.uniform(angle_min=-math.pi, angle_increment=step, count=_PLACES, range_max=farthest,
-                                   range_min=nearest, mount=mount)  # fmt: skip
-        ((first, step, count, _, _),) = bag.geometries
-        sign = -1 if upside_down else 1
-        return Scanner.uniform(angle_min=sign * first, angle_increment=sign * step, count=distinct_beams(step, count),
-                               range_max=farthest, range_min=nearest, mount=mount)  # fmt: skip
-
-
-def _readings(message: object, scanner: Scanner, common: bool, upside_down: bool) -> Floats:
-    """Return the readings of a scan for its scanner; read-only."""
-    if common:
-        ranges = spread_readings(message, scanner.count, upside_down)
-    else:
-        ranges = np.array(field_of("message", message, "ranges"), np.float64)[: scanner.count]
-    ranges[ranges == 0] = math.nan
-    ranges.setflags(write=False)
-    return ranges
-
-
-def _intensities(message: object, beams: int) -> NDArray[np.float32] | None:
-    """Return the intensities of a scan, read-only; None if it has none, or all are equal."""
-    try:
-        light = np.array(field_of("message", message, "intensities"), np.float32)
-    except (TypeError, ValueError):
-        return None
-    if light.ndim != 1 or not 0 < beams <= len(light) or not (light != light[0]).any():
-        return None
-    light = light[:beams]
-    light.setflags(write=False)
-    return light
-
-
-def _duration(message: object, beams: int) -> float:
-    """Return the time from the first beam to the last one [s]; 0 if the message states no plausible one."""
-    try:
-        lasted = real_field("message", message, "time_increment") * (beams - 1)
-    except (TypeError, ValueError):
-        return 0.0
-    return lasted if 0 < lasted <= _LONGEST else 0.0
+        warn_user(f"{bag.path}: mount {given} contradicts the transforms of the log, by which it is ({shown})")
 
 
 def _pose_at(time: float, times: Floats, poses: Floats) -> Pose:

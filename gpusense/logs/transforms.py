@@ -9,26 +9,21 @@ import numpy as np
 
 from gpusense._util.angles import wrapped
 from gpusense.logs.records import Floats, Pose, Scan
+from gpusense.world.messages import tilt_of
 
-# Smallest cosine between vertical axes of a laser that scans a level plane.
-_LEVEL = 0.985
+# Least tilt of a laser whose beams run clockwise [rad].
+_UPSIDE_DOWN = 2 * math.pi / 3
 # Check of a mount: headings tried, most pairs of scans, distance and turn between two scans of a pair.
 _HEADINGS, _PAIRS = 24, 12
 _SHIFT, _TURN = (0.15, 1.0), 0.2
 
 
-def planar_mount(matrix: Floats) -> tuple[Pose, bool]:
-    """Return (x, y, theta) of a laser's (4, 4) pose, and whether it is upside down, so that its bearings run clockwise.
-
-    Raises:
-        ValueError: The laser does not scan a level plane.
-    """
-    up = float(matrix[2, 2])
-    if abs(up) < _LEVEL:
-        rule = "must scan a level plane"
-        raise ValueError(f"laser: {rule}, got one tilted by {math.degrees(math.acos(min(abs(up), 1.0))):.3g} deg")
+def planar_mount(matrix: Floats) -> tuple[Pose, bool, float]:
+    """Return a laser's mount, whether it is upside down, so that its bearings run clockwise, and its tilt [rad]."""
     pose = float(matrix[0, 3]), float(matrix[1, 3]), math.atan2(matrix[1, 0], matrix[0, 0])
-    return pose, up < 0
+    tilt = tilt_of(matrix)
+    upside_down = tilt > _UPSIDE_DOWN
+    return pose, upside_down, math.pi - tilt if upside_down else tilt
 
 
 def check_mount(scans: Sequence[Scan]) -> str | None:

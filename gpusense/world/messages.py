@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from gpusense._util import checks
 
 _ABSENT = object()
-# Largest tilt of a planar pose: 1 minus the cosine of the angle between its z axis and the frame's.
-_LEVEL = 1e-3
+LEVEL = math.acos(1 - 1e-3)
+"""Largest tilt of a level pose [rad]."""
 
 
 def field(name: str, message: object, path: str) -> Any:
@@ -42,8 +42,12 @@ def real_field(name: str, message: object, path: str) -> float:
         TypeError: The field is absent or not a number.
         ValueError: The number is not finite.
     """
+    return checks.real(f"{name}.{path}", _number(message, path, name))
+
+
+def _number(message: object, path: str, name: str = "message") -> Any:
     value = field(name, message, path)
-    return checks.real(f"{name}.{path}", value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value)
+    return value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
 
 
 def stamp_of(name: str, message: object) -> float:
@@ -90,24 +94,55 @@ def rotation_of(name: str, quaternion: object) -> np.ndarray:
     return rotation_matrix(*unit_quaternion(name, quaternion))
 
 
+def planar_part(name: str, pose: object) -> tuple[tuple[float, float, float], float]:
+    """Return (x, y, yaw) of a pose with fields position and orientation, and its tilt [rad].
+
+    Raises:
+        TypeError: A field is absent or not a number.
+        ValueError: The pose is not finite, or its quaternion is 0.
+    """
+    rotation = rotation_of(f"{name}.orientation", field(name, pose, "orientation"))
+    x, y = (real_field(name, pose, f"position.{axis}") for axis in "xy")
+    return (x, y, math.atan2(rotation[1, 0], rotation[0, 0])), tilt_of(rotation)
+
+
+def tilt_of(rotation: np.ndarray) -> float:
+    """Return the angle between the z axes of a rotated frame and of its parent [rad]."""
+    return math.acos(min(max(float(rotation[2, 2]), -1.0), 1.0))
+
+
 def planar_pose(name: str, pose: object) -> tuple[float, float, float]:
-    """Return (x, y, yaw) of a pose with fields position and orientation.
+    """Return (x, y, yaw) of a pose that must be level.
 
     Raises:
         TypeError: A field is absent or not a number.
         ValueError: The pose is not level, or not finite.
     """
-    rotation = rotation_of(f"{name}.orientation", field(name, pose, "orientation"))
-    if rotation[2, 2] < 1 - _LEVEL:
+    planar, tilt = planar_part(name, pose)
+    if tilt > LEVEL:
         rule = "must be level, with a rotation about z only"
-        raise ValueError(f"{name}.orientation: {rule}, got a tilt of {math.degrees(math.acos(rotation[2, 2])):.3g} deg")
-    x, y = (real_field(name, pose, f"position.{axis}") for axis in "xy")
-    return x, y, math.atan2(rotation[1, 0], rotation[0, 0])
+        raise ValueError(f"{name}.orientation: {rule}, got a tilt of {math.degrees(tilt):.3g} deg")
+    return planar
 
 
 def distinct_beams(step: float, count: int) -> int:
     """Return the number of beams, less one if the last beam has the direction of the first."""
     return count - 1 if count > 2 and abs(abs(step) * (count - 1) - 2 * math.pi) < 0.5 * abs(step) else count
+
+
+def nearest_beams(bearings: NDArray[np.float64], first: float, step: float, count: int) -> NDArray[np.int64]:
+    """Return the index of the beam nearest to each bearing; -1 where the nearest beam is over half a step away.
+
+    Args:
+        bearings: (K,) bearings of any turn [rad].
+        first: Bearing of beam 0 [rad].
+        step: Step between beams [rad].
+        count: Number of beams.
+    """
+    turned = bearings - first if step > 0 else first - bearings
+    width = abs(step)
+    index = np.rint((np.mod(turned + width / 2, 2 * math.pi) - width / 2) / width).astype(np.int64)
+    return np.where(index < count, index, -1)
 
 
 def spread_readings(message: object, places: int, upside_down: bool = False) -> NDArray[np.float64]:
@@ -119,25 +154,57 @@ def spread_readings(message: object, places: int, upside_down: bool = False) -> 
         upside_down: Whether the beams run clockwise.
     """
     raw = checks.array("message.ranges", field("message", message, "ranges"), ("K",), finite=False)
-    first, step = (real_field("message", message, name) for name in ("angle_min", "angle_increment"))
-    raw = raw[: distinct_beams(step, len(raw))]
-    bearings = (first + step * np.arange(len(raw))) * (-1 if upside_down else 1)
+    first, step, count = laser_beams(message)
+    bearings = np.asarray(
+        (first + step * np.arange(distinct_beams(step, count))) * (-1 if upside_down else 1), np.float64
+    )
     ranges: NDArray[np.float64] = np.full(places, math.nan)
-    ranges[np.rint((bearings + math.pi) / (2 * math.pi) * places).astype(np.int64) % places] = raw
+    ranges[nearest_beams(bearings, -math.pi, 2 * math.pi / places, places)] = raw[: len(bearings)]
     return ranges
 
 
-def laser_geometry(message: object) -> dict[str, Any]:
+def laser_beams(message: object) -> tuple[float, float, int]:
+    """Return angle_min, angle_increment and the number of beams of a ``sensor_msgs/LaserScan``.
+
+    Raises:
+        TypeError: A field is absent or not a number.
+        ValueError: An angle is not finite, or several beams have the same bearing.
+    """
+    first, step = (real_field("message", message, name) for name in ("angle_min", "angle_increment"))
+    count = len(checks.array("message.ranges", field("message", message, "ranges"), ("K",), finite=False))
+    if count > 1 and step == 0:
+        raise ValueError(f"message.angle_increment: must not be 0 for {count} beams, got {step:g}")
+    return first, step, count
+
+
+def _range_limit(message: object, name: str, value: float | None, **rule: float) -> float:
+    """Return a limit of ranges [m], or the value that replaces it.
+
+    Raises:
+        TypeError: The field is absent or not a number.
+        ValueError: The field breaks its rule, and nothing replaces it.
+    """
+    if value is not None:
+        return value
+    try:
+        return checks.real(f"message.{name}", _number(message, name), **rule)
+    except ValueError as error:
+        raise ValueError(f"{error}; {name}= replaces it") from None
+
+
+def laser_geometry(message: object, range_max: float | None = None, range_min: float | None = None) -> dict[str, Any]:
     """Return angle_min, angle_increment, count, range_min and range_max of a ``sensor_msgs/LaserScan``.
+
+    Args:
+        message: The scan.
+        range_max: Replaces the message's value, which is not read then [m].
+        range_min: Replaces the message's value, which is not read then [m].
 
     Raises:
         TypeError: A field is absent or not a number.
         ValueError: A value is not finite, or several beams have the same bearing.
     """
-    names = ("angle_min", "angle_increment", "range_min", "range_max")
-    found: dict[str, Any] = {name: real_field("message", message, name) for name in names}
-    found["count"] = len(checks.array("message.ranges", field("message", message, "ranges"), ("K",), finite=False))
-    step = found["angle_increment"]
-    if found["count"] > 1 and step == 0:
-        raise ValueError(f"message.angle_increment: must not be 0 for {found['count']} beams, got {step:g}")
-    return found
+    first, step, count = laser_beams(message)
+    nearest = _range_limit(message, "range_min", range_min, low=0)
+    farthest = _range_limit(message, "range_max", range_max, above=0)
+    return dict(angle_min=first, angle_increment=step, count=count, range_min=nearest, range_max=farthest)

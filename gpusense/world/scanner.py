@@ -148,7 +148,14 @@ class Scanner:
         )  # fmt: skip
 
     @classmethod
-    def from_laser_scan(cls, message: Any, mount: ArrayLike = (0.0, 0.0, 0.0)) -> Scanner:
+    def from_laser_scan(
+        cls,
+        message: Any,
+        mount: ArrayLike = (0.0, 0.0, 0.0),
+        *,
+        range_max: float | None = None,
+        range_min: float | None = None,
+    ) -> Scanner:
         """Make the scanner of a ``sensor_msgs/LaserScan``, without ROS.
 
         Beam k has the bearing ``angle_min + k angle_increment``. Each of ``ranges`` has a beam, even if the last beam
@@ -159,6 +166,8 @@ class Scanner:
             message: Any object or mapping with the message's fields angle_min, angle_increment, range_min, range_max
                 and ranges. ``angle_max`` is not read, because it follows from the other fields.
             mount: Pose (x, y, theta) of the laser in the robot's frame [m, m, rad].
+            range_max: Replaces the message's ``range_max`` [m], for drivers that state infinity, NaN or 0.
+            range_min: Replaces the message's ``range_min`` [m].
 
         Raises:
             TypeError: A field is absent or has the wrong type.
@@ -170,7 +179,7 @@ class Scanner:
             >>> gs.Scanner.from_laser_scan(message, mount=(0.2, 0.0, 0.0))
             Scanner(7 beams over 171.9 deg, range_max=8.0, range_min=0.1, mount=(0.2, 0.0, 0.0))
         """
-        return cls.uniform(**laser_geometry(message), mount=mount)
+        return cls.uniform(**laser_geometry(message, range_max, range_min), mount=mount)
 
     @property
     def bearings(self) -> NDArray[np.float64]:

@@ -243,7 +243,7 @@ PAIRS = ["--pairs", "{file}", "--range-max", "5"]
     ("1,1", [*LOG, *PAIRS], "--map: must be left out with --pairs, got {map}"),
     ("1,1", PAIRS[:2], "--range-max: must be given with --pairs, got none"),
     ("1,1", [*PAIRS, "--range-min", "5"], "--range-min: must be < --range-max = 5.0, got 5.0"),
-    (None, [*LOG, "--range-min", "50"], "--range-min: must be < the log's range_max = 10.0, got 50.0"),
+    (None, [*LOG, "--range-min", "50"], "--range-min: must be < range_max = 10.0, got 50.0"),
     (None, [*LOG, "--range-max", "0"], "argument --range-max: must be a finite number > 0, got '0'"),
     (None, [*LOG, "--method", "magic"], "argument --method: invalid choice: 'magic'"),
     (None, [*LOG, "--offset", "99"], "log: must have a scan of index 99"),

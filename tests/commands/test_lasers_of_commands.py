@@ -78,7 +78,7 @@ def test_help_names_bags_and_lasers(capsys, name):
 @pytest.mark.parametrize("name", READERS)
 def test_a_bag_without_transforms_warns_of_the_mount(place, capsys, name):
     argv = command(place, name, "run.bag", *(["--fit-motion"] if name == "fit" else []))
-    text = f"{place / 'run.bag'}: has no fixed transforms from base_link to laser: .*, with mount .0, 0, 0.; give "
+    text = f"{place / 'run.bag'}: has no transforms from base_link to laser .*, with mount .0, 0, 0.; give "
     with pytest.warns(UserWarning, match=text):
         assert cli.main(argv) in (0, 1)
     with warnings.catch_warnings():

@@ -40,6 +40,15 @@ def test_a_scanner(form: Any) -> None:
     assert gs.Scanner.from_laser_scan(form(laser(angle_increment=-0.5))).bearings[1] == -2.0
 
 
+def test_arguments_replace_limits_of_ranges_before_these_are_checked() -> None:
+    for bad in (math.inf, math.nan, 0.0, -1.0, float(np.finfo(np.float32).max)):
+        assert gs.Scanner.from_laser_scan(laser(range_max=bad), range_max=8.0).range_max == 8.0
+    for bad in (math.inf, math.nan, -1.0, 9.0):
+        assert gs.Scanner.from_laser_scan(laser(range_min=bad), range_min=0.1).range_min == 0.1
+    with pytest.raises(ValueError, match=r"^range_max: must be finite and > 0, got inf$"):
+        gs.Scanner.from_laser_scan(laser(), range_max=math.inf)
+
+
 @pytest.mark.parametrize("form", [dict, as_object])
 def test_a_map(form: Any) -> None:
     rows = [[0, 100, -1], [50, 0, 0]]
@@ -54,7 +63,11 @@ V, T = ValueError, TypeError
 CASES: list[tuple[Any, dict[str, Any], type[Exception], str]] = [
     ("scan", {"range_max": 8.0}, T, "message: must have the field angle_min, got {'range_max': 8.0}"),
     ("scan", laser(angle_min="a"), T, "message.angle_min: must be a real number, got 'a'"),
-    ("scan", laser(range_max=math.inf), V, "message.range_max: must be finite, got inf"),
+    ("scan", laser(range_max=math.inf), V,
+     "message.range_max: must be finite and > 0, got inf; range_max= replaces it"),
+    ("scan", laser(range_max=0.0), V, "message.range_max: must be finite and > 0, got 0.0; range_max= replaces it"),
+    ("scan", laser(range_min=math.nan), V,
+     "message.range_min: must be finite and >= 0, got nan; range_min= replaces it"),
     ("scan", laser(angle_increment=0.0), V, "message.angle_increment: must not be 0 for 7 beams, got 0"),
     ("scan", laser(ranges=[[1.0]]), V, "message.ranges: shape must be (K,), got (1, 1)"),
     ("grid", grid([0, 0]), V, "message.data: must hold width * height = 6 cells, got 2"),

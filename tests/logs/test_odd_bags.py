@@ -1,0 +1,258 @@
+"""Bags as recorders and users leave them: journals, names, missing metadata, several odometries and echoes."""
+
+from __future__ import annotations
+
+import gzip
+import math
+import shutil
+import sqlite3
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.bags import BASE, LASER, Writer
+
+import gpusense as gs
+
+KINDS = ("ros1", "sqlite3", "mcap")
+each_kind = pytest.mark.parametrize("kind", KINDS)
+FLAT = (0.0, 0.0, 0.0)
+
+
+def read(path: Path, **options: Any) -> tuple[list[Any], list[str]]:
+    """Return the records of a log, and the warnings."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        records = list(gs.read_log(path, **options))
+    return records, [str(one.message) for one in caught]
+
+
+def bag_of(folder: Path, kind: str, name: str = "run", begin: int = 0) -> Path:
+    """Write a bag of three scans; return its file of messages."""
+    with Writer(folder, kind, name) as bag:
+        bag.transform(1.0 + begin, BASE, LASER, (0.1, 0.0), 0.0)
+        for k in range(begin, begin + 3):
+            bag.odometry(1.0 + k, 1.0 * k, 0.0, 0.0)
+            bag.scan(1.0 + k, [2.0 + k] * 5, -0.2, 0.1)
+    return bag.path if kind == "ros1" else next(one for one in bag.path.iterdir() if one.suffix != ".yaml")
+
+
+def times(path: Path, **options: Any) -> list[float]:
+    """Return the times of a log's scans, which must give no warning."""
+    scans, told = read(path, **options)
+    assert told == []
+    return [scan.time for scan in scans]
+
+
+# ---- journals
+
+
+def recorded(folder: Path, mode: str) -> Path:
+    """Write a database whose recorder was killed, beside which its journal lies."""
+    whole, live = bag_of(folder, "sqlite3", "whole"), folder / "live.db3"
+    source, target = sqlite3.connect(whole), sqlite3.connect(live)
+    target.execute(f"PRAGMA journal_mode = {'wal' if 'wal' in mode else 'delete'}")
+    target.execute("PRAGMA wal_autocheckpoint = 0")
+    target.execute("PRAGMA cache_size = 5")
+    for name, sql in source.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'").fetchall():
+        target.execute(sql)
+        for row in source.execute(f"SELECT * FROM {name}").fetchall() if name != "messages" else ():
+            target.execute(f"INSERT INTO {name} VALUES ({', '.join('?' * len(row))})", row)
+    rows = source.execute("SELECT * FROM messages ORDER BY timestamp").fetchall()
+    put = "INSERT INTO messages VALUES (?, ?, ?, ?)"
+    target.executemany(put, rows if mode == "rollback" else rows[:3])
+    target.commit()
+    if mode != "wal-new":
+        target.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+    if mode == "rollback":
+        # Pages of a transaction that was never committed are in the database.
+        target.execute("DELETE FROM messages WHERE id > 2")
+        target.executemany(put, [(1000 + k, 1, k, b"x" * 4000) for k in range(50)])
+    else:
+        target.executemany(put, rows[3:])
+        target.commit()
+    killed = folder / "killed"
+    killed.mkdir()
+    for end in ("", "-wal", "-shm", "-journal"):
+        file = live.with_name(live.name + end)
+        if file.exists() and (end != "-shm" or mode == "wal-shm"):
+            shutil.copy(file, killed / f"killed.db3{end}")
+    target.rollback()
+    target.close()
+    source.close()
+    return killed
+
+
+@pytest.mark.parametrize("mode", ["wal", "wal-shm", "wal-new", "rollback"])
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_killed_recorder_loses_nothing_that_it_committed(tmp_path: Path, mode: str, whole: bool) -> None:
+    folder = recorded(tmp_path, mode)
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    assert len(before) == (3 if mode == "wal-shm" else 2)
+    # A folder without metadata.yaml, or the file alone.
+    assert times(folder if whole else folder / "killed.db3") == [1.0, 2.0, 3.0]
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+    if whole and mode == "wal":
+        metadata = (tmp_path / "whole/metadata.yaml").read_text()
+        (folder / "metadata.yaml").write_text(metadata.replace("whole.db3", "killed.db3"))
+        assert times(folder) == [1.0, 2.0, 3.0]
+
+
+# ---- names and folders
+
+
+@each_kind
+@pytest.mark.parametrize("name", ["run", "run.bag.active", "run.bag", "run.log", "run.mcap", "run.db3", "RUN.DB3"])
+def test_first_bytes_decide_the_format(tmp_path: Path, kind: str, name: str) -> None:
+    file = bag_of(tmp_path, kind, "whole")
+    shutil.copy(file, tmp_path / name)
+    assert times(tmp_path / name) == [1.0, 2.0, 3.0]
+
+
+def test_a_bag_that_is_being_recorded_is_read_up_to_its_end(tmp_path: Path) -> None:
+    data = bag_of(tmp_path, "ros1").read_bytes()
+    active = tmp_path / "run.bag.active"
+    active.write_bytes(data[: -len(data) // 8])
+    scans, told = read(active, mount=FLAT)
+    assert scans and len(told) == 1 and "run.bag.active: the bag is cut off; it is read up to there" in told[0]
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
+@pytest.mark.parametrize("metadata", [None, ""])
+def test_a_folder_without_metadata_is_its_files_in_the_order_of_time(tmp_path: Path, kind: str, metadata: Any) -> None:
+    folder = tmp_path / "split"
+    folder.mkdir()
+    # Names sort otherwise: part 10 comes after part 9.
+    for name, begin in (("run_9", 0), ("run_10", 3)):
+        file = bag_of(tmp_path, kind, name, begin)
+        shutil.copy(file, folder / file.name)
+    (folder / "notes.txt").write_text("hall, second floor")
+    if metadata is not None:
+        (folder / "metadata.yaml").write_text(metadata)
+    assert times(folder) == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+    assert [record.time for record in read(folder, odometry=True)[0]][::2] == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+
+
+def test_compressed_files_of_a_bag_are_read_through_its_folder(tmp_path: Path) -> None:
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode
+
+    for mode in ("FILE", "MESSAGE"):
+        bag = Writer(tmp_path, "sqlite3", mode.lower())
+        bag.writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
+        with bag:
+            bag.scan(1.0, [2.0] * 5, -0.2, 0.1)
+        assert times(bag.path, mount=FLAT) == [1.0]
+    # Compressed messages are recognised without metadata.yaml.
+    assert times(tmp_path / "message/message.db3", mount=FLAT) == [1.0]
+    file = tmp_path / "file/file.db3.zstd"
+    with pytest.raises(
+        ValueError, match=r"file\.db3\.zstd: must be decompressed, or replaced by the folder of its bag"
+    ):
+        read(file, mount=FLAT)
+    (tmp_path / "file/metadata.yaml").unlink()
+    with pytest.raises(ValueError, match=r"file\.db3\.zstd: must be decompressed in a folder without metadata\.yaml"):
+        read(tmp_path / "file", mount=FLAT)
+
+
+def test_text_logs_keep_their_formats(tmp_path: Path) -> None:
+    text = "FLASER 3 1.0 2.5 8.0 0 0 0 0 0 0 12.5 host 12.5\n"
+    for name, data in (
+        ("run", text.encode()),
+        ("run.mcap.txt", text.encode()),
+        ("run.gz", gzip.compress(text.encode())),
+    ):
+        (tmp_path / name).write_bytes(data)
+        assert times(tmp_path / name, range_max=8.0) == [12.5]
+
+
+# ---- lasers
+
+
+@each_kind
+def test_the_first_echo_of_a_laser_with_several_is_its_reading(tmp_path: Path, kind: str) -> None:
+    with Writer(tmp_path, kind) as bag:
+        bag.transform(1.0, BASE, LASER, (0.1, 0.0), 0.0)
+        bag.echoes(1.0, [[1.0, 4.0], [], [2.0], [math.inf], [0.0, 3.0]], -0.2, 0.1)
+    (scan,), told = read(bag.path)
+    assert str(scan.ranges.tolist()) == "[1.0, nan, 2.0, inf, nan]" and told == [] and scan.intensities is None
+    with Writer(tmp_path, kind, "both") as bag:
+        bag.echoes(1.0, [[1.0, 4.0]], -0.2, 0.1)
+        bag.scan(2.0, [5.0], -0.2, 0.1, topic="/first")
+    assert times(bag.path, mount=FLAT) == [2.0] and times(bag.path, mount=FLAT, topic="echoes") == [1.0]
+
+
+@each_kind
+def test_a_bag_without_scans_lists_its_topics(tmp_path: Path, kind: str) -> None:
+    with Writer(tmp_path, kind) as bag:
+        bag.odometry(1.0, 0.0, 0.0, 0.0)
+        bag.put("/notes", "std_msgs/msg/String", 2.0, data="no laser")
+    text = r"LaserScan messages, got /odom \(nav_msgs/msg/Odometry\), /notes \(std_msgs/msg/String\)$"
+    with pytest.raises(ValueError, match=text):
+        read(bag.path)
+
+
+def test_a_topic_without_messages_is_not_chosen(tmp_path: Path) -> None:
+    for kind in KINDS:
+        with Writer(tmp_path, kind, kind) as bag:
+            empty = bag.writer.add_connection("/scan", "sensor_msgs/msg/LaserScan", typestore=bag.store)
+            bag.writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=bag.store)
+            bag.scan(1.0, [2.0], -0.2, 0.1, topic="/front")
+            bag.odometry(1.0, 3.0, 0.0, 0.0, topic="/wheels")
+        assert empty.topic == "/scan"
+        (scan,), told = read(bag.path, mount=FLAT)
+        assert scan.odometry[0] == 3.0 and told == []
+
+
+# ---- odometries
+
+
+def with_odometries(folder: Path, kind: str, topics: Any, frames: Any, scans: str = "/scan") -> Path:
+    """Write a bag whose k-th odometry has x = k; frames are pairs of odometry and base."""
+    with Writer(folder, kind) as bag:
+        bag.transform(1.0, BASE, LASER, (0.1, 0.0), 0.0)
+        for time in (1.0, 2.0):
+            for k, topic in enumerate(topics):
+                bag.odometry(time, float(k), 0.0, 0.0, topic=topic)
+            for k, (frame, base) in enumerate(frames, len(topics)):
+                bag.transform(time, frame, base, (float(k), 0.0), 0.0, topic="/tf")
+            bag.scan(time, [2.0] * 5, -0.2, 0.1, topic=scans)
+    return bag.path
+
+
+CHOICES: list[tuple[Any, Any, str, Any, int, str]] = [
+    (["/odom"], [("odom", BASE)], "/scan", None, 0, ""),
+    (["/wheels/odom"], [], "/scan", None, 0, ""),
+    (["/wheels/odom", "/odom"], [], "/scan", None, 1, "from /odom, not from /wheels/odom"),
+    (["/wheels/odom", "/odom"], [], "/scan", "wheels/odom", 0, ""),
+    (["/b/odom", "/a/odom"], [], "/scan", None, 1, "from /a/odom, not from /b/odom"),
+    (["/a/odom", "/odom", "/b/odom"], [], "/b/scan", None, 2, "from /b/odom, not from /a/odom, /odom"),
+    (["/odom"], [("odom_combined", BASE)], "/scan", None, 0, "from /odom, not from odom_combined"),
+    (["/odom"], [("odom_combined", BASE)], "/scan", "/odom_combined", 1, ""),
+    ([], [("robot1/odom", BASE)], "/scan", None, 0, ""),
+    ([], [("odom_combined", "base_footprint")], "/scan", None, 0, ""),
+    ([], [("robot2/odom", BASE), ("robot1/odom", "robot1/base_link")], "/scan", None, 0, "not from robot1/odom"),
+    ([], [("robot1/odom", BASE), ("odom", BASE)], "/scan", None, 1, "from odom, not from robot1/odom"),
+    ([], [("robot1/odom", BASE), ("odom", BASE)], "/scan", "robot1/odom", 0, ""),
+    ([], [("world", BASE)], "/scan", "world", 0, ""),
+]
+
+
+@pytest.mark.parametrize("choice", CHOICES, ids=[f"{one[:2]}-{one[3]}" for one in CHOICES])
+def test_one_odometry_is_used_and_named_if_there_are_several(tmp_path: Path, choice: Any) -> None:
+    topics, frames, scans, wanted, used, text = choice
+    for kind in ("ros1", "mcap"):
+        found, told = read(with_odometries(tmp_path, kind, topics, frames, scans), odometry_from=wanted)
+        assert {scan.odometry[0] for scan in found} == {used}
+        told = [one for one in told if "transforms from" not in one]
+        assert len(told) == (1 if text else 0) and all(text in one and "--odometry chooses" in one for one in told)
+
+
+def test_an_odometry_that_is_absent_is_an_error_that_lists_all(tmp_path: Path) -> None:
+    path = with_odometries(tmp_path, "ros1", ["/odom"], [("odom_combined", BASE)])
+    text = r"^odometry_from: must be one of /odom, odom_combined in .*run.bag, got '/visual'$"
+    with pytest.raises(ValueError, match=text):
+        read(path, odometry_from="/visual")
+    with pytest.raises(ValueError, match=r"^odometry_from: must be left out for a CARMEN log, got 'x'$"):
+        (tmp_path / "run.log").write_text("")
+        read(tmp_path / "run.log", odometry_from="x")

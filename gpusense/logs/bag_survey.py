@@ -4,87 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gpusense._util.notices import warn_user
 from gpusense.logs.bag_beams import Geometry, geometry_of
+from gpusense.logs.bag_odometry import Times, Track, check_track, chosen_track, odometry_pose, odometry_topic
 from gpusense.logs.bags import ECHOES, ODOMETRY, SCAN, TRANSFORMS, Message, messages, topics_of
-from gpusense.logs.records import Floats, Pose
 from gpusense.logs.transform_buffer import TransformBuffer
-from gpusense.world.messages import LEVEL, planar_part, stamp_of, tilt_of
 from gpusense.world.messages import field as field_of
-
-BASES = ("base_footprint", "base_link")
-# Longest time between the scans and the odometry of a sound bag [s].
-_APART = 1.0
-
-
-@dataclass
-class Times:
-    """Times of messages: the stamps of their headers, or the log's times if all stamps are 0.
-
-    Attributes:
-        stamps: Stamps [s].
-        clock: Times in the log [s].
-        from_zero: Whether a stamp of 0 is a time although all are 0.
-    """
-
-    stamps: list[float] = field(default_factory=list)
-    clock: list[float] = field(default_factory=list)
-    from_zero: bool = False
-
-    def add(self, stamp: float, clock: float) -> None:
-        """Add the times of a message."""
-        self.stamps.append(stamp)
-        self.clock.append(clock)
-
-    @property
-    def stamped(self) -> bool:
-        """Whether stamps are times."""
-        return self.from_zero or any(self.stamps)
-
-    def __iter__(self) -> Iterator[float]:
-        return iter(self.stamps if self.stamped else self.clock)
-
-
-@dataclass
-class Track:
-    """Poses of odometry.
-
-    Attributes:
-        times: Times of the poses.
-        poses: Poses of the robot's base.
-        tilts: Tilts of the base [rad].
-        base: Frame of the robot's base; "" if unknown.
-        frame: Frame of the odometry.
-    """
-
-    times: Times = field(default_factory=Times)
-    poses: list[Pose] = field(default_factory=list)
-    tilts: list[float] = field(default_factory=list)
-    base: str = ""
-    frame: str = ""
-
-    def add(self, stamp: float, clock: float, pose: Pose, tilt: float) -> None:
-        """Add a pose."""
-        self.times.add(stamp, clock)
-        self.poses.append(pose)
-        self.tilts.append(tilt)
-
-    def sorted(self) -> tuple[Floats, Floats]:
-        """Return (T,) ascending times [s], and (T, 3) poses with headings without jumps."""
-        times, poses = np.array(list(self.times)), np.array(self.poses).reshape(-1, 3)
-        order = np.argsort(times, kind="stable")
-        poses = poses[order]
-        poses[:, 2] = np.unwrap(poses[:, 2])
-        return times[order], poses
+from gpusense.world.messages import stamp_of
 
 
 @dataclass
@@ -94,7 +26,6 @@ class Bag:
     Attributes:
         path: The bag.
         topic: Topic of the scans.
-        odometer: Topic or frame of the odometry; "" without one.
         lasers: Numbers of scans by geometry, for each frame of a laser.
         unnamed: Frame of the scans that name none.
         times: Times of the scans.
@@ -104,7 +35,6 @@ class Bag:
 
     path: Path
     topic: str
-    odometer: str
     lasers: dict[str, Counter[Geometry]] = field(default_factory=dict)
     unnamed: str = ""
     times: Times = field(default_factory=Times)
@@ -144,8 +74,9 @@ def survey(path: Path, topic: str | None, frame: str | None, odometry_from: str 
     topics = topics_of(path)
     chosen = _scan_topic(path, topics, topic)
     odometers = topics.get(ODOMETRY, [])
-    odometer = _odometry_topic(odometers, chosen, odometry_from)
-    bag, skipped = Bag(path, chosen, odometer), _Skipped()
+    odometer = odometry_topic(odometers, chosen, odometry_from)
+    bag, skipped = Bag(path, chosen), _Skipped()
+    bag.track.source = odometer
     stamps = _TransformStamps()
     for message in messages(path, {**scans_on(chosen), ODOMETRY: {odometer}, TRANSFORMS: None}):
         for take, each in _parts(message):
@@ -160,8 +91,9 @@ def survey(path: Path, topic: str | None, frame: str | None, odometry_from: str 
     if not bag.lasers:
         raise ValueError(f"{path}: must hold scans on {chosen}, got none{skipped.reason(chosen)}")
     _name_frames(bag, frame)
-    _choose_track(bag, odometers, odometry_from)
-    _check_track(bag)
+    laser = next(iter(bag.lasers))
+    bag.track = chosen_track(str(path), bag.track, odometers, bag.transforms, laser, odometry_from)
+    check_track(str(path), bag.track, bag.times)
     return bag
 
 
@@ -173,11 +105,6 @@ def scans_on(topic: str) -> dict[str, set[str] | None]:
 def frame_of(message: object) -> str:
     """Return the frame of a message, without a leading slash."""
     return str(field_of("message", message, "header.frame_id")).strip("/")
-
-
-def odometry_pose(message: object) -> tuple[Pose, float]:
-    """Return the planar pose of a ``nav_msgs/Odometry``, and its tilt [rad]."""
-    return planar_part("message.pose", field_of("message", message, "pose.pose"))
 
 
 def _scan_topic(path: Path, topics: dict[str, list[str]], topic: str | None) -> str:
@@ -202,18 +129,6 @@ def _scan_topic(path: Path, topics: dict[str, list[str]], topic: str | None) -> 
     if not usual:
         raise ValueError(f"topic: must be given, one of {', '.join(known)}, for {path}, got None")
     return usual[0]
-
-
-def _odometry_topic(known: Sequence[str], scans: str, wanted: str | None) -> str:
-    """Return the topic of the odometry: the wanted one, else one beside the scans, ``/odom``, or the first by name."""
-    if wanted is not None:
-        return next((name for name in known if name.strip("/") == wanted.strip("/")), "")
-    beside = scans.rpartition("/")[0] + "/"
-    return min(
-        known,
-        key=lambda name: (beside == "/" or not name.startswith(beside), name.strip("/") != "odom", name),
-        default="",
-    )
 
 
 def _parts(message: Message) -> Iterator[tuple[Callable[[Bag, Message, Any], None], Any]]:
@@ -288,83 +203,3 @@ def _name_frames(bag: Bag, frame: str | None) -> None:
             known = ", ".join(bag.lasers)
             raise ValueError(f"frame: must be one of {known} for {bag.topic} in {bag.path}, got {frame!r}")
         bag.lasers = {frame.strip("/"): bag.lasers[frame.strip("/")]}
-
-
-def _choose_track(bag: Bag, odometers: Sequence[str], wanted: str | None) -> None:
-    """Choose the odometry: that of a topic, else the robot's base in a frame of odometry.
-
-    Raises:
-        ValueError: The wanted one is absent.
-
-    Warns:
-        UserWarning: There are several.
-    """
-    parents = {link.parent for link in bag.transforms.links()}
-    frames = sorted(each for each in parents if "odom" in each.rpartition("/")[2])
-    if not bag.track.poses:
-        usable = frames if wanted is None else [each for each in parents if each == wanted.strip("/")]
-        laser = next(iter(bag.lasers))
-        for frame in sorted(usable, key=lambda each: (laser not in _below(bag, each), each != "odom", each))[:1]:
-            bag.track, bag.odometer = _track_of(bag, frame), frame
-    if wanted is not None:
-        if not bag.track.poses:
-            known = ", ".join([*odometers, *frames])
-            raise ValueError(f"odometry_from: must be one of {known or 'none'} in {bag.path}, got {wanted!r}")
-        return
-    others = [name for name in odometers if name != bag.odometer]
-    others += [frame for frame in frames if frame not in (bag.odometer, bag.track.frame)]
-    if others and bag.track.poses:
-        warn_user(
-            f"{bag.path}: odometry is read from {bag.odometer}, not from {', '.join(others)}; odometry_from= or "
-            "--odometry chooses"
-        )
-
-
-def _below(bag: Bag, frame: str) -> list[str]:
-    """Return the frames below a frame, near ones first."""
-    found, at = [frame], 0
-    while at < len(found):
-        children = {link.child for link in bag.transforms.links() if link.parent == found[at]}
-        found += sorted(children.difference(found))
-        at += 1
-    return found[1:]
-
-
-def _track_of(bag: Bag, frame: str) -> Track:
-    """Return the motion of the robot's base in a frame of odometry."""
-    below = _below(bag, frame)
-    base = min(below, key=lambda each: (base_order(each)[0], below.index(each)))
-    times, poses = bag.transforms.history(frame, base)
-    track = Track(Times(times.tolist(), times.tolist()), base=base, frame=frame)
-    for pose in poses:
-        track.poses.append((float(pose[0, 3]), float(pose[1, 3]), math.atan2(pose[1, 0], pose[0, 0])))
-        track.tilts.append(tilt_of(pose))
-    return track
-
-
-def base_order(frame: str) -> tuple[int, str]:
-    """Return the key by which frames are ordered: usual names of a robot's base first."""
-    name = frame.rpartition("/")[2]
-    return (BASES.index(name) if name in BASES else len(BASES)), frame
-
-
-def _check_track(bag: Bag) -> None:
-    """Warn of odometry that is not level, or has other times than the scans."""
-    track = bag.track
-    if not track.poses:
-        return
-    tilted = [tilt for tilt in track.tilts if tilt > LEVEL]
-    if tilted:
-        warn_user(
-            f"{bag.path}: {len(tilted)} of {len(track.tilts)} poses of odometry ({bag.odometer}) are not level, by up "
-            f"to {math.degrees(max(tilted)):.3g} deg: their x, y and yaw are used"
-        )
-    for one, other in ((bag.times, track.times), (track.times, bag.times)):
-        # The only message of a simulation that begins at 0.
-        one.from_zero = len(one.stamps) == 1 and other.stamped and min(other.stamps) <= _APART
-    scans, poses = list(bag.times), list(track.times)
-    if min(scans) > max(poses) + _APART or max(scans) < min(poses) - _APART:
-        warn_user(
-            f"{bag.path}: the times of scans ({min(scans):.9g} to {max(scans):.9g} s) and odometry ({min(poses):.9g} "
-            f"to {max(poses):.9g} s) do not overlap: all scans have the same pose in odometry"
-        )

@@ -4,25 +4,29 @@
 message                        use
 =============================  ========================================================================================
 sensor_msgs/LaserScan          a :class:`Scan`: the topic ``/scan``, or the bag's only one, or ``topic=``
-nav_msgs/Odometry              ``Scan.odometry`` and :class:`Odometry` records: ``/odom``, or the topic first by name
-tf2_msgs/TFMessage             fixed transforms from the robot's base to the laser give the mount; without Odometry
-                               messages, the moving transform from ``odom`` gives odometry
+sensor_msgs/MultiEchoLaserScan the same with the first echo of each beam, if chosen or if the bag has no LaserScan
+nav_msgs/Odometry              ``Scan.odometry`` and :class:`Odometry` records: the topic beside the scans, ``/odom``,
+                               the first topic by name, or ``odometry_from=``
+tf2_msgs/TFMessage             transforms from the robot's base to the laser give the mount; without Odometry messages,
+                               the motion of the base in a frame such as ``odom`` gives odometry
 =============================  ========================================================================================
 
 All other messages are skipped without being decoded; message definitions within a bag are not used.
 
-* Times come from the header, or from the log if the header has none. Odometry is interpolated at a scan's time,
-    headings along the shorter arc; before the first and after the last message, the nearest message's is used. A log
-    without
-  odometry has (0, 0, 0). ``Scan.pose`` is None.
-* The robot's base is the child frame of odometry, else ``base_footprint`` or ``base_link``. Without a chain of
-    transforms the mount is (0, 0, 0), with a warning. The bearings of a laser that is mounted upside down run
-    clockwise.
+* Times come from the header, or from the log if all headers of a topic have the stamp 0. Odometry is interpolated at
+  a scan's time, headings along the shorter arc; before the first and after the last message, the nearest message
+  counts. A log without odometry has (0, 0, 0). ``Scan.pose`` is None.
+* The robot's base is the child frame of odometry, else ``base_footprint`` or ``base_link``. Each frame of a laser has
+  a mount. The last static transform counts for the whole log. A laser that moves on the robot by more than 2 cm or 2
+  degrees has the mount of each scan's time. Without transforms the mount is (0, 0, 0), with a warning. The bearings of
+  a laser that is mounted upside down run clockwise.
+* x, y and yaw are taken from poses that are not level, with a warning.
+* A message or a transform whose numbers are not finite, or whose quaternion is 0, is skipped; one warning counts them.
 * A last beam with the direction of the first one is dropped. A reading of exactly 0 becomes NaN, as it means "none" to
   all drivers. Other readings are those of the message: infinities are "no return", NaN is missing (REP-117).
-* Some lasers change the number and bearings of their beams from scan to scan. All scans then share one scanner with
-bearings every 0.25 degrees all round. Each reading takes the nearest bearing; the remaining readings are NaN, which
-models leave out. Bearings move by 0.125 degrees at most.
+* The beams and limits of most scans are the scanner. The readings of other scans take its nearest beams, half a step
+  away at most, and a warning counts these scans. If beams vary from scan to scan, all scans share a scanner with
+  bearings every 0.25 degrees all round, or finer; bearings move by half that step at most.
 """
 
 from __future__ import annotations
@@ -37,7 +41,8 @@ import numpy as np
 from gpusense._util.angles import wrapped
 from gpusense._util.notices import warn_user
 from gpusense.logs.bag_beams import Beams, shared_beams
-from gpusense.logs.bag_survey import BASES, Bag, base_order, frame_of, odometry_pose, scans_on, survey
+from gpusense.logs.bag_odometry import BASES, base_order, odometry_pose
+from gpusense.logs.bag_survey import Bag, frame_of, scans_on, survey
 from gpusense.logs.bags import ODOMETRY, Message, messages
 from gpusense.logs.records import Floats, Odometry, Pose, Scan
 from gpusense.logs.transform_buffer import TransformError
@@ -80,7 +85,7 @@ def _records(
     bag = survey(path, topic, frame, odometry_from)
     lasers = _lasers(bag, mount, range_min, range_max)
     times, poses = bag.track.sorted()
-    for message in messages(path, {**scans_on(bag.topic), ODOMETRY: {bag.odometer} if odometry else set()}):
+    for message in messages(path, {**scans_on(bag.topic), ODOMETRY: {bag.track.source} if odometry else set()}):
         try:
             record = _record(bag, message, lasers, times, poses)
         except ValueError:
@@ -139,6 +144,8 @@ def _lasers(bag: Bag, given: Pose | None, range_min: float | None, range_max: fl
     for frame, laser in found.items():
         place = f"{bag.path}: {bag.topic}" + (f" in {frame}" if len(found) > 1 else "")
         laser.beams = shared_beams(place, bag.lasers[frame], range_min, range_max)
+        # Limits that break a rule are errors before the first record.
+        laser.scanner(next(iter(bag.times)))
     return found
 
 
@@ -179,8 +186,9 @@ def _mounted(bag: Bag, given: Pose | None) -> dict[str, _Laser]:
         return {frame: _Laser(given, frame in found and found[frame].upside_down) for frame in bag.lasers}
     for frame in absent:
         warn_user(
-            f"{bag.path}: has no transforms from {' or '.join(bases)} to {frame or 'the laser'} ({reasons[frame]}): "
-            "the laser is taken to be at the robot's centre, with mount (0, 0, 0); give its place as mount= or --mount"
+            f"{bag.path}: has no transforms from {' or '.join(bases)} to {frame or 'the laser'}: "
+            f"{reasons[frame].rpartition(': ')[2]}; the laser is taken to be at the robot's centre, with mount (0, 0, "
+            "0); give its place as mount= or --mount"
         )
     for frame, laser in found.items():
         if laser.moves is not None:

@@ -78,7 +78,7 @@ def test_help_names_bags_and_lasers(capsys, name):
 @pytest.mark.parametrize("name", READERS)
 def test_a_bag_without_transforms_warns_of_the_mount(place, capsys, name):
     argv = command(place, name, "run.bag", *(["--fit-motion"] if name == "fit" else []))
-    text = f"{place / 'run.bag'}: has no transforms from base_link to laser .*, with mount .0, 0, 0.; give "
+    text = f"{place / 'run.bag'}: has no transforms from base_link to laser: .*, with mount .0, 0, 0.; give "
     with pytest.warns(UserWarning, match=text):
         assert cli.main(argv) in (0, 1)
     with warnings.catch_warnings():
@@ -92,8 +92,9 @@ def test_the_warning_is_one_line_once(place, tmp_path):
     done = script(f"from gpusense.commands.cli import main; sys.exit(main({argv!r}))", cwd=tmp_path)
     assert done.returncode in (0, 1)
     assert [line for line in done.stderr.splitlines() if "warning" in line] == [
-        f"gpusense: warning: {place / 'run.bag'}: has no fixed transforms from base_link to laser: the laser is taken "
-        "to be at the robot's centre, with mount (0, 0, 0); give its place as mount= or --mount"
+        f"gpusense: warning: {place / 'run.bag'}: has no transforms from base_link to laser: no transform names "
+        "base_link or laser; the laser is taken to be at the robot's centre, with mount (0, 0, 0); give its place "
+        "as mount= or --mount"
     ]
 
 

@@ -114,7 +114,7 @@ def test_a_bag_that_is_being_recorded_is_read_up_to_its_end(tmp_path: Path) -> N
     data = bag_of(tmp_path, "ros1").read_bytes()
     active = tmp_path / "run.bag.active"
     active.write_bytes(data[: -len(data) // 8])
-    scans, told = read(active, mount=FLAT)
+    scans, told = read(active, mount=(0.1, 0.0, 0.0))
     assert scans and len(told) == 1 and "run.bag.active: the bag is cut off; it is read up to there" in told[0]
 
 
@@ -256,3 +256,59 @@ def test_an_odometry_that_is_absent_is_an_error_that_lists_all(tmp_path: Path) -
     with pytest.raises(ValueError, match=r"^odometry_from: must be left out for a CARMEN log, got 'x'$"):
         (tmp_path / "run.log").write_text("")
         read(tmp_path / "run.log", odometry_from="x")
+
+
+# ---- transforms that move or were corrected
+
+
+@each_kind
+def test_the_last_static_transform_wins(tmp_path: Path, kind: str) -> None:
+    with Writer(tmp_path, kind) as bag:
+        bag.transform(1.0, BASE, LASER, (0.1, 0.0), 0.0)
+        bag.scan(1.0, [2.0] * 5, -0.2, 0.1)
+        bag.transform(2.0, BASE, LASER, (0.3, 0.0), 0.5, stamp=0.0)
+        bag.scan(3.0, [2.0] * 5, -0.2, 0.1)
+    scans, told = read(bag.path)
+    assert {scan.scanner.mount for scan in scans} == {(0.3, 0.0, 0.5)} and told == []
+
+
+def turning(folder: Path, kind: str, amplitude: float, turns: float) -> Path:
+    """Write a bag of a laser on a mast that moves on the base, beside a link that is fixed."""
+    with Writer(folder, kind) as bag:
+        bag.transform(1.0, "mast", LASER, (0.1, 0.0), 0.0)
+        for k in range(5):
+            bag.transform(1.0 + k, BASE, "mast", (amplitude * k, 0.0), turns * k, topic="/tf")
+        # Before the first, between two, and after the last transform.
+        for time in (0.5, 2.5, 3.0, 6.0):
+            bag.scan(time, [2.0] * 5, -0.2, 0.1)
+    return bag.path
+
+
+@each_kind
+def test_a_laser_that_moves_on_the_robot_has_the_mount_of_each_time(tmp_path: Path, kind: str) -> None:
+    path = turning(tmp_path, kind, 0.0, 0.4)
+    scans, told = read(path)
+    expected = [(0.1 * math.cos(turn), 0.1 * math.sin(turn), turn) for turn in (0.0, 0.6, 0.8, 1.6)]
+    for scan, mount in zip(scans, expected, strict=True):
+        assert scan.scanner.mount == pytest.approx(mount, abs=1e-9)
+    assert len(told) == 1 and "the transforms to laser move the laser on the robot" in told[0]
+    assert "91.7 deg: each scan has the mount of its time; mount= or --mount sets one" in told[0]
+    fixed, told = read(path, mount=(0.1, 0.0, 0.0))
+    assert {scan.scanner.mount for scan in fixed} == {(0.1, 0.0, 0.0)} and told == []
+
+
+def test_a_laser_that_shakes_has_one_mount(tmp_path: Path) -> None:
+    scans, told = read(turning(tmp_path, "mcap", 0.001, 0.002))
+    assert len({id(scan.scanner) for scan in scans}) == 1
+    assert scans[0].scanner.mount == pytest.approx((0.102, 0.0, 0.004), abs=1e-3)
+    assert len(told) == 1 and "by up to 0.00408 m and 0.458 deg: one mount serves all scans" in told[0]
+
+
+def test_a_chain_that_is_absent_says_what_is_missing(tmp_path: Path) -> None:
+    with Writer(tmp_path, "ros1") as bag:
+        bag.transform(1.0, BASE, "camera", (0.1, 0.0), 0.0)
+        bag.transform(1.0, "map", "post", (0.1, 0.0), 0.0)
+        bag.scan(1.0, [2.0] * 5, -0.2, 0.1, frame="post")
+        bag.scan(2.0, [2.0] * 5, -0.2, 0.1, frame="lidar", topic="/other")
+    assert "to lidar: no transform names lidar; the laser is taken" in read(bag.path, topic="/other")[1][0]
+    assert "to post: the frames are not connected; the laser is taken" in read(bag.path)[1][0]

@@ -101,10 +101,9 @@ ODD: dict[str, tuple[Any, str]] = {
 }
 
 
-@each_kind
 @pytest.mark.parametrize("name", ODD)
-def test_a_message_that_breaks_a_rule_is_skipped_and_counted(tmp_path: Path, kind: str, name: str) -> None:
-    put, count = ODD[name]
+def test_a_message_that_breaks_a_rule_is_skipped_and_counted(tmp_path: Path, name: str) -> None:
+    (put, count), kind = ODD[name], KINDS[list(ODD).index(name) % 3]
     found = []
     for folder, odd in ((tmp_path / "sound", nothing), (tmp_path / "odd", put)):
         folder.mkdir()

@@ -138,7 +138,7 @@ def test_a_bag_without_transforms_names_the_mount_that_is_assumed(tmp_path: Path
     with Writer(tmp_path, "mcap") as bag:
         bag.odometry(1.0, 0.0, 0.0, 0.0)
         bag.scan(1.0, [1.0, 2.0], 0.0, 0.1)
-    text = r"run: has no transforms from base_link to laser .* with mount \(0, 0, 0\)"
+    text = r"run: has no transforms from base_link to laser: .* with mount \(0, 0, 0\)"
     with pytest.warns(UserWarning, match=text) as caught:
         assert next(gs.read_log(bag.path)).scanner.mount == (0.0, 0.0, 0.0)
     assert [str(one.filename) for one in caught] == [__file__]

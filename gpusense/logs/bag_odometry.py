@@ -1,0 +1,189 @@
+"""The odometry of a bag: a topic of messages, or the motion of the robot's base by transforms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gpusense._util.notices import warn_user
+from gpusense.logs.records import Floats, Pose
+from gpusense.logs.transform_buffer import TransformBuffer
+from gpusense.world.messages import LEVEL, planar_part, tilt_of
+from gpusense.world.messages import field as field_of
+
+BASES = ("base_footprint", "base_link")
+"""Usual names of a robot's base."""
+# Longest time between the scans and the odometry of a sound bag [s].
+_APART = 1.0
+
+
+@dataclass
+class Times:
+    """Times of messages: the stamps of their headers, or the log's times if all stamps are 0.
+
+    Attributes:
+        stamps: Stamps [s].
+        clock: Times in the log [s].
+        from_zero: Whether a stamp of 0 is a time although all are 0.
+    """
+
+    stamps: list[float] = field(default_factory=list)
+    clock: list[float] = field(default_factory=list)
+    from_zero: bool = False
+
+    def add(self, stamp: float, clock: float) -> None:
+        """Add the times of a message."""
+        self.stamps.append(stamp)
+        self.clock.append(clock)
+
+    @property
+    def stamped(self) -> bool:
+        """Whether stamps are times."""
+        return self.from_zero or any(self.stamps)
+
+    def __iter__(self) -> Iterator[float]:
+        return iter(self.stamps if self.stamped else self.clock)
+
+
+@dataclass
+class Track:
+    """Poses of odometry.
+
+    Attributes:
+        source: Topic or frame of the odometry; "" without one.
+        times: Times of the poses.
+        poses: Poses of the robot's base.
+        tilts: Tilts of the base [rad].
+        base: Frame of the robot's base; "" if unknown.
+        frame: Frame of the odometry.
+    """
+
+    source: str = ""
+    times: Times = field(default_factory=Times)
+    poses: list[Pose] = field(default_factory=list)
+    tilts: list[float] = field(default_factory=list)
+    base: str = ""
+    frame: str = ""
+
+    def add(self, stamp: float, clock: float, pose: Pose, tilt: float) -> None:
+        """Add a pose."""
+        self.times.add(stamp, clock)
+        self.poses.append(pose)
+        self.tilts.append(tilt)
+
+    def sorted(self) -> tuple[Floats, Floats]:
+        """Return (T,) ascending times [s], and (T, 3) poses with headings without jumps."""
+        times, poses = np.array(list(self.times)), np.array(self.poses).reshape(-1, 3)
+        order = np.argsort(times, kind="stable")
+        poses = poses[order]
+        poses[:, 2] = np.unwrap(poses[:, 2])
+        return times[order], poses
+
+
+def odometry_pose(message: object) -> tuple[Pose, float]:
+    """Return the planar pose of a ``nav_msgs/Odometry``, and its tilt [rad]."""
+    return planar_part("message.pose", field_of("message", message, "pose.pose"))
+
+
+def odometry_topic(known: Sequence[str], scans: str, wanted: str | None) -> str:
+    """Return the topic of the odometry: the wanted one, else one beside the scans, ``/odom``, or the first by name."""
+    if wanted is not None:
+        return next((name for name in known if name.strip("/") == wanted.strip("/")), "")
+    beside = scans.rpartition("/")[0] + "/"
+    return min(
+        known,
+        key=lambda name: (beside == "/" or not name.startswith(beside), name.strip("/") != "odom", name),
+        default="",
+    )
+
+
+def chosen_track(
+    place: str, track: Track, topics: Sequence[str], transforms: TransformBuffer, laser: str, wanted: str | None
+) -> Track:
+    """Choose the odometry: the messages of a topic, else the motion of the robot's base in a frame of odometry.
+
+    Args:
+        place: The bag, for messages.
+        track: The odometry of the chosen topic, which may be empty.
+        topics: Topics of odometry.
+        transforms: Transforms of the bag.
+        laser: Frame of the laser.
+        wanted: Topic or frame that the user wants.
+
+    Raises:
+        ValueError: The wanted one is absent.
+
+    Warns:
+        UserWarning: There are several.
+    """
+    parents = {link.parent for link in transforms.links()}
+    frames = sorted(each for each in parents if "odom" in each.rpartition("/")[2])
+    if not track.poses:
+        usable = frames if wanted is None else [each for each in parents if each == wanted.strip("/")]
+        for frame in sorted(usable, key=lambda each: (laser not in _below(transforms, each), each != "odom", each))[:1]:
+            track = _track_of(transforms, frame)
+    if wanted is not None:
+        if not track.poses:
+            known = ", ".join([*topics, *frames])
+            raise ValueError(f"odometry_from: must be one of {known or 'none'} in {place}, got {wanted!r}")
+        return track
+    others = [name for name in topics if name != track.source]
+    others += [frame for frame in frames if frame not in (track.source, track.frame)]
+    if others and track.poses:
+        warn_user(
+            f"{place}: odometry is read from {track.source}, not from {', '.join(others)}; odometry_from= or "
+            "--odometry chooses"
+        )
+    return track
+
+
+def _below(transforms: TransformBuffer, frame: str) -> list[str]:
+    """Return the frames below a frame, near ones first."""
+    found, at = [frame], 0
+    while at < len(found):
+        children = {link.child for link in transforms.links() if link.parent == found[at]}
+        found += sorted(children.difference(found))
+        at += 1
+    return found[1:]
+
+
+def _track_of(transforms: TransformBuffer, frame: str) -> Track:
+    """Return the motion of the robot's base in a frame of odometry."""
+    below = _below(transforms, frame)
+    base = min(below, key=lambda each: (base_order(each)[0], below.index(each)))
+    times, poses = transforms.history(frame, base)
+    track = Track(frame, Times(times.tolist(), times.tolist()), base=base, frame=frame)
+    for pose in poses:
+        track.poses.append((float(pose[0, 3]), float(pose[1, 3]), math.atan2(pose[1, 0], pose[0, 0])))
+        track.tilts.append(tilt_of(pose))
+    return track
+
+
+def base_order(frame: str) -> tuple[int, str]:
+    """Return the key by which frames are ordered: usual names of a robot's base first."""
+    name = frame.rpartition("/")[2]
+    return (BASES.index(name) if name in BASES else len(BASES)), frame
+
+
+def check_track(place: str, track: Track, scans_at: Times) -> None:
+    """Warn of odometry that is not level, or has other times than the scans."""
+    if not track.poses:
+        return
+    tilted = [tilt for tilt in track.tilts if tilt > LEVEL]
+    if tilted:
+        warn_user(
+            f"{place}: {len(tilted)} of {len(track.tilts)} poses of odometry ({track.source}) are not level, by up "
+            f"to {math.degrees(max(tilted)):.3g} deg: their x, y and yaw are used"
+        )
+    for one, other in ((scans_at, track.times), (track.times, scans_at)):
+        # The only message of a simulation that begins at 0.
+        one.from_zero = len(one.stamps) == 1 and other.stamped and min(other.stamps) <= _APART
+    scans, poses = list(scans_at), list(track.times)
+    if min(scans) > max(poses) + _APART or max(scans) < min(poses) - _APART:
+        warn_user(
+            f"{place}: the times of scans ({min(scans):.9g} to {max(scans):.9g} s) and odometry ({min(poses):.9g} "
+            f"to {max(poses):.9g} s) do not overlap: all scans have the same pose in odometry"
+        )

@@ -1,7 +1,7 @@
-"""Find the files of a bag, and prepare files that the library rosbags cannot read as they are.
+"""Find the files of a bag, and prepare files that the library rosbags cannot read.
 
-A file that is cut off, has a journal beside it, or lacks the suffix of its format is copied or linked into a temporary
-folder that is deleted at the end of the process. The bag itself is never written.
+A file that is cut off, comes with a journal, or lacks the suffix of its format is copied or linked into a temporary
+folder that is deleted at the end of the process. The recording itself is never written.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from gpusense.logs.cut_bags import MCAP, ROS1, SQLITE, begins, mender_of
 
 ZSTD = b"\x28\xb5\x2f\xfd"
 _SUFFIXES = {MCAP: ".mcap", SQLITE: ".db3"}
-# Journals of a database: pages to add, and pages to restore, whose file begins with some bytes while it is in use.
+# Suffixes of a database's journals of pages to add and of pages to restore, and first bytes of the latter in use.
 _WAL, _ROLLBACK, _IN_USE = "-wal", "-journal", b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
 _FOLDERS: list[Any] = []
 

@@ -27,7 +27,7 @@ class Times:
     Attributes:
         stamps: Stamps [s].
         clock: Times in the log [s].
-        from_zero: Whether a stamp of 0 is a time although all are 0.
+        from_zero: True if a stamp of 0 is a time although all stamps are 0.
     """
 
     stamps: list[float] = field(default_factory=list)
@@ -41,7 +41,7 @@ class Times:
 
     @property
     def stamped(self) -> bool:
-        """Whether stamps are times."""
+        """True if stamps are times."""
         return self.from_zero or any(self.stamps)
 
     def __iter__(self) -> Iterator[float]:
@@ -89,7 +89,7 @@ def odometry_pose(message: object) -> tuple[Pose, float]:
 
 
 def odometry_topic(known: Sequence[str], scans: str, wanted: str | None) -> str:
-    """Return the topic of the odometry: the wanted one, else one beside the scans, ``/odom``, or the first by name."""
+    """Return the wanted topic, else a topic in the scans' namespace, ``/odom``, or the first topic by name."""
     if wanted is not None:
         return next((name for name in known if name.strip("/") == wanted.strip("/")), "")
     beside = scans.rpartition("/")[0] + "/"
@@ -163,7 +163,7 @@ def _track_of(transforms: TransformBuffer, frame: str) -> Track:
 
 
 def base_order(frame: str) -> tuple[int, str]:
-    """Return the key by which frames are ordered: usual names of a robot's base first."""
+    """Return a key that sorts usual names of a robot's base before other frames."""
     name = frame.rpartition("/")[2]
     return (BASES.index(name) if name in BASES else len(BASES)), frame
 

@@ -161,7 +161,7 @@ def _is_static(message: Message) -> bool:
 
 
 class _TransformStamps:
-    """Whether the transforms of a bag have stamps."""
+    """Search for a transform with a stamp."""
 
     def __init__(self) -> None:
         self._count, self._any = 0, False

@@ -125,7 +125,7 @@ def _open(path: Path, tell: bool = False) -> Iterator[tuple[list[Any], Any]]:
 
     Args:
         path: The bag.
-        tell: Whether to warn of a bag that is cut off.
+        tell: Warn of a bag that is cut off.
     """
     first = is_ros1(path)
     purpose = f"{path}: a ROS bag"

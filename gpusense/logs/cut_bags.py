@@ -45,7 +45,7 @@ def begins(file: Path, first: bytes) -> bool:
 
 
 def zstd() -> Any:
-    """Import the module that decompresses zstd, which is Python's from 3.14 on."""
+    """Import the module that decompresses zstd: Python's from 3.14 on, else a library's."""
     try:
         return importlib.import_module("compression.zstd")
     except ImportError:

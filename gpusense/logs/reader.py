@@ -41,7 +41,7 @@ class Format:
 
 
 BAG2 = Format("a ROS 2 bag", "gpusense.logs.ros", (MCAP, SQLITE, ZSTD), (".db3", ".mcap"), topics=True)
-# The last format is that of all files that no other format claims.
+# Files that no other format claims have the last format.
 FORMATS = (
     Format("a ROS 1 bag", "gpusense.logs.ros", (b"#ROSBAG V",), (".bag",), topics=True),
     BAG2,
@@ -126,8 +126,8 @@ def read_log(
             transforms. A warning reports that these contradict ``mount``, or that there are none and (0, 0, 0) is
             assumed; see also :func:`check_mount`.
         odometry_from: Topic of the odometry in a ROS bag, or the frame of the transforms that move the robot's base;
-            None takes the topic beside the scans, ``/odom``, the first topic by name, or a frame such as ``odom``. A
-            warning lists the alternatives.
+            None takes a topic in the scans' namespace, ``/odom``, the first topic by name, or a frame such as ``odom``.
+            A warning lists the alternatives.
 
     Returns:
         An iterator of :class:`Scan`, and of :class:`Odometry` if ``odometry``.

@@ -55,7 +55,7 @@ def check_scanner(scan: Scan, scanner: Scanner, where: str) -> None:
     """Check that a scan of a log comes from the scanner of the scans before.
 
     Raises:
-        ValueError: It comes from another one.
+        ValueError: The scanners differ.
     """
     if scan.scanner != scanner:
         remedy = ""

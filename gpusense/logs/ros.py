@@ -5,8 +5,8 @@ message                        use
 =============================  ========================================================================================
 sensor_msgs/LaserScan          a :class:`Scan`: the topic ``/scan``, or the bag's only one, or ``topic=``
 sensor_msgs/MultiEchoLaserScan the same with the first echo of each beam, if chosen or if the bag has no LaserScan
-nav_msgs/Odometry              ``Scan.odometry`` and :class:`Odometry` records: the topic beside the scans, ``/odom``,
-                               the first topic by name, or ``odometry_from=``
+nav_msgs/Odometry              ``Scan.odometry`` and :class:`Odometry` records: a topic in the scans' namespace,
+                               ``/odom``, the first topic by name, or ``odometry_from=``
 tf2_msgs/TFMessage             transforms from the robot's base to the laser give the mount; without Odometry messages,
                                the motion of the base in a frame such as ``odom`` gives odometry
 =============================  ========================================================================================
@@ -18,12 +18,12 @@ All other messages are skipped without being decoded; message definitions within
   counts. A log without odometry has (0, 0, 0). ``Scan.pose`` is None.
 * The robot's base is the child frame of odometry, else ``base_footprint`` or ``base_link``. Each frame of a laser has
   a mount. The last static transform counts for the whole log. A laser that moves on the robot by more than 2 cm or 2
-  degrees has the mount of each scan's time. Without transforms the mount is (0, 0, 0), with a warning. The bearings of
-  a laser that is mounted upside down run clockwise.
+  degrees has the mount of each scan's time. The mount is (0, 0, 0), with a warning, if transforms are absent. The
+  bearings of a laser that is mounted upside down run clockwise.
 * x, y and yaw are taken from poses that are not level, with a warning.
 * A message or a transform whose numbers are not finite, or whose quaternion is 0, is skipped; one warning counts them.
 * A last beam with the direction of the first one is dropped. A reading of exactly 0 becomes NaN, as it means "none" to
-  all drivers. Other readings are those of the message: infinities are "no return", NaN is missing (REP-117).
+  all drivers. Other readings are copied: infinities are "no return", NaN is missing (REP-117).
 * The beams and limits of most scans are the scanner. The readings of other scans take its nearest beams, half a step
   away at most, and a warning counts these scans. If beams vary from scan to scan, all scans share a scanner with
   bearings every 0.25 degrees all round, or finer; bearings move by half that step at most.

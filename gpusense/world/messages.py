@@ -197,8 +197,8 @@ def laser_geometry(message: object, range_max: float | None = None, range_min: f
 
     Args:
         message: The scan.
-        range_max: Replaces the message's value, which is not read then [m].
-        range_min: Replaces the message's value, which is not read then [m].
+        range_max: Upper limit instead of the message's [m].
+        range_min: Lower limit instead of the message's [m].
 
     Raises:
         TypeError: A field is absent or not a number.

@@ -19,7 +19,7 @@ from gpusense.commands import signals
 # Modules of gpusense.commands, in the order of the help.
 COMMANDS = (
     "devices", "selftest", "demo", "explain", "simulate", "map", "score", "localize", "fit", "match",
-    "likelihood-map", "features", "landmarks", "sweep", "bench",
+    "likelihood-map", "features", "landmarks", "ros", "sweep", "bench",
 )  # fmt: skip
 
 BAD_INPUT = 2

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 LaserModel = Literal["beam", "likelihood_field", "likelihood_field_prob"]
 
 # Defaults of nav2_amcl 1.5.0's node. The types of the values are those of the parameters.
-_DEFAULTS: dict[str, Any] = {
+DEFAULTS: dict[str, Any] = {
     "alpha1": 0.2, "alpha2": 0.2, "alpha3": 0.2, "alpha4": 0.2, "alpha5": 0.2,
     "base_frame_id": "base_footprint", "beam_skip_threshold": 0.3, "do_beamskip": False,
     "global_frame_id": "map", "odom_frame_id": "odom",
@@ -188,14 +188,14 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str |
         (0.1, 0.2)
     """
     content, name = _content(source)
-    found = parameters_of(content, name, node, (*_DEFAULTS, *START_NAMES))
+    found = parameters_of(content, name, node, (*DEFAULTS, *START_NAMES))
     robot = _ROBOTS[
-        checks.choice("robot_model_type", found.get("robot_model_type", _DEFAULTS["robot_model_type"]), tuple(_ROBOTS))
+        checks.choice("robot_model_type", found.get("robot_model_type", DEFAULTS["robot_model_type"]), tuple(_ROBOTS))
     ]
     odometry = _odometry(content, name) if robot == "differential" else None
     if odometry is not None:
         found = {f"alpha{k}": value for k, value in enumerate(odometry.alpha, 1)} | found
-    values = {key: _value(name, key, found.get(key, default), default) for key, default in _DEFAULTS.items()}
+    values = {key: _value(name, key, found.get(key, default), default) for key, default in DEFAULTS.items()}
     model = checks.choice("laser_model_type", values["laser_model_type"], _MODELS)
     weights = _weights(model, values)
     fitted = content.get("beam_model") if model == "beam" else None
@@ -222,13 +222,13 @@ def from_nav2(source: str | os.PathLike[str] | Mapping[str, Any], *, node: str |
         transform_tolerance=values["transform_tolerance"],
         initial_pose=first_pose(name, found) if values["set_initial_pose"] else None,
         initial_covariance=first_covariance(name, found) if values["set_initial_pose"] else None,
-        ignored=tuple(sorted(key for key in found if key not in _DEFAULTS and key not in START_NAMES)),
+        ignored=tuple(sorted(key for key in found if key not in DEFAULTS and key not in START_NAMES)),
     )
 
 
 def has_parameters(content: Mapping[Any, Any]) -> bool:
     """Return whether a file holds parameters by ROS nodes, or amcl's parameters without a node."""
-    flat = (*_DEFAULTS, *ROS_1)
+    flat = (*DEFAULTS, *ROS_1)
     inner = content.get("amcl")
     return any(key in content or (isinstance(inner, Mapping) and key in inner) for key in flat) or any(
         True for _ in nodes_of(content)

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from gpusense.world.messages import field as field_of
 from gpusense.world.messages import real_field, rotation_matrix, stamp_of, unit_quaternion
 
-# A step back in time that is no disorder of messages [s].
-_BACK = 2.0
+BACK = 2.0
+"""Step back in time that is no disorder of messages [s]."""
 # Largest change of a transform that still counts as fixed [m, 1].
 _FIXED = 1e-5
 # Translation and quaternion (x, y, z, w).
@@ -30,7 +30,15 @@ Vector = tuple[float, ...]
 
 
 class TransformError(LookupError):
-    """A transform is not known, or not at the time."""
+    """A transform is not known, or not at the time.
+
+    Attributes:
+        early: Whether the time is later than the known transforms, so that waiting helps.
+    """
+
+    def __init__(self, text: str, early: bool = False) -> None:
+        super().__init__(text)
+        self.early = early
 
 
 @dataclass
@@ -90,7 +98,8 @@ class Link:
         if not self.times[0] <= time <= self.times[-1]:
             end, word = (self.times[0], "begins") if time < self.times[0] else (self.times[-1], "ends")
             raise TransformError(
-                f"the transform from {self.parent} to {self.child} {word} at {end:.3f} s, asked for {time:.3f} s"
+                f"the transform from {self.parent} to {self.child} {word} at {end:.3f} s, asked for {time:.3f} s",
+                early=time > self.times[-1],
             )
         k = bisect_left(self.times, time)
         if self.times[k] == time:
@@ -134,7 +143,7 @@ class TransformBuffer:
         turn = unit_quaternion("message.rotation", field_of("message", message, "transform.rotation"))
         time = stamp_of("message", message)
         link = self._links.setdefault((parent, child), Link(parent, child))
-        back = not static and not link.static and len(link.times) > 0 and time < link.times[-1] - _BACK
+        back = not static and not link.static and len(link.times) > 0 and time < link.times[-1] - BACK
         if back:
             self.forget_after(time)
         link.put(time, (*place, *turn), static)
@@ -146,7 +155,7 @@ class TransformBuffer:
         """Forget moving transforms later than a time, with 2 s of tolerance for other links."""
         for link in self._links.values():
             if not link.static:
-                link.keep(-math.inf, time + _BACK)
+                link.keep(-math.inf, time + BACK)
 
     def clear(self) -> None:
         """Forget moving transforms."""

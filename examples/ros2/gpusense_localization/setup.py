@@ -16,5 +16,10 @@ setup(
     ],
     install_requires=["setuptools", "gpusense"],
     license="Apache-2.0",
-    entry_points={"console_scripts": [f"localize = {NAME}.node:main", f"watch = {NAME}.watch_node:main"]},
+    entry_points={
+        "console_scripts": [
+            f"{name} = gpusense.ros.nodes.{module}:main"
+            for name, module in (("localize", "localization"), ("watch", "watching"))
+        ]
+    },
 )

@@ -1,1 +1,1 @@
-"""A thin node for ROS 2 around gpusense's particle filter."""
+"""The package of gpusense's nodes for colcon; their code is gpusense.ros."""

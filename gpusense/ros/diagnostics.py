@@ -9,14 +9,17 @@ OK, WARN, ERROR, STALE = 0, 1, 2, 3
 LEVELS = {"tracking": OK, "uncertain": WARN, "lost": ERROR}
 
 
-def status_fields(name: str, level: int, message: str, values: Mapping[str, str]) -> dict[str, Any]:
+def status_fields(
+    name: str, level: int, message: str, values: Mapping[str, str], node: str = "gpusense"
+) -> dict[str, Any]:
     """Return the fields of diagnostic_msgs/DiagnosticStatus.
 
     Args:
-        name: Subject of the status, after "gpusense: ".
+        name: Subject of the status.
         level: OK, WARN, ERROR or STALE.
         message: One line for people.
         values: Values by their names.
+        node: Name of the node with its namespace, which tells robots apart.
     """
     pairs = [{"key": key, "value": value} for key, value in values.items()]
-    return {"name": f"gpusense: {name}", "hardware_id": "", "level": level, "message": message, "values": pairs}
+    return {"name": f"{node}: {name}", "hardware_id": node, "level": level, "message": message, "values": pairs}

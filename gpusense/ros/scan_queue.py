@@ -11,21 +11,19 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-# As in nav2_amcl.
-MOST = 50
+from gpusense.logs.transform_buffer import BACK, TransformError
 
-
-class NotYetError(Exception):
-    """The transforms of a scan are not known yet; its text is the reason."""
+MOST = 500
+"""Most scans that wait."""
 
 
 class ScanQueue:
     """Scans in their order, each of which waits for its transforms.
 
     Args:
-        look_up: Returns the transforms of a scan, or raises :class:`NotYetError`.
+        look_up: Returns the transforms of a scan, or raises ``TransformError``.
         deliver: Takes a scan and its transforms.
-        patience: Longest wait of a scan [s].
+        patience: Longest wait of a scan, without the time in which others are delivered [s].
         most: Most scans that wait; one more drops the oldest.
         clock: Returns the time [s].
 
@@ -45,15 +43,27 @@ class ScanQueue:
     ) -> None:
         self._look_up, self._deliver, self._clock = look_up, deliver, clock
         self.patience, self.most = patience, most
-        self.dropped, self.reason = 0, None
-        self._waiting: deque[tuple[float, Any]] = deque()
+        self.dropped = 0
+        self.reason: str | None = None
+        self._waiting: deque[tuple[float, float, Any]] = deque()
+        self._busy = 0.0
 
     def __len__(self) -> int:
         return len(self._waiting)
 
-    def add(self, scan: Any) -> None:
-        """Take a scan, and deliver what is ready."""
-        self._waiting.append((self._clock(), scan))
+    def add(self, scan: Any, stamp: float) -> None:
+        """Take a scan, and deliver what is ready.
+
+        Args:
+            scan: The scan.
+            stamp: Its time [s]. Scans that are later by more than 2 s are dropped: a recording starts again, or their
+                stamps were wrong.
+        """
+        later = [each for each in self._waiting if each[1] > stamp + BACK]
+        for each in later:
+            self._waiting.remove(each)
+            self._drop("the stamps of scans went back")
+        self._waiting.append((self._idle(), stamp, scan))
         self.check()
         while len(self._waiting) > self.most:
             self._waiting.popleft()
@@ -62,18 +72,20 @@ class ScanQueue:
     def check(self) -> None:
         """Deliver scans whose transforms are known, oldest first, and drop those that waited too long.
 
-        Transforms arrive in the order of time. Where a scan is ready, those before it are older than all that is known,
-        and never will be.
+        Transforms arrive in the order of time. Scans before a ready one are older than every known transform, and
+        never become ready. Scans after one that is too early are too early as well.
         """
         position = 0
         while position < len(self._waiting):
-            since, scan = self._waiting[position]
+            since, _, scan = self._waiting[position]
             try:
                 transforms = self._look_up(scan)
-            except NotYetError as error:
-                if self._clock() - since > self.patience:
+            except TransformError as error:
+                if self._idle() - since > self.patience:
                     del self._waiting[position]
                     self._drop(f"no transform within {self.patience:g} s: {error}")
+                elif error.early:
+                    return
                 else:
                     position += 1
                 continue
@@ -82,11 +94,16 @@ class ScanQueue:
                 self._drop("the transforms begin after the scan")
             self._waiting.popleft()
             position = 0
+            begin = self._clock()
             self._deliver(scan, transforms)
+            self._busy += self._clock() - begin
 
     def clear(self) -> None:
         """Forget the scans that wait, as when the node is deactivated."""
         self._waiting.clear()
+
+    def _idle(self) -> float:
+        return self._clock() - self._busy
 
     def _drop(self, reason: str) -> None:
         self.dropped, self.reason = self.dropped + 1, reason

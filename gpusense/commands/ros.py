@@ -1,0 +1,118 @@
+"""Run ``gpusense ros``: a node of ROS 2 that localises, or one that watches another localiser."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+from gpusense._util.documents import read_mapping
+from gpusense.commands.arguments import add_backend
+from gpusense.localization.nav2_file import FITTED
+
+NAME = "ros"
+HELP = "Localise inside ROS 2, in the place of nav2_amcl, or watch another localiser."
+
+_ROS = "--ros-args"
+
+EPILOG = """\
+Topics, frames and parameters are those of nav2_amcl: scan, map, initialpose and /tf come in; amcl_pose, particle_cloud,
+the transform from map to odom and /diagnostics go out. docs/ros2.md describes them. The node is a lifecycle node called
+amcl, and starts active.
+
+'gpusense ros watch' judges the poses of nav2_amcl, or of any node that publishes amcl_pose, and writes /diagnostics.
+
+Options of ROS 2 follow --ros-args: remappings, namespaces and parameters, as for every node.
+
+Exit codes: 0 interrupted or terminated, 1 the node could not start (its log has the reason), 2 bad input.
+
+examples:
+  gpusense ros --map map.yaml --params-file nav2_params.yaml
+  gpusense ros --map map.yaml --start 1 2 0 --ros-args -p use_sim_time:=true
+  gpusense ros --global --ros-args -r __ns:=/robot1 -r /tf:=tf -r /tf_static:=tf_static
+  gpusense ros --odom-topic odom --mount 0.2 0 0
+  gpusense ros watch --base-frame base_link"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's options."""
+    add = parser.add_argument
+    add("what", nargs="?", choices=("localize", "watch"), default="localize", metavar="watch",
+        help="judge the poses of another localiser (default: localise)")  # fmt: skip
+    add("--map", type=Path, metavar="YAML", help="a map_server map (default: the topic map)")
+    add("--params-file", type=Path, metavar="YAML",
+        help="parameters of nav2_amcl, as nav2_params.yaml has them, or parameters.yaml of 'gpusense fit'")  # fmt: skip
+    start = parser.add_mutually_exclusive_group()
+    start.add_argument("--start", type=float, nargs=3, metavar=("X", "Y", "THETA"), help="first pose [m, m, rad]")
+    start.add_argument("--global", dest="anywhere", action="store_true", help="start all over the map")
+    add("--mount", type=float, nargs=3, metavar=("X", "Y", "THETA"),
+        help="pose of the laser on the robot [m, m, rad] (default: by /tf)")  # fmt: skip
+    add("--odom-topic", metavar="TOPIC", help="read odometry from nav_msgs/Odometry (default: by /tf)")
+    add("--base-frame", metavar="FRAME", help="frame of the robot's base (default: base_footprint)")
+    add("--no-autostart", action="store_true", help="leave it to a lifecycle manager to configure and activate")
+    add_backend(parser)
+    add(_ROS, nargs=argparse.REMAINDER, default=[], metavar="ARGUMENT", help="arguments of ROS 2")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the node until it is interrupted or terminated."""
+    chosen = _localize(args) if args.what == "localize" else _watch(args)
+    if importlib.util.find_spec("rclpy") is None:
+        raise ValueError(
+            "gpusense ros: must run where rclpy can be imported: source a ROS installation, or on Linux (x86-64) "
+            "pip install 'gpusense[ros2]'"
+        )
+    ros: list[str] = [_ROS]
+    if args.params_file is not None and "parameters" not in chosen:
+        ros += ["--params-file", str(args.params_file)]
+    for name, value in chosen.items():
+        ros += ["-p", f"{name}:={_yaml(value)}"]
+    if args.what == "localize":
+        from gpusense.ros.nodes.localization import main
+    else:
+        from gpusense.ros.nodes.watching import main
+    # The user's own arguments come last, and win.
+    return main(["gpusense", *ros, *args.ros_args])
+
+
+def _localize(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the parameters of the localising node."""
+    chosen: dict[str, Any] = {"autostart_node": not args.no_autostart} | _common(args)
+    if args.base_frame is not None:
+        chosen["base_frame_id"] = args.base_frame
+    if args.odom_topic is not None:
+        chosen["odom_topic"] = args.odom_topic
+    if args.params_file is not None and any(key in read_mapping(args.params_file) for key in FITTED):
+        chosen["parameters"] = args.params_file
+    if args.anywhere:
+        chosen["set_initial_pose"] = False
+    if args.start is not None:
+        chosen["set_initial_pose"] = True
+        chosen |= {f"initial_pose.{name}": value for name, value in zip(("x", "y", "yaw"), args.start, strict=True)}
+    return chosen
+
+
+def _watch(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the parameters of the watching node."""
+    for name in ("start", "odom_topic", "anywhere", "no_autostart"):
+        if getattr(args, name):
+            raise ValueError(f"--{name.replace('_', '-').replace('anywhere', 'global')}: must not come with watch")
+    return _common(args) | ({} if args.base_frame is None else {"base_frame": args.base_frame})
+
+
+def _common(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the parameters of either node."""
+    chosen: dict[str, Any] = {} if args.backend == "auto" else {"backend": args.backend}
+    if args.map is not None:
+        chosen["map_file"] = args.map
+    if args.mount is not None:
+        chosen["mount"] = args.mount
+    return chosen
+
+
+def _yaml(value: Any) -> str:
+    """Return a parameter's value as YAML."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"'{value}'" if isinstance(value, (str, Path)) else str(value)

@@ -1,0 +1,172 @@
+"""Conversions between ROS messages and NumPy: messages are read by their fields, and written as plain mappings.
+
+Nothing here imports ROS. ``fill`` copies a mapping into a message.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from gpusense.logs.records import Pose
+from gpusense.logs.transforms import planar_mount
+from gpusense.world.messages import field, planar_pose
+from gpusense.world.scanner import Scanner
+
+# Largest negative eigenvalue of a covariance that rounding may cause, relative to its largest variance.
+_ROUNDING = 1e-6
+
+
+def quaternion_of(yaw: float) -> dict[str, float]:
+    """Return the fields of geometry_msgs/Quaternion for a rotation about z."""
+    return {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
+
+
+def planar(matrix: np.ndarray) -> Pose:
+    """Return (x, y, yaw) of a (4, 4) pose."""
+    return float(matrix[0, 3]), float(matrix[1, 3]), math.atan2(matrix[1, 0], matrix[0, 0])
+
+
+def pose_matrix(pose: Pose) -> np.ndarray:
+    """Return the (4, 4) matrix of a planar pose."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return np.array([[c, -s, 0, pose[0]], [s, c, 0, pose[1]], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+
+def compose(first: Pose, second: Pose) -> Pose:
+    """Return the pose ``second``, given in the frame of ``first``, in the frame of the latter's parent."""
+    c, s = math.cos(first[2]), math.sin(first[2])
+    x, y = first[0] + c * second[0] - s * second[1], first[1] + s * second[0] + c * second[1]
+    return x, y, math.remainder(first[2] + second[2], 2 * math.pi)
+
+
+def inverse(pose: Pose) -> Pose:
+    """Return the pose of the parent's frame in the pose's own."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return -c * pose[0] - s * pose[1], s * pose[0] - c * pose[1], -pose[2]
+
+
+def map_to_odometry(in_map: Pose, in_odometry: Pose) -> Pose:
+    """Return the pose of the odometry frame in the map, from the base's poses in both."""
+    return compose(in_map, inverse(in_odometry))
+
+
+def moved_enough(before: Pose, after: Pose, least: tuple[float, float]) -> bool:
+    """Tell whether the robot moved by ``least`` (m along x or y, rad), as nav2_amcl decides to update its filter."""
+    turn = abs(math.remainder(after[2] - before[2], 2 * math.pi))
+    return abs(after[0] - before[0]) > least[0] or abs(after[1] - before[1]) > least[0] or turn > least[1]
+
+
+def pose_fields(pose: Pose) -> dict[str, Any]:
+    """Return the fields of geometry_msgs/Pose."""
+    return {"position": {"x": pose[0], "y": pose[1], "z": 0.0}, "orientation": quaternion_of(pose[2])}
+
+
+def transform_fields(pose: Pose) -> dict[str, Any]:
+    """Return the fields of geometry_msgs/Transform."""
+    return {"translation": {"x": pose[0], "y": pose[1], "z": 0.0}, "rotation": quaternion_of(pose[2])}
+
+
+def covariance_fields(covariance: np.ndarray) -> list[float]:
+    """Return the 36 numbers of geometry_msgs/PoseWithCovariance for a (3, 3) covariance of x, y and yaw."""
+    full = np.zeros((6, 6))
+    full[np.ix_((0, 1, 5), (0, 1, 5))] = covariance
+    return [float(value) for value in full.ravel()]
+
+
+def covariance_of(numbers: Any) -> np.ndarray:
+    """Return the (3, 3) covariance of x, y and yaw out of the 36 numbers of geometry_msgs/PoseWithCovariance.
+
+    Raises:
+        ValueError: A number is not finite, or the covariance is not positive semidefinite.
+    """
+    full = np.asarray(numbers, np.float64).reshape(6, 6)
+    part = full[np.ix_((0, 1, 5), (0, 1, 5))]
+    if not np.isfinite(part).all():
+        raise ValueError(f"message.pose.covariance: must be finite, got {part.tolist()}")
+    part = 0.5 * (part + part.T)
+    least = float(np.linalg.eigvalsh(part).min())
+    if least < -_ROUNDING * max(float(part.diagonal().max()), 0.0):
+        raise ValueError(
+            f"message.pose.covariance: must be positive semidefinite, got an eigenvalue of {least:.3g} for x, y and yaw"
+        )
+    return part
+
+
+def start_of(message: Any, frame: str) -> tuple[Pose, np.ndarray]:
+    """Return the pose and the (3, 3) covariance of a geometry_msgs/PoseWithCovarianceStamped.
+
+    Args:
+        message: The pose.
+        frame: Frame in which it must be given.
+
+    Raises:
+        TypeError: A field is absent or not a number.
+        ValueError: The pose is in another frame, not finite or not level, or its covariance is none.
+    """
+    named = str(field("message", message, "header.frame_id")).lstrip("/")
+    if named != frame.lstrip("/"):
+        raise ValueError(f"message.header.frame_id: must be {frame!r}, got {named!r}")
+    pose = planar_pose("message.pose", field("message", message, "pose.pose"))
+    return pose, covariance_of(field("message", message, "pose.covariance"))
+
+
+def odometry_fields(message: Any, frames: tuple[str, str]) -> dict[str, Any]:
+    """Return a nav_msgs/Odometry as the fields of geometry_msgs/TransformStamped between two frames."""
+    pose = message.pose.pose
+    return {
+        "header": {"stamp": message.header.stamp, "frame_id": frames[0]}, "child_frame_id": frames[1],
+        "transform": {"translation": pose.position, "rotation": pose.orientation},
+    }  # fmt: skip
+
+
+def laser_scan(message: Any, laser: np.ndarray, farthest: float | None) -> tuple[Scanner, dict[str, Any]]:
+    """Return the scanner of a sensor_msgs/LaserScan, and the fields that give its readings.
+
+    Args:
+        message: The scan.
+        laser: (4, 4) pose of the laser on the robot's base. If it is upside down, the beams run clockwise.
+        farthest: Stands in for a ``range_max`` of the message that is not finite [m]; None for no such limit.
+
+    Raises:
+        TypeError: A field is absent or not a number.
+        ValueError: The laser is tilted, or a field breaks a rule.
+    """
+    mount, upside_down = planar_mount(laser)
+    names = ("angle_min", "angle_increment", "range_min", "range_max", "ranges")
+    fields = {name: field("message", message, name) for name in names}
+    if upside_down:
+        fields |= {name: -fields[name] for name in names[:2]}
+    if farthest is not None and not math.isfinite(fields["range_max"]):
+        fields["range_max"] = farthest
+    return Scanner.from_laser_scan(fields, mount), fields
+
+
+def cloud_fields(particles: np.ndarray, weights: np.ndarray, most: int = 2000) -> list[dict[str, Any]]:
+    """Return the fields of nav2_msgs/Particle of at most ``most`` particles, evenly picked."""
+    chosen = np.linspace(0, len(particles) - 1, min(most, len(particles))).astype(int)
+    return [
+        {"pose": pose_fields((float(x), float(y), float(yaw))), "weight": float(weight)}
+        for (x, y, yaw), weight in zip(particles[chosen], weights[chosen], strict=True)
+    ]
+
+
+def host_array(values: Any) -> np.ndarray:
+    """Return an array of the device of a filter as a NumPy array."""
+    for way in ("get", "numpy"):
+        if not isinstance(values, np.ndarray) and hasattr(values, way):
+            return np.asarray(getattr(values, way)())
+    return np.asarray(values)
+
+
+def fill(message: Any, fields: Mapping[str, Any]) -> Any:
+    """Copy fields into a message, part by part, and return it."""
+    for name, value in fields.items():
+        if isinstance(value, Mapping):
+            fill(getattr(message, name), value)
+        else:
+            setattr(message, name, value)
+    return message

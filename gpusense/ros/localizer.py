@@ -1,0 +1,221 @@
+"""The localiser behind the node, without ROS: map, scans and odometry in; estimate, cloud and transform out."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from gpusense.localization.nav2 import Nav2Options
+from gpusense.logs.records import Pose
+from gpusense.ros.conversions import host_array, laser_scan, map_to_odometry, moved_enough
+from gpusense.ros.diagnostics import ERROR, LEVELS, STALE, WARN, status_fields
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.messages import spread_readings
+from gpusense.world.scanner import Scanner
+
+PLACES = 1440
+"""Beams of the scanner of scans whose beams vary."""
+# Time without a scan after which diagnostics are stale [s].
+_PATIENCE = 5.0
+# Standard deviations of a first pose, as in nav2_amcl [m, m, rad].
+_START = (0.5, 0.5, math.pi / 12)
+
+
+class Localizer:
+    """A particle filter that is made as soon as map, scanner and first pose are known.
+
+    Args:
+        options: Options of nav2_amcl, see ``gpusense.compat.from_nav2``.
+        backend: The device.
+        seed: Seed of the filter.
+        clock: Returns the time [s].
+
+    Attributes:
+        estimate: Estimate of the last scan that counted; None before one, and after a new start.
+        problem: Why the last scan could not be used; None where it could.
+        counted: Number of scans that counted.
+    """
+
+    def __init__(
+        self,
+        options: Nav2Options,
+        *,
+        backend: str = "auto",
+        seed: int = 0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.options, self._clock = options, clock
+        self.backend, self.seed = backend, seed
+        self.grid: OccupancyGrid | None = None
+        self.filter: Any = None
+        self._scanner: Scanner | None = None
+        self._spread = False
+        self.estimate: Any = None
+        self.counted = 0
+        self._cause = ""
+        self._taken = clock()
+        self.problem: str | None = None
+        self._last: Pose | None = None
+        self._start: tuple[np.ndarray, np.ndarray] | None = None
+        if options.initial_pose is not None:
+            covariance = options.initial_covariance or np.diag(np.square(_START))
+            self.start_at(options.initial_pose, np.asarray(covariance))
+
+    def warm_up(self) -> None:
+        """Open the device, and compile what scans need, on the map or a made-up room.
+
+        Raises:
+            TypeError, ValueError: The device is absent, or a parameter breaks a rule.
+        """
+        cells = np.zeros((80, 80), np.int8)
+        cells[[0, -1]] = cells[:, [0, -1]] = 100
+        grid = OccupancyGrid(cells, 0.1) if self.grid is None else self.grid
+        scanner = Scanner.uniform(angle_min=-math.pi, angle_increment=math.pi / 180, count=360, range_max=10.0)
+        made = self.options.make_filter(self.options.make_model(grid, scanner, backend=self.backend), seed=self.seed)
+        made.initialize_uniform()
+        made.initialize(mean=(4.0, 4.0, 0.0), covariance=np.diag(np.square(_START)))
+        for step in range(2):
+            made.predict((0.1 * step, 0.0, 0.0), (0.1 * (step + 1), 0.0, 0.0))
+            made.correct(np.full(360, 3.0))
+            made.estimate()
+        made.diagnose()
+
+    def begin(self) -> None:
+        """Count the time without scans from now on."""
+        self._taken = self._clock()
+
+    def set_map(self, grid: OccupancyGrid) -> None:
+        """Take a map; a filter goes on around its last estimate."""
+        before, self.grid = self.grid, grid
+        if self.filter is None:
+            return
+        try:
+            self._make(self._scanner)
+        except Exception:
+            self.grid = before
+            raise
+
+    def start_at(self, pose: Pose, covariance: np.ndarray) -> None:
+        """Begin around a pose."""
+        self._start = np.array(pose), np.asarray(covariance)
+        self.start_again()
+
+    def start_anywhere(self) -> None:
+        """Begin all over the map, as nav2_amcl's ``reinitialize_global_localization`` does."""
+        self._start = None
+        self.start_again()
+
+    def start_again(self) -> None:
+        """Begin as the last time: around a pose, or all over the map."""
+        self._last = self.estimate = None
+        if self.filter is not None:
+            self._initialize()
+
+    def update(self, message: Any, odometry: Pose, laser: np.ndarray) -> bool:
+        """Take a sensor_msgs/LaserScan; return whether it counted.
+
+        As in nav2_amcl, a scan counts if there is a map and the robot has moved enough since the last one that did. One
+        that breaks a rule does not count, and ``problem`` says why. ``laser_max_range`` replaces a ``range_max``
+        that is not finite.
+
+        Args:
+            message: The scan.
+            odometry: Pose of the robot in the odometry frame.
+            laser: (4, 4) pose of the laser on the robot.
+        """
+        if self.grid is None:
+            return False
+        try:
+            scanner, fields = laser_scan(message, laser, self.options.range_limits[1])
+            self.problem = None
+        except (TypeError, ValueError) as error:
+            self.problem = str(error)
+            return False
+        self._taken = self._clock()
+        ranges = self._readings(fields, scanner)
+        if self._last is not None and not moved_enough(self._last, odometry, self.options.update_min):
+            return False
+        if self._last is not None:
+            self.filter.predict(np.array(self._last), np.array(odometry))
+        self.filter.correct(ranges)
+        self._last, self.estimate = odometry, self.filter.estimate()
+        self.counted, self._cause = self.counted + 1, ""
+        return True
+
+    def map_to_odometry(self) -> Pose:
+        """Return the pose of the odometry frame in the map, by the last scan that counted."""
+        if self._last is None:
+            raise ValueError("no scan counted since the start")
+        x, y, yaw = (float(value) for value in self.estimate.pose)
+        return map_to_odometry((x, y, yaw), self._last)
+
+    def cloud(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the (N, 3) particles and their (N,) weights."""
+        return host_array(self.filter.particles), host_array(self.filter.weights)
+
+    def status(self, counts: Mapping[str, int], reason: str | None = None, node: str = "gpusense") -> dict[str, Any]:
+        """Return the fields of diagnostic_msgs/DiagnosticStatus.
+
+        Args:
+            counts: Numbers of scans by what became of them.
+            reason: Why the last scan had no transforms, or why there is no map.
+            node: Name of the node with its namespace.
+        """
+        values = {"scans that counted": str(self.counted)} | {f"scans {key}": str(n) for key, n in counts.items()}
+        why = "" if reason is None else f": {reason}"
+        if self.grid is None:
+            return status_fields("filter", WARN, f"no map yet{why}", values, node)
+        if self.problem is not None:
+            return status_fields("filter", ERROR, f"scans cannot be used: {self.problem}", values, node)
+        if self._clock() - self._taken > _PATIENCE:
+            return status_fields("filter", STALE, f"no scan for {_PATIENCE:g} s{why}", values, node)
+        found = self.estimate
+        if found is None:
+            return status_fields("filter", WARN, f"no estimate since the start{why}", values, node)
+        values |= {
+            "verdict": found.verdict, "p_lost": f"{found.p_lost:.4f}", "explained": f"{found.explained:.3f}",
+            "particles": str(found.particles), "effective sample size": f"{found.effective_sample_size:.0f}",
+        }  # fmt: skip
+        # The search for a cause takes milliseconds, so it is made once for an estimate.
+        if found.verdict != "tracking" and not self._cause:
+            self._cause = self.filter.diagnose().text
+        text = ": ".join(filter(None, (found.verdict, self._cause)))
+        return status_fields("filter", LEVELS[found.verdict], text, values, node)
+
+    def _readings(self, fields: Mapping[str, Any], scanner: Scanner) -> np.ndarray:
+        """Return the readings for the filter's scanner; make the filter where there is none for it.
+
+        The first scan's geometry is the scanner. After a scan of another geometry, all scans are
+        spread on common bearings, so that varying beams need only a second model.
+        """
+        if self.filter is None:
+            self._spread = False
+            self._make(scanner)
+        elif scanner != self._scanner and not self._spread:
+            self._spread = True
+            self._make(Scanner.uniform(
+                angle_min=-math.pi, angle_increment=2 * math.pi / PLACES, count=PLACES, range_max=scanner.range_max,
+                range_min=scanner.range_min, mount=scanner.mount,
+            ))  # fmt: skip
+        return spread_readings(fields, PLACES) if self._spread else np.array(fields["ranges"], np.float64)
+
+    def _make(self, scanner: Scanner | None) -> None:
+        assert self.grid is not None and scanner is not None
+        model = self.options.make_model(self.grid, scanner, backend=self.backend)
+        before, self.filter = self.filter, self.options.make_filter(model, seed=self.seed)
+        self._scanner = scanner
+        if before is not None and self.estimate is not None:
+            estimate = before.estimate()
+            self.filter.initialize(mean=estimate.pose, covariance=estimate.covariance)
+        else:
+            self._initialize()
+
+    def _initialize(self) -> None:
+        if self._start is None:
+            self.filter.initialize_uniform()
+        else:
+            self.filter.initialize(mean=self._start[0], covariance=self._start[1])

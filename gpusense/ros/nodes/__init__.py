@@ -1,0 +1,1 @@
+"""Nodes for ROS 2, which import rclpy."""

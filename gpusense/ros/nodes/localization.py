@@ -1,0 +1,299 @@
+"""The node: scan, odometry and map in; pose, particle cloud and the transform from map to odometry out.
+
+It is a lifecycle node with the topics, frames and parameters of nav2_amcl.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Pose as PoseMessage
+from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import OccupancyGrid as MapMessage
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.qos import qos_profile_sensor_data
+from rclpy.time import Time
+from sensor_msgs.msg import LaserScan
+from std_srvs.srv import Empty
+
+from gpusense.logs.records import Pose
+from gpusense.logs.transform_buffer import BACK
+from gpusense.ros import conversions
+from gpusense.ros.diagnostics import ERROR
+from gpusense.ros.localizer import Localizer
+from gpusense.ros.nodes.wiring import Guard, TFMessage, Transforms, diagnostic_array, latched, run, unreliable
+from gpusense.ros.parameters import defaults, mount_of, options_of
+from gpusense.ros.scan_queue import ScanQueue
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.map_files import read_map
+from gpusense.world.messages import stamp_of
+
+try:
+    from nav2_msgs.msg import Particle, ParticleCloud
+except ImportError:
+    Particle, ParticleCloud = None, None
+
+# Time between two looks at how long scans wait [s].
+_LOOK = 0.1
+# Scans that wait in the middleware while the node is busy.
+_DEPTH = 50
+# A step of publication numbers beyond which another publisher is likely.
+_GAP = 10_000
+
+
+class LocalizationNode(LifecycleNode):
+    """Monte Carlo localisation with gpusense."""
+
+    def __init__(self) -> None:
+        super().__init__("amcl", automatically_declare_parameters_from_overrides=True)
+        for name, value in defaults().items():
+            if not self.has_parameter(name):
+                self.declare_parameter(name, value, ParameterDescriptor(dynamic_typing=True))
+        self.full_name = self.get_fully_qualified_name().lstrip("/")
+        self.guard = Guard(self.get_logger())
+        self.active = False
+        self._made: list[tuple[Callable[[Any], Any], Any]] = []
+
+    def start(self) -> bool:
+        """Configure and activate the node, if the parameter ``autostart_node`` is set; return whether it succeeded."""
+        if not self.get_parameter("autostart_node").value:
+            return True
+        triggers = (self.trigger_configure, self.trigger_activate)
+        return all(trigger() == TransitionCallbackReturn.SUCCESS for trigger in triggers)
+
+    # -------------------------------------------------------------------------------------------------- the lifecycle
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Read the parameters, compile, and listen for the map, a first pose and transforms."""
+        try:
+            self._configure({name: each.value for name, each in self.get_parameters_by_prefix("").items()})
+            return super().on_configure(state)
+        except Exception as error:
+            self.guard.report("configure", error)
+            self._release()
+            return TransitionCallbackReturn.FAILURE
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Begin to localise."""
+        self.active = True
+        self.localizer.begin()
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop to localise; the filter is kept."""
+        self.active = False
+        self.queue.clear()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Free the filter, topics and services."""
+        result = super().on_cleanup(state)
+        self._release()
+        return result
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Free the filter, topics and services."""
+        result = super().on_shutdown(state)
+        self._release()
+        return result
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Free all, so that the node can be configured anew."""
+        self._release()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _configure(self, values: dict[str, Any]) -> None:
+        self.options, without = options_of(values)
+        if without:
+            self.get_logger().warning(f"parameters without effect: {', '.join(without)}")
+        self.localizer = Localizer(self.options, backend=values["backend"], seed=values["seed"])
+        if values["map_file"]:
+            self.localizer.set_map(read_map(values["map_file"]))
+        begin = time.perf_counter()
+        self.localizer.warm_up()
+        self.get_logger().info(f"compiled for {values['backend']} in {time.perf_counter() - begin:.1f} s")
+        self.queue = ScanQueue(self.look_up, self.localize, patience=float(values["scan_patience"]))
+        self.restarts = values["restart_after_jump"]
+        self.received = self.lost = self.dropped = 0
+        self.number: int | None = None
+        self.stamp = -float("inf")
+        self.map_reason: str | None = None
+        self._listen(values)
+        self._publish()
+
+    def _listen(self, values: dict[str, Any]) -> None:
+        """Create subscriptions, the service and timers, and keep how each is destroyed."""
+        frames = self.options.frames[1:]
+        self.transforms = Transforms(
+            self, self.guard, frames, values["odom_topic"], mount_of(values["mount"]), self.check_waiting
+        )
+        made = list(self.transforms.subscriptions)
+        map_topic, scan_topic = self.options.topics
+        quality = SubscriptionEventCallbacks(incompatible_qos=self.on_map_quality)
+        if not values["map_file"]:
+            take = self.guard.around("map", self.on_map)
+            made.append(self.create_subscription(MapMessage, map_topic, take, latched(), event_callbacks=quality))
+        for kind, topic, callback, profile in (
+            (LaserScan, scan_topic, self.on_scan, unreliable(_DEPTH)),
+            (PoseWithCovarianceStamped, "initialpose", self.on_initial_pose, 1),
+        ):
+            made.append(self.create_subscription(kind, topic, self.guard.around(topic, callback), profile))
+        self._made += [(self.destroy_subscription, each) for each in made]
+        anywhere = "reinitialize_global_localization"
+        service = self.create_service(Empty, anywhere, self.guard.around(anywhere, self.on_reinitialize))
+        self._made.append((self.destroy_service, service))
+        # Scans wait by the wall's clock, as simulated time may stand.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        for period, name, work in ((_LOOK, "scans", self.check_waiting), (1.0, "status", self.publish_diagnostics)):
+            timer = self.create_timer(period, self.guard.around(name, work), clock=steady)
+            self._made.append((self.destroy_timer, timer))
+
+    def _publish(self) -> None:
+        """Create publishers, and keep how each is destroyed."""
+        add = self.create_lifecycle_publisher
+        self.pose = add(PoseWithCovarianceStamped, "amcl_pose", latched())
+        self.cloud = add(ParticleCloud or PoseArray, "particle_cloud", qos_profile_sensor_data)
+        self.diagnostics = add(DiagnosticArray, "/diagnostics", 10)
+        publishers = [self.pose, self.cloud, self.diagnostics]
+        self.broadcaster: Any = None
+        if TFMessage is not None and self.options.tf_broadcast:
+            self.broadcaster = add(TFMessage, "/tf", 100)
+            publishers.append(self.broadcaster)
+        self._made += [(self.destroy_lifecycle_publisher, each) for each in publishers]
+
+    def _release(self) -> None:
+        self.active = False
+        self.guard.troubles.clear()
+        made, self._made = self._made, []
+        for destroy, each in made:
+            destroy(each)
+
+    # ------------------------------------------------------------------------------------------------------ callbacks
+
+    def on_map(self, message: MapMessage) -> None:
+        """Take a map; the one before stays if this one is bad."""
+        self.localizer.set_map(OccupancyGrid.from_message(message))
+
+    def on_map_quality(self, event: Any) -> None:
+        """Say why a publisher's map does not come."""
+        self.map_reason = (
+            f"a publisher of {self.options.topics[0]} does not keep its map for late subscribers (its durability must "
+            "be transient local)"
+        )
+        self.get_logger().warning(f"no map: {self.map_reason}")
+
+    def on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
+        """Begin around a pose that a user sets."""
+        self.localizer.start_at(*conversions.start_of(message, self.options.frames[0]))
+
+    def on_reinitialize(self, request: Empty.Request, response: Empty.Response) -> Empty.Response:
+        """Begin all over the map."""
+        self.localizer.start_anywhere()
+        self.get_logger().info("the filter starts all over the map")
+        return response
+
+    def on_scan(self, message: LaserScan, info: Any) -> None:
+        """Take a scan; it waits for its transforms."""
+        number, before = info["publication_sequence_number"], self.number
+        self.number = number
+        if not self.active:
+            return
+        self.received += 1
+        if before is not None and 1 < number - before < _GAP:
+            self.lost += number - before - 1
+        self.queue.add(message, stamp_of("message", message))
+        self._report_dropped()
+
+    def check_waiting(self) -> None:
+        """Look whether the transforms of scans that wait have come."""
+        if self.active and len(self.queue):
+            self.queue.check()
+            self._report_dropped()
+
+    def _report_dropped(self) -> None:
+        if self.queue.dropped > self.dropped:
+            self.dropped = self.queue.dropped
+            self.get_logger().warning(f"a scan is skipped: {self.queue.reason}", throttle_duration_sec=2.0)
+
+    def look_up(self, message: LaserScan) -> tuple[Pose, Any]:
+        """Return the pose of the base in the odometry frame at a scan's stamp, and the laser's (4, 4) on the base.
+
+        Raises:
+            TransformError: They are not known yet.
+        """
+        laser = self.transforms.laser(message.header.frame_id)
+        odometry = self.transforms.buffer.look_up(*self.options.frames[1:], stamp_of("message", message))
+        return conversions.planar(odometry), laser
+
+    def localize(self, message: LaserScan, transforms: tuple[Pose, Any]) -> None:
+        """Localise with a scan, and publish the results."""
+        stamp = stamp_of("message", message)
+        if stamp < self.stamp - BACK:
+            self.get_logger().warning(f"time went back from {self.stamp:.3f} s to {stamp:.3f} s")
+            if self.restarts:
+                self.localizer.start_again()
+        self.stamp = stamp
+        if self.localizer.update(message, *transforms):
+            self.publish_estimate(message)
+        if self.localizer.problem is not None:
+            self.guard.report(self.options.topics[1], ValueError(self.localizer.problem))
+        if self.localizer.estimate is not None and self.broadcaster is not None:
+            self.publish_transform(message)
+
+    # ------------------------------------------------------------------------------------------------------- messages
+
+    def publish_estimate(self, scan: LaserScan) -> None:
+        """Publish the pose and the particles."""
+        estimate = self.localizer.estimate
+        pose = PoseWithCovarianceStamped()
+        pose.header.stamp, pose.header.frame_id = scan.header.stamp, self.options.frames[0]
+        x, y, yaw = (float(value) for value in estimate.pose)
+        conversions.fill(pose.pose.pose, conversions.pose_fields((x, y, yaw)))
+        pose.pose.covariance = conversions.covariance_fields(estimate.covariance)
+        self.pose.publish(pose)
+        if not self.cloud.get_subscription_count():
+            return
+        particles = conversions.cloud_fields(*self.localizer.cloud())
+        if ParticleCloud is None:
+            cloud = PoseArray(header=pose.header)
+            cloud.poses = [conversions.fill(PoseMessage(), fields["pose"]) for fields in particles]
+        else:
+            cloud = ParticleCloud(header=pose.header)
+            cloud.particles = [conversions.fill(Particle(), fields) for fields in particles]
+        self.cloud.publish(cloud)
+
+    def publish_transform(self, scan: LaserScan) -> None:
+        """Send the transform from the map to the odometry frame."""
+        sent = TransformStamped()
+        ahead = Time.from_msg(scan.header.stamp) + Duration(seconds=self.options.transform_tolerance)
+        sent.header.stamp, sent.header.frame_id = ahead.to_msg(), self.options.frames[0]
+        sent.child_frame_id = self.options.frames[1]
+        conversions.fill(sent.transform, conversions.transform_fields(self.localizer.map_to_odometry()))
+        self.broadcaster.publish(TFMessage(transforms=[sent]))
+
+    def publish_diagnostics(self) -> None:
+        """Publish how the filter fares."""
+        if not self.active:
+            return
+        counts = {
+            "received": self.received, "without transforms": self.queue.dropped,
+            "lost before the callback": self.lost,
+        }  # fmt: skip
+        reason = self.map_reason if self.localizer.grid is None else self.queue.reason
+        fields = self.localizer.status(counts, reason, self.full_name)
+        trouble = self.guard.text()
+        if trouble is not None:
+            fields |= {"level": ERROR, "message": trouble}
+        self.diagnostics.publish(diagnostic_array(fields, self.get_clock().now().to_msg()))
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node; with the parameter ``autostart_node`` it configures and activates itself."""
+    return run(LocalizationNode, args)

@@ -1,0 +1,93 @@
+"""The watching node: scans, map and the poses of any localiser in; diagnostics out.
+
+It needs no filter of gpusense: ``amcl_pose`` may come from nav2_amcl, or from any node that stamps its pose with the
+time of the scan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid as MapMessage
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.node import Node
+from sensor_msgs.msg import LaserScan
+
+from gpusense.logs.transform_buffer import TransformError
+from gpusense.ros.diagnostics import ERROR
+from gpusense.ros.nodes.wiring import Guard, Transforms, diagnostic_array, latched, run, unreliable
+from gpusense.ros.parameters import WATCH, check_watch, mount_of
+from gpusense.ros.watcher import Watcher
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.map_files import read_map
+
+
+class WatchingNode(Node):
+    """Diagnostics of a localiser."""
+
+    def __init__(self) -> None:
+        super().__init__("localization_watch")
+        dynamic = ParameterDescriptor(dynamic_typing=True)
+        values = {name: self.declare_parameter(name, value, dynamic).value for name, value in WATCH.items()}
+        check_watch(values)
+        self.full_name = self.get_fully_qualified_name().lstrip("/")
+        self.guard = Guard(self.get_logger())
+        self.watcher = Watcher(
+            backend=values["backend"], tolerance=values["tolerance"], patience=values["patience"],
+            frame=values["global_frame_id"], range_max=values["laser_max_range"],
+        )  # fmt: skip
+        self.transforms = Transforms(self, self.guard, ("odom", values["base_frame"]), "", mount_of(values["mount"]))
+        self.diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        kept = latched()
+        if values["map_file"]:
+            self.watcher.set_map(read_map(values["map_file"]))
+        else:
+            self.create_subscription(MapMessage, "map", self.guard.around("map", self.on_map), kept)
+        for kind, topic, callback, quality in (
+            (LaserScan, "scan", self.on_scan, unreliable(50)),
+            (PoseWithCovarianceStamped, "amcl_pose", self.on_pose, kept),
+            (PoseWithCovarianceStamped, "initialpose", self.on_initial_pose, 1),
+        ):
+            self.create_subscription(kind, topic, self.guard.around(topic, callback), quality)
+        self.create_timer(1.0, self.guard.around("status", self.publish))
+
+    def on_map(self, message: MapMessage) -> None:
+        """Take a map; the one before stays if this one is bad."""
+        self.watcher.set_map(OccupancyGrid.from_message(message))
+
+    def on_initial_pose(self, message: Any) -> None:
+        """Forget the scans so far."""
+        self.watcher.reset()
+
+    def on_scan(self, message: LaserScan) -> None:
+        """Keep a scan until its pose comes."""
+        try:
+            laser = self.transforms.laser(message.header.frame_id)
+        except TransformError as error:
+            self.get_logger().warning(str(error), throttle_duration_sec=2.0)
+            return
+        self.watcher.add_scan(message, laser)
+        if self.watcher.problem is not None:
+            raise ValueError(self.watcher.problem)
+
+    def on_pose(self, message: PoseWithCovarianceStamped) -> None:
+        """Judge a pose, and publish the verdict at once."""
+        if self.watcher.add_pose(message):
+            self.publish()
+
+    def publish(self) -> None:
+        """Publish the diagnostics."""
+        now = self.get_clock().now()
+        fields = self.watcher.status(1e-9 * now.nanoseconds, self.full_name)
+        trouble = self.guard.text()
+        if trouble is not None:
+            fields |= {"level": ERROR, "message": trouble}
+        self.diagnostics.publish(diagnostic_array(fields, now.to_msg()))
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run(WatchingNode, args)

@@ -1,0 +1,191 @@
+"""Pieces of ROS that both nodes use: guards around callbacks, transforms, messages, and the life of a process."""
+
+from __future__ import annotations
+
+import functools
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from nav_msgs.msg import Odometry
+from rclpy.executors import ExternalShutdownException
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from gpusense.logs.records import Pose
+from gpusense.logs.transform_buffer import TransformBuffer
+from gpusense.ros.conversions import odometry_fields, pose_matrix
+
+try:
+    from tf2_msgs.msg import TFMessage as TFMessage
+except ImportError:
+    TFMessage = None
+
+# Time for which moving transforms are kept, as in tf2 [s].
+_CACHE = 10.0
+# Least time between two lines about the same subject in the log [s].
+_QUIET = 2.0
+
+
+def latched() -> QoSProfile:
+    """Return the quality of service of topics whose last message newcomers get."""
+    return QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
+
+
+def unreliable(depth: int) -> QoSProfile:
+    """Return the quality of service of sensors, with a longer queue than theirs."""
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def diagnostic_array(fields: dict[str, Any], stamp: Any) -> DiagnosticArray:
+    """Return the message of one status.
+
+    Args:
+        fields: The fields of the status, see :func:`gpusense.ros.diagnostics.status_fields`.
+        stamp: builtin_interfaces/Time of the message.
+    """
+    status = DiagnosticStatus(name=fields["name"], hardware_id=fields["hardware_id"], message=fields["message"])
+    status.level = bytes([fields["level"]])
+    status.values = [KeyValue(**pair) for pair in fields["values"]]
+    array = DiagnosticArray(status=[status])
+    array.header.stamp = stamp
+    return array
+
+
+class Guard:
+    """Lets a callback fail without ending the node: the error is logged, and kept for diagnostics.
+
+    Args:
+        log: Logger of the node.
+
+    Attributes:
+        troubles: The error of each subject whose last callback failed.
+    """
+
+    def __init__(self, log: Any) -> None:
+        self.log = log
+        self.troubles: dict[str, str] = {}
+        self._logged: dict[str, tuple[str, float]] = {}
+
+    def around(self, subject: str, callback: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a callback with a guard around it.
+
+        Args:
+            subject: Name of the topic, or of the work, in messages.
+            callback: The callback. A service's response is returned where it fails.
+        """
+
+        @functools.wraps(callback)
+        def run(*arguments: Any) -> Any:
+            try:
+                result = callback(*arguments)
+            except Exception as error:
+                self.report(subject, error)
+                return arguments[1] if len(arguments) > 1 else None
+            self.troubles.pop(subject, None)
+            return result
+
+        return run
+
+    def report(self, subject: str, error: Exception) -> None:
+        """Log an error once, and at most one error of a subject in 2 s."""
+        text = str(error) if isinstance(error, (OSError, TypeError, ValueError)) else f"{type(error).__name__}: {error}"
+        self.troubles[subject] = text
+        before, since = self._logged.get(subject, ("", -_QUIET))
+        if text != before and time.monotonic() - since > _QUIET:
+            self._logged[subject] = text, time.monotonic()
+            self.log.error(f"{subject}: {text}")
+            if not isinstance(error, (OSError, TypeError, ValueError)):
+                self.log.debug("".join(traceback.format_exception(error)))
+
+    def text(self) -> str | None:
+        """Return the errors in one line; None without one."""
+        return "; ".join(f"{subject}: {text}" for subject, text in self.troubles.items()) or None
+
+
+class Transforms:
+    """Transforms of the robot, from ``/tf``, or odometry from ``nav_msgs/Odometry`` and the mount from a parameter.
+
+    Args:
+        node: The node.
+        guard: Its guard.
+        frames: Frames of the odometry and the robot's base.
+        odometry: Topic of nav_msgs/Odometry; empty for transforms.
+        mount: Pose (x, y, yaw) of the laser on the robot; None for transforms.
+        arrived: Called after new transforms.
+    """
+
+    def __init__(
+        self,
+        node: Any,
+        guard: Guard,
+        frames: tuple[str, str],
+        odometry: str = "",
+        mount: Pose | None = None,
+        arrived: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.buffer, self.frames, self.guard, self.arrived = TransformBuffer(_CACHE), frames, guard, arrived
+        self.mount = mount
+        self.subscriptions = []
+        if TFMessage is None:
+            self.mount = mount or (0.0, 0.0, 0.0)
+            odometry = odometry or "odom"
+            node.get_logger().warning(
+                f"tf2_msgs cannot be imported: odometry is read from the topic {odometry}, the laser is taken to be at "
+                f"{self.mount} on the robot (parameter mount), and no transform is sent"
+            )
+        else:
+            kept = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            for topic, quality in (("/tf", QoSProfile(depth=100)), ("/tf_static", kept)):
+                take = functools.partial(self._take, static=topic == "/tf_static")
+                self.subscriptions.append(node.create_subscription(TFMessage, topic, take, quality))
+        if odometry:
+            self.subscriptions.append(node.create_subscription(Odometry, odometry, self._take_odometry, 50))
+
+    def laser(self, frame: str) -> np.ndarray:
+        """Return the (4, 4) pose of a laser on the robot's base.
+
+        Raises:
+            TransformError: It is not known yet.
+        """
+        if self.mount is not None:
+            return pose_matrix(self.mount)
+        return self.buffer.look_up(self.frames[1], frame)
+
+    def _take(self, message: Any, static: bool) -> None:
+        for each in message.transforms:
+            self.guard.around("transforms", self.buffer.add)(each, static)
+        self.guard.around("scans", self.arrived)()
+
+    def _take_odometry(self, message: Odometry) -> None:
+        self.guard.around("odometry", self.buffer.add)(odometry_fields(message, self.frames))
+        self.guard.around("scans", self.arrived)()
+
+
+def run(make: Callable[[], Any], args: Sequence[str] | None = None) -> int:
+    """Run a node until it is interrupted or terminated.
+
+    Args:
+        make: Makes the node; its method ``start``, if it has one, returns whether the node can go on.
+        args: Arguments of the command line, with ``--ros-args``; ``sys.argv`` by default.
+
+    Returns:
+        The exit code: 0, or 1 where the node could not start.
+    """
+    node = None
+    try:
+        rclpy.init(args=None if args is None else list(args))
+        node = make()
+        if not getattr(node, "start", lambda: True)():
+            return 1
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0

@@ -1,0 +1,100 @@
+"""Parameters of the nodes by the names of nav2_amcl, without ROS."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from gpusense._util import checks
+from gpusense.localization.nav2 import DEFAULTS, Nav2Options, from_nav2
+
+OWN: dict[str, Any] = {
+    "parameters": "", "node": "", "backend": "auto", "autostart_node": False, "map_file": "", "odom_topic": "",
+    "mount": [], "scan_patience": 5.0, "restart_after_jump": False, "seed": 0,
+    "initial_pose.x": 0.0, "initial_pose.y": 0.0, "initial_pose.yaw": 0.0,
+}  # fmt: skip
+"""Parameters that nav2_amcl does not have, with their defaults."""
+
+# Parameters that are read, but change nothing.
+_IDLE = ("laser_min_range", "max_beams", "pf_err", "pf_z", "resample_interval")
+# Parameters of every node of ROS 2.
+_ROS = ("use_sim_time", "qos_overrides", "start_type_description_service")
+
+
+def defaults() -> dict[str, Any]:
+    """Return the parameters to declare, with their defaults."""
+    return DEFAULTS | OWN
+
+
+def options_of(values: Mapping[str, Any]) -> tuple[Nav2Options, tuple[str, ...]]:
+    """Return the options, and the names of parameters that have no effect.
+
+    Args:
+        values: Parameters of the node by dotted names. Where ``parameters`` names a file, it replaces those of
+            nav2_amcl, save for a first pose.
+
+    Raises:
+        OSError: The file cannot be read.
+        TypeError, ValueError: A parameter breaks a rule.
+    """
+    _check_own(values)
+    first = {name: value for name, value in values.items() if name.startswith("initial_pose.")}
+    first["set_initial_pose"] = values["set_initial_pose"]
+    if values["parameters"]:
+        options = from_nav2(values["parameters"], node=values["node"] or None)
+        if values["set_initial_pose"]:
+            start = from_nav2(first)
+            options = dataclasses.replace(
+                options, initial_pose=start.initial_pose, initial_covariance=start.initial_covariance
+            )
+        return options, options.ignored
+    options = from_nav2({name: value for name, value in values.items() if name not in OWN} | first)
+    unknown = [name for name in options.ignored if name.partition(".")[0] not in _ROS]
+    idle = [name for name in _IDLE if values[name] != DEFAULTS[name]]
+    return options, tuple(sorted(unknown + idle))
+
+
+def _check_own(values: Mapping[str, Any]) -> None:
+    for name in OWN:
+        value, default = values[name], OWN[name]
+        if isinstance(default, (bool, str)) and not isinstance(value, type(default)):
+            raise TypeError(f"{name}: must be {type(default).__name__}, got {checks.show(value)}")
+    checks.real("scan_patience", values["scan_patience"], above=0)
+    checks.integer("seed", values["seed"], low=0)
+    mount_of(values["mount"])
+    for name in ("parameters", "map_file"):
+        if values[name]:
+            checks.existing_file(Path(values[name]))
+
+
+def mount_of(value: Any) -> tuple[float, float, float] | None:
+    """Return the pose (x, y, yaw) of the laser on the robot; None where transforms give it.
+
+    Raises:
+        TypeError, ValueError: The value is neither empty nor three finite numbers.
+    """
+    if not len(value):
+        return None
+    x, y, yaw = checks.array("mount", list(value), (3,)).tolist()
+    return x, y, yaw
+
+
+WATCH: dict[str, Any] = {
+    "backend": "auto", "base_frame": "base_footprint", "global_frame_id": "map", "laser_max_range": 100.0,
+    "map_file": "", "mount": [], "patience": 10.0, "tolerance": 0.05,
+}  # fmt: skip
+"""Parameters of the watching node, with their defaults."""
+
+
+def check_watch(values: Mapping[str, Any]) -> None:
+    """Check the parameters of the watching node.
+
+    Raises:
+        OSError: The map is missing.
+        TypeError, ValueError: A parameter breaks a rule.
+    """
+    for name in ("laser_max_range", "patience", "tolerance"):
+        checks.real(name, values[name], above=0)
+    mount_of(values["mount"])

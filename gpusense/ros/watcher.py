@@ -1,0 +1,140 @@
+"""The monitor behind the watching node, without ROS: map, scans and poses in; diagnostics out.
+
+nav2_amcl stamps a pose with the time of the scan that it comes from, so the two are paired by their times.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from typing import Any
+
+import numpy as np
+
+from gpusense.localization.diagnosis import Diagnosis
+from gpusense.localization.monitor import PoseMonitor, PoseVerdict
+from gpusense.models.scan.field import LikelihoodFieldModel
+from gpusense.ros.conversions import laser_scan, start_of
+from gpusense.ros.diagnostics import LEVELS, STALE, status_fields
+from gpusense.world.grid import OccupancyGrid
+from gpusense.world.messages import stamp_of
+from gpusense.world.scanner import Scanner
+
+# Scans that wait for their pose.
+_KEPT = 40
+# Poses whose most frequent cause is reported.
+_CAUSES = 7
+
+
+class Watcher:
+    """A verdict on the poses of another localiser.
+
+    Args:
+        backend: The device.
+        tolerance: Largest difference of the times of a pose and its scan [s].
+        patience: Time without a judged pose after which the verdict is stale [s].
+        frame: Frame of the poses and the map.
+        range_max: Stands in for a ``range_max`` of scans that is not finite [m].
+
+    Attributes:
+        problem: Why the last scan could not be used; None where it could.
+    """
+
+    def __init__(
+        self,
+        *,
+        backend: str = "auto",
+        tolerance: float = 0.05,
+        patience: float = 10.0,
+        frame: str = "map",
+        range_max: float = 100.0,
+    ) -> None:
+        self.backend, self.tolerance, self.patience, self.frame = backend, tolerance, patience, frame
+        self.range_max = range_max
+        self.problem: str | None = None
+        self._grid: OccupancyGrid | None = None
+        self._monitor: PoseMonitor | None = None
+        self._scanner: Scanner | None = None
+        self._scans: deque[tuple[float, Scanner, np.ndarray]] = deque(maxlen=_KEPT)
+        self._verdict: PoseVerdict | None = None
+        self._causes: deque[Diagnosis] = deque(maxlen=_CAUSES)
+        self._judged = -math.inf
+
+    def set_map(self, grid: OccupancyGrid) -> None:
+        """Take a map; what was known of the pose is forgotten."""
+        self._grid, self._monitor = grid, None
+
+    def reset(self) -> None:
+        """Forget the scans so far, as after an initial pose."""
+        self._verdict = None
+        self._causes.clear()
+        if self._monitor is not None:
+            self._monitor.reset()
+
+    def add_scan(self, message: Any, laser: np.ndarray) -> None:
+        """Take a sensor_msgs/LaserScan, and the (4, 4) pose of its laser on the robot.
+
+        A scan that breaks a rule is left out, and ``problem`` says why.
+        """
+        try:
+            scanner, fields = laser_scan(message, laser, self.range_max)
+            self.problem = None
+        except (TypeError, ValueError) as error:
+            self.problem = str(error)
+            return
+        self._scans.append((stamp_of("message", message), scanner, np.array(fields["ranges"], np.float64)))
+
+    def add_pose(self, message: Any) -> bool:
+        """Take a geometry_msgs/PoseWithCovarianceStamped; return whether there was a map, and a scan of its time.
+
+        Raises:
+            ValueError: The pose is in another frame, not finite or not level, or its covariance is none.
+        """
+        pose, covariance = start_of(message, self.frame)
+        time = stamp_of("message", message)
+        nearest = min(self._scans, key=lambda scan: abs(scan[0] - time), default=None)
+        if self._grid is None or nearest is None or abs(nearest[0] - time) > self.tolerance:
+            return False
+        _, scanner, ranges = nearest
+        monitor = self._monitor_of(self._grid, scanner)
+        self._verdict = monitor.update(pose, ranges, covariance)
+        if self._verdict.verdict == "tracking":
+            self._causes.clear()
+        else:
+            self._causes.append(monitor.diagnose())
+        self._judged = time
+        return True
+
+    def status(self, now: float, node: str = "gpusense") -> dict[str, Any]:
+        """Return the fields of diagnostic_msgs/DiagnosticStatus.
+
+        Args:
+            now: Time [s].
+            node: Name of the node with its namespace.
+        """
+        # The clock goes back when a recording starts again.
+        if self._verdict is None or abs(now - self._judged) > self.patience:
+            return status_fields("localisation", STALE, "no pose with a scan of its time", {}, node)
+        found, likely = self._verdict, self._likely()
+        evidence = "" if likely is None else f": {likely.text}"
+        values = {"p_lost": f"{found.p_lost:.4f}", "verdict": found.verdict, "explained": f"{found.explained:.3f}"}
+        if likely is not None:
+            values["cause"] = likely.cause
+        return status_fields("localisation", LEVELS[found.verdict], f"{found.verdict}{evidence}", values, node)
+
+    def _likely(self) -> Diagnosis | None:
+        """Return the newest diagnosis of the cause that the last poses had most often."""
+        if not self._causes:
+            return None
+        ((cause, _),) = Counter(each.cause for each in self._causes).most_common(1)
+        return next(each for each in reversed(self._causes) if each.cause == cause)
+
+    def _monitor_of(self, grid: OccupancyGrid, scanner: Scanner) -> PoseMonitor:
+        """Return the monitor of a scanner; what it remembers stays where the scanner changes."""
+        if self._monitor is None or scanner != self._scanner:
+            before = self._monitor
+            self._monitor = PoseMonitor(LikelihoodFieldModel(grid, scanner, backend=self.backend))
+            self._scanner = scanner
+            if before is not None:
+                self._monitor.state = before.state
+        return self._monitor

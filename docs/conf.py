@@ -28,7 +28,7 @@ extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_ga
 root_doc = "docs/index"
 include_patterns = [
     "docs/**.md", "docs/**.rst", "bench/RESULTS.md", "bench/results/*.md", "CHANGELOG.md", "CODE_OF_CONDUCT.md",
-    "CONTRIBUTING.md", "README.md", "SECURITY.md", "examples/ros2/**/README.md",
+    "CONTRIBUTING.md", "README.md", "SECURITY.md",
     "examples/notebooks/*.ipynb",
 ]  # fmt: skip
 exclude_patterns = ["**/.*", "site", "docs/tour/GALLERY_HEADER.rst"]

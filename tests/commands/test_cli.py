@@ -44,7 +44,7 @@ def test_command_help_has_an_example(name, capsys):
     assert err == ""
     assert out.startswith(f"usage: gpusense {name} ")
     assert "example" in out and f"  gpusense {name}" in out
-    assert "--json" in out
+    assert "--json" in out or name == "ros"  # a node has no result
 
 
 @pytest.mark.parametrize("name", cli.COMMANDS)

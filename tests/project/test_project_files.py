@@ -55,7 +55,7 @@ def test_the_page_of_dependencies_has_each():
     first, second = page.split("| extra |")
     listed = {line.split("|")[1].strip() for line in first.splitlines() if re.match(r"\| [a-zA-Z]", line)} - {"package"}
     assert listed == names(PROJECT["dependencies"])
-    for extra in ("bench", "docs", "intel", "rerun", "sweep"):
+    for extra in ("bench", "docs", "intel", "rerun", "ros2", "sweep"):
         row = next(line for line in second.splitlines() if line.startswith(f"| `{extra}` |"))
         assert names(PROJECT["optional-dependencies"][extra]) <= set(re.findall(r"[\w.-]+", row)), extra
 
@@ -70,7 +70,7 @@ IGNORED = {
 
 def test_migration_names_every_parameter_of_nav2_amcl():
     part = MIGRATION[MIGRATION.index("## nav2_amcl") : MIGRATION.index("## Beluga")]
-    known = set(nav2._DEFAULTS) | {name for name in nav2_file.START_NAMES if "covariance" not in name}
+    known = set(nav2.DEFAULTS) | {name for name in nav2_file.START_NAMES if "covariance" not in name}
     alphas = {"alpha2", "alpha3"}  # between alpha1 and alpha4
     assert code_spans(part) == (known | IGNORED) - alphas
     assert gs.compat.from_nav2({"amcl": {"ros__parameters": dict.fromkeys(IGNORED, 1.0)}}).ignored == tuple(

@@ -73,7 +73,7 @@ class ScanQueue:
         """Deliver scans whose transforms are known, oldest first, and drop those that waited too long.
 
         Transforms arrive in the order of time. Scans before a ready one are older than every known transform, and
-        never become ready. Scans after one that is too early are too early as well.
+        never become ready. After a scan that must wait, all others must wait.
         """
         position = 0
         while position < len(self._waiting):

@@ -123,26 +123,32 @@ def odometry_fields(message: Any, frames: tuple[str, str]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def laser_scan(message: Any, laser: np.ndarray, farthest: float | None) -> tuple[Scanner, dict[str, Any]]:
-    """Return the scanner of a sensor_msgs/LaserScan, and the fields that give its readings.
+def laser_scan(
+    message: Any, laser: np.ndarray, limits: tuple[float | None, float | None]
+) -> tuple[Scanner, dict[str, Any]]:
+    """Return the scanner of a sensor_msgs/LaserScan, and the fields of its readings.
 
     Args:
         message: The scan.
         laser: (4, 4) pose of the laser on the robot's base. If it is upside down, the beams run clockwise.
-        farthest: Stands in for a ``range_max`` of the message that is not finite [m]; None for no such limit.
+        limits: Narrow the message's ``range_min`` and ``range_max``, as in nav2_amcl, or replace them where they are no
+            such limits [m]; None for the message's values.
 
     Raises:
         TypeError: A field is absent or not a number.
-        ValueError: The laser is tilted, or a field breaks a rule.
+        ValueError: A field breaks a rule.
     """
-    mount, upside_down = planar_mount(laser)
+    mount, upside_down, _ = planar_mount(laser)
     names = ("angle_min", "angle_increment", "range_min", "range_max", "ranges")
     fields = {name: field("message", message, name) for name in names}
     if upside_down:
         fields |= {name: -fields[name] for name in names[:2]}
-    if farthest is not None and not math.isfinite(fields["range_max"]):
-        fields["range_max"] = farthest
-    return Scanner.from_laser_scan(fields, mount), fields
+    (near, far), nearest, farthest = limits, fields["range_min"], fields["range_max"]
+    if far is not None and not 0 < farthest <= far:
+        farthest = far
+    if near is not None and not near <= nearest < farthest:
+        nearest = near
+    return Scanner.from_laser_scan(fields, mount, range_max=farthest, range_min=nearest), fields
 
 
 def cloud_fields(particles: np.ndarray, weights: np.ndarray, most: int = 2000) -> list[dict[str, Any]]:

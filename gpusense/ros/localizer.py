@@ -119,8 +119,7 @@ class Localizer:
         """Take a sensor_msgs/LaserScan; return whether it counted.
 
         As in nav2_amcl, a scan counts if there is a map and the robot has moved enough since the last one that did. One
-        that breaks a rule does not count, and ``problem`` says why. ``laser_max_range`` replaces a ``range_max``
-        that is not finite.
+        that breaks a rule does not count, and ``problem`` says why.
 
         Args:
             message: The scan.
@@ -130,7 +129,7 @@ class Localizer:
         if self.grid is None:
             return False
         try:
-            scanner, fields = laser_scan(message, laser, self.options.range_limits[1])
+            scanner, fields = laser_scan(message, laser, self.options.range_limits)
             self.problem = None
         except (TypeError, ValueError) as error:
             self.problem = str(error)

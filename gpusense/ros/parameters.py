@@ -18,7 +18,7 @@ OWN: dict[str, Any] = {
 """Parameters that nav2_amcl does not have, with their defaults."""
 
 # Parameters that are read, but change nothing.
-_IDLE = ("laser_min_range", "max_beams", "pf_err", "pf_z", "resample_interval")
+_IDLE = ("max_beams", "pf_err", "pf_z", "resample_interval")
 # Parameters of every node of ROS 2.
 _ROS = ("use_sim_time", "qos_overrides", "start_type_description_service")
 

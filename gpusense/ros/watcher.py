@@ -34,7 +34,7 @@ class Watcher:
         tolerance: Largest difference of the times of a pose and its scan [s].
         patience: Time without a judged pose after which the verdict is stale [s].
         frame: Frame of the poses and the map.
-        range_max: Stands in for a ``range_max`` of scans that is not finite [m].
+        range_max: Largest ``range_max`` of scans [m].
 
     Attributes:
         problem: Why the last scan could not be used; None where it could.
@@ -77,7 +77,7 @@ class Watcher:
         A scan that breaks a rule is left out, and ``problem`` says why.
         """
         try:
-            scanner, fields = laser_scan(message, laser, self.range_max)
+            scanner, fields = laser_scan(message, laser, (None, self.range_max))
             self.problem = None
         except (TypeError, ValueError) as error:
             self.problem = str(error)

@@ -113,8 +113,8 @@ def test_a_scan_that_breaks_a_rule_is_skipped() -> None:
     own = localizer.Localizer(from_nav2({"sigma_hit": 0.1}), backend="numpy")
     own.set_map(grid())
     wrong = scan_of(60)
-    wrong.range_max = -1.0
-    assert not own.update(wrong, (0.0, 0.0, 0.0), np.eye(4)) and "range_max" in own.problem
+    wrong.angle_increment = 0.0
+    assert not own.update(wrong, (0.0, 0.0, 0.0), np.eye(4)) and "angle_increment" in own.problem
     assert own.filter is None and own.estimate is None
     assert own.update(scan_of(60), (0.0, 0.0, 0.0), np.eye(4)) and own.problem is None
 
@@ -193,8 +193,8 @@ def test_the_watcher_publishes_the_verdict() -> None:
     assert status["level"] == 2 and status["message"].startswith("lost: ") and "likely cause" in status["message"]
     # No scan of this time, and a scan that breaks a rule.
     assert not own.add_pose(pose_message(20.0, truth))
-    own.add_scan(stamped(21.0, **(vars(scan_of(48)) | {"range_max": -1.0})), np.eye(4))
-    assert "range_max" in own.problem
+    own.add_scan(stamped(21.0, **(vars(scan_of(48)) | {"angle_increment": 0.0})), np.eye(4))
+    assert "angle_increment" in own.problem
     with pytest.raises(ValueError, match="covariance: must be finite"):
         own.add_pose(pose_message(7.0, truth, deviation=math.nan))
     with pytest.raises(ValueError, match="frame_id: must be 'map', got 'odom'"):
@@ -244,15 +244,22 @@ def test_a_bad_first_pose_is_refused(change: dict[str, Any], text: str) -> None:
 
 
 def test_a_laser_upside_down_has_beams_that_run_clockwise() -> None:
-    laser = np.diag([1.0, -1.0, -1.0, 1.0])
-    message = scan_of(4)
-    message.range_max = math.inf
-    scanner, fields = conversions.laser_scan(message, laser, 30.0)
+    scanner, fields = conversions.laser_scan(scan_of(4), np.diag([1.0, -1.0, -1.0, 1.0]), (None, None))
     np.testing.assert_allclose(scanner.bearings, [math.pi, math.pi / 2, 0.0, -math.pi / 2])
-    assert scanner.range_max == 30.0 and fields["angle_increment"] < 0
-    laser[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
-    with pytest.raises(ValueError, match="must scan a level plane"):
-        conversions.laser_scan(message, laser, 30.0)
+    assert fields["angle_increment"] < 0
+
+
+@pytest.mark.parametrize("low, high, limits, expected", [
+    (0.1, math.inf, (None, 30.0), (0.1, 30.0)), (0.1, math.nan, (None, 30.0), (0.1, 30.0)),
+    (0.1, 3e38, (None, 30.0), (0.1, 30.0)), (0.1, 0.0, (None, 30.0), (0.1, 30.0)),
+    (0.1, 8.0, (None, 30.0), (0.1, 8.0)), (math.nan, 8.0, (0.2, 30.0), (0.2, 8.0)),
+    (math.inf, 8.0, (0.2, 30.0), (0.2, 8.0)), (0.1, 8.0, (0.2, 6.0), (0.2, 6.0)), (9.0, 8.0, (0.0, None), (0.0, 8.0)),
+])  # fmt: skip
+def test_limits_narrow_or_replace_those_of_a_scan(low: float, high: float, limits: Any, expected: Any) -> None:
+    message = scan_of(4)
+    message.range_min, message.range_max = low, high
+    scanner, _ = conversions.laser_scan(message, np.eye(4), limits)
+    assert (scanner.range_min, scanner.range_max) == expected
 
 
 def test_diagnostics_before_and_without_scans() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import time
 import traceback
 from collections.abc import Callable, Sequence
@@ -17,7 +18,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from gpusense.logs.records import Pose
 from gpusense.logs.transform_buffer import TransformBuffer
+from gpusense.logs.transforms import planar_mount
 from gpusense.ros.conversions import odometry_fields, pose_matrix
+from gpusense.world.messages import LEVEL
 
 try:
     from tf2_msgs.msg import TFMessage as TFMessage
@@ -128,7 +131,7 @@ class Transforms:
         arrived: Callable[[], None] = lambda: None,
     ) -> None:
         self.buffer, self.frames, self.guard, self.arrived = TransformBuffer(_CACHE), frames, guard, arrived
-        self.mount = mount
+        self.mount, self._warned = mount, False
         self.subscriptions = []
         if TFMessage is None:
             self.mount = mount or (0.0, 0.0, 0.0)
@@ -153,7 +156,13 @@ class Transforms:
         """
         if self.mount is not None:
             return pose_matrix(self.mount)
-        return self.buffer.look_up(self.frames[1], frame)
+        matrix = self.buffer.look_up(self.frames[1], frame)
+        tilt = planar_mount(matrix)[2]
+        if tilt > LEVEL and not self._warned:
+            self._warned = True
+            degrees = math.degrees(tilt)
+            self.guard.log.warning(f"the laser {frame} is tilted by {degrees:.3g} deg; it is taken to be level")
+        return matrix
 
     def _take(self, message: Any, static: bool) -> None:
         for each in message.transforms:

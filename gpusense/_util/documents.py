@@ -131,11 +131,7 @@ def read_mapping(file: Path) -> dict[Any, Any]:
 
 
 def _check_keys(loader: Any, root: Any) -> None:
-    """Refuse mappings with a doubled key, of which PyYAML would silently keep the last value.
-
-    Raises:
-        yaml.YAMLError: A key is doubled.
-    """
+    """Refuse mappings with a doubled key, of which PyYAML would silently keep the last value."""
     import yaml
 
     nodes, seen = [root], set[int]()
@@ -186,11 +182,7 @@ def read_json(file: Path, kind: str) -> Any:
 
 
 def _bounded(file: Path, most: int, kind: str) -> bytes:
-    """Return the content of a file.
-
-    Raises:
-        ValueError: The file has more bytes than ``most``.
-    """
+    """Return the content of a file."""
     with file.open("rb") as stream:
         text = stream.read(most + 1)
     if len(text) > most:

@@ -60,11 +60,7 @@ def unmasked(name: str, value: Any) -> Any:
 
 
 def _parts(value: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the numbers and the mask of a masked array, or of nested lists with one in them.
-
-    Raises:
-        ValueError: The lists are ragged.
-    """
+    """Return the numbers and the mask of a masked array, or of nested lists with one in them."""
     if isinstance(value, (list, tuple)):
         datas, masks = zip(*map(_parts, value), strict=True)
         return np.stack(datas), np.stack(masks)

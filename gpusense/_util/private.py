@@ -67,21 +67,13 @@ def check_private(folder: Path) -> None:
 
 
 def _check_parents(folder: Path) -> None:
-    """Check that other users can rename neither a folder nor any folder above it.
-
-    Raises:
-        UnsafeFolderError: They can.
-    """
+    """Check that other users can rename neither a folder nor any folder above it."""
     for child, parent in zip((folder, *folder.parents), folder.parents, strict=False):
         _check_parent(parent, child.name)
 
 
 def _check_parent(folder: Path, child: str) -> None:
-    """Check that only this user and root can rename the files that they own in a folder.
-
-    Raises:
-        UnsafeFolderError: Other users can.
-    """
+    """Check that only this user and root can rename the files that they own in a folder."""
     status = os.stat(folder)
     if not _is_trusted(status.st_uid):
         owner = f"this user ({os.geteuid()}) or root, got owner {status.st_uid}"
@@ -155,11 +147,7 @@ def read_regular(path: Path, most: int, *, touch: bool = False, head: int | None
 
 
 def _check_regular(status: os.stat_result, path: Path, most: int) -> None:
-    """Check the kind, the owner and the size of a file.
-
-    Raises:
-        OSError: The file is not a regular file of this user, or is larger than ``most`` bytes.
-    """
+    """Check the kind, the owner and the size of a file."""
     if not stat.S_ISREG(status.st_mode):
         raise OSError(f"{path} must be a regular file, got another kind")
     if _HAS_OWNERS and status.st_uid != os.geteuid():

@@ -68,12 +68,7 @@ def copied_to_host(array: object, backend: Backend, name: str) -> object:
 
 
 def _adopt(array: Any, backend: Backend, name: str, *, in_place: bool = False) -> Adopted:
-    """Return an array on the device as a buffer of the backend.
-
-    Raises:
-        TypeError: The backend cannot read it.
-        ValueError: See Backend.adopt.
-    """
+    """Return an array on the device as a buffer of the backend."""
     if isinstance(array, Adopted):
         return array
     if backend.reads(array):
@@ -193,12 +188,7 @@ def adopt_readings(array: object, backend: Backend, beams: int, *, in_place: boo
 
 
 def _check_numbers(adopted: Adopted, name: str) -> None:
-    """Refuse numbers of another type than float32 or float64, and arrays that are not C-contiguous.
-
-    Raises:
-        TypeError: Another type.
-        ValueError: Not C-contiguous.
-    """
+    """Refuse numbers of another type than float32 or float64, and arrays that are not C-contiguous."""
     if adopted.dtype not in (np.float32, np.float64):
         dtype = adopted.dtype.name if adopted.dtype.isnative else adopted.dtype.str
         raise TypeError(f"{name}: must hold float32 or float64, got {dtype}")
@@ -260,12 +250,7 @@ def check_out(out: object, shape: tuple[int, ...], real: np.dtype, backend: Back
 def _check_result(
     dtype: np.dtype, shape: tuple[int, ...], usable: bool, real: np.dtype, wanted: tuple[int, ...]
 ) -> None:
-    """Check ``out`` against its rules.
-
-    Raises:
-        TypeError: Another precision.
-        ValueError: Another shape, or of no use for writing.
-    """
+    """Check ``out`` against its rules."""
     if dtype != real:
         raise TypeError(f"out: must hold {real.name}, got {dtype.name}")
     if shape != wanted:

@@ -128,11 +128,7 @@ def discard_entry(key: str) -> None:
 
 
 def _write(folder: Path, name: str, data: bytes) -> None:
-    """Write an entry by rename, and evict old entries where the folder exceeds its limit.
-
-    Raises:
-        OSError: The folder is not writable, or something other than a file is in the entry's place.
-    """
+    """Write an entry by rename, and evict old entries where the folder exceeds its limit."""
     with contextlib.suppress(FileNotFoundError):
         if not stat.S_ISREG(os.lstat(folder / name).st_mode):
             raise OSError(errno.EEXIST, f"{name} in it is no regular file")

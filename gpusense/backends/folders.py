@@ -122,10 +122,6 @@ def _mark(folder: Path) -> None:
 
     This process may be killed, or another may look, between any two steps. Therefore files are written only after a
     complete marker, and a process that finds only an unfinished marker completes it.
-
-    Raises:
-        UnsafeFolderError: The folder holds something and no marker.
-        OSError: The marker cannot be written.
     """
     if _marker(folder) == _MARKER_TEXT:
         return

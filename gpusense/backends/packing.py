@@ -53,11 +53,7 @@ def _is_below(name: str) -> bool:
 
 
 def _read_all(archive: zipfile.ZipFile) -> dict[str, bytes]:
-    """Return all files of an archive, whatever sizes it claims.
-
-    Raises:
-        RefusedError: They are too large.
-    """
+    """Return all files of an archive, whatever sizes it claims."""
     files, left = {}, _MOST_BYTES
     for name in archive.namelist():
         with archive.open(name) as file:

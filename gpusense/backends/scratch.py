@@ -78,11 +78,7 @@ def _candidates() -> Iterator[tuple[str, Callable[[], Path]]]:
 
 
 def _own_folder(place: folders.Place) -> Path:
-    """Return gpusense's folder in a place; report a place that is not safe, since compiled kernels are not kept there.
-
-    Raises:
-        OSError: Neither is possible.
-    """
+    """Return gpusense's folder in a place; report an unsafe place, where no compiled kernels are kept."""
     try:
         return folders.own_folder(place.folder)
     except UnsafeFolderError as error:
@@ -91,11 +87,7 @@ def _own_folder(place: folders.Place) -> Path:
 
 
 def _make(parent: Path, *, executable: bool) -> Path:
-    """Make a folder below ``parent`` that other processes do not remove while this one lives.
-
-    Raises:
-        OSError: It is not writable, has too little room, could be replaced by other users, or no code may run from it.
-    """
+    """Make a folder below ``parent`` that other processes do not remove while this one lives."""
     folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=parent))
     with contextlib.ExitStack() as failing:
         failing.callback(shutil.rmtree, folder, ignore_errors=True)
@@ -119,11 +111,7 @@ def _lock_text(name: str) -> bytes:
 
 
 def _lock(file: Any) -> None:
-    """Lock a file until it is closed or this process ends.
-
-    Raises:
-        OSError: Another process has locked it, or the system has no such locks.
-    """
+    """Lock a file until it is closed or this process ends."""
     try:
         import fcntl
     except ImportError:
@@ -132,11 +120,7 @@ def _lock(file: Any) -> None:
 
 
 def _check_room(folder: Path, *, executable: bool) -> None:
-    """Write a file to check the room of a folder; the figures of a file system do not show quotas.
-
-    Raises:
-        OSError: The folder does not take it, or the system does not let code run from it.
-    """
+    """Write a file to check the room of a folder; the figures of a file system do not show quotas."""
     probe = folder / "probe"
     with open(probe, "w+b") as file:
         if hasattr(os, "posix_fallocate"):
@@ -149,11 +133,7 @@ def _check_room(folder: Path, *, executable: bool) -> None:
 
 
 def _check_code(handle: int) -> None:
-    """Map a page of a file as code, as loading a library does.
-
-    Raises:
-        OSError: The system refuses, as on a file system that is mounted without execution.
-    """
+    """Map a page of a file as code, as loading a library does."""
     if not sys.platform.startswith("linux"):
         return
     try:
@@ -179,11 +159,7 @@ def _remove_stale(parent: Path) -> None:
 
 
 def _remove_killed(folder: Path) -> None:
-    """Remove the folder of a killed process: it is old and private, and its lock file is whole and free.
-
-    Raises:
-        OSError: It is not.
-    """
+    """Remove the folder of a killed process: it is old and private, and its lock file is whole and free."""
     if time.time() - folder.lstat().st_mtime < _STALE:
         return
     check_private(folder)

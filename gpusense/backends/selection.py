@@ -140,11 +140,7 @@ def _opened(selection: str) -> Backend:
 
 
 def _open_fastest() -> Backend:
-    """Open the fastest device that opens, and report those that were passed over.
-
-    Raises:
-        ValueError: There is none, not even NumPy.
-    """
+    """Open the fastest device that opens, and report those that were passed over."""
     chain = Chain()
     with notices.held() as lines:
         for device in chain:
@@ -165,11 +161,7 @@ def _open_fastest() -> Backend:
 
 @functools.cache
 def _open(selection: str) -> Backend:
-    """Open the device of a listed selection string.
-
-    Raises:
-        ValueError: It is unusable.
-    """
+    """Open the device of a listed selection string."""
     library, info, handle = listing.lookup(selection)
     verdict = listing.verdict_on(info, handle, library)
     if not verdict.usable:
@@ -191,11 +183,7 @@ def _opened_queue(queue: Any) -> Backend:
 
 
 def _library_of_queue(candidate: object) -> tuple[Library, int]:
-    """Return the library and the key of a user's queue.
-
-    Raises:
-        TypeError: It is no queue.
-    """
+    """Return the library and the key of a user's queue."""
     kinds = [entry for entry in ENTRIES if entry.queue]
     for entry in kinds:
         # A queue exists only where its library is loaded.
@@ -207,11 +195,7 @@ def _library_of_queue(candidate: object) -> tuple[Library, int]:
 
 
 def _open_queue(queue: Any, library: Library) -> Backend:
-    """Open a user's queue.
-
-    Raises:
-        ValueError: Its device is unusable, or it is not an in-order queue.
-    """
+    """Open a user's queue."""
     info, handle = library.device_of_queue(queue)
     verdict = proof.trust(info)
     # A child cannot address a part of a device.

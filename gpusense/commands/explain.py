@@ -78,11 +78,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _scene(args: argparse.Namespace) -> tuple[OccupancyGrid, Scanner, np.ndarray]:
-    """Return the map, the scanner and the readings.
-
-    Raises:
-        ValueError: there is a log without a map, the map has no free place, or the log has fewer scans.
-    """
+    """Return the map, the scanner and the readings."""
     import numpy as np
 
     from gpusense.commands.demo_scene import make_world
@@ -108,11 +104,7 @@ def _scene(args: argparse.Namespace) -> tuple[OccupancyGrid, Scanner, np.ndarray
 
 
 def _model(args: argparse.Namespace, grid: OccupancyGrid, scanner: Scanner) -> BeamModel | LikelihoodFieldModel:
-    """Return the model that the options choose.
-
-    Raises:
-        ValueError: a parameter breaks its rule or belongs to the other model, or the device is absent.
-    """
+    """Return the model that the options choose."""
     from gpusense.models.scan.beam import BeamModel
     from gpusense.models.scan.field import LikelihoodFieldModel
     from gpusense.world.parameters import BeamParameters

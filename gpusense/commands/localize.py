@@ -146,11 +146,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _recorders(args: argparse.Namespace, pf: ParticleFilter, scans: int) -> dict[Path, Recorder]:
-    """Return what records the run, by the files that the options name.
-
-    Raises:
-        ImportError: The viewer's library is not installed.
-    """
+    """Return what records the run, by the files that the options name."""
     recorders: dict[Path, Recorder] = {}
     if args.record is not None:
         from gpusense.plots.viewer import Recording

@@ -124,11 +124,7 @@ def make_filter(args: argparse.Namespace, grid: OccupancyGrid, steps: list[Step]
 
 
 def _motion(args: argparse.Namespace, steps: list[Step], read: Localization) -> MotionModel:
-    """Return the motion model from the options, or from the file of parameters for missing options.
-
-    Raises:
-        ValueError: there are no logged poses to learn from, or a number breaks its rule.
-    """
+    """Return the motion model from the options, or from the file of parameters for missing options."""
     from gpusense.evaluation.steps import references_to_learn_from
     from gpusense.localization.motion import OdometryMotion
     from gpusense.localization.motion_fit import fit_odometry_motion

@@ -85,11 +85,7 @@ def _content(path: Path) -> dict[Any, Any]:
 
 
 def _made(path: Path, name: str, values: Any, make: Any) -> Any:
-    """Build an object from a mapping of a file.
-
-    Raises:
-        ValueError: it is no mapping, or a parameter breaks its rule.
-    """
+    """Build an object from a mapping of a file."""
     from gpusense._util import checks
 
     if not isinstance(values, dict):

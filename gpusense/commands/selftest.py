@@ -110,11 +110,7 @@ def _run_stiff(args: argparse.Namespace) -> int:
 
 
 def _kept(stop: KeyboardInterrupt, results: Sequence[object]) -> KeyboardInterrupt:
-    """Return the interrupt that stopped the comparisons, to be raised after the results so far are printed.
-
-    Raises:
-        KeyboardInterrupt: there is none.
-    """
+    """Return the interrupt that stopped the comparisons, to be raised after the results so far are printed."""
     if not results:
         raise stop
     return stop

@@ -144,11 +144,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_output(args: argparse.Namespace) -> str:
-    """Return the format of the log, and check that it can be written before any work is done.
-
-    Raises:
-        ValueError, OSError: it cannot be written.
-    """
+    """Return the format of the log, and check that it can be written before any work is done."""
     from gpusense._util.files import check_writable
     from gpusense.evaluation.simulation.files import kind_of
     from gpusense.logs.bag_writer import check_bag
@@ -165,11 +161,7 @@ def _check_output(args: argparse.Namespace) -> str:
 
 
 def _generated(name: str, seed: int) -> OccupancyGrid:
-    """Return a generated world by a name such as ``office`` or ``office:3``.
-
-    Raises:
-        ValueError: there is no world of this name.
-    """
+    """Return a generated world by a name such as ``office`` or ``office:3``."""
     from gpusense.evaluation.named_worlds import WORLDS
 
     kind, colon, number = name.partition(":")

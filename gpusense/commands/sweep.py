@@ -113,11 +113,7 @@ def _fields(job: Job) -> dict[str, Any]:
 
 
 def _swept(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Sweep:
-    """Run the jobs on the executor of the options.
-
-    Raises:
-        OSError: the table exists or cannot be written, or the cluster is not reached or ends.
-    """
+    """Run the jobs on the executor of the options."""
     from gpusense.sweeps.run import run as run_jobs
 
     failures = 0
@@ -148,12 +144,7 @@ def _swept(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Sweep:
 
 @contextlib.contextmanager
 def _executor(args: argparse.Namespace, jobs: tuple[Job, ...]) -> Iterator[Executor]:
-    """Make the executor of the options, and end it afterwards.
-
-    Raises:
-        OSError: there is no cluster at the address.
-        ValueError: options exclude each other.
-    """
+    """Make the executor of the options, and end it afterwards."""
     from gpusense.sweeps.executors import ProcessExecutor
 
     devices: list[str] = args.device or []

@@ -201,11 +201,7 @@ def _number_rows(file: Any) -> Iterator[Floats]:
 
 
 def _numbers(file: Any, lines: list[tuple[int, str]], columns: int) -> Floats:
-    """Parse numbered lines of ``columns`` numbers each.
-
-    Raises:
-        ValueError: a line holds another number of columns or no numbers; the message names the first.
-    """
+    """Parse numbered lines of ``columns`` numbers each."""
     if columns in (2, 3) and all(text.count(",") == columns - 1 for _, text in lines):
         try:
             return np.array(",".join(text for _, text in lines).split(","), np.float64).reshape(-1, columns)

@@ -50,11 +50,7 @@ def write_tum(path: Path, times: Iterable[float], poses: Iterable[Floats], *, in
 
 
 def _rows(path: Path, lines: Iterator[tuple[int, bytes]]) -> Iterator[list[float]]:
-    """Yield the eight numbers of each numbered line; text after # is a comment.
-
-    Raises:
-        ValueError: a line has not eight numbers.
-    """
+    """Yield the eight numbers of each numbered line; text after # is a comment."""
     for line, data in lines:
         text = data.decode(errors="backslashreplace")
         if text.strip() == _INDICES:

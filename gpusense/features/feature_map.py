@@ -171,11 +171,7 @@ def _rows(path: Path) -> Iterator[tuple[str, list[float], int]]:
 
 
 def _row(words: list[str]) -> tuple[str, list[float], int]:
-    """Return kind, numbers and count of a line.
-
-    Raises:
-        ValueError: it breaks a rule, which the message names.
-    """
+    """Return kind, numbers and count of a line."""
     if len(words) != len(_COLUMNS):
         raise ValueError(f"must have {len(_COLUMNS)} columns")
     x, y, signature, kind, theta, size, xx, xy, yy, count = words

@@ -70,11 +70,7 @@ def resolve(text: str, flags: frozenset[str], name: str = "source") -> str:
 def _directive(
     where: str, number: int, word: str, rest: str, flags: frozenset[str], open_branches: list[_Branches]
 ) -> bool:
-    """Process a directive, and return whether it is left to the compiler.
-
-    Raises:
-        ValueError: See :func:`resolve`.
-    """
+    """Process a directive, and return whether it is left to the compiler."""
     if word in _PASSED:
         defined = re.match(r"\w*", rest)
         if word == "define" and defined is not None and defined.group() in FLAGS:
@@ -104,11 +100,7 @@ def _directive(
 
 
 def _is_true(where: str, condition: str, flags: frozenset[str]) -> bool:
-    """Return whether a condition holds.
-
-    Raises:
-        ValueError: The condition is not a single known flag.
-    """
+    """Return whether a condition holds."""
     match = _CONDITION.match(condition)
     if match is None or match.group(2) not in FLAGS:
         raise ValueError(f"{where}: condition must be one known flag, got {condition!r}")

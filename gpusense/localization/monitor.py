@@ -154,11 +154,7 @@ class PoseMonitor:
 
 
 def _checked(covariance: AnyArray) -> np.ndarray:
-    """Return a covariance.
-
-    Raises:
-        TypeError, ValueError: it is not symmetric, or has a NaN or a negative variance.
-    """
+    """Return a covariance."""
     matrix = checks.array("covariance", covariance, (3, 3), finite=False)
     if np.isnan(matrix).any():
         raise ValueError("covariance: must have no NaN, got one that has")

@@ -166,11 +166,7 @@ def fit_odometry_motion(odometry: AnyArray, poses: AnyArray, *, systematic: bool
 
 
 def _references(poses: AnyArray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the reference poses and their indices.
-
-    Raises:
-        TypeError, ValueError: the arrays are no poses, or fewer than three are known.
-    """
+    """Return the reference poses and their indices."""
     values = checks.array("poses", poses, (count, 3), finite=False)
     absent = np.isnan(values).all(axis=1)
     checks.array("poses", np.where(absent[:, None], 0.0, values))

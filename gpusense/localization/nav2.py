@@ -258,11 +258,7 @@ def _value(name: str, key: str, value: object, default: object) -> Any:
 
 
 def _odometry(content: Mapping[str, Any], name: str) -> OdometryMotion | None:
-    """Return the noise that gpusense fit wrote; None without it.
-
-    Raises:
-        TypeError, ValueError: It breaks a rule.
-    """
+    """Return the noise that gpusense fit wrote; None without it."""
     if "odometry_motion" not in content:
         return None
     try:
@@ -301,11 +297,7 @@ def _weights(model: str, v: Mapping[str, Any]) -> BeamWeights | FieldWeights:
 
 
 def _normalized(weights: BeamWeights | FieldWeights) -> BeamParameters | LikelihoodFieldParameters:
-    """Return the book's parameters with weights in the same proportion.
-
-    Raises:
-        ValueError: All weights are 0.
-    """
+    """Return the book's parameters with weights in the same proportion."""
     values = weights.to_dict()
     names = [name for name in values if name.startswith("z_")]
     total = sum(values[name] for name in names)

@@ -115,11 +115,7 @@ def _merged(matching: list[tuple[str, dict[str, Any]]], full: str, name: str) ->
 
 
 def _check_names(values: Mapping[Any, Any], name: str) -> None:
-    """Refuse parameters by their names in ROS 1, since the defaults differ.
-
-    Raises:
-        ValueError: A name is from ROS 1.
-    """
+    """Refuse parameters by their names in ROS 1, since the defaults differ."""
     if old := _ros_1_names(values):
         raise ValueError(f"{name}: must have amcl's names in ROS 2, got names of ROS 1: {old}")
 
@@ -136,11 +132,7 @@ def _ros_1_names(values: Mapping[Any, Any]) -> str:
 
 
 def _dotted(values: Mapping[Any, Any], name: str) -> dict[str, Any]:
-    """Return parameters by dotted names.
-
-    Raises:
-        ValueError: A parameter has two values, one by its dotted name and one in a mapping.
-    """
+    """Return parameters by dotted names."""
     flat: dict[str, Any] = {}
     for key, value in values.items():
         inner = isinstance(value, Mapping) and str(key) not in FITTED

@@ -75,22 +75,14 @@ class Options(NamedTuple):
 
 
 def _temperature(value: Any) -> float | str:
-    """Check a temperature.
-
-    Raises:
-        TypeError, ValueError: neither "auto" nor a number in (0, 1].
-    """
+    """Check a temperature."""
     if isinstance(value, str) and value != "auto":
         raise ValueError(f"temperature: must be 'auto' or a number, got {checks.show(value)}")
     return value if isinstance(value, str) else checks.real("temperature", value, above=0, high=1)
 
 
 def checked(*, particles: Any, temperature: Any, recovery: Any, beam_skip: Any, **options: Any) -> Options:
-    """Check the options of a filter.
-
-    Raises:
-        TypeError, ValueError: an option breaks its rule.
-    """
+    """Check the options of a filter."""
     least, most = _counts(particles)
     return Options(
         least=least,

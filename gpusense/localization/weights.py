@@ -150,11 +150,7 @@ def _residual(
 
 
 def _generator(rng: Any) -> np.random.Generator | np.random.RandomState:
-    """Return a generator as it is, or a new one from a seed.
-
-    Raises:
-        TypeError, ValueError: ``rng`` is neither a generator nor a seed.
-    """
+    """Return a generator as it is, or a new one from a seed."""
     if isinstance(rng, (np.random.Generator, np.random.RandomState)):
         return rng
     try:

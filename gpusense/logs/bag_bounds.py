@@ -71,11 +71,7 @@ def install() -> None:
 
 
 def _table(module: Any, name: str) -> Any:
-    """Return a table of the library.
-
-    Raises:
-        ImportError: this version has no such table, so its decompression cannot be bounded.
-    """
+    """Return a table of the library."""
     table = getattr(module, name, None)
     if not isinstance(table, dict):
         raise ImportError(f"{module.__name__} has no {name}: this version of rosbags is unknown")

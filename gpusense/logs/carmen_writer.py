@@ -72,11 +72,7 @@ def _within(scan: Scan) -> Iterable[float]:
 
 
 def _geometry(scanner: Scanner) -> str:
-    """Return type, start angle, field of view, resolution, maximum range, accuracy and remission mode.
-
-    Raises:
-        ValueError: The scanner has a mount, or its bearings have uneven steps.
-    """
+    """Return type, start angle, field of view, resolution, maximum range, accuracy and remission mode."""
     if any(scanner.mount):
         raise ValueError(f"mount: must be (0, 0, 0) in a CARMEN log, got {scanner.mount}")
     bearings = scanner.bearings

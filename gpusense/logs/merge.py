@@ -73,11 +73,7 @@ def read_lasers(
 def _records(
     form: Format, path: str | os.PathLike[str], name: str | None, odometry: bool, options: LogOptions
 ) -> Iterator[Scan | Odometry]:
-    """Read the records of one laser; None for the laser that ``read_log`` takes.
-
-    Raises:
-        ValueError: The log's format has no such laser.
-    """
+    """Read the records of one laser; None for the laser that ``read_log`` takes."""
     if form.topics:
         return read_log(path, odometry=odometry, topic=name, **options)
     if name not in (None, FRONT, REAR):

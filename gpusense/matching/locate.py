@@ -126,11 +126,7 @@ def end_points_of(model: LikelihoodFieldModel, ranges: np.ndarray) -> tuple[np.n
 
 
 def _allowed(grid: OccupancyGrid, stride: int) -> np.ndarray:
-    """Return which positions lie in free cells.
-
-    Raises:
-        ValueError: none does.
-    """
+    """Return which positions lie in free cells."""
     allowed = grid.free[::stride, ::stride]
     if not allowed.any():
         raise ValueError("positions: 'free' needs a position in a free cell, got none; use positions='all'")

@@ -112,11 +112,7 @@ def _starts(capture: float, reach: float, half: float) -> np.ndarray:
 
 
 def check_options(noise: object, capture: object, window: object) -> MatchOptions:
-    """Check the options of a match.
-
-    Raises:
-        TypeError, ValueError: an option breaks its rule.
-    """
+    """Check the options of a match."""
     if type(noise) is type(capture) is float and type(window) is tuple and {*map(type, window)} == {float}:
         return _of_numbers(noise, capture, window)
     return _checked(noise, capture, window)

@@ -250,9 +250,6 @@ def make_problem(
         loss_scale: Residual at which the loss bends.
         least: Least number of beacons of positive weight.
         reason: Reason of that number, for messages.
-
-    Raises:
-        TypeError, ValueError: An argument breaks its rule.
     """
     positions = checks.array("xy", xy, ("M", 2))
     count = len(positions)
@@ -285,11 +282,7 @@ def make_problem(
 
 
 def _not_negative(name: str, values: ArrayLike, count: int) -> Floats:
-    """Return (M,) numbers that are at least 0.
-
-    Raises:
-        TypeError, ValueError: They are not.
-    """
+    """Return (M,) numbers that are at least 0."""
     checked = checks.array(name, values, (count,))
     if checked.size and checked.min() < 0:
         raise ValueError(f"{name}: must be >= 0, got {checked.min()} at index {int(np.argmin(checked))}")
@@ -297,11 +290,7 @@ def _not_negative(name: str, values: ArrayLike, count: int) -> Floats:
 
 
 def _check_number(used: NDArray[np.bool], least: int, reason: str) -> None:
-    """Refuse fewer than ``least`` beacons of positive weight.
-
-    Raises:
-        ValueError: There are fewer, for the ``reason``.
-    """
+    """Refuse fewer than ``least`` beacons of positive weight."""
     number = int(np.count_nonzero(used))
     if number >= least:
         return

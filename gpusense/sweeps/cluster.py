@@ -96,13 +96,7 @@ class DaskExecutor(Executor):
             raise
 
     def _connect(self, address: str | None, names: list[str], security: Any) -> None:
-        """Start a cluster or connect to the one at the address, and wait for a worker.
-
-        Raises:
-            ImportError: A worker lacks gpusense.
-            OSError: There is no worker.
-            ValueError: The address has no port, or the cluster is not one of TLS.
-        """
+        """Start a cluster or connect to the one at the address, and wait for a worker."""
         import distributed
 
         # A discarded client closes itself when it is collected. If that happened during the start of another client, it
@@ -289,11 +283,7 @@ class DaskExecutor(Executor):
 
 
 def _check_address(address: str) -> None:
-    """Check the form of a scheduler's address, since a client that fails on it leaves a traceback.
-
-    Raises:
-        ValueError: It has no host and port, or an unknown scheme.
-    """
+    """Check the form of a scheduler's address, since a client that fails on it leaves a traceback."""
     from distributed.comm import get_address_host_port
 
     try:

@@ -90,11 +90,7 @@ class Job:
 
 
 def _pairs(name: str, values: Any) -> Pairs:
-    """Return a mapping or pairs as pairs of names and plain values; names of inner mappings are dotted.
-
-    Raises:
-        TypeError, ValueError: a name is no string, or a value is not plain.
-    """
+    """Return a mapping or pairs as pairs of names and plain values; names of inner mappings are dotted."""
     items: Any = tuple(values.items()) if isinstance(values, Mapping) else values
     if not isinstance(items, (tuple, list)):
         raise TypeError(f"{name}: must be a mapping, got {checks.show(values)}")
@@ -111,11 +107,7 @@ def _pairs(name: str, values: Any) -> Pairs:
 
 
 def _plain(name: str, value: Any) -> Any:
-    """Return a plain value; a list as a tuple.
-
-    Raises:
-        TypeError, ValueError: the value has another type, or is a number that is not finite.
-    """
+    """Return a plain value; a list as a tuple."""
     if isinstance(value, (list, tuple)):
         return tuple(_plain(name, one) for one in value)
     if value is not None and not isinstance(value, _SCALARS):

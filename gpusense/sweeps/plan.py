@@ -81,11 +81,7 @@ def jobs_of(document: Mapping[Any, Any]) -> tuple[Job, ...]:
 
 
 def _check_size(common: Any, sides: Mapping[str, list[tuple[Any, dict[str, Any]]]], count: int) -> None:
-    """Bound the options of all jobs before any is made.
-
-    Raises:
-        ValueError: the options are too many, or nested too deeply.
-    """
+    """Bound the options of all jobs before any is made."""
     values = count * checks.nested("options", common, deepest=DEEPEST, most=MOST_VALUES)
     for name, side in sides.items():
         options = checks.nested(f"axes.{name}", [one for _, one in side], deepest=DEEPEST, most=_MOST_VALUES)
@@ -95,11 +91,7 @@ def _check_size(common: Any, sides: Mapping[str, list[tuple[Any, dict[str, Any]]
 
 
 def _axis(name: str, values: Any) -> list[tuple[Any, dict[str, Any]]]:
-    """Return the labels of an axis, each with its fields and options.
-
-    Raises:
-        TypeError, ValueError: ``values`` is no axis.
-    """
+    """Return the labels of an axis, each with its fields and options."""
     if name == "seed" and isinstance(values, int) and not isinstance(values, bool):
         values = list(range(checks.integer("axes.seed", values, low=1, high=MOST_JOBS)))
     if isinstance(values, list):

@@ -20,8 +20,7 @@ from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, wait
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any
 
-from gpusense._util.worker_device import DEVICE
-from gpusense.sweeps.worker import error_text, receive
+from gpusense.sweeps.worker import DEVICE, error_text, receive
 
 # Processes in a row that may end before they take a call.
 _STARTS = 3
@@ -139,7 +138,7 @@ class Worker:
                     self._ended()
                     wait([answer], _GRACE)
                     break
-                if not answer.done() and not wanted():
+                if not answer.done() and (self._closed or not wanted()):
                     self._ended()
                     raise WorkerDied("as nothing waits for its job any more")
                 if not answer.done() and end is not None and time.monotonic() >= end:

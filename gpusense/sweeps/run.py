@@ -220,11 +220,7 @@ class Starts:
         jobs.popleft()
 
     def _ended(self, future: Future[Any]) -> Ended | None:
-        """Return the end of a job; None if it is started again.
-
-        Raises:
-            SweepLost: the executor has ended.
-        """
+        """Return the end of a job; None if it is started again."""
         job, starts = self._running[future]
         error = CancelledError("a job was cancelled") if future.cancelled() else future.exception()
         if error is None:

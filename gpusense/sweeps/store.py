@@ -99,11 +99,7 @@ _ALL = {"every": 1, "offset": 0, "limit": None}
 
 
 def _topic(job: Job) -> str | None:
-    """Return the option ``topic``, the laser of the log; None for its only or main laser.
-
-    Raises:
-        ValueError: it is no string.
-    """
+    """Return the option ``topic``, the laser of the log; None for its only or main laser."""
     topic = job.option("topic")
     if topic is not None and not isinstance(topic, str):
         raise ValueError(f"topic: must be a text, got {checks.show(topic)}")

@@ -220,11 +220,7 @@ def _lines(columns: Sequence[str], rows: Iterable[Mapping[str, str]]) -> bytes:
 
 
 def _parsed(data: bytes, path: Path) -> tuple[tuple[str, ...], list[Row]]:
-    """Return columns and rows of whole lines.
-
-    Raises:
-        ValueError: ``data`` is no table of a sweep.
-    """
+    """Return columns and rows of whole lines."""
     try:
         lines = list(csv.reader(io.StringIO(data.decode(), newline=""), strict=True))
     except (UnicodeDecodeError, csv.Error) as error:
@@ -241,12 +237,7 @@ def _parsed(data: bytes, path: Path) -> tuple[tuple[str, ...], list[Row]]:
 
 
 def _opened(path: Path) -> BinaryIO:
-    """Open a table for reading and appending, and lock it against other sweeps.
-
-    Raises:
-        OSError: another process writes it.
-        ValueError: it is no regular file.
-    """
+    """Open a table for reading and appending, and lock it against other sweeps."""
     if os.path.lexists(path) and not path.is_file():
         raise ValueError(f"{path}: must be a regular file, got another kind")
     stream = path.open("a+b")
@@ -270,9 +261,5 @@ def _write_parquet(path: Path, names: Sequence[str], rows: Sequence[Row]) -> Non
 
 
 def _pyarrow() -> Any:
-    """Return the Parquet module of pyarrow.
-
-    Raises:
-        ImportError: it is not installed.
-    """
+    """Return the Parquet module of pyarrow."""
     return library("pyarrow.parquet", "a Parquet table, in place of a .csv one,")

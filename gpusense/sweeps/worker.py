@@ -10,11 +10,12 @@ import traceback
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from gpusense._util.worker_device import device_of
 from gpusense.sweeps.job import Job
 from gpusense.sweeps.store import Store
 from gpusense.sweeps.tasks import task_of
 
+# Environment variable with the selection string of a worker's device.
+DEVICE = "GPUSENSE_SWEEP_DEVICE"
 # Longest text of an error.
 _LONGEST = 400
 
@@ -64,7 +65,7 @@ def work(job: Job, root: str, device: str, sweep: str = "") -> Outcome:
         device: Selection string of the device, for a worker without a chosen device.
         sweep: Name of the sweep; files read for another sweep are read again.
     """
-    chosen = device_of(device)
+    chosen = os.environ.get(DEVICE) or device
     with _LOCK:
         begin, begin_cpu = time.perf_counter(), time.process_time()
         key = (root, chosen, sweep)

@@ -92,11 +92,7 @@ def read_lookup(path: Path, obstacles: np.ndarray, limit: float, outside: str, b
 
 
 def _header(line: bytes, path: Path) -> dict[str, Any]:
-    """Return the header in the first line of a file.
-
-    Raises:
-        ValueError: The file is not a table, or has an old format.
-    """
+    """Return the header in the first line of a file."""
     try:
         header = json.loads(line)
     except (ValueError, RecursionError):

@@ -88,11 +88,7 @@ def _check_size(file: Path, rows: int, cols: int) -> None:
 
 
 def _check_memory(file: Path, rows: int, cols: int, pixel: int = 0) -> None:
-    """Check that an image of ``pixel`` bytes a pixel, if it is decoded as a whole, and its cells fit into memory.
-
-    Raises:
-        MemoryError: They do not fit.
-    """
+    """Check that an image of ``pixel`` bytes a pixel, if it is decoded as a whole, and its cells fit into memory."""
     check_room(str(file), rows * cols * (1 + pixel) + _STRIPS_BYTES, f"{rows} x {cols} cells")
 
 

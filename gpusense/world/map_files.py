@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Literal
@@ -20,8 +20,11 @@ from gpusense.world.grid import OccupancyGrid, grid_of_checked
 from gpusense.world.grid_frame import FARTHEST_ORIGIN, LARGEST_RESOLUTION, SMALLEST_RESOLUTION
 from gpusense.world.images import mapped, open_raster
 from gpusense.world.map_greys import MODES, UNKNOWN_GREY, MapMode, paint, write_image
-from gpusense.world.map_hints import check_no_image
 from gpusense.world.wean_map import read_probabilities
+
+_ENDINGS = (".pgm", ".ppm", ".pnm", ".png", ".bmp", ".jpg", ".jpeg", ".tif", ".tiff")
+# YAML files of a folder that are read to find the file of an image.
+_MOST = 50
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,7 @@ def read_map(path: str | os.PathLike[str], *, occupied_threshold: int = 65) -> O
     file = checks.existing_file(checks.path("path", path))
     if file.name.lower().endswith((".dat", ".dat.gz")):
         return read_probabilities(file, occupied_threshold=occupied_threshold)
-    check_no_image(file)
+    _check_no_image(file)
     meta = _read_yaml(file)
     checks.integer("occupied_threshold", occupied_threshold, low=1, high=100)
     size = meta.image.stat().st_size
@@ -227,11 +230,7 @@ def _read_yaml(file: Path) -> _MapYaml:
 
 
 def _image(file: Path, name: str) -> Path:
-    """Return the image that a YAML file names.
-
-    Raises:
-        FileNotFoundError, ValueError: The image is missing, or not a regular file; the message names both files.
-    """
+    """Return the image that a YAML file names."""
     try:
         return checks.existing_file(file.parent / name)
     except (FileNotFoundError, ValueError) as error:
@@ -271,3 +270,41 @@ def _cell_table(meta: _MapYaml) -> NDArray[np.int8]:
 def _frees_unknown(meta: _MapYaml, table: NDArray[np.int8]) -> bool:
     """Return whether the grey that map_saver writes for unknown cells is free."""
     return meta.mode == "trinary" and not meta.negate and bool(table[UNKNOWN_GREY] == 0)
+
+
+def _check_no_image(file: Path) -> None:
+    """Refuse an image in place of the YAML file of a map.
+
+    Raises:
+        ValueError: The file is an image; the message names the YAML file that belongs to it, if any.
+    """
+    if file.suffix.lower() not in _ENDINGS:
+        return
+    found = next(_yaml_files(file), None)
+    if found is not None:
+        raise ValueError(f"{file}: must be the YAML file of a map, got its image: the YAML file is {found}")
+    keys = "image, resolution, origin, negate, occupied_thresh and free_thresh"
+    raise ValueError(
+        f"{file}: must be the YAML file of a map, got an image, and no YAML file beside it names it: write "
+        f"{file.with_suffix('.yaml').name} with {keys}"
+    )
+
+
+def _yaml_files(image: Path) -> Iterator[Path]:
+    """Yield the YAML files in an image's folder that name the image, those with the same stem first."""
+    named = [image.with_suffix(suffix) for suffix in (".yaml", ".yml")]
+    others = sorted(path for path in image.parent.glob("*.y*ml") if path not in named)[:_MOST]
+    for path in (*named, *others):
+        try:
+            name = read_mapping(path).get("image") if path.is_file() else None
+        except (ValueError, OSError):
+            continue
+        if isinstance(name, str) and (path.parent / name).name == image.name and _same(path.parent / name, image):
+            yield path
+
+
+def _same(one: Path, other: Path) -> bool:
+    try:
+        return one.samefile(other)
+    except OSError:
+        return False

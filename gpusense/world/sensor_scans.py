@@ -84,11 +84,7 @@ def check_scans(scans: Any, scanner: Scanner | Sequence[Scanner], sensor: Any, r
 
 
 def _check_sensor(sensor: Any, scans: int, scanners: int) -> Integers:
-    """Return the scanner of each scan.
-
-    Raises:
-        TypeError, ValueError: The value is not S indices of scanners.
-    """
+    """Return the scanner of each scan."""
     if sensor is None:
         if scanners == 1:
             return np.zeros(scans, np.int64)

@@ -49,11 +49,7 @@ def read_probabilities(file: Path, *, occupied_threshold: int) -> OccupancyGrid:
 
 
 def _fields(where: str, line: bytes) -> list[bytes]:
-    """Return the fields of a line; all must be short, since an array pads each to the longest.
-
-    Raises:
-        ValueError: A field is longer than any number.
-    """
+    """Return the fields of a line; all must be short, since an array pads each to the longest."""
     fields = line.split()
     longest = max(fields, key=len)
     if len(longest) > _LONGEST_FIELD:

@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 import gpusense as gs
 from gpusense.backends import Backend, arrays, get_backend
 from gpusense.backends.workspace import Workspace
-from gpusense.models import bounds as bounds_module
 from gpusense.models import poses as poses_module
-from gpusense.models.bounds import bounds_on_device
+from gpusense.models.poses import bounds_on_device
 
 ODD = (np.nan, np.inf, -np.inf, 5e-324, 1.7e308, 2.0**20 + 1)
 GRID = gs.OccupancyGrid([[0] * 40 + [100]] * 30, 0.5)
@@ -123,6 +122,6 @@ def test_a_pose_that_is_not_finite_is_refused_with_the_same_words(device: Backen
 
 
 def test_only_gpus_bound_poses(device: Backend) -> None:
-    assert bounds_module.bounds_poses(device) == (device.info.kind == "gpu")
-    few = np.zeros((bounds_module.LEAST_BOUNDED, 3))
+    assert poses_module.bounds_poses(device) == (device.info.kind == "gpu")
+    few = np.zeros((poses_module.LEAST_BOUNDED, 3))
     assert arrays.bounds_of(few) == ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))

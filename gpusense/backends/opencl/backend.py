@@ -136,11 +136,7 @@ class OpenCLBackend(ProcessBound, Backend):
         return buffer
 
     def _check_size(self, size: int) -> None:
-        """Refuse a buffer that is larger than the device's largest.
-
-        Raises:
-            MemoryError: The buffer is larger.
-        """
+        """Refuse a buffer that is larger than the device's largest."""
         if size > self.info.max_buffer:
             raise MemoryError(
                 f"{self.info.name} cannot hold a buffer of {size} bytes: its largest is {self.info.max_buffer} bytes"
@@ -271,12 +267,7 @@ class OpenCLBackend(ProcessBound, Backend):
         return Launch(self, compiled, row, flags, limit, first)
 
     def _build(self, file: str, flags: frozenset[str]) -> tuple[cl.Program, str]:
-        """Build the program of a kernel file; return it with its key in the cache.
-
-        Raises:
-            ValueError: The device lacks float64 and the program needs it.
-            RuntimeError: The driver does not compile it.
-        """
+        """Build the program of a kernel file; return it with its key in the cache."""
         if "FLOAT64" in flags and not self.info.float64:
             raise ValueError(f"precision: must be 'float32' on {self.info.name}, which has no float64, got 'float64'")
         if not self.info.float64 and uses_double(file, flags):

@@ -226,11 +226,7 @@ def _key(drivers: tuple[Driver, ...]) -> str:
 
 
 def _variables(drivers: tuple[Driver, ...] | None, *, kernels: bool = True) -> dict[str, str]:
-    """Return the variables by which the loader loads these drivers only, and PoCL keeps kernels in scratch.
-
-    Raises:
-        OSError: No folder takes files.
-    """
+    """Return the variables by which the loader loads these drivers only, and PoCL keeps kernels in scratch."""
     variables = {}
     with contextlib.suppress(OSError):
         variables["POCL_CACHE_DIR"] = str(_pocl_folder(kernels=kernels))
@@ -247,11 +243,7 @@ def _variables(drivers: tuple[Driver, ...] | None, *, kernels: bool = True) -> d
 
 
 def _pocl_folder(*, kernels: bool) -> Path:
-    """Return the folder for PoCL; where no code may run it takes part in no run, and keeps PoCL out of other folders.
-
-    Raises:
-        OSError: No folder takes files.
-    """
+    """Return the folder that keeps PoCL out of other folders; without kernels it takes part in no run."""
     if kernels:
         with contextlib.suppress(OSError):
             return pocl_kernels.pocl_kernels().folder

@@ -58,11 +58,7 @@ def _hash(key: str) -> str:
 
 
 def _has_kernel(file: Path, kernels: Sequence[str]) -> bool:
-    """Return whether bitcode has one of these kernels: another thread may have compiled a program meanwhile.
-
-    Raises:
-        OSError: The file cannot be read.
-    """
+    """Return whether bitcode has one of these kernels: another thread may have compiled a program meanwhile."""
     bitcode = file.read_bytes()
     return any(name.encode() in bitcode for name in kernels)
 

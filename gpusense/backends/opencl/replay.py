@@ -76,12 +76,7 @@ class OpenCLRecording(Recording):
         return f"{pluralize(len(self._launches), 'launch')} one by one, their arguments stay set: OpenCL has no graphs"
 
     def _checked(self, stream: Any) -> cl.CommandQueue:
-        """Return a user's queue for the stream of a call.
-
-        Raises:
-            TypeError: It is no queue, or one of another context or device.
-            ValueError: It is not an in-order queue.
-        """
+        """Return a user's queue for the stream of a call."""
         same = isinstance(stream, cl.CommandQueue) and (stream.context, stream.device) == (
             self._queue.context,
             self._queue.device,

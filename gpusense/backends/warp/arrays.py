@@ -33,11 +33,7 @@ def adopted(array: Any, device: wp.Device, name: str) -> Adopted:
 
 
 def _view(array: Any, device: wp.Device, name: str) -> wp.array:
-    """Return an array of any library as Warp's.
-
-    Raises:
-        TypeError: Its gradients are recorded, or it holds other numbers than Warp takes.
-    """
+    """Return an array of any library as Warp's."""
     if isinstance(array, wp.array):
         return array
     if hasattr(array, "__dlpack__"):

@@ -256,11 +256,7 @@ class WarpBackend(ProcessBound, Backend):
             wp.synchronize_stream(self._device)
 
     def _build(self, row: Kernel, kernel: str, flags: frozenset[str]) -> Launch | SharedLaunch:
-        """Compile a kernel.
-
-        Raises:
-            RuntimeError: Warp does not compile it.
-        """
+        """Compile a kernel."""
         group = (team_of(row, flags) if "IN_TEAMS" in flags else row.group) if self._device.is_cuda else 1
         with settings():
             compiled = warp_module(row.file).make(kernel, flags)

@@ -136,11 +136,7 @@ class GraphCache:
         return Capture(graph)
 
     def _captured_graph(self, steps: list[Step]) -> Any:
-        """Return the graph of steps.
-
-        Raises:
-            RuntimeError: The driver does not capture them.
-        """
+        """Return the graph of steps."""
         if self._device.is_cuda and self._stream is None:
             self._stream = wp.Stream(self._device)
         where = {"stream": self._stream} if self._device.is_cuda else {"device": self._device}

@@ -71,11 +71,7 @@ class WarpRecording(Recording, Step):
         self._started = one_by_one(self._steps, reason) if self._graph is None else as_graph(self._steps)
 
     def _stream(self, stream: Any) -> wp.Stream:
-        """Return a stream of any library, or its address, as Warp's.
-
-        Raises:
-            TypeError: It is no stream of this device.
-        """
+        """Return a stream of any library, or its address, as Warp's."""
         if isinstance(stream, wp.Stream):
             return stream
         address = stream

@@ -44,11 +44,7 @@ def initialize() -> None:
 
 
 def _folder() -> Path:
-    """Return this process's folder for Warp's kernels, which Warp reads and does not map as code.
-
-    Raises:
-        OSError: No folder takes files.
-    """
+    """Return this process's folder for Warp's kernels, which Warp reads and does not map as code."""
     folder = scratch_folder(executable=False) / "warp"
     folder.mkdir(exist_ok=True)
     return folder

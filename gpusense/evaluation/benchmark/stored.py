@@ -44,11 +44,7 @@ def read_report(path: Path) -> dict[str, Any]:
 
 
 def _check_arguments(where: str, arguments: Mapping[str, Any]) -> None:
-    """Check the numbers that are defaults of the next run; None means the default of the device.
-
-    Raises:
-        ValueError: a value is no number, or out of its bounds.
-    """
+    """Check the numbers that are defaults of the next run; None means the default of the device."""
     for name in _ARGUMENTS:
         value = arguments.get(name)
         if value is not None:
@@ -57,11 +53,7 @@ def _check_arguments(where: str, arguments: Mapping[str, Any]) -> None:
 
 
 def _check_fields(where: str, item: object, fields: Mapping[str, Any]) -> None:
-    """Check the types of a mapping's fields.
-
-    Raises:
-        ValueError: a field is absent or has another type.
-    """
+    """Check the types of a mapping's fields."""
     if not isinstance(item, dict):
         raise ValueError(f"{where}: must be a mapping, got {checks.show(item)}")
     for name, kinds in fields.items():
@@ -75,11 +67,7 @@ def _check_fields(where: str, item: object, fields: Mapping[str, Any]) -> None:
 
 
 def _check_numbers(where: str, point: Mapping[str, Any]) -> None:
-    """Check the times and errors of a point, each a number or None.
-
-    Raises:
-        ValueError: a value is neither a number nor None, or a time is not above 0.
-    """
+    """Check the times and errors of a point, each a number or None."""
     for name in _TIMES if point["time"] else ():
         _check_number(f"{where}.time.{name}", point["time"].get(name), above=0)
     for kind, values in (point["errors"] or {}).items():

@@ -171,11 +171,7 @@ def simulate_run(
 
 
 def _check_kinds(grid: object, scanner: object, world: object, parameters: object, motion: object) -> None:
-    """Refuse arguments of another type.
-
-    Raises:
-        TypeError: an argument has another type.
-    """
+    """Refuse arguments of another type."""
     kinds: tuple[tuple[str, object, tuple[type, ...]], ...] = (
         ("grid", grid, (OccupancyGrid,)), ("scanner", scanner, (Scanner,)),
         ("world", grid if world is None else world, (OccupancyGrid,)), ("parameters", parameters, (BeamParameters,)),

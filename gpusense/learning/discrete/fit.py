@@ -58,12 +58,7 @@ def learn_causes(
 
 
 def _block_counts(data: Counts, ranges: object, expected: object, range_max: float, blocks: object) -> Floats:
-    """Return the (3, E) block, index of the cell among the counts, and number of readings of all cells that occur.
-
-    Raises:
-        TypeError: The labels are not integers.
-        ValueError: The shape differs from that of the readings, or fewer than 2 blocks have a reading.
-    """
+    """Return the (3, E) block, index of the cell among the counts, and number of readings of all cells that occur."""
     z, z_exp = (
         checks.as_array(name, value, masked=True) for name, value in (("ranges", ranges), ("expected", expected))
     )

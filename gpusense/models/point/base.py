@@ -116,11 +116,7 @@ class PointModel(Pickled):
         """Return the model's name in a report, and the omissions by its parameters."""
 
     def _check_scale(self, name: str, value: float, what: str = "") -> None:
-        """Refuse a deviation whose square is beyond the model's precision.
-
-        Raises:
-            ValueError: It is outside.
-        """
+        """Refuse a deviation whose square is beyond the model's precision."""
         limit = 100 if self._real == np.float64 else 12
         if not 10.0**-limit <= value <= 10.0**limit:
             rule = f"{what}must be >= 1e-{limit} and <= 1e{limit} in {self._real.name}"
@@ -147,9 +143,6 @@ class PointModel(Pickled):
             items: Cost of each pose, in readings of a scan.
             itemsize: Bytes that are kept for each pose and item.
             after: Function called with each part after its program has started.
-
-        Raises:
-            TypeError, ValueError: Poses that are not (N, 3) finite numbers, or an unfit array for the result.
         """
         backend, space, real = self._backend, self._workspace, self._real
         checked = Poses(poses, backend, late=program is not None)

@@ -176,11 +176,7 @@ class BeaconModel(PointModel):
         return hit
 
     def _indices(self, ids: object) -> np.ndarray:
-        """Return the (F,) indices of beacons.
-
-        Raises:
-            TypeError, ValueError: Indices that are no integers, or no beacon's.
-        """
+        """Return the (F,) indices of beacons."""
         known = len(self.xy)
         if ids is None:
             return np.arange(known)

@@ -303,11 +303,7 @@ def sample_outline(outline: object, segments: object, spacing: float) -> tuple[f
 
 
 def _count(length: float, spacing: float) -> int:
-    """Return the number of pieces of a stretch of the outline.
-
-    Raises:
-        ValueError: More than 65 536.
-    """
+    """Return the number of pieces of a stretch of the outline."""
     count = max(math.ceil(length / spacing), 1) if length / spacing <= _MOST_POINTS else _MOST_POINTS + 1
     if count > _MOST_POINTS:
         raise ValueError(f"outline: must be at most {_MOST_POINTS // 2} cells long in each part, got {length:g} m")

@@ -269,11 +269,7 @@ class BeamModel(ScanModel):
 
 
 def _method_of(caster: object, weights: Likelihood) -> Caster:
-    """Return the user's caster, or the default; ranges beyond range_max are only for a peer's weights.
-
-    Raises:
-        TypeError, ValueError: The value is not a caster, or its ranges do not fit the model.
-    """
+    """Return the user's caster, or the default; ranges beyond range_max are only for a peer's weights."""
     method = casters.choose("caster", weights.caster if caster is None else caster, lines=weights.name)
     if method.beyond and not weights.is_peer:
         raise ValueError(f"caster: must have ranges of at most range_max without compat, got {method}")
@@ -281,11 +277,7 @@ def _method_of(caster: object, weights: Likelihood) -> Caster:
 
 
 def _check_peer(peer: Peer, sensor_table: object) -> None:
-    """Refuse options that a beam model with ``compat`` does not have.
-
-    Raises:
-        ValueError: Such an option is set.
-    """
+    """Refuse options that a beam model with ``compat`` does not have."""
     check_absent("with compat", sensor_table=sensor_table)
     if peer.prob:
         raise ValueError(f"compat: prob must be False for a beam model, got {checks.show(peer)}")

@@ -73,11 +73,7 @@ def log_likelihoods(models: Sequence[ScanModel], poses: Any, ranges: Any, *, out
 
 
 def _checked(models: object) -> list[ScanModel]:
-    """Return models of one device as a list.
-
-    Raises:
-        TypeError, ValueError: Not models of scans, or models of several devices.
-    """
+    """Return models of one device as a list."""
     if not isinstance(models, (list, tuple)):
         raise TypeError(f"models: must be a list or tuple of models, got {checks.show(models)}")
     for i, model in enumerate(models):
@@ -91,11 +87,7 @@ def _checked(models: object) -> list[ScanModel]:
 
 
 def _one_each(name: str, value: Any, count: int) -> list[Any]:
-    """Return an argument of each model: an entry of a list or tuple, or the same value for all.
-
-    Raises:
-        ValueError: A list of another length.
-    """
+    """Return an argument of each model: an entry of a list or tuple, or the same value for all."""
     if not isinstance(value, (list, tuple)):
         return [value] * count
     if len(value) != count:

@@ -127,11 +127,7 @@ def learning_terms(p: BeamParameters, range_max: float, real: np.dtype) -> np.nd
 
 
 def _common_flags(kinds: Sequence[BeamParameters]) -> frozenset[str]:
-    """Return the flags of the shape of hits, which all bins of angles of incidence share.
-
-    Raises:
-        ValueError: Bins differ in it.
-    """
+    """Return the flags of the shape of hits, which all bins of angles of incidence share."""
     shapes = {p.hit: shape_of(p).flags for p in kinds}
     if len(shapes) > 1:
         raise ValueError(f"hit: must be the same for all angles of incidence, got {sorted(shapes)}")

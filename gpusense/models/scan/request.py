@@ -74,9 +74,6 @@ def make_request(
         per_beam: Whether the log-likelihoods of the readings are requested.
         known: Poses that were checked before.
         before: See Request.
-
-    Raises:
-        TypeError, ValueError: An argument breaks its rule.
     """
     backend, real, scanner = setting.backend, setting.real, setting.rules.scanner
     beams = scanner.count

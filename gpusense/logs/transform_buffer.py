@@ -52,6 +52,7 @@ class Link:
         moved: Whether a transform that is not static has changed.
         times: Stamps in increasing order [s].
         values: Translation [m] and quaternion at each stamp, in one row.
+        stray: Time and value of a single transform whose stamp went back; dropped if the next stamp does not.
     """
 
     parent: str
@@ -60,6 +61,7 @@ class Link:
     moved: bool = False
     times: array[float] = field(default_factory=lambda: array("d"))
     values: array[float] = field(default_factory=lambda: array("d"))
+    stray: tuple[float, Vector] | None = None
 
     def put(self, time: float, value: Vector, static: bool) -> None:
         """Add a transform in the order of time; a static one replaces the others."""
@@ -116,7 +118,8 @@ class TransformBuffer:
     """Transforms between frames over time. A slash before a frame's name is ignored.
 
     Args:
-        cache: Time for which moving transforms are kept [s].
+        cache: Time for which moving transforms are kept [s]. If infinite, as for a log, a single stamp that goes back
+            drops nothing.
     """
 
     def __init__(self, cache: float = math.inf) -> None:
@@ -144,8 +147,14 @@ class TransformBuffer:
         time = stamp_of("message", message)
         link = self._links.setdefault((parent, child), Link(parent, child))
         back = not static and not link.static and len(link.times) > 0 and time < link.times[-1] - BACK
+        stray, link.stray = link.stray, None
+        if back and stray is None and self.cache == math.inf:
+            link.stray = time, (*place, *turn)
+            return False
         if back:
-            self.forget_after(time)
+            self.forget_after(time if stray is None else min(time, stray[0]))
+            if stray is not None:
+                link.put(*stray, static)
         link.put(time, (*place, *turn), static)
         if link.times[-1] - link.times[0] > 1.5 * self.cache:
             link.keep(link.times[-1] - self.cache, math.inf)
@@ -212,10 +221,11 @@ class TransformBuffer:
             TransformError: The frames are not connected.
         """
         target, source = target.lstrip("/"), source.lstrip("/")
-        chain = [link for link, _ in self._chain(target, source, self._links.values()) if not link.static]
-        stamps = sorted({time for link in chain for time in link.times})
-        times = [time for time in stamps if all(link.times[0] <= time <= link.times[-1] for link in chain)]
-        poses = [self.look_up(target, source, time) for time in times]
+        chain = self._chain(target, source, self._links.values())
+        moving = [link for link, _ in chain if not link.static]
+        stamps = sorted({time for link in moving for time in link.times})
+        times = [time for time in stamps if all(_covers(link, time) for link in moving)]
+        poses = [_product((link.at(time), ahead) for link, ahead in chain) for time in times]
         return np.array(times), np.array(poses).reshape(-1, 4, 4)
 
     def _chain(self, target: str, source: str, links: Iterable[Link]) -> list[tuple[Link, bool]]:

@@ -119,7 +119,7 @@ def test_one_old_stamp_in_a_log_drops_nothing() -> None:
     # Two are a recording that starts again.
     moving(buffer, "odom", "base", 2.0, 2.5, 3.0)
     assert [buffer.look_up("odom", "base", time)[0, 3] for time in (2.25, 2.75)] == [2.25, 2.75]
-    with pytest.raises(TransformError, match="no transform from base to arm|base to arm ends"):
+    with pytest.raises(TransformError, match="no transform from base to arm yet"):
         buffer.look_up("base", "arm", 12.0)
 
 

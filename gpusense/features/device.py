@@ -34,14 +34,21 @@ class ScanDevice:
         self._space = Workspace(backend)
         self._arrays = {"point": points.point.astype(real), "start": points.start, "noise": noise.astype(real)}
 
-    def split(self, penalty: float) -> np.ndarray:
-        """Return, for each point, the end of the segment that begins there, or -1."""
+    def split(self, penalty: float, point: np.ndarray) -> np.ndarray:
+        """Return, for each point, the end of the segment that begins there, or -1.
+
+        Args:
+            penalty: Reduction of the cost from which two lines replace one.
+            point: (P, 4) points of the scans in the order in which they are split, see ``ScanPoints``.
+        """
         points = self._sizes["points"]
         stop = np.empty(points, _INT)
         with self._space as space:
             cost = space.empty("cost", points, self._real)
             out = space.empty("stop", points, _INT)
-            self._run("split_scans", self._sizes["scans"], cost=cost, stop=out, penalty=penalty, gap=self._gap)
+            placed = space.upload("ordered", point.astype(self._real))
+            self._run("split_scans", self._sizes["scans"], point=placed, cost=cost, stop=out, penalty=penalty,
+                      gap=self._gap)  # fmt: skip
             space.download(out, stop)
             space.wait()
         return stop
@@ -72,5 +79,5 @@ class ScanDevice:
 
     def _run(self, kernel: str, size: int, **arguments: Any) -> None:
         """Launch a kernel on the points."""
-        placed = {key: self._space.upload(key, value) for key, value in self._arrays.items()}
+        placed = {key: self._space.upload(key, value) for key, value in self._arrays.items() if key not in arguments}
         self._backend.run((launch(kernel, self._flags, (size,), **placed, **self._sizes, **arguments),))

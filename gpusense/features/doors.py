@@ -56,7 +56,8 @@ def find_doors(segments: Segments, straight: np.ndarray, beams: Beams, mount: tu
     """Return the doors of scans: centre of the gap, direction across, and width."""
     sides = np.flatnonzero(np.isfinite(segments.distance) & (segments.count >= 3))
     one, two = pairs_of(segments.scan[sides])
-    before, after = _ordered(segments, sides[one], sides[two])
+    # Also across the end of a scan.
+    before, after = sides[np.concatenate([one, two])], sides[np.concatenate([two, one])]
     kinds = _between_walls(segments, straight, before, after), _beside_leaves(segments, straight, before, after)
     names = ("before", "after", "wall", "other", "ends")
     gaps = _Gaps(*(np.concatenate([getattr(each, name) for each in kinds]) for name in names))
@@ -123,14 +124,6 @@ def _one_each(segments: Segments, gaps: _Gaps, sure: np.ndarray) -> np.ndarray:
         return bool(np.hypot(*(middle[j] - middle[k])) > 0.5 * (width[j] + width[k]))
 
     return first_apart(order, segments.scan[wall], do_not_overlap)
-
-
-def _ordered(segments: Segments, one: np.ndarray, two: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the segments before and after each gap, also across the end of a scan."""
-    around = segments.successor[np.searchsorted(segments.scan, segments.scan[one], side="right") - 1] >= 0
-    before = np.concatenate([one, two[around]])
-    after = np.concatenate([two, one[around]])
-    return before, after
 
 
 def _jambs(

@@ -23,7 +23,7 @@ from gpusense.features.reflectors import find_reflectors
 from gpusense.features.result import KINDS, Features, Found, check_kinds, features_of, joined
 from gpusense.features.segments import find_segments
 from gpusense.matching.match import readings
-from gpusense.matching.noise import ASSUMED_NOISE, scan_noise
+from gpusense.matching.noise import ASSUMED_NOISE, whole_noise
 from gpusense.matching.points import scan_points
 from gpusense.world.scanner import Scanner
 
@@ -89,7 +89,7 @@ def extract_features(
     scans = np.atleast_2d(readings("ranges", ranges, scanner, device))
     real = np.dtype(np.float64 if device.info.float64 else np.float32)
     if given is None:
-        deviation = scan_noise(scans, scanner)
+        deviation = whole_noise(scans, scanner)
         deviation = np.where(np.isnan(deviation), ASSUMED_NOISE, deviation)
         deviation = np.clip(deviation, _LEAST_NOISE, _LARGEST_NOISE)
     else:

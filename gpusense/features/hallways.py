@@ -45,8 +45,7 @@ def find_hallways(segments: Segments, straight: np.ndarray, mount: tuple[float, 
     good = (np.abs(off) <= _PARALLEL + _DEVIATIONS * deviation) & (width >= _NARROWEST) & (width <= _WIDEST)
     good &= overlap >= _LEAST_LENGTH * width
     a, b, off, overlap, width = (value[good] for value in (a, b, off, overlap, width))
-    length = np.minimum(segments.length[a], segments.length[b])
-    kept = _one_each(segments.scan[a], segments.angle[a], length)
+    kept = _one_each(segments.scan[a], segments.angle[a], np.stack([segments.length[a], segments.length[b]]))
     a, b, off, width = a[kept], b[kept], off[kept], width[kept]
     variance_a, variance_b = segments.covariance[a, 0, 0], segments.covariance[b, 0, 0]
     share = variance_b / (variance_a + variance_b)
@@ -83,12 +82,12 @@ def _extents(segments: Segments, lines: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _one_each(scan: np.ndarray, angle: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Choose the pair with the longest walls of each scan and axis."""
+    """Choose the pair of each scan and axis whose shorter wall (2, P) is longest; of equal ones the longest pair."""
 
     def on_another_axis(k: int, j: int) -> bool:
         return abs(math.remainder(angle[k] - angle[j], math.pi)) > _ONE_AXIS
 
-    return np.sort(first_apart(np.lexsort((-length, scan)), scan, on_another_axis))
+    return np.sort(first_apart(np.lexsort((-length.max(axis=0), -length.min(axis=0), scan)), scan, on_another_axis))
 
 
 def first_apart(order: np.ndarray, scan: np.ndarray, are_apart: Callable[[int, int], bool]) -> np.ndarray:

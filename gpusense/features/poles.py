@@ -28,6 +28,10 @@ def find_poles(
 ) -> Found:
     """Return the poles of scans: centre and radius."""
     first, count, scan, edges = _objects(segments, beams, noise)
+    # By bearing from the first segment on, whatever the heading of the scan.
+    begin = segments.first[np.searchsorted(segments.scan, scan)]
+    order = np.lexsort((np.mod(first - begin, segments.points.counts[scan]), scan))
+    first, count, scan, edges = first[order], count[order], scan[order], edges[order]
     part = np.stack([first, count], axis=1)
     step = segments.step
     edge = np.column_stack([edges, np.full((len(first), 2), step / math.sqrt(12))])

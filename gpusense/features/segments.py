@@ -21,7 +21,7 @@ LEAST_NOISE = 2e-4
 
 @dataclass(frozen=True)
 class Segments:
-    """Segments of all scans in their order, each with a line ``x cos(angle) + y sin(angle) = distance``.
+    """Segments of all scans by bearing, each with a line ``x cos(angle) + y sin(angle) = distance``.
 
     Attributes:
         points: The points of all scans.
@@ -35,7 +35,7 @@ class Segments:
         variance: (G,) variance of ranges, from the scan and from the segment's residuals [m^2].
         ends: (G, 2) positions of the first and last point along the line, from the foot of the normal [m].
         spacing: (G, 2) distances between neighbouring beams along the line at its ends [m].
-        successor: (G,) next segment of the scan, or -1; after the last one the first if beams cover a full turn.
+        successor: (G,) next segment of the scan, or -1; after the last one the first if no gap is between them.
         apart: (G,) whether something may be hidden before the successor.
     """
 
@@ -76,27 +76,74 @@ class Segments:
 
 
 def find_segments(device: ScanDevice, points: ScanPoints, noise: np.ndarray) -> Segments:
-    """Split scans into segments, and fit lines to them."""
-    stop = device.split(PENALTY)
+    """Split scans into segments, and fit lines to them.
+
+    The segments of a scan come by bearing, from its cut on; see :func:`_cut`.
+    """
+    if not len(points.point):
+        nothing = np.zeros(0, np.int64)
+        return _described(points, np.zeros(len(noise), bool), noise, nothing, nothing, nothing, np.zeros((0, 6)))
+    cut, closed, mirrored = _cut(points, noise)
+    place, point = _in_cut_order(points, cut, mirrored)
+    stop = device.split(PENALTY, point)
     first = np.flatnonzero(stop >= 0)
     scan = np.searchsorted(points.start, first, side="right") - 1
     count = stop[first] - first
+    # The first point by bearing of a segment of a mirrored scan is its last one.
+    first = place[np.where(mirrored[scan], first + count - 1, first)]
+    order = np.lexsort((np.mod(first - cut[scan], points.counts[scan]), scan))
+    first, count, scan = first[order], count[order], scan[order]
     line = device.lines(np.stack([first, count], axis=1), scan)
-    closed = _is_closed(points)
     first, count, scan, line = _joined_around(device, closed, first, count, scan, line)
     return _described(points, closed, noise, first, count, scan, line)
 
 
-def _is_closed(points: ScanPoints) -> np.ndarray:
-    """Return which scans (S,) have no gap between their last and their first point."""
-    some = points.counts > 0
-    if not len(points.point):
-        return some
-    bearing = points.point[:, 2].astype(np.float64)
-    ends = np.clip(points.start, 0, len(bearing) - 1)
-    around = bearing[ends[:-1]] + _FULL_TURN - bearing[np.maximum(points.start[1:] - 1, 0)]
-    result: np.ndarray = some & (around <= points.gap)
-    return result
+def _cut(points: ScanPoints, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where to cut scans open, by their readings alone, so that segments turn and mirror with their scans.
+
+    A scan is cut at its widest gap. Without a gap, it is cut where ranges deviate most from those of a straight wall:
+    at an edge or a corner.
+
+    Returns:
+        (S,) the first point after the cut; whether the cut is at no gap; and whether to split the scan against the
+        sense of its bearings: if the sum of the cubes of the steps of the logarithms of ranges is negative.
+    """
+    counts, total = points.counts, len(points.point)
+    scan = np.repeat(np.arange(len(counts)), counts)
+    begin, number = points.start[scan], np.arange(total)
+    following = begin + (number - begin + 1) % counts[scan]
+    before = begin + (number - begin - 1) % counts[scan]
+    bearing, r = points.point[:, 2].astype(np.float64), points.point[:, 3].astype(np.float64)
+    step = np.where(following == number, _FULL_TURN, np.mod(bearing[following] - bearing, _FULL_TURN))
+    is_gap = step > points.gap
+    # On a straight wall 1 / r = a cos(bearing) + b sin(bearing).
+    one, two = np.sin(step[before]), np.sin(step)
+    with np.errstate(all="ignore"):
+        expected = (two / r[before] + one / r[following]) / np.sin(step[before] + step)
+        off = np.nan_to_num(np.abs(expected * r - 1) * r / noise[scan], posinf=0.0)
+    # Gaps of as many beams are equally wide.
+    beams = np.minimum(np.rint(step * GAP / max(points.gap, 1e-9)), 1e9)
+    score = np.where(is_gap, 1e9 * beams, np.minimum(off + off[following], 1e8))
+    some = np.flatnonzero(counts)
+    best = np.lexsort((-number, score, scan))[points.start[some + 1] - 1]
+    cut, closed, mirrored = np.zeros(len(counts), np.int64), np.zeros(len(counts), bool), np.zeros(len(counts), bool)
+    cut[some], closed[some] = following[best], ~is_gap[best]
+    cubes = np.log(r[following] / r) ** 3
+    mirrored[some] = np.add.reduceat(cubes, points.start[some]) < 0
+    return cut, closed, mirrored
+
+
+def _in_cut_order(points: ScanPoints, cut: np.ndarray, mirrored: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices of points (P,) from the cut on, and the points with bearings from the cut, as kernels take."""
+    counts = points.counts
+    scan = np.repeat(np.arange(len(counts)), counts)
+    begin = points.start[scan]
+    number = np.arange(len(scan)) - begin
+    place = begin + np.where(mirrored[scan], cut[scan] - begin - 1 - number, cut[scan] - begin + number) % counts[scan]
+    bearing, r = points.point[:, 2].astype(np.float64), points.point[:, 3].astype(np.float64)
+    turned = np.mod(np.where(mirrored[scan], -1, 1) * (bearing[place] - bearing[place[begin]]), _FULL_TURN)
+    r = r[place]
+    return place, np.stack([r * np.cos(turned), r * np.sin(turned), turned, r], axis=1)
 
 
 def _joined_around(

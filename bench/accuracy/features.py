@@ -8,6 +8,7 @@
   open and closed, square pillars, poles, boxes). Recall is the share of well-visible features that are found, precision
   the share of returned features that exist. Median errors follow, the mean squared error over the covariance per degree
   of freedom (NEES; 1 is right) without errors beyond 99.9 % of chi squared, and the share of those.
+- ``chance``: poles in scans of independent ranges, which have no shape.
 - ``ransac``: lines by scikit-image's RANSAC, one after another, beside gpusense's.
 - ``real``: the share of features of recorded scans that are found again from another place, and their distances in
   standard deviations. The reference poses are not exact: their deviations are taken as 3 cm and 0.01 rad (jarvis 1 cm
@@ -41,7 +42,7 @@ from support.feature_scenes import floor_plan
 from support.feature_scores import FREE, Score, score_scan
 from support.feature_truth import truth_of
 
-PARTS = ("simulated", "ransac", "real", "localisation", "rates")
+PARTS = ("simulated", "chance", "ransac", "real", "localisation", "rates")
 BEAMS, NOISES = (180, 360, 1081), (0.0, 0.01, 0.03, 0.05)
 # Recordings, standard deviations of their reference poses, and scans of each to compare.
 RECORDINGS = {
@@ -113,6 +114,26 @@ def simulated(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
                 ])  # fmt: skip
     names = ["beams", "noise [cm]", "kind", "recall [%]", "precision [%]", "error [mm], median", "NEES", "outliers [%]"]
     return "## Simulated floors\n\n" + table(names, rows), report
+
+
+def chance(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
+    """Count the poles in scans of independent ranges."""
+    rng, rows, report = np.random.default_rng(arguments.seed), [], {}
+    for beams in (*BEAMS, 720):
+        shape = 60, beams
+        ranges = {
+            "3 + Exp(0.5)": 3 + rng.exponential(0.5, shape), "3 + Exp(0.2)": 3 + rng.exponential(0.2, shape),
+            "uniform in 1 to 5": rng.uniform(1, 5, shape), "2 + |N(0, 1)|": 2 + np.abs(rng.normal(size=shape)),
+        }  # fmt: skip
+        for name, values in ranges.items():
+            poles = {
+                str(noise): len(gs.extract_features(values, scanner_of(beams), "pole", arguments.backend, noise=noise))
+                for noise in ("auto", 0.02)
+            }
+            report[f"{beams} {name}"] = poles
+            rows.append([beams, name, *poles.values()])
+    names = ["beams", "ranges [m]", "poles in 60 scans, noise auto", "noise 2 cm"]
+    return "## Poles by chance\n\n" + table(names, rows), report
 
 
 def ransac_lines(points: np.ndarray, noise: float, rng: np.random.Generator) -> list[np.ndarray]:
@@ -369,7 +390,7 @@ def main(argv: list[str] | None = None) -> None:
     arguments = parse(parser, argv)
     if arguments.figure:
         return draw(arguments)
-    functions = dict(zip(PARTS, (simulated, rivals, real, localisation, rates), strict=True))
+    functions = dict(zip(PARTS, (simulated, chance, rivals, real, localisation, rates), strict=True))
     texts, report = [], {}
     for part in PARTS:
         if part in arguments.parts:

@@ -19,6 +19,9 @@ _BEHIND, _DEVIATIONS = 0.08, 6.0
 _USUAL = 0.1
 # Squared deviations per reading and edge of a pole, and how much more than its segments' lines it may cost.
 _POOR, _ROUND = 2.5, 6.0
+# Least evidence for a pole; beams on each side that chance is measured on, per beam of the pole and at least; and the
+# distance of ranges that are near [deviations].
+_LEAST_EVIDENCE, _AROUND, _FEWEST_AROUND, _NEAR = 7.0, 2, 20, 3.0
 # Reduction of the cost by which each line after the first fits noise.
 _EACH = 8.0
 
@@ -40,7 +43,9 @@ def find_poles(
     good = (cost >= 0) & (radius >= _THINNEST) & (radius <= _THICKEST) & np.isfinite(circle).all(axis=1)
     good &= cost <= _POOR * (count - 1) + 4
     good &= cost + np.square(radius / _USUAL) <= _cost_of_lines(segments, first, count, scan) + _ROUND
-    circle, scan, count, cost = circle[good], scan[good], count[good], cost[good]
+    rows = np.flatnonzero(good)
+    rows = rows[_evidence(segments, first[rows], count[rows], scan[rows], cost[rows], noise) > _LEAST_EVIDENCE]
+    circle, scan, count, cost = circle[rows], scan[rows], count[rows], cost[rows]
     inverse, radius = _covariance(circle), circle[:, 2]
     distance = np.hypot(circle[:, 0], circle[:, 1])
     sure = (np.sqrt(np.einsum("pii->p", inverse)) < 0.5 * np.maximum(radius, 0.05)) & (distance > radius)
@@ -50,6 +55,29 @@ def find_poles(
     fit = np.minimum(1, (count - 1) / np.maximum(cost, 1e-9))
     score = np.clip(fit * (1 - np.sqrt(np.einsum("pii->p", inverse)) / np.maximum(radius, 0.05)), 0, 1)
     return Found(scan, pose, observed, inverse, radius, score).only(sure)
+
+
+def _evidence(
+    segments: Segments, first: np.ndarray, count: np.ndarray, scan: np.ndarray, cost: np.ndarray, noise: np.ndarray
+) -> np.ndarray:
+    """Return the log-likelihood ratios (P,) of circles to chance, less the logarithm of a scan's number of places.
+
+    By chance, the ranges of an object are independent, with the density of the ranges around it. The density at a range
+    is the share of the beams on both sides whose ranges are near, plus one beam.
+    """
+    points, result = segments.points, np.zeros(len(first))
+    for k, (one, number, of) in enumerate(zip(first.tolist(), count.tolist(), scan.tolist(), strict=True)):
+        begin, total, sigma = int(points.start[of]), int(points.counts[of]), float(noise[of])
+        place = begin + np.mod(one - begin + np.arange(total), total)
+        bearing, r = points.point[place, 2].astype(np.float64), points.point[place, 3].astype(np.float64)
+        beams = max(_AROUND * number, _FEWEST_AROUND)
+        off = np.mod(np.stack([bearing - bearing[number - 1], bearing[0] - bearing]), 2 * math.pi).min(axis=0)
+        around = r[number:][off[number:] <= beams * segments.step]
+        near = np.abs(around - r[:number, None]) <= _NEAR * sigma
+        density = (near.sum(axis=1) + 1) / (2 * beams * 2 * _NEAR * sigma)
+        likelihood = -0.5 * cost[k] - number * math.log(sigma * math.sqrt(2 * math.pi))
+        result[k] = likelihood - np.log(density).sum() - math.log(total)
+    return result
 
 
 def _covariance(circle: np.ndarray) -> np.ndarray:

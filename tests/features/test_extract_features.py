@@ -322,6 +322,27 @@ def test_scans_in_several_parts_give_the_same(monkeypatch):
     np.testing.assert_array_equal(parts.pose, together.pose)
 
 
+@pytest.mark.parametrize("beams", [360, 1081])
+@pytest.mark.parametrize("noise", ["auto", 0.02])
+def test_independent_ranges_have_no_poles(beams, noise):
+    """Of 40 scans at most one has a pole by chance."""
+    rng, scanner = np.random.default_rng(1), ring(beams)
+    clutter = (
+        3 + rng.exponential(0.5, (40, beams)),
+        rng.uniform(1, 5, (40, beams)),
+        2 + np.abs(rng.normal(size=(40, beams))),
+    )
+    for ranges in clutter:
+        assert len(gs.extract_features(ranges, scanner, "pole", noise=noise)) <= 1
+    # A pole before them is still found.
+    off = scanner.bearings - scanner.bearings[beams // 3]
+    near = 0.8 * np.cos(off) - np.sqrt(np.maximum(0.12**2 - (0.8 * np.sin(off)) ** 2, 0))
+    ranges = np.maximum(clutter[1], np.where(np.cos(off) > 0.9, 2.0, 0.0))
+    ranges = np.where((np.abs(np.sin(off)) < 0.15) & (np.cos(off) > 0), near, ranges)
+    found = gs.extract_features(ranges, scanner, "pole", noise=0.02)
+    assert (np.abs(found.size - 0.12) < 0.01).sum() == len(ranges)
+
+
 def test_features_become_readings_of_landmarks():
     scanner = ring(720)
     ranges, _ = floor_scans(4, scanner, 0.01, count=12)

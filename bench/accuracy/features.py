@@ -123,7 +123,7 @@ def chance(arguments: argparse.Namespace) -> tuple[str, dict[str, Any]]:
         shape = 60, beams
         ranges = {
             "3 + Exp(0.5)": 3 + rng.exponential(0.5, shape), "3 + Exp(0.2)": 3 + rng.exponential(0.2, shape),
-            "uniform in 1 to 5": rng.uniform(1, 5, shape), "2 + |N(0, 1)|": 2 + np.abs(rng.normal(size=shape)),
+            "uniform in 1 to 5": rng.uniform(1, 5, shape), "2 + abs N(0, 1)": 2 + np.abs(rng.normal(size=shape)),
         }  # fmt: skip
         for name, values in ranges.items():
             poles = {

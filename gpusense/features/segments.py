@@ -101,7 +101,7 @@ def find_segments(device: ScanDevice, points: ScanPoints, noise: np.ndarray) -> 
 def _cut(points: ScanPoints, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return where to cut scans open, by their readings alone, so that segments turn and mirror with their scans.
 
-    A scan is cut at its widest gap. Without a gap, it is cut where ranges deviate most from those of a straight wall:
+    A scan is cut at its widest gap, or else where a range deviates most from the range that its neighbours predict:
     at an edge or a corner.
 
     Returns:

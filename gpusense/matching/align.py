@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 
+from gpusense.matching.refine_on_field import damping_of
 from gpusense.world.grid import OccupancyGrid
 
 # Deviation of the smoothing [cells of the global map], its reach in deviations, and least share of known cells.
@@ -87,14 +88,14 @@ class Alignment:
         at, damping = pose.astype(np.float64), 1e-3
         value, gradient, information = self._evaluated(at)
         for _ in range(_ITERATIONS):
-            diagonal = damping * information.diagonal() + 1e-9 * (1 + information.diagonal().max())
-            step = np.linalg.solve(information + np.diag(diagonal), -gradient)
+            damped = information + damping_of(information[None], np.array([damping]), 1e-9)[0]
+            step = np.linalg.solve(damped, -gradient)
             trial = at + step
             new = self._evaluated(trial)
             if better := new[0] < value:
                 at, (value, gradient, information) = trial, new
             damping = min(max(damping / 5 if better else damping * 8, 1e-6), 1e6)
-            if max(np.abs(step[:2]).max(), self._lever * abs(step[2])) < _SMALL:
+            if max(math.hypot(*step[:2]), self._lever * abs(step[2])) < _SMALL:
                 break
         moved = at - pose
         return at if math.hypot(*moved[:2]) <= self._farthest and abs(moved[2]) <= most else pose

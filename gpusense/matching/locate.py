@@ -44,10 +44,11 @@ def locate_scan(
 ) -> Location:
     """Find the likeliest pose of a scan on a grid of poses over the whole map, without a guess.
 
-    Positions are centres of map cells. Branch and bound (Hess et al., 2016) over integer scores finds every pose whose
-    score can belong to the largest log-likelihood, and the model evaluates them. So the pose equals the result of brute
-    force with ``model.log_likelihood``; ties go to the lowest row, then column, then heading. Damped Gauss-Newton on
-    the model's interpolated field then refines it.
+    Positions are centres of map cells, and headings are multiples of an angle from the map's x axis. Branch and bound
+    (Hess et al., 2016) over integer scores finds every pose whose score can belong to the largest log-likelihood, and
+    the model evaluates them. So the pose equals the result of brute force with ``model.log_likelihood``; ties go to the
+    lowest row, then column, then heading. Damped Gauss-Newton on the model's interpolated field then refines it, until
+    a step is shorter than 0.1 mm and 1e-4 rad in float64, and three times that in float32.
 
     ``p_right`` is the probability that the pose is right. It is computed from the shares of the readings that agree
     with the map, pass through its walls or end before them, at this pose and at other poses that score nearly as well.

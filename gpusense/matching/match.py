@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
@@ -266,18 +267,23 @@ def scan_map(ranges: np.ndarray, scanner: Scanner, margin: float, cell: float) -
         cell: Least side of a cell [m].
     """
     hits = classify_ranges(ranges, scanner.range_min, scanner.range_max)[0]
-    place = ranges[hits, None] * ray_vectors(scanner.bearings, scanner.mount)[hits] + np.array(scanner.mount[:2])
-    if not len(place):
-        place = np.zeros((1, 2))
-    low = place.min(axis=0) - margin
-    size = float((place.max(axis=0) + margin - low).max())
-    cell = max(cell, size / _MOST_CELLS)
-    cols, rows = (np.ceil((place.max(axis=0) + margin - low) / cell)).astype(int)
-    cells = np.full((rows, cols), -1, np.int8)
+    vectors, middle = ray_vectors(scanner.bearings, scanner.mount)[hits], np.array(scanner.mount[:2])
+    # Axes along the fourfold moment of the points, and space around the sensor on both sides: the cells turn and mirror
+    # with the scan.
+    weight = ranges[hits].astype(np.float64) ** 2
+    moment = np.sum(weight * (vectors[:, 0] + 1j * vectors[:, 1]) ** 4)
+    yaw = float(np.angle(moment)) / 4
+    c, s = math.cos(yaw), math.sin(yaw)
+    place = ranges[hits, None] * vectors @ np.array([[c, -s], [s, c]])
+    half = np.abs(place).max(axis=0, initial=0.0) + margin
+    cell = max(cell, float(2 * half.max()) / _MOST_CELLS)
+    cols, rows = np.ceil(half / cell).astype(int).tolist()
+    cells = np.full((2 * rows, 2 * cols), -1, np.int8)
     if hits.any():
-        col, row = np.floor((place - low) / cell).astype(int).T
-        cells[row, col] = 100
-    return OccupancyGrid(cells, resolution=cell, origin=(float(low[0]), float(low[1]), 0.0))
+        col, row = np.floor(place / cell).astype(int).T
+        cells[row + rows, col + cols] = 100
+    corner = middle - cell * np.array([c * cols - s * rows, s * cols + c * rows])
+    return OccupancyGrid(cells, resolution=cell, origin=(float(corner[0]), float(corner[1]), yaw))
 
 
 def match_by_maps(

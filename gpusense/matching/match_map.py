@@ -137,7 +137,7 @@ def match_map(
         raise ValueError("local_grid: must have an occupied cell, got none")
     device = get_backend(backend)
     local = _Local(local_grid, grid.resolution)
-    searched = _whole(grid, turn) if guess is None else _around(grid, local, guess, window, turn)
+    searched = _whole(grid, turn, local_grid.origin[2]) if guess is None else _around(grid, local, guess, window, turn)
     levels = min(_LEVELS, int(math.log2(max(min(searched.height, searched.width) / 4, 1))))
     search = Search(ScoreTables(device, _scores(grid, backend=backend), levels=levels))
     slack = math.ceil(_DEPTH * TOP * len(local.points))
@@ -158,10 +158,10 @@ class _Local:
 
     def __init__(self, grid: OccupancyGrid, cell: float) -> None:
         row, col = np.nonzero(~grid.unknown)
-        centers = grid.cell_centers(row, col)
-        middle = (centers.min(axis=0) + centers.max(axis=0)) / 2
+        centers, cells = grid.cell_centers(row, col), np.stack([row, col], axis=1)
+        middle = (cells.min(axis=0) + cells.max(axis=0)) / 2
         # The middle is the centre of a cell, so that maps with coincident cells match exactly.
-        self.middle = centers[np.hypot(*(centers - middle).T).argmin()]
+        self.middle = centers[np.hypot(*(cells - middle).T).argmin()]
         self.xy = (centers - self.middle) / cell
         self.occupied = occupied = grid.occupied[row, col]
         chosen = [_thinned(np.flatnonzero(mask), most) for mask, most in ((occupied, _OCCUPIED), (~occupied, _FREE))]
@@ -181,10 +181,10 @@ def _scores(grid: OccupancyGrid, *, backend: Selection) -> np.ndarray:
     return np.stack([field, free])
 
 
-def _whole(grid: OccupancyGrid, angle: float) -> PoseGrid:
-    """Return positions in all cells of a map, and headings all around in its frame."""
+def _whole(grid: OccupancyGrid, angle: float, yaw: float) -> PoseGrid:
+    """Return positions in all cells of a map, and headings all around; ``yaw`` is that of the local map's cells."""
     turns = 4 * math.ceil(math.pi / 2 / angle - 1e-9)
-    return PoseGrid(np.array([[0.5, 0.5]]), 2 * math.pi / turns * np.arange(turns)[None], *grid.shape)
+    return PoseGrid(np.array([[0.5, 0.5]]), 2 * math.pi / turns * np.arange(turns)[None] - yaw, *grid.shape)
 
 
 def _around(grid: OccupancyGrid, local: _Local, guess: ArrayLike, window: ArrayLike | None, angle: float) -> PoseGrid:

@@ -33,7 +33,25 @@ def scan_noise(ranges: np.ndarray, scanner: Scanner) -> np.ndarray:
     if scanner.count < 3 or not len(ranges):
         return np.full(len(ranges), np.nan)
     known = np.where(classify_ranges(ranges, scanner.range_min, scanner.range_max)[0], ranges, np.nan)
+    if not beams_in_order(scanner):
+        known = known[:, _order_of(scanner)]
     return noise_of(known.astype(np.float64, copy=False), *neighbors(scanner))
+
+
+def beams_in_order(scanner: Scanner) -> bool:
+    """Return whether beams come by bearing, from the widest gap or from -pi on."""
+    return bool((np.diff(_order_of(scanner)) > 0).all())
+
+
+@functools.lru_cache(maxsize=16)
+def _order_of(scanner: Scanner) -> np.ndarray:
+    """Return the order of beams by bearing, from the widest gap on, or from -pi if beams cover a full turn."""
+    bearing = np.mod(scanner.bearings + math.pi, 2 * math.pi)
+    order = np.argsort(bearing, kind="stable")
+    step = np.mod(np.diff(bearing[order], append=bearing[order[0]]), 2 * math.pi)
+    widest = int(step.argmax()) if len(step) else 0
+    is_full = not len(step) or step[widest] < 1.5 * np.median(step)
+    return order if is_full else np.roll(order, -1 - widest)
 
 
 def whole_noise(ranges: np.ndarray, scanner: Scanner) -> np.ndarray:
@@ -44,7 +62,7 @@ def whole_noise(ranges: np.ndarray, scanner: Scanner) -> np.ndarray:
     if scanner.count < 3 or not len(ranges):
         return np.full(len(ranges), np.nan)
     known = np.where(classify_ranges(ranges, scanner.range_min, scanner.range_max)[0], ranges, np.nan)
-    order = np.argsort(np.mod(scanner.bearings + scanner.mount[2], 2 * math.pi), kind="stable")
+    order = _order_of(scanner)
     step = np.mod(np.diff(scanner.bearings[order], append=scanner.bearings[order[0]]), 2 * math.pi)
     before = np.roll(step, 1)
     whole = np.sin(before + step)
@@ -58,8 +76,8 @@ def whole_noise(ranges: np.ndarray, scanner: Scanner) -> np.ndarray:
 
 @functools.lru_cache(maxsize=16)
 def neighbors(scanner: Scanner) -> tuple[tuple[slice, ...], np.ndarray, np.ndarray]:
-    """Return slices of the beams before, at and after (P,) places, and the neighbours' weights on a straight wall."""
-    bearing, last = scanner.bearings, scanner.count - 1
+    """Return slices of the beams before, at and after (P,) places in order, and their weights on a straight wall."""
+    bearing, last = scanner.bearings[_order_of(scanner)], scanner.count - 1
     step = -(-(last - 1) // _PLACES)
     places = slice(0, last - 1, step), slice(1, last, step), slice(2, last + 1, step)
     before, here, after = (bearing[part] for part in places)

@@ -1,4 +1,7 @@
-"""Find poses of maximal likelihood near starts by damped Gauss-Newton on a likelihood field."""
+"""Find poses of maximal likelihood near starts by damped Gauss-Newton on a likelihood field.
+
+Damping and the stopping rule are the same in all directions, so that ends turn with the map.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +9,8 @@ import numpy as np
 
 from gpusense.models.scan.field import LikelihoodFieldModel
 
-# Most iterations, and the largest step that ends them [m, rad].
-_ITERATIONS, _SMALL = 15, 1e-4
+# Most iterations, and the length and turn of a step that end them [m, rad].
+_ITERATIONS, _SMALL = 50, 1e-4
 
 
 def climb(
@@ -22,12 +25,7 @@ def climb(
         if not moving.any():
             break
         rows = np.flatnonzero(moving)
-        diagonal = np.einsum("sii->si", information)
-        damped = (
-            information
-            + np.eye(3) * (damping[:, None] * diagonal + 1e-6 * (1 + diagonal.max(axis=1))[:, None])[:, None]
-        )
-        step = np.linalg.solve(damped, gradient[..., None])[..., 0]
+        step = np.linalg.solve(information + damping_of(information, damping), gradient[..., None])[..., 0]
         length = np.hypot(step[:, 0], step[:, 1])
         step *= (1 / np.maximum(1, np.maximum(length / 0.5, np.abs(step[:, 2]) / 0.3)))[:, None]
         step[~moving] = 0
@@ -41,8 +39,16 @@ def climb(
         information = np.where(better[:, None, None], new_information, information)
         count += moving
         damping = np.clip(np.where(better, damping / 5, damping * 8), 1e-6, 1e6)
-        calm |= moving & (np.abs(step).max(axis=1) < (_SMALL if model.precision == "float64" else 3 * _SMALL))
+        largest = np.maximum(np.hypot(step[:, 0], step[:, 1]), np.abs(step[:, 2]))
+        calm |= moving & (largest < (_SMALL if model.precision == "float64" else 3 * _SMALL))
     return pose, count, calm
+
+
+def damping_of(information: np.ndarray, damping: np.ndarray, least: float = 1e-6) -> np.ndarray:
+    """Return diagonal matrices (S, 3, 3) that damp steps by (S, 3, 3) information, equally in x and y."""
+    diagonal = np.einsum("sii->si", information).copy()
+    diagonal[:, :2] = diagonal[:, :2].mean(axis=1, keepdims=True)
+    return np.eye(3) * (damping[:, None] * diagonal + least * (1 + diagonal.max(axis=1))[:, None])[:, None]
 
 
 def _evaluated(

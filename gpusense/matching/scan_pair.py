@@ -18,7 +18,7 @@ from gpusense.interface.lanes import with_lanes_flag
 from gpusense.interface.launches import Program, launch
 from gpusense.matching.chain import POOR, POOR_TURN, finished, judged_pairs, to_sensor
 from gpusense.matching.icp import WIDTH, PlacedPairs, line_rules, slack_of, space_of
-from gpusense.matching.noise import NoiseLevels, neighbors, noise_levels
+from gpusense.matching.noise import NoiseLevels, beams_in_order, neighbors, noise_levels
 from gpusense.matching.options import COARSE_POINTS, MatchOptions
 from gpusense.matching.points import beams_by_angle
 from gpusense.matching.result import ScanMatch
@@ -57,7 +57,12 @@ class _Scene(NamedTuple):
 
 def takes(backend: Backend, scanner: Scanner) -> bool:
     """Return whether a device matches the scans of a scanner in this way."""
-    return backend.info.kind == "cpu" and backend.info.float64 and scanner.count >= _LEAST_BEAMS
+    return (
+        backend.info.kind == "cpu"
+        and backend.info.float64
+        and scanner.count >= _LEAST_BEAMS
+        and beams_in_order(scanner)
+    )
 
 
 def match_pair(

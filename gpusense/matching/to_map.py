@@ -119,7 +119,7 @@ class MapMatcher:
         if len(behind):
             pose, iterations, calm = self.refined(ranges[behind], found.pose[behind], finest=True)
             centred = self._finished(ranges[behind], pose, iterations, calm, "gauss_newton")
-            off = np.abs(pose - found.pose[behind])[:, :2].max(axis=1)
+            off = np.hypot(*(pose - found.pose[behind])[:, :2].T)
             found = found.replaced(behind, centred, centred.usable & (off < _MOST_OFF * self._grid.resolution))
         return judged(found, guess, self._options)
 

@@ -26,6 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 import needs
 import reports
 from common import command_line, note, stated_commit
+from speed.baselines import candidates as outside
 
 from gpusense.backends import get_backend
 from gpusense.commands import bench
@@ -54,9 +55,11 @@ def plans_of(arguments: argparse.Namespace) -> tuple[list[Plan], dict[str, Any],
     ]
     words += [word for name in arguments.backend for word in ("--backend", name)]
     words += [word for name in arguments.scene or () for word in ("--scene", name)]
-    words += ["--no-peers"] if arguments.no_peers else []
     given = parser.parse_args(words)
-    whole, absent = bench.make_plan(given, None)
+    whole, absent = bench.make_plan(given)
+    if not arguments.no_peers:
+        whole = replace(whole, candidates=[*whole.candidates, *(one for one in outside() if not one.missing)])
+        absent += dict.fromkeys(f"{one.outside}: {one.missing}" for one in outside() if one.missing)
     sources = sorted(whole.sources, key=lambda one: FIRST.index(one.name) if one.name in FIRST else len(FIRST))
     exact = [one for one in whole.candidates if one.exact and not one.outside]
     plans = [

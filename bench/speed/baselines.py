@@ -1,4 +1,4 @@
-"""Offer outside rows of ``gpusense bench``: other implementations, measured in the same run on the same scenes.
+"""List other implementations as candidates, which error_vs_time/measure.py runs on the scenes of ``gpusense bench``.
 
 numba (``pip install numba``): this project's code after public descriptions, parallel over particles on all processors:
 

@@ -13,17 +13,15 @@ from gpusense._util.files import check_writable, write_whole
 from gpusense._util.progress import progress
 from gpusense.commands.arguments import BACKEND_HELP, add_json, open_backends, positive_number, whole_number
 from gpusense.commands.output import print_json, print_table
-from gpusense.evaluation.benchmark.choice import Wish, answers, parse_error, parse_time
+from gpusense.evaluation.benchmark.choice import Wish, choices, parse_error, parse_time
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
-    from gpusense.evaluation.benchmark.candidates import Candidate
     from gpusense.evaluation.benchmark.runner import Plan
 
 NAME = "bench"
-HELP = "Measure error against run time of every caster and model, and write a report."
+HELP = "Measure error against run time of every caster and model, and name the fastest method within an error."
 
-LESS_EXACT = 1
 PROBLEMS = ("ranges", "beam", "field")
 PRECISIONS = ("float32", "float64")
 DEFAULTS: dict[str, Any] = {"particles": None, "checked": 512, "beams": 360, "repeats": 20, "seed": 0}
@@ -39,46 +37,34 @@ EPILOG = """\
 Every method with every value of its knob computes the same ranges and scores the same scan, for particles over the
 whole map ('global') and around the true pose ('tracking'). Errors are against the exact caster and the float64 models.
 
+The answer comes first: for each problem and device the fastest method with an error of at most --max-error, or the most
+exact one whose call takes at most --max-time. The table below it lists the methods that no other method beats in both
+error and time. Nats are the KL divergence of the posterior, lengths the shift of its mean, both at a comparable
+temperature; per cent are rays wrong by more than a cell, cells the range error that 95 % of the rays keep. Times are
+calls of --particles times --beams.
+
 Scenes: 'building' and 'clutter' are generated. If GPUSENSE_DATA names the folder of recorded data, 'basement',
-'spielberg', 'willow' and 'intel' are added; --map adds others. Outside candidates, such as numba's, come from
-bench/speed/baselines.py of a checkout or from the file that --peers names; the file is executed.
+'spielberg', 'willow' and 'intel' are added; --map adds others.
 
---output DIR receives report.json, report.md and the diagrams: time over error, with a curve for each method traced by
-its knob, exact points in the strip on the left, failed points in the strip on the right. Failures are listed with
-their reasons.
-
---html FILE writes the interactive page of docs/error-vs-time.md for this measurement: time over error, the method for a
-budget, and performance profiles.
-
-The report ends with a recommendation for each device and problem: the fastest method with an error of at most
---max-error, or the most exact one whose call takes at most --max-time. Nats are the KL divergence of the posterior,
-lengths the shift of its mean, both at a comparable temperature; per cent are rays wrong by more than a cell, cells the
-range error that 95 % of the rays keep. Times are those of calls of --particles times --beams.
+--output DIR receives report.json and report.md with all points and the reasons of failures. --html FILE writes the
+interactive page of docs/error-vs-time.md for this measurement: time over error, the method for a budget, and
+performance profiles.
 
 --quick builds a table that takes more than 0.03 s once, and its time to build then includes compiling; a look-up table
 or CDDT serves both clouds of a scene.
-
---compare OLD repeats the measurements of the old report, with its particles, beams and seed unless options change
-them, and lists points that became slower or less exact; --compare OLD NEW compares two reports without measuring.
-
-Exit codes: 0 success, 1 something is less exact than in the old report, 2 bad input.
 
 examples:
   gpusense bench --quick --html bench.html
   gpusense bench --output results --backend opencl --backend warp:cpu
   gpusense bench --scene basement --method exact --method lookup --problem ranges
-  gpusense bench --map office.yaml --particles 10000 --beams 60 --max-error "0.01 nats" --max-time "1 ms"
-  gpusense bench --compare results/report.json"""
+  gpusense bench --map office.yaml --particles 10000 --beams 60 --max-error "0.01 nats" --max-time "1 ms\""""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's options."""
     add = parser.add_argument
-    add("--output", type=Path, metavar="DIR", help="folder for report and diagrams, created if absent")
+    add("--output", type=Path, metavar="DIR", help="folder for the reports, created if absent")
     add("--html", type=Path, metavar="FILE", help="interactive page of the measurement, one file that works offline")
-    add("--compare", nargs="+", type=Path, metavar=("OLD", "NEW"), help="compare with an old report, or two reports")
-    add("--slower", type=positive_number, default=1.3, metavar="F",
-        help="with --compare, factor of the times above which a point is slower (default: %(default)s)")  # fmt: skip
     add("--quick", action="store_true",
         help="small maps, few values of the knobs, float32: half a minute plus compiling")  # fmt: skip
     add("--scene", action="append", metavar="NAME", help="a scene; may be repeated (default: all)")
@@ -96,22 +82,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--checked", type=whole_number(low=2), metavar="M", help="particles whose errors are computed (default: 512)")
     add("--beams", type=whole_number(low=1, high=100_000), metavar="K", help="beams of the scanner (default: 360)")
     add("--repeats", type=whole_number(low=1), metavar="R", help="timed calls per point (default: 20; with --quick 10)")
-    add(
-        "--seconds",
-        type=positive_number,
-        metavar="S",
-        help="longest time of a point's timed calls, at least three [s] (default: 5; with --quick 0.02)",
-    )
+    add("--seconds", type=positive_number, metavar="S",
+        help="longest time of a point's timed calls, at least three [s] (default: 5; with --quick 0.02)")  # fmt: skip
     add("--build-limit", type=positive_number, metavar="S",
         help="leave out tables that take longer to build [s] (default: 60)")  # fmt: skip
-    add("--peers", type=Path, metavar="FILE", help="a Python file with outside candidates; it is executed")
-    add("--no-peers", action="store_true", help="no outside candidates")
     add("--max-error", action="append", default=[], type=_limit(parse_error), metavar="E",
         help="recommend the fastest method with at most this error, such as '0.01 nats', '2 cm', '1 %%' or '0.5 cells' "
         "(default: 0.01 nats, 1 %%); may be repeated with other units")  # fmt: skip
     add("--max-time", type=_limit(parse_time), metavar="T",
         help="recommend the most exact method whose call takes at most this time, such as '1 ms'")  # fmt: skip
-    add("--time", choices=("call", "launch"), default="call", help="time axis of the diagrams (default: %(default)s)")
     add("--seed", type=whole_number(low=0), metavar="N", help="seed of maps, scans and particles (default: 0)")
     add_json(parser)
 
@@ -129,69 +108,40 @@ def _limit(parse: Callable[[str], Any]) -> Callable[[str], Any]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, write the report and compare; after Ctrl-C write and print the points so far."""
-    from gpusense.evaluation.benchmark import compare as comparing
-    from gpusense.evaluation.benchmark.report import document, to_json
+    """Measure and write the report; after Ctrl-C write and print the points so far."""
+    from gpusense.evaluation.benchmark.report import document
     from gpusense.evaluation.benchmark.runner import Outcome, steps
     from gpusense.evaluation.benchmark.runner import run as run_plan
 
-    old, new = _reports(args)
-    measured, stopped = new is None, None
-    if new is None:
-        if args.output is not None:
-            _check_folder(args.output)
-        if args.html is not None:
-            check_writable(args.html)
-        plan, absent = make_plan(args, old)
-        outcome = Outcome([], [])
-        try:
-            with progress(steps(plan)) as step:
-                run_plan(plan, step, outcome)
-        except KeyboardInterrupt as stop:
-            if not outcome.points:
-                raise
-            stopped = stop
-        new = document(plan, outcome, arguments_of(args, plan), machine(), absent, command_of(sys.argv[1:]))
-        if args.output is not None:
-            write_report(args.output, new, to_json(new), args.time)
-        if args.html is not None:
-            write_page(args.html, new)
-    comparison = None if old is None or stopped is not None else comparing.compare(old, new, args.slower)
+    if args.output is not None:
+        _check_folder(args.output)
+    if args.html is not None:
+        check_writable(args.html)
+    plan, absent = make_plan(args)
+    outcome, stopped = Outcome([], []), None
+    try:
+        with progress(steps(plan)) as step:
+            run_plan(plan, step, outcome)
+    except KeyboardInterrupt as stop:
+        if not outcome.points:
+            raise
+        stopped = stop
+    report = document(plan, outcome, arguments_of(args, plan), machine(), absent, command_of(sys.argv[1:]))
+    if args.output is not None:
+        write_report(args.output, report)
+    if args.html is not None:
+        write_page(args.html, report)
     if args.json:
-        print_json(new if comparison is None else {"comparison": vars(comparison), "report": new if measured else None})
+        print_json(report)
     else:
-        if measured:
-            _print(new, args.output)
-            print("\n".join(["", *answers(new["points"], Wish(dict(args.max_error), args.max_time))]))
-        if comparison is not None:
-            print("\n".join(["", *comparing.lines_of(comparison, args.slower)]))
+        _print(report, Wish(dict(args.max_error), args.max_time), args.output)
     if stopped is not None:
         raise stopped
-    return LESS_EXACT if comparison is not None and comparison.less_exact else 0
+    return 0
 
 
-def _reports(args: argparse.Namespace) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
-    """Read the reports of ``--compare``: the old one and the new one, or None."""
-    from gpusense.evaluation.benchmark.stored import read_report
-
-    if not args.compare:
-        return None, None
-    if args.html is not None and len(args.compare) > 1:
-        raise ValueError("--html: must not be given with two reports of --compare, as nothing is measured")
-    if len(args.compare) > 2:
-        raise ValueError(f"--compare: must be one or two reports, got {len(args.compare)}")
-    if args.slower <= 1:
-        raise ValueError(f"--slower: must be > 1, got {args.slower:g}")
-    reports = [read_report(path) for path in args.compare]
-    return reports[0], reports[1] if len(reports) == 2 else None
-
-
-def make_plan(args: argparse.Namespace, old: Mapping[str, Any] | None) -> tuple[Plan, list[str]]:
-    """Make the plan of a run, and list absent devices and candidates with their reasons.
-
-    Args:
-        args: Arguments of the command.
-        old: The report of ``--compare``, whose arguments are defaults, or None.
+def make_plan(args: argparse.Namespace) -> tuple[Plan, list[str]]:
+    """Make the plan of a run, and list absent devices with their reasons.
 
     Raises:
         ValueError: an option names a scene, method or device that is not present.
@@ -200,15 +150,11 @@ def make_plan(args: argparse.Namespace, old: Mapping[str, Any] | None) -> tuple[
     from gpusense.evaluation.benchmark.runner import Plan
     from gpusense.evaluation.benchmark.scenes import sources
 
-    before = old["arguments"] if old is not None else {}
-    quick = args.quick or bool(before.get("quick"))
     numbers = {
-        name: getattr(args, name) if getattr(args, name) is not None else before.get(name, default)
-        for name, default in (QUICK if quick else DEFAULTS).items()
+        name: default if getattr(args, name) is None else getattr(args, name)
+        for name, default in (QUICK if args.quick else DEFAULTS).items()
     }
-    problems = args.problem or PROBLEMS
-    outside, absent = _outside(args, problems)
-    chosen = candidates(problems, quick=quick) + outside
+    chosen = candidates(args.problem or PROBLEMS, quick=args.quick)
     if args.method:
         names = list(dict.fromkeys(candidate.method for candidate in chosen))
         for method in args.method:
@@ -216,39 +162,17 @@ def make_plan(args: argparse.Namespace, old: Mapping[str, Any] | None) -> tuple[
                 raise ValueError(f"--method: must be one of {', '.join(names)}, got {method!r}")
         chosen = [candidate for candidate in chosen if candidate.method in args.method]
     backends, failures = open_backends(args.backend)
-    if quick and args.backend is None and len(backends) > 1:
+    if args.quick and args.backend is None and len(backends) > 1:
         backends = [backend for backend in backends if backend.info.backend != "numpy"]
     plan = Plan(
-        sources(args.scene or _names(old, args), args.map, quick=quick), backends, chosen,
-        args.precision or (PRECISIONS[:1] if quick else PRECISIONS),
-        build_limit=args.build_limit or (_QUICK_BUILD if quick else 60.0),
-        seconds=args.seconds or before.get("seconds") or (_QUICK_SECONDS if quick else 5.0),
-        deadline=_QUICK_DEADLINE if quick else float("inf"),
-        slow_to_make=_QUICK_TWICE if quick else None, **numbers,
+        sources(args.scene, args.map, quick=args.quick), backends, chosen,
+        args.precision or (PRECISIONS[:1] if args.quick else PRECISIONS),
+        build_limit=args.build_limit or (_QUICK_BUILD if args.quick else 60.0),
+        seconds=args.seconds or (_QUICK_SECONDS if args.quick else 5.0),
+        deadline=_QUICK_DEADLINE if args.quick else float("inf"),
+        slow_to_make=_QUICK_TWICE if args.quick else None, **numbers,
     )  # fmt: skip
-    return plan, [*_absent_devices(args.backend), *failures, *absent]
-
-
-def _names(old: Mapping[str, Any] | None, args: argparse.Namespace) -> list[str] | None:
-    """Return the scenes of an old report that are available here."""
-    from gpusense.evaluation.benchmark.scenes import sources
-
-    if old is None or args.map:
-        return None
-    available = [source.name for source in sources(quick=bool(old["arguments"].get("quick")))]
-    return [scene["name"] for scene in old["scenes"] if scene["name"] in available] or None
-
-
-def _outside(args: argparse.Namespace, problems: Sequence[str]) -> tuple[list[Candidate], list[str]]:
-    """Return the outside candidates that can run, and the reasons of those that cannot."""
-    from gpusense.evaluation.benchmark import peers
-
-    if args.no_peers and args.peers is not None:
-        raise ValueError("--no-peers: must not be given together with --peers")
-    file = None if args.no_peers else args.peers or peers.default_file()
-    listed = [] if file is None else peers.load(file, problems)
-    reasons = dict.fromkeys(f"{candidate.outside}: {candidate.missing}" for candidate in listed if candidate.missing)
-    return [candidate for candidate in listed if not candidate.missing], list(reasons)
+    return plan, [*_absent_devices(args.backend), *failures]
 
 
 def _absent_devices(selections: Sequence[str] | None) -> list[str]:
@@ -266,7 +190,6 @@ def arguments_of(args: argparse.Namespace, plan: Plan) -> dict[str, Any]:
         "precisions": list(plan.precisions), "build_limit": plan.build_limit,
         "max_error": [list(one) for one in args.max_error], "max_time": args.max_time,
         "problems": list(args.problem or PROBLEMS), "methods": args.method or [],
-        "peers": args.peers.name if args.peers else "",
     }  # fmt: skip
 
 
@@ -282,35 +205,13 @@ def _check_folder(folder: Path) -> None:
     check_writable((folder if folder.exists() else folder.parent) / "report.json")
 
 
-def write_report(folder: Path, report: Mapping[str, Any], text: str, timing: str) -> None:
-    """Write the diagrams, then the report as Markdown and as JSON, each file atomically.
-
-    Args:
-        folder: The folder, created if absent.
-        report: The report.
-        text: The report as JSON.
-        timing: Time of the diagrams, ``"call"`` or ``"launch"``.
-    """
-    from gpusense.evaluation.benchmark.profiles import profiles_of
-    from gpusense.evaluation.benchmark.report import markdown
-    from gpusense.plots.benchmark import MEASURES, Style, profile_figure, work_precision
-    from gpusense.plots.drawing import save
+def write_report(folder: Path, report: Mapping[str, Any]) -> None:
+    """Write the report as Markdown and as JSON, each file atomically; create an absent folder."""
+    from gpusense.evaluation.benchmark.report import markdown, to_json
 
     folder.mkdir(exist_ok=True)
-    points, images = report["points"], []
-    style = Style.of(points)
-    for problem, cloud in dict.fromkeys((point["problem"], point["cloud"]) for point in points):
-        group = [point for point in points if (point["problem"], point["cloud"]) == (problem, cloud)]
-        for measure in MEASURES[problem]:
-            name = f"{problem}-{measure[0]}-{cloud}.png"
-            save(work_precision(group, style, measure, timing), folder / name)
-            images.append((f"{problem}, {cloud} cloud: time over {measure[3]}", name))
-    profiles = profiles_of(points, timing)
-    if profiles:
-        save(profile_figure(profiles, points, style), folder / "profiles.png")
-        images.append(("Performance profiles", "profiles.png"))
-    write_whole(folder / "report.md", lambda stream: stream.write((markdown(report, images) + "\n").encode()))
-    write_whole(folder / "report.json", lambda stream: stream.write(text.encode()))
+    write_whole(folder / "report.md", lambda stream: stream.write((markdown(report) + "\n").encode()))
+    write_whole(folder / "report.json", lambda stream: stream.write(to_json(report).encode()))
 
 
 def write_page(file: Path, report: Mapping[str, Any]) -> None:
@@ -322,24 +223,22 @@ def write_page(file: Path, report: Mapping[str, Any]) -> None:
     write_whole(file, lambda stream: stream.write(page.encode()))
 
 
-def _print(report: Mapping[str, Any], folder: Path | None) -> None:
-    from gpusense.evaluation.benchmark.report import COLUMNS, RANGE_COLUMNS, TIMES, row
-
-    columns = ("scene", "cloud", "problem", *COLUMNS[:TIMES], *RANGE_COLUMNS, *COLUMNS[TIMES:])
-    kept = [columns.index(name) for name in (
-        "scene", "cloud", "problem", "backend", "method", "knob", "precision", "call ns", "launch ns", "build s", "p95",
-        "> 1 cell", "log p rms", "comparable KL",
-    )]  # fmt: skip
-    rows = [[point["scene"], point["cloud"], point["problem"], *row(point, extra=True)] for point in report["points"]]
-    named = [columns[i] for i in kept]
-    print_table(named, [[cells[i].replace("**", "") for i in kept] for cells in rows], right=named[7:])
+def _print(report: Mapping[str, Any], wish: Wish, folder: Path | None) -> None:
+    """Print the answers, the Pareto front of each device, and the points without a result."""
+    points = report["points"]
+    found = list(choices(points, wish))
+    for choice in found:
+        print(choice.answer)
+    for backend in dict.fromkeys(choice.backend for choice in found):
+        rows = [row for choice in found if choice.backend == backend for row in choice.rows]
+        print(f"\nbest methods on {backend}")
+        print_table(["problem", "method", "error", "time"], rows, right=["error", "time"])
     print()
-    for point in report["points"]:
+    for point in points:
         if point["status"] in ("failed", "unstable"):
             print(f"{point['status']}: {point['scene']}, {point['cloud']}, {point['backend']}, {point['method']}: "
                   f"{point['reason']}")  # fmt: skip
-    left = sum(point["status"] == "left out" for point in report["points"])
-    print(f"{len(report['points'])} points, {left} left out; truth: {report['truth']['device']}, float64")
+    left = sum(point["status"] == "left out" for point in points)
+    print(f"{len(points)} points, {left} left out; truth: {report['truth']['device']}, float64")
     print(machine_line())
-    if folder is not None:
-        print(f"written: {folder}")
+    print(f"written: {folder}" if folder is not None else "all points: --output DIR")

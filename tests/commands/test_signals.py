@@ -63,7 +63,7 @@ COMMANDS: dict[str, tuple[list[str], int, str]] = {
     "sweep": (["plan.yaml", "--table", "OUT/made.csv", "--device", "numpy"], 4, "made.csv has the finished jobs"),
     "landmarks": (["--folder", ".", "--robot", "1", "--backend", "numpy"], 1, "while localising; the noise of"),
     "selftest": (["--backend", "numpy", "--backend", "warp:cpu"], 2, "comparisons in"),
-    "bench": (["--quick", "--particles", "8", "--checked", "6", "--beams", "7", "--repeats", "1", "--no-peers",
+    "bench": (["--quick", "--particles", "8", "--checked", "6", "--beams", "7", "--repeats", "1",
                "--backend", "numpy", "--scene", "clutter", "--method", "exact", "--output", "OUT"], 3, "exact"),
     "demo": (["--particles", "400", "--beams", "20", "--backend", "numpy", "--output", "OUT/made.png"], 3,
              "Beam model: the likeliest of"),

@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from gpusense.evaluation.benchmark.profiles import error_of, label, pareto_front, setting, time_of
+from gpusense.evaluation.benchmark.points import error_of, label, setting, time_of
 
 ALIKE = 1.25
 """Factor of the times below which two methods are equally fast."""
@@ -151,17 +151,11 @@ def _quantity(text: str, units: Sequence[str], name: str) -> tuple[float, str]:
     return value, match[2]
 
 
-def call_time(point: Mapping[str, Any]) -> float | None:
-    """Return the least time of a point's calls [s]."""
-    return time_of(point, "call")
-
-
 def entries(
     points: Iterable[Mapping[str, Any]],
     problem: str,
     measure: Measure,
     backend: str,
-    timing: Callable[[Mapping[str, Any]], float | None] = call_time,
 ) -> list[Entry]:
     """Return the methods of a problem on one device, over all scenes and clouds where they were measured.
 
@@ -173,7 +167,6 @@ def entries(
         problem: The problem.
         measure: The measure of their errors.
         backend: Selection string of the device, or ``"outside"``.
-        timing: Time of a point [s]; None where it was not measured.
     """
     chosen = [point for point in points if point["problem"] == problem and point["backend"] == backend]
     places = {(point["scene"], point["cloud"]) for point in chosen if point["status"] != "left out"}
@@ -185,7 +178,7 @@ def entries(
     listed = []
     for (method, at, precision), group in groups.items():
         errors = [error_of(point, measure.kind, measure.name) for point in group]
-        times = [timing(point) for point in group]
+        times = [time_of(point, "call") for point in group]
         if any(value is None for value in (*errors, *times)):
             continue
         seconds = math.exp(sum(math.log(time or 1.0) for time in times) / len(times))
@@ -193,6 +186,24 @@ def entries(
         first = group[0]
         listed.append(Entry(backend, method, at, precision, error, seconds, first["code"], bool(first["exact"])))
     return listed
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Find the points that no other point dominates, that is, is no larger in both and smaller in one.
+
+    Args:
+        points: (error, time) of each point.
+
+    Returns:
+        Indices of these points by rising error; of equal points the first.
+    """
+    front: list[int] = []
+    fastest = math.inf
+    for i in sorted(range(len(points)), key=lambda i: (*points[i], i)):
+        if points[i][1] < fastest:
+            front.append(i)
+            fastest = points[i][1]
+    return front
 
 
 def front(listed: Sequence[Entry]) -> list[Entry]:
@@ -256,46 +267,47 @@ def time_text(seconds: float) -> str:
     return f"{seconds:.3g} s"
 
 
-def answers(points: Sequence[Mapping[str, Any]], wish: Wish) -> list[str]:
-    """Write lines that name the method to take, for each problem and device of a report.
+@dataclass(frozen=True)
+class Choice:
+    """The choice for a problem on a device.
+
+    Attributes:
+        backend: Selection string of the device.
+        answer: The limits, and the method within them with its time and error.
+        rows: Problem, method, error and time of the methods on the Pareto front.
+    """
+
+    backend: str
+    answer: str
+    rows: Sequence[tuple[str, str, str, str]]
+
+
+def choices(points: Sequence[Mapping[str, Any]], wish: Wish) -> Iterator[Choice]:
+    """Yield the choice for each problem and device of a report.
 
     Args:
         points: Points of a report.
         wish: The limits; a problem without a limit in its unit takes the limit of ``DEFAULTS``, or only the limit of
             time.
     """
-    lines: list[str] = []
-    for problem in dict.fromkeys(point["problem"] for point in points):
-        own = [point for point in points if point["problem"] == problem]
+    for problem, backend in dict.fromkeys((point["problem"], point["backend"]) for point in points):
         measures = MEASURES[problem]
         unit = next((unit for unit in wish.errors if unit in measures), None)
         limit = wish.errors[unit] if unit is not None else None
         if unit is None and wish.seconds is None:
             unit, limit = DEFAULTS[problem]
         measure = measures[unit if unit is not None else DEFAULTS[problem][0]]
-        for backend in dict.fromkeys(point["backend"] for point in own):
-            listed = entries(own, problem, measure, backend)
-            lines += _lines_of(listed, own, problem, measure, backend, limit, wish.seconds)
-    return lines
-
-
-def _lines_of(
-    listed: Sequence[Entry],
-    points: Sequence[Mapping[str, Any]],
-    problem: str,
-    measure: Measure,
-    backend: str,
-    limit: float | None,
-    seconds: float | None,
-) -> list[str]:
-    size = next(f"{p['particles']} x {p['beams']}" for p in points if p["backend"] == backend)
-    wanted = [f"error at most {error_text(limit, measure.unit)}"] if limit is not None else []
-    wanted += [f"at most {time_text(seconds)}"] if seconds is not None else []
-    chosen, title = choose(listed, limit, seconds), f"{problem} on {backend}, {size}, {', '.join(wanted)}"
-    if chosen is None:
-        return [f"{title}: no method"]
-    found = f"{chosen.text}: {time_text(chosen.seconds)}, {error_text(chosen.error, measure.unit)}"
-    shown = ", ".join(
-        f"{entry.text} ({time_text(entry.seconds)}, {error_text(entry.error, measure.unit)})" for entry in front(listed)
-    )
-    return [f"{title}: {found}", f"  best for some error or time: {shown}"]
+        listed = entries(points, problem, measure, backend)
+        size = next(
+            f"{p['particles']} x {p['beams']}" for p in points if (p["problem"], p["backend"]) == (problem, backend)
+        )
+        wanted = [f"error at most {error_text(limit, measure.unit)}"] if limit is not None else []
+        wanted += [f"at most {time_text(wish.seconds)}"] if wish.seconds is not None else []
+        best, found = choose(listed, limit, wish.seconds), "no method"
+        if best is not None:
+            found = f"{best.text}: {time_text(best.seconds)}, {error_text(best.error, measure.unit)}"
+        rows = [
+            (problem, one.text.removesuffix(", float32"), error_text(one.error, measure.unit), time_text(one.seconds))
+            for one in front(listed)
+        ]
+        yield Choice(backend, f"{problem} on {backend}, {size}, {', '.join(wanted)}: {found}", rows)

@@ -9,14 +9,14 @@ import subprocess
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
-from gpusense.evaluation.benchmark import peers
-from gpusense.evaluation.benchmark.profiles import label, profiles_of, setting
+from gpusense.evaluation.benchmark.points import label, setting
 from gpusense.evaluation.benchmark.runner import Outcome, Plan
 
 SCHEMA = 2
-"""Version of the report's fields; ``--compare`` accepts reports of this version only."""
+"""Version of the report's fields."""
 
 _DIGITS = 6
 
@@ -70,7 +70,6 @@ def document(
         "truth": outcome.truth,
         "scenes": outcome.scenes,
         "points": outcome.points,
-        "profiles": profiles_of(outcome.points),
     }
     return {key: plain(item) for key, item in value.items()}
 
@@ -100,8 +99,8 @@ def to_json(report: Mapping[str, Any]) -> str:
 
 def commit() -> str | None:
     """Return the commit of the package's checkout, with a plus if files differ; None outside a checkout."""
-    root = peers.checkout()
-    if root is None:
+    root = Path(__file__).resolve().parents[3]
+    if not ((root / "pyproject.toml").is_file() and (root / "gpusense").is_dir()):
         return None
 
     def git(*words: str) -> str:
@@ -113,13 +112,8 @@ def commit() -> str | None:
     return None
 
 
-def markdown(report: Mapping[str, Any], images: Sequence[tuple[str, str]] = ()) -> str:
-    """Format a report as Markdown.
-
-    Args:
-        report: A report of :func:`document`.
-        images: Title and file name of each diagram.
-    """
+def markdown(report: Mapping[str, Any]) -> str:
+    """Format a report of :func:`document` as Markdown."""
     machine, truth = report["machine"], report["truth"]
     facts = ", ".join(f"{name} {value}" for name, value in machine.items())
     lines = [
@@ -130,12 +124,7 @@ def markdown(report: Mapping[str, Any], images: Sequence[tuple[str, str]] = ()) 
         f"Arguments: {', '.join(f'{key} {value}' for key, value in report['arguments'].items())}.", "", _READING, "",
         "## Scenes", "", *_scene_table(report["scenes"]), "",
     ]  # fmt: skip
-    if images:
-        lines += ["## Diagrams", ""]
-        for title, name in images:
-            lines += [f"![{title}]({name})", ""]
     points = report["points"]
-    lines += _profile_table(report["profiles"])
     for status, title in (("failed", "Failed"), ("unstable", "Unstable"), ("left out", "Left out")):
         lines += _reasons(title, [point for point in points if point["status"] == status])
     groups = dict.fromkeys((p["problem"], p["scene"], p["cloud"]) for p in points)
@@ -166,23 +155,6 @@ def _scene_table(scenes: Sequence[Mapping[str, Any]]) -> list[str]:
         for s in scenes for name, c in s["clouds"].items()
     ]  # fmt: skip
     return table(columns, rows, 2)
-
-
-def _profile_table(profiles: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Format where each curve of the performance profiles begins and ends."""
-    lines = []
-    for profile in profiles:
-        rows = []
-        for curve in profile["curves"]:
-            steps = curve["steps"]
-            first = next((share for ratio, share in steps if ratio == 1), 0.0)
-            rows.append((curve["backend"], curve["method"], curve["setting"], curve["precision"], f"{first:.2g}",
-                         f"{steps[-1][1]:.2g}", f"{steps[-1][0]:.3g}"))  # fmt: skip
-        rows.sort(key=lambda row: (-float(row[5]), float(row[6])))
-        columns = ("backend", "method", "knob", "precision", "share where fastest", "share solved", "within times")
-        title = f"{profile['problem']} on a {profile['kind']}, {profile['limit']}, {len(profile['problems'])} problems"
-        lines += [f"### Profile: {title}", "", *table(columns, rows, 4), ""]
-    return ["## Performance profiles", "", *lines] if lines else []
 
 
 def _reasons(title: str, points: Sequence[Mapping[str, Any]]) -> list[str]:

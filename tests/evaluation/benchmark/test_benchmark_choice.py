@@ -107,10 +107,11 @@ def test_a_method_is_judged_by_its_worst_scene_and_must_work_in_all():
     ]
     (only,) = choice.entries(points, "beam", choice.KL, "numpy")
     assert (only.method, only.error, only.seconds) == ("exact", 0.3, pytest.approx(2.0))
-    lines = choice.answers(points, choice.Wish({"nats": 0.1}))
-    assert lines == ["beam on numpy, 10 x 10, error at most 0.1 nats: no method"]
-    lines = choice.answers(points, choice.Wish({"nats": 0.4}, 3.0))
-    assert lines[0] == "beam on numpy, 10 x 10, error at most 0.4 nats, at most 3 s: exact, float32: 2 s, 0.3 nats"
+    (found,) = choice.choices(points, choice.Wish({"nats": 0.1}))
+    assert found.answer == "beam on numpy, 10 x 10, error at most 0.1 nats: no method"
+    (found,) = choice.choices(points, choice.Wish({"nats": 0.4}, 3.0))
+    assert found.answer == "beam on numpy, 10 x 10, error at most 0.4 nats, at most 3 s: exact, float32: 2 s, 0.3 nats"
+    assert found.rows == [("beam", "exact", "0.3 nats", "2 s")]
 
 
 def test_limits_have_units():

@@ -11,6 +11,9 @@ from pathlib import Path
 
 import pytest
 
+# Workers fill the processor: threads of linear algebra would wait for each other. NumPy reads this when it is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from gpusense.backends import Backend, arrays, get_backend
 from gpusense.backends.base import Adopted
 
@@ -37,9 +40,20 @@ QUICK = (
 
 
 GOLDEN = (5**0.5 - 1) / 2
+# Part of a test's sample that runs by default; the rest is long.
+BRIEF = 1 / 3
 
 # Objects of collection live as long as the tests: looking for garbage among them takes a quarter of its time.
 gc.disable()
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """Return a worker for each usable core; none for tests of a single file, which stay in this process."""
+    files = {Path(argument.split("::")[0]) for argument in config.args}
+    if len(files) == 1 and files.pop().is_file():
+        return 0
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def pytest_collection_finish() -> None:
@@ -50,9 +64,11 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of the subset, and as slow the settings beyond the sample of a test."""
+    """Mark the tests of the subset, and as slow or long the settings beyond the samples of a test."""
     number: Counter[str] = Counter()
     kept: set[tuple[str, str]] = set()
+    brief: set[tuple[str, str]] = set()
+    beyond_brief: dict[tuple[str, str], list[pytest.Item]] = defaultdict(list)
     left: dict[tuple[str, str], list[pytest.Item]] = defaultdict(list)
     for item in items:
         sampled = item.get_closest_marker("sampled")
@@ -64,8 +80,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker("slow")
                 continue
             # Multiples of the golden ratio spread evenly over every parameter, whatever the order of its values.
-            if number[function] * GOLDEN % 1 < sampled.args[0]:
+            place = number[function] * GOLDEN % 1
+            if place < sampled.args[0]:
                 kept.add(where)
+                if place < BRIEF * sampled.args[0]:
+                    brief.add(where)
+                else:
+                    beyond_brief[where].append(item)
             else:
                 left[where].append(item)
             number[function] += 1
@@ -73,9 +94,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         # A sample leaves out no backend that its marker does not name.
         for item in beyond if where in kept else beyond[1:]:
             item.add_marker("slow")
+    for where, beyond in beyond_brief.items():
+        for item in beyond if where in brief else beyond[1:]:
+            item.add_marker("long")
     for item in items:
         path = item.path.relative_to(Path(__file__).parent).as_posix()
-        slow = item.get_closest_marker("slow") is not None
+        slow = any(item.get_closest_marker(name) is not None for name in ("slow", "long"))
         if not slow and any(path == part or path.startswith(f"{part}/") for part in QUICK):
             item.add_marker("quick")
 

@@ -201,6 +201,7 @@ def test_all_backends_present_agree(capsys):
 
 # The command's scenes cause no warning.
 @pytest.mark.filterwarnings("error::gpusense.world.plausible.PlausibilityWarning")
+@pytest.mark.long
 def test_json_lists_every_comparison(capsys):
     code, out, err = run(capsys, "--json", "--backend", "numpy")
     assert err == ""

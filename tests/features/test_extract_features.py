@@ -157,6 +157,7 @@ def test_devices_agree_with_the_reference(device, beams, noise):
     np.testing.assert_allclose(found.information, expected.information, rtol=1e-4, atol=1e-3)
 
 
+@pytest.mark.long
 def test_float32_finds_nearly_the_same(device, monkeypatch):
     scanner = ring(360)
     ranges, _ = floor_scans(1, scanner, 0.02)

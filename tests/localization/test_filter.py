@@ -109,6 +109,7 @@ def tracked(backend, count=400, **options):
     "options",
     [{}, dict(stages=1), dict(resampling="stratified"), dict(resampling="residual"), dict(particles=(200, 600))],
 )
+@pytest.mark.sampled(1.0)
 def test_a_robot_in_a_room_is_tracked(backend, options):
     pf, pose = tracked(backend, options.pop("particles", 400), **options)
     for method in ("mean", "cluster"):

@@ -197,6 +197,7 @@ def run_step(selection, count, flags=PLAIN, *, lanes=True, draws=c.SYSTEMATIC, l
 @pytest.mark.parametrize("count", [1, 37, 1500])
 @pytest.mark.parametrize("flags", [PLAIN, frozenset({"FLOAT64"})], ids=["float32", "float64"])
 @pytest.mark.parametrize("lanes", [False, True], ids=["scalars", "lanes"])
+@pytest.mark.sampled(1.0)
 def test_every_backend_has_the_bits_of_the_reference(backend, count, flags, lanes):
     expected, found = run_step("numpy", count, flags), run_step(backend, count, flags, lanes=lanes)
     for name, values in expected.items():

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
 import tomllib
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -112,3 +114,20 @@ def test_what_is_published_is_sound_and_small(tmp_path):
     check = [sys.executable, "-m", "twine", "check", "--strict", *files]
     done = subprocess.run(check, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
+
+
+def test_a_worker_for_each_core_and_none_for_a_file(pytestconfig: pytest.Config) -> None:
+    """Several files or a folder get workers without threads of linear algebra; tests of one file stay in a process."""
+
+    def workers(*arguments: str) -> int:
+        count: int = pytestconfig.hook.pytest_xdist_auto_num_workers(config=SimpleNamespace(args=arguments))
+        return count
+
+    assert (
+        workers(__file__)
+        == workers(f"{__file__}::test_a")
+        == workers(f"{__file__}::test_a", f"{__file__}::test_b")
+        == 0
+    )
+    assert workers("tests") == workers(__file__, str(ROOT / "tests" / "conftest.py")) >= 1
+    assert os.environ["OPENBLAS_NUM_THREADS"] != ""

@@ -107,6 +107,7 @@ def hashes(backend: str) -> str:
     return "".join(f"{kind} {p} {hashlib.sha256(bits.tobytes()).hexdigest()}\n" for (kind, p), bits in results.items())
 
 
+@pytest.mark.long
 def test_in_a_fresh_process(needs):
     """Another process orders sets of flags differently, and has a single thread."""
     from support.selection import BACKENDS

@@ -42,6 +42,7 @@ def model_of(score: dict, grid: gs.OccupancyGrid, scanner: gs.Scanner, backend: 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize("peer", ["amcl", "beluga"])
 @pytest.mark.parametrize("scene", SCENES, ids=["building", "corridor", "short"])
+@pytest.mark.sampled(1.0)
 def test_weights_are_those_of_the_compiled_peers(scene, peer, precision, backend):
     grid, scanner, poses, ranges = scene_of(scene, peer)
     scores = [score for score in scene["scores"] if score["peer"] == peer]
@@ -54,6 +55,7 @@ def test_weights_are_those_of_the_compiled_peers(scene, peer, precision, backend
 
 @pytest.mark.parametrize("peer", ["amcl", "beluga"])
 @pytest.mark.parametrize("scene", SCENES, ids=["building", "corridor", "short"])
+@pytest.mark.sampled(1.0)
 def test_ranges_are_those_of_the_compiled_peers(scene, peer, backend):
     grid, scanner, poses, _ = scene_of(scene, peer)
     model = gs.BeamModel(grid, scanner, compat=peer, backend=backend, precision="float64")
@@ -74,6 +76,7 @@ def line_to(cell: tuple[int, int], peer: str, backend: str) -> float:
     return float(model.expected_ranges([(0.5, 0.5, 0.0)])[0, 0])
 
 
+@pytest.mark.long
 def test_lines_midway_between_cells(backend):
     """The line to (2, 1) passes midway between (1, 0) and (1, 1): nav2_amcl takes the latter, Beluga the former."""
     root = pytest.approx(math.sqrt(5), rel=1e-6)

@@ -23,13 +23,10 @@ from gpusense.commands.scans import add_choice, add_log
 from gpusense.localization.defaults import DEFAULTS
 
 if TYPE_CHECKING:
+    from gpusense.commands.localize_report import Recorder
     from gpusense.evaluation.steps import Step
     from gpusense.evaluation.tracking import Track
     from gpusense.localization.filter import ParticleFilter
-    from gpusense.plots.animation import Animation
-    from gpusense.plots.viewer import Recording
-
-    Recorder = Recording | Animation
 
 NAME = "localize"
 HELP = "Localise a robot along a recorded log with a particle filter."

@@ -14,9 +14,12 @@ from gpusense.commands.scans import scan_times
 from gpusense.evaluation.machine import machine, machine_line
 
 if TYPE_CHECKING:
-    from gpusense.commands.localize import Recorder
     from gpusense.evaluation.tracking import Track
     from gpusense.localization.filter import ParticleFilter
+    from gpusense.plots.animation import Animation
+    from gpusense.plots.viewer import Recording
+
+    Recorder = Recording | Animation
 
 
 # Figures that are not a single number.

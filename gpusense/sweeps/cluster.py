@@ -28,6 +28,7 @@ from gpusense._util.extras import library
 from gpusense.sweeps.executors import device_names
 from gpusense.sweeps.on_worker import DEVICES, answer, one_start, processes
 from gpusense.sweeps.process import WorkerDied, result_of
+from gpusense.sweeps.worker import error_text
 
 _LOG = logging.getLogger("gpusense")
 _LOOPBACK = "127.0.0.1"
@@ -163,7 +164,14 @@ class DaskExecutor(Executor):
         return bool(self._client.status == "running" and not self._client.scheduler_comm.comm.closed())
 
     def _watch(self) -> None:
-        """Follow the workers of the cluster until it is lost."""
+        """Follow the workers of the cluster until it is lost; no call may wait for a watch that has failed."""
+        try:
+            self._follow()
+        except Exception as error:
+            _LOG.error("sweep: the workers could not be followed", exc_info=True)
+            self._lose(f"the workers could not be followed: {error_text(error)}")
+
+    def _follow(self) -> None:
         answered = present = time.monotonic()
         while not self._end.wait(_LOOK):
             workers, now = self._workers() if self.alive else None, time.monotonic()

@@ -220,3 +220,13 @@ def test_a_cluster_of_this_machine_may_use_tls(tmp_path):
         assert executor.address.startswith("tls://127.0.0.1:")
         assert all(address.startswith("tls://127.0.0.1:") for address in executor._workers())
         assert executor.submit(abs, -3).result(timeout=60) == 3
+
+
+def test_a_watch_that_fails_ends_the_calls():
+    with gs.sweep.DaskExecutor(timeout=60) as executor:
+        running = executor.submit(time.sleep, 600)
+        queued = executor.submit(abs, 1)
+        executor._usable = lambda workers: 1 / 0
+        for future in (running, queued):
+            with pytest.raises(OSError, match="the workers could not be followed: ZeroDivisionError"):
+                future.result(timeout=60)

@@ -69,6 +69,17 @@ class _Beacons(Problem):
                 starts.append(np.array([math.log(narrow * spread), weight, *heavy, *each]))
         return starts
 
+    def ordered(self, theta: Floats) -> Floats:
+        """See Problem.ordered: the narrow normal comes first; a normal without weight comes last and repeats sigma."""
+        if self.kind != "mixture":
+            return theta
+        ordered = theta.copy()
+        if theta[3] == 1 or (theta[3] > 0 and theta[0] > theta[2]):
+            ordered[[0, 2]], ordered[3] = theta[[2, 0]], 1 - theta[3]
+        if ordered[3] == 0:
+            ordered[2] = ordered[0]
+        return ordered
+
     def log_p(self, theta: Floats) -> tuple[Floats, Floats]:
         bias = self._bias(theta)
         mean = self.distances + bias
@@ -136,8 +147,9 @@ def fit_beacon_parameters(
     """Fit the parameters of ranges to beacons to readings at known poses, by maximum likelihood.
 
     The likelihood is :class:`BeaconModel`'s. Deviations, weights and offsets are fitted; the degrees of freedom of a
-    Student t are fixed. Starts come from the median and the densest part of the residuals, which are robust to
-    outliers.
+    Student t are fixed. In a mixture sigma_range is at most sigma_heavy. Where one normal suffices, heavy_weight is 0
+    and sigma_heavy equals sigma_range. Starts come from the median and the densest part of the residuals, which are
+    robust to outliers.
 
     Args:
         poses: (S, 3) robot poses [m, m, rad], or (F, 3) with ``ids``.

@@ -52,6 +52,10 @@ class Problem(ABC):
     def values(self, theta: Floats) -> dict[str, float]:
         """Return the parameters by name."""
 
+    def ordered(self, theta: Floats) -> Floats:
+        """Return coordinates of the same likelihood with exchangeable parts in their order."""
+        return theta
+
     def part(self, every: int) -> Problem:
         """Return the problem of every ``every``-th reading."""
         changes: dict[str, Any] = {name: getattr(self, name)[::every] for name in self.per_reading}

@@ -8,7 +8,7 @@ and Wright, *Numerical Optimization*, sections 3.4 and 16.7).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,7 @@ class Climb:
 
 
 def maximize(problem: Problem, max_iterations: int, tolerance: float, start: Floats | None = None) -> Climb:
-    """Search from the likeliest starts: first on a subset of many readings, then on all.
+    """Search from the likeliest starts, and return the end with the problem's parts in their order.
 
     Args:
         problem: The problem.
@@ -51,6 +51,16 @@ def maximize(problem: Problem, max_iterations: int, tolerance: float, start: Flo
         tolerance: A search has converged once it expects to gain less than this [nats].
         start: The only start; None for those of the problem.
     """
+    end = _best_end(problem, max_iterations, tolerance, start)
+    theta = problem.ordered(end.theta)
+    if np.array_equal(theta, end.theta):
+        return end
+    # Which of several equal maxima a search reaches depends on rounding.
+    return replace(end, theta=theta, free=_free(theta, problem.total(theta)[1], *problem.bounds()))
+
+
+def _best_end(problem: Problem, max_iterations: int, tolerance: float, start: Floats | None) -> Climb:
+    """Return the end of the likeliest search, first on a subset of many readings, then on all; see :func:`maximize`."""
     if start is not None:
         return climb(problem, start, max_iterations, tolerance)
     every = max(1, problem.readings // _SAMPLE)

@@ -20,7 +20,7 @@ from gpusense.backends.cache import BinaryCache
 from gpusense.backends.info import BackendInfo, ProcessBound
 from gpusense.backends.opencl import arrays, pocl, pocl_kernels
 from gpusense.backends.opencl.caches import new_kernel, without_caches
-from gpusense.backends.opencl.devices import shares_memory
+from gpusense.backends.opencl.devices import group_multiple, shares_memory
 from gpusense.backends.opencl.launch import Launch, watch
 from gpusense.backends.opencl.memory import SHARED, DeviceBuffer, SharedBuffer, driver_errors, raise_clearly
 from gpusense.backends.opencl.replay import OpenCLRecording
@@ -264,7 +264,7 @@ class OpenCLBackend(ProcessBound, Backend):
         name = pocl_kernels.own_name(kernel, key) if self._of_bitcode else kernel
         compiled = new_kernel(program, name)
         limit = compiled.get_work_group_info(cl.kernel_work_group_info.WORK_GROUP_SIZE, self._device)
-        return Launch(self, compiled, row, flags, limit, first)
+        return Launch(self, compiled, row, flags, limit, first, group_multiple(compiled, self._device))
 
     def _build(self, file: str, flags: frozenset[str]) -> tuple[cl.Program, str]:
         """Build the program of a kernel file; return it with its key in the cache."""

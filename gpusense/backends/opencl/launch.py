@@ -49,6 +49,7 @@ class Launch:
         flags: frozenset[str],
         limit: int,
         first: Callable[[], None] | None = None,
+        multiple: int = 1,
     ) -> None:
         self._backend, self._kernel = backend, kernel
         # Most work-items of a group of the kernel on the device.
@@ -61,7 +62,7 @@ class Launch:
         elif "IN_TEAMS" in flags:
             self._group = team_of(row, flags)
         if "IN_TEAMS" not in flags:
-            self._group = min(self._group, limit)
+            self._group = min(-(-self._group // multiple) * multiple, limit)
         self._lock = threading.Lock()
         real = np.dtype(np.float64 if "FLOAT64" in flags else np.float32)
         # With its types set, pyopencl sets all arguments in 1 us; otherwise a single number takes 6 us.

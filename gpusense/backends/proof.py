@@ -32,7 +32,7 @@ _HANGS, _HUNG = re.compile(r"\bhangs?\b"), "\nhung"
 # Remedies by the words of a failure.
 _REMEDIES = (
     # These failures already name the remedy.
-    (r"compiled kernels need a folder|PoCL was used before", ""),
+    (r"compiled kernels need a folder|PoCL was used before|needs a Turing GPU", ""),
     (
         r'"ld" doesn\'t exist|linker command failed',
         "install the linker ld (on Debian: apt-get install binutils), then run 'gpusense devices --prove'",

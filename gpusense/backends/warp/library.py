@@ -15,6 +15,12 @@ from gpusense.backends.warp.settings import initialize, trouble
 
 # There where the module of the driver is loaded.
 _DRIVER = "/proc/driver/nvidia/version"
+# First drivers of CUDA's major versions.
+_DRIVERS = {12: "R525", 13: "R580"}
+# Least compute capability of CUDA 13, a Turing GPU, as Warp writes it.
+_TURING = 75
+# Wheels of later versions are built with CUDA 13.
+_OLDER_WARP = 'pip install "warp-lang<1.18"'
 
 
 class WarpLibrary(Library):
@@ -28,7 +34,7 @@ class WarpLibrary(Library):
         return WarpBackend(info, handle)
 
     def trouble(self, handle: str) -> str:
-        return trouble()
+        return _trouble_of_card(wp.get_device(handle)) or trouble()
 
     def absent(self) -> list[Absent]:
         kinds = {info.kind for info, _ in self.list_devices()}
@@ -57,8 +63,24 @@ def _describe(device: wp.Device) -> BackendInfo:
     )
 
 
+def _trouble_of_card(device: wp.Device) -> str:
+    """Return why Warp compiles nothing for a card, with the remedy; empty where it does."""
+    toolkit = wp.get_cuda_toolkit_version()
+    if not device.is_cuda or toolkit is None or toolkit[0] < 13 or device.arch >= _TURING:
+        return ""
+    has, least = ("{}.{}".format(*divmod(arch, 10)) for arch in (device.arch, _TURING))
+    needed = f"Warp {wp.__version__} needs a Turing GPU or newer (compute capability {least})"
+    return f"{needed}, and this one has {has}: {_OLDER_WARP}"
+
+
 def _cuda_remedy() -> str:
     """Return why there is no CUDA device, with the remedy: a driver that is installed is not to be installed."""
+    driver, toolkit = wp.get_cuda_driver_version(), wp.get_cuda_toolkit_version()
+    if driver is not None and toolkit is not None and driver[0] < toolkit[0]:
+        needed = f"CUDA {toolkit[0]}" + (f" ({_DRIVERS[toolkit[0]]} or newer)" if toolkit[0] in _DRIVERS else "")
+        older = f", or {_OLDER_WARP}" if toolkit[0] >= 13 and driver[0] == 12 else ""
+        has = "CUDA {}.{}".format(*driver)
+        return f": NVIDIA's driver has {has}, and Warp {wp.__version__} needs {needed}: update the driver{older}"
     hiding = os.environ.get("CUDA_VISIBLE_DEVICES")
     if hiding is not None:
         return f" with CUDA_VISIBLE_DEVICES={hiding!r}: unset this variable where the machine has one"

@@ -11,10 +11,12 @@ import time
 import weakref
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+import gpusense as gs
 from gpusense.backends import Backend, get_backend
 from gpusense.interface.structs import ScanBatch, Score, Window
 
@@ -227,3 +229,50 @@ def test_an_error_in_another_thread_is_raised(field_launch) -> None:
     launch._launch = fail
     with pytest.raises(MemoryError, match="no more"):
         run(launch)
+
+
+OLDER = 'pip install "warp-lang<1.18"'
+
+
+@pytest.mark.parametrize(
+    "driver, toolkit, reason",
+    [
+        ((12, 4), (13, 4), f"CUDA 12.4, and Warp {{}} needs CUDA 13 (R580 or newer): update the driver, or {OLDER}"),
+        # No Warp that gpusense allows runs with this driver.
+        ((11, 8), (13, 4), "CUDA 11.8, and Warp {} needs CUDA 13 (R580 or newer): update the driver"),
+        ((11, 8), (12, 9), "CUDA 11.8, and Warp {} needs CUDA 12 (R525 or newer): update the driver"),
+        ((13, 0), (14, 1), "CUDA 13.0, and Warp {} needs CUDA 14: update the driver"),
+    ],
+)
+def test_a_driver_that_is_too_old_for_warp_is_named_with_the_remedy(
+    driver: tuple[int, int],
+    toolkit: tuple[int, int],
+    reason: str,
+    warp_backend: Backend,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    wp = pytest.importorskip("warp")
+    monkeypatch.setattr(wp, "get_devices", lambda: [wp.get_device("cpu")])
+    monkeypatch.setattr(wp, "get_cuda_driver_version", lambda: driver)
+    monkeypatch.setattr(wp, "get_cuda_toolkit_version", lambda: toolkit)
+    (absent,) = [device for device in gs.devices() if device.name == "CUDA (absent)"]
+    assert absent.reason.endswith(f"NVIDIA's driver has {reason.format(wp.__version__)}")
+
+
+@pytest.mark.parametrize("arch, toolkit, refused", [(70, (13, 4), True), (75, (13, 4), False), (61, (12, 9), False)])
+def test_a_card_that_is_too_old_for_warp_is_named_with_the_remedy(
+    arch: int, toolkit: tuple[int, int], refused: bool, warp_backend: Backend, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wp = pytest.importorskip("warp")
+    card = SimpleNamespace(is_cuda=True, arch=arch, name="Tesla V100", alias="cuda:0", total_memory=1 << 34)
+    monkeypatch.setattr(wp, "get_devices", lambda: [card])
+    monkeypatch.setattr(wp, "get_device", lambda alias: card)
+    monkeypatch.setattr(wp, "get_cuda_driver_version", lambda: (13, 0))
+    monkeypatch.setattr(wp, "get_cuda_toolkit_version", lambda: toolkit)
+    monkeypatch.setenv("GPUSENSE_PROOF", "off")
+    (found,) = [device for device in gs.devices() if device.selection == "warp:cuda:0"]
+    assert found.available is not refused
+    if refused:
+        assert found.reason == (
+            f"Warp {wp.__version__} needs a Turing GPU or newer (compute capability 7.5), and this one has 7.0: {OLDER}"
+        )

@@ -6,7 +6,7 @@ import dataclasses
 import gc
 import os
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 import pytest
@@ -21,7 +21,7 @@ from gpusense.backends.base import Adopted
 pytest.register_assert_rewrite("support")
 from support.array_libraries import Array, counted_copies, installed  # noqa: E402
 from support.map_files import yaml_text  # noqa: E402
-from support.selection import BACKENDS, present, skip_or_fail  # noqa: E402
+from support.selection import BACKENDS, NO_FLOAT64, lacks_float64, present, skip_or_fail  # noqa: E402
 
 # JAX would reserve three quarters of a GPU's memory in each process that imports it.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
@@ -102,6 +102,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         slow = any(item.get_closest_marker(name) is not None for name in ("slow", "long"))
         if not slow and any(path == part or path.startswith(f"{part}/") for part in QUICK):
             item.add_marker("quick")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, object, object]:
+    """Skip a test that computes in float64 where a tested device has none."""
+    try:
+        return (yield)
+    except ValueError as error:
+        if NO_FLOAT64.search(str(error)) and lacks_float64():
+            pytest.skip(str(error))
+        raise
 
 
 @pytest.fixture

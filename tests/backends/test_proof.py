@@ -13,7 +13,7 @@ from support import fake_driver
 
 import gpusense as gs
 from gpusense._util import files
-from gpusense.backends import BackendInfo, child, proof, selection
+from gpusense.backends import BackendInfo, child, get_backend, proof, selection
 from gpusense.backends.child import Outcome
 from gpusense.backends.proof import FLOAT64, SCALAR, VECTORS, Verdict, verdict_on
 
@@ -238,6 +238,25 @@ def test_the_scene_passes_on_real_devices_with_every_setting(needs, family, lane
     begun = [report["begin"] for report in said if "begin" in report]
     assert (FLOAT64 in begun) == float64
     assert (VECTORS in begun) == (lanes > 1)
+
+
+def test_a_driver_that_ends_long_loops_early_is_unusable(needs, monkeypatch):
+    """Mesa's llvmpipe ends all loops of a work-group after 65 535 steps; small scenes do not show it."""
+    from gpusense.evaluation import proof as scene
+
+    info, right = get_backend(needs("opencl")).info, scene.distance_transform
+
+    def cut(cells, *, squared, backend):
+        found = right(cells, squared=squared, backend=backend)
+        if backend.info.backend == "opencl":
+            found.ravel()[: max(cells.shape[1] - 30_000, 0)] = 0
+        return found
+
+    monkeypatch.setattr(scene, "distance_transform", cut)
+    said = []
+    scene.prove({"info": dataclasses.asdict(info)}, said.append)
+    assert said[0] == {"begin": SCALAR}
+    assert said[-1]["wrong"].startswith("1 x 32767 cells, distance transform: 2723 cells that differ")
 
 
 # ---- drivers that really fail

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 from collections.abc import Callable, Iterable
 
 import pytest
@@ -12,6 +13,14 @@ from gpusense.backends import get_backend
 
 # Where tests run; on a machine with a GPU for instance GPUSENSE_TEST_BACKENDS=numpy,opencl,warp:cuda:0.
 BACKENDS = os.environ.get("GPUSENSE_TEST_BACKENDS", "numpy,opencl,warp:cpu").split(",")
+
+# Errors of devices without float64.
+NO_FLOAT64 = re.compile(r"which has no float64|computes in float64, which .* does not have")
+
+
+def lacks_float64() -> bool:
+    """Return whether a tested device has no float64."""
+    return any(not get_backend(name).info.float64 for name in BACKENDS)
 
 
 def required(feature: str) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from support.scan_calls import GRID, SCANNER, cloud, scan
@@ -21,4 +23,21 @@ def test_groups_shrink_to_the_limit_of_a_kernel(as_gpu, monkeypatch, limit):
     monkeypatch.setattr(cl, "enqueue_nd_range_kernel", lambda *launch: (groups.add(launch[3][0]), enqueue(*launch))[1])
     found = gs.BeamModel(GRID, SCANNER, backend=as_gpu).log_likelihood(cloud(1, 100), scan(1))
     assert max(groups) == limit
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_groups_fill_the_vectors_of_llvmpipe(as_gpu, monkeypatch):
+    """Lanes without a work-item would go on in loops; see ``group_multiple``."""
+    import pyopencl as cl
+
+    # Scalar kernels of a processor, whose groups have 1, 16 and 64 work-items.
+    monkeypatch.setattr(as_gpu, "info", dataclasses.replace(as_gpu.info, kind="cpu"))
+    expected = gs.BeamModel(GRID, SCANNER, backend=as_gpu).log_likelihood(cloud(1, 100), scan(1))
+    as_gpu._launchers.clear()
+    groups, enqueue = set(), cl.enqueue_nd_range_kernel
+    monkeypatch.setattr(cl.Device, "name", property(lambda device: "llvmpipe (LLVM 15.0.6, 256 bits)"))
+    monkeypatch.setattr(cl.Kernel, "get_work_group_info", lambda kernel, name, device: 32)
+    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", lambda *launch: (groups.add(launch[3][0]), enqueue(*launch))[1])
+    found = gs.BeamModel(GRID, SCANNER, backend=as_gpu).log_likelihood(cloud(1, 100), scan(1))
+    assert groups == {32}
     np.testing.assert_array_equal(found, expected)

@@ -26,8 +26,8 @@ class Estimate:
         p_lost: Probability that the pose is off by more than 1 m or 0.5 rad; see ``docs/localization.md``.
         verdict: "tracking"; "uncertain", if the particles are spread widely or over several places, or p_lost is above
             0.1; or "lost", where scans or features contradict the pose and p_lost is above 0.5.
-        explained: Among the beams of the last scan that the map could explain, the share that agrees with it at the
-            pose; NaN without one.
+        explained: Among the beams of the last judged scan that the map could explain, the share that agrees with it at
+            the mean of the particles; NaN without one.
         temperature: Temperature of the first sensor.
         used: Share of the temperature that the stages of the last correction used: below 1 if even the last stage would
             have left too few particles.

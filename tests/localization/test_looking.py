@@ -134,17 +134,17 @@ def check(seed, backend):
     assert ran(seed, backend, looking(seed)) == ran(seed, backend, lambda pf: None)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(8))
 def test_random_looks_leave_the_bits_of_the_belief(seed):
     check(seed, "numpy")
 
 
-@pytest.mark.parametrize("seed", [20, 21, 22])
+@pytest.mark.parametrize("seed", [20, 21])
 def test_random_looks_leave_the_bits_of_the_belief_on_devices(seed, device):
     check(seed, device.info.selection)
 
 
-@pytest.mark.parametrize("seed", [30, 31, 32])
+@pytest.mark.parametrize("seed", [30, 31])
 def test_random_looks_leave_the_bits_of_the_belief_in_recorded_steps(seed, warp_as_gpu):
     check(seed, "warp:cpu")
 

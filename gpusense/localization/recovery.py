@@ -79,14 +79,14 @@ class Recovery:
     def corrected(self, readings: list[SensorReadings], last: Mapping[int, tuple[Any, ...]]) -> None:
         """Compare the particles with their rival, judge their pose, and search for a rival if scans contradict it.
 
-        A search needs two judgements in a row that contradict the pose.
+        A search needs two judgements in a row that contradict the pose, or one at every fifth to tenth correction.
 
         Args:
             readings: Indices of sensors, with the readings that corrected the particles.
             last: Copies of the same readings with all beams.
         """
         tracker, verdict, rival = self._tracker, self._verdict, self.active
-        searches = self._searches and rival is None and self._is_wanted()
+        searches = self._searches and rival is None and (verdict.due or self._is_wanted())
         if rival is not None:
             self._compare(rival, readings)
         if not verdict.is_informed_by(last):

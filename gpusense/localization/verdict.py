@@ -35,6 +35,8 @@ _RANDOM = 64
 # A pose with at most this belief of being wrong is judged again after this distance [m], turn [rad], number of
 # corrections, or drop of the readings' log-likelihood [nats].
 _SURE, _WAY, _TURNED, _SELDOM, _DROP = 0.05, 0.25, 0.25, 10, 3.0
+# Corrections after which one judgement of an unsure pose may begin a search.
+_INTERVAL = 5
 # Share of explained beams below which a search elsewhere is worthwhile.
 _FEW = 0.4
 
@@ -136,6 +138,11 @@ class Verdict:
         """Count a correction."""
         state = self.state
         self.state = state._replace(corrections=state.corrections + 1, belief=state.belief.counted())
+
+    @property
+    def due(self) -> bool:
+        """Tell whether the judgement of this correction alone may begin a search, without one before it."""
+        return self.state.corrections % (_SELDOM if self.state.belief.wrong <= _SURE else _INTERVAL) == 0
 
     def doubt(self) -> None:
         """Restart with a pose that a search has just found, for which the scans of the search are no evidence."""

@@ -19,6 +19,10 @@ from gpusense._util import masks
 
 T = TypeVar("T")
 
+FARTHEST = 1e9
+"""Largest coordinate of a place, and of a motion [m]; coordinates of UTM reach 1e7."""
+SMALLEST = 1e-9
+"""Smallest length that a sensor measures [m]."""
 _DOUBLE = np.dtype(np.float64)
 _REPR = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = 120
@@ -175,6 +179,7 @@ def array(
     shape: Sequence[int | str] | None = None,
     *,
     finite: bool = True,
+    largest: float = math.inf,
     dtype: DTypeLike | None = np.float64,
 ) -> NDArray[Any]:
     """Return ``value`` as an array of real numbers.
@@ -184,6 +189,7 @@ def array(
         value: Anything that ``numpy.asarray`` accepts; copied only if its dtype differs from ``dtype``.
         shape: Required shape; an integer is an exact length, a letter any length. None skips this check.
         finite: Whether to refuse NaN, infinities and masked values. Otherwise masked values are NaN.
+        largest: Largest magnitude of a finite value.
         dtype: Dtype of the result. An integer dtype accepts integers only. None keeps a floating dtype (in the
             machine's byte order) and converts integers to float64.
 
@@ -196,7 +202,7 @@ def array(
         # Most arguments are such arrays, and the other checks take five times as long.
         fits = shape is None or _fits(value.shape, shape)
         if fits and (not finite or np.logical_and.reduce(np.isfinite(value), axis=None)):
-            return value
+            return value if largest == math.inf else _limited(name, value, largest)
     values = as_array(name, value, masked=not finite)
     kinds, rule = "fiu", "must hold real numbers"
     if dtype is not None and np.dtype(dtype).kind in "iu":
@@ -208,10 +214,60 @@ def array(
     if dtype is None:
         dtype = values.dtype.newbyteorder("=") if values.dtype.kind == "f" else np.float64
     if finite and values.dtype.kind == "f" and not np.isfinite(values).all():
-        index = np.unravel_index(int(np.argmin(np.isfinite(values))), values.shape)
-        position = "" if values.ndim == 0 else f" at index {_index_text(index)}"
-        raise ValueError(f"{name}: every value must be finite, got {show(values[index])}{position}")
-    return values.astype(dtype, copy=False)
+        raise ValueError(f"{name}: every value must be finite, got {_first(values, ~np.isfinite(values))}")
+    if dtype is not None and np.dtype(dtype).kind == "i" and values.dtype.kind == "u" and values.size:
+        most = int(np.iinfo(np.dtype(dtype)).max)
+        if values.max() > most:
+            raise ValueError(f"{name}: every value must be <= {most}, got {_first(values, values > most)}")
+    converted = values.astype(dtype, copy=False)
+    return converted if largest == math.inf else _limited(name, converted, largest)
+
+
+def _limited(name: str, values: NDArray[Any], largest: float) -> NDArray[Any]:
+    """Return ``values`` after checking that no finite one is larger in magnitude than ``largest``.
+
+    Raises:
+        ValueError: A value is larger.
+    """
+    beyond = np.isfinite(values) & ((values > largest) | (values < -largest))
+    if beyond.any():
+        raise ValueError(f"{name}: every value must be from -{largest:g} to {largest:g}, got {_first(values, beyond)}")
+    return values
+
+
+def _first(values: NDArray[Any], bad: NDArray[np.bool]) -> str:
+    """Return the first of the bad values as text, with its index."""
+    index = np.unravel_index(int(np.argmax(bad)), values.shape)
+    return show(values[index]) + ("" if values.ndim == 0 else f" at index {_index_text(index)}")
+
+
+def indices(name: str, value: object, size: int, shape: Sequence[int | str] | None = None) -> NDArray[np.int64]:
+    """Return ``value`` as an array of indices from 0 to ``size`` - 1.
+
+    Raises:
+        TypeError: The array does not hold integers.
+        ValueError: The shape differs, or an index is out of range.
+    """
+    found = array(name, value, shape, dtype=np.int64)
+    bad = (found < 0) | (found >= size)
+    if bad.any():
+        raise ValueError(f"{name}: every index must be in [0, {size}), got {_first(found, bad)}")
+    return found
+
+
+def broadcast(named: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
+    """Return arrays by their names as views of one shape.
+
+    Raises:
+        ValueError: The shapes do not broadcast; the message names the last array.
+    """
+    try:
+        return list(np.broadcast_arrays(*named.values()))
+    except ValueError:
+        shapes = [shape_text(each.shape) for each in named.values()]
+        *others, last = named
+        rule = f"shape must broadcast with {' and '.join(others)}, {' and '.join(shapes[:-1])}"
+        raise ValueError(f"{last}: {rule}, got {shapes[-1]}") from None
 
 
 def check_values(name: str, array: object) -> None:

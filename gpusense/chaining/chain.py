@@ -133,7 +133,9 @@ class Chainer:
         self._data = data = check_scans(scans, scanner, sensor, partial(readings, backend=device))
         if not len(data):
             raise ValueError("scans: must hold at least one scan, got none")
-        self._odometry = None if odometry is None else checks.array("odometry", odometry, (len(data), 3))
+        self._odometry = (
+            None if odometry is None else checks.array("odometry", odometry, (len(data), 3), largest=checks.FARTHEST)
+        )
         self._times = check_times(times, len(data))
         self._durations = list(check_durations(duration, len(data.scanners), self._times is not None))
         if motion is not None and not isinstance(motion, OdometryMotion):

@@ -17,6 +17,8 @@ Floats = NDArray[np.float64]
 
 # A time gap longer than this many usual steps, and longer than this [s], is a jump.
 _JUMP_STEPS, _JUMP = 10.0, 2.0
+# Longest time from the first beam of a scan to the last one [s].
+_LONGEST = 3600.0
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ def check_steps(name: str, value: object) -> tuple[float, float]:
         TypeError, ValueError: not two finite numbers of at least 0.
     """
     values = checks.array(name, value, (2,))
-    length = checks.real(f"{name}[0]", float(values[0]), low=0.0)
+    length = checks.real(f"{name}[0]", float(values[0]), low=0.0, high=checks.FARTHEST)
     return length, checks.real(f"{name}[1]", float(values[1]), low=0.0, high=math.pi + 1e-9)
 
 
@@ -80,9 +82,9 @@ def check_durations(duration: object, scanners: int, timed: bool) -> tuple[float
     Raises:
         TypeError, ValueError: another kind, negative numbers, or numbers without times of the scans.
     """
-    several = scanners > 1 and np.ndim(duration) == 1  # type: ignore[arg-type]
+    several = scanners > 1 and checks.as_array("duration", duration).ndim == 1
     given = checks.array("duration", duration, (scanners,)).tolist() if several else [duration] * scanners
-    values = tuple(float(checks.real("duration", value, low=0.0)) for value in given)
+    values = tuple(float(checks.real("duration", value, low=0.0, high=_LONGEST)) for value in given)
     if max(values) > 0 and not timed:
         raise ValueError(f"duration: must be 0 without times, got {duration}")
     return values

@@ -85,7 +85,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--fit-motion", action="store_true", help="also learn the noise of the log's odometry from its poses")
     add("--incidence", type=whole_number(low=1, high=90), metavar="BINS",
         help="also fit parameters for BINS bins of the angle of incidence")  # fmt: skip
-    add("--restarts", type=whole_number(low=0), default=0, metavar="N", help="further random starts (default: 0)")
+    add(
+        "--restarts",
+        type=whole_number(low=0, high=10_000),
+        default=0,
+        metavar="N",
+        help="further random starts (default: 0)",
+    )
     add("--holdout", action="store_true", help="hold out every other block, and score it with other programs' defaults")
     add("--block", type=whole_number(low=1), metavar="B",
         help=f"neighbouring scans or pairs per block (default: 1 scan, {_PAIRS_BLOCK} pairs)")  # fmt: skip

@@ -61,11 +61,11 @@ def map_features(
     """
     checks.instance("features", features, Features)
     wanted = kinds_of(kinds, MAP_KINDS)
-    placed = checks.array("poses", poses, ("S", 3))
+    placed = checks.array("poses", poses, ("S", 3), largest=checks.FARTHEST)
     scans = int(features.scan.max(initial=-1)) + 1
     if len(placed) < scans:
         raise ValueError(f"poses: must have a pose of each of {scans} scans, got {len(placed)}")
-    spread = checks.array("pose_deviation", pose_deviation, (2,))
+    spread = checks.array("pose_deviation", pose_deviation, (2,), largest=checks.FARTHEST)
     if (spread < 0).any():
         raise ValueError(f"pose_deviation: must be at least 0, got {checks.show(spread)}")
     enough = checks.integer("least", least, low=1)
@@ -108,8 +108,8 @@ def landmarks_of_map(
     """
     checks.instance("grid", grid, OccupancyGrid)
     kinds = kinds_of(kinds, MAP_KINDS)
-    limit = checks.real("range_max", range_max, above=0)
-    poses = _free_places(grid, checks.real("spacing", spacing, above=0))
+    limit = checks.real("range_max", range_max, above=0, high=checks.FARTHEST)
+    poses = _free_places(grid, checks.real("spacing", spacing, low=checks.SMALLEST, high=checks.FARTHEST))
     scanner = Scanner(np.arange(_BEAMS) * (2 * math.pi / _BEAMS) - math.pi, limit)
     ranges = np.zeros((0, _BEAMS))
     if len(poses):

@@ -286,6 +286,7 @@ class ParticleFilter(Whole):
         Raises:
             RuntimeError: the filter is not initialised.
         """
+        checks.boolean("search", search)
         pose, _ = self.mean_and_covariance()
         search = search and grid_of(self._sensors) is not None
         return diagnose(self._sensors, self._parts.last, pose, self._parts.tracker.random_poses if search else None)

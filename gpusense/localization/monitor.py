@@ -143,6 +143,7 @@ class PoseMonitor:
         Raises:
             RuntimeError: no pose was judged yet.
         """
+        checks.boolean("search", search)
         if self._pose is None:
             raise RuntimeError("diagnose: needs an update first")
         search = search and any(hasattr(sensor.model, "grid") for sensor in self._sensors)

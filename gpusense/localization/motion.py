@@ -86,7 +86,10 @@ def odometry_turns(before: object, after: object) -> tuple[float, float, float]:
         >>> gs.odometry_turns((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
         (0.0, -1.0, 0.0)
     """
-    return turns_between(checks.array("before", before, (3,)), checks.array("after", after, (3,)))
+    return turns_between(
+        checks.array("before", before, (3,), largest=checks.FARTHEST),
+        checks.array("after", after, (3,), largest=checks.FARTHEST),
+    )
 
 
 def turns_between(before: np.ndarray, after: np.ndarray) -> tuple[float, float, float]:
@@ -224,7 +227,10 @@ class OmniMotion:
         """Return the numbers of a step from the odometer's poses before and after it."""
         if len(arguments) != 2:
             raise TypeError(f"predict: must have the odometry before and after the step, got {len(arguments)} values")
-        before, after = (checks.array(n, v, (3,)) for n, v in zip(("before", "after"), arguments, strict=True))
+        before, after = (
+            checks.array(n, v, (3,), largest=checks.FARTHEST)
+            for n, v in zip(("before", "after"), arguments, strict=True)
+        )
         x, y, turn = _difference(before, after)
         trans = math.hypot(x, y)
         direction = math.atan2(y, x) if trans > 0 else 0.0
@@ -267,8 +273,8 @@ class VelocityMotion:
         """Return the numbers of a step from velocities and a duration."""
         if len(arguments) != 2:
             raise TypeError(f"predict: must have velocities and a duration, got {len(arguments)} values")
-        v, w = (float(value) for value in checks.array("velocity", arguments[0], (2,)))
-        seconds = checks.real("seconds", arguments[1], low=0)
+        v, w = (float(value) for value in checks.array("velocity", arguments[0], (2,), largest=checks.FARTHEST))
+        seconds = checks.real("seconds", arguments[1], low=0, high=checks.FARTHEST)
         if abs(w * seconds) > _MOST_TURNED:
             raise ValueError(f"velocity: must turn by at most {_MOST_TURNED:g} rad in a step, got {w * seconds}")
         a1, a2, a3, a4, a5, a6 = self.alpha

@@ -129,7 +129,8 @@ def fit_odometry_motion(odometry: AnyArray, poses: AnyArray, *, systematic: bool
         >>> 0.005 < fit.motion.alpha[2] / fit.inflation < 0.02, "alpha1" in fit.undetermined
         (True, True)
     """
-    reported = checks.array("odometry", odometry, ("N", 3))
+    checks.boolean("systematic", systematic)
+    reported = checks.array("odometry", odometry, ("N", 3), largest=checks.FARTHEST)
     if len(reported) < 3:
         raise ValueError(f"odometry: must hold at least 3 poses, got {len(reported)}")
     reference, at = _references(poses, len(reported))
@@ -167,7 +168,7 @@ def fit_odometry_motion(odometry: AnyArray, poses: AnyArray, *, systematic: bool
 
 def _references(poses: AnyArray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the reference poses and their indices."""
-    values = checks.array("poses", poses, (count, 3), finite=False)
+    values = checks.array("poses", poses, (count, 3), finite=False, largest=checks.FARTHEST)
     absent = np.isnan(values).all(axis=1)
     checks.array("poses", np.where(absent[:, None], 0.0, values))
     at = np.flatnonzero(~absent)

@@ -8,22 +8,28 @@ from gpusense._util import checks
 from gpusense._util.angles import wrapped
 from gpusense._util.typing import AnyArray
 
+# Largest coordinate [m], so that sums stay finite.
+_LARGEST = 1e300
+
 
 def wrap_angle(angle: AnyArray) -> np.ndarray:
     """Return angles in [-pi, pi).
 
     Args:
-        angle: Angles [rad], any shape.
+        angle: Angles [rad], any shape; NaN stays NaN.
 
     Raises:
-        TypeError: not real numbers.
+        TypeError: Not real numbers.
+        ValueError: An angle is infinite.
 
     Example:
         >>> import gpusense as gs, numpy as np
         >>> float(gs.wrap_angle(3 * np.pi / 2) / np.pi)
         -0.5
     """
-    values = np.asarray(checks.as_array("angle", angle), np.float64)
+    values = checks.array("angle", angle, finite=False)
+    if np.isinf(values).any():
+        raise ValueError(f"angle: every value must be finite or NaN, got {checks.show(values[np.isinf(values)][0])}")
     return wrapped(values)
 
 
@@ -42,7 +48,10 @@ def compose_poses(first: AnyArray, second: AnyArray) -> np.ndarray:
         >>> gs.compose_poses([1.0, 2.0, np.pi / 2], [1.0, 0.0, 0.0]).round(3).tolist()
         [1.0, 3.0, 1.571]
     """
-    one, two = _poses("first", first), _poses("second", second)
+    return _composed(*_pair("first", first, "second", second))
+
+
+def _composed(one: np.ndarray, two: np.ndarray) -> np.ndarray:
     cosine, sine = np.cos(one[..., 2]), np.sin(one[..., 2])
     x = one[..., 0] + cosine * two[..., 0] - sine * two[..., 1]
     y = one[..., 1] + sine * two[..., 0] + cosine * two[..., 1]
@@ -63,7 +72,10 @@ def invert_poses(poses: AnyArray) -> np.ndarray:
         >>> gs.invert_poses([1.0, 2.0, np.pi / 2]).round(3).tolist()
         [-2.0, 1.0, -1.571]
     """
-    pose = _poses("poses", poses)
+    return _inverted(_poses("poses", poses))
+
+
+def _inverted(pose: np.ndarray) -> np.ndarray:
     cosine, sine = np.cos(pose[..., 2]), np.sin(pose[..., 2])
     x = -cosine * pose[..., 0] - sine * pose[..., 1]
     y = sine * pose[..., 0] - cosine * pose[..., 1]
@@ -85,7 +97,8 @@ def pose_difference(before: AnyArray, after: AnyArray) -> np.ndarray:
         >>> gs.pose_difference([0.0, 0.0, np.pi / 2], [0.0, 2.0, np.pi]).round(3).tolist()
         [2.0, 0.0, 1.571]
     """
-    return compose_poses(invert_poses(_poses("before", before)), _poses("after", after))
+    one, two = _pair("before", before, "after", after)
+    return _composed(_inverted(one), two)
 
 
 def mean_pose(poses: AnyArray, weights: AnyArray | None = None) -> np.ndarray:
@@ -103,21 +116,30 @@ def mean_pose(poses: AnyArray, weights: AnyArray | None = None) -> np.ndarray:
         >>> gs.mean_pose([(0.0, 0.0, 3.0), (2.0, 0.0, -3.0)]).round(3).tolist()
         [1.0, 0.0, 3.142]
     """
-    values = checks.array("poses", poses, ("N", 3))
+    values = checks.array("poses", poses, ("N", 3), largest=_LARGEST)
     if not len(values):
         raise ValueError("poses: must hold at least one pose, got shape (0, 3)")
     w = np.ones(len(values)) if weights is None else checks.array("weights", weights, (len(values),))
-    if not (w.min() >= 0 and w.sum() > 0):
-        raise ValueError(f"weights: must be >= 0 and have a positive sum, got {w.sum()}")
+    if not (w.min() >= 0 and w.max() > 0):
+        raise ValueError(f"weights: must be >= 0 and have a positive sum, got {checks.show(w)}")
+    w = w / w.max()
     w = w / w.sum()
     heading = np.arctan2(w @ np.sin(values[:, 2]), w @ np.cos(values[:, 2]))
     return np.array([w @ values[:, 0], w @ values[:, 1], heading])
 
 
 def _poses(name: str, poses: object) -> np.ndarray:
-    values = np.asarray(checks.as_array(name, poses), np.float64)
+    values = checks.array(name, poses, largest=_LARGEST)
     if values.shape[-1:] != (3,):
         raise ValueError(f"{name}: shape must be (..., 3), got {checks.shape_text(values.shape)}")
-    if not np.isfinite(values).all():
-        raise ValueError(f"{name}: must be finite, got one that is not")
     return values
+
+
+def _pair(name: str, poses: object, other_name: str, others: object) -> tuple[np.ndarray, np.ndarray]:
+    """Return two arrays of poses whose shapes broadcast.
+
+    Raises:
+        TypeError, ValueError: They are no poses, or their shapes do not broadcast.
+    """
+    one, two = checks.broadcast({name: _poses(name, poses), other_name: _poses(other_name, others)})
+    return one, two

@@ -14,6 +14,8 @@ import numpy as np
 from gpusense._util import checks
 from gpusense._util.typing import AnyArray
 
+# Most indices of a call, which take 2 GiB.
+_MOST = 1 << 28
 # Sum of the integer weights; the error of a weight is below one step per particle.
 _STEPS = 1 << 52
 
@@ -107,7 +109,7 @@ def resample(weights: AnyArray, count: int, rng: Any = None, *, method: str = "s
     """
     generator = _generator(rng)
     values = checks.array("weights", weights, ("N",))
-    size = checks.integer("count", count, low=0)
+    size = checks.integer("count", count, low=0, high=_MOST)
     checks.choice("method", method, ("systematic", "stratified", "residual"))
     if values.size == 0 or not values.max() > 0:
         raise ValueError(f"weights: must have a positive sum, got {values.sum()}")

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gpusense._util import checks
 from gpusense._util.angles import wrapped
 from gpusense.logs.records import Floats, Pose, Scan
 from gpusense.world.messages import tilt_of
@@ -36,11 +37,18 @@ def check_mount(scans: Sequence[Scan]) -> str | None:
     Args:
         scans: Scans in the order of time, with odometry.
 
+    Raises:
+        TypeError: ``scans`` holds something else.
+
     Example:
         >>> import gpusense as gs
         >>> gs.check_mount([]) is None
         True
     """
+    if not isinstance(scans, (list, tuple)):
+        raise TypeError(f"scans: must be a list of Scan, got {checks.show(scans)}")
+    for scan in scans:
+        checks.instance("scans", scan, Scan)
     pairs = _pairs(scans)
     if len(pairs) < 3:
         return None

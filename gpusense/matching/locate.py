@@ -84,10 +84,11 @@ def locate_scan(
         )
     ranges = masks.filled(ranges)
     cell = model.grid.resolution
-    stride = max(round(checks.real("resolution", resolution, above=0) / cell), 1)
+    stride = max(round(checks.real("resolution", resolution, above=0, high=checks.FARTHEST) / cell), 1)
     turns = 4 * math.ceil(math.pi / 2 / checks.real("angle", angle, above=1e-4, high=math.pi / 2) - 1e-9)
     checks.choice("positions", positions, ("free", "all"))
     checks.integer("modes", modes, low=1)
+    checks.boolean("refine", refine)
     checks.real("min_probability", min_probability, low=0, high=1)
     grid = model.grid
     headings = 2 * math.pi / turns * np.arange(turns)[None]

@@ -105,7 +105,7 @@ def match_scan(
     checks.choice("method", method, METHODS)
     given = not (isinstance(noise, str) and noise == "auto")
     options = check_options(noise if given else ASSUMED_NOISE, capture, window)
-    if temperature != 1.0 or isinstance(temperature, bool):
+    if type(temperature) is not float or temperature != 1.0:
         checks.real("temperature", temperature, above=0, high=1)
     device = get_backend(backend)
     real_dtype(precision, device)

@@ -33,6 +33,8 @@ _MODE_RADIUS, _MODE_ANGLE, _MODES = 0.5, math.radians(10), 10
 _OVERLAP, _RIVAL = 0.3, 0.95
 # Largest move of a pose by the alignment [cells, and steps of heading].
 _FARTHEST = 3.0
+# Most poses in a window.
+_MOST_POSES = 10**10
 # Half widths of the window around a guess [m, m, rad].
 _WINDOW = (1.0, 1.0, 0.35)
 
@@ -189,8 +191,8 @@ def _whole(grid: OccupancyGrid, angle: float, yaw: float) -> PoseGrid:
 
 def _around(grid: OccupancyGrid, local: _Local, guess: ArrayLike, window: ArrayLike | None, angle: float) -> PoseGrid:
     """Return the poses in a window around a guess, in the frame of the global map."""
-    x, y, theta = checks.array("guess", guess, (3,)).tolist()
-    half = checks.array("window", _WINDOW if window is None else window, (3,))
+    x, y, theta = checks.array("guess", guess, (3,), largest=checks.FARTHEST).tolist()
+    half = checks.array("window", _WINDOW if window is None else window, (3,), largest=checks.FARTHEST)
     if (half < 0).any():
         raise ValueError(f"window: must be at least 0, got {checks.show(window)}")
     cos, sin = math.cos(theta), math.sin(theta)
@@ -203,7 +205,11 @@ def _around(grid: OccupancyGrid, local: _Local, guess: ArrayLike, window: ArrayL
     swing = 2 * math.hypot(*local.middle) * math.sin(min(half[2], math.pi) / 2)
     wide = np.array([yaw_cos * half[0] + yaw_sin * half[1], yaw_sin * half[0] + yaw_cos * half[1]]) + swing
     reach = np.ceil(wide / grid.resolution - 1e-9).astype(int)
-    return PoseGrid.around(center, (int(reach[1]), int(reach[0])), math.ceil(half[2] / angle - 1e-9), angle)
+    turns = math.ceil(min(half[2], math.pi) / angle - 1e-9)
+    poses = math.prod(2 * int(each) + 1 for each in (*reach, turns))
+    if poses > _MOST_POSES:
+        raise ValueError(f"window: must hold at most {_MOST_POSES:.0e} poses, got {poses:.3g} in {checks.show(window)}")
+    return PoseGrid.around(center, (int(reach[1]), int(reach[0])), turns, angle)
 
 
 def _result(

@@ -124,7 +124,9 @@ def _checked(noise: object, capture: object, window: object) -> MatchOptions:
     reach = checks.real("window[0]", float(values[0]), low=0.0)
     turn = checks.real("window[1]", float(values[1]), low=0.0, high=math.pi + 1e-9)
     options = MatchOptions(
-        checks.real("noise", noise, low=0.0), checks.real("capture", capture, above=0.0), (reach, turn)
+        checks.real("noise", noise, low=0.0, high=_FARTHEST),
+        checks.real("capture", capture, above=0.0, high=_FARTHEST),
+        (reach, turn),
     )
     if reach > 20 * options.capture:
         raise ValueError(f"window: must reach at most 20 times capture = {options.capture}, got {reach}")

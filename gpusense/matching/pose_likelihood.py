@@ -55,7 +55,10 @@ class PoseLikelihood:
 
     def poses(self, row: ArrayLike, col: ArrayLike, heading: ArrayLike) -> Floats:
         """Return (M, 3) poses in the world of M indices of rows, columns and headings [m, m, rad]."""
-        row, col, heading = (index.ravel() for index in np.broadcast_arrays(row, col, heading))
+        rows, cols = self.cells.shape[:2]
+        sized = ("row", row, rows), ("col", col, cols), ("heading", heading, len(self.headings))
+        found = checks.broadcast({name: checks.indices(name, value, size) for name, value, size in sized})
+        row, col, heading = (index.ravel() for index in found)
         xy = self.grid._to_world((self.cells[row, col][:, ::-1] + 0.5) * self.grid.resolution)
         return np.column_stack([xy, self.headings[heading]])
 
@@ -103,10 +106,11 @@ class PoseLikelihood:
         left = np.where(np.isnan(self.log_p), -np.inf, self.log_p)
         poses: list[Floats] = []
         log_p: list[float] = []
-        reach = int(near / self.resolution)
+        radius = min(near / self.resolution, 2.0 * max(left.shape[:2]))
+        reach = int(radius)
         distant = np.abs(wrapped(np.subtract.outer(self.headings, self.headings)))
         rows, cols = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-        disc = rows**2 + cols**2 <= (near / self.resolution) ** 2
+        disc = rows**2 + cols**2 <= radius**2
         while len(log_p) < count:
             row, col, heading = np.unravel_index(int(left.argmax()), left.shape)
             if left[row, col, heading] == -np.inf:
@@ -182,7 +186,7 @@ def prepare_tiles(
     if not isinstance(model, ScanModel):
         raise TypeError(f"model: must be a BeamModel or LikelihoodFieldModel, got {checks.show(model)}")
     grid = model.grid
-    step = max(round(checks.real("resolution", resolution, above=0) / grid.resolution), 1)
+    step = max(round(checks.real("resolution", resolution, above=0, high=checks.FARTHEST) / grid.resolution), 1)
     count = checks.integer("headings", headings, low=1)
     checks.choice("positions", positions, ("free", "all"))
     z = checks.array("ranges", ranges, (model.scanner.count,), finite=False, dtype=None)

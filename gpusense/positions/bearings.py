@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense._util.typing import Loss
 from gpusense.positions.closed_forms import EPS, ROUNDINGS, three_bearings, two_rays
 from gpusense.positions.fix import PositionFix
-from gpusense.positions.problem import Floats, Problem, make_problem, subsets
+from gpusense.positions.problem import Floats, Problem, check_operands, make_problem, subsets
 from gpusense.positions.solver import in_line, minima, pick
 
 
@@ -62,6 +62,7 @@ def triangulate(
         ('unique', [2.0, 1.0])
     """
     least, remainder = (3, "an arc") if heading is None else (2, "a ray")
+    check_operands(bearings=bearings)
     problem = make_problem(
         xy, bearings=bearings, heading=heading, sigma_bearing=sigma, weights=weights, loss=loss, loss_scale=loss_scale,
         least=least, reason=f", or {remainder} of solutions remains",
@@ -113,6 +114,7 @@ def triangulate_triangle(xy: ArrayLike, bearings: ArrayLike, *, sigma: ArrayLike
         >>> gs.triangulate_triangle([(5, 3), (3, 5), (1, 3)], np.radians([-90, 0, 90])).best.round(3).tolist()
         [3.0, 3.0, 1.571]
     """
+    check_operands(bearings=bearings)
     problem = make_problem(xy, bearings=bearings, sigma_bearing=sigma)
     if len(problem.xy) != 3:
         raise ValueError(f"xy: must hold exactly 3 beacons, got {len(problem.xy)}")

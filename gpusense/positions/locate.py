@@ -11,7 +11,7 @@ from gpusense._util.angles import wrapped
 from gpusense._util.typing import Loss
 from gpusense.positions.closed_forms import two_circles, wrap
 from gpusense.positions.fix import PositionFix
-from gpusense.positions.problem import Floats, Problem, make_problem, subsets
+from gpusense.positions.problem import Floats, Problem, check_operands, make_problem, subsets
 from gpusense.positions.solver import minima, pick
 
 # Standard deviation of a bearing without information [rad].
@@ -68,9 +68,7 @@ def locate(
         >>> fix.status, (fix.best + 1e-9).round(3).tolist()
         ('unique', [0.0, 0.0, 0.0])
     """
-    for name, sigma in (("sigma_range", sigma_range), ("sigma_bearing", sigma_bearing)):
-        if sigma is None:
-            raise TypeError(f"{name}: must hold real numbers, got None")
+    check_operands(ranges=ranges, bearings=bearings, sigma_range=sigma_range, sigma_bearing=sigma_bearing)
     least, reason = (2, ", or a circle of solutions remains") if heading is None else (1, "")
     problem = make_problem(
         xy, ranges=ranges, bearings=bearings, heading=heading, sigma_range=sigma_range, sigma_bearing=sigma_bearing,

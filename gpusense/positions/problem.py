@@ -35,6 +35,10 @@ SINGULAR = 1e12
 # A robot nearer to a beacon than this share of the scene's spread stands at it: in bad geometry rounding of 1e-15 grows
 # to this.
 TOUCH = 1e-12
+# Limits of deviations, of the scale of a loss and of weights, whose squares stay far within float64.
+_SMALL, _LARGE = 1e-12, 1e12
+# Differences of coordinates below this are 0 [m].
+_SAME_PLACE = 1e-100
 # Largest number of subsets of the beacons whose closed forms are starts.
 STARTS = 300
 
@@ -204,6 +208,17 @@ class Problem:
         )
 
 
+def check_operands(**values: object) -> None:
+    """Refuse measurements or deviations that are None.
+
+    Raises:
+        TypeError: A value is None.
+    """
+    for name, value in values.items():
+        if value is None:
+            raise TypeError(f"{name}: must hold real numbers, got None")
+
+
 def deviations(name: str, sigma: ArrayLike | None, count: int) -> Floats:
     """Return (M,) standard deviations from one number, M numbers, or None for 1.
 
@@ -217,6 +232,9 @@ def deviations(name: str, sigma: ArrayLike | None, count: int) -> Floats:
         raise ValueError(f"{name}: shape must be () or ({count},), got {checks.shape_text(values.shape)}")
     if values.size and not values.min() > 0:
         raise ValueError(f"{name}: must be > 0, got {values.min()}")
+    if values.size and not (values.min() >= _SMALL and values.max() <= _LARGE):
+        worst = values.min() if values.min() < _SMALL else values.max()
+        raise ValueError(f"{name}: must be from {_SMALL:g} to {_LARGE:g}, got {worst}")
     return np.broadcast_to(values, (count,)).astype(np.float64)
 
 
@@ -251,23 +269,29 @@ def make_problem(
         least: Least number of beacons of positive weight.
         reason: Reason of that number, for messages.
     """
-    positions = checks.array("xy", xy, ("M", 2))
+    positions = checks.array("xy", xy, ("M", 2), largest=checks.FARTHEST)
     count = len(positions)
-    distances = None if ranges is None else _not_negative("ranges", ranges, count)
-    angles = None if bearings is None else checks.array("bearings", bearings, (count,))
+    distances = None if ranges is None else _not_negative("ranges", ranges, count, checks.FARTHEST)
+    angles = None if bearings is None else checks.array("bearings", bearings, (count,), largest=checks.FARTHEST)
     look_at_bearings("bearings", angles)
-    theta = None if heading is None else checks.real("heading", heading)
+    theta = (
+        None
+        if heading is None
+        else float(checks.array("heading", checks.real("heading", heading), largest=checks.FARTHEST))
+    )
     sigma_r, sigma_b = deviations(names[0], sigma_range, count), deviations(names[1], sigma_bearing, count)
-    factors = np.ones(count) if weights is None else _not_negative("weights", weights, count)
+    factors = np.ones(count) if weights is None else _not_negative("weights", weights, count, _LARGE)
     loss = checks.choice("loss", loss, tuple(LOSSES))
-    loss_scale = checks.real("loss_scale", loss_scale, above=0)
+    loss_scale = checks.real("loss_scale", checks.real("loss_scale", loss_scale, above=0), low=_SMALL, high=_LARGE)
     used = factors > 0
     _check_number(used, least, reason)
     positions, factors = positions[used], factors[used]
     # The middle of the box is rounded as finely as the beacons; differences of near numbers are exact.
     origin = positions.min(axis=0) / 2 + positions.max(axis=0) / 2
+    relative = positions - origin
+    relative[np.abs(relative) < _SAME_PLACE] = 0.0
     return Problem(
-        positions - origin,
+        relative,
         origin,
         None if distances is None else distances[used],
         None if angles is None else angles[used],
@@ -281,9 +305,9 @@ def make_problem(
     )
 
 
-def _not_negative(name: str, values: ArrayLike, count: int) -> Floats:
-    """Return (M,) numbers that are at least 0."""
-    checked = checks.array(name, values, (count,))
+def _not_negative(name: str, values: ArrayLike, count: int, largest: float) -> Floats:
+    """Return (M,) numbers from 0 to ``largest``."""
+    checked = checks.array(name, values, (count,), largest=largest)
     if checked.size and checked.min() < 0:
         raise ValueError(f"{name}: must be >= 0, got {checked.min()} at index {int(np.argmin(checked))}")
     return checked

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from gpusense._util.typing import Loss
 from gpusense.positions.closed_forms import two_circles
 from gpusense.positions.fix import PositionFix
-from gpusense.positions.problem import Floats, Problem, make_problem, subsets
+from gpusense.positions.problem import Floats, Problem, check_operands, make_problem, subsets
 from gpusense.positions.solver import distinct, in_line, minima, pick, reflect
 
 
@@ -58,6 +58,7 @@ def trilaterate(
         >>> fix
         PositionFix('unique', 1 solution, best=(2, 1.5), deviation=0.128 m)
     """
+    check_operands(ranges=ranges)
     problem = make_problem(
         xy, ranges=ranges, sigma_range=sigma, weights=weights, loss=loss, loss_scale=loss_scale, least=2,
         reason=", or a circle of solutions remains",

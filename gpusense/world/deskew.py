@@ -18,6 +18,8 @@ Floats = NDArray[np.float64]
 _RATIO, _SLACK = 0.1, 0.05
 # A beam has a reading only if one was measured within this many steps between bearings.
 _FARTHEST = 1.5
+# Largest motion during a scan [m, rad].
+_LARGEST = 1e6
 
 
 def check_motion(name: str, motion: object, scans: int) -> Floats | None:
@@ -34,7 +36,7 @@ def check_motion(name: str, motion: object, scans: int) -> Floats | None:
     if motion is None:
         return None
     read = checks.as_array(name, motion)
-    values = checks.array(name, read, (scans, 3) if read.ndim == 2 else (3,))
+    values = checks.array(name, read, (scans, 3) if read.ndim == 2 else (3,), largest=_LARGEST)
     return np.array(np.broadcast_to(values, (scans, 3)), np.float64)
 
 

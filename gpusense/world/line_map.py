@@ -43,7 +43,7 @@ class LineMap:
                 f"segments: length must be above 0 and finite, got {checks.show(self.segments[bad[0]].tolist())} "
                 f"at index {bad[0]}"
             )
-        sides = np.asarray(two_sided)
+        sides = checks.as_array("two_sided", two_sided)
         if sides.dtype != np.bool_:
             raise TypeError(f"two_sided: must hold bools, got {checks.show(two_sided)}")
         if sides.shape not in ((), (len(self.segments),)):

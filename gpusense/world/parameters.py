@@ -164,6 +164,8 @@ class IncidenceParameters:
             raise ValueError(f"edges: must rise from 0 to pi / 2, got {checks.show(self.edges)}")
         if any(low >= high for low, high in pairwise(edges)):
             raise ValueError(f"edges: must rise from 0 to pi / 2, got {checks.show(self.edges)}")
+        if not isinstance(self.parameters, (list, tuple)):
+            raise TypeError(f"parameters: must be a list of BeamParameters, got {checks.show(self.parameters)}")
         parameters = tuple(self.parameters)
         for each in parameters:
             checks.instance("parameters", each, BeamParameters)

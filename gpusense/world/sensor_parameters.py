@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal
@@ -25,7 +26,7 @@ def check_covariance(name: str, value: object) -> tuple[tuple[float, float], tup
         ValueError: The shape differs, or the matrix is not finite, symmetric and positive definite.
     """
     c = checks.array(name, value, (2, 2))
-    if abs(c[0, 1] - c[1, 0]) > 1e-9 * np.sqrt(abs(c[0, 0] * c[1, 1])):
+    if abs(c[0, 1] - c[1, 0]) > 1e-9 * math.sqrt(abs(c[0, 0])) * math.sqrt(abs(c[1, 1])):
         raise ValueError(f"{name}: must be symmetric, got {checks.show(c.tolist())}")
     xx, yy, off = float(c[0, 0]), float(c[1, 1]), float(c[0, 1] / 2 + c[1, 0] / 2)
     # Exact arithmetic, because models take the square root of the difference.
@@ -77,8 +78,8 @@ class PositionParameters(_Parameters):
         self._check_weights("z_hit", "z_rand")
         if self.region is not None:
             x, y, far_x, far_y = (float(value) for value in checks.array("region", self.region, (4,)))
-            if not (x < far_x and y < far_y):
-                rule = "must be (x_min, y_min, x_max, y_max) with x_min < x_max and y_min < y_max"
+            if not (x < far_x and y < far_y and 0 < (far_x - x) * (far_y - y) < math.inf):
+                rule = "must be (x_min, y_min, x_max, y_max) with x_min < x_max and y_min < y_max, of a finite area > 0"
                 raise ValueError(f"region: {rule}, got {checks.show(self.region)}")
             object.__setattr__(self, "region", (x, y, far_x, far_y))
         elif self.z_rand > 0:

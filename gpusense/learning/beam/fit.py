@@ -77,7 +77,7 @@ def fit_beam_parameters(
         max_iterations: Largest number of iterations of the method; None is 500 for ``"em"``, 60 for ``"em-book"``, 1000
             for the rest.
         tolerance: The method has converged once it expects to gain less than ``tolerance`` [nats].
-        restarts: Number of additional random starts; the best result is returned.
+        restarts: Number of additional random starts, at most 10 000; the best result is returned.
         seed: Seed of the random starts and of ``"genetic"``.
         range_bias: Whether the parameters also contain an offset b of correct ranges: z = z* + b. p_hit then has its
             mean at z* + b, clamped to [0, range_max].

@@ -178,7 +178,7 @@ def fit_incidence_parameters(
         precision: ``"float64"`` or ``"float32"``; None is float64 if the device has it.
         max_iterations: Largest number of iterations of each fit.
         tolerance: Expected gain below which a fit has converged [nats].
-        restarts: Number of additional random starts of each fit.
+        restarts: Number of additional random starts, at most 10 000 of each fit.
         seed: Seed of the random starts.
         range_bias: Whether to also fit an offset of correct ranges in each bin.
         hit: Shape of correct ranges, the same in all bins.

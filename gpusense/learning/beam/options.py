@@ -14,6 +14,7 @@ from gpusense.learning.beam.pairs import Pairs
 from gpusense.learning.beam.point import Bounds, Point, possible_causes
 from gpusense.world.parameters import BeamParameters
 
+MOST_RESTARTS = 10_000
 METHODS = ("em", "em-book", "gradient", "hill_climb", "genetic")
 Callback = Callable[[int, float, BeamParameters], object]
 
@@ -67,7 +68,7 @@ def check_options(
         method,
         checks.integer("max_iterations", max_iterations, low=1),
         checks.real("tolerance", tolerance, above=0),
-        checks.integer("restarts", restarts, low=0),
+        checks.integer("restarts", restarts, low=0, high=MOST_RESTARTS),
         checks.integer("seed", seed, low=0),
         bool(range_bias),
         bool(progress),

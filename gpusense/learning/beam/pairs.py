@@ -76,7 +76,7 @@ def make_pairs(ranges: ArrayLike, expected: ArrayLike, range_max: float, range_m
         ValueError: The shapes differ, every reading is missing, or an expected range is not in [0, range_max] beside a
             reading that is not missing.
     """
-    range_max = checks.real("range_max", range_max, above=0)
+    range_max = checks.real("range_max", range_max, low=checks.SMALLEST, high=checks.FARTHEST)
     range_min = checks.real("range_min", range_min, low=0, below=range_max)
     z = checks.array("ranges", ranges, finite=False, dtype=None)
     z_expected = checks.array("expected", expected, finite=False, dtype=None)

@@ -59,7 +59,7 @@ class Counts:
 
 def count_pairs(ranges: object, expected: object, range_max: float, bins: int) -> Counts:
     """Count readings; see ``DiscreteBeamModel.learn`` for arguments and errors."""
-    range_max = checks.real("range_max", range_max, above=0)
+    range_max = checks.real("range_max", range_max, low=checks.SMALLEST, high=checks.FARTHEST)
     bins = checks.integer("bins", bins, low=1, high=MOST_BINS)
     z, z_exp = (
         checks.as_array(name, value, masked=True) for name, value in (("ranges", ranges), ("expected", expected))

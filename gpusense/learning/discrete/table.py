@@ -182,6 +182,12 @@ class DiscreteBeamModel(SensorTable):
     def _rows(self, dtype: DTypeLike, *, density: bool) -> NDArray[Any]:
         from gpusense.learning.discrete.probabilities import separate_causes, shared_causes  # loads SciPy
 
+        try:
+            real = np.dtype(dtype)
+        except (TypeError, ValueError):
+            real = np.dtype(bool)
+        if real not in (np.float32, np.float64):
+            raise TypeError(f"dtype: must be float32 or float64, got {checks.show(dtype)}")
         table = np.empty((self.bins + 1, self.bins + 1), dtype)
         step = max(_BLOCK // self.bins, 1)
         for first in range(0, self.bins + 1, step):

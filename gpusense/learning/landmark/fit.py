@@ -128,8 +128,8 @@ def _sightings(
     map_signatures = landmarks.signatures
     with_signature = replace(base, sigma_signature=None if map_signatures is None else 1.0)
     full = check_features(features, with_signature, base.signature_span or (-math.inf, math.inf))
-    x, y, yaw = (float(number) for number in checks.array("mount", mount, (3,)))
-    robots = checks.array("poses", poses, (len(full) if scan is None else "S", 3))
+    x, y, yaw = (float(number) for number in checks.array("mount", mount, (3,), largest=checks.FARTHEST))
+    robots = checks.array("poses", poses, (len(full) if scan is None else "S", 3), largest=checks.FARTHEST)
     index = np.arange(len(full)) if scan is None else checks.array("scan", scan, (len(full),), dtype=np.int64)
     bad = np.flatnonzero((index < 0) | (index >= len(robots)))
     if len(bad):

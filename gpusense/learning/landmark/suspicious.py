@@ -102,8 +102,8 @@ def suspicious_landmarks(
     checks.instance("parameters", parameters, LandmarkParameters)
     full = check_features(features, parameters, span_of(parameters, landmarks))
     known = check_correspondence(correspondence, len(full), len(landmarks))
-    robots = checks.array("poses", poses, (len(full), 3))
-    x, y, yaw = (float(number) for number in checks.array("mount", mount, (3,)))
+    robots = checks.array("poses", poses, (len(full), 3), largest=checks.FARTHEST)
+    x, y, yaw = (float(number) for number in checks.array("mount", mount, (3,), largest=checks.FARTHEST))
     least = checks.real("least_gain", least_gain, above=0)
     fewest = checks.integer("least_readings", least_readings, low=1)
     full[:, 2] = np.nan

@@ -186,7 +186,7 @@ def fit_beacon_parameters(
     checks.choice("bias", bias, ("none", "common", "each"))
     degrees = checks.integer("nu", nu, low=1, high=MOST_DEGREES)
     longest = checks.real("range_max", range_max, above=0)
-    points = checks.array("xy", xy, ("M", 2))
+    points = checks.array("xy", xy, ("M", 2), largest=checks.FARTHEST)
     most = checks.integer("max_iterations", max_iterations, low=1)
     least = checks.real("tolerance", tolerance, above=0)
     pose, z, index = _readings(poses, ranges, len(points), ids)
@@ -210,12 +210,12 @@ def fit_beacon_parameters(
 def _readings(poses: ArrayLike, ranges: ArrayLike, beacons: int, ids: object) -> tuple[Floats, Floats, list[Integers]]:
     """Return the poses, (n,) ranges, and the index of each range's pose and beacon."""
     if ids is None:
-        pose = checks.array("poses", poses, ("S", 3))
+        pose = checks.array("poses", poses, ("S", 3), largest=checks.FARTHEST)
         table = checks.array("ranges", ranges, (len(pose), beacons), finite=False)
         rows, columns = (each.ravel().astype(np.int64) for each in np.indices(table.shape))
         return pose, table.ravel(), [rows, columns]
     columns = checks.array("ids", ids, ("F",), dtype=np.int64)
-    pose = checks.array("poses", poses, (len(columns), 3))
+    pose = checks.array("poses", poses, (len(columns), 3), largest=checks.FARTHEST)
     outside = np.flatnonzero((columns < 0) | (columns >= beacons))
     if len(outside):
         at = outside[0]

@@ -106,8 +106,8 @@ def fit_heading_parameters(
     checks.choice("kind", kind, ("wrapped_normal", "von_mises"))
     most = checks.integer("max_iterations", max_iterations, low=1)
     least = checks.real("tolerance", tolerance, above=0)
-    pose = checks.array("poses", poses, ("F", 3))
-    z = checks.array("headings", headings, (len(pose),), finite=False)
+    pose = checks.array("poses", poses, ("F", 3), largest=checks.FARTHEST)
+    z = checks.array("headings", headings, (len(pose),), finite=False, largest=checks.FARTHEST)
     labels = None if blocks is None else check_labels(blocks, len(pose))
     used = np.isfinite(z)
     if not used.any():

@@ -148,13 +148,12 @@ def fit_position_parameters(
         >>> fit.converged, round(fit.parameters.sigma, 1)
         (True, 2.0)
     """
-    for name, value in (("correlated", correlated), ("fit_mount", fit_mount)):
-        checks.boolean(name, value)
+    correlated, fit_mount = checks.boolean("correlated", correlated), checks.boolean("fit_mount", fit_mount)
     most = checks.integer("max_iterations", max_iterations, low=1)
     least = checks.real("tolerance", tolerance, above=0)
     base = PositionParameters(region=region, mount=mount)
-    pose = checks.array("poses", poses, ("F", 3))
-    z = checks.array("fixes", fixes, (len(pose), 2), finite=False)
+    pose = checks.array("poses", poses, ("F", 3), largest=checks.FARTHEST)
+    z = checks.array("fixes", fixes, (len(pose), 2), finite=False, largest=checks.FARTHEST)
     labels = None if blocks is None else check_labels(blocks, len(pose))
     used = np.isfinite(z).all(axis=1)
     if not used.any():

@@ -159,7 +159,8 @@ def _seen(
     sign = np.where(two_sided & (distance < 0), -1.0, 1.0)
     along = np.sort(sign[:, None] * (off @ np.array([-normal[1], normal[0]])), axis=1)
     distance = sign * distance
-    half = np.sqrt(np.maximum(p.range_max**2 - distance**2, 0.0))[:, None]
+    near = np.minimum(distance, 2 * p.range_max)
+    half = np.sqrt(np.maximum(p.range_max**2 - near**2, 0.0))[:, None]
     inside = np.clip(along, -half, half)
     seen = (distance >= 0) & (distance <= p.range_max) & (inside[:, 1] > inside[:, 0])
     angle = np.arctan2(sign * normal[1], sign * normal[0]) - turned

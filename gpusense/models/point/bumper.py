@@ -270,7 +270,7 @@ def sample_outline(outline: object, segments: object, spacing: float) -> tuple[f
         ValueError: A radius that is not positive, fewer than 3 corners, segments of a wrong shape, or too many points.
     """
     if isinstance(outline, (int, float, np.integer, np.floating)) and not isinstance(outline, bool):
-        radius = checks.real("outline", float(outline), above=0)
+        radius = checks.real("outline", outline, above=0)
         if segments is None:
             return radius, np.zeros((1, 2)), np.array([0, 1], np.int32)
         arcs = checks.array("segments", segments, ("B", 2))

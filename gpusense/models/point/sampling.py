@@ -69,7 +69,7 @@ def draws_at(poses: Any, backend: Backend, seed: object, step: object) -> Draws:
     key = checks.integer("seed", seed, low=0, high=MOST_SEED)
     first = checks.integer("step", step, low=0, high=MOST_STEP)
     read = arrays.copied_to_host(poses, backend, "poses")
-    several = np.ndim(read) == 3  # type: ignore[arg-type]
+    several = checks.as_array("poses", read).ndim == 3
     host = checks.array("poses", read, ("S", "N", 3) if several else ("N", 3))
     shape = host.shape[:-1]
     scan, particle = np.indices(shape) if several else (np.zeros(shape, np.int64), np.arange(shape[0]))

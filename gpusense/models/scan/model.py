@@ -233,6 +233,8 @@ class ScanModel(Pickled):
         Warns:
             PlausibilityWarning: In the first calls of a scanner, negative readings, or readings in millimetres.
         """
+        if per_beam is not False:
+            checks.boolean("per_beam", per_beam)
         if out is None and not per_beam and type(poses) is not np.ndarray and is_recorded(poses):
             calls = self._differentiable(ranges)
             if calls is not None:
@@ -345,7 +347,7 @@ class ScanModel(Pickled):
             RuntimeError: As :meth:`explain`.
         """
         plan = plan_of_call(self._notes(), self._setting, self._last)
-        if not measure:
+        if not checks.boolean("measure", measure):
             return plan
         from gpusense.models.scan.savings import measured_savings
 

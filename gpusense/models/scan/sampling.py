@@ -156,7 +156,7 @@ def poses_to_draw_at(poses: Any, backend: Backend) -> tuple[Poses, tuple[int, ..
         shape = tuple(poses.shape)
         return Poses(poses, backend, scans=shape[0] if len(shape) == 3 else None), shape[:-1]
     read: Any = arrays.to_host(poses)
-    if np.ndim(read) == 3:
+    if checks.as_array("poses", read).ndim == 3:
         several = checks.array("poses", read, ("S", "N", 3))
         return Poses(several.reshape(-1, 3), backend), several.shape[:-1]
     checked = Poses(read, backend)

@@ -124,7 +124,7 @@ MAP_CASES = [
             ("coarse", "5000", "must be finite and >= 0.0001 and <= 1000.0, got 5000"),
             ("nan", ".nan", "must be finite and >= 0.0001 and <= 1000.0, got nan"),
             ("bool", "true", "must be a real number, got True"),
-            ("string", "'0.05'", "must be a real number, got '0.05'"),
+            ("string", "'0.05 m'", "must be a real number, got '0.05 m'"),
             ("empty", "", "must be a real number, got None"),
         ]
     ],

@@ -118,7 +118,8 @@ def _add_data(s: SimpleNamespace, add: Any, made: Any) -> None:
     add("Scanner.uniform", lambda: gs.Scanner.uniform, angle_min=-1.0, angle_increment=0.1, count=9, range_max=6.0,
         range_min=0.1, mount=(0.1, 0.0, 0.0), cone=0.1, cone_rays=9, critical_incidence=0.5)  # fmt: skip
     scan = dict(angle_min=-1.5, angle_increment=0.5, range_min=0.1, range_max=8.0, ranges=[2.0] * 7)
-    add("Scanner.from_laser_scan", lambda: gs.Scanner.from_laser_scan, message=scan, mount=(0.0, 0.0, 0.0))
+    add("Scanner.from_laser_scan", lambda: gs.Scanner.from_laser_scan, message=scan, mount=(0.0, 0.0, 0.0),
+        range_max=8.0, range_min=0.1)  # fmt: skip
     made(gs.LandmarkMap, xy=s.beacons, signatures=[0, 1, 2, 3])
     made(gs.LineMap, segments=[(0.0, 0.0, 4.0, 0.0), (4.0, 0.0, 4.0, 3.0)], two_sided=True)
     add("classify", lambda: gs.classify, ranges=s.scan, scanner=s.scanner)
@@ -403,7 +404,8 @@ def _add_files(s: SimpleNamespace, add: Any) -> None:
     features.save(folder / "map.geojson")
     add("read_map", lambda: gs.read_map, path=folder / "map.yaml", occupied_threshold=65)
     add("write_map", lambda: gs.write_map, grid=s.grid, path=folder / "out.yaml", image_format="pgm", mode=None)
-    add("read_log", lambda: _read_all, path=folder / "run.log", range_max=6.0, odometry=False, rear=False, topic=None,
+    add("read_log", lambda: _read_all, path=folder / "run.log", range_max=6.0, odometry=False, rear=False,
+        range_min=None, topic=None, frame=None, odometry_from=None,
         mount=None)  # fmt: skip
     scans = list(gs.read_log(folder / "run.log", range_max=6.0))
     add("check_mount", lambda: gs.check_mount, scans=scans)

@@ -48,7 +48,20 @@ class Device:
     float64: bool = True
 
 
-def devices(*, anew: bool = False) -> list[Device]:
+class Devices(list[Device]):
+    """A list of devices that prints as a table."""
+
+    def __repr__(self) -> str:
+        rows = [("selection", "kind", "name", "driver", "state")]
+        for one in self:
+            state = "available" if one.available else one.reason
+            rows.append((one.selection or one.backend, one.kind, one.name, short_driver(one.driver), state))
+        widths = [max(map(len, column)) for column in list(zip(*rows, strict=True))[:-1]]
+        texts = ([*map(str.ljust, row, widths), row[-1]] for row in rows)
+        return "\n".join("  ".join(text).rstrip() for text in texts)
+
+
+def devices(*, anew: bool = False) -> Devices:
     """Return every device of this machine, and every backend that is absent with the reason and the remedy.
 
     A new device is proved first, which takes some seconds; see :mod:`gpusense.backends.proof`.
@@ -61,7 +74,7 @@ def devices(*, anew: bool = False) -> list[Device]:
         >>> [device.selection for device in gs.devices() if device.backend == "numpy"]
         ['numpy']
     """
-    return [device for entry in ENTRIES for device in _devices_of(entry, anew=anew)]
+    return Devices(device for entry in ENTRIES for device in _devices_of(entry, anew=anew))
 
 
 def present(entry: Entry) -> tuple[list[Device], list[Device]]:

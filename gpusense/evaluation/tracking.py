@@ -113,8 +113,8 @@ def start(
     if everywhere:
         pf.initialize_uniform()
     elif first is None:
-        rule = "must have a pose at the first chosen scan, unless --start gives one or --global begins anywhere"
-        raise ValueError(f"log: {rule}, got none at scan {steps[0].index}")
+        rule = "must have a pose at the first chosen scan, got none; where does the robot start?"
+        raise ValueError(f"log: {rule} Add --start X Y THETA, or --global to begin anywhere")
     else:
         pf.initialize(mean=first, covariance=np.diag(np.square(START)) if covariance is None else covariance)
 

@@ -121,7 +121,18 @@ class PoseLikelihood:
             inside = (i >= 0) & (i < left.shape[0]) & (j >= 0) & (j < left.shape[1])
             around = np.flatnonzero(distant[heading] <= turn)
             left[i[inside, None], j[inside, None], around] = -np.inf
-        return np.array(poses).reshape(-1, 3), np.array(log_p)
+        found = np.array(poses).reshape(-1, 3)
+        found[:, 2] = wrapped(found[:, 2])
+        return found, np.array(log_p)
+
+    def __repr__(self) -> str:
+        rows, cols, headings = self.log_p.shape
+        best = self.modes(1)[0]
+        at = "{:.2f} m, {:.2f} m, {:.2f} rad".format(*best[0]) if len(best) else "nowhere"
+        return (
+            f"PoseLikelihood({rows} x {cols} positions of {self.resolution:g} m, {headings} headings; best at {at}, "
+            f"entropy {self.entropy:.3g} nats)"
+        )
 
     def plot(self, path: str | os.PathLike[str]) -> None:
         """Draw the map and the likelihood of each position, and write the picture; see ``gs.plots``.

@@ -300,6 +300,9 @@ def grid_of_checked(
 def _checked_cells(cells: ArrayLike) -> NDArray[np.int8]:
     """Check (H, W) occupancies and return a read-only int8 copy."""
     values = checks.as_array("cells", cells)
+    if values.dtype.kind in "bf" and values.size:
+        convert = "100 * cells" if values.dtype.kind == "b" else "(100 * cells).round().astype(int)"
+        raise TypeError(f"cells: must hold integers from -1 to 100, got dtype {values.dtype}; pass {convert}")
     dtype = values.dtype if values.dtype.kind in "iu" else np.int64
     values = checks.array("cells", values, ("H", "W"), dtype=dtype)
     if values.size == 0:

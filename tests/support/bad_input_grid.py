@@ -37,13 +37,13 @@ GRID_CASES = [
         "grid-float",
         lambda tmp: OccupancyGrid([[0.5, 1.0]]),
         TypeError,
-        "cells: must hold integers, got dtype float64",
+        "cells: must hold integers from -1 to 100, got dtype float64; pass (100 * cells).round().astype(int)",
     ),
     (
         "grid-bool",
         lambda tmp: OccupancyGrid([[True, False]]),
         TypeError,
-        "cells: must hold integers, got dtype bool",
+        "cells: must hold integers from -1 to 100, got dtype bool; pass 100 * cells",
     ),
     ("grid-none", lambda tmp: OccupancyGrid(None), TypeError, "cells: must hold integers, got dtype object"),
     (

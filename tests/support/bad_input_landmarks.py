@@ -189,7 +189,8 @@ CASES: list[tuple[str, Callable[[], object], type[Exception], str]] = [
      "correspondence: must hold integers, got dtype float64"),
     ("joint-many", score([[1.0, 0.0]] * 9, own=JOINT), ValueError,
      "features: must be at most 8 with association='joint', got 9"),
-    ("landmark-poses", score(poses=[1, 2, 3]), ValueError, "poses: shape must be (N, 3), got (3,)"),
+    ("landmark-poses", score(poses=[1, 2, 3]), ValueError,
+     "poses: shape must be (N, 3), got (3,); a single one is poses[None]"),
     ("landmark-pose-nan", score(poses=[[0, 0, NAN]]), ValueError,
      "poses: every value must be finite, got nan at index (0, 2)"),
 ]  # fmt: skip

@@ -170,7 +170,12 @@ MODEL_CASES = [
 ]
 
 CALL_CASES = [
-    ("poses-of-one-dimension", score([0.5, 0.5, 0.0]), ValueError, "poses: shape must be (N, 3), got (3,)"),
+    (
+        "poses-of-one-dimension",
+        score([0.5, 0.5, 0.0]),
+        ValueError,
+        "poses: shape must be (N, 3), got (3,); a single one is poses[None]",
+    ),
     ("poses-of-four-columns", score(np.zeros((2, 4))), ValueError, "poses: shape must be (N, 3), got (2, 4)"),
     ("poses-empty-list", score([]), ValueError, "poses: shape must be (N, 3), got (0,)"),
     (
@@ -276,7 +281,12 @@ CASTER_CASES = [
     ("caster-precision", caster(precision="double"), ValueError, FLOATS("'double'")),
     ("caster-unknown", caster(unknown=True), TypeError, UNKNOWN("True")),
     ("caster-outside", caster(outside="clip"), ValueError, OUTSIDE("'clip'")),
-    ("cast-poses", cast([1, 2, 3]), ValueError, "poses: shape must be (N, 3), got (3,)"),
+    (
+        "cast-poses",
+        cast([1, 2, 3]),
+        ValueError,
+        "poses: shape must be (N, 3), got (3,); a single one is poses[None]",
+    ),
     ("cast-nan", cast([[1, 2, NAN]]), ValueError, "poses: every value must be finite, got nan at index (0, 2)"),
     ("cast-bearings-2d", cast(POSE, [[0.0]]), ValueError, "bearings: shape must be (K,), got (1, 1)"),
     ("cast-bearings-scalar", cast(POSE, 0.0), ValueError, "bearings: shape must be (K,), got ()"),

@@ -210,8 +210,8 @@ def array(
     if values.dtype.kind not in kinds and not (values.size == 0 and values.dtype.kind == "f"):
         raise TypeError(f"{name}: {rule}, got dtype {values.dtype}")
     if shape is not None and not _fits(values.shape, shape):
-        single = len(shape) > 1 and isinstance(shape[0], str) and _fits(values.shape, shape[1:])
-        hint = f"; a single one is {name}[None]" if single and name.isidentifier() else ""
+        single = len(shape) > 1 and shape[0] == "N" and _fits(values.shape, shape[1:])
+        hint = f"; a single one is {name}[None]" if single else ""
         raise ValueError(f"{name}: shape must be {shape_text(shape)}, got {shape_text(values.shape)}{hint}")
     if dtype is None:
         dtype = values.dtype.newbyteorder("=") if values.dtype.kind == "f" else np.float64

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the devices; for absent devices, also the reason and the remedy."""
     from gpusense.backends import devices
 
-    listed = devices(anew=args.prove)
+    listed: list[Device] = devices(anew=args.prove)
     auto, auto_error = _auto()
     listed = _with_failures(listed)
     if args.json:

@@ -56,7 +56,7 @@ class _Skipped:
     def warn(self, path: Path) -> None:
         if total := self._counts.total():
             each = ", ".join(f"{number} on {topic}" for topic, number in sorted(self._counts.items()))
-            warn_user(f"{path}: {total} messages are skipped ({each}); the first is {self._reason}")
+            warn_user(f"{path}: skipped messages: {total} ({each}); the first is {self._reason}")
 
     def reason(self, topic: str) -> str:
         return f" but {self._counts[topic]} that are skipped ({self._reason})" if self._counts[topic] else ""

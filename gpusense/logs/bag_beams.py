@@ -162,8 +162,8 @@ def shared_beams(place: str, found: Counter[Geometry], range_min: float | None, 
         )  # fmt: skip
         if alike < total:
             warn_user(
-                f"{place}: scans with other beams or range limits: {total - alike} of {total}; their readings are placed "
-                "on the nearest beams of the others"
+                f"{place}: scans with other beams or range limits: {total - alike} of {total}; their readings are "
+                "placed on the nearest beams of the others"
             )
         return Beams(first, step, distinct_beams(step, count), near, far, overridden, False)
     finest = min((abs(step) for _, step, count in angles_of if count > 1), default=2 * math.pi / _PLACES)

@@ -1,105 +1,107 @@
-"""Find the files of a bag, and prepare files that the library rosbags cannot read.
+"""Find the files of a bag.
 
-A file that is cut off, comes with a journal, or lacks the suffix of its format is copied or linked into a temporary
-folder that is deleted at the end of the process. The recording itself is never written.
+A database with a journal, and a file that is compressed as a whole, are copied into a temporary folder that is deleted
+at the end of the process. The recording itself is never written.
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
-import os
+import re
 import shutil
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gpusense.logs.cut_bags import MCAP, ROS1, SQLITE, begins, mender_of
+from gpusense._util.inflate import most_bytes
+from gpusense.logs.bag_chunks import Mcap, Ros1
+from gpusense.logs.bag_storage import MCAP, ROS1, SQLITE, ZSTD, Sqlite, Storage, zstd
 
-ZSTD = b"\x28\xb5\x2f\xfd"
-_SUFFIXES = {MCAP: ".mcap", SQLITE: ".db3"}
 # Suffixes of a database's journals of pages to add and of pages to restore, and first bytes of the latter in use.
 _WAL, _ROLLBACK, _IN_USE = "-wal", "-journal", b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
+# Files in the list of metadata.yaml, and the part of it that is searched [bytes].
+_LISTED = re.compile(r"""^ *- +['"]?([^\s'"]+\.(?:db3|mcap)(?:\.zstd)?)['"]? *\r?$""", re.MULTILINE)
+_LARGEST_METADATA = 1 << 24
+_PIECE = 1 << 20
 _FOLDERS: list[Any] = []
+
+
+def begins(file: Path, *firsts: bytes) -> bool:
+    """Return whether a file begins with one of several byte strings."""
+    with file.open("rb") as stream:
+        return stream.read(max(map(len, firsts))).startswith(firsts)
 
 
 def is_ros1(path: Path) -> bool:
     """Return whether a bag is one of ROS 1, by its first bytes, or by its suffix if they are of no kind of bag."""
-    if path.is_dir() or any(begins(path, first) for first in (*_SUFFIXES, ZSTD)):
+    if path.is_dir() or begins(path, MCAP, SQLITE, ZSTD):
         return False
     return begins(path, ROS1) or path.suffix.lower() == ".bag"
 
 
-def has_metadata(folder: Path) -> bool:
-    """Return whether a folder has a ``metadata.yaml`` that is not empty."""
-    file = folder / "metadata.yaml"
-    return file.is_file() and file.stat().st_size > 0
-
-
-def storage_files(folder: Path) -> list[Path]:
-    """Return the files of a ROS 2 bag whose folder has no ``metadata.yaml``, by name.
-
-    Raises:
-        ValueError: They are compressed as a whole.
-    """
-    files = [file for file in sorted(folder.iterdir()) if file.is_file()]
-    found = [file for file in files if any(begins(file, first) for first in _SUFFIXES)]
-    if not found:
-        packed = next((file for file in files if begins(file, ZSTD)), None)
-        if packed is not None:
-            raise ValueError(f"{packed}: must be decompressed in a folder without metadata.yaml, got a zstd file")
-    return found
-
-
 def is_bag_folder(folder: Path) -> bool:
     """Return whether a folder is a ROS 2 bag."""
-    if (folder / "metadata.yaml").is_file():
-        return True
-    firsts = (*_SUFFIXES, ZSTD)
-    return any(file.is_file() and any(begins(file, first) for first in firsts) for file in folder.iterdir())
+    return (folder / "metadata.yaml").is_file() or bool(_parts(folder))
 
 
-def readable(path: Path) -> tuple[Path, bool]:
-    """Return a bag that rosbags can read, and whether it has only the messages up to a cut.
-
-    Args:
-        path: A file of a bag, or a folder with ``metadata.yaml``.
+def storages(path: Path) -> list[Storage]:
+    """Return the files of a bag in the order of time.
 
     Raises:
-        ValueError: The file is compressed as a whole.
+        ValueError: A file is broken, or compressed as a whole without the folder of its bag.
     """
-    files = sorted(path.iterdir()) if path.is_dir() else [path, *map(path.with_name, _journal_names(path))]
-    stats = tuple((file, file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.is_file())
-    return _readable(path, stats)
+    files = _parts(path) if path.is_dir() else [path]
+    packed = [file for file in files if begins(file, ZSTD)]
+    metadata = path / "metadata.yaml"
+    if packed and not path.is_dir():
+        rule = "must be decompressed, or replaced by the folder of its bag"
+        raise ValueError(f"{path}: {rule}, got a file that is compressed as a whole")
+    if metadata.is_file() and metadata.stat().st_size:
+        _check_parts(metadata, files)
+    elif packed:
+        raise ValueError(f"{packed[0]}: must be decompressed in a folder without metadata.yaml, got a zstd file")
+    return sorted(map(_storage, files), key=lambda each: each.start)
 
 
-@functools.lru_cache(maxsize=4)
-def _readable(path: Path, stats: tuple[tuple[Path, int, int], ...]) -> tuple[Path, bool]:
-    made: dict[Path, Callable[[Path], object]] = {}
-    cut = False
-    for file, size, _ in stats:
-        if begins(file, SQLITE) and any(_holds_pages(file.with_name(name)) for name in _journal_names(file)):
-            made[file] = functools.partial(_with_journal, file)
-        elif (make := mender_of(file, size)) is not None:
-            made[file], cut = make, True
-    if path.is_file():
-        if begins(path, ZSTD):
-            rule = "must be decompressed, or replaced by the folder of its bag"
-            raise ValueError(f"{path}: {rule}, got a file that is compressed as a whole")
-        suffix = next((each for first, each in _SUFFIXES.items() if begins(path, first)), path.suffix)
-        if not made and path.suffix == suffix:
-            return path, False
-        target = _folder() / (path.name if path.suffix == suffix else path.name + suffix)
-        made.get(path, functools.partial(os.symlink, path.resolve()))(target)
-        return target, cut
-    if not made:
-        return path, False
-    target = _folder() / path.name
-    target.mkdir()
-    for file, _, _ in stats:
-        made.get(file, functools.partial(os.symlink, file.resolve()))(target / file.name)
-    return target, cut
+def _check_parts(metadata: Path, files: list[Path]) -> None:
+    """Check that a folder holds the files that its metadata list; nothing else in them is read.
+
+    Raises:
+        ValueError: A file is absent.
+    """
+    with metadata.open("rb") as stream:
+        text = stream.read(_LARGEST_METADATA).decode(errors="replace")
+    known = {file.name for file in files} | {file.with_suffix("").name for file in files}
+    for name in _LISTED.findall(text):
+        if not known.intersection((Path(name).name, Path(name).with_suffix("").name)):
+            raise ValueError(f"{metadata.parent}: must hold the file {name} of its metadata.yaml, got none")
+
+
+def _parts(folder: Path) -> list[Path]:
+    """Return the files of messages in a folder, by name; a compressed file only if its plain one is absent."""
+    files = [file for file in sorted(folder.iterdir()) if file.is_file() and begins(file, MCAP, SQLITE, ZSTD)]
+    return [file for file in files if not begins(file, ZSTD) or file.with_suffix("") not in files]
+
+
+def _storage(file: Path) -> Storage:
+    stats = [one.stat() for one in (file, *_journals(file))]
+    return _read(file, tuple((each.st_size, each.st_mtime_ns) for each in stats))
+
+
+@functools.lru_cache(maxsize=16)
+def _read(file: Path, stats: tuple[tuple[int, int], ...]) -> Storage:
+    """Find the records of a file; the sizes and times of change of the file and its journals are part of the key."""
+    if begins(file, ZSTD):
+        file = _decompressed(file)
+    if begins(file, MCAP):
+        return Mcap(file)
+    if begins(file, ROS1):
+        return Ros1(file)
+    if begins(file, SQLITE):
+        return Sqlite(_with_journal(file) if _journals(file) else file, _folder)
+    with file.open("rb") as stream:
+        raise ValueError(f"{file}: must begin as a bag of ROS 1 (version 2.0), MCAP or SQLite, got {stream.read(16)!r}")
 
 
 def _folder() -> Path:
@@ -109,26 +111,40 @@ def _folder() -> Path:
     return Path(made.name)
 
 
-def _journal_names(file: Path) -> tuple[str, str]:
-    return file.name + _WAL, file.name + _ROLLBACK
+def _decompressed(file: Path) -> Path:
+    """Decompress a file, up to a bound.
+
+    Raises:
+        ValueError: The file holds more than the bound, or than the disk.
+    """
+    out = _folder() / file.with_suffix("").name
+    room = min(most_bytes(file.stat().st_size), shutil.disk_usage(tempfile.gettempdir()).free * 9 // 10)
+    with file.open("rb") as packed, zstd().open(packed, "rb") as stream, out.open("wb") as target:
+        while data := stream.read(_PIECE):
+            room -= len(data)
+            if room < 0:
+                rule = "must hold no more than 100 times its size and the disk's room"
+                raise ValueError(f"{file}: {rule}, got more")
+            target.write(data)
+    return out
 
 
-def _holds_pages(journal: Path) -> bool:
-    """Return whether a journal exists and has pages that its database lacks."""
-    if not journal.is_file() or journal.stat().st_size == 0:
-        return False
-    return journal.name.endswith(_WAL) or begins(journal, _IN_USE)
+def _journals(file: Path) -> list[Path]:
+    """Return the journals of a database that have pages which it lacks."""
+    wal, rollback = file.with_name(file.name + _WAL), file.with_name(file.name + _ROLLBACK)
+    found = [wal] if wal.is_file() and wal.stat().st_size else []
+    return [*found, rollback] if rollback.is_file() and begins(rollback, _IN_USE) else found
 
 
-def _with_journal(file: Path, out: Path) -> None:
-    """Write a database with all its committed messages; SQLite applies the journal to a copy."""
+def _with_journal(file: Path) -> Path:
+    """Return a copy of a database with all its committed messages, to which SQLite applies the journal."""
     import sqlite3
 
-    shutil.copyfile(file, out)
-    for name, copied in zip(_journal_names(file), _journal_names(out), strict=True):
-        if _holds_pages(file.with_name(name)):
-            shutil.copyfile(file.with_name(name), out.with_name(copied))
-    with contextlib.closing(sqlite3.connect(out)) as database:
+    folder = _folder()
+    for one in (file, *_journals(file)):
+        shutil.copyfile(one, folder / one.name)
+    with contextlib.closing(sqlite3.connect(folder / file.name)) as database:
         database.execute("PRAGMA trusted_schema = OFF")
         database.execute("SELECT count(*) FROM sqlite_master").fetchall()
         database.execute("PRAGMA journal_mode = DELETE")
+    return folder / file.name

@@ -1,4 +1,4 @@
-"""Open rosbags through the library rosbags and yield messages of known types, with errors that name file and place.
+"""Yield the messages of known types in a bag, decoded by the library rosbags, with errors that name file and place.
 
 A bag's message definitions are never used, because a library would turn them into code: messages are decoded by the
 layouts that come with rosbags, and by one layout that is defined here.
@@ -6,10 +6,10 @@ layouts that come with rosbags, and by one layout that is defined here.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,8 +18,8 @@ import numpy as np
 
 from gpusense._util.extras import library
 from gpusense._util.notices import warn_user
-from gpusense.logs.bag_bounds import check_metadata, decompressed, install
-from gpusense.logs.bag_files import ZSTD, has_metadata, is_ros1, readable, storage_files
+from gpusense.logs.bag_files import is_ros1, storages
+from gpusense.logs.bag_storage import Topic, unpacked
 
 SCAN, ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 ECHOES = "sensor_msgs/msg/MultiEchoLaserScan"
@@ -44,15 +44,18 @@ def topics_of(path: Path) -> dict[str, list[str]]:
     Raises:
         ValueError: The bag is broken.
     """
-    counts: dict[tuple[str, str], int] = {}
-    with errors_at(str(path)), _open(path, tell=True) as (readers, _):
-        for connection in (each for reader in readers for each in reader.connections):
-            key = _kind(connection), connection.topic
-            counts[key] = counts.get(key, 0) + connection.msgcount
+    counts: Counter[Topic] = Counter()
+    with errors_at(str(path)):
+        files = storages(path)
+    for file in files:
+        if file.cut:
+            warn_user(f"{path}: the bag is cut off; it is read up to there")
+        for topic, number in file.counts.items():
+            counts[_known(topic)] += number
     found: dict[str, list[str]] = {}
-    for kind, topic in sorted(counts):
-        if counts[kind, topic] or not any(counts.values()):
-            found.setdefault(kind, []).append(topic)
+    for topic in sorted(counts):
+        if counts[topic] or not any(counts.values()):
+            found.setdefault(topic.kind, []).append(topic.name)
     return found
 
 
@@ -66,34 +69,35 @@ def messages(path: Path, wanted: Mapping[str, set[str] | None]) -> Iterator[Mess
     Raises:
         ValueError: The bag or a message is broken; the error names the file, the topic and the message's number.
     """
+
+    def chosen(topic: Topic) -> bool:
+        names = wanted.get(_known(topic).kind, set())
+        return names is None or topic.name in names
+
     place = str(path)
-    with errors_at(place), _open(path) as (readers, decode):
-        numbers: dict[str, int] = {}
-        for reader in readers:
-            chosen = []
-            for connection in reader.connections:
-                topics = wanted.get(_kind(connection), set())
-                if topics is None or connection.topic in topics:
-                    chosen.append(connection)
-            stream = iter(reader.messages(connections=chosen)) if chosen else iter(())
-            while True:
-                with errors_at(place):
-                    each = next(stream, None)
-                if each is None:
-                    break
-                connection, clock, raw = each
-                number = numbers[connection.topic] = numbers.get(connection.topic, 0) + 1
-                where = f"{path}: {connection.topic}, message {number}"
-                kind = _kind(connection)
-                with errors_at(where):
-                    fields = decode(raw, kind)
-                    if kind == ECHOES:
-                        kind, fields = SCAN, _first_echo(fields)
-                yield Message(where, kind, connection.topic, clock / 1e9, fields)
+    decode = _decoder(path)
+    numbers: Counter[str] = Counter()
+    with errors_at(place):
+        files = storages(path)
+    for file in files:
+        stream = file.messages(chosen)
+        while True:
+            with errors_at(place):
+                raw = next(stream, None)
+            if raw is None:
+                break
+            kind, name = _known(raw.topic)
+            numbers[name] += 1
+            where = f"{path}: {name}, message {numbers[name]}"
+            with errors_at(where):
+                fields = decode(raw.data, kind)
+                if kind == ECHOES:
+                    kind, fields = SCAN, _first_echo(fields)
+            yield Message(where, kind, name, raw.time / 1e9, fields)
 
 
-def _kind(connection: Any) -> str:
-    return _SAME_LAYOUT.get(connection.msgtype, connection.msgtype)
+def _known(topic: Topic) -> Topic:
+    return topic._replace(kind=_SAME_LAYOUT.get(topic.kind, topic.kind))
 
 
 def _first_echo(message: Any) -> Any:
@@ -119,44 +123,13 @@ def errors_at(where: str) -> Iterator[None]:
         raise ValueError(f"{where}: must be a sound ROS message or bag, got {text[:200]}") from None
 
 
-@contextmanager
-def _open(path: Path, tell: bool = False) -> Iterator[tuple[list[Any], Any]]:
-    """Open a bag: the readers of rosbags in the order of time, and the function that decodes a message of a type.
-
-    Args:
-        path: The bag.
-        tell: Warn of a bag that is cut off.
-    """
+def _decoder(path: Path) -> Callable[[bytes, str], Any]:
+    """Return the function that decodes a message of a type."""
     first = is_ros1(path)
-    purpose = f"{path}: a ROS bag"
-    readers = library("rosbags.rosbag1" if first else "rosbags.rosbag2", purpose)
-    types = library("rosbags.typesys", purpose)
-    install()
+    types = library("rosbags.typesys", f"{path}: a ROS bag")
     store = types.get_typestore(types.Stores.ROS1_NOETIC if first else types.Stores.ROS2_HUMBLE)
     if TRANSFORMS not in store.types:
         store.register(types.get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
-    if path.is_dir() and has_metadata(path):
-        check_metadata(path)
-        parts = [path]
-    else:
-        parts = storage_files(path) if path.is_dir() else [path]
-    with contextlib.ExitStack() as stack:
-        opened = [stack.enter_context(contextlib.closing(_opened(readers.Reader, part, tell))) for part in parts]
-        opened.sort(key=lambda reader: reader.start_time)
-
-        def decode(raw: bytes, kind: str) -> Any:
-            if first:
-                return store.deserialize_ros1(raw, kind)
-            return store.deserialize_cdr(decompressed(raw) if raw[:4] == ZSTD else raw, kind)
-
-        yield opened, decode
-
-
-def _opened(kind: Any, path: Path, tell: bool) -> Any:
-    """Return an open reader of a bag; for a truncated bag, of its messages up to the cut."""
-    file, cut = readable(path)
-    if cut and tell:
-        warn_user(f"{path}: the bag is cut off; it is read up to there")
-    reader = kind(file)
-    reader.open()
-    return reader
+    if first:
+        return lambda data, kind: store.deserialize_ros1(data, kind)
+    return lambda data, kind: store.deserialize_cdr(unpacked(data), kind)

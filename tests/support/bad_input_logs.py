@@ -40,7 +40,7 @@ LOG_CASES = [
         "log-folder",
         lambda tmp: read_log(put(tmp, "readme.txt", "").parent),
         ValueError,
-        f"{{tmp}}/input: must be {KNOWN}, got a folder without metadata.yaml",
+        f"{{tmp}}/input: must be {KNOWN}, got a folder without metadata.yaml, .db3 or .mcap files",
     ),
     (
         "log-topic",

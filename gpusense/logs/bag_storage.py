@@ -1,0 +1,130 @@
+"""Read the messages of a bag's file, as bytes: the interface, and databases of SQLite.
+
+A database that is cut off, by a killed recorder, a full disk or an interrupted copy, is read up to the cut. Its header
+states its size; see https://www.sqlite.org/fileformat.html.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import shutil
+import struct
+import urllib.parse
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from gpusense._util.inflate import inflated
+
+MCAP, ROS1, SQLITE = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n", b"SQLite format 3\0"
+"""First bytes of the files of bags."""
+ZSTD = b"\x28\xb5\x2f\xfd"
+LARGEST = 1 << 29
+"""Most bytes of a chunk or a message [bytes]."""
+
+
+class Topic(NamedTuple):
+    """A topic: the type of its messages, and its name."""
+
+    kind: str
+    name: str
+
+
+class Raw(NamedTuple):
+    """An encoded message: time in the log [ns], topic, and bytes."""
+
+    time: int
+    topic: Topic
+    data: bytes
+
+
+class Storage:
+    """A file of a bag.
+
+    Attributes:
+        counts: Number of messages by topic; 0 if the file does not state it.
+        start: Time of the first message [ns].
+        cut: Whether the file is cut off.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self.counts: Counter[Topic] = Counter()
+        self.start, self.cut = 0, False
+
+    def messages(self, wanted: Callable[[Topic], bool]) -> Iterator[Raw]:
+        """Yield the messages of some topics in the order of time; of a file that is cut off, up to the cut."""
+        raise NotImplementedError
+
+
+def zstd() -> Any:
+    """Import the module that decompresses zstd: Python's from 3.14 on, else a library's."""
+    try:
+        return importlib.import_module("compression.zstd")
+    except ImportError:
+        return importlib.import_module("backports.zstd")
+
+
+def unpacked(message: bytes) -> bytes:
+    """Decompress a message if it is compressed by zstd."""
+    return inflated(zstd().ZstdDecompressor, message, LARGEST) if message[:4] == ZSTD else message
+
+
+class Sqlite(Storage):
+    """A database of ROS 2."""
+
+    def __init__(self, file: Path, scratch: Callable[[], Path]) -> None:
+        super().__init__(file)
+        with file.open("rb") as stream:
+            header = stream.read(32)
+        page, pages = struct.unpack(">H", header[16:18])[0], struct.unpack(">I", header[28:32])[0]
+        size = (65536 if page == 1 else page) * pages
+        if file.stat().st_size < size:
+            # SQLite reads a copy of the stated size, whose end is a hole.
+            self.cut, self.file = True, scratch() / file.name
+            shutil.copyfile(file, self.file)
+            os.truncate(self.file, size)
+        with self._open() as database:
+            rows = database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
+            self._topics = {number: Topic(str(kind), str(name)) for number, name, kind, _ in rows}
+            other = next((each for each in rows if each[3] != "cdr"), None)
+            if other is not None:
+                raise ValueError(f"{other[1]}: must be encoded as cdr, got {other[3]!r}")
+            numbers: dict[int, int] = {}
+            if not self.cut:
+                numbers = dict(database.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id"))
+                self.start = database.execute("SELECT min(timestamp) FROM messages").fetchone()[0] or 0
+        for number, topic in self._topics.items():
+            self.counts[topic] += numbers.get(number, 0)
+
+    @contextlib.contextmanager
+    def _open(self) -> Iterator[Any]:
+        sqlite3 = importlib.import_module("sqlite3")
+        place = f"file:{urllib.parse.quote(str(self.file))}?mode=ro&immutable=1"
+        with contextlib.closing(sqlite3.connect(place, uri=True)) as database:
+            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST)
+            database.execute("PRAGMA trusted_schema = OFF")
+            yield database
+
+    def messages(self, wanted: Callable[[Topic], bool]) -> Iterator[Raw]:
+        chosen = {number: topic for number, topic in self._topics.items() if wanted(topic)}
+        with self._open() as database:
+            if self.cut:
+                yield from self._up_to_the_cut(database, chosen)
+                return
+            marks = ", ".join("?" * len(chosen))
+            query = f"SELECT timestamp, topic_id, data FROM messages WHERE topic_id IN ({marks}) ORDER BY timestamp"
+            for time, number, data in database.execute(query, list(chosen)):
+                yield Raw(time, chosen[number], data)
+
+    def _up_to_the_cut(self, database: Any, chosen: dict[int, Topic]) -> Iterator[Raw]:
+        """Yield messages in the order of their rows, up to the first one that is not whole."""
+        with contextlib.suppress(importlib.import_module("sqlite3").DatabaseError):
+            for time, number, data in database.execute("SELECT timestamp, topic_id, data FROM messages ORDER BY id"):
+                if number not in self._topics:
+                    return
+                if number in chosen:
+                    yield Raw(time, chosen[number], data)

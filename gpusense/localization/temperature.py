@@ -30,6 +30,7 @@ f) / (1 - r f) of independent ones. Its inverse is the second factor of the temp
 from __future__ import annotations
 
 import functools
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,6 +45,8 @@ INDEPENDENT_AT_FIRST = 10.0
 INDEPENDENT_AT_LEAST, _LARGEST_REPEAT, _LARGEST_GROWTH = 1.0, 0.9, 5 / 3
 # Number of scans over which weights fall to 1 / e; least scans for an estimate; least beams of a scan.
 _MEMORY, _LEAST_SCANS, _FEWEST = 40, 5, 8
+# Deviations beyond which the variance of blocks exceeds that of independent beams.
+_SIGNIFICANT = 2.0
 # Blocks of a scan: long ones, short ones, and those compared from scan to scan.
 _LONG, _SHORT, _SECTORS = 4, 16, 8
 # Least and largest steps [m], and radians that correspond to a metre.
@@ -210,8 +213,14 @@ class BeamCorrelation:
         _, _, long, long_wanted, short, short_wanted = self._sums
         if not (long_wanted > 0 and short_wanted > 0 and short > 0):
             return 1.0
-        quarters = long / long_wanted
-        growth = min(max(quarters / (short / short_wanted), 1.0), _LARGEST_GROWTH)
+        quarters, sixteenths = long / long_wanted, short / short_wanted
+        # Deviations of the ratios for independent beams, whose blocks have at least one degree of freedom each.
+        scans = min(self.scans, 2 * _MEMORY - 1)
+        unsure, less = (_SIGNIFICANT * math.sqrt(2 / ((blocks - 1) * scans)) for blocks in (_LONG, _SHORT))
+        if quarters <= 1 + unsure and sixteenths <= 1 + less:
+            return 1.0
+        growth = quarters / sixteenths
+        growth = min(growth, _LARGEST_GROWTH) if growth > 1 + unsure else 1.0
         return float(max(quarters * 3 * growth / (5 - 2 * growth), 1.0))
 
     def temperature(self, beams: int) -> float:

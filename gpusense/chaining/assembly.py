@@ -18,8 +18,6 @@ Flags = NDArray[np.bool]
 
 TEMPERATURE = 0.04
 """Factor of the information of matches: recorded scans have repeating errors that no single match reveals."""
-INFLATION = 2.0
-"""Factor of the covariances of poses: with it six of eight recorded logs err as stated or less (docs/matching.md)."""
 # Share of the largest eigenvalue below which the information of a scan's links leaves a direction open.
 _OPEN = 1e-6
 # Relative gain of the cost below which the solution for a fit of the odometry's noise ends: the fitted variances change

@@ -13,7 +13,6 @@ from gpusense._util import checks
 from gpusense._util.typing import Precision
 from gpusense.backends import Selection, get_backend
 from gpusense.chaining.assembly import (
-    INFLATION,
     TEMPERATURE,
     constant_motion_links,
     fitted_odometry,
@@ -224,7 +223,7 @@ class Chainer:
             poses = _carried(poses, joint.keys, loops.solution.poses)
         # Without closures hardly anything tells how a long chain bends, and the chain of matches bends least.
         solution = solve(poses, Links.joined([links, closures]), settle=len(closures) > 0)
-        spread = INFLATION * pose_covariances(solution)
+        spread = pose_covariances(solution)
         found = solution.links.kind == CLOSURE
         moved = relative(joint.poses, solution.links.first[found], solution.links.second[found])
         corrections = np.hypot(*(solution.links.pose[found] - moved)[:, :2].T)

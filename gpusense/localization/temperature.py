@@ -213,7 +213,7 @@ class BeamCorrelation:
         _, _, long, long_wanted, short, short_wanted = self._sums
         if not (long_wanted > 0 and short_wanted > 0 and short > 0):
             return 1.0
-        quarters, sixteenths = long / long_wanted, short / short_wanted
+        quarters, sixteenths = float(long / long_wanted), float(short / short_wanted)
         # Deviations of the ratios for independent beams, whose blocks have at least one degree of freedom each.
         scans = min(self.scans, 2 * _MEMORY - 1)
         unsure, less = (_SIGNIFICANT * math.sqrt(2 / ((blocks - 1) * scans)) for blocks in (_LONG, _SHORT))
@@ -221,7 +221,7 @@ class BeamCorrelation:
             return 1.0
         growth = quarters / sixteenths
         growth = min(growth, _LARGEST_GROWTH) if growth > 1 + unsure else 1.0
-        return float(max(quarters * 3 * growth / (5 - 2 * growth), 1.0))
+        return max(quarters * 3 * growth / (5 - 2 * growth), 1.0)
 
     def temperature(self, beams: int) -> float:
         """Return the temperature of a sensor with ``beams`` beams: from its scans, or an initial one before the first.

@@ -152,3 +152,25 @@ def test_a_filter_learns_from_each_scanner_while_its_particles_lie_together():
     pf.initialize_uniform()
     pf.correct({models[0]: np.full(60, 20.0)})
     assert pf._sensors[0]._correlation.scans == 8
+
+
+@pytest.mark.parametrize("scans", [5, 20])
+def test_independent_beams_are_not_taken_for_correlated_ones(scans):
+    inflations, count = [], 180
+    for seed in range(30):
+        rng, correlation = np.random.default_rng(seed), BeamCorrelation()
+        for _ in range(scans):
+            poses = poses_around(np.zeros(3), np.eye(3))
+            gradients, errors = 0.02 * rng.normal(size=(count, 3)), rng.normal(size=count)
+            correlation.add(-0.5 * (errors - poses @ gradients.T) ** 2, np.eye(3))
+        inflations.append(correlation.inflation)
+    assert np.mean(inflations) < 1.05
+
+
+def test_correlated_beams_of_a_few_scans_are_seen():
+    rng, correlation = np.random.default_rng(0), BeamCorrelation()
+    for _ in range(5):
+        gradients = np.repeat(0.02 * rng.normal(size=(4, 3)), 45, axis=0)
+        errors = autoregressive(rng, 180, 0.95)
+        correlation.add(-0.5 * (errors - poses_around(np.zeros(3), np.eye(3)) @ gradients.T) ** 2, np.eye(3))
+    assert correlation.inflation > 5

@@ -27,7 +27,7 @@ from gpusense.evaluation import landmark_runs as lr
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from common import make_parser, note, parse, publish, table
-from studies.landmark_sets import run_of
+from studies.landmark_sets import repaired, run_of
 
 SETS = ("simulated", "mrclam_1", "mrclam_2", "mrclam_3", "beacons", "lego")
 WINDOW = 10.0
@@ -60,7 +60,7 @@ def simulated(seed: int) -> Ranges:
 def recorded(data: Path, name: str) -> Ranges:
     """Read the ranges of a run, with its exchanged landmarks repaired."""
     run = run_of(data, name)
-    run = lr.repaired(run, lr.suspicions(run, lr.fit_run(run)))
+    run = repaired(run, lr.suspicions(run, lr.fit_run(run)))
     known = np.flatnonzero(run.ids >= 0)
     scan = run.scan[known]
     windows = (run.time[scan] // WINDOW).astype(int)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import csv
 import gzip
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 import gpusense as gs
 from gpusense.evaluation.landmark_runs import first_scans
+from gpusense.learning.landmark.suspicious import Suspicions
 from gpusense.logs.mrclam import read_mrclam
 from gpusense.logs.records import LandmarkRun
 
@@ -110,7 +112,7 @@ def _lego(data: Path) -> LandmarkRun:
     features, ids = np.concatenate(found), np.concatenate(ids)
     scan = np.repeat(np.arange(len(found)), [len(f) for f in found])
     return LandmarkRun(
-        gs.LandmarkMap(xy), np.arange(len(xy)), scans[:, 0] / 1000, odometry, np.column_stack([position, headings]),
+        gs.gs.LandmarkMap(xy), np.arange(len(xy)), scans[:, 0] / 1000, odometry, np.column_stack([position, headings]),
         features, scan, ids, 3.0, 2.1 * float(np.abs(features[:, 1]).max()), {},
     )  # fmt: skip
 
@@ -152,3 +154,11 @@ def _path(moves: np.ndarray) -> np.ndarray:
     return np.column_stack([
         np.cumsum(moves[:, 1] * np.cos(along)), np.cumsum(moves[:, 1] * np.sin(along)), heading
     ])  # fmt: skip
+
+
+def repaired(run: LandmarkRun, suspected: Suspicions) -> LandmarkRun:
+    """Return the run with the positions of exchanged landmarks swapped back."""
+    xy = run.landmarks.xy.copy()
+    for pair in suspected.exchanged:
+        xy[[pair.first, pair.second]] = xy[[pair.second, pair.first]]
+    return replace(run, landmarks=gs.LandmarkMap(xy, run.landmarks.signatures))

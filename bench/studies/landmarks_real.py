@@ -20,13 +20,16 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import gpusense as gs
 from gpusense.evaluation import landmark_runs as lr
+from gpusense.logs.records import LandmarkRun
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from common import make_parser, note, parse, publish, table
-from studies.landmark_sets import run_of
+from studies.landmark_sets import repaired, run_of
 
 SETS = ("mrclam_1", "mrclam_2", "mrclam_3", "beacons", "lego", "freiburg")
 MOVED = ((0.0, 0.0), (0.1, 0.05), (0.3, 0.15))
@@ -39,7 +42,7 @@ def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, A
     found = lr.suspicions(run, fit)
     variants = {"as recorded": run}
     if found.exchanged:
-        variants["repaired"] = lr.repaired(run, found)
+        variants["repaired"] = repaired(run, found)
     rows = []
     for variant, own in variants.items():
         for known in (True, False):
@@ -48,8 +51,8 @@ def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, A
             row: dict[str, Any] = {"map": variant, "known": known, "fit": learned.to_dict()}
             if not known:
                 row["association"] = [
-                    {"sigma_position": m, "sigma_heading": h,
-                     **lr.association(own, model, sigma_position=m, sigma_heading=h)} for m, h in MOVED
+                    {"sigma_position": m, "sigma_heading": h, **lr.association(own, model, moved(own, m, h))}
+                    for m, h in MOVED
                 ]  # fmt: skip
             track = lr.localise(own, model, known=known, particles=arguments.particles, seed=arguments.seed)
             row["filter"] = track.summary()
@@ -65,6 +68,12 @@ def measure(data: Path, name: str, arguments: argparse.Namespace) -> dict[str, A
         ],
         "misplaced": [{"landmark": label[m.landmark], "agree": m.agree} for m in found.misplaced],
     }  # fmt: skip
+
+
+def moved(run: LandmarkRun, position: float, heading: float) -> np.ndarray:
+    """Return the logged poses with normal errors of these deviations [m, rad]."""
+    rng = np.random.default_rng(0)
+    return run.truth + rng.normal(size=run.truth.shape) * (position, position, heading)
 
 
 def to_markdown(sets: list[dict[str, Any]]) -> str:

@@ -14,7 +14,6 @@ from gpusense.commands.arguments import (
     add_json,
     add_seed,
     not_negative_number,
-    output_path,
     positive_number,
     whole_number,
 )
@@ -53,7 +52,7 @@ Exit codes: 0 success, 1 lost at the end, 2 bad input.
 
 examples:
   gpusense landmarks --folder MRCLAM_Dataset1 --robot 1
-  gpusense landmarks --folder MRCLAM_Dataset1 --robot 2 --unknown --particles 5000 --plot run.png"""
+  gpusense landmarks --folder MRCLAM_Dataset1 --robot 2 --unknown --particles 5000"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -85,8 +84,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_backend(parser)
     add_seed(parser)
     add_json(parser)
-    add("--plot", type=output_path(".png", ".pdf", ".svg"), metavar="FILE",
-        help="draw path, estimate and landmarks")  # fmt: skip
 
 
 def _probability(text: str) -> float:
@@ -112,7 +109,7 @@ def run(args: argparse.Namespace) -> int:
     suspicions = landmark_runs.suspicions(recorded_run, known_fit)
     fit = known_fit if args.known else landmark_runs.fit_run(recorded_run, known=False)
     model = LandmarkModel(recorded_run.landmarks, landmark_runs.usable(fit.parameters), backend=args.backend)
-    agreement = landmark_runs.association(recorded_run, model, sigma_position=0.0, sigma_heading=0.0, seed=args.seed)
+    agreement = landmark_runs.association(recorded_run, model)
     alpha = None if args.motion_noise is None else tuple(args.motion_noise)
     drift = None if args.drift is None else tuple(args.drift)
     motion = run_motion(recorded_run, alpha=alpha, reverse=args.reverse, drift=drift, fit=args.fit_motion)
@@ -129,10 +126,6 @@ def run(args: argparse.Namespace) -> int:
         print_json(_document(args, recorded_run, fit, suspicions, agreement, track, motion, model.device.selection))
     else:
         _print(args, recorded_run, fit, suspicions, agreement, track, motion)
-    if args.plot is not None:
-        _draw(args.plot, recorded_run, track, suspicions)
-        if not args.json:
-            print(f"drawn: {args.plot}")
     return LOST if track.lost else 0
 
 
@@ -142,13 +135,6 @@ def _print_fit(args: argparse.Namespace, fit: LandmarkFit) -> None:
         print_json({"interrupted": True, "fit": fit.to_dict(), "machine": machine()})
     else:
         print(f"interrupted while localising; the noise of the sensor:\n\n{fit}")
-
-
-def _draw(path: Path, recorded_run: LandmarkRun, track: Track, suspicions: Suspicions) -> None:
-    from gpusense.plots.drawing import save
-    from gpusense.plots.landmark_runs import run_figure
-
-    save(run_figure(recorded_run, track, suspicions), path)
 
 
 def _document(

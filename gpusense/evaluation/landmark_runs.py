@@ -16,7 +16,6 @@ from gpusense.localization.filter import ParticleFilter
 from gpusense.localization.words import LOST
 from gpusense.logs.records import LandmarkRun
 from gpusense.models.landmark.model import LandmarkModel
-from gpusense.world.landmarks import LandmarkMap
 from gpusense.world.parameters import LandmarkParameters
 
 Floats = NDArray[np.float64]
@@ -108,23 +107,18 @@ def usable(parameters: LandmarkParameters) -> LandmarkParameters:
     return parameters.replace(z_false=z, z_detect=1 - z)
 
 
-def association(
-    run: LandmarkRun, model: LandmarkModel, *, sigma_position: float, sigma_heading: float, seed: int = 0
-) -> dict[str, float]:
-    """Compare the likeliest landmark of each feature with the recorded one, at perturbed logged poses.
+def association(run: LandmarkRun, model: LandmarkModel, poses: Floats | None = None) -> dict[str, float]:
+    """Compare the likeliest landmark of each feature with the recorded one.
 
     Args:
         run: The run.
         model: The model of the run's map.
-        sigma_position: Deviation of the perturbation in x and in y [m]; 0 for the logged positions.
-        sigma_heading: Deviation of the perturbation of headings [rad].
-        seed: Seed of the random numbers.
+        poses: (S, 3) poses of the scans [m, m, rad]; None for the logged ones.
 
     Returns:
         Shares of features: right, none (classed as a false positive but recorded as a landmark) and wrong.
     """
-    rng = np.random.default_rng(seed)
-    poses = run.truth + rng.normal(size=run.truth.shape) * (sigma_position, sigma_position, sigma_heading)
+    poses = run.truth if poses is None else poses
     likeliest = np.empty(len(run.ids), np.int64)
     for first, last in _scans(run):
         likeliest[first:last] = model.associate(poses[[run.scan[first]]], run.features[first:last])[0][0]
@@ -185,14 +179,6 @@ def _scans(run: LandmarkRun) -> list[tuple[int, int]]:
     """Return the first feature and the end (excluded) of each scan that has features."""
     starts = np.flatnonzero(np.diff(run.scan, prepend=-1))
     return list(zip(starts.tolist(), [*starts[1:].tolist(), len(run.scan)], strict=True))
-
-
-def repaired(run: LandmarkRun, suspected: Suspicions) -> LandmarkRun:
-    """Return the run with the positions of exchanged landmarks swapped back."""
-    xy = run.landmarks.xy.copy()
-    for pair in suspected.exchanged:
-        xy[[pair.first, pair.second]] = xy[[pair.second, pair.first]]
-    return replace(run, landmarks=LandmarkMap(xy, run.landmarks.signatures))
 
 
 def first_scans(run: LandmarkRun, count: int | None) -> LandmarkRun:

@@ -76,11 +76,9 @@ def test_command_localises(capsys, folder, kind):
 
 
 @pytest.mark.slow
-def test_exchanged_landmarks_are_reported_and_survived(capsys, swapped, tmp_path):
-    drawn = tmp_path / "run.png"
-    text = run(capsys, swapped, "--particles", "300", "--scans", "150", "--plot", str(drawn))
+def test_exchanged_landmarks_are_reported_and_survived(capsys, swapped):
+    text = run(capsys, swapped, "--particles", "300", "--scans", "150")
     assert "SUSPICIOUS: landmarks 8 and 12 fit better exchanged" in text and "known landmarks" in text
-    assert drawn.stat().st_size > 10_000
     document = json.loads(run(capsys, swapped, "--particles", "300", "--scans", "60", "--json"))
     assert [(e["first"], e["second"]) for e in document["exchanged"]] == [(8, 12)]
     assert document["filter"]["error_median"] < 0.2
@@ -149,7 +147,6 @@ def test_bad_files(capsys, folder, tmp_path, file, text, message):
         (["--robot", "1", "--drift", "-1", "0"], "argument --drift: must be a finite number >= 0, got '-1'"),
         (["--robot", "2"], "{}/Robot2_Measurement.dat: must exist, got no such file"),
         (["--robot", "1", "--range-max", "1"], None),
-        (["--robot", "1", "--plot", "run.txt"], "argument --plot: must end in .png or .pdf or .svg, got 'run.txt'"),
     ],
 )
 def test_bad_arguments(capsys, folder, arguments, message):

@@ -36,11 +36,9 @@ TIMES = {"CONFIGURE": Transition.TRANSITION_CONFIGURE, "ACTIVATE": Transition.TR
          "DEACTIVATE": Transition.TRANSITION_DEACTIVATE, "CLEANUP": Transition.TRANSITION_CLEANUP}  # fmt: skip
 
 
-def room() -> gs.OccupancyGrid:
-    """Return a room with a wall in it, 4 m wide."""
-    cells = np.zeros((40, 40), np.int8)
-    cells[[0, -1]] = cells[:, [0, -1]] = cells[:12, 25] = 100
-    return gs.OccupancyGrid(cells, 0.1)
+# A room with a wall in it, 4 m wide.
+CELLS = np.zeros((40, 40), np.int8)
+CELLS[[0, -1]] = CELLS[:, [0, -1]] = CELLS[:12, 25] = 100
 
 
 def wait_for(condition: Callable[[], Any], what: str) -> Any:
@@ -156,13 +154,26 @@ class Robot:
         wait_for(future.done, "the state")
         return str(future.result().current_state.label)
 
-    def status(self, ends: str, condition: Callable[[Any], Any]) -> Any:
-        """Return the next diagnostic status of a name that meets a condition."""
+    def status(
+        self, ends: str, condition: Callable[[Any], Any], send: Callable[[], Any] | None = None, pause: float = 0.2
+    ) -> Any:
+        """Return the next diagnostic status of a name that meets a condition; send messages until it comes."""
         kept = self.listen(DiagnosticArray, "/diagnostics")
         del kept[:]
-        seen = lambda: [one for array in list(kept) for one in array.status if one.name.endswith(ends)]  # noqa: E731
+        last = -math.inf
+
+        def found() -> Any:
+            nonlocal last
+            if send is not None and time.monotonic() - last > pause:
+                last = time.monotonic()
+                send()
+            return next((one for one in seen() if condition(one)), None)
+
+        def seen() -> list[Any]:
+            return [one for array in list(kept) for one in array.status if one.name.endswith(ends)]
+
         try:
-            return wait_for(lambda: next((one for one in seen() if condition(one)), None), f"a status of {ends}")
+            return wait_for(found, f"a status of {ends}")
         except AssertionError as error:
             raise AssertionError(f"{error}; {[(one.name, one.message) for one in seen()[-3:]]}") from None
 
@@ -189,7 +200,7 @@ class Robot:
         one = self.stamp(LaserScan(range_min=0.05, range_max=8.0), time, "laser")
         one.angle_min, one.angle_increment = -math.pi, 2 * math.pi / COUNT
         bearings = -math.pi + 2 * math.pi / COUNT * np.arange(COUNT)
-        caster = gs.RayCaster(room(), range_max=8.0, backend="numpy")
+        caster = gs.RayCaster(gs.OccupancyGrid(CELLS, 0.1), range_max=8.0, backend="numpy")
         one.ranges = caster.cast([(x + 0.1, 1.3, 0.0)], bearings)[0].astype(np.float32).tolist()
         for name, value in changes.items():
             setattr(one, name, value)
@@ -204,14 +215,18 @@ class Robot:
         one.pose.covariance = covariance.ravel().tolist()
         self.publisher(PoseWithCovarianceStamped, topic).publish(one)
 
-    def map(self, quality: Any = None, **changes: Any) -> None:
+    def map(self, **changes: Any) -> None:
+        """Publish the room."""
+        self.publisher(OccupancyGrid, "map", latched()).publish(self.map_message(**changes))
+
+    def map_message(self, **changes: Any) -> OccupancyGrid:
         one = OccupancyGrid()
         one.info.width = one.info.height = 40
         one.info.resolution, one.info.origin.orientation.w = 0.1, 1.0
-        one.data = (100 * (np.asarray(room().data) > 0)).astype(np.int8).ravel().tolist()
+        one.data = CELLS.ravel().tolist()
         for name, value in changes.items():
             setattr(one if name == "data" else one.info, name, value)
-        self.publisher(OccupancyGrid, "map", quality or latched()).publish(one)
+        return one
 
     def drive(self, times: Any, first: float = 0.0) -> None:
         """Publish transforms and scans of a robot that drives 0.1 m from scan to scan."""

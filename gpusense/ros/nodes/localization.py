@@ -26,7 +26,6 @@ from std_srvs.srv import Empty
 from gpusense.logs.records import Pose
 from gpusense.logs.transform_buffer import BACK
 from gpusense.ros import conversions
-from gpusense.ros.diagnostics import ERROR
 from gpusense.ros.localizer import Localizer
 from gpusense.ros.nodes.wiring import Guard, TFMessage, Transforms, diagnostic_array, latched, run, unreliable
 from gpusense.ros.parameters import defaults, mount_of, options_of
@@ -288,9 +287,7 @@ class LocalizationNode(LifecycleNode):
         }  # fmt: skip
         reason = self.map_reason if self.localizer.grid is None else self.queue.reason
         fields = self.localizer.status(counts, reason, self.full_name)
-        trouble = self.guard.text()
-        if trouble is not None:
-            fields |= {"level": ERROR, "message": trouble}
+        fields = self.guard.into(fields)
         self.diagnostics.publish(diagnostic_array(fields, self.get_clock().now().to_msg()))
 
 

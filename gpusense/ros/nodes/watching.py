@@ -17,7 +17,6 @@ from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
 from gpusense.logs.transform_buffer import TransformError
-from gpusense.ros.diagnostics import ERROR
 from gpusense.ros.nodes.wiring import Guard, Transforms, diagnostic_array, latched, run, unreliable
 from gpusense.ros.parameters import WATCH, check_watch, mount_of
 from gpusense.ros.watcher import Watcher
@@ -48,7 +47,7 @@ class WatchingNode(Node):
             self.create_subscription(MapMessage, "map", self.guard.around("map", self.on_map), kept)
         for kind, topic, callback, quality in (
             (LaserScan, "scan", self.on_scan, unreliable(50)),
-            (PoseWithCovarianceStamped, "amcl_pose", self.on_pose, kept),
+            (PoseWithCovarianceStamped, "amcl_pose", self.on_pose, unreliable(50)),
             (PoseWithCovarianceStamped, "initialpose", self.on_initial_pose, 1),
         ):
             self.create_subscription(kind, topic, self.guard.around(topic, callback), quality)
@@ -82,9 +81,7 @@ class WatchingNode(Node):
         """Publish the diagnostics."""
         now = self.get_clock().now()
         fields = self.watcher.status(1e-9 * now.nanoseconds, self.full_name)
-        trouble = self.guard.text()
-        if trouble is not None:
-            fields |= {"level": ERROR, "message": trouble}
+        fields = self.guard.into(fields)
         self.diagnostics.publish(diagnostic_array(fields, now.to_msg()))
 
 

@@ -20,6 +20,7 @@ from gpusense.logs.records import Pose
 from gpusense.logs.transform_buffer import TransformBuffer
 from gpusense.logs.transforms import planar_mount
 from gpusense.ros.conversions import odometry_fields, pose_matrix
+from gpusense.ros.diagnostics import ERROR
 from gpusense.world.messages import LEVEL
 
 try:
@@ -104,9 +105,12 @@ class Guard:
             if not isinstance(error, (OSError, TypeError, ValueError)):
                 self.log.debug("".join(traceback.format_exception(error)))
 
-    def text(self) -> str | None:
-        """Return the errors in one line; None without one."""
-        return "; ".join(f"{subject}: {text}" for subject, text in self.troubles.items()) or None
+    def into(self, fields: dict[str, Any]) -> dict[str, Any]:
+        """Return the fields of a status with the errors, if there are any."""
+        if not self.troubles:
+            return fields
+        texts = [f"{subject}: {text}" for subject, text in self.troubles.items()]
+        return fields | {"level": ERROR, "message": "; ".join([*texts, fields["message"]])}
 
 
 class Transforms:

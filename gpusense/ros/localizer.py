@@ -76,13 +76,17 @@ class Localizer:
         grid = OccupancyGrid(cells, 0.1) if self.grid is None else self.grid
         scanner = Scanner.uniform(angle_min=-math.pi, angle_increment=math.pi / 180, count=360, range_max=10.0)
         made = self.options.make_filter(self.options.make_model(grid, scanner, backend=self.backend), seed=self.seed)
-        made.initialize_uniform()
-        made.initialize(mean=(4.0, 4.0, 0.0), covariance=np.diag(np.square(_START)))
-        for step in range(2):
-            made.predict((0.1 * step, 0.0, 0.0), (0.1 * (step + 1), 0.0, 0.0))
-            made.correct(np.full(360, 3.0))
-            made.estimate()
-        made.diagnose()
+        for start in range(2):
+            if start == 0:
+                made.initialize_uniform()
+            else:
+                made.initialize(mean=(4.0, 4.0, 0.0), covariance=np.diag(np.square(_START)))
+            # Scans that fit the middle of the room, and scans that fit nowhere.
+            for step, distance in enumerate((4.0, 4.0, 0.5)):
+                made.correct(np.full(360, distance))
+                made.estimate()
+                made.diagnose()
+                made.predict((0.1 * step, 0.0, 0.0), (0.1 * (step + 1), 0.0, 0.0))
 
     def begin(self) -> None:
         """Count the time without scans from now on."""

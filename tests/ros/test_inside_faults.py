@@ -108,6 +108,32 @@ def test_faults_are_reported_and_the_node_goes_on(robot: Any, tmp_path: Path) ->
         assert node.alive() and node.stop(signal.SIGINT) == 0
 
 
+def test_time_that_goes_back_may_start_the_filter_again_and_lost_scans_are_counted(robot: Any, tmp_path: Path) -> None:
+    with started(tmp_path / "log", *START, "-p", "restart_after_jump:=true") as node:
+        robot.poses()
+        ready(robot)
+        robot.drive([30.0, 30.1])
+        last_x(robot, 30.1)
+        robot.transform(1.0, "odom", "base_footprint", 7.0)
+        robot.scan(1.0)
+        assert abs(last_x(robot, 1.0) - 1.0) < 0.1
+
+        def known(status: Any) -> int:
+            counts = {pair.key: pair.value for pair in status.values}
+            return int(counts["scans received"]) + int(counts["scans lost before the callback"])
+
+        before, sent = known(robot.status("amcl: filter", lambda one: True)), [0]
+
+        def send(number: int) -> None:
+            sent[0] += number
+            for _ in range(number):
+                robot.publishers["scan"].publish(robot.last)
+
+        send(400)
+        robot.status("amcl: filter", lambda one: known(one) - before == sent[0], send=lambda: send(1), pause=2.5)
+        assert node.alive() and node.stop() == 0
+
+
 @pytest.mark.parametrize("more, text", [
     (["--backend", "nosuch"], "nosuch"), (["--ros-args", "-p", "scan_topic:='bad topic'"], "bad topic"),
     (["--ros-args", "-p", "z_hit:=-1.0"], "z_hit"), (["--map", "{}/no.yaml"], "no.yaml"),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import gpusense as gs
+from gpusense.backends import get_backend
 from gpusense.logs.transform_buffer import TransformError
 from gpusense.ros import conversions, localizer, parameters, watcher
 from gpusense.ros.scan_queue import ScanQueue
@@ -280,6 +281,23 @@ def test_a_device_that_is_absent_is_an_error_before_the_first_scan() -> None:
     with pytest.raises(ValueError, match="nosuch"):
         localizer.Localizer(from_nav2({"max_particles": 500}), backend="nosuch").warm_up()
     localizer.Localizer(from_nav2({"max_particles": 500}), backend="numpy").warm_up()
+
+
+@pytest.mark.parametrize("values", [{"max_particles": 600}, {"laser_model_type": "beam", "max_particles": 600}])
+def test_the_first_scan_compiles_nothing(monkeypatch: pytest.MonkeyPatch, needs: Any, values: dict[str, Any]) -> None:
+    needs("opencl")
+    kind, made = type(get_backend("opencl")), set()
+    monkeypatch.setattr(kind, "compile", lambda self, *key, real=kind.compile: made.add(key) or real(self, *key))
+    own = localizer.Localizer(from_nav2(values), backend="opencl")
+    own.warm_up()
+    warm = set(made)
+    own.set_map(grid())
+    own.start_at((1.0, 1.3, 0.0), np.diag([0.01, 0.01, 0.01]))
+    for k in range(2):
+        assert own.update(scan_of(90), (0.3 * k, 0.0, 0.0), AHEAD)
+    own.start_anywhere()
+    assert own.update(scan_of(90), (0.6, 0.0, 0.0), AHEAD)
+    assert warm and made == warm
 
 
 # ------------------------------------------------------------------------------------------------------ parameters

@@ -204,6 +204,7 @@ class Robot:
         one.ranges = caster.cast([(x + 0.1, 1.3, 0.0)], bearings)[0].astype(np.float32).tolist()
         for name, value in changes.items():
             setattr(one, name, value)
+        self.last = one
         self.publisher(LaserScan, "scan").publish(one)
 
     def initial_pose(self, x: float, variance: float = 0.01, frame: str = "map", topic: str = "initialpose",

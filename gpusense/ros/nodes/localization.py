@@ -116,6 +116,7 @@ class LocalizationNode(LifecycleNode):
         if values["map_file"]:
             self.localizer.set_map(read_map(values["map_file"]))
         begin = time.perf_counter()
+        self.get_logger().info(f"compiling for {values['backend']}, which takes long the first time")
         self.localizer.warm_up()
         self.get_logger().info(f"compiled for {values['backend']} in {time.perf_counter() - begin:.1f} s")
         self.queue = ScanQueue(self.look_up, self.localize, patience=float(values["scan_patience"]))

@@ -17,20 +17,20 @@ real cast_ray(global const entry *map_table, const Window window, const int2 cel
     int k_x = start.k_x, k_y = start.k_y;
     real t = start.t;
     if (t >= limit) return limit;
-    for (;;) {
-        const int state = map_table[padded(cell.y + r.step_y * k_y, cell.x + r.step_x * k_x, window.cols)];
-#if OUTSIDE_OCCUPIED
-        if (state != 0) return t;
-#else
-        if (state != 0) return state == 1 ? t : limit;
-#endif
+    int state = map_table[padded(cell.y + r.step_y * k_y, cell.x + r.step_x * k_x, window.cols)];
+    // A step beyond limit still ends in the table. With several exits of the loop Mesa's llvmpipe has wrong ranges.
+    while (state == 0 && t < limit) {
         const real t_x = ((real)k_x + r.a_x) * r.inv_x;
         const real t_y = ((real)k_y + r.a_y) * r.inv_y;
-        t = t_x <= t_y ? t_x : t_y;
-        if (t >= limit) return limit;
-        if (t_x <= t_y)
-            ++k_x;
-        else
-            ++k_y;
+        const int by_x = t_x <= t_y;
+        t = by_x ? t_x : t_y;
+        k_x += by_x;
+        k_y += !by_x;
+        state = map_table[padded(cell.y + r.step_y * k_y, cell.x + r.step_x * k_x, window.cols)];
     }
+#if OUTSIDE_OCCUPIED
+    return t < limit ? t : limit;
+#else
+    return t < limit && state == 1 ? t : limit;
+#endif
 }

@@ -6,12 +6,27 @@ import atexit
 import contextlib
 import os
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, BinaryIO
 
 # Unfinished files of this process: entered before they are created, removed after they are deleted.
 _UNFINISHED: set[Path] = set()
+
+
+@contextlib.contextmanager
+def naming(path: object) -> Iterator[None]:
+    """Name a file in errors of the operating system that lack a name, such as that of a full disk.
+
+    Raises:
+        OSError: The error, with the file's name.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None or error.strerror is None:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def check_writable(path: Path) -> None:
@@ -69,7 +84,7 @@ def write_several(writers: Mapping[Path, Callable[[BinaryIO], object]]) -> None:
         try:
             for target, write in writers.items():
                 _UNFINISHED.add(fresh[target])
-                with fresh[target].open("xb") as stream:
+                with naming(target), fresh[target].open("xb") as stream:
                     write(stream)
             for target in writers:
                 if existed[target]:
@@ -97,7 +112,7 @@ def _write_fresh(path: Path, write: Callable[[BinaryIO], object], target: Path |
     try:
         try:
             _UNFINISHED.add(fresh)
-            with fresh.open("xb") as stream:
+            with naming(path), fresh.open("xb") as stream:
                 write(stream)
             if target is not None:
                 os.replace(fresh, target)

@@ -20,6 +20,7 @@ BACKEND_HELP = (
     "opencl:<platform>:<device>, warp:cpu or warp:cuda:<number>; 'gpusense devices' lists the devices"
 )
 
+_LONGEST_RANGE = 10_000.0
 # Library that writes files with a suffix, and the subject of the message if it is absent.
 _PICTURE = ("matplotlib", "a picture")
 _WRITERS = {".png": _PICTURE, ".pdf": _PICTURE, ".svg": _PICTURE, ".rrd": ("rerun", "a recording for Rerun")}
@@ -107,6 +108,14 @@ def positive_number(text: str) -> float:
     number = _finite(text)
     if not number > 0:
         raise argparse.ArgumentTypeError(f"must be a finite number > 0, got {text!r}")
+    return number
+
+
+def range_number(text: str) -> float:
+    """Convert an argument to a range that a scanner may have [m]."""
+    number = _finite(text)
+    if not 0 < number <= _LONGEST_RANGE:
+        raise argparse.ArgumentTypeError(f"must be a number > 0 and <= {_LONGEST_RANGE:g} (metres), got {text!r}")
     return number
 
 

@@ -119,6 +119,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit code: 0 success, 2 bad input, 130 interrupted, 143 terminated, 129 after a hang-up of the terminal, 141
         when the reader of standard output is gone, or a code of the command.
     """
+    _open_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         # A device's name may have characters outside the terminal's encoding.
         if isinstance(stream, io.TextIOWrapper):
@@ -145,6 +146,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _failed(absent)
 
 
+def _open_closed_streams() -> None:
+    """Discard the output to a stream that the caller closed, as by ``>&-``; Python has None for it."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
+
+
 def _failed(error: Exception) -> int:
     """Print an error as one line, with its traceback if the environment requests it."""
     if os.environ.get(TRACEBACK):
@@ -158,7 +166,7 @@ def _settle() -> None:
     """Flush standard output, and redirect it if that fails, so that Python's flush at exit succeeds."""
     try:
         print(end="", flush=True)
-    except OSError:
+    except (OSError, ValueError):
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -271,6 +272,7 @@ def _write(folder: Path, result: FitResult) -> list[Path]:
     from gpusense.plots import fits as fit_plots
     from gpusense.plots.drawing import save
 
+    folder.mkdir(parents=True, exist_ok=True)
     text = parameters_yaml(result).encode()
     file = folder / "parameters.yaml"
     write_whole(file, lambda stream: stream.write(text))
@@ -294,12 +296,15 @@ def _write(folder: Path, result: FitResult) -> list[Path]:
 
 
 def _folder(text: str) -> Path:
-    """Convert an argument to a folder that can be written to, created if absent."""
+    """Convert an argument to a folder that can be written to, or created."""
     check_writer(".png")
     folder = Path(text)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        check_writable(folder / "parameters.yaml")
+        # The folder is created once the fit has succeeded.
+        there = next(each for each in (folder, *folder.absolute().parents) if os.path.lexists(each))
+        if not there.is_dir():
+            raise ValueError(f"{there} is no folder")
+        check_writable(there / "parameters.yaml")
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise argparse.ArgumentTypeError(f"must be a folder that can be written to, got {text!r}: {reason}") from None

@@ -15,6 +15,7 @@ from gpusense.commands.arguments import (
     add_seed,
     not_negative_number,
     positive_number,
+    range_number,
     whole_number,
 )
 from gpusense.commands.output import print_json, print_table
@@ -77,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "(default: 0.01 and the measured error of the odometer's heading)")  # fmt: skip
     add("--fit-motion", action="store_true", help="learn the motion noise from the logged poses of this run first")
     add("--scans", type=whole_number(low=1), metavar="S", help="largest number of scans (default: all)")
-    add("--range-max", type=positive_number, metavar="M",
+    add("--range-max", type=range_number, metavar="M",
         help="the sensor's largest range [m] (default: the next metre above the largest reading)")  # fmt: skip
     add("--field-of-view", type=positive_number, metavar="RAD",
         help="the sensor's field of view [rad] (default: 5 %% more than the readings' span)")  # fmt: skip

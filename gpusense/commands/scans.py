@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpusense.commands.arguments import finite_number, not_negative_number, positive_number, whole_number
+from gpusense.commands.arguments import finite_number, not_negative_number, range_number, whole_number
 
 if TYPE_CHECKING:
     from gpusense.logs import Scan
@@ -64,7 +64,7 @@ def add_choice(parser: argparse.ArgumentParser, what: str = "scan", several: str
 def add_range_max(parser: argparse.ArgumentParser) -> None:
     """Add ``--range-max`` and ``--range-min``, the limits of readings."""
     parser.add_argument(
-        "--range-max", type=positive_number, metavar="M",
+        "--range-max", type=range_number, metavar="M",
         help="readings of at least this are 'no return' [m] (default: the log's reading for 'no return')",
     )  # fmt: skip
     parser.add_argument(

@@ -16,6 +16,7 @@ from gpusense.commands.arguments import (
     not_negative_number,
     output_path,
     positive_number,
+    range_number,
     whole_number,
 )
 from gpusense.commands.output import counted, print_json
@@ -103,7 +104,7 @@ def _add_sensors(parser: argparse.ArgumentParser) -> None:
         help="beams of the laser (default: %(default)s)")  # fmt: skip
     add("--view", type=positive_number, default=180.0, metavar="DEG",
         help="angle between the first and the last beam [deg], below 360 (default: 180)")  # fmt: skip
-    add("--range-max", type=positive_number, default=20.0, metavar="M", help="largest range [m] (default: 20)")
+    add("--range-max", type=range_number, default=20.0, metavar="M", help="largest range [m] (default: 20)")
     add("--mount", type=finite_number, nargs=3, default=(0.0, 0.0, 0.0), metavar=("X", "Y", "THETA"),
         help="pose of the laser on the robot [m, m, rad] (default: 0 0 0)")  # fmt: skip
     add("--noise", type=positive_number, metavar="M", help="standard deviation of ranges [m] (default: 0.02)")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import shutil
+import sqlite3
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -13,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from gpusense._util.extras import library
+from gpusense._util.files import naming
 from gpusense.logs.bags import ODOMETRY, SCAN, TRANSFORMS
 from gpusense.logs.records import Pose, Scan
 
@@ -35,10 +38,13 @@ def write_bag(path: Path, scans: Iterable[Scan], *, first: bool) -> None:
         OSError: the bag cannot be written.
     """
     check_bag(path, first=first)
-    with tempfile.TemporaryDirectory(prefix=".gpusense-", suffix=".new", dir=path.parent) as folder:
+    with naming(path), tempfile.TemporaryDirectory(prefix=".gpusense-", suffix=".new", dir=path.parent) as folder:
         fresh = Path(folder, path.name)
-        with _Writer(fresh, first=first) as writer:
-            _write(writer, scans)
+        try:
+            with _Writer(fresh, first=first) as writer:
+                _write(writer, scans)
+        except sqlite3.Error as error:  # a full disk, for example
+            raise OSError(errno.EIO, str(error), str(path)) from error
         os.replace(fresh, path) if first else shutil.move(fresh, path)
 
 

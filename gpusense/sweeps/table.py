@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 
 from gpusense._util import checks
 from gpusense._util.extras import library
-from gpusense._util.files import write_whole
+from gpusense._util.files import naming, write_whole
 from gpusense.sweeps.job import Job
 from gpusense.sweeps.worker import Outcome
 
@@ -100,9 +100,10 @@ class Table:
         if more or not self.columns:
             self._rewrite(self.rows.values(), self._merged(row))
         else:
-            self._stream.write(_lines(self.columns, [row]))
-            self._stream.flush()
-            os.fsync(self._stream.fileno())
+            with naming(self.path):
+                self._stream.write(_lines(self.columns, [row]))
+                self._stream.flush()
+                os.fsync(self._stream.fileno())
         return row
 
     def _merged(self, row: Iterable[str]) -> tuple[str, ...]:

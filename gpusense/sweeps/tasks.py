@@ -156,7 +156,8 @@ def fit(job: Job, store: Store) -> Values:
     return {**found.parameters.to_dict(), **figures, "converged": found.converged, "readings": len(ranges)}
 
 
-_STRIDES = ("every", "offset", "limit")
+# Options that choose scans, with their least values.
+_STRIDES = {"every": 1, "offset": 0, "limit": 1}
 _SCANS = (*_STRIDES, "topic")
 TASKS: dict[str, Task] = {
     "localize": Task(
@@ -188,14 +189,17 @@ def task_of(job: Job) -> Callable[[Job, Store], Values]:
 
 
 def check_options(job: Job) -> None:
-    """Check the names of a job's model and options.
+    """Check the names of a job's model and options, and the options that choose scans.
 
     Raises:
-        ValueError: the task has no such model or option.
+        TypeError, ValueError: the task has no such model or option, or a value breaks its rule.
     """
     checks.choice("model", job.model, MODELS)
     known = (*TASKS[job.task].options, *MODEL_OPTIONS)
-    for name, _ in job.options:
+    for name, value in job.options:
+        low = _STRIDES.get(name.removeprefix("training."))
+        if low is not None and value is not None:
+            checks.integer(f"options.{name}", value, low=low)
         group, dot, rest = name.partition(".")
         training = group == "training" and rest in _STRIDES
         if name not in known and not training and not (dot and group == "parameters"):

@@ -29,6 +29,8 @@ Bools = NDArray[np.bool]
 Rng = np.random.Generator
 
 READINGS = BeamParameters(z_hit=0.97, z_short=0.01, z_max=0.01, z_rand=0.01, sigma_hit=0.02, lambda_short=0.5)
+# Largest distance between two scans [m]; a path between two places of a building must be longer now and then.
+_FARTHEST_STEP = 100.0
 # Per step about 5 % of the translation and of the turn, and 0.03 rad/m.
 MOTION = OdometryMotion((0.0025, 0.001, 0.0025, 0.0001), reverse=0.0, least=(0.001, 0.001))
 _SCANS = 200
@@ -144,7 +146,7 @@ def simulate_run(
     share = checks.real("hidden", hidden, low=0, high=0.9)
     every = checks.real("period", period, above=0)
     room = checks.real("clearance", clearance, low=0)
-    rates = checks.real("step", step, above=0), checks.real("turn", turn, above=0)
+    rates = checks.real("step", step, above=0, high=_FARTHEST_STEP), checks.real("turn", turn, above=0)
     _check_kinds(grid, scanner, world, parameters, motion)
     # Each part has a separate random stream, so that people do not change the odometry.
     streams = np.random.SeedSequence(checks.integer("seed", seed, low=0)).spawn(6)

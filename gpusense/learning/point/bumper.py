@@ -122,7 +122,7 @@ def fit_bumper_parameters(
     model = BumperModel(
         grid, outline, wide, segments=segments, backend=backend, precision=precision, unknown=unknown, outside=outside
     )
-    pose = checks.array("poses", poses, ("F", 3), largest=checks.FARTHEST)
+    pose = checks.array("poses", poses, ("F", 3))
     raw = checks.as_array("pressed", pressed, masked=True)
     shape = (len(pose),) if raw.ndim == 1 and model.segments == 1 else (len(pose), model.segments)
     table = checks.array("pressed", raw.astype(np.float64) if raw.dtype == bool else raw, shape, finite=False)

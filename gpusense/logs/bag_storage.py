@@ -47,7 +47,7 @@ class Storage:
     Attributes:
         counts: Number of messages by topic; 0 if the file does not state it.
         start: Time of the first message [ns].
-        cut: Whether the file is cut off.
+        cut: True if the file is cut off.
     """
 
     def __init__(self, file: Path) -> None:
@@ -83,7 +83,7 @@ class Sqlite(Storage):
         page, pages = struct.unpack(">H", header[16:18])[0], struct.unpack(">I", header[28:32])[0]
         size = (65536 if page == 1 else page) * pages
         if file.stat().st_size < size:
-            # SQLite reads a copy of the stated size, whose end is a hole.
+            # SQLite reads a copy of the stated size, with a hole at the end.
             self.cut, self.file = True, scratch() / file.name
             shutil.copyfile(file, self.file)
             os.truncate(self.file, size)

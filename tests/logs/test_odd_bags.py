@@ -61,14 +61,14 @@ def recorded(folder: Path, mode: str) -> Path:
             target.execute(f"INSERT INTO {name} VALUES ({', '.join('?' * len(row))})", row)
     rows = source.execute("SELECT * FROM messages ORDER BY timestamp").fetchall()
     put = "INSERT INTO messages VALUES (?, ?, ?, ?)"
-    target.executemany(put, rows if mode == "rollback" else rows[:3])
+    filler = [(1000 + k, 99, k, b"x" * 4000) for k in range(50)]
+    target.executemany(put, [*rows, *filler] if mode == "rollback" else rows[:3])
     target.commit()
     if mode != "wal-new":
         target.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
     if mode == "rollback":
         # Pages of a transaction that was never committed are in the database.
-        target.execute("DELETE FROM messages WHERE id > 2")
-        target.executemany(put, [(1000 + k, 1, k, b"x" * 4000) for k in range(50)])
+        target.execute("UPDATE messages SET topic_id = 98")
     else:
         target.executemany(put, rows[3:])
         target.commit()

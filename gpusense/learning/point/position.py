@@ -18,6 +18,8 @@ from gpusense.learning.point.search import maximize
 from gpusense.world.sensor_parameters import PositionParameters
 
 _LOG_TWO_PI = math.log(2 * math.pi)
+# Largest difference of fixes that are exact but for rounding [m].
+_EXACT = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +168,10 @@ def fit_position_parameters(
     start = base.mount
     errors = z[used] - places_of(pose[used], (0.0, 0.0) if fit_mount else start)
     shown = errors if not fit_mount else z[used] - places_of(pose[used], start)
+    if np.abs(shown).max() <= _EXACT:
+        raise ValueError(
+            f"fixes: must differ from the places at the poses, got {len(shown)} equal ones: no noise is left"
+        )
     spread = 1.4826 * float(np.median(np.abs(shown))) or float(np.abs(shown).max()) or 1e-6
     heading = pose[used, 2]
     problem = _Fixes(errors, np.cos(heading), np.sin(heading), inside, correlated, area, start, fit_mount, spread)

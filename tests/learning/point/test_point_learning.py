@@ -300,3 +300,10 @@ def test_a_mixture_that_needs_one_normal_has_no_other(seed: int) -> None:
     assert fit.values["heavy_weight"] == 0
     assert fit.values["sigma_heavy"] == fit.values["sigma_range"] == pytest.approx(0.6 / 12**0.5, rel=0.05)
     assert {"sigma_heavy", "heavy_weight"} <= set(fit.held) and "sigma_range" not in fit.held
+
+
+@pytest.mark.parametrize("options", [{}, {"correlated": True}, {"fit_mount": True}, {"region": (0, 0, 50, 50)}])
+def test_exact_fixes_have_no_noise_to_fit(options):
+    poses = np.random.default_rng(0).uniform((0, 0, -3), (50, 50, 3), (90, 3))
+    with pytest.raises(ValueError, match="fixes: must differ from the places at the poses, got 90 equal ones"):
+        gs.fit_position_parameters(poses, poses[:, :2], **options)

@@ -7,8 +7,9 @@ import importlib.util
 from pathlib import Path
 from typing import Any
 
+from gpusense._util import checks
 from gpusense._util.documents import read_mapping
-from gpusense.commands.arguments import add_backend
+from gpusense.commands.arguments import add_backend, finite_number
 from gpusense.localization.nav2_file import FITTED
 
 NAME = "ros"
@@ -44,9 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--params-file", type=Path, metavar="YAML",
         help="parameters of nav2_amcl, as nav2_params.yaml has them, or parameters.yaml of 'gpusense fit'")  # fmt: skip
     start = parser.add_mutually_exclusive_group()
-    start.add_argument("--start", type=float, nargs=3, metavar=("X", "Y", "THETA"), help="first pose [m, m, rad]")
+    start.add_argument(
+        "--start", type=finite_number, nargs=3, metavar=("X", "Y", "THETA"), help="first pose [m, m, rad]"
+    )
     start.add_argument("--global", dest="anywhere", action="store_true", help="start all over the map")
-    add("--mount", type=float, nargs=3, metavar=("X", "Y", "THETA"),
+    add("--mount", type=finite_number, nargs=3, metavar=("X", "Y", "THETA"),
         help="pose of the laser on the robot [m, m, rad] (default: by /tf)")  # fmt: skip
     add("--odom-topic", metavar="TOPIC", help="read odometry from nav_msgs/Odometry (default: by /tf)")
     add("--base-frame", metavar="FRAME", help="frame of the robot's base (default: base_footprint)")
@@ -95,9 +98,11 @@ def _localize(args: argparse.Namespace) -> dict[str, Any]:
 
 def _watch(args: argparse.Namespace) -> dict[str, Any]:
     """Return the parameters of the watching node."""
-    for name in ("start", "odom_topic", "anywhere", "no_autostart"):
-        if getattr(args, name):
-            raise ValueError(f"--{name.replace('_', '-').replace('anywhere', 'global')}: must not come with watch")
+    options = {"--start": args.start, "--global": args.anywhere, "--odom-topic": args.odom_topic,
+               "--no-autostart": args.no_autostart}  # fmt: skip
+    for name, value in options.items():
+        if value:
+            raise ValueError(f"{name}: must not come with watch")
     return _common(args) | ({} if args.base_frame is None else {"base_frame": args.base_frame})
 
 
@@ -105,7 +110,7 @@ def _common(args: argparse.Namespace) -> dict[str, Any]:
     """Return the parameters of either node."""
     chosen: dict[str, Any] = {} if args.backend == "auto" else {"backend": args.backend}
     if args.map is not None:
-        chosen["map_file"] = args.map
+        chosen["map_file"] = checks.existing_file(args.map)
     if args.mount is not None:
         chosen["mount"] = args.mount
     return chosen
@@ -115,4 +120,6 @@ def _yaml(value: Any) -> str:
     """Return a parameter's value as YAML."""
     if isinstance(value, bool):
         return str(value).lower()
-    return f"'{value}'" if isinstance(value, (str, Path)) else str(value)
+    if isinstance(value, (str, Path)):
+        return "'" + str(value).replace("'", "''") + "'"
+    return str(value)

@@ -136,10 +136,11 @@ def test_time_that_goes_back_may_start_the_filter_again_and_lost_scans_are_count
 
 @pytest.mark.parametrize("more, text", [
     (["--backend", "nosuch"], "nosuch"), (["--ros-args", "-p", "scan_topic:='bad topic'"], "bad topic"),
-    (["--ros-args", "-p", "z_hit:=-1.0"], "z_hit"), (["--map", "{}/no.yaml"], "no.yaml"),
+    (["--ros-args", "-p", "z_hit:=-1.0"], "z_hit"), (["--ros-args", "-p", "map_file:=/no.yaml"], "no.yaml"),
+    (["watch", "--backend", "nosuch"], "nosuch"), (["watch", "--ros-args", "-p", "patience:=0.0"], "patience"),
+    (["--ros-args", "-p", "nothing"], "nothing"),
 ])  # fmt: skip
 def test_what_cannot_be_configured_is_named(robot: Any, tmp_path: Path, more: list[str], text: str) -> None:
-    more = [each.format(tmp_path) for each in more]
     with started(tmp_path / "log", *more) as node:
         assert node.process.wait(90) == 1
     assert text in node.text() and "Traceback" not in node.text()

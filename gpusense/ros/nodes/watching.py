@@ -16,6 +16,7 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
+from gpusense.backends import get_backend
 from gpusense.logs.transform_buffer import TransformError
 from gpusense.ros.nodes.wiring import Guard, Transforms, diagnostic_array, latched, run, unreliable
 from gpusense.ros.parameters import WATCH, check_watch, mount_of
@@ -32,6 +33,7 @@ class WatchingNode(Node):
         dynamic = ParameterDescriptor(dynamic_typing=True)
         values = {name: self.declare_parameter(name, value, dynamic).value for name, value in WATCH.items()}
         check_watch(values)
+        get_backend(values["backend"])
         self.full_name = self.get_fully_qualified_name().lstrip("/")
         self.guard = Guard(self.get_logger())
         self.watcher = Watcher(

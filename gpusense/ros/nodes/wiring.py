@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import rclpy
+import rclpy.logging
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from nav_msgs.msg import Odometry
 from rclpy.executors import ExternalShutdownException
@@ -96,7 +97,7 @@ class Guard:
 
     def report(self, subject: str, error: Exception) -> None:
         """Log an error once, and at most one error of a subject in 2 s."""
-        text = str(error) if isinstance(error, (OSError, TypeError, ValueError)) else f"{type(error).__name__}: {error}"
+        text = described(error)
         self.troubles[subject] = text
         before, since = self._logged.get(subject, ("", -_QUIET))
         if text != before and time.monotonic() - since > _QUIET:
@@ -190,8 +191,12 @@ def run(make: Callable[[], Any], args: Sequence[str] | None = None) -> int:
     """
     node = None
     try:
-        rclpy.init(args=None if args is None else list(args))
-        node = make()
+        try:
+            rclpy.init(args=None if args is None else list(args))
+            node = make()
+        except Exception as error:
+            rclpy.logging.get_logger("gpusense").error(described(error))
+            return 1
         if not getattr(node, "start", lambda: True)():
             return 1
         rclpy.spin(node)
@@ -202,3 +207,8 @@ def run(make: Callable[[], Any], args: Sequence[str] | None = None) -> int:
             node.destroy_node()
         rclpy.try_shutdown()
     return 0
+
+
+def described(error: Exception) -> str:
+    """Return an error's text, with its type where the user did not cause it."""
+    return str(error) if isinstance(error, (OSError, TypeError, ValueError)) else f"{type(error).__name__}: {error}"

@@ -21,6 +21,8 @@ PLACES = 1440
 """Beams of the scanner of scans whose beams vary."""
 # Time without a scan after which diagnostics are stale [s].
 _PATIENCE = 5.0
+# Bearings that differ by less than this share of a step, and mounts that differ by less [m, rad], are the same.
+_SAME, _SAME_MOUNT = 0.05, 1e-3
 # Standard deviations of a first pose, as in nav2_amcl [m, m, rad].
 _START = (0.5, 0.5, math.pi / 12)
 
@@ -190,21 +192,26 @@ class Localizer:
         return status_fields("filter", LEVELS[found.verdict], text, values, node)
 
     def _readings(self, fields: Mapping[str, Any], scanner: Scanner) -> np.ndarray:
-        """Return the readings for the filter's scanner; make the filter where there is none for it.
+        """Return the readings for the filter's scanner, as in logs; make the filter where there is none for it.
 
-        The first scan's geometry is the scanner. After a scan of another geometry, all scans are
-        spread on common bearings, so that varying beams need only a second model.
+        The first scan's geometry is the scanner. After a scan of another geometry, all scans are spread on common
+        bearings, so that varying beams need only a second model. Readings of 0 are missing, and the limits of each scan
+        are kept.
         """
-        if self.filter is None:
+        if self._scanner is None or self.filter is None:
             self._spread = False
             self._make(scanner)
-        elif scanner != self._scanner and not self._spread:
+        elif not self._spread and not alike(scanner, self._scanner):
             self._spread = True
             self._make(Scanner.uniform(
                 angle_min=-math.pi, angle_increment=2 * math.pi / PLACES, count=PLACES, range_max=scanner.range_max,
                 range_min=scanner.range_min, mount=scanner.mount,
             ))  # fmt: skip
-        return spread_readings(fields, PLACES) if self._spread else np.array(fields["ranges"], np.float64)
+        ranges = spread_readings(fields, PLACES) if self._spread else np.array(fields["ranges"], np.float64)
+        ranges[ranges == 0] = math.nan
+        ranges[ranges < scanner.range_min] = math.nan
+        ranges[ranges >= scanner.range_max] = math.inf
+        return ranges
 
     def _make(self, scanner: Scanner | None) -> None:
         assert self.grid is not None and scanner is not None
@@ -222,3 +229,11 @@ class Localizer:
             self.filter.initialize_uniform()
         else:
             self.filter.initialize(mean=self._start[0], covariance=self._start[1])
+
+
+def alike(first: Scanner, second: Scanner) -> bool:
+    """Return whether the beams of two scanners have the same bearings, but for rounding, and the same mount."""
+    if first.count != second.count or not np.allclose(first.mount, second.mount, rtol=0, atol=_SAME_MOUNT):
+        return False
+    step = abs(float(first.bearings[1] - first.bearings[0])) if first.count > 1 else 1.0
+    return bool(np.abs(first.bearings - second.bearings).max() < _SAME * step)

@@ -120,6 +120,22 @@ def test_a_scan_that_breaks_a_rule_is_skipped() -> None:
     assert own.update(scan_of(60), (0.0, 0.0, 0.0), np.eye(4)) and own.problem is None
 
 
+def test_scans_that_differ_by_rounding_or_limits_keep_the_scanner(monkeypatch: pytest.MonkeyPatch) -> None:
+    FakeFilter.made = []
+    monkeypatch.setattr("gpusense.localization.filter.ParticleFilter", FakeFilter)
+    own = localizer.Localizer(from_nav2({"sigma_hit": 0.1}), backend="numpy")
+    own.set_map(grid())
+    assert own.update(scan_of(4), (0.0, 0.0, 0.0), AHEAD)
+    message = scan_of(4)
+    message.angle_min += 1e-6
+    message.range_min, message.range_max, message.ranges = 0.5, 6.0, np.array([0.0, 0.3, 7.0, 2.0])
+    laser = AHEAD.copy()
+    laser[0, 3] += 1e-9
+    assert own.update(message, (1.0, 0.0, 0.0), laser)
+    (made,) = FakeFilter.made
+    np.testing.assert_array_equal(made.calls[-1][1], [math.nan, math.nan, math.inf, 2.0])
+
+
 def test_a_scanner_of_as_many_beams_as_places_may_vary(monkeypatch: pytest.MonkeyPatch) -> None:
     FakeFilter.made = []
     monkeypatch.setattr("gpusense.localization.filter.ParticleFilter", FakeFilter)

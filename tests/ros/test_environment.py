@@ -18,7 +18,7 @@ def test_the_nodes_run_inside_ros(tmp_path: Path) -> None:
         pytest.skip("this environment has ROS: the other files run in it")
     if not place:
         skip_or_fail("ros", f"{VARIABLE} must name an environment that .ci/ros made")
-    command = [f"{place}/bin/python", "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist",
+    command = [f"{place}/bin/python", "-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0",
                f"--basetemp={tmp_path / 'inside'}", str(TESTS / "ros"), "-m", "", "-k", "inside"]  # fmt: skip
     done = subprocess.run(
         command, env=environment() | {"PYTEST_ADDOPTS": ""}, cwd=TESTS.parent, capture_output=True, text=True,

@@ -1,4 +1,4 @@
-"""Settings of the site, whose source is the whole checkout: python -m sphinx -W -c docs . site"""
+"""Configure the site; its source is the whole checkout: python -m sphinx -W -c docs . site"""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ exclude_patterns = ["**/.*", "site", "docs/tour/GALLERY_HEADER.rst"]
 suppress_warnings = ["myst.header", "config.cache"]
 
 myst_heading_anchors = 4
-# Notebooks have no outputs in the checkout; each runs here, in a folder of its own.
+# Notebooks have no outputs in the checkout; each runs here, in a separate folder.
 nb_execution_mode = "force"
 nb_execution_in_temp = True
 nb_execution_raise_on_error = True
@@ -72,7 +72,7 @@ html_copy_source = False
 
 
 def mark_reports(app: Any, name: str, source: list[str]) -> None:
-    """Say that a report or a note stands in no table of contents; pages link to it."""
+    """Mark reports and notes as orphans: pages link to them, tables of contents do not list them."""
     if name.startswith(("bench/results/", "docs/notes/")):
         source[0] = f"---\norphan: true\n---\n{source[0]}"
 
@@ -82,7 +82,7 @@ COLON = "\ue000"
 
 
 def hide_colons(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Replace colons in the first line of an attribute's text: napoleon takes words before one for a type."""
+    """Replace colons in the first line of an attribute's text: napoleon reads words before a colon as a type."""
     if what in ("attribute", "property") and lines:
         lines[0] = lines[0].replace(": ", f"{COLON} ")
 
@@ -93,7 +93,7 @@ def show_colons(app: Any, what: str, name: str, obj: Any, options: Any, lines: l
 
 
 def open_figures(app: Any, doctree: nodes.document) -> None:
-    """Let links to files of ``docs/front`` open them: they lie at the root of the site, and are no downloads."""
+    """Let links to files of ``docs/front`` open them: they belong to the root of the site, and are no downloads."""
     root = "../" * app.env.docname.count("/")
     for node in list(doctree.findall(addnodes.download_reference)):
         _, front, path = node["reftarget"].partition("front/")

@@ -1,4 +1,4 @@
-"""Write the site's pages of public names, one for each room of the package, from the table of names."""
+"""Write the API reference from the table of public names: a page for each room of the package."""
 
 from __future__ import annotations
 

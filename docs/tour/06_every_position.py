@@ -4,8 +4,9 @@ Where could this scan come from?
 
 P(z | x, m) at all poses of a map, drawn at the best heading of each position: the darker, the likelier. Nothing is
 known before but the map; the sum over a grid of poses is the first step of grid localisation (book section 8.2). The
-likelihood field does not ask whether a wall stands between the robot and the end of a beam, so other places can score nearly the same. **Try:** ``default_rng(2)``, a scan for which a wrong place is the likeliest, and ``beams=8``; or `drag
-a scanner over a map <../../figures/scan.html>`__ in the browser.
+likelihood field does not ask whether a wall stands between the robot and the end of a beam, so other places can score
+nearly the same. **Try:** ``default_rng(2)``, a scan for which a wrong place is the likeliest, and ``beams=8``; or
+`drag a scanner over a map <../../figures/scan.html>`__ in the browser.
 """
 
 import matplotlib.pyplot as plt

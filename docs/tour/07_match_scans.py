@@ -2,9 +2,10 @@
 Match a scan to an earlier one
 ==============================
 
-How did the robot move between two scans? ``gs.match_scan`` lays the second over the first: points to lines, with a wide covariance and a
-status for directions that the scans do not determine (book section 6.5 matches maps; Censi, ICRA 2008, is the source of
-this method). Right: in a map the gradient of the likelihood field points to the pose from positions around it (book section 6.4). **Try:** a guess of (1.5, 0, 1), from which no match is found, and read
+How did the robot move between two scans? ``gs.match_scan`` lays the second over the first: points to lines, with a
+wide covariance and a status for directions that the scans do not determine (book section 6.5 matches maps; Censi,
+ICRA 2008, is the source of this method). Right: in a map the gradient of the likelihood field points to the pose from
+positions around it (book section 6.4). **Try:** a guess of (1.5, 0, 1), from which no match is found, and read
 ``match.explain()``.
 """
 

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gpusense._util import checks
-from gpusense.reference.reading_class import is_hit, is_max
 from gpusense.world import plausible
 from gpusense.world.messages import laser_geometry
 
@@ -298,9 +297,13 @@ def classify(ranges: ArrayLike, scanner: Scanner) -> NDArray[np.uint8]:
 def classify_ranges(
     z: NDArray[np.floating], range_min: float, range_max: float
 ) -> tuple[NDArray[np.bool], NDArray[np.bool]]:
-    """Return which readings of any shape are hits, and which are max readings; the others are missing."""
+    """Return which readings of any shape are hits, and which are max readings; the others are missing.
+
+    Kernels have the same rule in the file ``reading_class``. Calls of its functions would take longer than the
+    comparisons.
+    """
     nearest, farthest = range_limits(z.dtype, range_min, range_max)
-    return is_hit(z, nearest, farthest), is_max(z, farthest)
+    return (z >= nearest) & (z < farthest), z >= farthest
 
 
 def reading_classes(z: NDArray[np.floating], range_min: float, range_max: float) -> NDArray[np.uint8]:

@@ -56,7 +56,8 @@ CASES: list[tuple[str, Callable[[], object], type[Exception], str]] = [
     ("no-region", make(P, sigma=1, z_hit=0.9, z_rand=0.1), V,
      "region: must be given where z_rand > 0, got None with z_rand = 0.1"),
     ("region-empty", make(P, sigma=1, region=(0, 0, 0, 1)), V,
-     "region: must be (x_min, y_min, x_max, y_max) with x_min < x_max and y_min < y_max, got (0, 0, 0, 1)"),
+     "region: must be (x_min, y_min, x_max, y_max) with x_min < x_max and y_min < y_max, of a finite area > 0, "
+     "got (0, 0, 0, 1)"),
     ("temperature-0", make(gs.HeadingModel, backend="numpy", temperature=0), V, WARM("0")),
     ("temperature-2", make(gs.PositionModel, P(sigma=1), backend="numpy", temperature=2), V, WARM("2")),
     ("temperature-nan", make(gs.BeaconModel, [[0, 0]], backend="numpy", temperature=NAN), V, WARM("nan")),

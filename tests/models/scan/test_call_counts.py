@@ -22,7 +22,7 @@ RANGES = gs.RayCaster(GRID, 9.0, backend="numpy").cast(POSE[None], SCANNER.beari
 PACKAGE = Path(gs.__file__).parent
 # Largest number of calls of Python functions, NumPy's included, with Python 3.11.
 # A step judges its pose, whether or not anybody asks for it.
-MOST_FIELD, MOST_BEAMS, MOST_STEP, MOST_BOUND = 80, 90, 215, 90
+MOST_FIELD, MOST_BEAMS, MOST_STEP, MOST_BOUND = 80, 90, 225, 90
 # Most stays of a call in rooms of the package: successive calls in one room are one stay.
 MOST_STAYS = 22
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import difflib
 import importlib
 import io
 import os
+import re
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
@@ -21,6 +23,7 @@ COMMANDS = (
     "devices", "selftest", "demo", "explain", "simulate", "map", "score", "localize", "fit", "match",
     "likelihood-map", "features", "landmarks", "ros", "sweep", "bench",
 )  # fmt: skip
+ALIASES = {"localise": "localize"}
 
 BAD_INPUT = 2
 BROKEN_PIPE = 141
@@ -45,15 +48,44 @@ keeps and prints the results so far."""
 class Parser(argparse.ArgumentParser):
     """A parser that reports an error as one line."""
 
+    _command: str | None = None
+
     def error(self, message: str) -> NoReturn:
-        """Print the message without the usage, and exit."""
-        self.exit(BAD_INPUT, _error_line(message))
+        """Print the message without the usage but with a likely correction, and exit."""
+        self.exit(BAD_INPUT, _error_line(message + self._correction(message)))
+
+    def _correction(self, message: str) -> str:
+        """Return the name that an unknown command, choice or option resembles; empty without one."""
+        wrong = re.match(r"argument (\S+): invalid choice: '([^']*)'|unrecognized arguments: (-\S+)", message)
+        if wrong is None:
+            return ""
+        name, choice, option = wrong.groups()
+        parser = self
+        if option:
+            # The top-level parser reports the unknown options of commands.
+            parser = self._commands().get(self._command, self)
+            known: list[str] = [text for action in parser._actions for text in action.option_strings]
+        elif name == "COMMAND":
+            known = list(COMMANDS)
+        else:
+            actions = [
+                action for action in self._actions if name.split("/")[0] in (*action.option_strings, action.dest)
+            ]
+            known = [str(choice) for action in actions for choice in action.choices or ()]
+        close = difflib.get_close_matches(option or choice, known, n=1)
+        return f"; did you mean {close[0]!r}?" if close else ""
+
+    def _commands(self) -> dict[str, Parser]:
+        """Return the parsers of commands by name."""
+        actions = [action for action in self._actions if isinstance(action, argparse._SubParsersAction)]
+        return actions[0].choices if actions else {}  # type: ignore[return-value]
 
     def parse_known_args(  # type: ignore[override]
         self, args: Any = None, namespace: Any = None
     ) -> tuple[argparse.Namespace, list[str]]:
         """Parse arguments as the base class does, and check that no output is another file of the command."""
         found, rest = super().parse_known_args(args, namespace)
+        self._command = getattr(found, "command", None)
         self._check_outputs(found)
         return found, rest
 
@@ -173,6 +205,7 @@ def _settle() -> None:
 
 def _dispatch(argv: list[str]) -> int:
     # Import only the chosen command, so that an import error in another command does not affect it.
+    argv = [ALIASES.get(argv[0], argv[0]), *argv[1:]] if argv else argv
     names = (argv[0],) if argv and argv[0] in COMMANDS else COMMANDS
     parser = _build(names)
     try:

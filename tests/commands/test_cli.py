@@ -72,8 +72,9 @@ def test_version(capsys):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["devices", "--jsn"], "unrecognized arguments: --jsn"),
-        ([*SMALL, "--js"], "unrecognized arguments: --js"),
+        (["devices", "--jsn"], "unrecognized arguments: --jsn; did you mean '--json'?"),
+        ([*SMALL, "--js"], "unrecognized arguments: --js; did you mean '--json'?"),
+        ([*SMALL, "--nothing-like-it"], "unrecognized arguments: --nothing-like-it"),
         (["demo", "--particles", "-5"], "argument --particles: must be an integer from 1 to 100000000, got -5"),
         (["demo", "--particles", "1e3"], "argument --particles: must be an integer from 1 to 100000000, got '1e3'"),
         (["demo", "--beams", "181"], "argument --beams: must be an integer from 1 to 180, got 181"),
@@ -103,6 +104,14 @@ def test_unknown_command_names_the_choices(capsys):
     message = error_of(["bogus"], capsys)
     assert message.startswith("argument COMMAND: invalid choice: 'bogus'")
     assert all(name in message for name in cli.COMMANDS)
+    assert "did you mean" not in message
+    assert error_of(["localizze"], capsys).endswith("; did you mean 'localize'?")
+    assert error_of(["fit", "--method", "graddient"], capsys).endswith("; did you mean 'gradient'?")
+
+
+def test_localise_is_localize(capsys):
+    assert cli.main(["localise", "--help"]) == 0
+    assert capsys.readouterr().out.startswith("usage: gpusense localize ")
 
 
 @pytest.mark.parametrize(

@@ -63,7 +63,7 @@ class Parser(argparse.ArgumentParser):
         parser = self
         if option:
             # The top-level parser reports the unknown options of commands.
-            parser = self._commands().get(self._command, self)
+            parser = self._commands().get(self._command or "", self)
             known: list[str] = [text for action in parser._actions for text in action.option_strings]
         elif name == "COMMAND":
             known = list(COMMANDS)
@@ -78,7 +78,7 @@ class Parser(argparse.ArgumentParser):
     def _commands(self) -> dict[str, Parser]:
         """Return the parsers of commands by name."""
         actions = [action for action in self._actions if isinstance(action, argparse._SubParsersAction)]
-        return actions[0].choices if actions else {}  # type: ignore[return-value]
+        return actions[0].choices if actions else {}
 
     def parse_known_args(  # type: ignore[override]
         self, args: Any = None, namespace: Any = None

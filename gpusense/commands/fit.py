@@ -303,7 +303,7 @@ def _folder(text: str) -> Path:
         # The folder is created once the fit has succeeded.
         there = next(each for each in (folder, *folder.absolute().parents) if os.path.lexists(each))
         if not there.is_dir():
-            raise ValueError(f"{there} is no folder")
+            raise ValueError("not a folder")
         check_writable(there / "parameters.yaml")
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from support.bags import Writer
 from support.command_line import error_of, script
 from support.paths import ROOT
 from support.room_log import write_room
@@ -42,8 +43,10 @@ CALLS = [
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Make a folder with maps, logs and a plan the working directory."""
     write_room(tmp_path, scans=3)
-    for name in ("run.bag", "run.mcap"):
-        (tmp_path / name).write_bytes(b"#ROSBAG V2.0\n")
+    for kind in ("ros1", "mcap"):
+        with Writer(tmp_path, kind) as bag:
+            bag.scan(0.0, [1.0, 2.0, 3.0], -0.1, 0.1)
+    next((tmp_path / "run").glob("*.mcap")).rename(tmp_path / "run.mcap")
     (tmp_path / "plan.yaml").write_text("axes: {log: {run: {log: run.log, map: map.yaml}}}\n")
     gs.write_map(gs.OccupancyGrid([[0, 100]]), tmp_path / "png.yaml", image_format="png")
     monkeypatch.chdir(tmp_path)
@@ -89,11 +92,11 @@ def test_an_interpreter_without_a_library(place):
 
 
 def test_a_library_that_does_not_load_says_why(place, block, monkeypatch, capsys):
-    block("lz4")
     for module in [each for each in sys.modules if each.startswith("rosbags")]:
         monkeypatch.delitem(sys.modules, module)
+    block("rosbags.typesys.store")
     message = error_of(["match", "--log", "run.bag"], capsys)
-    assert "needs the library rosbags, which cannot be imported (" in message and "lz4" in message
+    assert "needs the library rosbags, which cannot be imported (" in message and "store" in message
 
 
 def test_a_module_of_gpusense_that_is_absent_keeps_its_traceback(place, monkeypatch):

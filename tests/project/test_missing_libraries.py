@@ -91,12 +91,18 @@ def test_an_interpreter_without_a_library(place):
     )
 
 
-def test_a_library_that_does_not_load_says_why(place, block, monkeypatch, capsys):
+def test_a_library_that_does_not_load_says_why(place, monkeypatch, capsys):
+    class Broken:
+        @staticmethod
+        def find_spec(name: str, *_: object) -> None:
+            if name.startswith("rosbags"):
+                raise ImportError("a part of lz4 is absent")
+
     for module in [each for each in sys.modules if each.startswith("rosbags")]:
         monkeypatch.delitem(sys.modules, module)
-    block("rosbags.typesys.store")
+    monkeypatch.setattr(sys, "meta_path", [Broken, *sys.meta_path])
     message = error_of(["match", "--log", "run.bag"], capsys)
-    assert "needs the library rosbags, which cannot be imported (" in message and "store" in message
+    assert "needs the library rosbags, which cannot be imported (" in message and "lz4" in message
 
 
 def test_a_module_of_gpusense_that_is_absent_keeps_its_traceback(place, monkeypatch):
